@@ -46,11 +46,11 @@ fn report(database: &str, group: usize, time: Duration) {
 
 async fn measure(location: Location, commits: &[Commit]) -> Duration {
     let store = common::create_at(location).await;
-    let begun = Instant::now();
+    let started = Instant::now();
     for commit in commits {
         store.commit(commit).await.unwrap();
     }
-    let time = begun.elapsed();
+    let time = started.elapsed();
     store.close().await;
     time
 }

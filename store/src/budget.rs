@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_limit_is_reached_when_as_much_was_used() {
+    fn a_limit_is_reached_when_use_equals_it() {
         let used = BudgetUse { labels: 3, under_way: 2, core_hours: 1.5, wall_hours: 0.25 };
         let none = Budget::default();
         assert!(none.is_none() && none.time_used_up(&used).is_none() && !none.allows_no_attempt(&used));

@@ -343,7 +343,7 @@ mod tests {
 
     /// What databases drop must not change the checksum; everything else must.
     #[test]
-    fn values_that_come_back_the_same_have_the_same_checksum() {
+    fn values_that_read_back_equal_have_equal_checksums() {
         let of = |value: Value| checksum(&[value]);
         assert_eq!(of(0.0.into()), of((-0.0).into()));
         assert_eq!(of(f64::NAN.into()), of(Value::Real(None)));
@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn what_joins_select_are_the_columns_of_the_table() {
+    fn joins_select_the_columns_of_the_table() {
         for (table, selected) in [
             (&CANDIDATE, joined!(candidate)),
             (&DECISION, joined!(decision)),

@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_structure_comes_back_and_damage_is_seen() {
+    fn a_structure_is_read_back_and_damage_is_detected() {
         let structure = Structure {
             species: vec!["Al".parse().unwrap(), "O".parse().unwrap()],
             positions: vec![[0.1, -0.0, 3.0], [1e300, 5e-324, -7.25]],

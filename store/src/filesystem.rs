@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn network_file_systems_are_known_by_their_numbers() {
+    fn network_file_systems_are_recognized_by_their_magic_numbers() {
         for (magic, name) in [
             (0x6969, "NFS"),
             (0xff53_4d42, "CIFS"),
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mount_table_tells_file_systems_in_user_space_apart() {
+    fn the_mount_table_distinguishes_file_systems_in_user_space() {
         let table = "22 1 8:1 / / rw,relatime shared:1 - ext4 /dev/sda1 rw\n\
                      30 22 0:50 / /home/a\\040b rw shared:2 - fuse.sshfs host:/x rw\n\
                      31 22 0:51 / /mnt/usb rw - fuseblk /dev/sdb1 rw\n\

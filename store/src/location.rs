@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_a_url_is_refused_without_showing_it() {
+    fn invalid_urls_are_refused_without_showing_them() {
         for url in [
             "postgres://anna:s3/cret@host/lab",
             "postgres://anna:s3cret@host:port/lab",
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_the_same_however_it_is_written() {
+    fn the_campaign_key_is_independent_of_the_form_of_the_url() {
         let place = |url: &str| url.parse::<ServerUrl>().unwrap().campaign_key();
         let expected = place("postgres://anna@localhost/lab?schema=alloy");
         for same in [
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_schema_it_is_the_one_that_every_database_has() {
+    fn the_default_schema_is_public() {
         let server: ServerUrl = "postgres://host/lab?host=/run/postgresql&port=5433".parse().unwrap();
         assert_eq!(server.schema, "public");
         assert_eq!(server.as_str(), "postgres://host/lab?host=/run/postgresql&port=5433");

@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_second_holder_is_told_the_process_and_the_lock_comes_free() {
+    fn a_second_holder_learns_of_the_process_and_the_lock_is_released() {
         let directory = tempfile::tempdir().unwrap();
         let lock = CampaignLock::acquire(directory.path(), "run").unwrap();
         let message = CampaignLock::acquire(directory.path(), "run").unwrap_err().to_string();
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn deleting_the_file_lets_nobody_in() {
+    fn deleting_the_file_does_not_release_the_lock() {
         let directory = tempfile::tempdir().unwrap();
         let lock = CampaignLock::acquire(directory.path(), "run").unwrap();
         fs::remove_file(directory.path().join(LOCK)).unwrap();
@@ -137,7 +137,7 @@ mod tests {
 
     /// An earlier version, which locks only the file.
     #[test]
-    fn who_has_only_the_file_is_respected() {
+    fn a_holder_of_the_file_alone_is_respected() {
         let directory = tempfile::tempdir().unwrap();
         let file = File::create(directory.path().join(LOCK)).unwrap();
         file.lock().unwrap();

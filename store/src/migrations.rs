@@ -25,7 +25,7 @@ mod tests {
 
     /// The steps match the files as sqlx reads the folder: same versions, names and checksums.
     #[tokio::test]
-    async fn the_steps_are_the_files_of_their_folder() {
+    async fn the_migrations_match_the_files_of_their_folder() {
         for (folder, steps) in
             [("sqlite", &crate::sqlite::STEPS[..]), ("postgres", &crate::postgres::STEPS[..])]
         {

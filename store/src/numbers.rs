@@ -93,7 +93,7 @@ mod tests {
         #![proptest_config(ProptestConfig { rng_seed: RngSeed::Fixed(8), ..ProptestConfig::default() })]
 
         #[test]
-        fn every_bit_comes_back(bits in proptest::collection::vec(any::<u64>(), 0..300)) {
+        fn every_bit_is_preserved(bits in proptest::collection::vec(any::<u64>(), 0..300)) {
             let numbers: Vec<f64> = bits.iter().map(|b| f64::from_bits(*b)).collect();
             for bytes in [encode_numbers(&numbers), compress(&numbers)] {
                 let back = decode_numbers(&bytes).unwrap();
@@ -102,7 +102,7 @@ mod tests {
         }
 
         #[test]
-        fn foreign_bytes_are_refused_not_believed(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+        fn arbitrary_bytes_are_rejected(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
             prop_assert!(decode_numbers(&bytes).is_err());
         }
     }
@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_count_and_missing_bytes_are_seen() {
+    fn a_wrong_count_and_missing_bytes_are_detected() {
         for (bytes, found) in [(encode_numbers(&[1.0, 2.0, 3.0]), 24), (compress(&[1.0, 2.0, 3.0]), 17)] {
             let mut wrong = bytes.clone();
             wrong[0] = 2;

@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn living_and_dead_processes_are_told_apart() {
+    fn living_and_dead_processes_are_distinguished() {
         let own = process_start_time(std::process::id()).unwrap();
         assert!(is_running(std::process::id(), &own) && is_running(std::process::id(), ""));
         assert!(!is_running(0, "") && !is_running(u32::MAX, ""));
@@ -119,9 +119,12 @@ mod tests {
         assert!(!is_from_another_boot(&start_time));
         // It ends, and its parent has not reaped it yet.
         drop(child.stdin.take());
-        let begun = Instant::now();
+        let started = Instant::now();
         while is_running(child.id(), &start_time) {
-            assert!(begun.elapsed() < Duration::from_secs(60), "an ended process is taken for a running one");
+            assert!(
+                started.elapsed() < Duration::from_secs(60),
+                "an ended process is taken for a running one"
+            );
             std::thread::sleep(Duration::from_millis(5));
         }
         assert!(has_number(child.id()) && !is_running(child.id(), ""));
@@ -130,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_was_given_out_again_fools_nobody() {
+    fn a_reused_process_id_is_recognized() {
         let (pid, own) = (std::process::id(), process_start_time(std::process::id()).unwrap());
         let (place, ticks) = own.rsplit_once('/').unwrap();
         let earlier = format!("{place}/{}", ticks.parse::<u64>().unwrap() - 1);
@@ -140,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_of_other_containers_mean_nothing_here() {
+    fn process_ids_of_other_containers_are_not_local() {
         let (pid, own) = (std::process::id(), process_start_time(std::process::id()).unwrap());
         let [boot, namespace, ticks] = own.split('/').collect::<Vec<_>>().try_into().unwrap();
         assert_eq!(is_local(&own), Some(true));
@@ -153,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_programs_do_not_confuse() {
+    fn program_names_do_not_confuse_the_parser() {
         let rest = "0 ".repeat(18);
         let stat = parse(&format!("7 (a) Z (b) S {rest}123456 0")).unwrap();
         assert!(!stat.ended && stat.ticks == 123_456);

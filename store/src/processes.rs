@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ran_before_the_last_boot_is_gone_wherever_it_ran() {
+    fn processes_from_before_the_last_boot_are_dead() {
         let record = own(ProcessRecord::LABELLER);
         assert!(!record.is_dead());
         let elsewhere = ProcessRecord { pid: u32::MAX, ..elsewhere(&record) };
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_born_on_another_host_is_gone_after_a_day_of_silence() {
+    fn processes_on_another_host_are_dead_after_a_day_of_silence() {
         let record =
             ProcessRecord { start_time: "another-boot/1/1".into(), ..own(ProcessRecord::ORCHESTRATOR) };
         let silent_for = |silence| ProcessRecord { silence: Some(silence), ..record.clone() };

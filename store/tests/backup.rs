@@ -44,7 +44,7 @@ async fn back_up(store: &Store, target: &Path) -> Result<(), StoreError> {
 }
 
 #[tokio::test]
-async fn a_backup_is_a_campaign_of_its_own() {
+async fn a_backup_is_an_independent_campaign() {
     let (home, elsewhere) = (Home::new(), tempfile::tempdir().unwrap());
     let store = home.create().await;
     for k in 1..=200 {
@@ -102,7 +102,7 @@ async fn nothing_is_overwritten() {
 
 /// A copy is complete at any time.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn copies_are_made_while_the_campaign_goes_on() {
+async fn backups_are_made_while_the_campaign_runs() {
     let (home, elsewhere) = (Home::new(), tempfile::tempdir().unwrap());
     let (store, stop) = (home.create().await, Arc::new(AtomicBool::new(false)));
     let committing = tokio::spawn({
@@ -135,7 +135,7 @@ async fn copies_are_made_while_the_campaign_goes_on() {
 }
 
 #[tokio::test]
-async fn compacting_gives_space_back_and_changes_nothing() {
+async fn compacting_frees_space_and_changes_nothing() {
     let home = Home::new();
     let store = home.create().await;
     let long = |k: u32, length: usize| {
@@ -151,14 +151,14 @@ async fn compacting_gives_space_back_and_changes_nothing() {
     store.commit(&numbered(1)).await.unwrap();
     let (before, size) = (contents(&store).await, store.size().await.unwrap());
     // On a server, rows that another transaction may still see stay; other tests hold some.
-    let begun = Instant::now();
+    let started = Instant::now();
     loop {
         store.compact().await.unwrap();
         let compacted = store.size().await.unwrap();
         if compacted + 3_000_000 < size {
             break;
         }
-        assert!(begun.elapsed() < Duration::from_secs(60), "{compacted} of {size}");
+        assert!(started.elapsed() < Duration::from_secs(60), "{compacted} of {size}");
         tokio::time::sleep(Duration::from_millis(200)).await;
     }
     assert_eq!(contents(&store).await, before);

@@ -16,7 +16,7 @@ async fn limit(store: &Store, budget: Budget) {
 }
 
 #[tokio::test]
-async fn no_more_labels_are_begun_than_there_may_be() {
+async fn no_more_labels_start_than_the_budget_permits() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 4).await;
@@ -41,7 +41,7 @@ async fn no_more_labels_are_begun_than_there_may_be() {
 }
 
 #[tokio::test]
-async fn hours_are_those_of_all_attempts_and_of_all_runs() {
+async fn hours_sum_over_all_attempts_and_runs() {
     let home = Home::new();
     let store = home.create().await.with_caller_clock();
     accept(&store, 4).await;

@@ -9,7 +9,7 @@ use wire::{Origin, WalkId};
 use crate::common::*;
 
 #[tokio::test]
-async fn a_campaign_is_begun_once_and_opened_often() {
+async fn a_campaign_is_created_once_and_opened_often() {
     let home = Home::new();
     let error = Store::open(home.location()).await.unwrap_err();
     assert!(matches!(error, StoreError::Missing { .. }), "{error}");
@@ -53,7 +53,7 @@ fn mixed_commit() -> Commit {
 }
 
 #[tokio::test]
-async fn what_is_committed_comes_back() {
+async fn committed_data_is_read_back() {
     let home = Home::new();
     let store = home.create().await;
     let commit = mixed_commit();
@@ -209,7 +209,7 @@ async fn status_counts_everything_once() {
 }
 
 #[tokio::test]
-async fn what_is_not_known_of_a_walk_is_no_zero() {
+async fn unknown_values_of_a_walk_are_not_zero() {
     let home = Home::new();
     let store = home.create().await;
     let progress = |tau, gamma_max| Progress {
@@ -225,13 +225,13 @@ async fn what_is_not_known_of_a_walk_is_no_zero() {
     let known = |walk: store::WalkStatus| (walk.tau, walk.temperature, walk.relative_volume, walk.gamma_max);
     let walks = store.status().await.unwrap().walks.into_iter().map(known).collect::<Vec<_>>();
     // One with a bias, one without, one that has not started.
-    let begun = (Some(0.5), Some(300.0), Some(1.1), Some(1.2));
+    let started = (Some(0.5), Some(300.0), Some(1.1), Some(1.2));
     let unbiased = (Some(0.0), Some(300.0), Some(1.1), None);
-    assert_eq!(walks, [begun, unbiased, (None, None, None, None)]);
+    assert_eq!(walks, [started, unbiased, (None, None, None, None)]);
 }
 
 #[tokio::test]
-async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
+async fn walks_can_be_paused_and_resumed_at_any_time() {
     let home = Home::new();
     let store = home.create().await;
     let pause = async |walks: &[u32], paused| {
@@ -273,7 +273,7 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
 }
 
 #[tokio::test]
-async fn the_newest_decisions_come_in_short() {
+async fn the_newest_decisions_are_summarized() {
     let home = Home::new();
     let store = home.create().await;
     let records = vec![

@@ -7,7 +7,7 @@ use wire::{Origin, WalkId};
 use crate::common::*;
 
 #[tokio::test]
-async fn a_candidate_is_found_with_what_stands_around_it() {
+async fn a_candidate_is_found_with_related_records() {
     let home = Home::new();
     let store = home.create().await.with_caller_clock();
     // Their walkers saw version 3; each decision adds a version.

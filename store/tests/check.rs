@@ -34,14 +34,14 @@ async fn check(store: &Store) -> Vec<Finding> {
 }
 
 #[tokio::test]
-async fn nothing_is_found_in_a_whole_campaign() {
+async fn an_intact_campaign_has_no_findings() {
     let home = Home::new();
     assert_eq!(check(&whole(&home).await).await, []);
     assert_eq!(check(&home.open_read_only().await).await, []);
 }
 
 #[tokio::test]
-async fn each_damage_is_found_and_told_in_words() {
+async fn each_kind_of_damage_is_found_and_described() {
     for (damage, words) in [
         (
             "DELETE FROM decision WHERE sequence = 4",
@@ -109,7 +109,7 @@ async fn each_damage_is_found_and_told_in_words() {
 }
 
 #[tokio::test]
-async fn leases_of_nobody_are_found() {
+async fn leases_without_a_holder_are_found() {
     let home = Home::new();
     let store = whole(&home).await;
     store.lease(protocol("dft").hash, "nobody", 0, 600).await.unwrap().unwrap();

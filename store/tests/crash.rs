@@ -73,7 +73,7 @@ fn tell(what: &str, number: u64) {
 
 fn start(directory: &Path) -> Child {
     Command::new(env::current_exe().unwrap())
-        .args(["--exact", "crash::a_killed_process_leaves_whole_commits", "--nocapture"])
+        .args(["--exact", "crash::a_killed_process_leaves_complete_commits", "--nocapture"])
         .env(DIRECTORY, directory)
         .stdout(Stdio::piped())
         .spawn()
@@ -153,7 +153,7 @@ async fn check(store: &Store, committed: u64, labelled: &[u64]) -> u64 {
 }
 
 #[test]
-fn a_killed_process_leaves_whole_commits() {
+fn a_killed_process_leaves_complete_commits() {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     if let Some(directory) = env::var_os(DIRECTORY) {
         runtime.block_on(work(directory.as_ref()));

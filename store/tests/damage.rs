@@ -275,7 +275,7 @@ fn damage(bytes: &mut Vec<u8>, page: usize, random: &mut Random) -> String {
 }
 
 #[tokio::test]
-async fn a_damaged_database_is_exported_as_it_was_or_not_at_all() {
+async fn a_damaged_database_exports_the_original_data_or_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let store = full(directory.path(), 60).await;
     store.close().await;
@@ -302,7 +302,7 @@ async fn a_damaged_database_is_exported_as_it_was_or_not_at_all() {
 
 /// An index entry is missing, as after damage to its page.
 #[tokio::test]
-async fn a_label_that_its_index_has_lost_is_missed() {
+async fn a_label_missing_in_its_index_is_detected() {
     let directory = tempfile::tempdir().unwrap();
     let store = full(directory.path(), 12).await;
     store.close().await;
@@ -330,7 +330,7 @@ async fn lose_from_index(directory: &Path, label: i64) {
 /// Rows written before there were checksums are not damaged: each gets its checksum during the migration and is
 /// read as before.
 #[tokio::test]
-async fn an_earlier_database_gets_its_checksums() {
+async fn a_database_of_an_earlier_version_gets_checksums() {
     let directory = tempfile::tempdir().unwrap();
     let store = full(directory.path(), 12).await;
     store.close().await;

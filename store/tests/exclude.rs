@@ -59,7 +59,7 @@ fn change(id: &str, changed: bool, excluded: Option<&str>) -> ExclusionChange {
 }
 
 #[tokio::test]
-async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
+async fn an_excluded_label_counts_nowhere_until_it_is_included_again() {
     let home = Home::new();
     let (store, candidates) = labelled(&home, 3).await;
     let dft = protocol("dft");
@@ -110,7 +110,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
 }
 
 #[tokio::test]
-async fn all_that_are_named_are_excluded_or_none() {
+async fn either_all_named_structures_are_excluded_or_none() {
     let home = Home::new();
     let (store, candidates) = labelled(&home, 2).await;
     let covered = candidate(0, 7, Origin::Biased, Fate::Declined(Decline::Covered));
@@ -143,7 +143,7 @@ async fn all_that_are_named_are_excluded_or_none() {
 }
 
 #[tokio::test]
-async fn only_a_label_that_was_asked_for_comes_in_its_place() {
+async fn only_a_requested_label_replaces_an_excluded_one() {
     let home = Home::new();
     let store = home.create().await.with_caller_clock();
     let (names, dft) = (accept(&store, 1).await, protocol("dft"));

@@ -7,7 +7,7 @@ use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError};
 use crate::common::*;
 
 #[tokio::test]
-async fn a_database_is_there_as_a_whole_or_not_at_all() {
+async fn a_database_is_created_as_a_whole_or_not_at_all() {
     let directory = tempfile::tempdir().unwrap();
     // Leftovers of a killed creation are ignored.
     fs::write(directory.path().join("campaign.sqlite.new"), b"half a file").unwrap();
@@ -17,7 +17,7 @@ async fn a_database_is_there_as_a_whole_or_not_at_all() {
 }
 
 #[tokio::test]
-async fn other_files_and_versions_are_refused_with_what_was_found() {
+async fn other_files_and_versions_are_refused_with_a_description() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join(DATABASE);
     fs::write(&path, "units metal\natom_style atomic\n").unwrap();
@@ -71,7 +71,7 @@ async fn a_directory_that_cannot_be_written_is_named() {
 
 #[cfg(unix)]
 #[tokio::test]
-async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
+async fn a_campaign_opens_read_only_where_nothing_may_be_written() {
     use std::os::unix::fs::PermissionsExt;
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
@@ -93,7 +93,7 @@ async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
 }
 
 #[tokio::test]
-async fn nothing_is_written_into_a_file_that_is_not_there_any_more() {
+async fn nothing_is_written_to_a_deleted_file() {
     let directory = tempfile::tempdir().unwrap();
     let (path, moved) = (directory.path().join(DATABASE), directory.path().join("moved"));
     let store = create(directory.path()).await;

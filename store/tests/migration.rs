@@ -91,7 +91,7 @@ fn old_process() -> ProcessRecord {
 }
 
 #[tokio::test]
-async fn a_campaign_of_version_1_is_looked_at_as_it_is() {
+async fn a_campaign_of_version_1_opens_read_only_without_migration() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let before = fs::read(directory.path().join(DATABASE)).unwrap();
@@ -106,7 +106,7 @@ async fn a_campaign_of_version_1_is_looked_at_as_it_is() {
 }
 
 #[tokio::test]
-async fn a_campaign_of_version_1_goes_on() {
+async fn a_campaign_of_version_1_continues() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
@@ -129,7 +129,7 @@ async fn a_campaign_of_version_1_goes_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn several_processes_may_bring_it_up_to_date() {
+async fn several_processes_may_migrate_it() {
     for _ in 0..10 {
         let directory = tempfile::tempdir().unwrap();
         version_1(directory.path()).await;

@@ -46,7 +46,7 @@ async fn filled(home: &Home) -> (Store, Vec<String>) {
 }
 
 #[tokio::test]
-async fn costs_are_those_of_the_attempts_that_brought_labels() {
+async fn costs_are_those_of_successful_attempts() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     let costs = store.label_costs(protocol("dft").hash, 10).await.unwrap();
@@ -73,7 +73,7 @@ async fn costs_are_those_of_the_attempts_that_brought_labels() {
 }
 
 #[tokio::test]
-async fn failures_are_counted_by_class_and_by_what_became_of_the_job() {
+async fn failures_are_counted_by_class_and_outcome() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     let found = store.failures(protocol("dft").hash).await.unwrap();
@@ -87,7 +87,7 @@ async fn failures_are_counted_by_class_and_by_what_became_of_the_job() {
 }
 
 #[tokio::test]
-async fn what_failed_is_a_part_of_the_collected_space() {
+async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
     let home = Home::new();
     let (store, names) = filled(&home).await;
     let unlabelled = store.unlabelled(protocol("dft").hash, true).await.unwrap();
@@ -130,7 +130,7 @@ async fn what_failed_is_a_part_of_the_collected_space() {
 }
 
 #[tokio::test]
-async fn structures_that_may_be_the_same_are_those_nearest_in_energy_that_have_labels() {
+async fn near_duplicates_are_the_labelled_structures_nearest_in_energy() {
     let home = Home::new();
     let store = home.create().await.with_caller_clock();
     let mut names = Vec::new();
@@ -161,7 +161,7 @@ async fn structures_that_may_be_the_same_are_those_nearest_in_energy_that_have_l
 }
 
 #[tokio::test]
-async fn everything_that_was_collected_comes_with_its_label_if_it_has_one() {
+async fn collected_structures_come_with_their_labels() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     store.commit(&commit_of(vec![candidate(1, 9, Origin::Control, Fate::Accepted)])).await.unwrap();

@@ -32,7 +32,7 @@ async fn holders(store: &Store) -> Vec<String> {
 }
 
 #[tokio::test]
-async fn a_record_comes_back_as_it_was_written() {
+async fn a_record_is_read_as_it_was_written() {
     let home = Home::new();
     let store = home.create().await;
     let mut record = living("l", ProcessRecord::LABELLER, Some(7));
@@ -51,7 +51,7 @@ async fn a_record_comes_back_as_it_was_written() {
 }
 
 #[tokio::test]
-async fn a_replacement_takes_the_place_of_its_predecessor() {
+async fn a_process_replaces_its_dead_predecessor() {
     let home = Home::new();
     let store = home.create().await;
     let walkers =
@@ -72,7 +72,7 @@ async fn a_replacement_takes_the_place_of_its_predecessor() {
 }
 
 #[tokio::test]
-async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
+async fn leases_of_living_processes_last_and_those_of_dead_ones_are_released() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 5).await;
@@ -95,7 +95,7 @@ async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
 }
 
 #[tokio::test]
-async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
+async fn an_expired_lease_continues_while_its_holder_may_be_at_work() {
     const HOUR: i64 = 3_600_000;
     let home = Home::new();
     let store = home.create().await;
@@ -127,7 +127,7 @@ async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
 }
 
 #[tokio::test]
-async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
+async fn a_starting_run_keeps_living_labellers_and_reclaims_other_leases() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 5).await;
@@ -155,7 +155,7 @@ async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
 }
 
 #[tokio::test]
-async fn status_says_who_is_gone_and_who_was_given_up() {
+async fn status_shows_dead_and_failed_processes() {
     let home = Home::new();
     let store = home.create().await;
     let said = |id: &str, number, state: &str| ProcessRecord {

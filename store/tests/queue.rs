@@ -22,7 +22,7 @@ async fn state(store: &Store, candidate: &str) -> JobState {
 }
 
 #[tokio::test]
-async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
+async fn jobs_are_leased_by_priority_then_age_and_return_on_expiry() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 3).await;
@@ -53,7 +53,7 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
 }
 
 #[tokio::test]
-async fn the_first_result_is_the_label_whoever_brings_it() {
+async fn the_first_result_becomes_the_label() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 1).await;
@@ -73,7 +73,7 @@ async fn the_first_result_is_the_label_whoever_brings_it() {
 }
 
 #[tokio::test]
-async fn results_that_cannot_be_true_are_refused() {
+async fn impossible_results_are_rejected() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 1).await;
@@ -120,7 +120,7 @@ async fn failures_count_and_releases_do_not() {
 }
 
 #[tokio::test]
-async fn a_job_that_crashes_its_labellers_is_given_up() {
+async fn a_job_that_crashes_its_labellers_fails() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 2).await;
@@ -139,7 +139,7 @@ async fn a_job_that_crashes_its_labellers_is_given_up() {
 }
 
 #[tokio::test]
-async fn a_job_that_is_lost_again_and_again_is_given_up() {
+async fn a_job_that_is_lost_repeatedly_fails() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 1).await;
@@ -176,7 +176,7 @@ async fn a_job_that_is_lost_again_and_again_is_given_up() {
 }
 
 #[tokio::test]
-async fn jobs_are_found_by_name_or_a_beginning_of_it() {
+async fn jobs_are_found_by_name_or_prefix() {
     let home = Home::new();
     let store = home.create().await;
     let error = store.drop_job("0.0.1", 0).await.unwrap_err();
@@ -230,7 +230,7 @@ async fn all_jobs_are_listed_by_state_and_priority() {
 }
 
 #[tokio::test]
-async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
+async fn a_dropped_job_stays_dropped_until_it_is_requeued() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 1).await;
@@ -246,7 +246,7 @@ async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
 }
 
 #[tokio::test]
-async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
+async fn candidates_found_before_there_is_a_protocol_get_jobs_later() {
     let home = Home::new();
     let store = Store::create(home.location(), &campaign(), &[], 0).await.unwrap().with_caller_clock();
     let names = accept(&store, 2).await;
@@ -267,7 +267,7 @@ async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
 }
 
 #[tokio::test]
-async fn imports_label_what_waits_and_can_be_repeated() {
+async fn imports_label_waiting_jobs_and_can_be_repeated() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 2).await;
@@ -337,7 +337,7 @@ async fn exports_do_not_depend_on_the_order_of_labels() {
 }
 
 #[tokio::test]
-async fn an_exported_row_tells_all_that_is_known() {
+async fn an_exported_row_has_all_data() {
     let home = Home::new();
     let store = home.create().await;
     let record = candidate(0, 1, Origin::Biased, Fate::Accepted);
@@ -388,7 +388,7 @@ async fn two_connections_never_lease_the_same_job() {
 
 /// A calculation that was taken over counts once, with the attempt that delivered its result.
 #[tokio::test]
-async fn what_calculations_take_is_kept_and_counted_once() {
+async fn the_cost_of_a_calculation_is_counted_once() {
     let home = Home::new();
     let store = home.create().await.with_caller_clock();
     let names = accept(&store, 2).await;
@@ -444,7 +444,7 @@ async fn what_calculations_take_is_kept_and_counted_once() {
 }
 
 #[tokio::test]
-async fn directories_of_calculations_are_kept_with_their_attempts() {
+async fn archives_are_stored_with_their_attempts() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 1).await;
@@ -472,7 +472,7 @@ async fn directories_of_calculations_are_kept_with_their_attempts() {
 
 /// The reply to the commit of a lease was lost: its holder is alive and does not know of it.
 #[tokio::test]
-async fn what_a_holder_does_not_state_comes_back() {
+async fn leases_that_a_holder_does_not_state_are_released() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 4).await;

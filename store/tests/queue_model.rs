@@ -257,7 +257,7 @@ proptest! {
     })]
 
     #[test]
-    fn the_queue_does_what_its_model_does(steps in proptest::collection::vec(step(), 1..50)) {
+    fn the_queue_agrees_with_its_model(steps in proptest::collection::vec(step(), 1..50)) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let mut run = Run::new().await;

@@ -73,7 +73,7 @@ async fn whole(store: &Store) {
 }
 
 #[tokio::test]
-async fn a_doubtful_label_stays_until_the_new_one_comes() {
+async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 2, 1).await;
     let dft = protocol("dft");
@@ -110,7 +110,7 @@ async fn a_doubtful_label_stays_until_the_new_one_comes() {
 }
 
 #[tokio::test]
-async fn a_label_that_cannot_be_made_again_stays_as_it_was() {
+async fn a_label_that_cannot_be_remade_stays() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 1).await;
     let dft = protocol("dft");
@@ -136,7 +136,7 @@ async fn a_label_that_cannot_be_made_again_stays_as_it_was() {
 }
 
 #[tokio::test]
-async fn what_began_before_is_only_a_check() {
+async fn an_attempt_from_before_the_request_gives_a_check() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 0).await;
     let dft = protocol("dft");
@@ -154,7 +154,7 @@ async fn what_began_before_is_only_a_check() {
 }
 
 #[tokio::test]
-async fn another_protocol_takes_over_label_by_label() {
+async fn another_protocol_supersedes_label_by_label() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 5, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
@@ -216,7 +216,7 @@ async fn another_protocol_takes_over_label_by_label() {
 }
 
 #[tokio::test]
-async fn a_campaign_may_go_back_to_its_first_protocol() {
+async fn a_campaign_may_return_to_its_first_protocol() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 3, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
@@ -245,7 +245,7 @@ async fn a_campaign_may_go_back_to_its_first_protocol() {
 }
 
 #[tokio::test]
-async fn what_was_dropped_is_left_alone() {
+async fn dropped_jobs_are_not_relabelled() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 1).await;
     let fine = protocol("fine");
@@ -268,7 +268,7 @@ async fn what_was_dropped_is_left_alone() {
 }
 
 #[tokio::test]
-async fn an_imported_label_may_be_the_one_that_is_superseded_or_the_one_that_was_asked_for() {
+async fn an_imported_label_may_be_superseded_or_satisfy_a_request() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 2, 0).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
@@ -289,7 +289,7 @@ async fn an_imported_label_may_be_the_one_that_is_superseded_or_the_one_that_was
 }
 
 #[tokio::test]
-async fn two_protocols_do_not_share_a_name() {
+async fn two_protocols_cannot_share_a_name() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 1).await;
     let mut other = protocol("other");

@@ -31,10 +31,10 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) -> WalkerExit 
             return WalkerExit::Stopped;
         }
         // A panic is a defect of this program. It ends the walk that caused it, not the campaign.
-        let begun = Instant::now();
+        let started = Instant::now();
         let turn = catch_unwind(AssertUnwindSafe(|| run_assignment(context, &work, transport)));
         let made = turn.unwrap_or_else(|_| crash_report(&work));
-        log_outcome(&work, &made, begun.elapsed());
+        log_outcome(&work, &made, started.elapsed());
         report = Some(made);
     }
     WalkerExit::Dismissed

@@ -119,9 +119,9 @@ async fn labelled_with(energies: &[f64]) -> Vec<Result<f64, (String, String)>> {
 }
 
 async fn until(or: &str, condition: impl AsyncFn() -> bool) {
-    let begun = Instant::now();
+    let started = Instant::now();
     while !condition().await {
-        assert!(begun.elapsed() < Duration::from_secs(60), "{or}");
+        assert!(started.elapsed() < Duration::from_secs(60), "{or}");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
@@ -206,8 +206,8 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
     let labeller =
         tokio::spawn(async move { run(own, method, settings, &shutdown, unix_milliseconds, |_| ()).await });
     gate.wait_for_labels(1).await;
-    let begun = Instant::now();
-    while begun.elapsed() < Duration::from_secs(15) {
+    let started = Instant::now();
+    while started.elapsed() < Duration::from_secs(15) {
         let now = unix_milliseconds();
         assert!(store.lease(protocol("dft").hash, "b", now, 1).await.unwrap().is_none());
         tokio::time::sleep(Duration::from_millis(50)).await;
@@ -219,7 +219,7 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn energies_beyond_all_bounds_are_failed_attempts_from_the_first_label_on() {
+async fn energies_out_of_bounds_fail_from_the_first_label_on() {
     let outcomes = labelled_with(&[1e300, -106.0, f64::INFINITY]).await;
     let (class, log) = outcomes[0].as_ref().unwrap_err();
     assert_eq!(class, "implausible");
@@ -235,7 +235,7 @@ async fn energies_beyond_all_bounds_are_failed_attempts_from_the_first_label_on(
 
 /// The second is accepted, since nothing is known at that point, and does no harm.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn energies_are_held_against_the_potential_when_its_zero_is_known() {
+async fn energies_are_compared_with_the_potential_once_offsets_are_known() {
     let energies = [-106.0, 1e6, -106.1, -105.9, -106.0, -105.0, 1e4, -107.0, -206.5, -204.0];
     let outcomes = labelled_with(&energies).await;
     let believed: Vec<_> = outcomes.iter().filter_map(|outcome| outcome.clone().ok()).collect();
@@ -291,7 +291,7 @@ async fn a_label_is_not_lost_while_the_database_is_locked() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_labeller_stays_while_an_orchestrator_lives_and_goes_when_it_is_gone() {
+async fn a_labeller_stays_while_an_orchestrator_lives_and_exits_after_it() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     store.upsert_process(&living("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
@@ -308,7 +308,7 @@ async fn a_labeller_stays_while_an_orchestrator_lives_and_goes_when_it_is_gone()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn without_an_orchestrator_the_queue_is_emptied_first() {
+async fn without_an_orchestrator_the_queue_is_emptied_before_exit() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     accept(&store, 4).await;
@@ -326,7 +326,7 @@ async fn without_an_orchestrator_the_queue_is_emptied_first() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
+async fn a_stop_waits_for_the_current_label_while_heartbeats_continue() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     accept(&store, 2).await;
@@ -346,7 +346,7 @@ async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
+async fn a_label_that_outlasts_the_grace_period_is_released() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     let candidates = accept(&store, 1).await;
@@ -355,10 +355,10 @@ async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
     settings.timing.grace = Some(Duration::from_millis(300));
     let labeller = Labeller::with(directory.path(), &gate, settings).await;
     gate.wait_for_labels(1).await;
-    let begun = Instant::now();
+    let started = Instant::now();
     labeller.shutdown.stop();
     labeller.ended().await.unwrap();
-    assert!(begun.elapsed() >= Duration::from_millis(300));
+    assert!(started.elapsed() >= Duration::from_millis(300));
     assert_eq!((number(&store, JobState::Queued).await, names(&store).await), (1, vec![]));
     let job = store.queue_show(&candidates[0]).await.unwrap();
     assert_eq!((job.job.failures, job.attempts_made[0].outcome.as_deref()), (0, Some("released")));
@@ -366,7 +366,7 @@ async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
 
 /// Also without an orchestrator, until every walk is over.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_labeller_that_is_to_stay_waits_for_the_end_of_the_campaign() {
+async fn a_labeller_may_wait_for_the_end_of_the_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     let (gate, settings) =
@@ -386,7 +386,7 @@ async fn a_labeller_that_is_to_stay_waits_for_the_end_of_the_campaign() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn of_two_labellers_with_one_number_the_earlier_goes_home() {
+async fn of_two_labellers_with_one_number_the_earlier_exits() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     store.upsert_process(&living("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
@@ -426,7 +426,7 @@ async fn a_labeller_ends_when_its_campaign_was_deleted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_ends_a_labeller_is_kept_in_its_record() {
+async fn the_error_that_ends_a_labeller_is_recorded() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     accept(&store, 1).await;

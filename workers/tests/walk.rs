@@ -101,7 +101,7 @@ fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) ->
 }
 
 #[test]
-fn a_turn_in_pieces_is_the_same_turn() {
+fn a_split_assignment_gives_the_same_result() {
     let settings = WalkSettings { collection: never(), ..settings() };
     let whole = run(&settings, &assignment(seed("vacancy"), 120));
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::Turn, 120));
@@ -115,7 +115,7 @@ fn a_turn_in_pieces_is_the_same_turn() {
 
 /// A damaged checkpoint continues or ends its walk. `CALMWALK_MUTATIONS=5000` runs the long version.
 #[test]
-fn damaged_checkpoints_stop_no_walker() {
+fn damaged_checkpoints_do_not_stop_a_walker() {
     let settings = WalkSettings { collection: never(), ..settings() };
     let mut turn = assignment(seed("vacancy"), 110);
     let checkpoint = run(&settings, &turn).checkpoint;
@@ -189,7 +189,7 @@ fn reference(
 
 /// The trap of the reference's walker: τ = 2.0 on a model of one phase, and a ZBL that ends at 1.8 Å.
 #[test]
-fn a_trapped_walk_goes_back_with_a_smaller_bias() {
+fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), ..settings() };
     let reports = whole_walk(&settings, seed("fcc-100"), 150);
     let last = reports.last().unwrap();
@@ -204,7 +204,7 @@ fn a_trapped_walk_goes_back_with_a_smaller_bias() {
 
 /// Steps between two candidates along the path that joins them, across roll backs.
 #[test]
-fn the_gap_between_collections_holds_across_returns() {
+fn the_interval_between_collections_holds_across_roll_backs() {
     let guard = GuardSettings { tau_factor: 0.8, most_returns: 6, ..settings().guard };
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), gap: 120, guard, ..settings() };
     let reports = whole_walk(&settings, seed("fcc-097"), 150);
@@ -248,7 +248,7 @@ fn the_skin_changes_nothing() {
 }
 
 #[test]
-fn a_walk_without_a_way_out_ends() {
+fn a_walk_that_cannot_leave_a_trap_ends() {
     let guard = GuardSettings { least_distance: 3.0, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
     let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
@@ -263,7 +263,7 @@ fn a_walk_without_a_way_out_ends() {
 }
 
 #[test]
-fn a_walk_that_blows_up_ends_with_its_reason() {
+fn a_diverging_walk_ends_with_its_reason() {
     let guard = GuardSettings { highest_temperature: 900.0, ..settings().guard };
     let settings = WalkSettings { temperature: 2500.0, collection: never(), guard, ..settings() };
     let report = run(&settings, &assignment(seed("fcc-100"), 600));
@@ -272,7 +272,7 @@ fn a_walk_that_blows_up_ends_with_its_reason() {
 }
 
 #[test]
-fn a_control_walk_gives_the_wanted_frames_and_follows_the_biased_one_until_the_bias_speaks() {
+fn a_control_walk_gives_the_requested_frames_and_follows_the_biased_one_until_the_bias_acts() {
     let settings = settings();
     let mut control = assignment(seed("slab-111"), 90);
     control.origin = Origin::Control;

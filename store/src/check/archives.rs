@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_or_changed_anywhere_is_found() {
+    fn truncated_or_changed_archives_are_detected() {
         let content: Vec<u8> =
             (0..20_000_u32).flat_map(|n| n.wrapping_mul(2_654_435_761).to_le_bytes()).collect();
         let whole = packed(&content);

@@ -93,14 +93,14 @@ impl Query {
 
     /// Reads again over another connection if one breaks.
     async fn read_from(self, server: &Server) -> Result<Vec<Row>> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             let read = match server.connection().await {
                 Ok(mut connection) => self.clone().fetch_postgres(&mut *connection).await,
                 Err(error) => Err(error),
             };
             match read {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < server.reconnect_timeout => {
+                Err(StoreError::Unreachable(_)) if started.elapsed() < server.reconnect_timeout => {
                     tokio::time::sleep(RETRY_INTERVAL).await
                 }
                 read => return read,

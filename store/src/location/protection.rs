@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn off_this_host_nothing_goes_unprotected_by_default() {
+    fn connections_to_other_hosts_must_be_protected() {
         for local in ["localhost", "127.0.0.1", "127.8.0.1:5433", "[::1]:5433", "%2Frun%2Fpostgresql"] {
             assert_eq!(unprotected(&format!("postgres://anna@{local}/lab")), Ok(false), "{local}");
         }
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn what_means_something_else_than_it_says_is_refused() {
+    fn misleading_parameters_are_refused() {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path().join("an authority.pem");
         std::fs::write(&root, "certificate").unwrap();

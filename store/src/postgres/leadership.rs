@@ -45,10 +45,10 @@ impl Leadership {
         let server = Server::connect(url, true);
         make_tables(url, &server).await?;
         server.close().await;
-        let (options, begun) = (options(url), Instant::now());
+        let (options, started) = (options(url), Instant::now());
         let mut connection = options.connect().await?;
         while !try_lock(&mut connection, &url.schema).await? {
-            if begun.elapsed() > RELEASE_TIMEOUT {
+            if started.elapsed() > RELEASE_TIMEOUT {
                 let holder: String =
                     sqlx::query_scalar("SELECT holder FROM leader").fetch_one(&mut connection).await?;
                 return Err(StoreError::Locked { location: url.to_string(), holder });

@@ -170,13 +170,13 @@ impl Server {
 
     /// Before a transaction begins nothing has happened, so a failed start can be retried.
     async fn begin_with(&self, statement: &'static str) -> Result<Transaction> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             match self.explain_timeout(self.pool.begin_with(statement).await).await {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < self.reconnect_timeout => {
+                Err(StoreError::Unreachable(_)) if started.elapsed() < self.reconnect_timeout => {
                     sleep(RETRY_INTERVAL).await
                 }
-                begun => return Ok(Transaction::Postgres(begun?, self.clock)),
+                result => return Ok(Transaction::Postgres(result?, self.clock)),
             }
         }
     }

@@ -35,7 +35,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_no_disk_can_hold_is_refused_with_both_numbers() {
+    fn missing_disk_space_is_reported_with_both_numbers() {
         let directory = tempfile::tempdir().unwrap();
         let database = directory.path().join("campaign.sqlite");
         check(&database, 1000).unwrap();

@@ -103,11 +103,11 @@ impl DatabaseFile {
 
     /// Opens the database in `directory` and migrates its tables to the newest version.
     pub async fn open(directory: &Path) -> Result<Self> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             match Self::open_now(directory).await {
                 // Another process opens or closes it at this moment; SQLite does not always wait for that.
-                Err(StoreError::Busy) if begun.elapsed() < BUSY_TIMEOUT => {
+                Err(StoreError::Busy) if started.elapsed() < BUSY_TIMEOUT => {
                     tokio::time::sleep(OPEN_RETRY_INTERVAL).await;
                 }
                 opened => return opened,

@@ -35,7 +35,7 @@ async fn plan(file: &DatabaseFile, sql: &str) -> String {
 }
 
 #[tokio::test]
-async fn what_is_asked_often_goes_through_indexes() {
+async fn frequent_queries_use_indexes() {
     let directory = tempfile::tempdir().unwrap();
     let (_store, file) = store(directory.path()).await;
     for sql in [
@@ -91,7 +91,7 @@ async fn what_is_asked_often_goes_through_indexes() {
 }
 
 #[tokio::test]
-async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
+async fn connections_survive_power_loss_and_use_large_pages() {
     let directory = tempfile::tempdir().unwrap();
     let (_store, file) = store(directory.path()).await;
     let pool = file.writer.as_ref().unwrap();
@@ -112,7 +112,7 @@ async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
 }
 
 #[tokio::test]
-async fn a_full_disk_says_so_and_loses_nothing() {
+async fn a_full_disk_is_reported_and_loses_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let (store, file) = store(directory.path()).await;
     let component = |size| Commit {

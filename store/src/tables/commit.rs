@@ -71,10 +71,12 @@ impl Store {
     /// nothing is written.
     pub async fn commit(&self, commit: &Commit) -> Result<Range<i64>> {
         let mark = RandomState::new().hash_one("mark").cast_signed();
-        let (begun, mut again) = (Instant::now(), false);
+        let (started, mut again) = (Instant::now(), false);
         loop {
             match self.commit_once(commit, mark, again).await {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < SERVER_RECONNECT_TIMEOUT => again = true,
+                Err(StoreError::Unreachable(_)) if started.elapsed() < SERVER_RECONNECT_TIMEOUT => {
+                    again = true
+                }
                 done => return done,
             }
             tokio::time::sleep(RETRY_INTERVAL).await;

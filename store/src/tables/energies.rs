@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_formula_has_its_elements_and_numbers() {
+    fn a_formula_is_parsed_into_elements_and_counts() {
         let found = |formula: &str| {
             let composition = composition(formula)?.into_iter();
             Some(composition.map(|(species, number)| (species.symbol(), number)).collect::<Vec<_>>())

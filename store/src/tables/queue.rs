@@ -114,8 +114,8 @@ impl Store {
         let lease = query(sql).bind(holder).bind(lease_expiry(now, seconds)).bind(attempt).bind(job);
         lease.execute(&mut transaction).await?;
         let sql = "INSERT INTO attempt (job, attempt, holder, started) VALUES ($1, $2, $3, $4)";
-        let begun = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
-        begun.execute(&mut transaction).await?;
+        let insert = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
+        insert.execute(&mut transaction).await?;
         let (candidate, model_energy) = candidate_of(&mut transaction, next.decision).await?;
         let lease = Lease {
             job,

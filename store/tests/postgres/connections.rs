@@ -11,7 +11,7 @@ use super::leading::connect;
 
 /// A server that refuses new connections.
 #[tokio::test]
-async fn a_server_without_a_connection_left_is_waited_for_and_says_so() {
+async fn a_server_without_free_connections_is_waited_for_and_named() {
     let home = Home::new();
     let store = home.create().await;
     store.close().await;
@@ -36,7 +36,7 @@ async fn a_server_without_a_connection_left_is_waited_for_and_says_so() {
 
 /// All connections of a process wait for a lock.
 #[tokio::test]
-async fn who_waits_for_a_lock_is_not_told_that_the_server_is_away() {
+async fn waiting_for_a_lock_is_not_reported_as_an_unreachable_server() {
     let home = Home::new();
     let store = home.create().await;
     let mut other = connect(&home).await;

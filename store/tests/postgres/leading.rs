@@ -25,7 +25,7 @@ async fn break_the_lock(home: &Home) {
 }
 
 #[tokio::test]
-async fn a_second_holder_is_told_the_first_and_the_lock_comes_free() {
+async fn a_second_holder_learns_of_the_first_and_the_lock_is_released() {
     let home = Home::new();
     let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
     let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
@@ -54,7 +54,7 @@ async fn a_lock_whose_connection_broke_is_taken_again() {
 }
 
 #[tokio::test]
-async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
+async fn a_process_that_lost_the_lock_stops_writing() {
     let home = Home::new();
     let first = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
     let old = home.create().await.fenced_by(&first);
@@ -88,7 +88,7 @@ async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
 }
 
 #[tokio::test]
-async fn another_campaign_in_the_same_schema_is_refused_with_both_names() {
+async fn another_campaign_in_the_same_schema_is_refused_with_both_ids() {
     let home = Home::new();
     home.create().await;
     let other = Campaign { id: CampaignId([3; 16]), ..campaign() };
@@ -101,7 +101,7 @@ async fn another_campaign_in_the_same_schema_is_refused_with_both_names() {
 }
 
 #[tokio::test]
-async fn foreign_tables_and_newer_versions_are_left_alone() {
+async fn foreign_tables_and_newer_versions_are_refused() {
     let home = Home::new();
     let mut connection = connect(&home).await;
     let schema = sqlx::AssertSqlSafe(format!("CREATE SCHEMA {}", home.schema()));
@@ -126,7 +126,7 @@ async fn foreign_tables_and_newer_versions_are_left_alone() {
 
 /// Several at once: none finds tables that another is still creating.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn several_processes_may_make_the_tables() {
+async fn several_processes_may_create_the_tables() {
     let home = Home::new();
     let create = || {
         let location = home.location();

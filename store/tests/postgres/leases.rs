@@ -60,7 +60,7 @@ async fn eight_labellers_at_once_never_get_the_same_job() {
 
 /// A job that is being leased does not block the next one.
 #[tokio::test]
-async fn a_job_in_other_hands_is_passed_over() {
+async fn a_job_locked_by_another_is_skipped() {
     let home = Home::new();
     let store = with_jobs(&home, 2).await;
     let mut other = connect(&home).await;
@@ -73,7 +73,7 @@ async fn a_job_in_other_hands_is_passed_over() {
 }
 
 #[tokio::test]
-async fn labellers_whose_clocks_are_an_hour_apart_respect_each_other() {
+async fn labellers_with_clocks_an_hour_apart_respect_each_others_leases() {
     let home = Home::new();
     let (store, now) = (with_jobs(&home, 2).await, store::unix_milliseconds());
     let slow = lease(&store, "slow", now - HOUR, 600).await.unwrap();
@@ -95,21 +95,21 @@ async fn labellers_whose_clocks_are_an_hour_apart_respect_each_other() {
         ProcessRecord { start_time: format!("{place}0/{ticks}"), ..here }
     };
     assert!(store.renew(&slow, now - HOUR, 1).await.unwrap());
-    let begun = Instant::now();
+    let started = Instant::now();
     store.upsert_process(&elsewhere("slow", now + HOUR)).await.unwrap();
     let again = loop {
         if let Some(lease) = lease(&store, "fast", now - HOUR, 1).await {
             break lease;
         }
-        assert!(begun.elapsed() < Duration::from_secs(60), "the silent one keeps its job for ever");
+        assert!(started.elapsed() < Duration::from_secs(60), "the silent one keeps its job for ever");
         tokio::time::sleep(Duration::from_millis(50)).await;
     };
     assert_eq!((again.job, again.attempt), (slow.job, 2));
-    assert!(begun.elapsed() >= Duration::from_millis(900), "not before a second of silence");
+    assert!(started.elapsed() >= Duration::from_millis(900), "not before a second of silence");
 }
 
 #[tokio::test]
-async fn a_label_that_comes_after_its_lease_went_to_another_counts_once() {
+async fn a_label_delivered_after_its_lease_was_lost_counts_once() {
     let home = Home::new();
     let store = with_jobs(&home, 1).await;
     let late = lease(&store, "late", 0, 1).await.unwrap();
@@ -126,30 +126,30 @@ async fn a_label_that_comes_after_its_lease_went_to_another_counts_once() {
 }
 
 #[tokio::test]
-async fn whoever_waits_is_told_of_new_jobs() {
+async fn waiting_labellers_are_notified_of_new_jobs() {
     let home = Home::new();
     let store = with_jobs(&home, 1).await;
     let long = Duration::from_secs(60);
     // Until it listens.
     store.wait_for_jobs(long).await;
-    let (waiting, begun) = (store.clone(), Instant::now());
+    let (waiting, started) = (store.clone(), Instant::now());
     let wait = tokio::spawn(async move { waiting.wait_for_jobs(long).await });
     tokio::time::sleep(Duration::from_millis(100)).await;
     store.commit(&commit_of(vec![candidate(1, 1, Origin::Biased, Fate::Accepted)])).await.unwrap();
     wait.await.unwrap();
-    assert!(begun.elapsed() < long / 2);
+    assert!(started.elapsed() < long / 2);
     // Notified once; a job that returns to the queue causes a notification as well.
     tokio::time::timeout(Duration::from_millis(300), store.wait_for_jobs(long)).await.unwrap_err();
     let leased = lease(&store, "a", 0, 600).await.unwrap();
     store.release_all("a", 0).await.unwrap();
     store.wait_for_jobs(long).await;
-    assert!(begun.elapsed() < long / 2);
+    assert!(started.elapsed() < long / 2);
     assert_eq!(lease(&store, "b", 0, 600).await.unwrap().job, leased.job);
 }
 
 /// The output of a process may contain anything.
 #[tokio::test]
-async fn zero_bytes_in_a_log_are_no_obstacle() {
+async fn nul_characters_in_a_log_are_replaced() {
     let home = Home::new();
     let store = with_jobs(&home, 1).await;
     let leased = lease(&store, "a", 0, 600).await.unwrap();

@@ -29,7 +29,7 @@ async fn exported(location: impl Into<Location>) -> Vec<String> {
 }
 
 #[tokio::test]
-async fn tables_without_checksums_are_looked_at_copied_and_brought_up_to_date() {
+async fn tables_without_checksums_are_read_copied_and_migrated() {
     let home = Home::new();
     let store = home.create().await;
     let records = (1..=3).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();

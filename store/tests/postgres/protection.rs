@@ -33,7 +33,7 @@ async fn connections(home: &Home) -> (i64, i64) {
 }
 
 #[tokio::test]
-async fn a_server_that_is_known_is_spoken_to_in_secret() {
+async fn a_verified_server_gets_an_encrypted_connection() {
     let home = Home::new();
     let root = certificates(&home).await.join("authority.pem");
     let location =
@@ -47,7 +47,7 @@ async fn a_server_that_is_known_is_spoken_to_in_secret() {
 }
 
 #[tokio::test]
-async fn a_server_that_is_not_known_is_not_spoken_to() {
+async fn an_unverified_server_is_refused() {
     let home = Home::new();
     let own = certificates(&home).await;
     let others = tempfile::tempdir().unwrap();
@@ -71,7 +71,7 @@ async fn a_server_that_is_not_known_is_not_spoken_to() {
 }
 
 #[tokio::test]
-async fn a_user_may_be_known_by_a_certificate() {
+async fn a_user_may_log_in_with_a_certificate() {
     let home = Home::new();
     let certificates = certificates(&home).await;
     let make = "DO $$ BEGIN CREATE ROLE anna LOGIN SUPERUSER; EXCEPTION WHEN duplicate_object THEN END $$";

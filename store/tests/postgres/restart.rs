@@ -67,7 +67,7 @@ async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
+async fn nothing_is_lost_or_duplicated_when_the_server_restarts() {
     let home = Home::new();
     let lock = CampaignLock::acquire_at(home.location(), "restart test").await.unwrap();
     drop(home.create().await);

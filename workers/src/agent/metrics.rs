@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_are_those_that_were_made_here() {
+    fn steps_count_those_made_here() {
         let mut metrics = AgentMetrics::default();
         metrics.received(&turn(0, None), 7);
         metrics.record_progress(WALK, &at(0, 10));
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_are_counted_by_what_came_of_them() {
+    fn assignments_are_counted_by_outcome() {
         let mut metrics = AgentMetrics::default();
         let report = |outcome| {
             let checkpoint = Vec::new();

@@ -226,14 +226,14 @@ impl Calculation {
         // All descendants of the program stay below this process, even if their parents end.
         set_child_subreaper(Some(getpid()))?;
         let kills = out_of_memory_kills();
-        let begun = Instant::now();
+        let started = Instant::now();
         let program = self.start()?;
         let program = i32::try_from(program.id()).ok().and_then(Pid::from_raw);
         let program = program.ok_or(ErrorKind::InvalidInput)?;
         let mut children = Children::new(program);
-        let (limit, memory) = self.wait(program, &mut children, begun)?;
+        let (limit, memory) = self.wait(program, &mut children, started)?;
         let status = children.terminate()?;
-        let seconds = begun.elapsed().as_secs_f64();
+        let seconds = started.elapsed().as_secs_f64();
         let node = std::env::var(NODE_VARIABLE).ok();
         if node.is_some() && limit.is_none() && !status.success() {
             // If Slurm is killing the job, this process is killed here as well, and Slurm reports the reason.
@@ -276,12 +276,17 @@ impl Calculation {
 
     /// Waits until the program has ended or reaches a limit. Returns the limit, if any, and the largest observed
     /// memory.
-    fn wait(&self, program: Pid, children: &mut Children, begun: Instant) -> io::Result<(Option<Exit>, u64)> {
+    fn wait(
+        &self,
+        program: Pid,
+        children: &mut Children,
+        started: Instant,
+    ) -> io::Result<(Option<Exit>, u64)> {
         let end = pidfd_open(program, PidfdFlags::empty())?;
         let limit = Duration::try_from_secs_f64(self.time_limit).unwrap_or(Duration::MAX);
         let mut most = 0;
         loop {
-            let left = limit.saturating_sub(begun.elapsed());
+            let left = limit.saturating_sub(started.elapsed());
             if left.is_zero() {
                 return Ok((Some(Exit::TimeLimit), most));
             }

@@ -177,7 +177,7 @@ async fn label_jobs(
         };
         idle = Duration::ZERO;
         debug!(candidate = lease.candidate, job = lease.job, attempt = lease.attempt, "leased");
-        let begun = Instant::now();
+        let started = Instant::now();
         let size = method.size(&lease.structure);
         if let Some(reason) = retry_until_written(shutdown, || guard::refusal(store, &lease, size)).await? {
             // Another attempt would be refused as well, whatever was tried before.
@@ -216,7 +216,7 @@ async fn label_jobs(
         let made = made.validated(&lease, &settings.bounds, expected);
         let Delivered { validated, became, ended } =
             deliver_attempt(store, method, &lease, settings, made, shutdown, &now).await?;
-        let line = report_line::format_report(&lease, &validated, &became, begun.elapsed().as_secs_f64());
+        let line = report_line::format_report(&lease, &validated, &became, started.elapsed().as_secs_f64());
         match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
             Err(failure) => {

@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn each_is_made_for_this_user_alone_with_another_name() {
+    fn directories_are_private_and_have_unique_names() {
         let scratch = tempfile::tempdir().unwrap();
         let parent = scratch.path().join("new/scratch");
         let (a, b) = (make(&parent, "calmwalk-x-").unwrap(), make(&parent, "calmwalk-x-").unwrap());
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn what_others_could_change_is_refused() {
+    fn directories_that_others_could_change_are_refused() {
         let scratch = tempfile::tempdir().unwrap();
         let parent = scratch.path().join("scratch");
         fs::create_dir(&parent).unwrap();
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn what_others_have_made_is_not_ours() {
+    fn directories_of_others_are_not_ours() {
         let scratch = tempfile::tempdir().unwrap();
         let path = make(scratch.path(), "calmwalk-x-").unwrap();
         let link = scratch.path().join("calmwalk-x-link");

@@ -118,7 +118,7 @@ fn terminate(is_ours: impl Fn(Pid) -> bool) -> io::Result<()> {
 
 /// Processes that are being ended.
 struct Termination {
-    begun: Instant,
+    started: Instant,
     asked: HashSet<Pid>,
     /// Whether this user may not signal some of them.
     has_refused: bool,
@@ -126,7 +126,7 @@ struct Termination {
 
 impl Termination {
     fn start() -> Self {
-        Self { begun: Instant::now(), asked: HashSet::new(), has_refused: false }
+        Self { started: Instant::now(), asked: HashSet::new(), has_refused: false }
     }
 
     /// Sends SIGTERM to new processes among `found`, and SIGKILL to all after the grace period. Returns whether any
@@ -138,7 +138,7 @@ impl Termination {
     ) -> io::Result<bool> {
         let mut left = None;
         for pid in found {
-            let signal = match self.begun.elapsed() >= TERMINATION_GRACE {
+            let signal = match self.started.elapsed() >= TERMINATION_GRACE {
                 true => Signal::KILL,
                 // Only once: some programs take a second signal as a request to hurry.
                 false if self.asked.insert(pid) => Signal::TERM,
@@ -153,7 +153,7 @@ impl Termination {
             }
         }
         match left {
-            Some(pid) if self.begun.elapsed() > KILL_TIMEOUT => {
+            Some(pid) if self.started.elapsed() > KILL_TIMEOUT => {
                 let message = format!("cannot end process {}", pid.as_raw_nonzero());
                 Err(io::Error::new(io::ErrorKind::TimedOut, message))
             }

@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_goes_however_deep_it_is() {
+    fn trees_of_any_depth_are_removed() {
         let home = tempfile::tempdir().unwrap();
         let root = home.path().join("root");
         fs::create_dir(&root).unwrap();

@@ -50,7 +50,7 @@ mod tests {
     const SHORT: Duration = Duration::from_millis(1);
 
     #[tokio::test]
-    async fn tries_go_on_until_one_succeeds_or_fails_for_good() {
+    async fn writes_are_retried_until_success_or_a_permanent_error() {
         let shutdown = Shutdown::default();
         let mut tries = 0;
         let written = retry_for(SHORT, Duration::ZERO, &shutdown, || {
@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_is_asked_to_stop_tries_for_a_while_more() {
+    async fn retries_continue_for_a_while_after_a_stop_request() {
         let (shutdown, mut tries, mut asked) = (Shutdown::default(), 0, None);
         let timeout = Duration::from_millis(50);
         let full = retry_for(SHORT, timeout, &shutdown, || {

@@ -33,11 +33,11 @@ pub async fn label_structure(
     structure: &Structure,
     bounds: &LabelBounds,
 ) -> Result<SingleLabel, StoreError> {
-    let begun = Instant::now();
+    let started = Instant::now();
     let mut label = match method {
         Method::Reference(method) => {
             let result = evaluate(Arc::clone(method), structure.clone()).await;
-            SingleLabel { result, log: String::new(), core_seconds: begun.elapsed().as_secs_f64() }
+            SingleLabel { result, log: String::new(), core_seconds: started.elapsed().as_secs_f64() }
         }
         Method::Code(method) => method.single_label(structure).await?,
     };

@@ -8,7 +8,7 @@ use workers::labeller::LabellerSettings;
 use super::fixture::*;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn each_failure_climbs_its_ladder_with_everything_written_down() {
+async fn each_failure_gets_its_remedies_with_a_complete_record() {
     let script = "cat remedies; grep -q other_algorithm remedies || exit 3; echo -7.5 > energy";
     let fixture = Fixture::new(1, script).await;
     fixture.work().await;
@@ -30,7 +30,7 @@ async fn each_failure_climbs_its_ladder_with_everything_written_down() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_no_remedy_helps_against_is_given_up_and_others_go_on() {
+async fn a_job_without_a_remedy_fails_and_others_continue() {
     let fixture = Fixture::new(2, "[ $(cat $HERE/begun | wc -l) -gt 4 ] || exit 3; echo -7.5 > energy").await;
     let attempts = |settings: &mut LabellerSettings| settings.attempts = 100;
     fixture.labeller_with(attempts).await.ended().await.unwrap();
@@ -49,7 +49,7 @@ async fn what_no_remedy_helps_against_is_given_up_and_others_go_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_time_limit_ends_everything_and_is_doubled_once() {
+async fn the_time_limit_ends_all_processes_and_is_doubled_once() {
     let mut fixture = Fixture::new(1, "sleep 1000 & setsid sleep 1000 & sleep 1000").await;
     fixture.running.time_limit = 0.4;
     fixture.work().await;
@@ -63,7 +63,7 @@ async fn the_time_limit_ends_everything_and_is_doubled_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_has_to_end_is_asked_first_and_then_killed() {
+async fn processes_are_asked_to_end_before_they_are_killed() {
     let script = "trap 'echo asked >> $HERE/asked' TERM; while true; do sleep 1000; done";
     let mut fixture = Fixture::new(1, script).await;
     fixture.running.time_limit = 0.4;
@@ -74,7 +74,7 @@ async fn what_has_to_end_is_asked_first_and_then_killed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn too_much_memory_of_all_processes_together_ends_it() {
+async fn the_memory_limit_applies_to_all_processes_together() {
     // `tail` buffers a line that never ends; two of them need twice as much memory.
     let hungry = "head -c 60000000 /dev/zero | tail -n 1 | { sleep 2; cat > /dev/null; }";
     let mut fixture = Fixture::new(1, &format!("({hungry}) & ({hungry}) & wait; echo -7.5 > energy")).await;
@@ -87,7 +87,7 @@ async fn too_much_memory_of_all_processes_together_ends_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_program_that_cannot_be_started_is_the_hosts_fault_and_not_the_jobs() {
+async fn a_program_that_cannot_be_started_fails_the_labeller_not_the_job() {
     let mut fixture = Fixture::new(1, "").await;
     fixture.script = "no-such-program at all".to_owned();
     let error = fixture.labeller().await.ended().await.unwrap_err();
@@ -100,7 +100,7 @@ async fn a_program_that_cannot_be_started_is_the_hosts_fault_and_not_the_jobs() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn another_version_of_a_program_is_the_hosts_fault_and_not_the_jobs() {
+async fn another_version_of_a_program_fails_the_labeller_not_the_job() {
     let mut fixture = Fixture::new(1, "exit 4").await;
     let error = fixture.labeller().await.ended().await.unwrap_err();
     assert_eq!(error.to_string(), "cannot use sh (calculated by script 2, and not 1)");

@@ -10,7 +10,7 @@ use super::fixture::*;
 use crate::common::structure;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn directories_of_failures_are_kept_in_the_store() {
+async fn directories_of_failures_are_archived() {
     let script =
         "mkdir deep; echo x > deep/file; head -c 20000000 /dev/zero > large; echo Zr > POTCAR; exit 3";
     for (keep, archives) in
@@ -68,7 +68,7 @@ async fn a_file_that_is_replaced_between_two_labels_ends_the_labeller() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_under_way_has_a_copy_of_its_own() {
+async fn a_running_calculation_has_its_own_copy() {
     let script = "while [ ! -e $HERE/go ]; do sleep 0.01; done; cat ../data/setup > energy";
     let fixture = Fixture::with_setup(1, script, "-7.5\n").await;
     let labeller = fixture.labeller().await;
@@ -83,7 +83,7 @@ async fn what_is_under_way_has_a_copy_of_its_own() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn copies_of_files_are_not_kept_in_the_store() {
+async fn copies_of_files_are_not_archived() {
     let mut fixture = Fixture::with_setup(1, "cat ../data/setup > energy", "-7.5\n").await;
     fixture.running.keep = KeepDirectories::All;
     fixture.work().await;

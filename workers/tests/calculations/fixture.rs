@@ -264,9 +264,9 @@ impl Labeller {
 }
 
 pub async fn until(or: &str, condition: impl AsyncFn() -> bool) {
-    let begun = Instant::now();
+    let started = Instant::now();
     while !condition().await {
-        assert!(begun.elapsed() < Duration::from_secs(60), "{or}");
+        assert!(started.elapsed() < Duration::from_secs(60), "{or}");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }

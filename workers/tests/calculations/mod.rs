@@ -22,7 +22,7 @@ fn runner() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_label_comes_with_all_that_is_known_of_it() {
+async fn a_label_is_stored_with_its_details() {
     let script = "echo said; echo warned >&2; echo $SCRIPT $CALMWALK_CORES; sleep 0.2; echo -7.5 > energy";
     let fixture = Fixture::new(1, script).await;
     fixture.work().await;

@@ -9,7 +9,7 @@ use super::fixture::*;
 use crate::common::{label, protocol};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_killed_labeller_began_is_finished_once() {
+async fn a_calculation_of_a_killed_labeller_is_finished_once() {
     let fixture = Fixture::new(1, WITH_CHILDREN).await;
     for killed in 1..=3 {
         let labeller = fixture.labeller().await;
@@ -36,7 +36,7 @@ async fn what_a_killed_labeller_began_is_finished_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_ended_while_nobody_waited_is_read_and_not_repeated() {
+async fn a_calculation_that_ended_unattended_is_read_and_not_repeated() {
     let fixture = Fixture::new(1, WAITS).await;
     let labeller = fixture.labeller().await;
     fixture.wait_until_begun(1).await;
@@ -49,7 +49,7 @@ async fn what_ended_while_nobody_waited_is_read_and_not_repeated() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_left_of_a_calculation_without_a_keeper_is_ended_and_it_begins_again() {
+async fn a_calculation_without_a_runner_is_ended_and_started_again() {
     for labeller_lives in [true, false] {
         let fixture = Fixture::new(1, WITH_CHILDREN).await;
         let mut labeller = fixture.labeller().await;
@@ -75,7 +75,7 @@ async fn what_is_left_of_a_calculation_without_a_keeper_is_ended_and_it_begins_a
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_killed_program_is_a_failure_and_tried_again() {
+async fn a_killed_program_counts_as_a_failure_and_is_retried() {
     let fixture = Fixture::new(1, WITH_CHILDREN).await;
     let labeller = fixture.labeller().await;
     fixture.wait_until_begun(1).await;
@@ -91,7 +91,7 @@ async fn a_killed_program_is_a_failure_and_tried_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_stopped_ends_the_calculation_after_the_grace_and_gives_the_label_back() {
+async fn a_stopped_labeller_ends_the_calculation_after_the_grace_period_and_releases_the_job() {
     let fixture = Fixture::new(1, WITH_CHILDREN).await;
     let grace = Some(Duration::from_millis(300));
     let labeller = fixture.labeller_with(|settings| settings.timing.grace = grace).await;
@@ -113,7 +113,7 @@ async fn who_is_stopped_ends_the_calculation_after_the_grace_and_gives_the_label
 
 /// With a grace period the labeller ends the calculation after it, since nobody may take it over.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_stopped_without_a_time_of_grace_leaves_the_calculation_to_the_next() {
+async fn a_stopped_labeller_without_a_grace_period_leaves_the_calculation_to_the_next() {
     let fixture = Fixture::new(1, WITH_CHILDREN).await;
     let labeller = fixture.labeller().await;
     fixture.wait_until_begun(1).await;
@@ -128,7 +128,7 @@ async fn who_is_stopped_without_a_time_of_grace_leaves_the_calculation_to_the_ne
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_stopped_while_results_cannot_be_read_ends_all_the_same() {
+async fn a_stopped_labeller_ends_even_if_results_cannot_be_read() {
     for grace in [None, Some(Duration::from_secs(600))] {
         let fixture = Fixture::new(1, "echo -7.5 > energy").await;
         let slow = fixture.home.path().join("slow");
@@ -148,7 +148,7 @@ async fn who_is_stopped_while_results_cannot_be_read_ends_all_the_same() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_calculation_that_nobody_waits_for_any_more_is_ended() {
+async fn a_calculation_whose_result_is_not_needed_is_ended() {
     let fixture = Fixture::new(1, WITH_CHILDREN).await;
     let labeller = fixture.labeller().await;
     fixture.wait_until_begun(1).await;

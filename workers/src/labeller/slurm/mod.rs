@@ -205,7 +205,7 @@ impl Slurm {
     /// Cancels a job and waits briefly for its end. If Slurm does not respond, this fails: the job continues, and
     /// whoever looks for it later finds it.
     pub async fn cancel(&self, job: &Job) -> Result<(), StoreError> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             let jobs = self.ask(job).await.map_err(|error| cannot(job, error))?;
             let living = jobs.iter().filter(|reported| reported.phase() != Phase::Over);
@@ -215,7 +215,8 @@ impl Slurm {
                 .map(|reported| reported.id)
                 .collect();
             self.commands.cancel(&ids).await.map_err(|error| cannot(job, error))?;
-            if jobs.iter().all(|reported| reported.phase() == Phase::Over) || begun.elapsed() > CANCEL_TIMEOUT
+            if jobs.iter().all(|reported| reported.phase() == Phase::Over)
+                || started.elapsed() > CANCEL_TIMEOUT
             {
                 return Ok(());
             }
@@ -279,7 +280,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn what_another_user_has_submitted_is_not_looked_for() {
+    async fn jobs_of_another_user_are_ignored() {
         let directory = tempfile::tempdir().unwrap();
         let job = Job {
             cluster: "any".to_owned(),

@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn a_script_has_everything_that_a_job_needs() {
+    fn a_script_contains_everything_a_job_needs() {
         let home = tempfile::tempdir().unwrap();
         let options = ["--partition=long".to_owned()];
         let avoid = ["n1".to_owned(), "n2".to_owned()];

@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn a_job_without_an_end_ends_as_slurm_says() {
+    fn a_job_without_a_recorded_end_ends_as_slurm_reports() {
         use Exit::{LostNode, OutOfMemory, TimeLimit};
         let expected = [
             ("TIMEOUT", TimeLimit, None),
@@ -199,7 +199,7 @@ mod tests {
 
     /// Log lines of Slurm 22.05.
     #[test]
-    fn the_log_tells_what_slurm_has_forgotten() {
+    fn the_log_gives_the_end_of_a_forgotten_job() {
         use Exit::{LostNode, OutOfMemory, TimeLimit};
         let cancelled = "slurmstepd-n1: error: *** JOB 1 ON n1 CANCELLED AT 2026-11-22T12:06:38";
         let memory = "slurmstepd-n1: error: StepId=1.batch exceeded memory limit (434741248 > 104857600), being killed";
@@ -231,14 +231,14 @@ mod tests {
     }
 
     #[test]
-    fn a_job_that_slurm_refused_never_was() {
+    fn a_job_that_slurm_refused_is_ignored() {
         let refused = SqueueJob::parse("3|FAILED||0:00|BadConstraints").unwrap();
         assert!(refused.was_refused() && !reported("FAILED").was_refused());
         assert!(!SqueueJob::parse("3|CANCELLED||0:00|None").unwrap().was_refused());
     }
 
     #[test]
-    fn of_two_jobs_of_one_name_the_one_counts_that_did_something() {
+    fn of_two_jobs_with_one_name_the_informative_one_counts() {
         let jobs = [reported("COMPLETED"), reported("TIMEOUT")];
         assert_eq!(most_informative(&jobs), Some(&jobs[1]));
         assert_eq!(most_informative(&jobs[..1]), Some(&jobs[0]));

@@ -57,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_answer_is_read_for_a_while() {
+    fn a_cached_answer_expires() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join(CACHE_FILE);
         assert_eq!(read_recent(&path), None);

@@ -44,7 +44,7 @@ fn said(change: impl FnOnce(&mut Calculated), offsets: Option<&EnergyOffsets>) -
 }
 
 #[test]
-fn numbers_that_are_none_or_too_many_are_not_believed() {
+fn non_finite_numbers_and_wrong_counts_are_rejected() {
     assert_eq!(said(|_| (), None), "");
     for energy in [f64::NAN, f64::INFINITY] {
         let expected = format!("an energy of {energy}, which is not a finite number");
@@ -63,7 +63,7 @@ fn numbers_that_are_none_or_too_many_are_not_believed() {
 }
 
 #[test]
-fn what_is_beyond_a_bound_is_not_believed_whatever_else_is_known() {
+fn results_out_of_bounds_are_rejected() {
     for energy in [1e300, -1e300] {
         let expected = format!(
             "an energy of {:.3e} eV/atom, beyond label.largest_energy = 2000000 eV/atom",
@@ -84,7 +84,7 @@ fn what_is_beyond_a_bound_is_not_believed_whatever_else_is_known() {
 }
 
 #[test]
-fn an_energy_is_held_against_the_potential_once_labels_speak_for_it() {
+fn an_energy_is_compared_once_enough_labels_support_it() {
     let far = |made: &mut Calculated| made.energy = -215.0 + 2.0 * 5e4;
     assert_eq!(said(far, None), "");
     assert_eq!(said(far, Some(&offsets(4, &[]))), "", "four labels");
