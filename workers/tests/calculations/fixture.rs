@@ -230,7 +230,7 @@ impl Fixture {
     /// Ignores findings about candidates, whose walks these tests lack.
     pub async fn is_consistent(&self) {
         let found = self.store.check(|_, _| ()).await.unwrap();
-        assert!(found.len() == 1 && found[0].what.contains("candidates of walks"), "{found:?}");
+        assert!(found.len() == 1 && found[0].what.contains("candidates of missing walks"), "{found:?}");
     }
 
     /// Kills the runner of the only running calculation.
