@@ -103,7 +103,7 @@ impl Ends {
     /// Of these walks; those that are under way are not counted.
     pub fn of(walks: &[WalkStatus]) -> Self {
         let mut ends = Self::default();
-        for walk in walks.iter().filter(|walk| !walk.is_under_way()) {
+        for walk in walks.iter().filter(|walk| !walk.is_active()) {
             ends.add(walk.walk, &walk.state, &walk.reason);
         }
         ends

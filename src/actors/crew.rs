@@ -217,7 +217,7 @@ impl<'a> Crew<'a> {
     }
 
     async fn look_for_labels(&mut self) -> Result<(), StoreError> {
-        if !self.store.awaits_labels(unix_milliseconds()).await? {
+        if !self.store.has_pending_labels(unix_milliseconds()).await? {
             self.last_labels = None;
             self.labellers.children.stop();
         }

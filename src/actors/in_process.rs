@@ -122,7 +122,7 @@ impl Actors {
 /// Waits until no structure waits for a label, or somebody asks to stop.
 async fn wait_for_labels(store: &Store, closing: &Shutdown) -> Result<(), StoreError> {
     while !closing.is_stopping() {
-        match store.awaits_labels(unix_milliseconds()).await {
+        match store.has_pending_labels(unix_milliseconds()).await {
             Ok(false) => break,
             Err(error) if !error.is_transient() => return Err(error),
             _ => tokio::time::sleep(LAST_LABELS).await,

@@ -126,7 +126,7 @@ impl Crew<'_> {
     /// Takes in the slots' signs of life, and says what the queue does.
     async fn look(&mut self) -> Result<(), StoreError> {
         self.labellers.look(self.store, PROVEN).await?;
-        let jobs = self.store.awaits_labels(unix_milliseconds()).await?;
+        let jobs = self.store.has_pending_labels(unix_milliseconds()).await?;
         let leaders = self.store.processes(Some(ProcessRecord::ORCHESTRATOR)).await?;
         self.display.queue(jobs, leaders.iter().any(ProcessRecord::is_leading));
         Ok(())

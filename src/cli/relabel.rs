@@ -104,7 +104,8 @@ impl Relabel {
         };
         let protocol = new.as_ref().map_or(&in_force, |new| &new.protocol).clone();
         let choice = self.choose(&store, &protocol).await?;
-        let moved = if new.is_some() { store.unlabelled_by_others(protocol.hash).await? } else { 0 };
+        let moved =
+            if new.is_some() { store.unlabelled_under_other_protocols(protocol.hash).await? } else { 0 };
         let bill = bill::again(&store, &in_force, &choice.sizes()).await?;
         let next = self.next(&store, &location).await?;
         let mut done = RelabelCounts { again: choice.structures().len() as u64, moved };

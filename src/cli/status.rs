@@ -230,7 +230,7 @@ impl Disk {
 }
 
 fn walks_in_words(status: &Standing, ends: &Ends) -> String {
-    let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
+    let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let are = if status.led { "under way" } else { "not finished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),

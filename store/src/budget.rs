@@ -57,7 +57,7 @@ impl Budget {
     }
 
     /// Whether no further attempt may start. A running attempt may still deliver the last label.
-    pub fn allows_no_attempt(&self, used: &BudgetUse) -> bool {
+    pub fn forbids_attempts(&self, used: &BudgetUse) -> bool {
         let labels = used.labels + used.under_way;
         self.time_used_up(used).is_some() || self.labels.is_some_and(|limit| labels >= limit)
     }
@@ -71,10 +71,10 @@ mod tests {
     fn a_limit_is_reached_when_use_equals_it() {
         let used = BudgetUse { labels: 3, under_way: 2, core_hours: 1.5, wall_hours: 0.25 };
         let none = Budget::default();
-        assert!(none.is_none() && none.time_used_up(&used).is_none() && !none.allows_no_attempt(&used));
+        assert!(none.is_none() && none.time_used_up(&used).is_none() && !none.forbids_attempts(&used));
         for (labels, allows) in [(6, true), (5, false), (4, false)] {
             let budget = Budget { labels: Some(labels), ..Budget::default() };
-            assert_eq!((budget.allows_no_attempt(&used), budget.time_used_up(&used)), (!allows, None));
+            assert_eq!((budget.forbids_attempts(&used), budget.time_used_up(&used)), (!allows, None));
         }
         for (core_hours, wall_hours, key) in [
             (1.5, 1.0, Some("budget.core_hours")),
@@ -85,7 +85,7 @@ mod tests {
             let budget =
                 Budget { core_hours: Some(core_hours), wall_hours: Some(wall_hours), ..Budget::default() };
             assert_eq!(budget.time_used_up(&used), key);
-            assert_eq!(budget.allows_no_attempt(&used), key.is_some());
+            assert_eq!(budget.forbids_attempts(&used), key.is_some());
         }
     }
 }

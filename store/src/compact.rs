@@ -33,7 +33,7 @@ impl Store {
     /// Deletes the features of declined candidates, which only a replay with other rules needs. The caller holds
     /// the [`crate::CampaignLock`]. Returns the number of candidates.
     pub async fn drop_declined_features(&self, now: i64) -> Result<u64> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         // The checksum of missing features depends on the candidate's number.
         let with = "SELECT candidate.decision FROM candidate CROSS JOIN candidate_data
                     ON candidate_data.decision = candidate.decision

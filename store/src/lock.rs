@@ -18,10 +18,10 @@ pub const LOCK: &str = "campaign.lock";
 
 /// The right to run a campaign. Released on drop.
 #[derive(Debug)]
-pub struct CampaignLock(Held);
+pub struct CampaignLock(HeldLock);
 
 #[derive(Debug)]
-enum Held {
+enum HeldLock {
     Directory { _lock: DirectoryLock },
     Session(Leadership),
 }
@@ -50,7 +50,7 @@ impl CampaignLock {
     pub async fn acquire_at(location: impl Into<Location>, who: &str) -> Result<Self> {
         match location.into() {
             Location::Directory(directory) => Self::acquire(&directory, who),
-            Location::Server(url) => Ok(Self(Held::Session(Leadership::take(&url, who).await?))),
+            Location::Server(url) => Ok(Self(HeldLock::Session(Leadership::take(&url, who).await?))),
         }
     }
 
@@ -58,16 +58,16 @@ impl CampaignLock {
     /// other process took the lock meanwhile. A lock on a directory lasts as long as its process.
     pub async fn lost(&self) -> StoreError {
         match &self.0 {
-            Held::Directory { .. } => std::future::pending().await,
-            Held::Session(leadership) => leadership.lost().await,
+            HeldLock::Directory { .. } => std::future::pending().await,
+            HeldLock::Session(leadership) => leadership.lost().await,
         }
     }
 
     /// The fencing token: it distinguishes transactions of this holder from those of earlier ones.
     pub(crate) fn generation(&self) -> Option<i64> {
         match &self.0 {
-            Held::Directory { .. } => None,
-            Held::Session(leadership) => Some(leadership.generation),
+            HeldLock::Directory { .. } => None,
+            HeldLock::Session(leadership) => Some(leadership.generation),
         }
     }
 
@@ -105,7 +105,7 @@ impl CampaignLock {
         held.file.set_len(0).map_err(failed)?;
         held.file.rewind().map_err(failed)?;
         held.file.write_all(line.as_bytes()).map_err(failed)?;
-        Ok(Self(Held::Directory { _lock: held }))
+        Ok(Self(HeldLock::Directory { _lock: held }))
     }
 }
 

@@ -119,7 +119,7 @@ impl ProcessRecord {
 
     /// Whether it may still work on something that it leased for `seconds` although the lease has expired, see
     /// [`crate::Store::lease`].
-    pub(crate) fn may_be_at_work(&self, now: i64, seconds: u32) -> bool {
+    pub(crate) fn may_be_working(&self, now: i64, seconds: u32) -> bool {
         let allowed = if self.is_local() { MAX_LOCAL_SILENCE } else { 1000 * i64::from(seconds) };
         let silence = self.silence.unwrap_or_else(|| now.saturating_sub(self.last_seen));
         !self.is_dead() && silence < allowed

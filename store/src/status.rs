@@ -135,7 +135,7 @@ pub struct WalkStatus {
 
 impl WalkStatus {
     /// Whether it has more steps to make.
-    pub fn is_under_way(&self) -> bool {
+    pub fn is_active(&self) -> bool {
         matches!(self.state.as_str(), "waiting" | "running")
     }
 }

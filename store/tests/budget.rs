@@ -24,18 +24,18 @@ async fn no_more_labels_start_than_the_budget_permits() {
     let lease = async || store.lease(protocol("dft").hash, "a", 0, 1000).await.unwrap();
     let (first, second) = (lease().await.unwrap(), lease().await.unwrap());
     assert!(lease().await.is_none(), "two are under way");
-    assert!(store.awaits_labels(0).await.unwrap());
+    assert!(store.has_pending_labels(0).await.unwrap());
     store.complete(&first, &label(-1.0), 10).await.unwrap();
     store.fail(&second, "unconverged", "", 9, 20).await.unwrap();
     // A failed attempt makes no label.
     let third = lease().await.unwrap();
     store.complete(&third, &label(-2.0), 30).await.unwrap();
     assert!(lease().await.is_none());
-    assert!(!store.awaits_labels(40).await.unwrap(), "what is queued waits for a larger budget");
+    assert!(!store.has_pending_labels(40).await.unwrap(), "what is queued waits for a larger budget");
     let (_, used) = store.budget(40).await.unwrap();
     assert_eq!((used.labels, used.under_way), (2, 0));
     limit(&store, Budget { labels: Some(3), ..Budget::default() }).await;
-    assert!(store.awaits_labels(40).await.unwrap() && lease().await.is_some());
+    assert!(store.has_pending_labels(40).await.unwrap() && lease().await.is_some());
     limit(&store, Budget::default()).await;
     assert!(lease().await.is_some());
 }

@@ -220,7 +220,7 @@ async fn exported(directory: &Path) -> Result<BTreeMap<String, String>, StoreErr
 async fn read(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
     let filter = ExportFilter { protocol: protocol("dft").hash, biased: true, control: true, imported: true };
     store.check_for_export().await?;
-    let (mut missing, mut last, mut rows) = (store.labelled_places(&filter).await?, None, BTreeMap::new());
+    let (mut missing, mut last, mut rows) = (store.labelled_cursors(&filter).await?, None, BTreeMap::new());
     loop {
         let page = store.labelled(&filter, last, 7).await?;
         let Some(row) = page.last() else { break };

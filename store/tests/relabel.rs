@@ -167,7 +167,7 @@ async fn another_protocol_supersedes_label_by_label() {
         all.iter().map(|one| (one.content, one.job)).collect::<Vec<_>>(),
         [(structures[0], None), (structures[1], None)]
     );
-    assert_eq!(store.unlabelled_by_others(fine.hash).await.unwrap(), 3);
+    assert_eq!(store.unlabelled_under_other_protocols(fine.hash).await.unwrap(), 3);
 
     for expected in [RelabelCounts { again: 2, moved: 3 }, RelabelCounts::default()] {
         assert_eq!(change_to(&store, &fine, &structures).await, expected, "asking twice is asking once");

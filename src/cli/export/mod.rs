@@ -118,7 +118,7 @@ async fn refuse_to_miss(
         return Ok(());
     }
     // What was dropped, or labelled again, since it was counted is not missing.
-    let now = store.labelled_places(filter).await?;
+    let now = store.labelled_cursors(filter).await?;
     missing.retain(|place| now.contains(place));
     let place = match missing.first() {
         None => return Ok(()),
@@ -187,7 +187,7 @@ impl Export {
         let protocol = self.choose_protocol(&store).await?;
         let (filter, campaign) = (self.filter(&protocol), store.campaign().await?.id.to_string());
         let (mut parts, dealt) = self.parts(&store).await?;
-        let mut missing = store.labelled_places(&filter).await?;
+        let mut missing = store.labelled_cursors(&filter).await?;
         let (mut frames, mut last, bar) = (0, None, Bar::new(None, BAR));
         loop {
             let page = store.labelled(&filter, last, PAGE).await?;

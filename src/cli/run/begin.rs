@@ -70,7 +70,7 @@ async fn tell_where(store: &Store, origin: &Origin, location: &Location) -> Resu
     let status = store.status().await?;
     let decisions = store.newest_mixture().await?.decision;
     let steps: u64 = status.walks.iter().map(|walk| walk.step).sum();
-    let over = status.walks.iter().filter(|walk| !walk.is_under_way()).count() as u64;
+    let over = status.walks.iter().filter(|walk| !walk.is_active()).count() as u64;
     let from = if decisions == 0 {
         "nothing was decided yet".to_owned()
     } else {

@@ -28,7 +28,7 @@ impl End {
         }
         let steps = |key: &str| configuration["walk"][key].as_u64().unwrap_or_default();
         let of_a_walk = steps("equilibration") + steps("steps");
-        let under_way = status.walks.iter().filter(|walk| walk.is_under_way());
+        let under_way = status.walks.iter().filter(|walk| walk.is_active());
         let left: u64 = under_way.map(|walk| of_a_walk.saturating_sub(walk.step)).sum();
         let pace = status.steps_per_second.filter(|pace| is_led && *pace > 0.0);
         let walks_hours = match left {

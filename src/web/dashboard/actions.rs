@@ -85,7 +85,7 @@ pub async fn act_on_walks(
         _ => return Err(Refusal::new(StatusCode::NOT_FOUND, "there is pause and resume")),
     };
     let walks = match walk.as_str() {
-        "all" => store.walks_under_way().await?,
+        "all" => store.active_walks().await?,
         number => {
             vec![WalkId(number.parse().map_err(|_| Refusal::wrong("expected the number of a walk, or all"))?)]
         }

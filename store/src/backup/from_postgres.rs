@@ -89,7 +89,7 @@ const OPERATIONS: Table = table!("operation" { number: I, time: I, kind: T, deta
 
 /// Writes the copy into a directory.
 pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
-    let mut from = server.begin_to_read().await?;
+    let mut from = server.begin_read().await?;
     // Their checksums are marked as unknown.
     let without_checksums = !from.has_column("label", "checksum").await?;
     let tables = || TABLES.iter().chain([&OPERATIONS]);

@@ -31,7 +31,7 @@ impl Store {
     /// # Errors
     /// [`StoreError::Damaged`], which names the first finding.
     pub async fn check_for_export(&self) -> Result<()> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let mut findings = own_check_of(&mut transaction, &TABLES).await?;
         if findings.is_empty() {
             findings = rules::losses(&mut transaction).await?;
@@ -47,8 +47,8 @@ impl Store {
 
     /// Positions of all rows that [`Self::labelled`] should find, determined in another way: labels and candidates
     /// are read separately and without the indexes that it uses.
-    pub async fn labelled_places(&self, filter: &ExportFilter) -> Result<BTreeSet<ExportCursor>> {
-        let mut transaction = self.database.begin_to_read().await?;
+    pub async fn labelled_cursors(&self, filter: &ExportFilter) -> Result<BTreeSet<ExportCursor>> {
+        let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, filter.protocol).await?;
         let labelled = labelled(&mut transaction, protocol).await?;
         let dropped: Vec<i64> = query(DROPPED).bind(protocol).fetch_all(&mut transaction).await?;

@@ -35,7 +35,7 @@ impl Store {
     /// Checks everything. `tell` receives the number of rows read and the total. This crate treats components of
     /// the mixture as bytes: check those of [`Store::load_components`] with the crate that decodes them.
     pub async fn check(&self, mut tell: impl FnMut(u64, u64)) -> Result<Vec<Finding>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let mut findings = Vec::new();
         own_check(&mut transaction, &mut findings).await?;
         match ours(&mut transaction, &mut findings, &mut tell).await {

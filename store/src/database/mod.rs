@@ -58,27 +58,27 @@ impl Database {
     ///
     /// # Errors
     /// [`StoreError::LockLost`] if another process leads the campaign now.
-    pub async fn begin_to_lead(&self) -> Result<Transaction> {
+    pub async fn begin_as_leader(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.begin().await?)),
-            Self::Postgres(server) => server.begin_to_lead().await,
+            Self::Postgres(server) => server.begin_as_leader().await,
         }
     }
 
     /// Begins the transaction of a commit with this mark. The second value says whether an earlier try has already
     /// made the commit; that is looked up only if `again` is set.
-    pub async fn begin_to_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
+    pub async fn begin_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
         match self {
             Self::Sqlite(file) => Ok((Transaction::Sqlite(file.begin().await?), false)),
-            Self::Postgres(server) => server.begin_to_commit(mark, again).await,
+            Self::Postgres(server) => server.begin_commit(mark, again).await,
         }
     }
 
     /// Begins a transaction that reads a snapshot.
-    pub async fn begin_to_read(&self) -> Result<Transaction> {
+    pub async fn begin_read(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.readers.begin().await?)),
-            Self::Postgres(server) => server.begin_to_read().await,
+            Self::Postgres(server) => server.begin_read().await,
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! A connection may break while its process lives, and another process may then take the lock. Each new holder
 //! therefore increments the generation in the table `leader`, a fencing token under which it writes
-//! ([`Server::begin_to_lead`]): holders of an earlier generation can no longer write. A process that loses the
+//! ([`Server::begin_as_leader`]): holders of an earlier generation can no longer write. A process that loses the
 //! connection takes the lock again if nobody had it meanwhile.
 
 use std::time::{Duration, Instant};

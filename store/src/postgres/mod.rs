@@ -164,7 +164,7 @@ impl Server {
         self.begin_with("BEGIN ISOLATION LEVEL READ COMMITTED").await
     }
 
-    pub async fn begin_to_read(&self) -> Result<Transaction> {
+    pub async fn begin_read(&self) -> Result<Transaction> {
         self.begin_with("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY").await
     }
 
@@ -182,16 +182,16 @@ impl Server {
     }
 
     /// Begins a transaction that locks the leader's row and checks the fencing token, if there is one.
-    pub async fn begin_to_lead(&self) -> Result<Transaction> {
+    pub async fn begin_as_leader(&self) -> Result<Transaction> {
         let mut transaction = self.begin().await?;
         let leader = query("SELECT generation, holder FROM leader").locked();
         self.check_leader(leader.fetch_one(&mut transaction).await?)?;
         Ok(transaction)
     }
 
-    /// See [`Database::begin_to_commit`]. The first statement locks the leader's row, so this waits for an earlier
+    /// See [`Database::begin_commit`]. The first statement locks the leader's row, so this waits for an earlier
     /// try that the server still executes.
-    pub async fn begin_to_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
+    pub async fn begin_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
         let mut transaction = self.begin().await?;
         if again {
             let last: i64 = query("SELECT mark FROM leader").locked().fetch_one(&mut transaction).await?;

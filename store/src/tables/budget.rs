@@ -54,14 +54,14 @@ impl Store {
     /// Sets the limits for every labeller from now on.
     pub async fn set_budget(&self, budget: &Budget) -> Result<()> {
         let text = serde_json::to_string(budget).expect("plain data becomes JSON");
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, "budget", &text).await?;
         transaction.commit().await
     }
 
     /// The limits, and their use until `now`.
     pub async fn budget(&self, now: i64) -> Result<(Budget, BudgetUse)> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let read = read(&mut transaction, now).await?;
         transaction.commit().await?;
         Ok(read)
@@ -69,7 +69,7 @@ impl Store {
 
     /// Adds to the running time of the campaign.
     pub async fn add_running_time(&self, milliseconds: u64) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         let before = time_under_way(&mut transaction).await?;
         let now = before.saturating_add(milliseconds).to_string();
         set_campaign_value(&mut transaction, "time_under_way", &now).await?;
@@ -77,14 +77,14 @@ impl Store {
     }
 
     /// Whether a label is in progress, or waits and may be started.
-    pub async fn awaits_labels(&self, now: i64) -> Result<bool> {
-        let mut transaction = self.database.begin_to_read().await?;
+    pub async fn has_pending_labels(&self, now: i64) -> Result<bool> {
+        let mut transaction = self.database.begin_read().await?;
         let some = |state: &'static str| {
             query("SELECT count(*) FROM (SELECT 1 FROM job WHERE state = $1 LIMIT 1) AS one").bind(state)
         };
         let leased: u64 = some("leased").fetch_one(&mut transaction).await?;
         let queued: u64 = some("queued").fetch_one(&mut transaction).await?;
-        let awaits = leased > 0 || (queued > 0 && !allows_no_attempt(&mut transaction, now).await?);
+        let awaits = leased > 0 || (queued > 0 && !forbids_attempts(&mut transaction, now).await?);
         transaction.commit().await?;
         Ok(awaits)
     }
@@ -115,12 +115,12 @@ async fn attempts(transaction: &mut Transaction, now: i64) -> Result<(u64, u64, 
 }
 
 /// Whether no further attempt may start. Attempts are counted only if there is a limit.
-pub(super) async fn allows_no_attempt(transaction: &mut Transaction, now: i64) -> Result<bool> {
+pub(super) async fn forbids_attempts(transaction: &mut Transaction, now: i64) -> Result<bool> {
     if limits(transaction).await?.is_none() {
         return Ok(false);
     }
     let (limits, used) = read(transaction, now).await?;
-    Ok(limits.allows_no_attempt(&used))
+    Ok(limits.forbids_attempts(&used))
 }
 
 async fn limits(transaction: &mut Transaction) -> Result<Budget> {

@@ -218,7 +218,7 @@ impl Store {
         let status = query(walks!("WHERE walk = $1"));
         let status: Option<WalkStatus> = status.bind(walk.0).fetch_optional(&self.database).await?;
         let Some(mut status) = status else { return Ok(None) };
-        status.paused = status.is_under_way() && self.paused_walks().await?.contains(&walk);
+        status.paused = status.is_active() && self.paused_walks().await?.contains(&walk);
         let partner = query("SELECT coalesce(partner, -1) FROM walk WHERE walk = $1").bind(walk.0);
         let partner: i64 = partner.fetch_one(&self.database).await?;
         Ok(Some((status, u32::try_from(partner).ok().map(WalkId))))

@@ -234,7 +234,7 @@ impl Store {
     /// Recomputes the checksum of every row, after rows were written without this program.
     #[doc(hidden)]
     pub async fn write_checksums(&self) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         fill(&mut transaction).await?;
         transaction.commit().await
     }

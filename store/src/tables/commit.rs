@@ -87,7 +87,7 @@ impl Store {
     async fn commit_once(&self, commit: &Commit, mark: i64, again: bool) -> Result<Range<i64>> {
         // Copies everything before the transaction begins, so that nobody waits for the copying.
         let mut rows = Rows::from_commit(commit)?;
-        let (mut transaction, made) = self.database.begin_to_commit(mark, again).await?;
+        let (mut transaction, made) = self.database.begin_commit(mark, again).await?;
         let last = query("SELECT coalesce(max(sequence), 0) FROM decision");
         let last: i64 = last.fetch_one(&mut transaction).await?;
         let decisions = integer("number of decisions", commit.decisions.len() as u64)?;

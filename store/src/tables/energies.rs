@@ -33,7 +33,7 @@ impl Store {
         protocol: ContentHash,
         limit: u32,
     ) -> Result<Vec<LabelledEnergies>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let rows = query(ENERGIES).bind(protocol).bind(limit);
         let mut rows: Vec<EnergyRow> = rows.fetch_all(&mut transaction).await?;

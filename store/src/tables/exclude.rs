@@ -62,7 +62,7 @@ from_columns!(LabelStatusRow { protocol, standing, exclusion });
 from_columns!(ExcludedRow { id, protocol, excluded, exclusion });
 
 /// A structure named by the user.
-struct CandidateRef {
+struct NamedStructure {
     structure: i64,
     id: String,
 }
@@ -89,7 +89,7 @@ impl Store {
 
     /// Every excluded label, in order of exclusion.
     pub async fn excluded(&self) -> Result<Vec<ExcludedLabel>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         if !has_exclusion_columns(&mut transaction).await? {
             return Ok(Vec::new());
         }
@@ -106,7 +106,7 @@ impl Store {
         reason: Option<&str>,
         now: i64,
     ) -> Result<Vec<ExclusionChange>> {
-        let mut named: Vec<CandidateRef> = Vec::new();
+        let mut named: Vec<NamedStructure> = Vec::new();
         for id in ids {
             let found = self.named(id).await?;
             if named.iter().all(|other| other.structure != found.structure) {
@@ -131,7 +131,7 @@ impl Store {
     }
 
     /// The structure with that name.
-    async fn named(&self, id: &str) -> Result<CandidateRef> {
+    async fn named(&self, id: &str) -> Result<NamedStructure> {
         if let Some(number) = id.strip_prefix("import-") {
             let structure = match number.parse::<i64>() {
                 Ok(number) => query(STRUCTURE_OF_IMPORT).bind(number).fetch_optional(&self.database).await?,
@@ -139,7 +139,7 @@ impl Store {
             };
             let imported = self.imported_structures().await?;
             let structure = structure.ok_or(StoreError::UnknownImport { id: id.to_owned(), imported })?;
-            return Ok(CandidateRef { structure, id: id.to_owned() });
+            return Ok(NamedStructure { structure, id: id.to_owned() });
         }
         let found = self.find_candidate(id).await?;
         let structure: i64 =
@@ -147,14 +147,14 @@ impl Store {
         if structure == 0 {
             return Err(StoreError::NoLabel { id: found.candidate, why: "it was declined".to_owned() });
         }
-        Ok(CandidateRef { structure, id: found.candidate })
+        Ok(NamedStructure { structure, id: found.candidate })
     }
 }
 
 /// Excludes the labels of a structure, or includes them without a `reason`.
 async fn change(
     transaction: &mut Transaction,
-    CandidateRef { structure, id }: CandidateRef,
+    NamedStructure { structure, id }: NamedStructure,
     reason: Option<&str>,
     now: i64,
 ) -> Result<ExclusionChange> {

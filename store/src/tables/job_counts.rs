@@ -71,7 +71,7 @@ pub(super) async fn labels_in_last_hour(transaction: &mut Transaction, now: i64)
 impl Store {
     /// Number of label jobs by protocol name and state, in the order in which protocols were added.
     pub async fn jobs_by_protocol(&self) -> Result<Vec<(String, JobState, u64)>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let sql = if have_counts(&mut transaction).await? { PROTOCOLS } else { COUNTED_PROTOCOLS };
         let rows: Vec<(String, String, u64)> = query(sql).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
@@ -85,7 +85,7 @@ impl Store {
 
     /// Unfinished jobs of this protocol, by size.
     pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<PendingJobs>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let sql = if have_counts(&mut transaction).await? { WAITING } else { COUNTED_WAITING };
         let rows: Vec<(u32, String, u32, u64)> =

@@ -76,7 +76,7 @@ impl Store {
         lease: &Lease,
         limit: u32,
     ) -> Result<Option<(Vec<f64>, Vec<NearDuplicate>)>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let protocol = super::protocols::protocol_id(&mut transaction, lease.protocol).await?;
         let own: Own = query(OWN).bind(lease.job).fetch_one(&mut transaction).await?;
         let (Some(energy), Some(features)) = (own.energy, own.features) else { return Ok(None) };

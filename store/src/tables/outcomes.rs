@@ -90,7 +90,7 @@ const LEAST_MILLISECONDS: i64 = 1;
 impl Store {
     /// Costs of the newest labels made under this protocol, at most `limit`.
     pub async fn label_costs(&self, protocol: ContentHash, limit: u32) -> Result<Vec<LabelCost>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let costs = query(COSTS).bind(protocol).bind(limit).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
@@ -99,7 +99,7 @@ impl Store {
 
     /// Resources used by attempts so far, and cores in use now.
     pub async fn label_usage(&self) -> Result<LabelUsage> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let kept =
             "SELECT key, value FROM campaign WHERE key IN ('core_milliseconds', 'label_core_milliseconds')";
         let kept: Vec<(String, String)> = query(kept).fetch_all(&mut transaction).await?;
@@ -118,7 +118,7 @@ impl Store {
 
     /// Failures of attempts under this protocol, by class.
     pub async fn failures(&self, protocol: ContentHash) -> Result<Vec<FailureCount>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let rows: Vec<(String, u64, u64, u64)> =
             query(CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
@@ -131,7 +131,7 @@ impl Store {
     /// Structures without a label because labelling under this protocol failed, by seed structure and formula.
     /// Without `ranges` of the labelled ones, this reads only as many rows as there are failures.
     pub async fn unlabelled(&self, protocol: ContentHash, ranges: bool) -> Result<Vec<Unlabelled>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let ranges = ranges || !job_counts::have_counts(&mut transaction).await?;
         let sql = if ranges { UNLABELLED } else { FAILED };
@@ -148,7 +148,7 @@ impl Store {
         after: i64,
         limit: u32,
     ) -> Result<Vec<FinishedCandidate>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let page = query(FINISHED).bind(after).bind(protocol).bind(limit);
         let page = page.fetch_all(&mut transaction).await?;

@@ -24,7 +24,7 @@ impl Store {
     }
 
     /// Walks that have more steps to make.
-    pub async fn walks_under_way(&self) -> Result<Vec<WalkId>> {
+    pub async fn active_walks(&self) -> Result<Vec<WalkId>> {
         let sql = "SELECT walk FROM walk WHERE state IN ('waiting', 'running') ORDER BY walk";
         let walks: Vec<u32> = query(sql).fetch_all(&self.database).await?;
         Ok(walks.into_iter().map(WalkId).collect())

@@ -72,7 +72,7 @@ impl Store {
     /// of all others and releases their leases, see [`Self::release_leases_of_dead_processes`]. Returns the number
     /// of leases released.
     pub async fn reclaim_leases(&self, now: i64) -> Result<usize> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         let leased = leased(&mut transaction).await?;
         let lives_on =
             |process: &ProcessRecord| process.kind == ProcessRecord::LABELLER && !process.is_dead();

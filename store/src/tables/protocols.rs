@@ -47,7 +47,7 @@ pub(crate) async fn write_campaign(
     seeds: &[SeedStructure],
     now: i64,
 ) -> Result<()> {
-    let mut transaction = database.begin_to_lead().await?;
+    let mut transaction = database.begin_as_leader().await?;
     for (key, value) in [
         ("id", campaign.id.to_string().as_str()),
         ("program_version", &campaign.program_version),
@@ -98,7 +98,7 @@ impl Store {
         changes: &[serde_json::Value],
         now: i64,
     ) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, "configuration_in_force", configuration).await?;
         for change in changes {
             insert_operation(&mut transaction, now, "configuration", change).await?;
@@ -117,14 +117,14 @@ impl Store {
         if self.metadata(name).await?.as_deref() == Some(note) {
             return Ok(());
         }
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, &format!("note/{name}"), note).await?;
         transaction.commit().await
     }
 
     /// The protocol of new label jobs, if there is one.
     pub async fn protocol_in_force(&self) -> Result<Option<Protocol>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let Some(number) = in_force(&mut transaction).await? else { return Ok(None) };
         let row = query("SELECT * FROM protocol WHERE number = $1").bind(number);
         row.fetch_one(&mut transaction).await.map(Some)
@@ -132,7 +132,7 @@ impl Store {
 
     /// Stores where the leader has the files that grades depend on: a JSON object of paths.
     pub async fn set_grade_files(&self, files: &serde_json::Value) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, "grade_files", &files.to_string()).await?;
         transaction.commit().await
     }
@@ -147,7 +147,7 @@ impl Store {
 
     /// Adds seed structures, or replaces those with the same index.
     pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         for seed in seeds {
             insert_seed_structure(&mut transaction, seed).await?;
         }
@@ -167,7 +167,7 @@ impl Store {
     /// Makes `protocol` the protocol of new label jobs. Accepted candidates without any job (found before there was
     /// a protocol) get one; existing jobs keep their protocol.
     pub async fn add_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         insert_protocol(&mut transaction, protocol, now).await?;
         set_campaign_value(&mut transaction, "protocol", &protocol.hash.to_string()).await?;
         let number = protocol_id(&mut transaction, protocol.hash).await?;
@@ -181,7 +181,7 @@ impl Store {
 
     /// Adds a protocol that is not used for new labels.
     pub async fn register_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         insert_protocol(&mut transaction, protocol, now).await?;
         transaction.commit().await
     }

@@ -98,7 +98,7 @@ impl Store {
         let protocol_number = protocols::protocol_id(&mut transaction, protocol).await?;
         let now = transaction.time(now).await?;
         end_expired(&mut transaction, now, seconds).await?;
-        if budget::allows_no_attempt(&mut transaction, now).await? {
+        if budget::forbids_attempts(&mut transaction, now).await? {
             transaction.commit().await?;
             return Ok(None);
         }
@@ -229,7 +229,7 @@ impl Store {
         let now = transaction.time(now).await?;
         let job = job_row(&mut transaction, lease.job).await?;
         let held = job.state == "leased" && job.attempts == lease.attempt;
-        explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
+        record_failure(&mut transaction, lease.job, lease.attempt, class, log).await?;
         let lost = match held {
             false => FailOutcome::LeaseLost,
             true => {
@@ -263,7 +263,7 @@ impl Store {
                 _ => FailOutcome::GivenUp,
             }
         } else {
-            explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
+            record_failure(&mut transaction, lease.job, lease.attempt, class, log).await?;
             FailOutcome::LeaseLost
         };
         transaction.commit().await?;
@@ -308,7 +308,7 @@ impl Store {
     }
 
     /// Whether every walk is over; false in a new campaign without walks.
-    pub async fn all_walks_are_over(&self) -> Result<bool> {
+    pub async fn all_walks_ended(&self) -> Result<bool> {
         let sql = "SELECT EXISTS (SELECT 1 FROM walk)
                    AND NOT EXISTS (SELECT 1 FROM walk WHERE state IN ('waiting', 'running'))";
         query(sql).fetch_one(&self.database).await
@@ -341,7 +341,7 @@ async fn end_expired(transaction: &mut Transaction, now: i64, seconds: u32) -> R
         return Ok(());
     }
     let processes = processes::all(transaction).await?;
-    let holds_on = |process: &&ProcessRecord| process.may_be_at_work(now, seconds);
+    let holds_on = |process: &&ProcessRecord| process.may_be_working(now, seconds);
     let at_work: Vec<_> = processes.iter().filter(holds_on).collect();
     for (job, holder) in expired {
         if !at_work.iter().any(|process| process.is_holder(&holder)) {
@@ -375,7 +375,7 @@ pub(crate) async fn end_without_label(
     let given_up = match how {
         AttemptEnd::Failed { class, log, limit } => {
             end_attempt(transaction, job, "failed", now).await?;
-            explain(transaction, job, attempts, class, log).await?;
+            record_failure(transaction, job, attempts, class, log).await?;
             failures += 1;
             failures >= limit
         }
@@ -385,7 +385,7 @@ pub(crate) async fn end_without_label(
             if losses >= LOSS_LIMIT {
                 let log =
                     format!("{losses} attempts in a row were lost without a message from their labellers");
-                explain(transaction, job, attempts, LOST_TOO_OFTEN, &log).await?;
+                record_failure(transaction, job, attempts, LOST_TOO_OFTEN, &log).await?;
             }
             losses >= LOSS_LIMIT
         }
@@ -407,7 +407,7 @@ async fn has_label(transaction: &mut Transaction, structure: i64, protocol: i64)
 }
 
 /// Stores with an attempt why it failed.
-async fn explain(
+async fn record_failure(
     transaction: &mut Transaction,
     job: i64,
     attempt: u32,

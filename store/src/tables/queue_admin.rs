@@ -123,7 +123,7 @@ impl Store {
     /// Jobs in a state, in the order in which they would be leased: by priority, then in decision order. Without a
     /// state, all jobs: leased first, then queued, failed, dropped and finished ones.
     pub async fn queue_list(&self, state: Option<JobState>, limit: u32, offset: u32) -> Result<Vec<Job>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let numbers = job_counts::states(&mut transaction).await?;
         let excluded = exclude::by_job(&mut transaction).await?;
         let number =
@@ -157,7 +157,7 @@ impl Store {
                    AND protocol = (SELECT protocol FROM job WHERE number = $2) ORDER BY number";
         let labels = query(sql).bind(row.structure).bind(job);
         let labels: Vec<LabelRow> = labels.fetch_all(&self.database).await?;
-        let excluded = exclude::by_job(&mut self.database.begin_to_read().await?).await?;
+        let excluded = exclude::by_job(&mut self.database.begin_read().await?).await?;
         Ok(JobDetails {
             job: row.into_job(&excluded)?,
             attempts_made: attempts,

@@ -64,7 +64,7 @@ const WITHDRAW_REQUESTS: &str =
 
 /// Moves jobs of earlier protocols without a label to the protocol in force, unless that has a job for the
 /// structure in another state.
-const GO_OVER: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
+const MOVE_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
     SELECT structure, CAST($1 AS BIGINT), decision, priority, CASE WHEN EXISTS (SELECT 1 FROM label
             WHERE label.structure = job.structure AND label.protocol = $1 AND standing IN ('label', 'excluded'))
             THEN 'labelled' ELSE 'queued' END, overruled, relabel, 0
@@ -72,7 +72,7 @@ const GO_OVER: &str = "INSERT INTO job (structure, protocol, decision, priority,
     ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = excluded.overruled,
         relabel = excluded.relabel, relabel_after = job.attempts WHERE job.state = 'superseded'";
 
-const LEAVE_BEHIND: &str =
+const SUPERSEDE_UNLABELLED: &str =
     "UPDATE job SET state = 'superseded', relabel = NULL, relabel_after = NULL, holder = NULL,
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')";
@@ -92,7 +92,7 @@ const SUPERSEDE_JOBS: &str =
     WHERE structure = $1 AND protocol <> $2 AND state NOT IN ('dropped', 'superseded')";
 
 /// Number of jobs with a request for a new label, by state.
-const ASKED: &str = "SELECT state, count(*) FROM job WHERE relabel IS NOT NULL GROUP BY state";
+const REQUESTED: &str = "SELECT state, count(*) FROM job WHERE relabel IS NOT NULL GROUP BY state";
 
 /// The columns of a job that decide the status of a result.
 struct RelabelRow {
@@ -126,7 +126,7 @@ impl Store {
     /// Every structure that has a label and was not dropped, in decision order, with its job under that protocol.
     /// The campaign need not know the protocol.
     pub async fn relabellable(&self, protocol: ContentHash) -> Result<Vec<Relabellable>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let own = query("SELECT number FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
         let own: Option<i64> = own.fetch_optional(&mut transaction).await?;
         let found: Vec<Relabellable> =
@@ -145,7 +145,7 @@ impl Store {
 
     /// Number of structures without a label whose jobs have another protocol. They move to this one when it comes
     /// into force.
-    pub async fn unlabelled_by_others(&self, protocol: ContentHash) -> Result<u64> {
+    pub async fn unlabelled_under_other_protocols(&self, protocol: ContentHash) -> Result<u64> {
         let sql = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed')
                    AND protocol <> coalesce((SELECT number FROM protocol WHERE hash = $1), 0)
                    AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
@@ -163,7 +163,7 @@ impl Store {
     /// there is a new protocol and another process leads the campaign.
     pub async fn relabel(&self, order: &RelabelRequest<'_>, now: i64) -> Result<RelabelCounts> {
         let mut transaction = match order.protocol {
-            Some(_) => self.database.begin_to_lead().await?,
+            Some(_) => self.database.begin_as_leader().await?,
             None => self.database.begin().await?,
         };
         let mut requeued = RelabelCounts::default();
@@ -200,7 +200,7 @@ pub(super) async fn relabel_requests(transaction: &mut Transaction) -> Result<Ve
     if !has_relabel_columns(transaction).await? {
         return Ok(Vec::new());
     }
-    query(ASKED).fetch_all(transaction).await
+    query(REQUESTED).fetch_all(transaction).await
 }
 
 /// Brings a protocol into force. Returns the number of structures without a label that moved to it.
@@ -216,8 +216,8 @@ async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, n
     }
     let protocol = protocol_id(transaction, new.protocol.hash).await?;
     query(WITHDRAW_REQUESTS).bind(protocol).execute(&mut *transaction).await?;
-    query(GO_OVER).bind(protocol).execute(&mut *transaction).await?;
-    let moved = query(LEAVE_BEHIND).bind(protocol).execute(&mut *transaction).await?;
+    query(MOVE_JOBS).bind(protocol).execute(&mut *transaction).await?;
+    let moved = query(SUPERSEDE_UNLABELLED).bind(protocol).execute(&mut *transaction).await?;
     let now = transaction.time(now).await?;
     query(END_ATTEMPTS).bind(now).execute(&mut *transaction).await?;
     Ok(moved)

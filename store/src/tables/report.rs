@@ -43,7 +43,7 @@ impl Store {
         after: i64,
         limit: u32,
     ) -> Result<Vec<CollectedStructure>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let number = match protocol {
             Some(protocol) => super::protocols::protocol_id(&mut transaction, protocol).await?,
             None => NO_PROTOCOL,

@@ -138,7 +138,7 @@ impl Store {
 
     /// The last decision and the mixture after it, read as a snapshot.
     pub async fn newest_mixture(&self) -> Result<NewestMixture> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let last =
             query("SELECT * FROM decision ORDER BY sequence DESC LIMIT 1").rows(&mut transaction).await?;
         let (decision, version) = match last.first() {

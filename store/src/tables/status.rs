@@ -47,7 +47,7 @@ impl Store {
     /// have no speed.
     pub async fn status(&self) -> Result<Status> {
         let now = unix_milliseconds();
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let are_counted = transaction.has_table("candidate_count").await?;
         let fates = query(if are_counted { FATES } else { COUNTED_FATES });
         let fates: Vec<(String, String, u64)> = fates.fetch_all(&mut transaction).await?;
@@ -69,7 +69,7 @@ impl Store {
         let paused = pauses::read(&mut transaction).await?;
         let mut steps_per_second = None;
         if led {
-            advance(&mut walks, &walk_progress::fresh(&mut transaction, now).await?);
+            apply_progress(&mut walks, &walk_progress::recent(&mut transaction, now).await?);
             steps_per_second = walk_progress::total_steps_per_second(&mut transaction, now).await?;
         }
         transaction.commit().await?;
@@ -77,17 +77,17 @@ impl Store {
         let time_used_up = limits.time_used_up(&used);
         set_budget_reason(&mut walks, time_used_up, &limits);
         for walk in &mut walks {
-            walk.paused = walk.is_under_way() && paused.contains(&WalkId(walk.walk));
+            walk.paused = walk.is_active() && paused.contains(&WalkId(walk.walk));
             walk.steps_per_second = walk.steps_per_second.filter(|_| !walk.paused);
         }
-        let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.allows_no_attempt(&used));
+        let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.forbids_attempts(&used));
         Ok(Status {
             candidates: candidates(&fates, refused),
             imported,
             led,
             mixture_version,
             round,
-            finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_under_way) && no_more_labels,
+            finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_active) && no_more_labels,
             budget: BudgetStatus { used_up: used_up(time_used_up, &walks), limits, used },
             labels,
             oldest_lease,
@@ -100,8 +100,8 @@ impl Store {
 }
 
 /// Adds the speed of running walks, and their progress since the last checkpoint.
-fn advance(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
-    for walk in walks.iter_mut().filter(|walk| walk.is_under_way()) {
+fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
+    for walk in walks.iter_mut().filter(|walk| walk.is_active()) {
         let Ok(found) = progress.binary_search_by_key(&walk.walk, |latest| latest.walk) else { continue };
         let latest = &progress[found];
         walk.steps_per_second = latest.steps_per_second;

@@ -47,7 +47,7 @@ impl Store {
                 Value::Real(finite(walk.gamma_max)),
             ]
         };
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         execute_rows(&mut transaction, UPSERT, &COLUMNS, walks.iter().map(row).collect()).await?;
         let all = json!({ "time": now, "steps_per_second": all }).to_string();
         set_campaign_value(&mut transaction, ALL, &all).await?;
@@ -61,7 +61,7 @@ fn finite(number: Option<f64>) -> Option<f64> {
 }
 
 /// Progress reported within the last minute; empty for tables of an earlier version.
-pub(super) async fn fresh(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgress>> {
+pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgress>> {
     if !transaction.has_table("pace").await? {
         return Ok(Vec::new());
     }

@@ -23,7 +23,7 @@ async fn exported(location: impl Into<Location>) -> Vec<String> {
     let filter = ExportFilter { protocol: protocol("dft").hash, biased: true, control: true, imported: true };
     store.check_for_export().await.unwrap();
     let rows = store.labelled(&filter, None, 100).await.unwrap();
-    assert_eq!(rows.len(), store.labelled_places(&filter).await.unwrap().len());
+    assert_eq!(rows.len(), store.labelled_cursors(&filter).await.unwrap().len());
     store.close().await;
     rows.iter().map(|row| format!("{row:?}")).collect()
 }

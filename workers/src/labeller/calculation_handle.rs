@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use store::StoreError;
 
 use super::calculation_runner::CalculationEnd;
-use super::code::{blocking, file};
+use super::code::{blocking, file_error};
 use super::local::{self, LocalCalculation};
 use super::slurm::{Job, Slurm};
 
@@ -86,6 +86,6 @@ impl CalculationHandle {
                 Ok(())
             }
         });
-        removed.await.map_err(|error| file(&directory, error))
+        removed.await.map_err(|error| file_error(&directory, error))
     }
 }

@@ -18,7 +18,7 @@ use super::calculation_handle::{CalculationHandle, CalculationState};
 use super::calculation_runner::{Calculation, CalculationEnd, EndReason, WORK};
 use super::local;
 use super::method::LabelAttempt;
-use super::prepare::{Prepared, prepare, read, write};
+use super::prepare::{PreparedInput, prepare, read, write};
 use super::scratch::{self, ScratchRoot};
 use super::slurm::{self, Slurm};
 use super::{
@@ -38,12 +38,12 @@ pub struct CodeMethod {
     runner: RunnerCommand,
     /// The directory of this campaign's calculations.
     root: OnceCell<ScratchRoot>,
-    in_hand: Mutex<Option<InHand>>,
+    current: Mutex<Option<CurrentCalculation>>,
     slurm: Slurm,
 }
 
 /// A calculation that this labeller waits for.
-struct InHand {
+struct CurrentCalculation {
     handle: CalculationHandle,
     /// Its runner, if this process started it and must reap it.
     runner: Option<Child>,
@@ -67,9 +67,9 @@ enum PreparedCalculation {
 
 impl CodeMethod {
     pub(super) fn new(runner: RunnerCommand, code: Box<dyn Code>, execution: ExecutionSettings) -> Self {
-        let (root, in_hand, slurm) =
+        let (root, current, slurm) =
             (OnceCell::new(), Mutex::default(), Slurm::new(&execution.pass_environment));
-        Self { code: code.into(), execution, runner, root, in_hand, slurm }
+        Self { code: code.into(), execution, runner, root, current, slurm }
     }
 
     pub(super) fn size(&self, structure: &Structure) -> Size {
@@ -142,10 +142,10 @@ impl CodeMethod {
         &self,
         root: &Path,
         structure: &Structure,
-        prepared: &Prepared,
+        prepared: &PreparedInput,
     ) -> Result<LabelAttempt, StoreError> {
-        let directory =
-            private_directory::make_inside(root, &scratch::name(1, 1)).map_err(|error| file(root, error))?;
+        let directory = private_directory::make_inside(root, &scratch::name(1, 1))
+            .map_err(|error| file_error(root, error))?;
         let handle = self.start(self.prepare_directory(&directory, prepared, &[]).await?).await?;
         let never = Shutdown::default();
         let made = self.outcome(structure.clone(), handle, prepared.time_limit, &never).await?;
@@ -153,7 +153,11 @@ impl CodeMethod {
     }
 
     /// Prepares everything that is needed before the start.
-    async fn prepare(&self, structure: Structure, failures: Vec<FailureClass>) -> Result<Prepared, Failure> {
+    async fn prepare(
+        &self,
+        structure: Structure,
+        failures: Vec<FailureClass>,
+    ) -> Result<PreparedInput, Failure> {
         let Some(remedies) = dft::remedies(&failures) else {
             let class = failures.last().copied().unwrap_or(FailureClass::Crashed);
             return Err(class.because("no remedy is left"));
@@ -214,10 +218,10 @@ impl CodeMethod {
     async fn prepare_directory(
         &self,
         directory: &Path,
-        prepared: &Prepared,
+        prepared: &PreparedInput,
         failed_on: &[String],
     ) -> Result<PreparedCalculation, StoreError> {
-        let Prepared { input, time_limit, memory_limit, avoids_nodes, .. } = prepared;
+        let PreparedInput { input, time_limit, memory_limit, avoids_nodes, .. } = prepared;
         let mut environment: Vec<_> = input.environment.clone().into_iter().collect();
         environment.push(("CALMWALK_CORES".to_owned(), self.execution.cores.to_string()));
         let calculation = Calculation {
@@ -244,7 +248,7 @@ impl CodeMethod {
                 slurm::write(calculation, &requirements).map(|()| PreparedCalculation::Slurm(job))
             }
         };
-        ready.map_err(|error| unused(file(directory, error)))
+        ready.map_err(|error| unused(file_error(directory, error)))
     }
 
     /// Starts the calculation.
@@ -252,7 +256,7 @@ impl CodeMethod {
         let handle = ready.handle();
         match ready {
             PreparedCalculation::Local(ready) => {
-                let runner = ready.start().map_err(|error| file(handle.directory(), error))?;
+                let runner = ready.start().map_err(|error| file_error(handle.directory(), error))?;
                 self.take(handle.clone(), Some(runner));
             }
             PreparedCalculation::Slurm(job) => {
@@ -298,7 +302,7 @@ impl CodeMethod {
             EndReason::NotStarted(number) => {
                 handle.remove().await?;
                 self.reap();
-                return Err(file(&end.program, io::Error::from_raw_os_error(number)));
+                return Err(file_error(&end.program, io::Error::from_raw_os_error(number)));
             }
             EndReason::Ended(exit) => exit,
         };
@@ -309,7 +313,7 @@ impl CodeMethod {
         });
         if let Err(Failure { class: FailureClass::OtherProgram, message }) = &result {
             // Whatever the structure: calculations on this host would not follow the protocol.
-            let error = file(&end.program, io::Error::other(message.clone()));
+            let error = file_error(&end.program, io::Error::other(message.clone()));
             handle.remove().await?;
             self.reap();
             return Err(error);
@@ -333,22 +337,22 @@ impl CodeMethod {
     }
 
     fn take(&self, handle: CalculationHandle, runner: Option<Child>) {
-        *self.in_hand() = Some(InHand { handle, runner });
+        *self.current() = Some(CurrentCalculation { handle, runner });
     }
 
     /// The handle of the current calculation, in the form of the store.
     pub(super) fn calculation(&self) -> Option<String> {
-        self.in_hand().as_ref().map(|in_hand| in_hand.handle.identity())
+        self.current().as_ref().map(|current| current.handle.identity())
     }
 
     /// Leaves the current calculation running without this labeller.
     pub(super) fn detach(&self) {
-        self.in_hand().take();
+        self.current().take();
     }
 
     /// Ends the current calculation and removes what is left of it.
     pub(super) async fn cancel(&self) -> Result<(), StoreError> {
-        let handle = self.in_hand().as_ref().map(|in_hand| in_hand.handle.clone());
+        let handle = self.current().as_ref().map(|current| current.handle.clone());
         if let Some(handle) = handle {
             handle.clear(&self.slurm).await?;
             self.reap();
@@ -361,8 +365,8 @@ impl CodeMethod {
 
     /// Reaps the runner of the current calculation.
     fn reap(&self) {
-        let in_hand = self.in_hand().take();
-        if let Some(mut runner) = in_hand.and_then(|in_hand| in_hand.runner) {
+        let current = self.current().take();
+        if let Some(mut runner) = current.and_then(|current| current.runner) {
             // It has ended, or is about to.
             let _ = runner.wait();
         }
@@ -385,8 +389,8 @@ impl CodeMethod {
         Ok(())
     }
 
-    fn in_hand(&self) -> MutexGuard<'_, Option<InHand>> {
-        self.in_hand.lock().unwrap_or_else(PoisonError::into_inner)
+    fn current(&self) -> MutexGuard<'_, Option<CurrentCalculation>> {
+        self.current.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -434,6 +438,6 @@ pub(super) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send 
 }
 
 /// An error that fails the labeller and not the job: another host may be able to run it.
-pub(super) fn file(path: &Path, source: io::Error) -> StoreError {
+pub(super) fn file_error(path: &Path, source: io::Error) -> StoreError {
     StoreError::File { path: path.to_owned(), source }
 }

@@ -88,7 +88,7 @@ async fn send_heartbeat(
     let is_over = match exit_policy {
         _ if led => false,
         ExitPolicy::UntilEmpty => true,
-        ExitPolicy::UntilFinished => store.all_walks_are_over().await?,
+        ExitPolicy::UntilFinished => store.all_walks_ended().await?,
     };
     shutdown.set_no_more_jobs(is_over);
     if !led {

@@ -214,9 +214,9 @@ async fn label_jobs(
         };
         let expected = offsets.expected(store, &settings.protocol, &lease, &made.result, shutdown).await?;
         let made = made.validated(&lease, &settings.bounds, expected);
-        let Delivered { validated, became, ended } =
+        let Delivered { validated, outcome, ended } =
             deliver_attempt(store, method, &lease, settings, made, shutdown, &now).await?;
-        let line = report_line::format_report(&lease, &validated, &became, started.elapsed().as_secs_f64());
+        let line = report_line::format_report(&lease, &validated, &outcome, started.elapsed().as_secs_f64());
         match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
             Err(failure) => {
@@ -233,7 +233,7 @@ async fn label_jobs(
 /// A result that has been stored.
 struct Delivered {
     validated: Result<Calculated, Failure>,
-    became: DeliveryOutcome,
+    outcome: DeliveryOutcome,
     ended: Option<EndedCalculation>,
 }
 
@@ -255,9 +255,9 @@ async fn deliver_attempt(
     // A failure without a remedy is not tried again.
     let no_remedy = validated.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
     let attempts = if no_remedy { 1 } else { settings.attempts };
-    let became =
+    let outcome =
         retry_until_written(shutdown, || deliver(store, lease, &validated, log, attempts, now())).await?;
-    Ok(Delivered { validated, became, ended })
+    Ok(Delivered { validated, outcome, ended })
 }
 
 async fn poll_queue(
@@ -268,7 +268,7 @@ async fn poll_queue(
 ) -> Result<QueuePoll, StoreError> {
     // The loop holds no lease at this point: leasing, labelling and polling follow each other.
     give_back_unknown(store, &settings.holder, &[], now).await?;
-    if !store.awaits_labels(now).await? {
+    if !store.has_pending_labels(now).await? {
         return Ok(if no_more_jobs { QueuePoll::Finished } else { QueuePoll::Nothing });
     }
     let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());

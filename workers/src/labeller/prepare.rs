@@ -11,7 +11,7 @@ use store::{CalculationRecord, StoreError};
 
 use super::ExecutionSettings;
 use super::calculation_runner::WORK;
-use super::code::file;
+use super::code::file_error;
 use super::input_diff::input_diff;
 
 /// Beside [`WORK`]: input files that all calculations share.
@@ -21,7 +21,7 @@ pub(super) const DATA: &str = "data";
 const GIGABYTE: f64 = 1e9;
 
 /// The input of a calculation and its record in the store.
-pub(super) struct Prepared {
+pub(super) struct PreparedInput {
     pub input: Input,
     pub record: CalculationRecord,
     /// Seconds.
@@ -38,7 +38,7 @@ pub(super) fn prepare(
     execution: &ExecutionSettings,
     structure: &Structure,
     remedies: &BTreeSet<Remedy>,
-) -> Result<Prepared, Failure> {
+) -> Result<PreparedInput, Failure> {
     let input = code.input(structure, remedies)?;
     let (size, mut record) = (code.size(structure), CalculationRecord::default());
     record.cores = Some(execution.cores);
@@ -52,7 +52,7 @@ pub(super) fn prepare(
     }
     let twice = |remedy| if remedies.contains(&remedy) { 2.0 } else { 1.0 };
     let memory = execution.memory.map(|gigabytes| twice(Remedy::MoreMemory) * GIGABYTE * gigabytes);
-    Ok(Prepared {
+    Ok(PreparedInput {
         input,
         record,
         time_limit: twice(Remedy::MoreTime) * execution.time_limit,
@@ -69,11 +69,11 @@ pub(super) fn prepare(
 pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
     let copy = |(name, original): (&String, &Original)| match original.content() {
         Ok(content) => Ok((name.clone(), content)),
-        Err(error) => Err(file(original.path(), error)),
+        Err(error) => Err(file_error(original.path(), error)),
     };
     let data = input.data.iter().map(copy).collect::<Result<BTreeMap<_, _>, _>>()?;
     let written = fill(&directory.join(WORK), &input.files).and_then(|()| fill(&directory.join(DATA), &data));
-    written.map_err(|error| file(directory, error))
+    written.map_err(|error| file_error(directory, error))
 }
 
 /// Creates a folder with these files.

@@ -14,7 +14,7 @@ use rustix::io::Errno;
 use rustix::process::{getegid, geteuid};
 use store::StoreError;
 
-use super::code::file;
+use super::code::file_error;
 
 /// Random bytes in a name.
 const RANDOM: usize = 8;
@@ -79,7 +79,7 @@ pub(super) fn make(parent: &Path, prefix: &str) -> Result<PathBuf, StoreError> {
             }
         }
     };
-    made().map_err(|error: NotPrivate| file(parent, io::Error::other(error)))
+    made().map_err(|error: NotPrivate| file_error(parent, io::Error::other(error)))
 }
 
 /// Checks a directory in which [`make`] is to create others. Creates it if it does not exist.
@@ -87,7 +87,7 @@ pub(super) fn make(parent: &Path, prefix: &str) -> Result<PathBuf, StoreError> {
 /// # Errors
 /// [`NotPrivate`] if another user could change directories in it.
 pub(super) fn check(parent: &Path) -> Result<(), StoreError> {
-    open_parent(parent).map(drop).map_err(|error| file(parent, io::Error::other(error)))
+    open_parent(parent).map(drop).map_err(|error| file_error(parent, io::Error::other(error)))
 }
 
 /// Creates a directory for this user alone inside one that [`make`] created. `NotFound` if that one was removed.

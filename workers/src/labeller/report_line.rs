@@ -14,11 +14,11 @@ pub(super) enum DeliveryOutcome {
 pub(super) fn format_report(
     lease: &Lease,
     validated: &Result<Calculated, Failure>,
-    became: &DeliveryOutcome,
+    outcome: &DeliveryOutcome,
     seconds: f64,
 ) -> String {
     let candidate = &lease.candidate;
-    match (validated, became) {
+    match (validated, outcome) {
         (Ok(label), DeliveryOutcome::Completed(CompleteOutcome::Label)) => {
             format!("labelled {candidate}: {:.4} eV, {seconds:.1} s", label.energy)
         }

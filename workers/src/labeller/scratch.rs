@@ -14,7 +14,7 @@ use store::{Store, StoreError};
 use wire::CampaignId;
 
 use super::calculation_handle::{CalculationHandle, CalculationState};
-use super::code::{blocking, file};
+use super::code::{blocking, file_error};
 use super::execution::KeepDirectories;
 use super::slurm::{self, Slurm};
 use super::{Shutdown, local, pack, private_directory, retry_until_written};
@@ -45,8 +45,8 @@ impl ScratchRoot {
     pub fn prepare(&self) -> Result<PathBuf, StoreError> {
         private_directory::check(&self.scratch)?;
         let prefix = format!("{}-", self.prefix);
-        let found =
-            private_directory::ours_in(&self.scratch, &prefix).map_err(|error| file(&self.scratch, error))?;
+        let found = private_directory::ours_in(&self.scratch, &prefix)
+            .map_err(|error| file_error(&self.scratch, error))?;
         match found.into_iter().find(|path| private_directory::is_closed(path)) {
             Some(root) => Ok(root),
             None => private_directory::make(&self.scratch, &prefix),
@@ -65,7 +65,7 @@ impl ScratchRoot {
             match private_directory::make_inside(&root, &name(job, attempt)) {
                 // The process that ended last has removed it.
                 Err(error) if error.kind() == io::ErrorKind::NotFound && tries < MAX_ATTEMPTS => {}
-                made => return made.map_err(|error| file(&root, error)),
+                made => return made.map_err(|error| file_error(&root, error)),
             }
         }
     }
@@ -80,7 +80,7 @@ impl ScratchRoot {
         shutdown: &Shutdown,
     ) -> Result<(), StoreError> {
         for root in self.all()? {
-            let entries = fs::read_dir(&root).map_err(|error| file(&root, error))?;
+            let entries = fs::read_dir(&root).map_err(|error| file_error(&root, error))?;
             for directory in entries.flatten().map(|entry| entry.path()).filter(|path| is_old(path)) {
                 cleanup_one(store, &directory, keep, slurm, shutdown).await?;
             }
@@ -97,7 +97,8 @@ impl ScratchRoot {
 
     /// All directories of this campaign, including those of earlier versions of this program.
     fn all(&self) -> Result<Vec<PathBuf>, StoreError> {
-        private_directory::ours_in(&self.scratch, &self.prefix).map_err(|error| file(&self.scratch, error))
+        private_directory::ours_in(&self.scratch, &self.prefix)
+            .map_err(|error| file_error(&self.scratch, error))
     }
 }
 
@@ -127,7 +128,7 @@ pub(super) async fn pack(
     directory: &Path,
 ) -> Result<(), StoreError> {
     let from = directory.to_owned();
-    let packed = blocking(move || pack::pack(&from)).await.map_err(|error| file(directory, error))?;
+    let packed = blocking(move || pack::pack(&from)).await.map_err(|error| file_error(directory, error))?;
     retry_until_written(shutdown, || store.keep_archive(job, attempt, &packed.bytes, &packed.left_out)).await
 }
 
@@ -153,7 +154,7 @@ async fn cleanup_one(
     }
     if is_over {
         let cleared = directory.to_owned();
-        blocking(move || local::clear(&cleared)).await.map_err(|error| file(directory, error))?;
+        blocking(move || local::clear(&cleared)).await.map_err(|error| file_error(directory, error))?;
     }
     Ok(())
 }

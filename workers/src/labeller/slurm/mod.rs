@@ -29,7 +29,7 @@ use tokio::time::sleep;
 
 use super::calculation_handle::CalculationState;
 use super::calculation_runner::CalculationEnd;
-use super::code::file;
+use super::code::file_error;
 use super::private_directory;
 use squeue::{SqueueJob, Traces};
 
@@ -120,10 +120,10 @@ impl Slurm {
             }
             refused += 1;
             // All allowed nodes may be excluded.
-            let again =
-                script::clear_excluded_nodes(&job.directory).map_err(|error| file(&job.directory, error))?;
+            let again = script::clear_excluded_nodes(&job.directory)
+                .map_err(|error| file_error(&job.directory, error))?;
             if refused >= MAX_REFUSALS && !again {
-                return Err(cannot(job, format_args!("cannot submit its job: {error}")));
+                return Err(job_error(job, format_args!("cannot submit its job: {error}")));
             }
             sleep(RETRY_INTERVAL).await;
         }
@@ -145,7 +145,7 @@ impl Slurm {
         let lives = jobs.iter().any(|reported| reported.phase() != Phase::Over);
         match (lives, job.directory.is_dir()) {
             (true, true) => Ok(CalculationState::Running),
-            (true, false) => Err(cannot(
+            (true, false) => Err(job_error(
                 job,
                 format_args!(
                     "job '{}' is running there, but its directory is not visible here: {SCRATCH_NOT_SHARED}",
@@ -169,13 +169,13 @@ impl Slurm {
             None if !begun => return Ok(CalculationState::Ready),
             Some(reported) if !begun && reported.ran_to_its_end() => {
                 let message = format!("{reported}, but its files are not visible here: {SCRATCH_NOT_SHARED}");
-                return Err(cannot(job, message));
+                return Err(job_error(job, message));
             }
             _ => {}
         }
         // Slurm forgets it after a while.
         let end = squeue::infer_end(reported, &Traces::read(&job.directory));
-        end.write(&job.directory).map_err(|error| file(&job.directory, error))?;
+        end.write(&job.directory).map_err(|error| file_error(&job.directory, error))?;
         Ok(CalculationState::Ended(end))
     }
 
@@ -207,14 +207,14 @@ impl Slurm {
     pub async fn cancel(&self, job: &Job) -> Result<(), StoreError> {
         let started = Instant::now();
         loop {
-            let jobs = self.ask(job).await.map_err(|error| cannot(job, error))?;
+            let jobs = self.ask(job).await.map_err(|error| job_error(job, error))?;
             let living = jobs.iter().filter(|reported| reported.phase() != Phase::Over);
             // Jobs that are completing were cancelled before.
             let ids: Vec<_> = living
                 .filter(|reported| reported.phase() != Phase::Completing)
                 .map(|reported| reported.id)
                 .collect();
-            self.commands.cancel(&ids).await.map_err(|error| cannot(job, error))?;
+            self.commands.cancel(&ids).await.map_err(|error| job_error(job, error))?;
             if jobs.iter().all(|reported| reported.phase() == Phase::Over)
                 || started.elapsed() > CANCEL_TIMEOUT
             {
@@ -229,7 +229,7 @@ impl Slurm {
         loop {
             match self.ask(job).await {
                 Ok(jobs) => return Ok(jobs),
-                Err(error) if error.is_missing() => return Err(cannot(job, error)),
+                Err(error) if error.is_missing() => return Err(job_error(job, error)),
                 Err(_) => sleep(SQUEUE_INTERVAL).await,
             }
         }
@@ -246,7 +246,7 @@ impl Slurm {
         let ask = async || loop {
             match self.commands.cluster().await {
                 Err(error) if error.is_missing() => {
-                    return Err(file(directory, io::Error::other(error.to_string())));
+                    return Err(file_error(directory, io::Error::other(error.to_string())));
                 }
                 Err(_) => sleep(RETRY_INTERVAL).await,
                 Ok(cluster) => return Ok(cluster),
@@ -263,8 +263,8 @@ fn own_user() -> u32 {
     rustix::process::getuid().as_raw()
 }
 
-fn cannot(job: &Job, why: impl ToString) -> StoreError {
-    file(&job.directory, io::Error::other(why.to_string()))
+fn job_error(job: &Job, why: impl ToString) -> StoreError {
+    file_error(&job.directory, io::Error::other(why.to_string()))
 }
 
 /// Makes files from other hosts visible: a network file system refreshes a directory when a file is created in it.
