@@ -115,8 +115,8 @@ fn record(number: usize) -> CandidateRecord {
 }
 
 /// Pseudo-random numbers (SplitMix64) in [0, 1).
-fn noise(seed: u64, count: usize) -> Vec<f64> {
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+fn noise(rng_seed: u64, count: usize) -> Vec<f64> {
+    let mut state = rng_seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
     let mut next = || {
         state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

@@ -27,11 +27,12 @@ impl Store {
     pub async fn create(
         location: impl Into<Location>,
         campaign: &Campaign,
-        seeds: &[SeedStructure],
+        seed_structures: &[SeedStructure],
         now: i64,
     ) -> Result<Self> {
-        let fill =
-            async |database: &Database| protocols::write_campaign(database, campaign, seeds, now).await;
+        let fill = async |database: &Database| {
+            protocols::write_campaign(database, campaign, seed_structures, now).await
+        };
         let database = match location.into() {
             Location::Directory(directory) => Database::Sqlite(DatabaseFile::create(&directory, fill).await?),
             Location::Server(url) => {

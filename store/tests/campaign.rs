@@ -19,9 +19,9 @@ async fn a_campaign_is_created_once_and_opened_often() {
 
     let store = home.open().await;
     assert_eq!(store.campaign().await.unwrap(), campaign());
-    let seeds = store.seed_structures().await.unwrap();
-    assert_eq!((seeds.len(), seeds[0].name.as_str()), (1, "diamond"));
-    assert_eq!(seeds[0].structure, structure(0.0));
+    let seed_structures = store.seed_structures().await.unwrap();
+    assert_eq!((seed_structures.len(), seed_structures[0].name.as_str()), (1, "diamond"));
+    assert_eq!(seed_structures[0].structure, structure(0.0));
     assert_eq!(store.protocols().await.unwrap(), [protocol("dft")]);
     let change = serde_json::json!({ "key": "walkers", "before": 1, "after": 2 });
     store.set_configuration_in_force("{\"walkers\":2}", std::slice::from_ref(&change), 7).await.unwrap();

@@ -51,11 +51,11 @@ fn main() {
     }
     let model = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
     let mixture = Arc::new(Artifact::load_export(folder.join("kokkos.npz")).expect("a CALM mixture").mixture);
-    let seed = crystal(model.elements(), 4.05);
-    let walk = TimedWalk::new(&model, &mixture, seed.clone());
+    let seed_structure = crystal(model.elements(), 4.05);
+    let walk = TimedWalk::new(&model, &mixture, seed_structure.clone());
     for ensemble in ensembles {
         for &cores in &cores {
-            let mut peer = Peer::start(&python, &folder, &seed, &ensemble, cores);
+            let mut peer = Peer::start(&python, &folder, &seed_structure, &ensemble, cores);
             let mut walks = vec![walk.clone(); cores];
             let (mut ours, mut theirs, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
             for round in 0..=ROUNDS {
@@ -98,10 +98,10 @@ struct Peer {
 
 impl Peer {
     /// On one core with one thread, or on all cores with any number of threads.
-    fn start(python: &Path, folder: &Path, seed: &Structure, ensemble: &str, cores: usize) -> Self {
+    fn start(python: &Path, folder: &Path, seed_structure: &Structure, ensemble: &str, cores: usize) -> Self {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let mut text = Vec::new();
-        write_frame(&mut text, &Frame::from(seed.clone())).expect("a crystal");
+        write_frame(&mut text, &Frame::from(seed_structure.clone())).expect("a crystal");
         let structure = directory.path().join("seed.extxyz");
         std::fs::write(&structure, text).expect("a file");
         let program = python.with_file_name("grace_uq");

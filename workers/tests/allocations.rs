@@ -49,7 +49,7 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
 }
 
-fn seed() -> Structure {
+fn seed_structure() -> Structure {
     read_extxyz(&data("aluminium_seeds.extxyz")).unwrap().swap_remove(0).structure
 }
 
@@ -60,7 +60,7 @@ fn a_biased_step_allocates_nothing() {
 }
 
 fn check(precision: Precision) {
-    let structure = seed();
+    let structure = seed_structure();
     let file = data("al_eam_1l/kokkos.npz");
     let model = Arc::new(GraceModel::load_in(&file, precision, RadialPath::default()).unwrap());
     let mixture = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);

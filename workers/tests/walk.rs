@@ -19,7 +19,7 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
 }
 
-fn seed(name: &str) -> Structure {
+fn seed_structure(name: &str) -> Structure {
     let frames = read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
     frames.into_iter().find(|frame| frame.info["name"].text() == Some(name)).unwrap().structure
 }
@@ -103,9 +103,9 @@ fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) ->
 #[test]
 fn a_split_assignment_gives_the_same_result() {
     let settings = WalkSettings { collection: never(), ..settings() };
-    let whole = run(&settings, &assignment(seed("vacancy"), 120));
+    let whole = run(&settings, &assignment(seed_structure("vacancy"), 120));
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::Turn, 120));
-    let mut turn = assignment(seed("vacancy"), 0);
+    let mut turn = assignment(seed_structure("vacancy"), 0);
     for until in [1, 19, 20, 21, 33, 90, 120] {
         turn.until = until;
         turn.checkpoint = Some(run(&settings, &turn).checkpoint);
@@ -117,7 +117,7 @@ fn a_split_assignment_gives_the_same_result() {
 #[test]
 fn damaged_checkpoints_do_not_stop_a_walker() {
     let settings = WalkSettings { collection: never(), ..settings() };
-    let mut turn = assignment(seed("vacancy"), 110);
+    let mut turn = assignment(seed_structure("vacancy"), 110);
     let checkpoint = run(&settings, &turn).checkpoint;
     let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
     let mixture = mixture();
@@ -139,7 +139,7 @@ fn never() -> CollectionRule {
 
 #[test]
 fn the_bias_is_the_hal_force() {
-    let (model, mixture, structure) = (model(), mixture(), seed("slab-111"));
+    let (model, mixture, structure) = (model(), mixture(), seed_structure("slab-111"));
     let species = &structure.species;
     let mut biased =
         BiasedPotential::new(Grace::new(Arc::clone(&model)), Arc::clone(&mixture), None, 10, species)
@@ -191,7 +191,7 @@ fn reference(
 #[test]
 fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), ..settings() };
-    let reports = whole_walk(&settings, seed("fcc-100"), 150);
+    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
     let last = reports.last().unwrap();
     assert!(last.progress.returns >= 1, "{last:?}");
     assert_eq!(last.progress.segment, last.progress.returns);
@@ -207,7 +207,7 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
 fn the_interval_between_collections_holds_across_roll_backs() {
     let guard = GuardSettings { tau_factor: 0.8, most_returns: 6, ..settings().guard };
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), gap: 120, guard, ..settings() };
-    let reports = whole_walk(&settings, seed("fcc-097"), 150);
+    let reports = whole_walk(&settings, seed_structure("fcc-097"), 150);
     let candidate = |report: &Report<Candidate>| match &report.outcome {
         Outcome::Candidate(candidate) => Some((candidate.id.segment, candidate.id.step)),
         _ => None,
@@ -232,7 +232,7 @@ fn the_interval_between_collections_holds_across_roll_backs() {
 #[test]
 fn the_skin_changes_nothing() {
     // A cluster that loses an atom: when this is noticed must not depend on when the list was built.
-    let mut cluster = seed("fcc-100");
+    let mut cluster = seed_structure("fcc-100");
     cluster.periodic = [false; 3];
     cluster.species.truncate(5);
     cluster.positions.truncate(5);
@@ -252,7 +252,7 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
     let guard = GuardSettings { least_distance: 3.0, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
     let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
-    let reports = whole_walk(&settings, seed("fcc-100"), 150);
+    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
     let last = reports.last().unwrap();
     assert!(
         matches!(&last.outcome, Outcome::Ended(End::Trapped { guard }) if guard == "shortest-bond"),
@@ -266,7 +266,7 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
 fn a_diverging_walk_ends_with_its_reason() {
     let guard = GuardSettings { highest_temperature: 900.0, ..settings().guard };
     let settings = WalkSettings { temperature: 2500.0, collection: never(), guard, ..settings() };
-    let report = run(&settings, &assignment(seed("fcc-100"), 600));
+    let report = run(&settings, &assignment(seed_structure("fcc-100"), 600));
     let Outcome::Ended(End::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };
     assert!(reason.contains("above the allowed 900 K"), "{reason}");
 }
@@ -274,7 +274,7 @@ fn a_diverging_walk_ends_with_its_reason() {
 #[test]
 fn a_control_walk_gives_the_requested_frames_and_follows_the_biased_one_until_the_bias_acts() {
     let settings = settings();
-    let mut control = assignment(seed("slab-111"), 90);
+    let mut control = assignment(seed_structure("slab-111"), 90);
     control.origin = Origin::Control;
     control.walk = WalkId(9);
     control.wanted = vec![25, 90];
@@ -284,7 +284,7 @@ fn a_control_walk_gives_the_requested_frames_and_follows_the_biased_one_until_th
     // The bias is zero for its first ten evaluations: up to step 30 both trajectories agree.
     let same = |until: u64| {
         let quiet = WalkSettings { collection: never(), ..settings.clone() };
-        let biased = run(&quiet, &assignment(seed("slab-111"), until));
+        let biased = run(&quiet, &assignment(seed_structure("slab-111"), until));
         let mut control = Assignment { wanted: Vec::new(), ..control.clone() };
         control.until = until;
         let state =

@@ -15,7 +15,7 @@ use crate::records::{Campaign, Protocol, SeedStructure};
 /// Priority of jobs added later than their candidate.
 const LATE_PRIORITY: i32 = 0;
 
-macro_rules! seeds {
+macro_rules! seed_structures {
     ($rest:literal) => {
         concat!(
             "SELECT ",
@@ -44,7 +44,7 @@ impl FromRow for SeedStructure {
 pub(crate) async fn write_campaign(
     database: &Database,
     campaign: &Campaign,
-    seeds: &[SeedStructure],
+    seed_structures: &[SeedStructure],
     now: i64,
 ) -> Result<()> {
     let mut transaction = database.begin_as_leader().await?;
@@ -58,8 +58,8 @@ pub(crate) async fn write_campaign(
     ] {
         set_campaign_value(&mut transaction, key, value).await?;
     }
-    for seed in seeds {
-        insert_seed_structure(&mut transaction, seed).await?;
+    for seed_structure in seed_structures {
+        insert_seed_structure(&mut transaction, seed_structure).await?;
     }
     let detail = serde_json::json!({ "program_version": campaign.program_version });
     insert_operation(&mut transaction, now, "created", &detail).await?;
@@ -146,22 +146,22 @@ impl Store {
     }
 
     /// Adds seed structures, or replaces those with the same index.
-    pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
+    pub async fn add_seed_structures(&self, seed_structures: &[SeedStructure]) -> Result<()> {
         let mut transaction = self.database.begin_as_leader().await?;
-        for seed in seeds {
-            insert_seed_structure(&mut transaction, seed).await?;
+        for seed_structure in seed_structures {
+            insert_seed_structure(&mut transaction, seed_structure).await?;
         }
         transaction.commit().await
     }
 
     /// Every seed structure, by index.
     pub async fn seed_structures(&self) -> Result<Vec<SeedStructure>> {
-        query(seeds!("ORDER BY seed")).fetch_all(&self.database).await
+        query(seed_structures!("ORDER BY seed")).fetch_all(&self.database).await
     }
 
     /// The seed structure with that index.
     pub async fn seed_structure(&self, index: u32) -> Result<Option<SeedStructure>> {
-        query(seeds!("WHERE seed = $1")).bind(index).fetch_optional(&self.database).await
+        query(seed_structures!("WHERE seed = $1")).bind(index).fetch_optional(&self.database).await
     }
 
     /// Makes `protocol` the protocol of new label jobs. Accepted candidates without any job (found before there was
@@ -244,12 +244,19 @@ pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str,
     Ok(())
 }
 
-async fn insert_seed_structure(transaction: &mut Transaction, seed: &SeedStructure) -> Result<()> {
-    let structure = structure_id(transaction, &seed.structure, ContentHash::of(&seed.structure)).await?;
+async fn insert_seed_structure(transaction: &mut Transaction, seed_structure: &SeedStructure) -> Result<()> {
+    let structure =
+        structure_id(transaction, &seed_structure.structure, ContentHash::of(&seed_structure.structure))
+            .await?;
     let sql =
         "INSERT INTO seed_structure (seed, name, source, structure, checksum) VALUES ($1, $2, $3, $4, $5)
                ON CONFLICT (seed) DO UPDATE SET name = $2, source = $3, structure = $4, checksum = $5";
-    let row = vec![seed.index.into(), (&seed.name).into(), (&seed.source).into(), structure.into()];
+    let row = vec![
+        seed_structure.index.into(),
+        (&seed_structure.name).into(),
+        (&seed_structure.source).into(),
+        structure.into(),
+    ];
     query(sql).bind_all(SEED_STRUCTURE.with_checksum(row)).execute(&mut *transaction).await?;
     Ok(())
 }

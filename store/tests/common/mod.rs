@@ -50,13 +50,13 @@ pub async fn create(directory: &std::path::Path) -> Store {
 }
 
 pub async fn create_at(location: Location) -> Store {
-    let seed = SeedStructure {
+    let seed_structure = SeedStructure {
         index: 0,
         name: "diamond".into(),
         source: "seeds.extxyz".into(),
         structure: structure(0.0),
     };
-    let store = Store::create(location, &campaign(), &[seed], 0).await.unwrap();
+    let store = Store::create(location, &campaign(), &[seed_structure], 0).await.unwrap();
     store.add_protocol(&protocol("dft"), 0).await.unwrap();
     store
 }

@@ -22,13 +22,13 @@ pub struct TimedWalk {
 }
 
 impl TimedWalk {
-    pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed: Structure) -> Self {
+    pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed_structure: Structure) -> Self {
         let context = |threshold| WalkContext {
             model: Arc::clone(model),
             threads: Threads::default(),
             settings: Arc::new(settings(threshold)),
         };
-        let mut assignment = assignment(seed, u64::MAX);
+        let mut assignment = assignment(seed_structure, u64::MAX);
         // Any structure is a candidate from the first permitted step on.
         let report = run(&context(1e-9), &assignment, mixture);
         let Outcome::Candidate(candidate) = report.outcome else {

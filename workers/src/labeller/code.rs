@@ -113,11 +113,11 @@ impl CodeMethod {
             }
         };
         let outcome = self.outcome(lease.structure.clone(), handle, prepared.time_limit, shutdown).await?;
-        let Some(made) = outcome else { return Ok(None) };
-        if let Some(failed) = failed_on_node(&made) {
+        let Some(attempt) = outcome else { return Ok(None) };
+        if let Some(failed) = failed_on_node(&attempt) {
             record(&failed).await?;
         }
-        Ok(Some(made))
+        Ok(Some(attempt))
     }
 
     /// A calculation outside a campaign.
@@ -128,10 +128,10 @@ impl CodeMethod {
             Err(failure) => return Ok(none(Err(failure))),
         };
         let root = private_directory::make(&self.execution.scratch(), "calmwalk-once-")?;
-        let made = self.single_label_in(&root, structure, &prepared).await;
+        let attempt = self.single_label_in(&root, structure, &prepared).await;
         self.cancel().await?;
         scratch::remove_empty(&root);
-        let LabelAttempt { result, ended } = made?;
+        let LabelAttempt { result, ended } = attempt?;
         Ok(match ended {
             Some(EndedCalculation { core_seconds, log, .. }) => SingleLabel { result, log, core_seconds },
             None => none(result),
@@ -148,8 +148,8 @@ impl CodeMethod {
             .map_err(|error| file_error(root, error))?;
         let handle = self.start(self.prepare_directory(&directory, prepared, &[]).await?).await?;
         let never = Shutdown::default();
-        let made = self.outcome(structure.clone(), handle, prepared.time_limit, &never).await?;
-        Ok(made.expect("nobody asks to stop"))
+        let attempt = self.outcome(structure.clone(), handle, prepared.time_limit, &never).await?;
+        Ok(attempt.expect("nobody asks to stop"))
     }
 
     /// Prepares everything that is needed before the start.
@@ -281,7 +281,7 @@ impl CodeMethod {
         };
         let left = Duration::try_from_secs_f64(time_limit - end.seconds).unwrap_or_default();
         tokio::select! {
-            made = self.read(structure, handle, end, left.max(MIN_READ_TIME)) => made.map(Some),
+            attempt = self.read(structure, handle, end, left.max(MIN_READ_TIME)) => attempt.map(Some),
             () = async {
                 shutdown.stop_requested().await;
                 tokio::time::sleep(READ_GRACE).await;
@@ -410,12 +410,12 @@ fn failed_nodes(lease: &Lease) -> Vec<String> {
 }
 
 /// The handle of a calculation that failed and may succeed on another node, with its node.
-fn failed_on_node(made: &LabelAttempt) -> Option<CalculationHandle> {
+fn failed_on_node(attempt: &LabelAttempt) -> Option<CalculationHandle> {
     use FailureClass::{Crashed, LostNode, OutOfMemory};
     let LabelAttempt {
         result: Err(failure),
         ended: Some(EndedCalculation { handle: CalculationHandle::Slurm(job), node, .. }),
-    } = made
+    } = attempt
     else {
         return None;
     };

@@ -53,7 +53,7 @@ pub(super) struct Offsets {
 
 impl Offsets {
     /// The reference for the energy of a result; `None` if there is none yet.
-    pub async fn expected(
+    pub async fn energy_reference(
         &mut self,
         store: &Store,
         protocol: &Protocol,

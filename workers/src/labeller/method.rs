@@ -36,7 +36,7 @@ impl LabelAttempt {
         bounds: &LabelBounds,
         expected: Option<EnergyReference<'_>>,
     ) -> Self {
-        let result = self.result.and_then(|made| validate(made, &lease.structure, bounds, expected));
+        let result = self.result.and_then(|results| validate(results, &lease.structure, bounds, expected));
         Self { result, ..self }
     }
 }

@@ -155,7 +155,7 @@ async fn label_jobs(
     now: impl Fn() -> i64,
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
-    let say = |line: &str| {
+    let announce = |line: &str| {
         info!("{line}");
         tell(line);
     };
@@ -182,40 +182,44 @@ async fn label_jobs(
         if let Some(reason) = retry_until_written(shutdown, || guard::refusal(store, &lease, size)).await? {
             // Another attempt would be refused as well, whatever was tried before.
             retry_until_written(shutdown, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
-            say(&format!("refused {}: {reason}", lease.candidate));
+            announce(&format!("refused {}: {reason}", lease.candidate));
             continue;
         }
-        let made = match make(store, method, &lease, &settings.timing, shutdown, &now).await? {
-            LeaseOutcome::Done(made) => *made,
+        let attempt = match make_label(store, method, &lease, &settings.timing, shutdown, &now).await? {
+            LeaseOutcome::Done(attempt) => *attempt,
             LeaseOutcome::NotWanted => {
                 method.stop().await?;
-                say(&format!("stopped labelling {}: its result is no longer needed", lease.candidate));
+                announce(&format!("stopped labelling {}: its result is no longer needed", lease.candidate));
                 continue;
             }
             LeaseOutcome::Detached => {
                 method.detach();
-                say(&format!("{} is finished by another labeller on this host", lease.candidate));
+                announce(&format!("{} is finished by another labeller on this host", lease.candidate));
                 continue;
             }
             LeaseOutcome::LeftRunning => {
                 method.detach();
-                say(&format!("{} continues and is left to the next labeller on this host", lease.candidate));
+                announce(&format!(
+                    "{} continues and is left to the next labeller on this host",
+                    lease.candidate
+                ));
                 return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
                     .await
                     .map(drop);
             }
             LeaseOutcome::GraceExpired => {
                 method.stop().await?;
-                say(&format!("released {}: there is no time to finish it", lease.candidate));
+                announce(&format!("released {}: there is no time to finish it", lease.candidate));
                 return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
                     .await
                     .map(drop);
             }
         };
-        let expected = offsets.expected(store, &settings.protocol, &lease, &made.result, shutdown).await?;
-        let made = made.validated(&lease, &settings.bounds, expected);
+        let reference =
+            offsets.energy_reference(store, &settings.protocol, &lease, &attempt.result, shutdown).await?;
+        let attempt = attempt.validated(&lease, &settings.bounds, reference);
         let Delivered { validated, outcome, ended } =
-            deliver_attempt(store, method, &lease, settings, made, shutdown, &now).await?;
+            deliver_attempt(store, method, &lease, settings, attempt, shutdown, &now).await?;
         let line = report_line::format_report(&lease, &validated, &outcome, started.elapsed().as_secs_f64());
         match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
@@ -243,11 +247,11 @@ async fn deliver_attempt(
     method: &Method,
     lease: &Lease,
     settings: &LabellerSettings,
-    made: LabelAttempt,
+    attempt: LabelAttempt,
     shutdown: &Shutdown,
     now: impl Fn() -> i64,
 ) -> Result<Delivered, StoreError> {
-    let LabelAttempt { result: validated, ended } = made;
+    let LabelAttempt { result: validated, ended } = attempt;
     let log = ended.as_ref().map_or("", |ended| &ended.log);
     if let Some(ended) = &ended {
         retry_until_written(shutdown, || store.record_cost(lease, ended.core_seconds, log)).await?;
@@ -267,7 +271,7 @@ async fn poll_queue(
     now: i64,
 ) -> Result<QueuePoll, StoreError> {
     // The loop holds no lease at this point: leasing, labelling and polling follow each other.
-    give_back_unknown(store, &settings.holder, &[], now).await?;
+    release_unknown_leases(store, &settings.holder, &[], now).await?;
     if !store.has_pending_labels(now).await? {
         return Ok(if no_more_jobs { QueuePoll::Finished } else { QueuePoll::Nothing });
     }
@@ -282,7 +286,12 @@ async fn poll_queue(
 
 /// Releases leases that the store has under this labeller's name but that it does not know: the reply to a commit
 /// was lost.
-async fn give_back_unknown(store: &Store, holder: &str, held: &[&Lease], now: i64) -> Result<(), StoreError> {
+async fn release_unknown_leases(
+    store: &Store,
+    holder: &str,
+    held: &[&Lease],
+    now: i64,
+) -> Result<(), StoreError> {
     let leases = store.state_leases(holder, held, now).await?;
     if leases > 0 {
         warn!(leases, "released leases: the database's reply to a commit was lost");
@@ -327,7 +336,7 @@ enum LeaseOutcome {
 /// Works on a job and renews its lease meanwhile. If the lease is lost, the label is still finished: if another
 /// result comes first, it becomes a check. But its calculation is ended when the result is no longer needed, and
 /// left alone when another labeller waits for it.
-async fn make(
+async fn make_label(
     store: &Store,
     method: &Method,
     lease: &Lease,
@@ -335,7 +344,7 @@ async fn make(
     shutdown: &Shutdown,
     now: impl Fn() -> i64,
 ) -> Result<LeaseOutcome, StoreError> {
-    let mut making = pin!(method.make(store, lease, shutdown));
+    let mut labelling = pin!(method.make(store, lease, shutdown));
     let mut too_late = pin!(end_of_grace(timing.grace, shutdown));
     // Labellers without a grace period are followed by others, which find the calculation.
     let leaves = timing.grace.is_none() && method.outlives_labeller();
@@ -349,8 +358,8 @@ async fn make(
     let mut held = true;
     loop {
         tokio::select! {
-            made = &mut making => {
-                return Ok(made?.map_or(LeaseOutcome::LeftRunning, |made| LeaseOutcome::Done(Box::new(made))));
+            attempt = &mut labelling => {
+                return Ok(attempt?.map_or(LeaseOutcome::LeftRunning, |attempt| LeaseOutcome::Done(Box::new(attempt))));
             }
             () = &mut too_late => return Ok(LeaseOutcome::GraceExpired),
             () = &mut leave => return Ok(LeaseOutcome::LeftRunning),
@@ -364,7 +373,7 @@ async fn make(
             };
         }
         // The server may have completed a commit after its connection broke and the queue was polled.
-        match give_back_unknown(store, &lease.holder, &[lease], now()).await {
+        match release_unknown_leases(store, &lease.holder, &[lease], now()).await {
             Err(error) if !error.is_transient() => return Err(error),
             _ => {}
         }
@@ -400,7 +409,9 @@ async fn deliver(
     now: i64,
 ) -> Result<DeliveryOutcome, StoreError> {
     let failure = match validated {
-        Ok(made) => return store.complete(lease, &label(made), now).await.map(DeliveryOutcome::Completed),
+        Ok(results) => {
+            return store.complete(lease, &label(results), now).await.map(DeliveryOutcome::Completed);
+        }
         Err(failure) => failure,
     };
     let (class, text) = (failure.class.name(), format!("{failure}\n{log}"));
@@ -414,16 +425,16 @@ async fn deliver(
 }
 
 /// Converts a result for the store.
-fn label(made: &Calculated) -> Label {
+fn label(results: &Calculated) -> Label {
     Label {
-        energy: made.energy,
-        forces: made.forces.clone(),
-        stress: made.stress,
+        energy: results.energy,
+        forces: results.forces.clone(),
+        stress: results.stress,
         details: LabelDetails {
-            energy_without_smearing: made.energy_without_smearing,
-            magnetic_moments: made.magnetic_moments.clone(),
-            magnetisation: made.magnetisation,
-            electronic_steps: made.electronic_steps,
+            energy_without_smearing: results.energy_without_smearing,
+            magnetic_moments: results.magnetic_moments.clone(),
+            magnetisation: results.magnetisation,
+            electronic_steps: results.electronic_steps,
         },
     }
 }

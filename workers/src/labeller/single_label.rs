@@ -41,6 +41,6 @@ pub async fn label_structure(
         }
         Method::Code(method) => method.single_label(structure).await?,
     };
-    label.result = label.result.and_then(|made| validate(made, structure, bounds, None));
+    label.result = label.result.and_then(|results| validate(results, structure, bounds, None));
     Ok(label)
 }

@@ -87,50 +87,50 @@ pub(super) struct EnergyReference<'a> {
 /// # Errors
 /// [`FailureClass::Implausible`], with the reason.
 pub(super) fn validate(
-    made: Calculated,
+    results: Calculated,
     structure: &Structure,
     bounds: &LabelBounds,
     expected: Option<EnergyReference<'_>>,
 ) -> Result<Calculated, Failure> {
-    let problem = wrong_number(&made, structure.len())
-        .or_else(|| not_finite(&made))
-        .or_else(|| bounds.refuses(made.energy, &made.forces, made.stress.as_ref()))
-        .or_else(|| bounds.refuses_energy(made.energy_without_smearing?, structure.len()))
-        .or_else(|| too_far(&made, structure, bounds, expected?));
+    let problem = wrong_number(&results, structure.len())
+        .or_else(|| not_finite(&results))
+        .or_else(|| bounds.refuses(results.energy, &results.forces, results.stress.as_ref()))
+        .or_else(|| bounds.refuses_energy(results.energy_without_smearing?, structure.len()))
+        .or_else(|| too_far(&results, structure, bounds, expected?));
     match problem {
         Some(problem) => Err(FailureClass::Implausible.because(problem)),
-        None => Ok(made),
+        None => Ok(results),
     }
 }
 
-fn wrong_number(made: &Calculated, atoms: usize) -> Option<String> {
-    let moments = made.magnetic_moments.as_ref().map_or(atoms, Vec::len);
-    let lists = [("forces", made.forces.len()), ("magnetic moments", moments)];
+fn wrong_number(results: &Calculated, atoms: usize) -> Option<String> {
+    let moments = results.magnetic_moments.as_ref().map_or(atoms, Vec::len);
+    let lists = [("forces", results.forces.len()), ("magnetic moments", moments)];
     let (name, found) = lists.into_iter().find(|(_, found)| *found != atoms)?;
     Some(format!("{found} {name} for {atoms} atoms"))
 }
 
-fn not_finite(made: &Calculated) -> Option<String> {
-    let energies = [Some(made.energy), made.energy_without_smearing];
-    let moments = made.magnetic_moments.iter().flatten().chain(&made.magnetisation);
+fn not_finite(results: &Calculated) -> Option<String> {
+    let energies = [Some(results.energy), results.energy_without_smearing];
+    let moments = results.magnetic_moments.iter().flatten().chain(&results.magnetisation);
     let find = |name, mut numbers: &mut dyn Iterator<Item = f64>| {
         let found = (&mut numbers).find(|x| !x.is_finite())?;
         Some(format!("{name} of {found}, which is not a finite number"))
     };
     find("an energy", &mut energies.into_iter().flatten())
-        .or_else(|| find("a force", &mut made.forces.iter().flatten().copied()))
-        .or_else(|| find("a stress component", &mut made.stress.iter().flatten().flatten().copied()))
+        .or_else(|| find("a force", &mut results.forces.iter().flatten().copied()))
+        .or_else(|| find("a stress component", &mut results.stress.iter().flatten().flatten().copied()))
         .or_else(|| find("a magnetic moment", &mut moments.copied()))
 }
 
 fn too_far(
-    made: &Calculated,
+    results: &Calculated,
     structure: &Structure,
     bounds: &LabelBounds,
     expected: EnergyReference<'_>,
 ) -> Option<String> {
     let EnergyReference { model, offsets } = expected;
-    let label = labelled_energy(structure, model, made.energy);
+    let label = labelled_energy(structure, model, results.energy);
     let difference = -offsets.error_per_atom(&label, LEAST_SUPPORT)?;
     let bound = bounds.largest_energy_difference;
     (difference.abs() > bound).then(|| {
