@@ -13,7 +13,7 @@ use crate::error::{Result, StoreError};
 /// Schema for URLs that name none.
 const SCHEMA: &str = "public";
 /// Longest schema name: with prefixes it must fit the 63 bytes of a PostgreSQL identifier.
-const LONGEST_SCHEMA: usize = 50;
+const MAX_SCHEMA_LENGTH: usize = 50;
 
 /// Where a campaign is kept.
 #[derive(Clone, Debug)]
@@ -98,9 +98,9 @@ impl FromStr for ServerUrl {
             return Err(StoreError::Url { url: shown, reason: reason.to_owned() });
         }
         let valid = |c: char| matches!(c, 'a'..='z' | '0'..='9' | '_');
-        if schema.is_empty() || schema.len() > LONGEST_SCHEMA || !schema.chars().all(valid) {
+        if schema.is_empty() || schema.len() > MAX_SCHEMA_LENGTH || !schema.chars().all(valid) {
             let reason = format!(
-                "the schema '{schema}' must consist of at most {LONGEST_SCHEMA} lower-case letters, digits and underscores"
+                "the schema '{schema}' must consist of at most {MAX_SCHEMA_LENGTH} lower-case letters, digits and underscores"
             );
             return Err(StoreError::Url { url: shown, reason });
         }

@@ -17,7 +17,7 @@ use crate::tables::labels::decode_label;
 /// Rows read at a time: a row of a large structure has megabytes.
 const PAGE: u32 = 16;
 /// Number of findings of a kind that are listed one by one.
-const TOLD: usize = 5;
+const MAX_LISTED: usize = 5;
 
 const STRUCTURES: &str =
     "SELECT number AS place, structure.* FROM structure WHERE number > $1 ORDER BY number LIMIT $2";
@@ -160,11 +160,11 @@ impl<'a> Contents<'a> {
 
     fn found(&mut self, faults: Vec<String>) {
         let then = "its content is damaged; restore the campaign from a backup";
-        if faults.len() > TOLD {
-            let more = format!("{} more rows of the same table have such faults", faults.len() - TOLD);
+        if faults.len() > MAX_LISTED {
+            let more = format!("{} more rows of the same table have such faults", faults.len() - MAX_LISTED);
             self.findings.push(Finding { what: more, then });
         }
-        self.findings.extend(faults.into_iter().take(TOLD).map(|what| Finding { what, then }));
+        self.findings.extend(faults.into_iter().take(MAX_LISTED).map(|what| Finding { what, then }));
     }
 }
 

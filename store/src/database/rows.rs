@@ -14,7 +14,7 @@ use super::value::{Value, replace_nul};
 use crate::error::{Result, StoreError};
 
 /// Approximate number of bytes sent at once: PostgreSQL arrays hold up to 1 GB, and the server copies them.
-const LOAD: usize = 1 << 25;
+const BATCH_BYTES: usize = 1 << 25;
 
 /// Executes `sql` for every row. In it, `{rows}` stands for a table `new` of the rows, `{columns}` for its column
 /// names, separated by commas, and `{excluded}` for the assignments that overwrite all columns except the first.
@@ -42,7 +42,7 @@ pub async fn execute_rows(
             let sql = sql.replace("{rows}", &arrays(columns, first)).replace("CROSS JOIN", "JOIN");
             let mut rows = rows.into_iter().peekable();
             while rows.peek().is_some() {
-                let load = load(&mut rows);
+                let load = next_batch(&mut rows);
                 let mut query = sqlx::query(AssertSqlSafe(sql.clone()));
                 for column in transpose(columns.len(), load) {
                     query = bind_column(query, column)?;
@@ -76,9 +76,9 @@ fn arrays(columns: &[&str], first: &[Value]) -> String {
 }
 
 /// The next rows to send at once.
-fn load(rows: &mut impl Iterator<Item = Vec<Value>>) -> Vec<Vec<Value>> {
+fn next_batch(rows: &mut impl Iterator<Item = Vec<Value>>) -> Vec<Vec<Value>> {
     let (mut load, mut bytes) = (Vec::new(), 0);
-    while bytes < LOAD
+    while bytes < BATCH_BYTES
         && let Some(row) = rows.next()
     {
         bytes += row.iter().map(Value::len).sum::<usize>();

@@ -18,12 +18,12 @@ use crate::records::{Operation, Protocol};
 use crate::status::WalkStatus;
 
 /// Number of candidates shown if a name fits none or several.
-const SHOWN: u32 = 5;
+const MAX_SUGGESTIONS: u32 = 5;
 /// Decisions read at a time when the log is followed from one decision on, and the most that are read.
 const PAGE: u32 = 1000;
-const FAR: i64 = 20_000;
+const MAX_DECISIONS: i64 = 20_000;
 /// A structure rarely occurs more than twice: as a candidate and as a frame of its control.
-const SAME: u32 = 100;
+const MAX_OCCURRENCES: u32 = 100;
 
 pub(crate) const NUMBERED: &str = "SELECT decision, id AS candidate FROM candidate WHERE decision = $1";
 
@@ -138,7 +138,7 @@ impl Store {
     }
 
     async fn names_with_prefix(&self, begin: &str) -> Result<Vec<CandidateRef>> {
-        query(BEGINNING).bind(begin).bind(SHOWN).fetch_all(&self.database).await
+        query(BEGINNING).bind(begin).bind(MAX_SUGGESTIONS).fetch_all(&self.database).await
     }
 
     async fn campaign_prefix(&self) -> Result<String> {
@@ -164,7 +164,7 @@ impl Store {
 
     /// Other occurrences of this structure.
     pub async fn same_structure(&self, content: ContentHash) -> Result<SameStructure> {
-        let candidates = query(SAME_STRUCTURE).bind(&content.0[..]).bind(SAME);
+        let candidates = query(SAME_STRUCTURE).bind(&content.0[..]).bind(MAX_OCCURRENCES);
         let import = query(
             "SELECT import.number FROM structure CROSS JOIN import ON import.structure = structure.number
              WHERE structure.hash = $1",
@@ -228,7 +228,7 @@ impl Store {
     /// back some thousands of decisions at most.
     pub async fn updates_since(&self, seen: u64, decision: i64) -> Result<Vec<CandidateRef>> {
         let (mut updates, mut first) = (Vec::new(), decision);
-        while first > decision - FAR {
+        while first > decision - MAX_DECISIONS {
             let page: Vec<Before> = query(BEFORE).bind(first).bind(PAGE).fetch_all(&self.database).await?;
             let Some(last) = page.last() else { break };
             first = last.sequence;
@@ -264,7 +264,7 @@ impl Store {
             if over {
                 return Ok(found);
             }
-            if last >= decision + FAR {
+            if last >= decision + MAX_DECISIONS {
                 found.looked_until = Some(last);
                 return Ok(found);
             }

@@ -95,7 +95,7 @@ pub(crate) const LARGEST_GAMMA: &str = page!(
     "original_gamma DESC, candidate.decision DESC",
     "$3"
 );
-pub(crate) const LEAST_GAMMA: &str =
+pub(crate) const SMALLEST_GAMMA: &str =
     page!("(original_gamma, candidate.decision) > ($1, $2)", "original_gamma, candidate.decision", "$3");
 
 pub(crate) const LARGEST_VOLUME: &str = page!(
@@ -103,7 +103,7 @@ pub(crate) const LARGEST_VOLUME: &str = page!(
     "relative_volume DESC, candidate.decision DESC",
     "$3"
 );
-pub(crate) const LEAST_VOLUME: &str =
+pub(crate) const SMALLEST_VOLUME: &str =
     page!("(relative_volume, candidate.decision) > ($1, $2)", "relative_volume, candidate.decision", "$3");
 
 /// Candidates of a walk, ordered by name.
@@ -136,9 +136,9 @@ impl Store {
             (ListOrder::Decision, true) => query(NEWEST),
             (ListOrder::Decision, false) => query(OLDEST),
             (ListOrder::Gamma, true) => query(LARGEST_GAMMA).bind(value),
-            (ListOrder::Gamma, false) => query(LEAST_GAMMA).bind(value),
+            (ListOrder::Gamma, false) => query(SMALLEST_GAMMA).bind(value),
             (ListOrder::Volume, true) => query(LARGEST_VOLUME).bind(value),
-            (ListOrder::Volume, false) => query(LEAST_VOLUME).bind(value),
+            (ListOrder::Volume, false) => query(SMALLEST_VOLUME).bind(value),
         };
         query.bind(decision).bind(limit).fetch_all(&self.database).await
     }

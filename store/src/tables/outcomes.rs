@@ -21,7 +21,7 @@ pub(crate) const CORES_IN_USE: &str =
     "SELECT attempt.* FROM job CROSS JOIN attempt ON attempt.job = job.number AND attempt.attempt = job.attempts
     WHERE job.state = 'leased'";
 
-pub(crate) const CLASSES: &str = "SELECT class,
+pub(crate) const FAILURE_CLASSES: &str = "SELECT class,
         count(DISTINCT CASE WHEN state = 'labelled' THEN job.number END),
         count(DISTINCT CASE WHEN state = 'failed' THEN job.number END),
         count(DISTINCT CASE WHEN state IN ('queued', 'leased') THEN job.number END)
@@ -85,7 +85,7 @@ pub(crate) const FINISHED: &str = concat!(
 );
 
 /// Minimum duration of a label, whatever the clock says.
-const LEAST_MILLISECONDS: i64 = 1;
+const MIN_MILLISECONDS: i64 = 1;
 
 impl Store {
     /// Costs of the newest labels made under this protocol, at most `limit`.
@@ -121,7 +121,7 @@ impl Store {
         let mut transaction = self.database.begin_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let rows: Vec<(String, u64, u64, u64)> =
-            query(CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
+            query(FAILURE_CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let count =
             |(class, labelled, given_up, unfinished)| FailureCount { class, labelled, given_up, unfinished };
@@ -161,7 +161,7 @@ impl FromRow for LabelCost {
     fn from_row(row: &Row) -> Result<Self> {
         let (started, ended): (i64, Option<i64>) = (row.get("started")?, row.get("ended")?);
         let cores = row.get_or_default::<Option<u32>>("cores")?.unwrap_or(1);
-        let milliseconds = ended.unwrap_or(started).saturating_sub(started).max(LEAST_MILLISECONDS);
+        let milliseconds = ended.unwrap_or(started).saturating_sub(started).max(MIN_MILLISECONDS);
         let by_the_clock = milliseconds as f64 / 1000.0 * f64::from(cores);
         Ok(Self {
             seed_structure: row.get("seed_structure")?,

@@ -17,7 +17,7 @@ use crate::jobs::{Attempt, Job, JobDetails};
 use crate::records::JobState;
 
 /// Number of candidates shown if a name fits none or several.
-const SHOWN: usize = 5;
+const MAX_SUGGESTIONS: usize = 5;
 
 /// The columns shown of a job besides its own.
 macro_rules! columns {
@@ -237,7 +237,7 @@ impl Store {
     }
 
     async fn jobs_with_prefix(&self, begin: &str) -> Result<Vec<(String, i64)>> {
-        let query = query(FIND).bind(begin).bind(SHOWN as i64);
+        let query = query(FIND).bind(begin).bind(MAX_SUGGESTIONS as i64);
         query.fetch_all(&self.database).await
     }
 

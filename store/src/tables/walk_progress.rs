@@ -9,10 +9,10 @@ use crate::error::Result;
 use crate::walk_progress::WalkProgress;
 
 /// Progress older than this (ms) is ignored.
-const FRESH: i64 = 60_000;
+const MAX_AGE: i64 = 60_000;
 
 /// The campaign key of the total.
-const ALL: &str = "pace";
+const TOTAL_KEY: &str = "pace";
 
 const COLUMNS: [&str; 9] = [
     "walk",
@@ -50,7 +50,7 @@ impl Store {
         let mut transaction = self.database.begin_as_leader().await?;
         execute_rows(&mut transaction, UPSERT, &COLUMNS, walks.iter().map(row).collect()).await?;
         let all = json!({ "time": now, "steps_per_second": all }).to_string();
-        set_campaign_value(&mut transaction, ALL, &all).await?;
+        set_campaign_value(&mut transaction, TOTAL_KEY, &all).await?;
         transaction.commit().await
     }
 }
@@ -65,14 +65,14 @@ pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Ve
     if !transaction.has_table("pace").await? {
         return Ok(Vec::new());
     }
-    query("SELECT * FROM pace WHERE seen > $1 ORDER BY walk").bind(now - FRESH).fetch_all(transaction).await
+    query("SELECT * FROM pace WHERE seen > $1 ORDER BY walk").bind(now - MAX_AGE).fetch_all(transaction).await
 }
 
 /// Steps per second of all walks together; `None` without a report in the last minute.
 pub(super) async fn total_steps_per_second(transaction: &mut Transaction, now: i64) -> Result<Option<f64>> {
-    let found = query("SELECT value FROM campaign WHERE key = $1").bind(ALL);
+    let found = query("SELECT value FROM campaign WHERE key = $1").bind(TOTAL_KEY);
     let found: Option<String> = found.fetch_optional(transaction).await?;
     let found: Json = found.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
-    let is_fresh = found["time"].as_i64().is_some_and(|time| time > now - FRESH);
+    let is_fresh = found["time"].as_i64().is_some_and(|time| time > now - MAX_AGE);
     Ok(found["steps_per_second"].as_f64().filter(|_| is_fresh))
 }

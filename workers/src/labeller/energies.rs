@@ -13,9 +13,9 @@ use super::validate::EnergyReference;
 use super::{Shutdown, retry_until_written};
 
 /// Number of labels in the fit: the newest ones.
-const LABELS: u32 = 2_000;
+const MAX_FIT_LABELS: u32 = 2_000;
 /// The fit is repeated when this labeller has made 1/8 as many new labels as the last fit used.
-const REFIT: usize = 8;
+const REFIT_DIVISOR: usize = 8;
 
 /// Fits the energy offsets of elements to the newest labels of a protocol, without excluded ones.
 ///
@@ -25,7 +25,7 @@ pub async fn energy_offsets(
     store: &Store,
     protocol: ContentHash,
 ) -> Result<Result<EnergyOffsets, TooFewLabels>, StoreError> {
-    let labels = store.labelled_energies(protocol, LABELS).await?;
+    let labels = store.labelled_energies(protocol, MAX_FIT_LABELS).await?;
     let labels = labels.into_iter().map(|found| LabelledEnergy {
         composition: found.composition.iter().map(|(species, n)| (species.atomic_number(), *n)).collect(),
         model: found.model,
@@ -48,7 +48,7 @@ pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> Labelle
 pub(super) struct Offsets {
     fitted: Option<EnergyOffsets>,
     /// Labels until the next fit.
-    left: usize,
+    until_refit: usize,
 }
 
 impl Offsets {
@@ -62,11 +62,12 @@ impl Offsets {
         shutdown: &Shutdown,
     ) -> Result<Option<EnergyReference<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };
-        if self.left == 0 {
+        if self.until_refit == 0 {
             self.fitted = retry_until_written(shutdown, || energy_offsets(store, protocol.hash)).await?.ok();
-            self.left = self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT).max(1);
+            self.until_refit =
+                self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT_DIVISOR).max(1);
         }
-        self.left -= 1;
+        self.until_refit -= 1;
         Ok(self.fitted.as_ref().map(|offsets| EnergyReference { model, offsets }))
     }
 }

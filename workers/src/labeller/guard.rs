@@ -23,9 +23,9 @@ pub const GUARD: &str = "label_guard";
 pub(super) const REFUSED: &str = "refused";
 
 /// Number of structures whose features are compared: those nearest in energy.
-const COMPARED: u32 = 32;
+const MAX_COMPARED: u32 = 32;
 /// Number of labels used to estimate the cost.
-const LEARNED_FROM: u32 = 1_000;
+const MAX_COST_LABELS: u32 = 1_000;
 
 /// `[label.guard]`: limits that are not set do not apply. Shape limits ignore non-periodic directions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -151,7 +151,7 @@ pub(super) async fn refusal(
         return Ok(Some(reason));
     }
     let Some(bound) = guard.near_duplicate else { return Ok(None) };
-    let near = store.near_duplicates(lease, COMPARED).await?;
+    let near = store.near_duplicates(lease, MAX_COMPARED).await?;
     let Some((own, others)) = near else { return Ok(None) };
     let like = others.iter().find(|other| is_near(&own, &other.features, lease.structure.len(), bound));
     Ok(like.map(|other| {
@@ -174,7 +174,7 @@ async fn too_costly(
     guard: &LabelGuard,
 ) -> Result<Option<String>, StoreError> {
     let Some(largest) = guard.largest_cost else { return Ok(None) };
-    let costs = store.label_costs(lease.protocol, LEARNED_FROM).await?;
+    let costs = store.label_costs(lease.protocol, MAX_COST_LABELS).await?;
     let measured: Vec<_> = costs
         .iter()
         .map(|cost| Measured {

@@ -5,7 +5,7 @@ use std::path::Path;
 use dft::result_file;
 
 /// Bytes kept of each stream.
-const TAIL: u64 = 3000;
+const TAIL_BYTES: u64 = 3000;
 
 /// The last lines of its standard output and standard error.
 pub(super) fn tail(work: &Path) -> String {
@@ -16,10 +16,10 @@ pub(super) fn tail(work: &Path) -> String {
 
 /// As many whole lines as fit, or the end of a single line; empty if the file cannot be read.
 pub(super) fn last_lines(path: &Path) -> String {
-    let Ok(tail) = result_file::tail(path, TAIL) else { return String::new() };
+    let Ok(tail) = result_file::tail(path, TAIL_BYTES) else { return String::new() };
     let text = String::from_utf8_lossy(&tail.bytes);
     let text = match text.split_once('\n') {
-        Some((_, whole)) if tail.length > TAIL && !whole.trim().is_empty() => whole,
+        Some((_, whole)) if tail.length > TAIL_BYTES && !whole.trim().is_empty() => whole,
         _ => &text,
     };
     text.trim().to_owned()

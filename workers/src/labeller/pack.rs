@@ -17,7 +17,7 @@ const MAX_FILE_SIZE: u64 = 16 << 20;
 /// Maximum size of all files before compression, with headers.
 const MAX_TOTAL_SIZE: u64 = 64 << 20;
 /// Size of a file's header.
-const HEADER: u64 = 1024;
+const HEADER_SIZE: u64 = 1024;
 /// Maximum directory depth. Paths thousands of levels deep exceed the system's limit.
 const MAX_DEPTH: usize = 64;
 /// Maximum number of lines about files left out.
@@ -43,12 +43,15 @@ pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
     for path in files(directory, &mut left_out) {
         let name = path.strip_prefix(directory).unwrap_or(&path);
         let size = fs::symlink_metadata(&path).map_or(0, |file| file.len());
-        if name.starts_with(DATA) || name.ends_with(LICENSED) || size.max(HEADER) > MAX_FILE_SIZE.min(room) {
+        if name.starts_with(DATA)
+            || name.ends_with(LICENSED)
+            || size.max(HEADER_SIZE) > MAX_FILE_SIZE.min(room)
+        {
             left_out.add(name, &format!("{size} bytes"));
             continue;
         }
         match append(&mut archive, &path, name) {
-            Ok(()) => room = room.saturating_sub(size + HEADER),
+            Ok(()) => room = room.saturating_sub(size + HEADER_SIZE),
             Err(Unpacked::Unreadable(why)) => left_out.add(name, &why),
             Err(Unpacked::Archive(error)) => return Err(error),
         }

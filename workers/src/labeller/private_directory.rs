@@ -17,7 +17,7 @@ use store::StoreError;
 use super::code::file_error;
 
 /// Random bytes in a name.
-const RANDOM: usize = 8;
+const RANDOM_BYTES: usize = 8;
 /// Mode bits that permit others to write.
 const OTHERS_WRITE: u32 = 0o022;
 /// Mode bits that permit others anything.
@@ -186,7 +186,7 @@ fn is_unmapped(owner: u32) -> bool {
 
 /// Hexadecimal digits from the system's random source.
 fn random() -> io::Result<String> {
-    let mut bytes = [0; RANDOM];
+    let mut bytes = [0; RANDOM_BYTES];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;
     Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
 }
@@ -209,7 +209,7 @@ mod tests {
         let (a, b) = (make(&parent, "calmwalk-x-").unwrap(), make(&parent, "calmwalk-x-").unwrap());
         assert!(a != b && is_ours(&a) && is_ours(&b));
         assert_eq!(fs::metadata(&a).unwrap().mode() & 0o7777, 0o700);
-        assert_eq!(a.file_name().unwrap().len(), "calmwalk-x-".len() + 2 * RANDOM);
+        assert_eq!(a.file_name().unwrap().len(), "calmwalk-x-".len() + 2 * RANDOM_BYTES);
         let inside = make_inside(&a, "1-1-0").unwrap();
         assert_eq!(fs::metadata(inside).unwrap().mode() & 0o7777, 0o700);
         let mut both = [a, b];

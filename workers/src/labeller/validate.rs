@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::energies::labelled_energy;
 
 /// Minimum number of labelled structures that must support a composition before energies are compared for it.
-const LEAST_SUPPORT: f64 = 5.0;
+const MIN_SUPPORT: f64 = 5.0;
 /// eV/Å³ in GPa.
 const GPA: f64 = 160.217_663_4;
 
@@ -92,25 +92,25 @@ pub(super) fn validate(
     bounds: &LabelBounds,
     expected: Option<EnergyReference<'_>>,
 ) -> Result<Calculated, Failure> {
-    let problem = wrong_number(&results, structure.len())
-        .or_else(|| not_finite(&results))
+    let problem = wrong_length(&results, structure.len())
+        .or_else(|| non_finite(&results))
         .or_else(|| bounds.refuses(results.energy, &results.forces, results.stress.as_ref()))
         .or_else(|| bounds.refuses_energy(results.energy_without_smearing?, structure.len()))
-        .or_else(|| too_far(&results, structure, bounds, expected?));
+        .or_else(|| energy_mismatch(&results, structure, bounds, expected?));
     match problem {
         Some(problem) => Err(FailureClass::Implausible.because(problem)),
         None => Ok(results),
     }
 }
 
-fn wrong_number(results: &Calculated, atoms: usize) -> Option<String> {
+fn wrong_length(results: &Calculated, atoms: usize) -> Option<String> {
     let moments = results.magnetic_moments.as_ref().map_or(atoms, Vec::len);
     let lists = [("forces", results.forces.len()), ("magnetic moments", moments)];
     let (name, found) = lists.into_iter().find(|(_, found)| *found != atoms)?;
     Some(format!("{found} {name} for {atoms} atoms"))
 }
 
-fn not_finite(results: &Calculated) -> Option<String> {
+fn non_finite(results: &Calculated) -> Option<String> {
     let energies = [Some(results.energy), results.energy_without_smearing];
     let moments = results.magnetic_moments.iter().flatten().chain(&results.magnetisation);
     let find = |name, mut numbers: &mut dyn Iterator<Item = f64>| {
@@ -123,7 +123,7 @@ fn not_finite(results: &Calculated) -> Option<String> {
         .or_else(|| find("a magnetic moment", &mut moments.copied()))
 }
 
-fn too_far(
+fn energy_mismatch(
     results: &Calculated,
     structure: &Structure,
     bounds: &LabelBounds,
@@ -131,7 +131,7 @@ fn too_far(
 ) -> Option<String> {
     let EnergyReference { model, offsets } = expected;
     let label = labelled_energy(structure, model, results.energy);
-    let difference = -offsets.error_per_atom(&label, LEAST_SUPPORT)?;
+    let difference = -offsets.error_per_atom(&label, MIN_SUPPORT)?;
     let bound = bounds.largest_energy_difference;
     (difference.abs() > bound).then(|| {
         format!(
