@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use analysis::{CostModel, Measured, Predicted, Size};
 use serde::Serialize;
-use store::{LabelCost, Protocol, Store, StoreError, Waiting};
+use store::{LabelCost, PendingJobs, Protocol, Store, StoreError};
 use wire::ContentHash;
 
 use crate::output::count;
@@ -60,7 +60,7 @@ impl CostEstimator {
         for cost in costs.iter().rev() {
             sizes.insert((cost.seed_structure, cost.formula.clone()), size(cost));
         }
-        let work = store.label_work().await?;
+        let work = store.label_usage().await?;
         let overhead = work.core_seconds.zip(work.label_core_seconds.filter(|brought| *brought > 0.0));
         let overhead = overhead.map_or(1.0, |(all, brought)| (all / brought).max(1.0));
         Ok(Self { model: CostModel::fit(&measured, None), sizes, overhead })
@@ -84,7 +84,7 @@ impl CostEstimator {
 
     /// A job has the size of the newest label of its seed structure and formula. Otherwise only the number of atoms
     /// is known.
-    fn size_of(&self, waiting: &Waiting) -> Size {
+    fn size_of(&self, waiting: &PendingJobs) -> Size {
         let known = self.sizes.get(&(waiting.seed_structure, waiting.formula.clone()));
         let other = self.sizes.values().next();
         known.copied().unwrap_or_else(|| {
@@ -100,7 +100,7 @@ impl CostEstimator {
 /// Cost of the jobs that have no label of `protocol` yet.
 pub async fn queue_cost(store: &Store, protocol: ContentHash) -> Result<QueueCost, StoreError> {
     let waiting = store.waiting_jobs(protocol).await?;
-    let (costs, work) = (CostEstimator::from_store(store, protocol).await?, store.label_work().await?);
+    let (costs, work) = (CostEstimator::from_store(store, protocol).await?, store.label_usage().await?);
     let remaining = costs.predict(waiting.iter().map(|waiting| (costs.size_of(waiting), waiting.jobs)));
     let hours_left = remaining.filter(|_| work.cores > 0).map(|hours| hours.expected / work.cores as f64);
     Ok(QueueCost {
@@ -128,7 +128,7 @@ pub struct RelabelCost {
 pub async fn relabel_cost(
     store: &Store,
     in_force: &Protocol,
-    structures: &[Waiting],
+    structures: &[PendingJobs],
 ) -> Result<RelabelCost, StoreError> {
     let mut protocol = in_force.clone();
     let mut costs = CostEstimator::from_store(store, protocol.hash).await?;

@@ -133,7 +133,7 @@ impl LabelSetup {
         let text = store.campaign().await?.configuration_in_force;
         let EffectiveConfig { label: LabelLimits { attempts, bounds, lease } } =
             serde_json::from_str(&text).map_err(unreadable)?;
-        let noted = store.note(LABEL_METHOD_KEY).await?.ok_or_else(|| {
+        let noted = store.metadata(LABEL_METHOD_KEY).await?.ok_or_else(|| {
             Failure::Failed(
                 "the store has no label settings: an earlier version of this program last ran the campaign; run it once \
                  with this one"

@@ -3,7 +3,7 @@
 
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
-use store::{AtomGrades, ExportFilter, ExportSource, Finished, Store, StoreError};
+use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Store, StoreError};
 use wire::{ContentHash, Origin};
 
 use crate::energy_errors::{EnergyErrors, EnergyReference};
@@ -64,7 +64,7 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
     loop {
         let page = store.labelled(&filter, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
-        after = Some(last.place);
+        after = Some(last.cursor);
         for row in &page {
             let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
             let forces = block.view().forces;
@@ -98,7 +98,7 @@ impl LabelStatistics {
         [&mut self.all, of_origin].into_iter().for_each(&mut change);
     }
 
-    fn finished(&mut self, candidate: &Finished) {
+    fn finished(&mut self, candidate: &FinishedCandidate) {
         for (completion, value) in
             [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
         {

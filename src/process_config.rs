@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
 use wire::ipc::Door;
-use workers::labeller::{LabelBounds, Method, Running};
+use workers::labeller::{ExecutionSettings, LabelBounds, Method};
 use workers::settings::WalkSettings;
 
 use crate::config::PotentialKind;
@@ -117,7 +117,7 @@ pub enum MethodConfig {
         /// The program and the protocol.
         settings: Box<dft::Settings>,
         /// How its calculations run.
-        running: Running,
+        running: ExecutionSettings,
     },
 }
 
@@ -207,7 +207,7 @@ mod tests {
             "command": ["sh", "label.sh"], "files": [script], "version": "1"
         } });
         let settings = Box::new(serde_json::from_value(settings).unwrap());
-        let method = MethodConfig::Code { settings, running: Running::default() };
+        let method = MethodConfig::Code { settings, running: ExecutionSettings::default() };
         let protocol = label_setup::protocol("script", method.identity().unwrap());
         assert!(method.load(&protocol).is_ok());
         fs::write(&script, "exit 1").unwrap();

@@ -68,8 +68,8 @@ impl Provenance {
 
     /// Reads it from the store. `None` for campaigns of early versions.
     pub async fn read(store: &Store) -> Result<Option<Self>, StoreError> {
-        let note = store.note(METADATA_KEY).await?;
-        Ok(note.and_then(|note| serde_json::from_str(&note).ok()))
+        let metadata = store.metadata(METADATA_KEY).await?;
+        Ok(metadata.and_then(|text| serde_json::from_str(&text).ok()))
     }
 
     /// Compares the configuration of a run (`now`) with that of the campaign. `holds_campaign` says whether the

@@ -1,6 +1,6 @@
 //! Describes the collected structures whose labels failed for good.
 
-use store::{Range, Unlabelled};
+use store::{Unlabelled, ValueRange};
 
 use crate::output::Table;
 
@@ -49,7 +49,7 @@ fn line(part: &Unlabelled) -> Vec<String> {
     ]
 }
 
-fn range(range: &Range, decimals: usize) -> String {
+fn range(range: &ValueRange, decimals: usize) -> String {
     match (range.low, range.high) {
         (Some(low), Some(high)) if low < high => format!("{low:.decimals$} to {high:.decimals$}"),
         (Some(only), _) => format!("{only:.decimals$}"),
@@ -63,7 +63,7 @@ mod tests {
 
     #[test]
     fn failed_ranges_are_compared_with_labelled_ones() {
-        let range = |low, high| Range { low: Some(low), high: Some(high) };
+        let range = |low, high| ValueRange { low: Some(low), high: Some(high) };
         let part = Unlabelled {
             seed_structure: "fcc".into(),
             formula: "Al32".into(),
@@ -72,7 +72,7 @@ mod tests {
             gamma: range(3.0, 4.0),
             gamma_labelled: range(1.5, 2.25),
             relative_volume: range(1.4, 1.4),
-            relative_volume_labelled: Range::default(),
+            relative_volume_labelled: ValueRange::default(),
         };
         let text = describe(&[part.clone(), part], 12, 1);
         let lines: Vec<_> = text.lines().collect();

@@ -104,7 +104,7 @@ impl WalkEnds {
     /// Counts these walks, except those that are running.
     pub fn from_walks(walks: &[WalkStatus]) -> Self {
         let mut ends = Self::default();
-        for walk in walks.iter().filter(|walk| !walk.is_under_way()) {
+        for walk in walks.iter().filter(|walk| !walk.is_active()) {
             ends.add(walk.walk, &walk.state, &walk.reason);
         }
         ends

@@ -41,7 +41,7 @@ fn a_copy_of_a_running_campaign_can_be_run_on() {
     assert!(said.contains("backed up to "), "{said}");
     assert_eq!(visible(elsewhere.path()), ["copy"]);
     let message = refuse(place.path(), ["store", "backup", place.argument(), &copy]);
-    assert!(message.contains("exists already: a backup is a new directory"), "{message}");
+    assert!(message.contains("exists already: give the backup a new directory"), "{message}");
     let message = refuse(place.path(), ["store", "compact", place.argument()]);
     assert!(message.contains("is being run by process"), "{message}");
     let said = succeed(place.path(), ["store", "check", &copy]);

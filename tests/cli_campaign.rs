@@ -124,7 +124,7 @@ fn a_finished_campaign_is_shown() {
             .contains("no label job belongs to 'zzz'; near it are")
     );
     assert!(refuse(here, ["queue", "small", "drop", id]).contains("its label job is labelled"));
-    assert!(refuse(here, ["queue", "small", "show", "0."]).contains("give more of it"));
+    assert!(refuse(here, ["queue", "small", "show", "0."]).contains("give a longer prefix"));
     assert!(refuse(here, ["status", "nowhere"]).contains("there is no campaign"));
 }
 

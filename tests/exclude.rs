@@ -77,7 +77,7 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     assert!(succeed(here, ["run", "campaign.toml", "--directory", "here"]).contains("1 excluded by hand"));
     // Dropping is for what has no label, and says what is for the others.
     let message = refuse(here, ["queue", "here", "drop", bad]);
-    assert!(message.contains("calmwalk exclude takes its label out of the data set"), "{message}");
+    assert!(message.contains("use calmwalk exclude to take its label out of the data set"), "{message}");
 
     let said = succeed(here, ["exclude", "here", bad, "--undo"]);
     assert_eq!(said, format!("{bad}: label of 'reference' included again\n"));
@@ -99,8 +99,8 @@ fn what_cannot_be_excluded_is_refused_and_nothing_changes() {
         (vec!["exclude", "here", &names[0]], "--reason <TEXT>"),
         (vec!["exclude", "here", &names[0], "--reason", " "], "expected a reason"),
         (vec!["exclude", "here", &names[0], "--reason", "x", "--undo"], "cannot be used with"),
-        (vec!["exclude", "here", &names[0], "99.0.1", "--reason", "x"], "no candidate is called '99.0.1'"),
-        (vec!["exclude", "here", "import-1", "--reason", "x"], "no imported structure is called 'import-1'"),
+        (vec!["exclude", "here", &names[0], "99.0.1", "--reason", "x"], "no candidate matches '99.0.1'"),
+        (vec!["exclude", "here", "import-1", "--reason", "x"], "no imported structure matches 'import-1'"),
         (vec!["exclude", "nowhere", &names[0], "--reason", "x"], "nowhere"),
     ] {
         let message = refuse(here, &arguments);

@@ -251,7 +251,7 @@ fn imported_structures_have_theirs_and_what_is_not_there_is_refused() {
     let first = contents(here).into_iter().find(|(decision, _)| decision.candidate.is_some()).unwrap().0;
     for wrong in ["1", "99.0.1", "nonsense", "-1"] {
         let message = refuse(here, ["explain", "here", "--", wrong]);
-        assert!(message.contains(&format!("no candidate is called '{wrong}'")), "{message}");
+        assert!(message.contains(&format!("no candidate matches '{wrong}'")), "{message}");
         assert!(message.contains(&format!("{} to ", first.sequence)), "{message}");
         assert!(message.contains(first.candidate.as_deref().unwrap()), "{message}");
     }

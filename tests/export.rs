@@ -252,7 +252,7 @@ fn a_damaged_database_is_refused_with_what_is_damaged() {
     fs::write(&database, &whole).unwrap();
     change(here, &["DELETE FROM candidate WHERE decision = (SELECT max(decision) FROM candidate)"]);
     let message = fails(here);
-    assert!(message.contains("decisions about candidates that are not there"), "{message}");
+    assert!(message.contains("decisions on missing candidates"), "{message}");
 
     fs::write(&database, &whole).unwrap();
     export(here, &[]);

@@ -182,7 +182,7 @@ fn a_scratch_directory_that_others_can_write_to_is_refused() {
     let said = stderr(&output);
     let expected =
         format!("cannot use {} (others may write to it (mode 0777, no sticky bit)", scratch.display());
-    assert!(said.contains(&expected) && said.contains("name that as label.scratch"), "{said}");
+    assert!(said.contains(&expected) && said.contains("set label.scratch to it"), "{said}");
     fs::set_permissions(&scratch, Permissions::from_mode(0o1777)).unwrap();
     label(once.command().output().unwrap());
     once.assert_no_leftovers();

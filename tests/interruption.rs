@@ -187,9 +187,9 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
         // Whether a labeller in another container lives cannot be seen from here.
         let here =
             store::ProcessRecord::new(store::ProcessRecord::LABELLER, Some(0), std::process::id(), now);
-        let (place, ticks) = here.birth.rsplit_once('/').unwrap();
-        let birth = format!("{place}0/{ticks}");
-        let elsewhere = store::ProcessRecord { id: "elsewhere".into(), birth, ..here };
+        let (place, ticks) = here.start_time.rsplit_once('/').unwrap();
+        let start_time = format!("{place}0/{ticks}");
+        let elsewhere = store::ProcessRecord { id: "elsewhere".into(), start_time, ..here };
         store.upsert_process(&elsewhere).await.unwrap();
         let protocol = store.protocols().await.unwrap()[0].hash;
         store.lease(protocol, "elsewhere", now, 600).await.unwrap().expect("the job that was put back");

@@ -4,7 +4,7 @@ use std::fs;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use store::{JobState, Standing};
+use store::{JobState, LabelStatus};
 
 use crate::common::campaign::{Outcome, Small, outcome, outcome_at};
 use crate::common::label_campaign::LabelCampaign;
@@ -228,12 +228,15 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     let exported = place.export();
     signal(slot, "CONT");
     assert_eq!(ended(&mut late), Some(0), "{}", place.said());
-    assert!(place.said().contains("had its label already; this one is kept as a check"), "{}", place.said());
+    assert!(place.said().contains("has a label already; this result is kept as a check"), "{}", place.said());
     let job = place.job(&name);
     let outcomes: Vec<_> = job.attempts_made.iter().map(|attempt| attempt.outcome.as_deref()).collect();
     assert_eq!(outcomes, [Some("check"), Some("labelled")]);
     let standings: Vec<_> = job.energies.iter().map(|(standing, _)| *standing).collect();
-    assert_eq!((job.job.state, standings), (JobState::Labelled, vec![Standing::Label, Standing::Check]));
+    assert_eq!(
+        (job.job.state, standings),
+        (JobState::Labelled, vec![LabelStatus::Label, LabelStatus::Check])
+    );
     assert_eq!(place.export(), exported);
 }
 

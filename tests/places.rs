@@ -161,7 +161,7 @@ fn forget_the_configuration(campaign: &Path) {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     runtime.block_on(async {
         let store = store::Store::open(campaign).await.unwrap();
-        store.leave_note("configuration_file", "").await.unwrap();
+        store.set_metadata("configuration_file", "").await.unwrap();
         store.close().await;
     });
 }

@@ -46,13 +46,16 @@ fn other_files_in_the_place_of_the_database_are_refused_unchanged() {
     };
     let known = u32::from_be_bytes(good[60..64].try_into().unwrap());
     let refused =
-        |version: u32| format!("has a schema of version {version}; this program reads version {known}");
+        |version: u32| format!("has schema version {version}, and this program reads up to version {known}");
     for (content, words) in [
         (patched(60, known + 1), refused(known + 1).as_str()),
         (patched(60, 0), refused(0).as_str()),
         (patched(68, 5), "is a database of another program (application id 0x5,"),
-        (b"units metal\natom_style atomic\n".to_vec(), "is no SQLite database: it begins with 'units metal"),
-        (Vec::new(), "is no SQLite database: it begins with ''"),
+        (
+            b"units metal\natom_style atomic\n".to_vec(),
+            "is not an SQLite database: it begins with 'units metal",
+        ),
+        (Vec::new(), "is not an SQLite database: it begins with ''"),
     ] {
         fs::write(&database, &content).unwrap();
         let message = assert_plain(&calmwalk(directory.path(), RUN), 2);
@@ -92,7 +95,7 @@ fn a_directory_that_is_none_is_told() {
     let text = fs::read(directory.path().join("campaign.toml")).unwrap();
     for (place, reason) in [("campaign.toml", "it is a file"), ("campaign.toml/here", "Not a directory")] {
         let message = refuse(directory.path(), ["run", "campaign.toml", "--directory", place]);
-        assert!(message.contains(&format!("cannot work in the directory {place} ({reason}")), "{message}");
+        assert!(message.contains(&format!("cannot use the directory {place} ({reason}")), "{message}");
     }
     assert_eq!(fs::read(directory.path().join("campaign.toml")).unwrap(), text);
     let message = refuse(directory.path(), ["status", "."]);
@@ -111,7 +114,7 @@ fn names_need_not_be_text_but_for_sqlite() {
         [OsStr::new("run"), config.as_os_str(), OsStr::new("--directory"), place].map(OsString::from)
     };
     let message = refuse(above.path(), run(directory.as_os_str()));
-    assert!(message.contains("(its name is not UTF-8, as SQLite needs it)"), "{message}");
+    assert!(message.contains("(its name is not UTF-8, which SQLite needs it)"), "{message}");
     assert!(succeed(above.path(), run(OsStr::new("here"))).contains("; next:"));
 }
 
@@ -135,7 +138,7 @@ fn a_directory_without_write_permission_is_told() {
     fs::set_permissions(directory.path(), fs::Permissions::from_mode(0o755)).unwrap();
     let Some(mut command) = unprivileged(directory.path()) else { return };
     let message = assert_plain(&command.args(RUN).output().unwrap(), 2);
-    assert!(message.contains("cannot work in the directory here (Permission denied"), "{message}");
+    assert!(message.contains("cannot use the directory here (Permission denied"), "{message}");
     assert!(!directory.path().join("here").exists());
 
     // Nor can another's campaign be gone on with.
@@ -144,7 +147,7 @@ fn a_directory_without_write_permission_is_told() {
     let before = fs::read(&database).unwrap();
     let mut command = unprivileged(directory.path()).expect("as before");
     let message = assert_plain(&command.args(RUN).output().unwrap(), 2);
-    assert!(message.contains("cannot work in the directory here (Permission denied"), "{message}");
+    assert!(message.contains("cannot use the directory here (Permission denied"), "{message}");
     assert_eq!(fs::read(&database).unwrap(), before);
 }
 

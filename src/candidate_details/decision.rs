@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use store::{LoggedDecision, Store, StoreError, StoredCandidate};
 
-use super::{Covered, Named};
+use super::{CandidateRef, CoveredCandidate};
 
 /// Metadata key under which the leader stores the symbols of the model's elements.
 pub const ELEMENTS_KEY: &str = "elements";
@@ -74,11 +74,11 @@ pub struct LoggedUpdate {
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Coverage {
     /// For a candidate declined as covered: the candidates whose updates its walker had not seen, newest first.
-    pub by: Vec<Named>,
+    pub by: Vec<CandidateRef>,
     /// For a candidate that updated the mixture: later candidates that were declined as covered while their walkers
     /// had not seen the update. If `decided` − `seen` is 1, this update alone covered them, otherwise the updates of
     /// those versions together.
-    pub later: Vec<Covered>,
+    pub later: Vec<CoveredCandidate>,
     /// The last decision that was checked for that, if there are more.
     pub looked_until: Option<i64>,
 }
@@ -136,8 +136,8 @@ impl Update {
 
 /// Symbols of the model's elements, in the model's order. Empty in campaigns of earlier versions.
 async fn elements(store: &Store) -> Result<Vec<String>, StoreError> {
-    let note = store.note(ELEMENTS_KEY).await?;
-    Ok(note.and_then(|note| serde_json::from_str(&note).ok()).unwrap_or_default())
+    let metadata = store.metadata(ELEMENTS_KEY).await?;
+    Ok(metadata.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default())
 }
 
 /// Largest number of versions by which a walker's mixture was older than the selector's. `None` in campaigns of

@@ -7,8 +7,8 @@ use atoms::Vec3;
 use atoms::cell::{norm, sub};
 use serde::Serialize;
 use store::{
-    Exclusion, JobDetails, LabelDetails, LabelRecord, LabelSource, Operation, Standing, Store, StoreError,
-    StructureLabel, Superseded,
+    Exclusion, JobDetails, LabelDetails, LabelRecord, LabelSource, LabelStatus, Operation, Store, StoreError,
+    StructureLabel, Supersession,
 };
 use wire::{CandidateView, ContentHash};
 
@@ -47,13 +47,13 @@ pub struct CandidateLabel {
     /// Its hash.
     pub protocol_hash: String,
     /// Its current status.
-    pub standing: Standing,
+    pub standing: LabelStatus,
     /// Its source, as text.
     pub source: String,
     /// When it was stored, ms since 1970.
     pub received: i64,
     /// When and why another label replaced it.
-    pub superseded: Option<Superseded>,
+    pub superseded: Option<Supersession>,
     /// When and why it was excluded from the data set.
     pub excluded: Option<Exclusion>,
     /// Energy, eV.
@@ -94,7 +94,7 @@ pub(super) async fn jobs(store: &Store, content: ContentHash) -> Result<Vec<Labe
     for details in store.jobs_of(content).await? {
         let known = details.attempts_made.iter().filter_map(|attempt| attempt.core_seconds);
         let core_seconds = known.reduce(|sum, seconds| sum + seconds);
-        let by_hand = store.done_by_hand(details.job.job).await?;
+        let by_hand = store.manual_operations(details.job.job).await?;
         jobs.push(LabelJob {
             core_seconds,
             by_hand: by_hand.into_iter().map(ManualAction::from_operation).collect(),
@@ -139,7 +139,7 @@ impl ManualAction {
 impl CandidateLabel {
     fn new(label: StructureLabel, model: Option<ForceError>) -> Self {
         let StructureLabel { protocol, record } = label;
-        let LabelRecord { standing, label, source, received, superseded, excluded } = record;
+        let LabelRecord { status: standing, label, source, received, superseded, excluded } = record;
         let atoms = label.forces.len().max(1) as f64;
         Self {
             protocol: protocol.name,

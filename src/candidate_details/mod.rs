@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use atoms::Structure;
 use serde::Serialize;
 use serde_json::Value;
-use store::{Covered, Named, Store, StoreError, StoredCandidate};
+use store::{CandidateRef, CoveredCandidate, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
 pub use decision::{Coverage, DecisionDetails, ELEMENTS_KEY, Update};
@@ -52,7 +52,7 @@ pub struct CandidateDetails {
     /// The decision about it.
     pub decision: Option<DecisionDetails>,
     /// Other candidates with an identical structure.
-    pub same_structure: Vec<Named>,
+    pub same_structure: Vec<CandidateRef>,
     /// The import with an identical structure.
     pub same_import: Option<i64>,
     /// Its label jobs, at most one per protocol.
@@ -112,7 +112,7 @@ async fn read_import(store: &Store, id: &str, number: &str) -> Result<CandidateD
     Ok(story)
 }
 
-async fn read_candidate(store: &Store, named: Named) -> Result<CandidateDetails, StoreError> {
+async fn read_candidate(store: &Store, named: CandidateRef) -> Result<CandidateDetails, StoreError> {
     let stored = store.candidate(&named.candidate).await?;
     let stored = stored.ok_or_else(|| damaged(&named, "it is missing"))?;
     let logged = store.decisions(stored.decision..=stored.decision).await?.into_iter().next();
@@ -200,6 +200,6 @@ fn not_recorded(stored: &StoredCandidate) -> Vec<&'static str> {
     missing
 }
 
-fn damaged(named: &Named, problem: &str) -> StoreError {
+fn damaged(named: &CandidateRef, problem: &str) -> StoreError {
     StoreError::damaged("a candidate", format!("{}: {problem}", named.candidate))
 }

@@ -3,7 +3,7 @@
 use atoms::{NeighbourList, Structure, shortest_distance};
 use serde::Serialize;
 use serde_json::Value;
-use store::{Named, Store, StoreError, StoredCandidate, WalkStatus};
+use store::{CandidateRef, Store, StoreError, StoredCandidate, WalkStatus};
 
 /// Cutoff of the neighbour search, Å. No larger distance matters to the guards.
 const NEIGHBOUR_CUTOFF: f64 = 8.0;
@@ -30,7 +30,7 @@ pub struct Discovery {
     /// The biased walk that this control walk matches. `None` for biased walks.
     pub control_of: Option<u32>,
     /// The accepted candidate of that walk at the same step, if it belongs to the steps of the same segment.
-    pub partner: Option<Named>,
+    pub partner: Option<CandidateRef>,
     /// Distances that the guards check.
     pub distances: Distances,
     /// Current state of the walk, with the refusals of its guard.

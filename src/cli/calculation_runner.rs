@@ -1,7 +1,7 @@
 //! `calmwalk calculation-runner`
 
 use orchestrator::launcher;
-use workers::labeller::keep;
+use workers::labeller::run_calculation;
 
 use super::{ExitStatus, Failure};
 
@@ -14,7 +14,7 @@ pub struct CalculationRunner {}
 impl CalculationRunner {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
-        keep().map_err(Failure::failed)?;
+        run_calculation().map_err(Failure::failed)?;
         Ok(ExitStatus::Done)
     }
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use atoms::extxyz::{Frame, Labels};
 use atoms::{FileError, Structure};
 use store::records::{Label, LabelDetails, Protocol};
-use store::{CampaignLock, Imported, Store, unix_milliseconds};
+use store::{CampaignLock, ImportCounts, Store, unix_milliseconds};
 use wire::ContentHash;
 use workers::labeller::LabelBounds;
 
@@ -63,7 +63,7 @@ impl Import {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let files: Vec<_> = self.files.iter().map(|path| read(path)).collect::<Result<_, _>>()?;
         let (protocol, imported) = block_on(self.import(&files))??;
-        let Imported { labels, checks, known } = imported;
+        let ImportCounts { labels, checks, known } = imported;
         print(|out| {
             let name = &protocol.name;
             let (labels, checks) = (count(labels, "label"), count(checks, "check"));
@@ -72,7 +72,7 @@ impl Import {
         Ok(ExitStatus::Done)
     }
 
-    async fn import(&self, files: &[File]) -> Result<(Protocol, Imported), Failure> {
+    async fn import(&self, files: &[File]) -> Result<(Protocol, ImportCounts), Failure> {
         let location = self.location.get()?;
         let store = Store::open(&location).await?;
         // Imported structures change which candidates are duplicates: exclude a run.
@@ -83,7 +83,7 @@ impl Import {
             Some(name) => protocol_named(&store, name).await?,
             None => current_protocol(&store).await?,
         };
-        let mut all = Imported::default();
+        let mut all = ImportCounts::default();
         for File { name, frames, .. } in files {
             let imported = store.import(protocol.hash, name, frames, unix_milliseconds()).await?;
             all.labels += imported.labels;
@@ -147,6 +147,6 @@ async fn protocol_named(store: &Store, name: &str) -> Result<Protocol, Failure> 
     let settings = serde_json::json!({ "method": "import" });
     let hash = ContentHash(*blake3::hash(format!("calmwalk import protocol {name}").as_bytes()).as_bytes());
     let protocol = Protocol { hash, name: name.to_owned(), settings };
-    store.know_protocol(&protocol, unix_milliseconds()).await?;
+    store.register_protocol(&protocol, unix_milliseconds()).await?;
     Ok(protocol)
 }

@@ -9,7 +9,7 @@ use atoms::{Structure, read_structures};
 use serde::Serialize;
 use store::Protocol;
 use tokio::sync::Notify;
-use workers::labeller::{Once, label_once};
+use workers::labeller::{SingleLabel, label_structure};
 
 use super::{ExitStatus, Failure, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write};
@@ -92,7 +92,7 @@ impl LabelFile {
             let structure = frame.structure;
             structure.validate().map_err(|error| Failure::Input(format!("{source}: {error}")))?;
             let attempt = tokio::select! {
-                attempt = label_once(&method, &structure, &bounds) => attempt?,
+                attempt = label_structure(&method, &structure, &bounds) => attempt?,
                 () = stop.notified() => {
                     method.stop().await?;
                     return Ok(ExitStatus::Interrupted);
@@ -118,9 +118,9 @@ impl Labelled {
         source: String,
         structure: &Structure,
         protocol: &Protocol,
-        attempt: Once,
+        attempt: SingleLabel,
     ) -> Result<Self, Failure> {
-        let Once { result, log, core_seconds } = attempt;
+        let SingleLabel { result, log, core_seconds } = attempt;
         let label = result.map_err(|failure| {
             let log = log.trim_end();
             let log = if log.is_empty() { String::new() } else { format!("; end of its log:\n{log}") };

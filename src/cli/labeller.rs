@@ -6,7 +6,7 @@ use std::time::Duration;
 use orchestrator::launcher;
 use store::{Location, ProcessRecord, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
-use workers::labeller::{Closing, LabellerSettings, Method, Stay, Timing, insist, serve};
+use workers::labeller::{ExitPolicy, LabellerSettings, Method, Shutdown, Timing, retry_until_written, serve};
 
 use super::{ExitStatus, Failure, block_on};
 use crate::log;
@@ -31,13 +31,13 @@ impl Labeller {
             None => launcher::own_session().map_err(Failure::failed)?,
         }
         let method = setup.method.load(&setup.protocol)?;
-        let closing = Arc::new(Closing::default());
+        let closing = Arc::new(Shutdown::default());
         block_on(label(setup, method, &closing))??;
         Ok(if closing.is_stopping() { ExitStatus::Interrupted } else { ExitStatus::Done })
     }
 }
 
-async fn label(setup: LabellerConfig, method: Method, closing: &Arc<Closing>) -> Result<(), Failure> {
+async fn label(setup: LabellerConfig, method: Method, closing: &Arc<Shutdown>) -> Result<(), Failure> {
     let (mut terminate, asked) =
         (signal(SignalKind::terminate()).map_err(Failure::failed)?, Arc::clone(closing));
     tokio::spawn(async move {
@@ -47,7 +47,7 @@ async fn label(setup: LabellerConfig, method: Method, closing: &Arc<Closing>) ->
     });
     let location: Location =
         setup.location.to_str().map_or_else(|| Ok(Location::from(&setup.location)), str::parse)?;
-    let store = insist(closing, || Store::open(&location)).await?;
+    let store = retry_until_written(closing, || Store::open(&location)).await?;
     let (pid, now) = (std::process::id(), unix_milliseconds());
     let record = ProcessRecord::new(ProcessRecord::LABELLER, setup.number, pid, now);
     // Only labellers of `calmwalk run` are taken over by the next run.
@@ -59,7 +59,11 @@ async fn label(setup: LabellerConfig, method: Method, closing: &Arc<Closing>) ->
         protocol: setup.protocol,
         attempts: setup.attempts,
         bounds: setup.bounds,
-        stay: if slot.is_none_or(|slot| slot.until_empty) { Stay::UntilEmpty } else { Stay::UntilFinished },
+        exit_policy: if slot.is_none_or(|slot| slot.until_empty) {
+            ExitPolicy::UntilEmpty
+        } else {
+            ExitPolicy::UntilFinished
+        },
         timing: Timing {
             lease: setup.lease,
             grace: slot.map(|slot| Duration::from_secs_f64(slot.grace)),

@@ -97,7 +97,7 @@ pub const FOLDER: &str = "slurm";
 pub fn job_names(location: &Location) -> JobNames {
     let location = match location {
         Location::Directory(directory) => directory.display().to_string(),
-        Location::Server(url) => url.place(),
+        Location::Server(url) => url.campaign_key(),
     };
     JobNames::new(&blake3::hash(location.as_bytes()).to_hex()[..12])
 }

@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use serde_json::{Value, json};
-use store::{CampaignLock, Location, NewProtocol, Protocol, Requeued, Store, unix_milliseconds};
+use store::{CampaignLock, Location, NewProtocol, Protocol, RelabelCounts, Store, unix_milliseconds};
 
 use self::protocol_change::ProtocolChange;
 use self::selection::Selection;
@@ -66,7 +66,7 @@ struct RelabelReport {
     selection: Selection,
     cost: RelabelCost,
     /// Numbers of structures.
-    requeued: Requeued,
+    requeued: RelabelCounts,
     /// What the user does next.
     next: String,
 }
@@ -106,10 +106,11 @@ impl Relabel {
         };
         let protocol = new.as_ref().map_or(&in_force, |new| &new.protocol).clone();
         let selection = self.select(&store, &protocol).await?;
-        let moved = if new.is_some() { store.unlabelled_by_others(protocol.hash).await? } else { 0 };
+        let moved =
+            if new.is_some() { store.unlabelled_under_other_protocols(protocol.hash).await? } else { 0 };
         let cost = label_cost::relabel_cost(&store, &in_force, &selection.sizes()).await?;
         let next = self.next(&store, &location).await?;
-        let mut requeued = Requeued { again: selection.structures().len() as u64, moved };
+        let mut requeued = RelabelCounts { again: selection.structures().len() as u64, moved };
         if !self.dry_run {
             requeued = self.apply(&store, new.as_ref(), &selection).await?;
         }
@@ -153,7 +154,7 @@ impl Relabel {
         store: &Store,
         new: Option<&ProtocolChange>,
         selection: &Selection,
-    ) -> Result<Requeued, Failure> {
+    ) -> Result<RelabelCounts, Failure> {
         let changes: Vec<_> = new.iter().flat_map(|new| &new.changes).map(|change| change.detail()).collect();
         let protocol = new.map(|new| NewProtocol {
             protocol: &new.protocol,
@@ -162,7 +163,8 @@ impl Relabel {
             notes: &new.notes,
         });
         let (structures, again) = (selection.structures(), self.include_current || !self.ids.is_empty());
-        let request = store::Relabel { structures: &structures, again, reason: &self.reason, protocol };
+        let request =
+            store::RelabelRequest { structures: &structures, again, reason: &self.reason, protocol };
         Ok(store.relabel(&request, unix_milliseconds()).await?)
     }
 }

@@ -13,7 +13,9 @@ use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
-use store::{DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
+use store::{
+    DATABASE, Location, ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds,
+};
 use tokio::sync::Notify;
 use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
@@ -155,7 +157,7 @@ async fn run(
     let lock = lock::server(location, wait_timeout).await?;
     let origin = Provenance::new(&campaign.path, &campaign.text, directory);
     let store = open_store(campaign, location, &origin, adopt).await?;
-    let store = lock.iter().fold(store, Store::led_by);
+    let store = lock.iter().fold(store, Store::fenced_by);
     if let Location::Directory(directory) = &location {
         warn_if_disk_is_too_small(campaign, directory, &store).await?;
     }
@@ -198,7 +200,7 @@ async fn run(
     serving.end().await;
     let ended = worked?;
     // Do not fail after hours of work because the server is unreachable in the last second.
-    let store = store.patient(SERVER_AWAY);
+    let store = store.with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT);
     loop {
         match unregister(&store, &process, ended).await {
             Err(StoreError::Unreachable(_)) => {}
@@ -276,12 +278,12 @@ async fn open_store(
 async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
     let text = |json: serde_json::Result<String>| json.map_err(Failure::failed);
     let method = campaign.method()?;
-    store.leave_note(LABEL_METHOD_KEY, &text(serde_json::to_string(&method))?).await?;
-    store.leave_note(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
+    store.set_metadata(LABEL_METHOD_KEY, &text(serde_json::to_string(&method))?).await?;
+    store.set_metadata(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
     let elements: Vec<_> = campaign.model.elements().iter().map(|species| species.symbol()).collect();
-    store.leave_note(candidate_details::ELEMENTS_KEY, &text(serde_json::to_string(&elements))?).await?;
+    store.set_metadata(candidate_details::ELEMENTS_KEY, &text(serde_json::to_string(&elements))?).await?;
     store
-        .leave_note(
+        .set_metadata(
             disk_forecast::METADATA_KEY,
             &text(serde_json::to_string(&DiskForecast::from_campaign(campaign)))?,
         )
@@ -312,7 +314,7 @@ async fn warn_if_disk_is_too_small(
 /// Registers this process, and reclaims the leases of dead ones. The caller holds the lock, so there is no other orchestrator.
 async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
     let now = unix_milliseconds();
-    store.take_over(now).await?;
+    store.reclaim_leases(now).await?;
     let record = ProcessRecord::new(ProcessRecord::ORCHESTRATOR, None, std::process::id(), now);
     store.upsert_process(&record).await?;
     let detail = json!({ "process": record.id, "program_version": env!("CARGO_PKG_VERSION") });

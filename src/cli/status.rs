@@ -85,7 +85,7 @@ impl Snapshot {
 
     /// Reads the state of a campaign.
     pub async fn read(store: &Store) -> Result<Self, Failure> {
-        let forecast = store.note(disk_forecast::METADATA_KEY).await?;
+        let forecast = store.metadata(disk_forecast::METADATA_KEY).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
         let (campaign, status) = (store.campaign().await?, store.status().await?);
         let labels = LabelSummary::read(store, &status).await?;
@@ -237,7 +237,7 @@ impl Disk {
 }
 
 fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
-    let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
+    let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let state = if status.led { "active" } else { "not finished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),

@@ -31,8 +31,8 @@ impl Walker {
         let ended = walker::run(&context, &mut transport);
         match (ended, transport.failure()) {
             (_, Some(failure)) => Err(Failure::failed(failure)),
-            (walker::Ended::SentHome, None) => Ok(ExitStatus::Done),
-            (walker::Ended::Stopped, None) => Ok(ExitStatus::Interrupted),
+            (walker::WalkerExit::Dismissed, None) => Ok(ExitStatus::Done),
+            (walker::WalkerExit::Stopped, None) => Ok(ExitStatus::Interrupted),
         }
     }
 }

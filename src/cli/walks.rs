@@ -55,7 +55,7 @@ pub async fn change(location: &Location, action: &Action) -> Result<Vec<String>,
     };
     let store = Store::open(location).await?;
     let walks = match selection.all {
-        true => store.walks_under_way().await?,
+        true => store.active_walks().await?,
         false => selection.walks.iter().copied().map(WalkId).collect(),
     };
     let changed = store.pause_walks(&walks, paused, unix_milliseconds()).await?;

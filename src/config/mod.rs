@@ -26,7 +26,7 @@ use potentials::grace::Precision;
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
-use workers::labeller::{BatchSystem, Keep, LabelBounds, LabelGuard, Running};
+use workers::labeller::{BatchSystem, ExecutionSettings, KeepDirectories, LabelBounds, LabelGuard};
 use workers::settings::ThermostatKind;
 
 pub use changes::{Change, Refused, changed_keys, compare, without_changeable};
@@ -267,7 +267,7 @@ pub struct LabelSection {
     pub scratch: Option<PathBuf>,
     /// Which of these directories are kept in the store.
     #[serde(default)]
-    pub keep: Keep,
+    pub keep: KeepDirectories,
     /// Variables of the labeller's environment that its program gets beside those that every program gets.
     #[serde(default)]
     pub pass_environment: PassedEnvironment,
@@ -490,8 +490,8 @@ impl LabelSection {
     }
 
     /// How the calculations of a program run.
-    pub fn running(&self) -> Running {
-        Running {
+    pub fn running(&self) -> ExecutionSettings {
+        ExecutionSettings {
             cores: self.cores.get(),
             time_limit: self.time_limit.get(),
             memory: self.memory.map(Positive::get),

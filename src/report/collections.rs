@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use analysis::SystematicSample;
 use atoms::cell::{norm, sub};
 use atoms::{NeighbourList, Species, Structure, shortest_distance};
-use store::{Collected, JobState, SeedStructure, Store, StoreError};
+use store::{CollectedStructure, JobState, SeedStructure, Store, StoreError};
 use wire::{ContentHash, Origin};
 
 use super::features::Features;
@@ -148,14 +148,14 @@ impl OriginCollection {
         }
     }
 
-    fn count(&mut self, row: &Collected) {
+    fn count(&mut self, row: &CollectedStructure) {
         let counts = self.labels.entry(row.seed_structure).or_default();
         counts.structures += 1;
         counts.labelled += u64::from(row.label_forces.is_some());
         counts.failed += u64::from(row.job == Some(JobState::Failed));
     }
 
-    fn add(&mut self, row: &Collected, shortest: Option<f64>) {
+    fn add(&mut self, row: &CollectedStructure, shortest: Option<f64>) {
         let view = row.block.view();
         let structure = view.structure();
         let periodic = structure.periodic == [true; 3];
@@ -173,7 +173,7 @@ impl OriginCollection {
 
     fn add_atoms(
         &mut self,
-        row: &Collected,
+        row: &CollectedStructure,
         forces: &[[f64; 3]],
         structure: &Structure,
         shortest: Option<f64>,

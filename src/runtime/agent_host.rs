@@ -17,7 +17,7 @@ use wire::mixture::SharedMixture;
 use wire::net::{self, Address, Joined, NetError, Parted, Tls, Uplink};
 use wire::place::Place;
 use wire::transport::Incoming;
-use workers::agent::{self, Agent, News};
+use workers::agent::{self, Agent, AgentEvent};
 
 use super::process_manager::all_failed_message;
 use super::{CHANNEL, STOP_MESSAGE, stop_signal};
@@ -66,15 +66,15 @@ pub async fn run(
     let (flag, wake) = (Arc::clone(&stopping), Arc::clone(&stop));
     let numbers = Arc::clone(&state.numbers);
     let dispatch = |incoming| {
-        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience, numbers }.run(move |news| match news {
-            News::Stop => {
+        tokio::spawn(Agent { uplink, joined, incoming, stopping, orchestrator_timeout: patience, metrics: numbers }.run(move |news| match news {
+            AgentEvent::Stop => {
                 flag.store(true, Ordering::Relaxed);
                 wake.notify_one();
             }
-            News::Silent { untold, idle } => log_and_warn(format_args!(
-                "the orchestrator does not answer: {untold} unsent reports, {idle} of {walkers} walkers idle"
+            AgentEvent::Unresponsive { unsent, idle } => log_and_warn(format_args!(
+                "the orchestrator does not answer: {unsent} unsent reports, {idle} of {walkers} walkers idle"
             )),
-            News::Back => log_and_print("the orchestrator answers again"),
+            AgentEvent::Recovered => log_and_print("the orchestrator answers again"),
         }))
     };
     let ended = run_in(&place, &setup, (walkers, threads), &mixture, dispatch, &stop, state).await;
@@ -138,7 +138,7 @@ struct AgentHost {
     given_up: Option<String>,
 }
 
-type DispatchTask = JoinHandle<Result<agent::Ended, Parted>>;
+type DispatchTask = JoinHandle<Result<agent::AgentExit, Parted>>;
 
 async fn run_in(
     place: &Place,
@@ -212,7 +212,7 @@ impl AgentHost {
                 ended = &mut self.dispatching, if dispatched.is_none() => {
                     let ended = ended.map_err(Failure::failed)?;
                     match ended {
-                        Ok(agent::Ended::Done) => self.walkers.close(),
+                        Ok(agent::AgentExit::Done) => self.walkers.close(),
                         _ => self.walkers.stop(),
                     }
                     dispatched = Some(ended.map_err(Failure::failed));
@@ -221,7 +221,7 @@ impl AgentHost {
         }
         self.serving.await.map_err(Failure::failed)?.map_err(Failure::failed)?;
         match dispatched.transpose()? {
-            Some(agent::Ended::Done) => Ok(ExitStatus::Done),
+            Some(agent::AgentExit::Done) => Ok(ExitStatus::Done),
             _ => match self.given_up {
                 Some(how) => Err(Failure::Failed(format!("no walker is left: {how}"))),
                 None => Ok(ExitStatus::Interrupted),

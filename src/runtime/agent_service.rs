@@ -7,12 +7,12 @@ use std::time::Duration;
 
 use calm::Mixture;
 use serde_json::json;
-use store::{ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
+use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval};
 use wire::net::{self, AgentEvent, Hub, NetError, Welcome};
 use wire::transport::Incoming;
-use workers::labeller::SIGN_OF_LIFE;
+use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::RunContext;
 use crate::exit_status::Failure;
@@ -40,7 +40,8 @@ impl AgentService {
     /// Starts to listen if the run is configured to.
     pub async fn open(run: RunContext<'_>, session: u64, mixture: &Arc<Mixture>) -> Result<Self, Failure> {
         // Writes wait here while the database is unreachable.
-        let (store, mixture) = (run.store.clone().patient(SERVER_AWAY), Arc::clone(mixture));
+        let (store, mixture) =
+            (run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT), Arc::clone(mixture));
         let Some(listen) = run.listen else { return Ok(Self { hub: None, store, mixture }) };
         let config = &run.campaign.config;
         let model = std::path::absolute(config.potential.model.get_ref()).map_err(Failure::failed)?;
@@ -92,7 +93,7 @@ impl AgentService {
 /// cannot take.
 async fn record_events(store: &Store, mut events: mpsc::UnboundedReceiver<AgentEvent>) {
     let mut records = BTreeMap::new();
-    let mut heartbeats = interval(SIGN_OF_LIFE);
+    let mut heartbeats = interval(HEARTBEAT_INTERVAL);
     heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         let written = tokio::select! {
@@ -145,7 +146,7 @@ async fn record_event(
         id: agent.id.clone(),
         host: agent.host.clone(),
         // This host cannot check whether the process lives.
-        birth: String::new(),
+        start_time: String::new(),
         ..ProcessRecord::new(ProcessRecord::AGENT, None, agent.pid, now)
     });
     (record.last_seen, record.state) = (now, state.to_owned());

@@ -10,7 +10,7 @@ use orchestrator::supervisor::{Limits, Standing};
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval};
-use workers::labeller::SIGN_OF_LIFE;
+use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::labellers::Labellers;
 use super::multi_process::LABELLER_TIMEOUT;
@@ -56,7 +56,7 @@ pub async fn run(
         display: Display { bar: Bar::new(None, BAR), labels: 0, queue: String::new() },
         unreachable: false,
     };
-    let mut ticks = interval(SIGN_OF_LIFE);
+    let mut ticks = interval(HEARTBEAT_INTERVAL);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut failure = None;
     loop {
@@ -127,7 +127,7 @@ impl PoolManager<'_> {
     /// Reads the labellers' heartbeats and displays the state of the queue.
     async fn update(&mut self) -> Result<(), StoreError> {
         self.labellers.read_heartbeats(self.store, PROVEN_AFTER).await?;
-        let jobs = self.store.awaits_labels(unix_milliseconds()).await?;
+        let jobs = self.store.has_pending_labels(unix_milliseconds()).await?;
         let leaders = self.store.processes(Some(ProcessRecord::ORCHESTRATOR)).await?;
         self.display.queue(jobs, leaders.iter().any(ProcessRecord::is_leading));
         Ok(())

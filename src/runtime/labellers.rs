@@ -49,7 +49,7 @@ impl Labellers {
             let log = ended.ending.to_string();
             store.fail_leases_of(&record.id, "crashed", &log, self.attempts, now).await?;
         }
-        store.release_leases_of_gone_processes(now).await?;
+        store.release_leases_of_dead_processes(now).await?;
         Ok(record)
     }
 

@@ -25,7 +25,7 @@ use std::time::{Duration, Instant};
 
 use orchestrator::reactor::{self, Notice, Reactor};
 use orchestrator::selector::Selector;
-use store::{ProcessRecord, SERVER_AWAY, Store, unix_milliseconds};
+use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{Notify, mpsc};
 use wire::transport::Incoming;
@@ -86,7 +86,7 @@ fn start_reactor(
     }
     let reactor = Reactor {
         selector,
-        store: run.store.clone().patient(SERVER_AWAY),
+        store: run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT),
         incoming,
         stopping: Arc::clone(stopping),
         queue_limit,

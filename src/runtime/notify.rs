@@ -45,7 +45,7 @@ impl<'a> Notifier<'a> {
     ) -> Result<Option<Self>, StoreError> {
         let settings = &config.notify;
         let Some(command) = settings.command.clone() else { return Ok(None) };
-        let told = store.note(METADATA_KEY).await?;
+        let told = store.metadata(METADATA_KEY).await?;
         let told = told.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
         let stall = Duration::from_secs_f64(60.0 * settings.stall.get());
         Ok(Some(Self {
@@ -86,7 +86,7 @@ impl<'a> Notifier<'a> {
         }
         // Store this first, so that no event is reported twice.
         let told = serde_json::to_string(self.tracker.sent()).map_err(Failure::failed)?;
-        self.store.leave_note(METADATA_KEY, &told).await?;
+        self.store.set_metadata(METADATA_KEY, &told).await?;
         let snapshot = status::Snapshot::read(self.store).await?;
         let state = snapshot.to_json().map_err(Failure::failed)?;
         due.into_iter().for_each(|due| self.notify(due, &state));

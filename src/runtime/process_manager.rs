@@ -9,7 +9,7 @@ use orchestrator::supervisor::Standing;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use wire::ipc::Handle;
-use workers::labeller::SIGN_OF_LIFE;
+use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::db_status::DbStatus;
 use super::labellers::Labellers;
@@ -62,7 +62,7 @@ impl<'a> ProcessManager<'a> {
         labellers: Labellers,
         stopping: Arc<AtomicBool>,
     ) -> Self {
-        let mut heartbeats = interval(SIGN_OF_LIFE);
+        let mut heartbeats = interval(HEARTBEAT_INTERVAL);
         heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let records = ProcessRecords::new(store, process, walkers.status().len());
         Self {
@@ -214,12 +214,12 @@ impl<'a> ProcessManager<'a> {
     async fn send_heartbeats(&mut self) -> Result<(), StoreError> {
         self.records.write_heartbeats(self.line.traffic()).await?;
         // This includes processes whose end could not be recorded at once.
-        self.store.release_leases_of_gone_processes(unix_milliseconds()).await?;
+        self.store.release_leases_of_dead_processes(unix_milliseconds()).await?;
         self.labellers.read_heartbeats(self.store, PROVEN_AFTER).await
     }
 
     async fn check_labels(&mut self) -> Result<(), StoreError> {
-        if !self.store.awaits_labels(unix_milliseconds()).await? {
+        if !self.store.has_pending_labels(unix_milliseconds()).await? {
             self.label_checks = None;
             self.labellers.children.stop();
         }

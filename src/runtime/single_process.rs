@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
 use wire::place::Place;
 use wire::transport::{InProcess, Incoming};
-use workers::labeller::{self, Closing, LabellerSettings, SIGN_OF_LIFE, Stay, Timing};
+use workers::labeller::{self, ExitPolicy, HEARTBEAT_INTERVAL, LabellerSettings, Shutdown, Timing};
 use workers::walk::WalkContext;
 use workers::walker;
 
@@ -45,7 +45,7 @@ pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::End
 async fn write_heartbeats(store: Store, mut process: ProcessRecord) {
     let mut db_status = DbStatus::default();
     loop {
-        tokio::time::sleep(SIGN_OF_LIFE).await;
+        tokio::time::sleep(HEARTBEAT_INTERVAL).await;
         process.last_seen = unix_milliseconds();
         // A busy database may miss a heartbeat.
         db_status.observe(&store.upsert_process(&process).await);
@@ -54,12 +54,12 @@ async fn write_heartbeats(store: Store, mut process: ProcessRecord) {
 
 /// Walkers, reactor and labellers.
 struct Tasks {
-    walkers: Vec<JoinHandle<walker::Ended>>,
+    walkers: Vec<JoinHandle<walker::WalkerExit>>,
     labellers: JoinSet<Result<(), StoreError>>,
     reactor: ReactorTask,
     /// The store to poll for labels that other processes make, if this one makes none.
     external_labels: Option<Store>,
-    closing: Arc<Closing>,
+    closing: Arc<Shutdown>,
     stopping: Arc<AtomicBool>,
 }
 
@@ -67,7 +67,7 @@ impl Tasks {
     /// Starts all of them.
     fn start(run: RunContext<'_>, selector: Selector) -> Result<Self, Failure> {
         let stopping = Arc::new(AtomicBool::new(false));
-        let closing = Arc::new(Closing::default());
+        let closing = Arc::new(Shutdown::default());
         let asked = (Arc::clone(&stopping), Arc::clone(&closing));
         let stop = move || {
             asked.0.store(true, Ordering::Relaxed);
@@ -121,9 +121,9 @@ impl Tasks {
 }
 
 /// Waits until no structure lacks a label or a stop is requested.
-async fn wait_for_labels(store: &Store, closing: &Closing) -> Result<(), StoreError> {
+async fn wait_for_labels(store: &Store, closing: &Shutdown) -> Result<(), StoreError> {
     while !closing.is_stopping() {
-        match store.awaits_labels(unix_milliseconds()).await {
+        match store.has_pending_labels(unix_milliseconds()).await {
             Ok(false) => break,
             Err(error) if !error.is_transient() => return Err(error),
             _ => tokio::time::sleep(LABEL_CHECK_INTERVAL).await,
@@ -144,7 +144,7 @@ fn start_walkers(
     campaign: &Campaign,
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &Arc<AtomicBool>,
-) -> Result<Vec<JoinHandle<walker::Ended>>, Failure> {
+) -> Result<Vec<JoinHandle<walker::WalkerExit>>, Failure> {
     let (model, settings) = (Arc::clone(&campaign.model), Arc::new(campaign.walk_settings()));
     let start = |number| {
         let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
@@ -160,7 +160,7 @@ fn start_walkers(
 
 fn start_labellers(
     run: RunContext<'_>,
-    closing: &Arc<Closing>,
+    closing: &Arc<Shutdown>,
 ) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
     let RunContext { campaign, store, process, .. } = run;
     let label = &campaign.config.label;
@@ -172,7 +172,7 @@ fn start_labellers(
             protocol: campaign.protocol.clone(),
             attempts: label.attempts.get(),
             bounds: label.bounds(),
-            stay: Stay::UntilEmpty,
+            exit_policy: ExitPolicy::UntilEmpty,
             timing: Timing { lease: Duration::from_secs(label.lease.get().into()), ..Timing::default() },
         };
         let (store, closing) = (store.clone(), Arc::clone(closing));

@@ -68,10 +68,10 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
     let mut adopted = BTreeMap::new();
     for found in running_labellers(store).await? {
         let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");
-        match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
+        match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.start_time).is_ok()) {
             Some(number) => drop(adopted.insert(number, found.pid)),
             // Ignore a labeller that has ended meanwhile.
-            None => drop(ask_to_end(found.pid, &found.birth)),
+            None => drop(ask_to_end(found.pid, &found.start_time)),
         }
     }
     Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
@@ -80,7 +80,7 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
 /// Asks the labellers of an earlier run to end, because this run makes labels itself.
 pub async fn stop_labellers(store: &Store) -> Result<(), Failure> {
     for found in running_labellers(store).await? {
-        let _ = ask_to_end(found.pid, &found.birth);
+        let _ = ask_to_end(found.pid, &found.start_time);
     }
     Ok(())
 }
@@ -89,7 +89,7 @@ pub async fn stop_labellers(store: &Store) -> Result<(), Failure> {
 /// alone.
 async fn running_labellers(store: &Store) -> Result<Vec<ProcessRecord>, StoreError> {
     let mut labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
-    labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_gone());
+    labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_dead());
     Ok(labellers)
 }
 

@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use orchestrator::reactor::Notice;
-use store::{Pace, Store, unix_milliseconds};
+use store::{Store, WalkProgress, unix_milliseconds};
 use tokio::time::{MissedTickBehavior, interval};
 use wire::WalkId;
 use wire::messages::Progress;
@@ -32,7 +32,7 @@ pub struct Throughput {
 
 #[derive(Debug, Default)]
 struct Walk {
-    pace: Pace,
+    pace: WalkProgress,
     speed: Speed,
     /// Steps in this run, including repeated ones.
     steps: u64,
@@ -83,7 +83,7 @@ impl Throughput {
             self.steps += made;
         }
         entry.speed.update(entry.steps, now);
-        entry.pace = Pace {
+        entry.pace = WalkProgress {
             walk: walk.0,
             seen: now,
             segment: progress.segment,
@@ -98,7 +98,7 @@ impl Throughput {
     }
 
     /// The changed walks, and steps per second of all walks.
-    fn take_changes(&mut self, now: i64) -> (Vec<Pace>, Option<f64>) {
+    fn take_changes(&mut self, now: i64) -> (Vec<WalkProgress>, Option<f64>) {
         self.all.update(self.steps, now);
         let changed = std::mem::take(&mut self.changed);
         (changed.iter().map(|walk| self.walks[walk].pace.clone()).collect(), self.all.average)
@@ -113,7 +113,7 @@ pub async fn record(store: &Store, throughput: &Mutex<Throughput>) -> Infallible
         write.tick().await;
         let now = unix_milliseconds();
         let (changed, all) = throughput.lock().unwrap_or_else(PoisonError::into_inner).take_changes(now);
-        let _ = store.set_paces(&changed, all, now).await;
+        let _ = store.set_walk_progress(&changed, all, now).await;
     }
 }
 

@@ -44,6 +44,6 @@ pub async fn track(store: &Store, limits: &Budget, limit_reached: &Notify) -> St
 
 /// Adds to the count. Checks the limits if there are any.
 async fn add_time(store: &Store, time: Duration, limited: bool) -> Result<Option<&'static str>, StoreError> {
-    store.add_time_under_way(time.as_millis() as u64).await?;
+    store.add_running_time(time.as_millis() as u64).await?;
     if limited { exhausted_time_limit(store).await } else { Ok(None) }
 }

@@ -10,7 +10,7 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use orchestrator::supervisor::{ChildStatus, Standing};
-use workers::agent::Numbers;
+use workers::agent::AgentMetrics;
 
 use super::exposition::{CONTENT_TYPE, Text};
 
@@ -18,7 +18,7 @@ use super::exposition::{CONTENT_TYPE, Text};
 #[derive(Clone, Debug, Default)]
 pub struct AgentState {
     /// Its assignments and its connection.
-    pub numbers: Arc<Mutex<Numbers>>,
+    pub numbers: Arc<Mutex<AgentMetrics>>,
     /// Its walkers.
     pub walkers: Arc<Mutex<Vec<ChildStatus>>>,
 }
@@ -34,7 +34,7 @@ async fn metrics(State(state): State<AgentState>) -> Response {
     ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&numbers, &walkers)).into_response()
 }
 
-fn text(numbers: &Numbers, walkers: &[ChildStatus]) -> String {
+fn text(numbers: &AgentMetrics, walkers: &[ChildStatus]) -> String {
     let mut text = Text::default();
     let host = store::this_host();
     let labels = [("host", host.as_str()), ("version", env!("CARGO_PKG_VERSION"))];
@@ -52,7 +52,7 @@ fn text(numbers: &Numbers, walkers: &[ChildStatus]) -> String {
     text.into_string()
 }
 
-fn walker_metrics(text: &mut Text, numbers: &Numbers, walkers: &[ChildStatus]) {
+fn walker_metrics(text: &mut Text, numbers: &AgentMetrics, walkers: &[ChildStatus]) {
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
     walkers.iter().for_each(|walker| *states.entry(state_name(walker.standing)).or_default() += 1);
     let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
@@ -72,20 +72,20 @@ fn walker_metrics(text: &mut Text, numbers: &Numbers, walkers: &[ChildStatus]) {
     );
 }
 
-fn assignment_metrics(text: &mut Text, numbers: &Numbers) {
-    let taken = numbers.turns_taken as f64;
+fn assignment_metrics(text: &mut Text, numbers: &AgentMetrics) {
+    let taken = numbers.assignments_received as f64;
     text.counter(
         "calmwalk_agent_turns_taken_total",
         "Assignments received from the orchestrator.",
         &[(&[], taken)],
     );
-    let turns = &numbers.turns;
+    let assignments = &numbers.assignments;
     let outcomes = [
-        ("candidate", turns.candidate),
-        ("turn", turns.turn),
-        ("paused", turns.paused),
-        ("ended", turns.ended),
-        ("lost", turns.lost),
+        ("candidate", assignments.candidate),
+        ("turn", assignments.steps_done),
+        ("paused", assignments.paused),
+        ("ended", assignments.ended),
+        ("lost", assignments.lost),
     ];
     let labels = outcomes.map(|(outcome, _)| [("outcome", outcome)]);
     let samples: Vec<_> =
@@ -99,7 +99,7 @@ fn assignment_metrics(text: &mut Text, numbers: &Numbers) {
     text.counter("calmwalk_agent_steps_total", "Steps of the walkers of this host.", &[(&[], steps)]);
 }
 
-fn link_metrics(text: &mut Text, numbers: &Numbers) {
+fn link_metrics(text: &mut Text, numbers: &AgentMetrics) {
     let linked = f64::from(numbers.is_linked());
     text.gauge("calmwalk_agent_link_up", "Whether the orchestrator answers.", &[(&[], linked)]);
     optional_gauge(
@@ -114,7 +114,7 @@ fn link_metrics(text: &mut Text, numbers: &Numbers) {
         "Round-trip time of the last request to the orchestrator.",
         numbers.round_trip.map(|took| took.as_secs_f64()),
     );
-    let places = numbers.places as f64;
+    let places = numbers.joins as f64;
     text.counter(
         "calmwalk_agent_places_total",
         "Number of times that this agent has joined.",
@@ -123,7 +123,7 @@ fn link_metrics(text: &mut Text, numbers: &Numbers) {
     text.gauge(
         "calmwalk_agent_untold_reports",
         "Reports that the orchestrator has not acknowledged yet.",
-        &[(&[], numbers.untold as f64)],
+        &[(&[], numbers.unsent as f64)],
     );
 }
 

@@ -1,8 +1,8 @@
-//! What a commit costs: groups of candidates with 108 atoms and 130 features, each with its decision and its walk's
-//! checkpoint, half of them accepted, with a label job and a component of the mixture.
+//! The cost of a commit: groups of candidates with 108 atoms and 130 features, each with its decision and its
+//! walk's checkpoint. Half of them are accepted, with a label job and a component of the mixture.
 //!
-//! `cargo bench -p store --bench commit`; with a PostgreSQL server too if `CALMWALK_POSTGRES` is its URL, see
-//! `.ci/postgres`. The figures are in `docs/benchmarks.md`.
+//! `cargo bench -p store --bench commit`; also on a PostgreSQL server if `CALMWALK_POSTGRES` is its URL, see
+//! `.ci/postgres`. The results are in `docs/benchmarks.md`.
 
 #[path = "../tests/common/mod.rs"]
 mod common;
@@ -20,7 +20,7 @@ use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 const ATOMS: usize = 108;
 const FEATURES: usize = 130;
 const CHECKPOINT: usize = 27_000;
-/// A packed Cholesky factor and what goes with it.
+/// A packed Cholesky factor and its header.
 const COMPONENT: usize = 8 * FEATURES * (FEATURES + 1) / 2;
 const CANDIDATES: usize = 512;
 
@@ -46,11 +46,11 @@ fn report(database: &str, group: usize, time: Duration) {
 
 async fn measure(location: Location, commits: &[Commit]) -> Duration {
     let store = common::create_at(location).await;
-    let begun = Instant::now();
+    let started = Instant::now();
     for commit in commits {
         store.commit(commit).await.unwrap();
     }
-    let time = begun.elapsed();
+    let time = started.elapsed();
     store.close().await;
     time
 }
@@ -61,7 +61,7 @@ async fn drop_schema() {
     options.connect().await.unwrap().execute(sql).await.unwrap();
 }
 
-/// A group whose candidates are numbered from `first` on.
+/// A group of candidates numbered from `first`.
 fn commit(first: usize, group: usize) -> Commit {
     let records: Vec<_> = (first..first + group).map(record).collect();
     let walks = (0..group as u32).map(|k| {
@@ -114,9 +114,9 @@ fn record(number: usize) -> CandidateRecord {
     }
 }
 
-/// Numbers as good as random (SplitMix64), in [0, 1).
-fn noise(seed: u64, count: usize) -> Vec<f64> {
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+/// Pseudo-random numbers (SplitMix64) in [0, 1).
+fn noise(rng_seed: u64, count: usize) -> Vec<f64> {
+    let mut state = rng_seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
     let mut next = || {
         state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

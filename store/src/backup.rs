@@ -1,4 +1,4 @@
-//! A copy of a campaign, whole or not at all: a directory with a database in SQLite, wherever the campaign is kept.
+//! Backups: a directory with an SQLite database, for either kind of campaign, created as a whole or not at all.
 
 mod directory;
 mod from_postgres;
@@ -7,24 +7,24 @@ use std::path::Path;
 
 use serde_json::json;
 
-use self::directory::Unfinished;
+use self::directory::StagedDirectory;
 use crate::Store;
 use crate::database::{Database, query};
 use crate::error::Result;
 use crate::sqlite::DatabaseFile;
 use crate::tables::logs::insert_operation;
 use crate::tables::processes::LEASED;
-use crate::tables::queue::{InVain, end_in_vain};
+use crate::tables::queue::{AttemptEnd, end_without_label};
 
 impl Store {
-    /// Copies the campaign as it is at one instant into a new directory `target`, which appears when it is complete and on
-    /// the disk. The copy has no processes, and what they have leased waits in its queue. `tell` hears how much is done, of
-    /// how much: bytes, or rows.
+    /// Copies a snapshot of the campaign into a new directory `target`, which appears once it is complete and on
+    /// disk. The copy has no processes; its leased jobs return to the queue. `tell` receives progress and total, in
+    /// bytes or rows.
     ///
     /// # Errors
-    /// [`crate::StoreError::BackupExists`] if there is anything at `target`.
+    /// [`crate::StoreError::BackupExists`] if anything exists at `target`.
     pub async fn backup(&self, target: &Path, now: i64, tell: impl FnMut(u64, u64)) -> Result<()> {
-        let unfinished = Unfinished::beside(target)?;
+        let unfinished = StagedDirectory::beside(target)?;
         match &self.database {
             Database::Sqlite(file) => file.copy_into(unfinished.path(), tell).await?,
             Database::Postgres(server) => from_postgres::copy(server, unfinished.path(), tell).await?,
@@ -37,12 +37,12 @@ impl Store {
         unfinished.publish(target)
     }
 
-    /// Makes it the copy's own: who works for the original does not work for it.
+    /// Removes the processes of the original campaign and releases their leases.
     async fn forget_processes(&self, now: i64) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let leased: Vec<(i64, String)> = query(LEASED).fetch_all(&mut transaction).await?;
         for (job, _) in &leased {
-            end_in_vain(&mut transaction, *job, InVain::Lost("released"), now).await?;
+            end_without_label(&mut transaction, *job, AttemptEnd::Lost("released"), now).await?;
         }
         query("DELETE FROM process").execute(&mut transaction).await?;
         let detail = json!({ "leases": leased.len() });

@@ -1,52 +1,52 @@
-//! What a campaign may use up, and what it has.
+//! Budgets of a campaign and their use.
 
 use serde::{Deserialize, Serialize};
 
-/// Limits; none where there is none.
+/// Limits of a campaign; `None` for no limit.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Budget {
-    /// Labels that are made.
+    /// Number of labels.
     pub labels: Option<u64>,
-    /// Hours of label attempts, each on one core.
+    /// Core-hours of label attempts.
     pub core_hours: Option<f64>,
-    /// Hours for which the campaign is under way.
+    /// Wall-clock hours of the campaign's runs.
     pub wall_hours: Option<f64>,
-    /// The key of the configuration that limits the number of structures; the selector sees to that.
+    /// The configuration key that limits the number of structures; the selector enforces that limit.
     pub structures_by: Option<String>,
 }
 
 /// What was used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct BudgetUse {
-    /// Labels that were made, also such as came too late and were kept beside another.
+    /// Labels made, including late results that were stored as checks.
     pub labels: u64,
     /// Attempts that are under way.
     pub under_way: u64,
-    /// Hours of label attempts, those that are under way so far.
+    /// Core-hours of label attempts, including those in progress.
     pub core_hours: f64,
-    /// Hours for which the campaign was under way, summed over its runs.
+    /// Wall-clock hours, summed over all runs.
     pub wall_hours: f64,
 }
 
-/// Both, for those who watch.
+/// Limits and use, for display.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct BudgetStatus {
     /// The limits.
     pub limits: Budget,
-    /// What was used of them.
+    /// Use of the limits.
     pub used: BudgetUse,
-    /// The key of the configuration that ended the campaign.
+    /// The configuration key of the limit that ended the campaign.
     pub used_up: Option<String>,
 }
 
 impl Budget {
-    /// Whether labellers are free to begin what is queued.
+    /// Whether no limit applies to labels.
     pub fn is_none(&self) -> bool {
         self.labels.is_none() && self.core_hours.is_none() && self.wall_hours.is_none()
     }
 
-    /// The key of the limit of time that was reached: walks stop where they stand.
+    /// The configuration key of the time limit that was reached: walks stop where they are.
     pub fn time_used_up(&self, used: &BudgetUse) -> Option<&'static str> {
         let limits = [
             ("budget.wall_hours", self.wall_hours, used.wall_hours),
@@ -56,8 +56,8 @@ impl Budget {
         limits.into_iter().find(reached).map(|(key, ..)| key)
     }
 
-    /// Whether no further attempt may begin: one that is under way may still bring the last label.
-    pub fn allows_no_attempt(&self, used: &BudgetUse) -> bool {
+    /// Whether no further attempt may start. A running attempt may still deliver the last label.
+    pub fn forbids_attempts(&self, used: &BudgetUse) -> bool {
         let labels = used.labels + used.under_way;
         self.time_used_up(used).is_some() || self.labels.is_some_and(|limit| labels >= limit)
     }
@@ -68,13 +68,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_limit_is_reached_when_as_much_was_used() {
+    fn a_limit_is_reached_when_use_equals_it() {
         let used = BudgetUse { labels: 3, under_way: 2, core_hours: 1.5, wall_hours: 0.25 };
         let none = Budget::default();
-        assert!(none.is_none() && none.time_used_up(&used).is_none() && !none.allows_no_attempt(&used));
+        assert!(none.is_none() && none.time_used_up(&used).is_none() && !none.forbids_attempts(&used));
         for (labels, allows) in [(6, true), (5, false), (4, false)] {
             let budget = Budget { labels: Some(labels), ..Budget::default() };
-            assert_eq!((budget.allows_no_attempt(&used), budget.time_used_up(&used)), (!allows, None));
+            assert_eq!((budget.forbids_attempts(&used), budget.time_used_up(&used)), (!allows, None));
         }
         for (core_hours, wall_hours, key) in [
             (1.5, 1.0, Some("budget.core_hours")),
@@ -85,7 +85,7 @@ mod tests {
             let budget =
                 Budget { core_hours: Some(core_hours), wall_hours: Some(wall_hours), ..Budget::default() };
             assert_eq!(budget.time_used_up(&used), key);
-            assert_eq!(budget.allows_no_attempt(&used), key.is_some());
+            assert_eq!(budget.forbids_attempts(&used), key.is_some());
         }
     }
 }

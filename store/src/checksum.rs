@@ -1,43 +1,43 @@
-//! Checksums of rows: whoever reads a stored number sees whether it is the one that was written.
+//! Row checksums, by which every reader detects rows that differ from what was written.
 //!
-//! A checksum is a CRC-32 of the columns of a row, each with its type and length. It finds every single-bit flip, and misses other
-//! damage once in 2³². Disks and memory damage bytes by accident, so nothing is gained from a hash that withstands an adversary,
-//! which takes several times as long.
+//! A checksum is a CRC-32 of a row's columns, each with type and length. It detects every single-bit flip and
+//! misses other damage with probability 2⁻³². Disks and memory damage bytes by accident, so a cryptographic hash
+//! would gain nothing and take several times as long.
 //!
-//! Columns that SQL changes in place (the standing of a label, whatever belongs to the queue) have none: `store check` compares
-//! them with each other.
+//! Columns that SQL changes in place (the status of a label, everything in the queue) have no checksum: `store
+//! check` compares them with each other.
 
 use crc32fast::Hasher;
 
-use crate::database::value::{Kind, without_zeros};
+use crate::database::value::{Kind, replace_nul};
 use crate::database::{Row, Value};
 use crate::error::{Result, StoreError};
 
-/// What stands in the place of the checksums of tables of an earlier version, which are only looked at.
+/// Stands for the missing checksums of tables of an earlier version that are opened read-only.
 pub const UNKNOWN: i64 = -1;
 
-/// A table whose rows have a checksum.
+/// A table with row checksums.
 pub struct CheckedTable {
     /// Its name.
     pub name: &'static str,
-    /// The column by which messages name a row.
+    /// The column that names a row in messages.
     key: Column,
-    /// The columns that the checksum is of, in its order.
+    /// The columns covered by the checksum, in its order.
     columns: &'static [Column],
     checksum: Column,
 }
 
-/// A column, its name in joins (`table__column`, see [`joined`]), and its type.
+/// A column, with its name in joins (`table__column`, see [`joined`]) and its type.
 struct Column {
     name: &'static str,
     joined: &'static str,
     kind: Kind,
 }
 
-/// Which names the columns of a row have.
+/// The naming of the columns of a row.
 #[derive(Clone, Copy)]
 pub enum Names {
-    /// Those of the table.
+    /// The table's own names.
     Plain,
     /// `table__column`.
     Joined,
@@ -64,7 +64,7 @@ macro_rules! checked {
 /// The values of the selector.
 pub static VALUE: CheckedTable = checked!("value" by name Text { name: Text, value: Text });
 
-/// The campaign's own values. Those that SQL changes in place have no checksum.
+/// Values of the campaign. Those that SQL changes in place have no checksum.
 pub static CAMPAIGN: CheckedTable = checked!("campaign" by key Text { key: Text, value: Text });
 
 /// Structures.
@@ -86,7 +86,7 @@ pub static DECISION: CheckedTable = checked!("decision" by sequence Integer {
     detail: Text,
 });
 
-/// Candidates, without the number of their structure: its content is that of the structure.
+/// Candidates, without the number of their structure: the content hash identifies it.
 pub static CANDIDATE: CheckedTable = checked!("candidate" by decision Integer {
     decision: Integer, id: Text, content: Bytes, walk: Integer, segment: Integer, step: Integer,
     seed_structure: Integer, origin: Text, fate: Text, reason: Text, mixture_version: Integer, atoms: Integer,
@@ -99,14 +99,14 @@ pub static CANDIDATE: CheckedTable = checked!("candidate" by decision Integer {
 pub static COMPONENT: CheckedTable =
     checked!("component" by element Integer { element: Integer, slot: Integer, bytes: Bytes });
 
-/// Walks without their checkpoints, see [`CHECKPOINT`].
+/// Walks, without their checkpoints (see [`CHECKPOINT`]).
 pub static WALK: CheckedTable = checked!("walk" by walk Integer {
     walk: Integer, origin: Text, partner: Integer, seed_structure: Integer, state: Text, reason: Text, turn: Integer,
     accepted: Integer, step: Integer, segment: Integer, tau: Real, temperature: Real, relative_volume: Real,
     gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
 });
 
-/// Labels, without their standing and why it changed.
+/// Labels, without their status and why it changed.
 pub static LABEL: CheckedTable = checked!("label" by number Integer {
     structure: Integer, protocol: Integer, energy: Real, forces: Bytes, stress: Bytes, job: Integer,
     attempt: Integer, file: Text, frame: Integer, received: Integer, details: Text,
@@ -116,22 +116,23 @@ pub static LABEL: CheckedTable = checked!("label" by number Integer {
 pub static IMPORT: CheckedTable =
     checked!("import" by structure Integer { structure: Integer, file: Text, frame: Integer });
 
-/// Packed directories of calculations.
+/// Packed work directories of calculations.
 pub static ARCHIVE: CheckedTable =
     checked!("archive" by job Integer { job: Integer, attempt: Integer, bytes: Bytes, left_out: Text });
 
-/// A long column whose checksum stands in another: with that of the row, whoever needs the short columns would read it as well.
+/// A long column with a checksum of its own, stored in another column. Under the row's checksum, every reader of
+/// the short columns would have to read the long one as well.
 pub struct CheckedColumn {
     /// Its name.
     name: &'static str,
-    /// The column of the number of its row.
+    /// The column with the number of its row.
     key: &'static str,
-    /// The column of its checksum.
+    /// The column with its checksum.
     checksum: &'static str,
     what: &'static str,
 }
 
-/// Features of a candidate; the checksum stands in the table `candidate`, as that of the grades.
+/// Features of a candidate; their checksum is in the table `candidate`, like those of the grades.
 pub static FEATURES: CheckedColumn = CheckedColumn {
     name: "features",
     key: "decision",
@@ -156,7 +157,7 @@ pub static ORIGINAL_GRADES: CheckedColumn = CheckedColumn {
 };
 
 /// The long columns of a candidate, in the order of its checksums.
-pub static LONG: [&CheckedColumn; 3] = [&FEATURES, &SELECTOR_GRADES, &ORIGINAL_GRADES];
+pub static LONG_COLUMNS: [&CheckedColumn; 3] = [&FEATURES, &SELECTOR_GRADES, &ORIGINAL_GRADES];
 
 /// The checkpoint of a walk.
 pub static CHECKPOINT: CheckedColumn = CheckedColumn {
@@ -166,7 +167,7 @@ pub static CHECKPOINT: CheckedColumn = CheckedColumn {
     what: "the checkpoint of walk",
 };
 
-/// What queries select to verify a row of a table in a join, as [`Names::Joined`].
+/// The columns that a query with a join selects to verify a row of a table ([`Names::Joined`]).
 macro_rules! joined {
     (candidate) => {
         "candidate.decision AS candidate__decision, candidate.id AS candidate__id, candidate.content AS candidate__content,
@@ -215,23 +216,23 @@ macro_rules! joined {
 pub(crate) use joined;
 
 impl CheckedTable {
-    /// The values of a row with its checksum behind them.
+    /// The values of a row, followed by their checksum.
     pub fn with_checksum(&self, mut row: Vec<Value>) -> Vec<Value> {
         debug_assert_eq!(row.len(), self.columns.len(), "{}", self.name);
         row.push(checksum(&row).into());
         row
     }
 
-    /// The checksum that a row with these names of its columns should have.
+    /// Computes the checksum of a row whose columns have these names.
     pub fn compute(&self, row: &Row, names: Names) -> Result<i64> {
         let values = self.columns.iter().map(|column| column.kind.read(row, column.called(names)));
         Ok(checksum(&values.collect::<Result<Vec<_>>>()?))
     }
 
-    /// Checks that a row is the one that was written.
+    /// Verifies a row.
     ///
     /// # Errors
-    /// [`StoreError::Damaged`] if it is not.
+    /// [`StoreError::Damaged`] if the row differs from what was written.
     pub fn verify(&self, row: &Row, names: Names) -> Result<()> {
         let found: Option<i64> = row.get(self.checksum.called(names))?;
         if found == Some(UNKNOWN) {
@@ -262,16 +263,16 @@ impl CheckedColumn {
         hasher.finalize().into()
     }
 
-    /// The checksum that the column of a row should have.
+    /// Computes the checksum of the column in a row.
     pub fn compute(&self, row: &Row) -> Result<i64> {
         let (number, bytes): (i64, Option<Vec<u8>>) = (row.get(self.key)?, row.get(self.name)?);
         Ok(Self::checksum(number, bytes.as_deref()))
     }
 
-    /// Checks that the bytes are those that were written. The row has the number and the checksum, too.
+    /// Verifies the bytes of the column. The row must contain the number and the checksum.
     ///
     /// # Errors
-    /// [`StoreError::Damaged`] if they are not.
+    /// [`StoreError::Damaged`] if the bytes differ from what was written.
     pub fn verify(&self, row: &Row) -> Result<()> {
         let found: Option<i64> = row.get(self.checksum)?;
         if found == Some(UNKNOWN) {
@@ -294,14 +295,14 @@ fn compare(found: Option<i64>, computed: i64, what: impl FnOnce() -> String) -> 
     }
 }
 
-/// The checksum of values, as the store's columns have it.
+/// The checksum of values, in the form in which the store keeps it.
 pub fn checksum(values: &[Value]) -> i64 {
     let mut hasher = Hasher::new();
     values.iter().for_each(|value| add(&mut hasher, value));
     hasher.finalize().into()
 }
 
-/// Databases keep neither the sign of zero nor zero bytes in text.
+/// Databases drop the sign of zero and NUL bytes in text.
 fn add(hasher: &mut Hasher, value: &Value) {
     let number = |hasher: &mut Hasher, kind: u8, bits: Option<[u8; 8]>| {
         hasher.update(&[kind, u8::from(bits.is_some())]);
@@ -314,7 +315,7 @@ fn add(hasher: &mut Hasher, value: &Value) {
             number(hasher, b'r', value.map(f64::to_le_bytes));
         }
         Value::Text(Some(text)) if text.contains('\0') => {
-            add_bytes(hasher, Some(without_zeros(text.clone()).as_bytes()));
+            add_bytes(hasher, Some(replace_nul(text.clone()).as_bytes()));
         }
         Value::Text(text) => add_bytes(hasher, text.as_ref().map(String::as_bytes)),
         Value::Bytes(bytes) => add_bytes(hasher, bytes.as_deref()),
@@ -340,9 +341,9 @@ fn show(value: &Value) -> String {
 mod tests {
     use super::*;
 
-    /// What databases do not keep must not count, and everything else must.
+    /// What databases drop must not change the checksum; everything else must.
     #[test]
-    fn values_that_come_back_the_same_have_the_same_checksum() {
+    fn values_that_read_back_equal_have_equal_checksums() {
         let of = |value: Value| checksum(&[value]);
         assert_eq!(of(0.0.into()), of((-0.0).into()));
         assert_eq!(of(f64::NAN.into()), of(Value::Real(None)));
@@ -366,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn what_joins_select_are_the_columns_of_the_table() {
+    fn joins_select_the_columns_of_the_table() {
         for (table, selected) in [
             (&CANDIDATE, joined!(candidate)),
             (&DECISION, joined!(decision)),

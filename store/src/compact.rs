@@ -1,15 +1,15 @@
-//! Giving space back.
+//! Reclaiming disk space.
 
 use serde_json::json;
 
 use crate::Store;
 use crate::checksum::CheckedColumn;
-use crate::database::{Database, for_rows, query};
+use crate::database::{Database, execute_rows, query};
 use crate::error::Result;
 use crate::tables::logs::insert_operation;
 
 impl Store {
-    /// Bytes that the campaign takes, with its log in SQLite and with its indexes on a server.
+    /// Size of the campaign in bytes, with its write-ahead log in SQLite and with its indexes on a server.
     pub async fn size(&self) -> Result<u64> {
         match &self.database {
             Database::Sqlite(file) => file.size(),
@@ -17,11 +17,12 @@ impl Store {
         }
     }
 
-    /// Writes every table anew without the gaps that changed rows have left. The caller holds the
-    /// [`crate::CampaignLock`]; whoever else writes waits.
+    /// Rewrites every table without the gaps of changed rows. The caller holds the [`crate::CampaignLock`]; other
+    /// writers wait.
     ///
     /// # Errors
-    /// [`crate::StoreError::NoRoom`] where the disk cannot hold the copy that this takes; a server does not tell.
+    /// [`crate::StoreError::InsufficientSpace`] if the disk cannot hold the copy that this needs. A server does not
+    /// report its free space.
     pub async fn compact(&self) -> Result<()> {
         match &self.database {
             Database::Sqlite(file) => file.compact().await,
@@ -29,11 +30,11 @@ impl Store {
         }
     }
 
-    /// Drops the features of declined candidates, which only a replay with other rules needs. The caller holds the
-    /// [`crate::CampaignLock`]. Returns of how many.
+    /// Deletes the features of declined candidates, which only a replay with other rules needs. The caller holds
+    /// the [`crate::CampaignLock`]. Returns the number of candidates.
     pub async fn drop_declined_features(&self, now: i64) -> Result<u64> {
-        let mut transaction = self.database.begin_to_lead().await?;
-        // That of no features depends on the number of the candidate.
+        let mut transaction = self.database.begin_as_leader().await?;
+        // The checksum of missing features depends on the candidate's number.
         let with = "SELECT candidate.decision FROM candidate CROSS JOIN candidate_data
                     ON candidate_data.decision = candidate.decision
                     WHERE fate = 'declined' AND features IS NOT NULL";
@@ -43,7 +44,7 @@ impl Store {
         let sql = "UPDATE candidate SET features_checksum = new.checksum FROM {rows}
                    WHERE candidate.decision = new.decision";
         let rows = with.iter().map(checksum).collect();
-        for_rows(&mut transaction, sql, &["decision", "checksum"], rows).await?;
+        execute_rows(&mut transaction, sql, &["decision", "checksum"], rows).await?;
         let sql = "UPDATE candidate_data SET features = NULL WHERE features IS NOT NULL
                    AND decision IN (SELECT decision FROM candidate WHERE fate = 'declined')";
         let dropped = query(sql).execute(&mut transaction).await?;

@@ -1,4 +1,4 @@
-//! Structures and vectors as bytes of a column: little-endian, in a fixed order.
+//! Structures and vectors as bytes: little-endian, in a fixed order.
 
 use atoms::{Cell, Matrix3, Species, Structure, Vec3};
 use wire::ContentHash;
@@ -7,9 +7,9 @@ use crate::checksum::{Names, STRUCTURE};
 use crate::database::Row;
 use crate::error::{Result, StoreError};
 
-/// Periodicity and lattice vectors, before what counts with the atoms.
+/// Size of periodicity and lattice vectors.
 const FIXED: usize = 3 + 72;
-/// Atomic number and position.
+/// Size of atomic number and position.
 const PER_ATOM: usize = 1 + 24;
 
 /// Periodicity (3 bytes), lattice vectors, atomic numbers (1 byte each), positions.
@@ -21,14 +21,14 @@ pub fn encode_structure(structure: &Structure) -> Vec<u8> {
     bytes
 }
 
-/// The structure, checked against its hash.
+/// Decodes a structure and checks its hash.
 pub fn decode_structure(bytes: &[u8], hash: &[u8]) -> Result<Structure> {
     parse_structure(bytes)
         .filter(|structure| ContentHash::of(structure).0 == hash)
-        .ok_or_else(|| StoreError::damaged("a structure", "its content does not have its hash"))
+        .ok_or_else(|| StoreError::damaged("a structure", "its content does not match its hash"))
 }
 
-/// The structure in a row that selects `joined!(structure)`, checked against its checksum and its hash.
+/// Reads the structure of a row that selects `joined!(structure)`, and checks its checksum and hash.
 pub fn read_structure(row: &Row) -> Result<Structure> {
     STRUCTURE.verify(row, Names::Joined)?;
     let (data, hash): (Vec<u8>, Vec<u8>) = (row.get("structure__data")?, row.get("structure__hash")?);
@@ -54,7 +54,7 @@ pub fn encode_vectors(vectors: &[Vec3]) -> Vec<u8> {
     vectors.iter().flatten().flat_map(|x| x.to_le_bytes()).collect()
 }
 
-/// The vectors; `None` if the bytes are not whole vectors.
+/// Decodes vectors; `None` for a wrong length.
 pub fn decode_vectors(bytes: &[u8]) -> Option<Vec<Vec3>> {
     let (vectors, rest) = bytes.as_chunks::<24>();
     let vector = |bytes: &[u8; 24]| {
@@ -69,9 +69,9 @@ pub fn decode_matrix(bytes: &[u8]) -> Option<Matrix3> {
     decode_vectors(bytes)?.try_into().ok()
 }
 
-/// A number for a column of the database, which has signs.
+/// Converts a number for a signed database column.
 pub fn integer(what: &str, number: u64) -> Result<i64> {
-    i64::try_from(number).map_err(|_| StoreError::Inconsistent(format!("{what} {number} is absurd")))
+    i64::try_from(number).map_err(|_| StoreError::Inconsistent(format!("{what} {number} is out of range")))
 }
 
 /// A hash from a column.
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_structure_comes_back_and_damage_is_seen() {
+    fn a_structure_is_read_back_and_damage_is_detected() {
         let structure = Structure {
             species: vec!["Al".parse().unwrap(), "O".parse().unwrap()],
             positions: vec![[0.1, -0.0, 3.0], [1e300, 5e-324, -7.25]],

@@ -1,4 +1,4 @@
-//! What can go wrong with a store, and what to do about it.
+//! Errors of the store, each with what to do about it.
 
 use std::io;
 use std::path::PathBuf;
@@ -7,65 +7,65 @@ use sqlx::postgres::PgDatabaseError;
 use wire::{BlockError, WalkId};
 
 use crate::JobState;
-use crate::history::Named;
+use crate::candidate_history::CandidateRef;
 use crate::numbers::NumbersError;
 
-/// What the functions of this crate return.
+/// The result type of this crate.
 pub type Result<T> = std::result::Result<T, StoreError>;
 
-/// Why the store did not do what was asked.
+/// An error of the store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    /// Nothing there.
+    /// There is no campaign.
     #[error(
-        "there is no campaign in {location}: it has no {lacks}; name the place of a campaign, or begin one there"
+        "there is no campaign in {location}: it has no {lacks}; give the location of a campaign, or create one there"
     )]
     Missing {
-        /// The directory or server looked at.
+        /// The directory or server that was searched.
         location: String,
-        /// What would be there.
+        /// What is missing there.
         lacks: &'static str,
     },
-    /// Something there already.
-    #[error("{path} exists already: a campaign is begun in a directory without one", path = path.display())]
+    /// There is a campaign already.
+    #[error("{path} exists already: create the campaign in another directory", path = path.display())]
     Exists {
         /// The database.
         path: PathBuf,
     },
-    /// A backup must not overwrite anything.
-    #[error("{path} exists already: a backup is a new directory; name another one, or remove it", path = path.display())]
+    /// A backup never overwrites anything.
+    #[error("{path} exists already: give the backup a new directory, or remove this one", path = path.display())]
     BackupExists {
-        /// Where the backup was to be.
+        /// The target of the backup.
         path: PathBuf,
     },
-    /// Too little space to write the database anew.
+    /// Too little space to rewrite the database.
     #[error(
-        "{directory} has {} MB free, and writing the database anew takes {} MB there: make space, or let SQLITE_TMPDIR name a directory on another disk",
+        "{directory} has {} MB free, and rewriting the database needs {} MB there: free space, or set SQLITE_TMPDIR to a directory on another disk",
         found / 1_000_000,
         needed.div_ceil(1_000_000),
         directory = directory.display()
     )]
-    NoRoom {
-        /// The directory on the disk.
+    InsufficientSpace {
+        /// A directory on the disk.
         directory: PathBuf,
-        /// Bytes that are free.
+        /// Free bytes.
         found: u64,
-        /// Bytes that are needed.
+        /// Required bytes.
         needed: u64,
     },
-    /// Another campaign there already.
+    /// The schema holds another campaign.
     #[error(
-        "campaign {wanted} cannot begin in {location}, which holds campaign {found}: a schema holds one campaign; name another one with ?schema=… in the URL"
+        "cannot create campaign {wanted} in {location}, which holds campaign {found}: a schema holds one campaign; choose another schema with ?schema=… in the URL"
     )]
     Occupied {
         /// URL of the server.
         location: String,
-        /// Id of the campaign that is there.
+        /// Id of the existing campaign.
         found: String,
-        /// Id of the one that was to be begun.
+        /// Id of the new campaign.
         wanted: String,
     },
-    /// Not the URL of a server.
+    /// Not a valid URL of a server.
     #[error("'{url}' cannot be used: {reason}")]
     Url {
         /// The URL without its password.
@@ -73,12 +73,12 @@ pub enum StoreError {
         /// What is wrong with it.
         reason: String,
     },
-    /// No directory, or one where nothing may be written.
-    #[error("cannot work in the directory {directory} ({source}): it must exist, and reading and writing there must be allowed", directory = directory.display())]
+    /// The directory does not exist or is not writable.
+    #[error("cannot use the directory {directory} ({source}): it must exist and be readable and writable", directory = directory.display())]
     Directory {
         /// The directory.
         directory: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// A file of the campaign cannot be read or written.
@@ -86,16 +86,16 @@ pub enum StoreError {
     File {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The database is not the file any more that was opened.
-    #[error("{path} was deleted, moved or replaced while it was in use, and what is written now would be lost: put it back, or stop what works on it", path = path.display())]
+    /// The opened database file was deleted, moved or replaced.
+    #[error("{path} was deleted, moved or replaced while it was in use, and further changes would be lost: restore it, or stop the processes that use it", path = path.display())]
     Removed {
         /// The database.
         path: PathBuf,
     },
-    /// A directory that several hosts see.
+    /// SQLite cannot work on a network file system.
     #[error("{directory} is on a network file system ({kind}), where SQLite loses data: put the campaign on a disk of this machine", directory = directory.display())]
     NetworkFileSystem {
         /// The directory.
@@ -110,29 +110,29 @@ pub enum StoreError {
     Locked {
         /// The directory or server.
         location: String,
-        /// Who holds the lock, with its process number.
+        /// The holder of the lock, with its process id.
         holder: String,
     },
-    /// Another process runs the campaign that this one ran.
+    /// Another process took the lock while this one had lost its connection.
     #[error(
-        "the campaign in {location} was taken over by {holder} while this process had lost its connection: it writes nothing more"
+        "the campaign in {location} was taken over by {holder} while this process had lost its connection: this process stops writing"
     )]
     LockLost {
         /// The server.
         location: String,
-        /// Who holds the lock now.
+        /// The holder of the lock now.
         holder: String,
     },
-    /// Not a file of SQLite.
-    #[error("{path} is no SQLite database: it begins with '{found}' and not with 'SQLite format 3'; restore it from a copy, or begin a campaign in another directory", path = path.display())]
+    /// Not an SQLite file.
+    #[error("{path} is not an SQLite database: it begins with '{found}', expected 'SQLite format 3'; restore it from a backup, or create a campaign in another directory", path = path.display())]
     NotADatabase {
         /// The file.
         path: PathBuf,
         /// Its first bytes.
         found: String,
     },
-    /// Somebody else's database.
-    #[error("{path} is a database of another program (application id {found:#x}, this program's is {expected:#x}): name the directory of a campaign", path = path.display())]
+    /// A database of another program.
+    #[error("{path} is a database of another program (application id {found:#x}, expected {expected:#x}): give the directory of a campaign", path = path.display())]
     Foreign {
         /// The file.
         path: PathBuf,
@@ -141,9 +141,9 @@ pub enum StoreError {
         /// That of this program.
         expected: i64,
     },
-    /// Somebody else's tables.
+    /// Tables of another program.
     #[error(
-        "the schema in {location} has a table '{found}' and is not of this program: name another one with ?schema=… in the URL"
+        "the schema in {location} has a table '{found}' of another program: choose another schema with ?schema=… in the URL"
     )]
     ForeignSchema {
         /// URL of the server.
@@ -151,40 +151,38 @@ pub enum StoreError {
         /// A table in it.
         found: String,
     },
-    /// A database of another version of this program.
-    #[error("{path} has a schema of version {found}; this program reads version {reads}: use the program that wrote it, or a newer one", path = path.display())]
+    /// A database of an unsupported version.
+    #[error("{path} has schema version {found}, and this program reads up to version {reads}: use the program that wrote it, or a newer one", path = path.display())]
     Version {
         /// The file.
         path: PathBuf,
         /// Its version.
         found: i64,
-        /// The version that this program reads.
+        /// The newest version that this program reads.
         reads: i64,
     },
-    /// The tables could not be made or brought up to date.
-    #[error("the schema of the database could not be brought up to date: {0}")]
+    /// The tables could not be created or migrated.
+    #[error("cannot migrate the schema of the database: {0}")]
     Schema(sqlx::migrate::MigrateError),
-    /// A writing function of a store opened only to be read, or of a file that is protected.
-    #[error(
-        "nothing can be written: the database was opened only to be read, or its file is write-protected"
-    )]
+    /// The store was opened read-only, or its file is write-protected.
+    #[error("nothing can be written: the database was opened read-only, or its file is write-protected")]
     ReadOnly,
-    /// No space left.
+    /// The disk is full.
     #[error(
-        "the disk is full: nothing was written, and what was committed before is safe; make space and start again"
+        "the disk is full: nothing was written, and earlier commits are safe; free space and start again"
     )]
     DiskFull,
-    /// Another connection holds the database for longer than the time limit.
+    /// Another connection held the database until the timeout.
     #[error("the database is busy: another program holds it (a backup, an open transaction?); try again")]
     Busy,
     /// The server cannot be reached, or the connection to it broke.
     #[error(
-        "the database server does not answer ({0}): it may be restarting; see that it runs and can be reached, and try again"
+        "the database server does not answer ({0}): it may be restarting; check that it runs and can be reached, and try again"
     )]
     Unreachable(sqlx::Error),
-    /// The server is there, but what it says about itself or what it is told about us is not believed.
+    /// The server responds, but the authentication of either side failed.
     #[error(
-        "no protected connection to the database server ({0}): with sslmode=verify-full its certificate must have the name by which the URL calls it, and sslrootcert=FILE the authority that signed it; where the server asks for one, sslcert=FILE and sslkey=FILE are our own"
+        "no protected connection to the database server ({0}): with sslmode=verify-full its certificate must contain the host name in the URL, and sslrootcert=FILE must be the authority that signed it; if the server requires a client certificate, give sslcert=FILE and sslkey=FILE"
     )]
     Protection(sqlx::Error),
     /// Content that this program cannot have written.
@@ -192,70 +190,70 @@ pub enum StoreError {
     Damaged {
         /// What was read.
         what: String,
-        /// What is wrong with it.
+        /// The fault.
         reason: String,
     },
-    /// A commit that contradicts itself or what is stored: an error of the caller.
+    /// A commit that contradicts itself or the stored data: a programming error of the caller.
     #[error("inconsistent commit: {0}")]
     Inconsistent(String),
-    /// The candidate is there already: an error of the caller, who must look before.
-    #[error("candidate {0} was committed before")]
+    /// The candidate exists already: a programming error of the caller, who must check before.
+    #[error("candidate {0} is committed already")]
     DuplicateCandidate(String),
     /// No such job.
     #[error("no label job belongs to '{id}'; {}", neighbours(near))]
     UnknownJob {
-        /// What was asked for.
+        /// The given name.
         id: String,
-        /// Candidates whose names begin alike.
+        /// Candidates with similar names.
         near: Vec<String>,
     },
-    /// A prefix of several.
-    #[error("'{id}' could be {}: give more of it", list(matches))]
+    /// The name is a prefix of several candidates.
+    #[error("'{id}' matches {}: give a longer prefix", list(matches))]
     AmbiguousJob {
-        /// What was asked for.
+        /// The given name.
         id: String,
-        /// Some of the candidates that it could be.
+        /// Some of the matching candidates.
         matches: Vec<String>,
     },
     /// No such candidate.
-    #[error("no candidate is called '{id}'; {}", candidates(range.as_ref()))]
+    #[error("no candidate matches '{id}'; {}", candidates(range.as_ref()))]
     UnknownCandidate {
-        /// What was asked for.
+        /// The given name.
         id: String,
         /// The first and the last candidate.
-        range: Option<(Named, Named)>,
+        range: Option<(CandidateRef, CandidateRef)>,
     },
     /// No such imported structure.
     #[error(
-        "no imported structure is called '{id}'; {}",
+        "no imported structure matches '{id}'; {}",
         if *imported == 0 { "the campaign has none".into() } else { format!("they are import-1 to import-{imported}") }
     )]
     UnknownImport {
-        /// What was asked for.
+        /// The given name.
         id: String,
-        /// Number of the last one.
+        /// Number of imported structures.
         imported: u64,
     },
     /// No such walk.
     #[error(
         "the campaign has no walk {walk}; {}",
-        if *walks == 0 { "none has begun yet".into() } else { format!("they are 0 to {}", walks - 1) }
+        if *walks == 0 { "no walk has started yet".into() } else { format!("they are 0 to {}", walks - 1) }
     )]
     UnknownWalk {
-        /// What was asked for.
+        /// The given walk.
         walk: WalkId,
-        /// Walks that have begun.
+        /// Number of walks that have started.
         walks: u64,
     },
-    /// It makes no more steps.
-    #[error("walk {walk} has ended ({state}): only those that have more steps to make can be paused")]
+    /// The walk has ended.
+    #[error("walk {walk} has ended ({state}): only running walks can be paused")]
     EndedWalk {
         /// The walk.
         walk: WalkId,
         /// How it ended.
         state: String,
     },
-    /// The job is not in a state where that makes sense.
+    /// The state of the job does not permit the change.
     #[error("cannot {action} {candidate}: its label job is {state}, and only {allowed} jobs can be {past}{}", exclude_instead(action, *state), past = past(action))]
     WrongState {
         /// `drop`, `retry`, `prioritise`.
@@ -264,10 +262,10 @@ pub enum StoreError {
         candidate: String,
         /// State of its job.
         state: JobState,
-        /// The states in which it could be done.
+        /// The states that permit it.
         allowed: &'static str,
     },
-    /// A structure has no label that could be excluded, or included again.
+    /// The structure has no label to exclude or include.
     #[error("{id} has no label to exclude: {why}")]
     NoLabel {
         /// The candidate or import.
@@ -278,27 +276,27 @@ pub enum StoreError {
     /// Not a protocol of this campaign.
     #[error("the campaign has no label protocol {0}: add it first")]
     UnknownProtocol(String),
-    /// Two protocols of one name.
+    /// Another protocol has the same name.
     #[error(
         "the campaign has another label protocol '{0}' with other settings: give the new one another name"
     )]
     ProtocolName(String),
-    /// A label with impossible numbers.
+    /// A label with invalid numbers.
     #[error("not a valid label: {0}")]
     InvalidLabel(String),
-    /// Anything else that the database says.
+    /// Any other error of the database.
     #[error("database: {0}")]
     Database(sqlx::Error),
 }
 
 impl StoreError {
-    /// Whether the same call may succeed later without anyone changing the campaign: the disk is full, the database
-    /// busy, or its server away.
+    /// Whether the same call may succeed later without a change of the campaign: the disk is full, the database
+    /// busy, or its server unreachable.
     pub fn is_transient(&self) -> bool {
         matches!(self, Self::DiskFull | Self::Busy | Self::Unreachable(_))
     }
 
-    /// The database holds what it cannot hold.
+    /// An error for content that is invalid or damaged.
     pub fn damaged(what: impl ToString, reason: impl ToString) -> Self {
         Self::Damaged { what: what.to_string(), reason: reason.to_string() }
     }
@@ -321,10 +319,10 @@ impl From<sqlx::Error> for StoreError {
                 }
             }
             sqlx::Error::PoolTimedOut => Self::Busy,
-            // TLS calls what it does not believe invalid data; nothing else does.
+            // TLS reports untrusted peers as invalid data; nothing else does.
             sqlx::Error::Io(source) if source.kind() == io::ErrorKind::InvalidData => Self::Protection(error),
             sqlx::Error::Tls(_) => Self::Protection(error),
-            // SQLite has no connections that break.
+            // Only a server has connections that break.
             sqlx::Error::Io(_) => Self::Unreachable(error),
             sqlx::Error::ColumnDecode { .. } | sqlx::Error::Decode(_) => Self::damaged("a row", error),
             _ => Self::Database(error),
@@ -350,7 +348,7 @@ fn from_postgres(code: &str, error: sqlx::Error) -> StoreError {
         "40001" | "40P01" | "55P03" => StoreError::Busy,
         "25006" => StoreError::ReadOnly,
         "53100" => StoreError::DiskFull,
-        // Too many connections; it shuts down, has crashed, starts, or let the connection go.
+        // Too many connections; the server shuts down, has crashed, is starting, or closed the connection.
         "53300" | "57P01" | "57P02" | "57P03" | "57P05" => StoreError::Unreachable(error),
         code if code.starts_with("08") => StoreError::Unreachable(error),
         "XX001" | "XX002" => StoreError::damaged("the server's files", error),
@@ -375,13 +373,13 @@ fn list(names: &[String]) -> String {
 }
 
 fn neighbours(names: &[String]) -> String {
-    if names.is_empty() { "the queue is empty".into() } else { format!("near it are {}", list(names)) }
+    if names.is_empty() { "the queue is empty".into() } else { format!("similar names: {}", list(names)) }
 }
 
-fn candidates(range: Option<&(Named, Named)>) -> String {
+fn candidates(range: Option<&(CandidateRef, CandidateRef)>) -> String {
     let Some((first, last)) = range else { return "the campaign has none yet".into() };
     format!(
-        "give the number of the decision about it, {} to {} (some of these are about walks), or the beginning of its name, as \
+        "give the number of its decision, {} to {} (some of these concern walks), or a prefix of its name, such as \
          {} (the first) or {} (the last)",
         first.decision, last.decision, first.candidate, last.candidate
     )
@@ -395,10 +393,10 @@ fn past(action: &str) -> &'static str {
     }
 }
 
-/// What takes a label out of the data set that is there already.
+/// Hint for removing an existing label from the data set.
 fn exclude_instead(action: &str, state: JobState) -> &'static str {
     match (action, state) {
-        ("drop", JobState::Labelled) => "; calmwalk exclude takes its label out of the data set",
+        ("drop", JobState::Labelled) => "; use calmwalk exclude to take its label out of the data set",
         _ => "",
     }
 }

@@ -1,4 +1,4 @@
-//! Labels that were taken out of the data set by hand.
+//! Labels excluded from the data set by hand.
 
 use serde::Serialize;
 
@@ -11,16 +11,16 @@ pub struct Exclusion {
     pub reason: String,
 }
 
-/// What became of a structure that was to be excluded, or included again.
+/// The effect of excluding or including one structure.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct ExclusionChange {
     /// Name of the candidate, or `import-N`.
     pub id: String,
     /// Protocols of its labels.
     pub protocols: Vec<String>,
-    /// Whether anything is other than before.
+    /// Whether anything changed.
     pub changed: bool,
-    /// Why its labels are excluded; none if they are not.
+    /// Why its labels are excluded; `None` if they are not.
     pub excluded: Option<String>,
 }
 

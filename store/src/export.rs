@@ -1,4 +1,4 @@
-//! What an export reads: labelled structures in an order that does not depend on when labels came.
+//! Rows of an export: labelled structures in an order that does not depend on when their labels arrived.
 
 use atoms::Structure;
 use wire::{CandidateBlock, ContentHash, Origin};
@@ -14,25 +14,25 @@ pub struct ExportFilter {
     pub biased: bool,
     /// Frames of control walks.
     pub control: bool,
-    /// Structures that came with their labels.
+    /// Structures imported with their labels.
     pub imported: bool,
 }
 
-/// Place of a row in the order of exports: candidates in decision order, then imports as they came.
+/// Position of a row in an export: candidates in decision order, then imports in import order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum ExportPlace {
-    /// Number of the decision.
+pub enum ExportCursor {
+    /// Sequence number of the decision.
     Candidate(i64),
-    /// Number of the import.
+    /// Import number.
     Import(i64),
 }
 
 /// A labelled structure.
 #[derive(Clone, Debug)]
 pub struct ExportRow {
-    /// Where it stands; the next page begins after it.
-    pub place: ExportPlace,
-    /// Where it came from.
+    /// Its position; the next page starts after it.
+    pub cursor: ExportCursor,
+    /// Its origin.
     pub source: ExportSource,
     /// The structure.
     pub structure: Structure,
@@ -44,7 +44,7 @@ pub struct ExportRow {
     pub protocol: ContentHash,
 }
 
-/// Where an exported structure came from.
+/// Origin of an exported structure.
 #[derive(Clone, Debug)]
 pub enum ExportSource {
     /// A walk.
@@ -59,8 +59,7 @@ pub enum ExportSource {
         origin: Origin,
         /// Version of the mixture after the decision.
         mixture_version_after: u64,
-        /// Everything that the walker knew (walk, segment, step, the version that it saw, the potential's forces),
-        /// without features.
+        /// All data of the walker (walk, segment, step, mixture version, the potential's forces), without features.
         block: CandidateBlock,
         /// γ and γ_nbr under the original mixture.
         original: AtomGrades,

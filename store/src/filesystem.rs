@@ -1,5 +1,5 @@
-//! Where a database may live: SQLite's write-ahead log needs memory that all its processes share, so a
-//! directory that several hosts see is refused.
+//! Checks where a database may be kept. SQLite's write-ahead log needs memory shared by all its processes, so
+//! directories on network file systems are refused.
 
 use std::io;
 use std::path::Path;
@@ -8,10 +8,11 @@ use rustix::fs::Access;
 
 use crate::error::{Result, StoreError};
 
-/// Checks that `directory` exists, may be written to, is on a disk of this machine, and has a name that SQLite takes.
+/// Checks that `directory` exists, is writable, is on a local disk and has a name that SQLite accepts.
 pub fn check_directory(directory: &Path) -> Result<()> {
     if directory.to_str().is_none() {
-        let source = io::Error::new(io::ErrorKind::InvalidInput, "its name is not UTF-8, as SQLite needs it");
+        let source =
+            io::Error::new(io::ErrorKind::InvalidInput, "its name is not UTF-8, which SQLite requires");
         return Err(StoreError::Directory { directory: directory.into(), source });
     }
     let denied = |source: rustix::io::Errno| StoreError::Directory {
@@ -25,7 +26,7 @@ pub fn check_directory(directory: &Path) -> Result<()> {
     }
 }
 
-/// Bytes that this user may still write into `directory`.
+/// Free bytes in `directory` for this user.
 pub fn free_space(directory: &Path) -> Result<u64> {
     let disk = rustix::fs::statvfs(directory)
         .map_err(|error| StoreError::Directory { directory: directory.into(), source: error.into() })?;
@@ -34,7 +35,7 @@ pub fn free_space(directory: &Path) -> Result<u64> {
 
 #[cfg(target_os = "linux")]
 fn network_file_system_of(directory: &Path) -> rustix::io::Result<Option<String>> {
-    // The type of the field differs between processors; the numbers have 32 bits.
+    // The type of this field depends on the architecture; the value has 32 bits.
     let magic = rustix::fs::statfs(directory)?.f_type as u64 as u32;
     if magic != FUSE {
         return Ok(network_file_system(magic).map(str::to_owned));
@@ -49,10 +50,10 @@ fn network_file_system_of(_: &Path) -> rustix::io::Result<Option<String>> {
     Ok(None)
 }
 
-/// File systems in user space: some are of this machine, some are not; the mount table tells which.
+/// File systems in user space may be local or not; the mount table tells.
 const FUSE: u32 = 0x6573_5546;
 
-/// The name of the network file system with the magic number `magic` of statfs(2), `None` for any other.
+/// Name of the network file system with the statfs(2) magic number `magic`; `None` for any other.
 pub fn network_file_system(magic: u32) -> Option<&'static str> {
     Some(match magic {
         0x0000_6969 => "NFS",
@@ -73,7 +74,7 @@ pub fn network_file_system(magic: u32) -> Option<&'static str> {
     })
 }
 
-/// Whether a type of the mount table, such as `fuse.sshfs`, reaches other hosts.
+/// Whether a type in the mount table, such as `fuse.sshfs`, is a network file system.
 fn is_network_fuse(kind: &str) -> bool {
     const NETWORK: [&str; 14] = [
         "sshfs",
@@ -95,7 +96,7 @@ fn is_network_fuse(kind: &str) -> bool {
     NETWORK.iter().any(|name| kind.starts_with(name))
 }
 
-/// The type of the innermost mount that holds `path`, from the text of /proc/self/mountinfo (proc(5)).
+/// Type of the innermost mount that contains `path`, from the text of /proc/self/mountinfo (proc(5)).
 fn mount_type(mountinfo: &str, path: &Path) -> Option<String> {
     mountinfo
         .lines()
@@ -105,7 +106,7 @@ fn mount_type(mountinfo: &str, path: &Path) -> Option<String> {
             Some((point, after.split(' ').next()?))
         })
         .filter(|(point, _)| path.starts_with(point))
-        // The last of equals: it is mounted over the others.
+        // Of equal mount points the last one is visible.
         .max_by_key(|(point, _)| point.len())
         .map(|(_, kind)| kind.to_owned())
 }
@@ -115,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn network_file_systems_are_known_by_their_numbers() {
+    fn network_file_systems_are_recognized_by_their_magic_numbers() {
         for (magic, name) in [
             (0x6969, "NFS"),
             (0xff53_4d42, "CIFS"),
@@ -135,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mount_table_tells_file_systems_in_user_space_apart() {
+    fn the_mount_table_distinguishes_file_systems_in_user_space() {
         let table = "22 1 8:1 / / rw,relatime shared:1 - ext4 /dev/sda1 rw\n\
                      30 22 0:50 / /home/a\\040b rw shared:2 - fuse.sshfs host:/x rw\n\
                      31 22 0:51 / /mnt/usb rw - fuseblk /dev/sdb1 rw\n\

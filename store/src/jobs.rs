@@ -1,4 +1,4 @@
-//! The label queue and its labels, as they are shown.
+//! Views of the label queue and of labels.
 
 use serde::Serialize;
 
@@ -7,92 +7,92 @@ use crate::error::Result;
 use crate::exclude::Exclusion;
 use crate::records::{JobState, Label};
 
-/// The label attempt under way that began first.
+/// The running label attempt that started first.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct OldestLease {
-    /// Number of its job.
+    /// Id of its job.
     pub job: i64,
-    /// Who makes it.
+    /// The labeller that makes it.
     pub holder: String,
-    /// When it began, ms since 1970.
+    /// When it started, ms since 1970.
     pub started: i64,
 }
 
 from_columns!(OldestLease { job, holder, started });
 
-/// What became of a result that was brought.
+/// What the store did with a delivered result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Completed {
-    /// It is the label.
+pub enum CompleteOutcome {
+    /// It became the label.
     Label,
-    /// There was a label already: it is kept beside it.
+    /// There was a label already: the result is stored as a check.
     KeptAsCheck,
 }
 
-/// What became of a job whose attempt failed.
+/// What happened to a job whose attempt failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Failed {
+pub enum FailOutcome {
     /// It waits for another attempt.
     Requeued,
-    /// It has used up its attempts.
+    /// It has no attempts left.
     GivenUp,
-    /// The lease was lost before: what became of the job was decided without this attempt.
+    /// The lease had been lost before: this attempt no longer decides about the job.
     LeaseLost,
 }
 
-/// What has become of a job whose lease was lost.
+/// State of a lease that may have been lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Whereabouts {
-    /// The lease still lasts.
+pub enum LeaseStatus {
+    /// The lease is still held.
     Held,
-    /// Somebody else has leased it.
+    /// Another holder has leased the job.
     LeasedAgain {
-        /// The calculation that they wait for, if they have started or found one.
+        /// The calculation that the other holder waits for, if it has started or found one.
         calculation: Option<String>,
     },
-    /// It waits for somebody.
+    /// The job waits in the queue.
     Queued,
-    /// It has its label, was given up or dropped: nobody waits for a result.
+    /// The job is labelled, failed or dropped: its result is no longer needed.
     Over,
 }
 
-/// A calculation of an attempt, as far as the store knows it.
+/// The store's record of an attempt's calculation.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PastCalculation {
-    /// What finds it again.
+    /// Identifies the calculation.
     pub calculation: Option<String>,
-    /// It was a failure.
+    /// The calculation failed.
     pub failed: bool,
-    /// Somebody may still read what it gives.
+    /// Its result may still be read.
     pub wanted: bool,
 }
 
-/// The packed directory of a calculation.
+/// The packed work directory of a calculation.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Archive {
-    /// Number of the attempt.
+    /// Attempt number.
     pub attempt: u32,
     /// A tar file, compressed with zstd.
     pub bytes: Vec<u8>,
-    /// Files that are not in it, with their sizes, a line each.
+    /// Files left out of it, with their sizes, one per line.
     pub left_out: String,
 }
 
-/// How many of the frames of an import became what.
+/// Number of imported frames, by what became of them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Imported {
+pub struct ImportCounts {
     /// Labels.
     pub labels: usize,
-    /// Other numbers for structures that have a label: kept beside it.
+    /// Different results for structures that have a label: stored as checks.
     pub checks: usize,
-    /// The very same numbers were there.
+    /// Results that were there already, identical.
     pub known: usize,
 }
 
-/// A line of the queue.
+/// An entry of the queue.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Job {
-    /// Number of the job.
+    /// Id of the job.
     pub job: i64,
     /// Name of the candidate.
     pub candidate: String,
@@ -102,13 +102,13 @@ pub struct Job {
     pub state: JobState,
     /// Higher first.
     pub priority: i32,
-    /// Who labels it now.
+    /// The labeller that holds its lease.
     pub holder: Option<String>,
-    /// When the lease ends, ms since 1970.
+    /// When the lease expires, ms since 1970.
     pub expires: Option<i64>,
-    /// Attempts begun.
+    /// Attempts started.
     pub attempts: u32,
-    /// Those that failed since the job was last put into the queue by hand.
+    /// Attempts that failed since the job was last requeued by hand.
     pub failures: u32,
     /// Number of atoms.
     pub atoms: u32,
@@ -130,54 +130,54 @@ pub struct Job {
     pub temperature: Option<f64>,
     /// V/V₀.
     pub relative_volume: Option<f64>,
-    /// Somebody has put it into the queue by hand: guards let it pass.
+    /// The job was requeued by hand: guards let it pass.
     pub overruled: bool,
-    /// Why another label was asked for in the place of the one that there is, until it has come.
+    /// Why a new label was requested although there is one; cleared when it arrives.
     pub relabel: Option<String>,
-    /// Why its label is excluded from the data set; none if it is not.
+    /// Why its label is excluded from the data set; `None` if it is not.
     pub excluded: Option<String>,
 }
 
 /// An attempt at a job.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Attempt {
-    /// Its number, from 1.
+    /// Attempt number, from 1.
     pub attempt: u32,
-    /// Who made it.
+    /// The labeller that made it.
     pub holder: String,
-    /// What finds the calculation again (process group, number in a batch system).
+    /// Identifies the calculation (process, id in a batch system).
     pub calculation: Option<String>,
     /// When it started, ms since 1970.
     pub started: i64,
     /// When it ended.
     pub ended: Option<i64>,
-    /// `labelled`, `check`, `failed`, `expired`, `released`, `lost`, `dropped`, `overtaken`; none while it lasts.
+    /// `labelled`, `check`, `failed`, `expired`, `released`, `lost`, `dropped`, `overtaken`; `None` while it runs.
     pub outcome: Option<String>,
-    /// Class of a failure; `lost_too_often` with the loss after which the job was given up.
+    /// Failure class; `lost_too_often` for the loss after which the job failed.
     pub class: Option<String>,
-    /// Why it failed, and the end of what its program said.
+    /// Why it failed, and the end of the program's output.
     pub log: Option<String>,
-    /// What its calculation was, if it was one of another program.
+    /// Its calculation, if another program made it.
     #[serde(flatten)]
     pub made: CalculationRecord,
-    /// Core-seconds of its calculation, if that has ended. Without them the attempt counts with its own time.
+    /// Core-seconds of its calculation, once that has ended. Without them the duration of the attempt counts.
     pub core_seconds: Option<f64>,
 }
 
-/// What a calculation is, as far as it is known before it starts.
+/// What is known of a calculation before it starts.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct CalculationRecord {
-    /// Cores that it has.
+    /// Cores.
     pub cores: Option<u32>,
-    /// What was changed because of earlier failures: names separated by commas.
+    /// Adjustments made because of earlier failures: names separated by commas.
     pub remedies: Option<String>,
-    /// What that changed in its input: lines with `-` and `+`.
+    /// The changes of its input that they caused: lines with `-` and `+`.
     pub difference: Option<String>,
-    /// Atoms.
+    /// Number of atoms.
     pub atoms: Option<u32>,
-    /// Electrons that the program treats.
+    /// Number of electrons that the program treats.
     pub electrons: Option<f64>,
-    /// Points of its k-point mesh.
+    /// Number of k-points.
     pub k_points: Option<u32>,
 }
 
@@ -214,24 +214,24 @@ pub struct JobDetails {
     /// Every attempt, oldest first.
     pub attempts_made: Vec<Attempt>,
     /// Energies of its structure's labels and checks, oldest first, eV.
-    pub energies: Vec<(Standing, f64)>,
+    pub energies: Vec<(LabelStatus, f64)>,
 }
 
-/// What a stored result is.
+/// Status of a stored result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Standing {
+pub enum LabelStatus {
     /// The label.
     Label,
-    /// A further result, for comparison.
+    /// A further result, kept for comparison.
     Check,
-    /// It was the label until another came that was asked for anew.
+    /// The label until a requested new label replaced it.
     Superseded,
-    /// It would be the label, but somebody has taken it out of the data set.
+    /// Taken out of the data set by hand; otherwise it would be the label.
     Excluded,
 }
 
-impl Standing {
+impl LabelStatus {
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Label => "label",
@@ -248,14 +248,14 @@ impl Standing {
     }
 }
 
-/// Where a label came from.
+/// Origin of a label.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum LabelSource {
     /// A calculation of this campaign.
     Attempt {
-        /// Number of the job.
+        /// Id of the job.
         job: i64,
-        /// Number of the attempt.
+        /// Attempt number.
         attempt: u32,
     },
     /// A file.
@@ -270,25 +270,25 @@ pub enum LabelSource {
 /// A label with its history.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelRecord {
-    /// What it is now.
-    pub standing: Standing,
-    /// Its numbers.
+    /// Its status.
+    pub status: LabelStatus,
+    /// Energy, forces, stress and details.
     pub label: Label,
-    /// Where it came from.
+    /// Its origin.
     pub source: LabelSource,
-    /// When it came, ms since 1970.
+    /// When it was stored, ms since 1970.
     pub received: i64,
-    /// When and why another came in its place.
-    pub superseded: Option<Superseded>,
-    /// When and why it was taken out of the data set.
+    /// When and why another label replaced it.
+    pub superseded: Option<Supersession>,
+    /// When and why it was excluded from the data set.
     pub excluded: Option<Exclusion>,
 }
 
 /// How a label was superseded.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Superseded {
-    /// When the label came that is in its place, ms since 1970.
+pub struct Supersession {
+    /// When the new label was stored, ms since 1970.
     pub time: i64,
-    /// Why another was asked for.
+    /// Why it was requested.
     pub reason: String,
 }

@@ -1,15 +1,15 @@
-//! The database of a campaign: what was decided, what is queued, what was labelled.
+//! The database of a campaign: decisions, candidates, the mixture, the label queue and labels.
 //!
-//! One directory holds one campaign, or one schema of a server ([`Location`]). Whoever runs it holds the [`CampaignLock`]; anyone may open the [`Store`] beside
-//! it. Every writing function is one transaction that is on the disk when the function returns, so any process
-//! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
+//! A campaign is kept in one directory or in one schema of a server ([`Location`]). The process that runs it holds
+//! the [`CampaignLock`]; any other process may open the [`Store`] at the same time. Every writing function is one
+//! transaction that is on disk when the function returns, so any process may be killed at any time. No function
+//! reads the wall clock: `now` is in ms since 1970, see [`unix_milliseconds`].
 
 mod backup;
-mod birth;
 mod budget;
+mod candidate_history;
 mod check;
 mod checksum;
-mod collected;
 mod compact;
 mod database;
 mod encoding;
@@ -17,7 +17,6 @@ mod error;
 mod exclude;
 mod export;
 mod filesystem;
-mod history;
 mod jobs;
 mod listing;
 mod location;
@@ -25,49 +24,54 @@ mod lock;
 mod migrations;
 mod numbers;
 mod outcomes;
-mod pace;
 mod postgres;
+mod process_start;
 mod processes;
 mod recent;
 pub mod records;
 mod relabel;
+mod report;
 mod sqlite;
 mod status;
 mod store;
 mod tables;
+mod walk_progress;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-pub use birth::{is_local, is_running, process_birth};
 pub use budget::{Budget, BudgetStatus, BudgetUse};
+pub use candidate_history::{
+    CandidateRef, CoveredCandidate, ImportedStructure, LaterCoveredCandidates, SameStructure, StructureLabel,
+};
 pub use check::Finding;
-pub use collected::{Collected, FateCount};
 pub use error::{Result, StoreError};
 pub use exclude::{ExcludedLabel, Exclusion, ExclusionChange};
-pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
+pub use export::{ExportCursor, ExportFilter, ExportRow, ExportSource};
 pub use filesystem::{check_directory, free_space, network_file_system};
-pub use history::{Covered, ImportedStructure, LaterCovered, Named, SameStructure, StructureLabel};
 pub use jobs::{
-    Archive, Attempt, CalculationRecord, Completed, Failed, Imported, Job, JobDetails, LabelRecord,
-    LabelSource, OldestLease, PastCalculation, Standing, Superseded, Whereabouts,
+    Archive, Attempt, CalculationRecord, CompleteOutcome, FailOutcome, ImportCounts, Job, JobDetails,
+    LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, Supersession,
 };
-pub use listing::{ListOrder, ListPlace, ListedCandidate};
+pub use listing::{ListCursor, ListOrder, ListedCandidate};
 pub use location::{Location, ServerUrl};
 pub use lock::{CampaignLock, LOCK};
 pub use numbers::NumbersError;
 pub use outcomes::{
-    FailureCount, Finished, LabelCost, LabelledEnergies, NearLabel, Range, Unlabelled, Waiting, Work,
+    FailureCount, FinishedCandidate, LabelCost, LabelUsage, LabelledEnergies, NearDuplicate, PendingJobs,
+    Unlabelled, ValueRange,
 };
-pub use pace::Pace;
+pub use process_start::{is_local, is_running, process_start_time};
 pub use processes::{ProcessRecord, this_host};
 pub use recent::{DecidedCandidate, RecentDecision};
 pub use records::*;
-pub use relabel::{NewProtocol, Relabel, Relabellable, Requeued};
+pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
+pub use report::{CollectedStructure, FateCount};
 pub use sqlite::DATABASE;
 pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
-pub use store::{SERVER_AWAY, Store};
+pub use store::{SERVER_RECONNECT_TIMEOUT, Store};
+pub use walk_progress::WalkProgress;
 
-/// The time now, ms since 1970.
+/// The current time, ms since 1970.
 pub fn unix_milliseconds() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     i64::try_from(since.as_millis()).unwrap_or(i64::MAX)

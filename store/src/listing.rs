@@ -1,41 +1,41 @@
-//! Candidates as a table: pages of it, in an order that has an index.
+//! Pages of the candidate table, in orders that have an index.
 
 use serde::Serialize;
 
-/// By what candidates are in order. Where several have the same, by decision.
+/// The order of candidates; ties are ordered by decision.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ListOrder {
     /// As they were decided.
     Decision,
-    /// Largest γ under the original mixture. Those without a finite one are left out.
+    /// Largest γ under the original mixture. Leaves out candidates without a finite value.
     Gamma,
-    /// V/V₀. Those without one are left out.
+    /// V/V₀. Leaves out candidates without it.
     Volume,
 }
 
-/// Where a page ends: the value that it is ordered by, and the decision.
+/// The end of a page: its sort value and decision.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ListPlace {
-    /// γ or V/V₀; of any other order, anything.
+pub struct ListCursor {
+    /// γ or V/V₀; ignored for any other order.
     pub value: f64,
     /// Number of the decision.
     pub decision: i64,
 }
 
-/// A line of the table.
+/// A row of the table.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ListedCandidate {
-    /// Number of the decision about it.
+    /// Sequence number of the decision on it.
     pub decision: i64,
     /// Its name.
     pub id: String,
     /// `biased` or `control`.
     pub origin: String,
-    /// `accepted`, or why it was declined.
+    /// `accepted`, or the reason of the decline.
     pub fate: String,
     /// Number of its walk.
     pub walk: u32,
-    /// Piece of the walk between two returns to a checkpoint.
+    /// Segment of the walk (between two roll backs to a checkpoint).
     pub segment: u32,
     /// Step, equilibration included.
     pub step: u64,
@@ -57,13 +57,14 @@ pub struct ListedCandidate {
     pub gamma: Option<f64>,
     /// Largest γ_nbr under the original mixture.
     pub gamma_nbr: Option<f64>,
-    /// State of the newest label job of its structure; none if there is no job.
+    /// State of the newest label job of its structure; `None` without a job.
     pub job_state: Option<String>,
     /// Priority of that job.
     pub priority: Option<i32>,
     /// Attempts at that job.
     pub attempts: Option<u32>,
-    /// Energy of its structure's label under that job's protocol, eV; none without a label, or if it is excluded.
+    /// Energy of its structure's label under that job's protocol, eV; `None` without a label, or if the label is
+    /// excluded.
     pub energy: Option<f64>,
     /// Largest force of that label, eV/Å.
     pub max_force: Option<f64>,

@@ -1,4 +1,4 @@
-//! Where a campaign is kept: a directory of this host, or a server.
+//! Location of a campaign: a directory on this host, or a server.
 
 mod protection;
 
@@ -10,22 +10,23 @@ use sqlx::postgres::PgConnectOptions;
 
 use crate::error::{Result, StoreError};
 
-/// The schema of a database in which a campaign is kept, if the URL names none.
+/// Schema for URLs that name none.
 const SCHEMA: &str = "public";
-/// Longest name of a schema: with what is added to it, it is a name of PostgreSQL, of 63 bytes at most.
-const LONGEST_SCHEMA: usize = 50;
+/// Longest schema name: with prefixes it must fit the 63 bytes of a PostgreSQL identifier.
+const MAX_SCHEMA_LENGTH: usize = 50;
 
 /// Where a campaign is kept.
 #[derive(Clone, Debug)]
 pub enum Location {
-    /// A directory of this host, with SQLite.
+    /// A directory on this host, with SQLite.
     Directory(PathBuf),
-    /// A schema of a database on a server, with PostgreSQL.
+    /// A database schema on a server, with PostgreSQL.
     Server(ServerUrl),
 }
 
-/// `postgres://user@host:port/database?schema=name` and what libpq takes besides; user, password and so on may also
-/// come from the environment (`PGPASSWORD` and the like) and from `~/.pgpass`. It never shows its password.
+/// `postgres://user@host:port/database?schema=name`, with further libpq parameters. User, password and other
+/// settings may also come from the environment (such as `PGPASSWORD`) and from `~/.pgpass`. Neither `Display` nor
+/// `Debug` shows the password.
 #[derive(Clone)]
 pub struct ServerUrl {
     pub(crate) options: Box<PgConnectOptions>,
@@ -41,13 +42,14 @@ impl ServerUrl {
         &self.shown
     }
 
-    /// Whether a password stands in the URL itself, where it does not belong if the URL is written down.
+    /// Whether the URL itself contains a password. A URL that is written down should not.
     pub fn has_password(&self) -> bool {
         self.has_password
     }
 
-    /// What tells its campaign from others: server, port, database and schema, however the URL says them, and whoever connects.
-    pub fn place(&self) -> String {
+    /// Identifies the campaign by server, port, database and schema, independent of the form of the URL and of the
+    /// user.
+    pub fn campaign_key(&self) -> String {
         let options = &self.options;
         let host = match options.get_socket() {
             Some(directory) => directory.display().to_string(),
@@ -57,14 +59,14 @@ impl ServerUrl {
         format!("{host}:{}/{database}?schema={}", options.get_port(), self.schema)
     }
 
-    /// Whether what is said to the server crosses a network that others may read and change, since the URL says so.
+    /// Whether the connection crosses a network without protection because the URL asks for it.
     pub fn is_unprotected(&self) -> bool {
         self.is_unprotected
     }
 }
 
 impl Location {
-    /// Whether a text means a server rather than a directory.
+    /// Whether a text denotes a server rather than a directory.
     pub fn is_server(text: &str) -> bool {
         text.starts_with("postgres://") || text.starts_with("postgresql://")
     }
@@ -73,14 +75,14 @@ impl Location {
 impl FromStr for Location {
     type Err = StoreError;
 
-    /// A URL that begins with `postgres://` or `postgresql://`; anything else that is no URL is a directory.
+    /// Parses a URL that begins with `postgres://` or `postgresql://`. Any text that is no URL is a directory.
     fn from_str(text: &str) -> Result<Self> {
         let is_url = text.split_once("://").is_some_and(|(scheme, _)| is_scheme(scheme));
         if is_url { Ok(Self::Server(text.parse()?)) } else { Ok(Self::Directory(text.into())) }
     }
 }
 
-/// RFC 3986: a letter, then letters, digits, +, - and full stops.
+/// RFC 3986: a letter, then letters, digits, +, - and dots.
 fn is_scheme(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_alphabetic())
         && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.'))
@@ -90,33 +92,33 @@ impl FromStr for ServerUrl {
     type Err = StoreError;
 
     fn from_str(url: &str) -> Result<Self> {
-        let Parts { shown, plain, schema, has_password } = Parts::of(url)?;
+        let UrlParts { shown, plain, schema, has_password } = UrlParts::parse(url)?;
         if !Location::is_server(url) {
-            let reason = "it must begin with postgres:// (a campaign in a directory has no run.store, and its name no ://)";
+            let reason = "it must begin with postgres:// (a campaign in a directory needs no run.store, and the name of a directory contains no ://)";
             return Err(StoreError::Url { url: shown, reason: reason.to_owned() });
         }
         let valid = |c: char| matches!(c, 'a'..='z' | '0'..='9' | '_');
-        if schema.is_empty() || schema.len() > LONGEST_SCHEMA || !schema.chars().all(valid) {
+        if schema.is_empty() || schema.len() > MAX_SCHEMA_LENGTH || !schema.chars().all(valid) {
             let reason = format!(
-                "the schema '{schema}' must be a name of at most {LONGEST_SCHEMA} small letters, digits and underscores"
+                "the schema '{schema}' must consist of at most {MAX_SCHEMA_LENGTH} lower-case letters, digits and underscores"
             );
             return Err(StoreError::Url { url: shown, reason });
         }
         protection::check_parameters(&plain)
             .map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
-        // What its parser says may show a part of what it was given.
+        // The parser's own message may show a part of the URL.
         let options: PgConnectOptions = plain.parse().map_err(|_| StoreError::Url {
             url: shown.clone(),
             reason: "it should look like postgres://user@host:5432/database?schema=name".into(),
         })?;
         let (options, is_unprotected) =
-            protection::settle(options).map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
+            protection::resolve(options).map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
         Ok(Self { options: Box::new(options), schema, shown, has_password, is_unprotected })
     }
 }
 
 /// A URL taken apart.
-struct Parts {
+struct UrlParts {
     /// Without password.
     shown: String,
     /// Without schema.
@@ -125,13 +127,13 @@ struct Parts {
     has_password: bool,
 }
 
-impl Parts {
-    fn of(url: &str) -> Result<Self> {
+impl UrlParts {
+    fn parse(url: &str) -> Result<Self> {
         let (begin, parameters) = url.split_once('?').unwrap_or((url, ""));
         let (scheme, rest) = begin.split_once("://").unwrap_or(("", begin));
         let (mut shown, mut plain) = (String::new(), begin.to_owned());
         let mut has_password = false;
-        // A password may hold any character but '/', '?' and '#', which would end it.
+        // A password may contain any character except '/', '?' and '#', which end it.
         let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
         match authority.rsplit_once('@') {
             Some((user, host)) => {
@@ -156,7 +158,7 @@ impl Parts {
             }
         }
         if path.contains('@') {
-            let reason = "the '/' in its password must be written as %2F".to_owned();
+            let reason = "write the '/' in its password as %2F".to_owned();
             return Err(StoreError::Url { url: format!("{scheme}://…"), reason });
         }
         Ok(Self { shown, plain, schema: schema.to_owned(), has_password })
@@ -203,8 +205,8 @@ impl From<PathBuf> for Location {
 }
 
 impl From<&Self> for Location {
-    fn from(place: &Self) -> Self {
-        place.clone()
+    fn from(location: &Self) -> Self {
+        location.clone()
     }
 }
 
@@ -234,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_a_url_is_refused_without_showing_it() {
+    fn invalid_urls_are_refused_without_showing_them() {
         for url in [
             "postgres://anna:s3/cret@host/lab",
             "postgres://anna:s3cret@host:port/lab",
@@ -253,8 +255,8 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_the_same_however_it_is_written() {
-        let place = |url: &str| url.parse::<ServerUrl>().unwrap().place();
+    fn the_campaign_key_is_independent_of_the_form_of_the_url() {
+        let place = |url: &str| url.parse::<ServerUrl>().unwrap().campaign_key();
         let expected = place("postgres://anna@localhost/lab?schema=alloy");
         for same in [
             "postgresql://localhost:5432/lab?schema=alloy",
@@ -269,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_schema_it_is_the_one_that_every_database_has() {
+    fn the_default_schema_is_public() {
         let server: ServerUrl = "postgres://host/lab?host=/run/postgresql&port=5433".parse().unwrap();
         assert_eq!(server.schema, "public");
         assert_eq!(server.as_str(), "postgres://host/lab?host=/run/postgresql&port=5433");

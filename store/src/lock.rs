@@ -1,8 +1,8 @@
-//! One process runs a campaign: an advisory lock on the campaign's directory and on a file in it, or of the server. It is
-//! released when the process ends, however it ends.
+//! Only one process runs a campaign: it holds an advisory lock on the campaign's directory and on a file in it, or
+//! on the server. The lock is released when the process ends, in whatever way.
 //!
-//! The file says who holds the lock, and is all that earlier versions know. It can be deleted; the directory cannot be without
-//! the database.
+//! The file names the holder, and earlier versions lock only the file. It can be deleted; the directory cannot be
+//! deleted without the database.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Seek, Write};
@@ -13,66 +13,66 @@ use crate::error::{Result, StoreError};
 use crate::location::Location;
 use crate::postgres::leadership::Leadership;
 
-/// Name of the file that is locked, in the campaign's directory.
+/// Name of the lock file in the campaign's directory.
 pub const LOCK: &str = "campaign.lock";
 
-/// The right to run a campaign, until it is dropped.
+/// The right to run a campaign. Released on drop.
 #[derive(Debug)]
-pub struct CampaignLock(Held);
+pub struct CampaignLock(HeldLock);
 
 #[derive(Debug)]
-enum Held {
+enum HeldLock {
     Directory { _lock: DirectoryLock },
     Session(Leadership),
 }
 
-/// A directory and the file in it that are locked.
+/// A locked directory and the lock file in it.
 #[derive(Debug)]
 struct DirectoryLock {
     file: File,
-    /// None where directories cannot be locked (NFS): the file is what counts there.
+    /// `None` on file systems that cannot lock directories (NFS); there the file decides.
     directory: Option<File>,
 }
 
 impl Drop for DirectoryLock {
-    /// Closing is not enough at once: a process that is just being started has the files too, until its program begins.
+    /// Closing the files is not enough: a child that is being spawned inherits them until it executes its program.
     fn drop(&mut self) {
         for file in self.directory.iter().chain([&self.file]) {
-            // What cannot be unlocked comes free with the last who has the file.
+            // If unlocking fails, the lock is released with the last open file handle.
             let _ = file.unlock();
         }
     }
 }
 
 impl CampaignLock {
-    /// Takes the lock of the campaign in a directory (see [`Self::acquire`]) or on a server, where its tables are made
-    /// if they are not there yet.
+    /// Acquires the lock of a campaign in a directory (see [`Self::acquire`]) or on a server. Creates the tables on
+    /// the server if they do not exist.
     pub async fn acquire_at(location: impl Into<Location>, who: &str) -> Result<Self> {
         match location.into() {
             Location::Directory(directory) => Self::acquire(&directory, who),
-            Location::Server(url) => Ok(Self(Held::Session(Leadership::take(&url, who).await?))),
+            Location::Server(url) => Ok(Self(HeldLock::Session(Leadership::take(&url, who).await?))),
         }
     }
 
-    /// Waits until the lock is not held any longer, and says who has it. On a server a connection may break; it is taken
-    /// again then, if nobody else had it meanwhile. A file stays locked for as long as its process lives.
+    /// Waits until the lock is lost, and names the new holder. A broken connection to a server is restored if no
+    /// other process took the lock meanwhile. A lock on a directory lasts as long as its process.
     pub async fn lost(&self) -> StoreError {
         match &self.0 {
-            Held::Directory { .. } => std::future::pending().await,
-            Held::Session(leadership) => leadership.lost().await,
+            HeldLock::Directory { .. } => std::future::pending().await,
+            HeldLock::Session(leadership) => leadership.lost().await,
         }
     }
 
-    /// What tells the transactions of this holder from those of earlier ones.
+    /// The fencing token: it distinguishes transactions of this holder from those of earlier ones.
     pub(crate) fn generation(&self) -> Option<i64> {
         match &self.0 {
-            Held::Directory { .. } => None,
-            Held::Session(leadership) => Some(leadership.generation),
+            HeldLock::Directory { .. } => None,
+            HeldLock::Session(leadership) => Some(leadership.generation),
         }
     }
 
-    /// Takes the lock of the campaign in `directory`, or says who has it. `who` is written into the file beside
-    /// the process number, for the message that a second process gets.
+    /// Acquires the lock of the campaign in `directory`. Writes `who` and the process id into the lock file, for
+    /// the error message that a second process gets.
     pub fn acquire(directory: &Path, who: &str) -> Result<Self> {
         let path = directory.join(LOCK);
         let failed = |source: io::Error| match source.kind() {
@@ -105,7 +105,7 @@ impl CampaignLock {
         held.file.set_len(0).map_err(failed)?;
         held.file.rewind().map_err(failed)?;
         held.file.write_all(line.as_bytes()).map_err(failed)?;
-        Ok(Self(Held::Directory { _lock: held }))
+        Ok(Self(HeldLock::Directory { _lock: held }))
     }
 }
 
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_second_holder_is_told_the_process_and_the_lock_comes_free() {
+    fn a_second_holder_learns_of_the_process_and_the_lock_is_released() {
         let directory = tempfile::tempdir().unwrap();
         let lock = CampaignLock::acquire(directory.path(), "run").unwrap();
         let message = CampaignLock::acquire(directory.path(), "run").unwrap_err().to_string();
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn deleting_the_file_lets_nobody_in() {
+    fn deleting_the_file_does_not_release_the_lock() {
         let directory = tempfile::tempdir().unwrap();
         let lock = CampaignLock::acquire(directory.path(), "run").unwrap();
         fs::remove_file(directory.path().join(LOCK)).unwrap();
@@ -135,9 +135,9 @@ mod tests {
         CampaignLock::acquire(directory.path(), "again").unwrap();
     }
 
-    /// A version that only knows the file.
+    /// An earlier version, which locks only the file.
     #[test]
-    fn who_has_only_the_file_is_respected() {
+    fn a_holder_of_the_file_alone_is_respected() {
         let directory = tempfile::tempdir().unwrap();
         let file = File::create(directory.path().join(LOCK)).unwrap();
         file.lock().unwrap();

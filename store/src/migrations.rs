@@ -1,15 +1,15 @@
-//! The steps that bring a database of an earlier version up to date.
+//! Migrations of databases of earlier versions.
 //!
-//! They stand in the program, and the library looks at what a database has already had of them. Its macro that finds
-//! the files by itself would build both databases a second time, for the compiler.
+//! They are embedded in the program; sqlx records which ones a database has had. Its macro that embeds the files
+//! would compile both databases a second time for the build.
 
 use sqlx::SqlSafeStr;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 
-/// Version, name and text of a step, as its file `<version>_<name>.sql` has them.
+/// Version, name and SQL of a migration, from its file `<version>_<name>.sql`.
 pub type Step = (i64, &'static str, &'static str);
 
-/// The steps in their order.
+/// A migrator for these steps, in order.
 pub fn migrator(steps: &[Step]) -> Migrator {
     let migrations = steps.iter().map(|(version, name, text)| {
         Migration::new(*version, (*name).into(), MigrationType::Simple, text.into_sql_str(), false)
@@ -23,9 +23,9 @@ mod tests {
 
     use super::*;
 
-    /// Every file is there, as the library itself reads the folder: same versions, names and checksums.
+    /// The steps match the files as sqlx reads the folder: same versions, names and checksums.
     #[tokio::test]
-    async fn the_steps_are_the_files_of_their_folder() {
+    async fn the_migrations_match_the_files_of_their_folder() {
         for (folder, steps) in
             [("sqlite", &crate::sqlite::STEPS[..]), ("postgres", &crate::postgres::STEPS[..])]
         {

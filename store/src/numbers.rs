@@ -1,36 +1,37 @@
-//! Arrays of f64 in a column, every bit as it was.
+//! Arrays of f64 in a column, bit for bit.
 //!
-//! What is measured or computed is as good as random in all but its first bytes: compression took a tenth off features,
-//! and more time than it takes to write that tenth. So numbers are written as they are: one word with [`PLAIN`] and
-//! their count, then the numbers, little-endian. Rows of earlier versions are compressed and still read: a word with the
-//! count alone, then one zstd frame of the bytes in order of significance (all first bytes, then all second ones …).
+//! Measured or computed numbers are nearly random in all but their first bytes: compression saved a tenth of the
+//! size of features and took longer than writing that tenth. Numbers are therefore stored uncompressed: one word
+//! with [`PLAIN`] and their count, then the numbers, little-endian. Compressed rows of earlier versions can still
+//! be read: a word with the count alone, then one zstd frame of the bytes by significance (all first bytes, then
+//! all second bytes …).
 
 use std::io::{self, Read};
 
-/// Set in the first word of what is not compressed.
+/// Set in the first word of uncompressed arrays.
 const PLAIN: u64 = 1 << 63;
 const WORD: usize = size_of::<u64>();
 
-/// Why bytes are no array of numbers.
+/// Why bytes are not an array of numbers.
 #[derive(Debug, thiserror::Error)]
 pub enum NumbersError {
-    /// Shorter than the count at its begin.
-    #[error("{0} bytes, too few to hold anything")]
+    /// Shorter than the leading count.
+    #[error("{0} bytes, too few for an array")]
     Short(usize),
-    /// zstd does not accept them.
+    /// zstd rejects them.
     #[error("zstd: {0}")]
     Zstd(#[from] io::Error),
-    /// Too much or too little follows the count.
-    #[error("{found} bytes or more, where {count} numbers were announced")]
+    /// The length does not match the count.
+    #[error("{found} bytes or more, expected {count} numbers")]
     Length {
         /// Bytes that were found.
         found: usize,
-        /// Numbers that should have been.
+        /// Expected number of values.
         count: u64,
     },
 }
 
-/// The bytes of `numbers` for a column.
+/// Encodes `numbers` for a column.
 pub fn encode_numbers(numbers: &[f64]) -> Vec<u8> {
     let mut bytes = vec![0; WORD * (1 + numbers.len())];
     let (words, _) = bytes.as_chunks_mut::<WORD>();
@@ -43,7 +44,7 @@ pub fn encode_numbers(numbers: &[f64]) -> Vec<u8> {
     bytes
 }
 
-/// The numbers in the bytes of a column, of this version or an earlier one.
+/// Decodes the bytes of a column, written by this version or an earlier one.
 pub fn decode_numbers(bytes: &[u8]) -> Result<Vec<f64>, NumbersError> {
     let (first, rest) = bytes.split_first_chunk::<WORD>().ok_or(NumbersError::Short(bytes.len()))?;
     let first = u64::from_le_bytes(*first);
@@ -58,7 +59,7 @@ pub fn decode_numbers(bytes: &[u8]) -> Result<Vec<f64>, NumbersError> {
 
 fn decompress(count: u64, frame: &[u8]) -> Result<Vec<f64>, NumbersError> {
     let mut planes = Vec::new();
-    // One byte more than announced is enough to see that there are too many.
+    // One byte more than expected is enough to detect excess data.
     let limit = count.saturating_mul(8).saturating_add(1);
     zstd::stream::read::Decoder::new(frame)?.take(limit).read_to_end(&mut planes)?;
     check_length(planes.len(), count)?;
@@ -79,7 +80,7 @@ mod tests {
 
     use super::*;
 
-    /// As earlier versions wrote numbers.
+    /// Compresses numbers as earlier versions did.
     fn compress(numbers: &[f64]) -> Vec<u8> {
         let planes: Vec<u8> =
             (0..8).flat_map(|plane| numbers.iter().map(move |x| x.to_le_bytes()[plane])).collect();
@@ -92,7 +93,7 @@ mod tests {
         #![proptest_config(ProptestConfig { rng_seed: RngSeed::Fixed(8), ..ProptestConfig::default() })]
 
         #[test]
-        fn every_bit_comes_back(bits in proptest::collection::vec(any::<u64>(), 0..300)) {
+        fn every_bit_is_preserved(bits in proptest::collection::vec(any::<u64>(), 0..300)) {
             let numbers: Vec<f64> = bits.iter().map(|b| f64::from_bits(*b)).collect();
             for bytes in [encode_numbers(&numbers), compress(&numbers)] {
                 let back = decode_numbers(&bytes).unwrap();
@@ -101,7 +102,7 @@ mod tests {
         }
 
         #[test]
-        fn foreign_bytes_are_refused_not_believed(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+        fn arbitrary_bytes_are_rejected(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
             prop_assert!(decode_numbers(&bytes).is_err());
         }
     }
@@ -116,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_count_and_missing_bytes_are_seen() {
+    fn a_wrong_count_and_missing_bytes_are_detected() {
         for (bytes, found) in [(encode_numbers(&[1.0, 2.0, 3.0]), 24), (compress(&[1.0, 2.0, 3.0]), 17)] {
             let mut wrong = bytes.clone();
             wrong[0] = 2;

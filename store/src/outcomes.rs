@@ -1,4 +1,4 @@
-//! What became of label jobs, and what they took.
+//! Results and costs of label jobs.
 
 use atoms::Species;
 use serde::Serialize;
@@ -6,7 +6,7 @@ use wire::Origin;
 
 use crate::records::AtomGrades;
 
-/// What a label took that was made in this campaign.
+/// The cost of a label made in this campaign.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelCost {
     /// Index of the seed structure.
@@ -15,18 +15,18 @@ pub struct LabelCost {
     pub formula: String,
     /// Number of atoms.
     pub atoms: u32,
-    /// Electrons that were treated, if the method has any.
+    /// Electrons treated, if the method has any.
     pub electrons: Option<f64>,
-    /// Points of the k-point mesh, if the method has one.
+    /// Number of k-points, if the method has any.
     pub k_points: Option<u32>,
-    /// Core-seconds of the attempt that brought it.
+    /// Core-seconds of the successful attempt.
     pub core_seconds: f64,
 }
 
 /// Both energies of a labelled structure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledEnergies {
-    /// Numbers of atoms of its elements.
+    /// Number of atoms of each element.
     pub composition: Vec<(Species, u32)>,
     /// By the potential, eV.
     pub model: f64,
@@ -34,54 +34,54 @@ pub struct LabelledEnergies {
     pub label: f64,
 }
 
-/// Jobs of one size that have no label yet.
+/// Label jobs of one size that have no label yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Waiting {
+pub struct PendingJobs {
     /// Index of the seed structure.
     pub seed_structure: u32,
     /// Formula.
     pub formula: String,
     /// Number of atoms.
     pub atoms: u32,
-    /// How many.
+    /// Number of jobs.
     pub jobs: u64,
 }
 
-/// What label attempts have used so far, and what is at work.
+/// Resources that label attempts have used and use now.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Work {
-    /// Core-seconds of all attempts that ended, also of those that brought nothing; `None` in a database of an earlier
-    /// version, which keeps no such sum.
+pub struct LabelUsage {
+    /// Core-seconds of all attempts that ended, successful or not; `None` in a database of an earlier version,
+    /// which has no such total.
     pub core_seconds: Option<f64>,
-    /// Those of them that brought labels; `None` likewise.
+    /// Core-seconds of the successful attempts; `None` likewise.
     pub label_core_seconds: Option<f64>,
-    /// Cores of the attempts under way.
+    /// Cores of the running attempts.
     pub cores: u64,
 }
 
-/// How often a class of failure was met.
+/// How often a failure class occurred.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct FailureCount {
-    /// The class, as attempts have it.
+    /// The class, as stored with attempts.
     pub class: String,
-    /// Jobs that met it and have their labels all the same.
+    /// Jobs that met it and were labelled later.
     pub labelled: u64,
-    /// Jobs that met it and were given up, by this or another.
+    /// Jobs that met it and failed in the end, for this or another reason.
     pub given_up: u64,
-    /// Jobs that met it and are not done.
+    /// Jobs that met it and are unfinished.
     pub unfinished: u64,
 }
 
-/// Least and largest of some values; none of none.
+/// Minimum and maximum of some values; `None` without values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Range {
-    /// Least.
+pub struct ValueRange {
+    /// Minimum.
     pub low: Option<f64>,
-    /// Largest.
+    /// Maximum.
     pub high: Option<f64>,
 }
 
-/// Where labels of one seed structure and formula finally failed: this part of what was collected has no label.
+/// Failed labels of one seed structure and formula: this part of the collected structures has no label.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Unlabelled {
     /// Name of the seed structure.
@@ -90,27 +90,27 @@ pub struct Unlabelled {
     pub formula: String,
     /// Structures whose labels failed.
     pub failed: u64,
-    /// Those that have their labels.
+    /// Structures that have their label.
     pub labelled: u64,
-    /// Largest γ of the former, under the original mixture.
-    pub gamma: Range,
-    /// The same of the latter.
-    pub gamma_labelled: Range,
-    /// V/V₀ of the former.
-    pub relative_volume: Range,
-    /// The same of the latter.
-    pub relative_volume_labelled: Range,
+    /// Range of the largest γ of the failed ones, under the original mixture.
+    pub gamma: ValueRange,
+    /// The same for the labelled ones.
+    pub gamma_labelled: ValueRange,
+    /// Range of V/V₀ of the failed ones.
+    pub relative_volume: ValueRange,
+    /// The same for the labelled ones.
+    pub relative_volume_labelled: ValueRange,
 }
 
-/// A candidate whose job has come to its end. Several have one job if they are the same structure, such as the first steps
-/// of a walk and of its control.
+/// A candidate whose job is finished. Identical structures share a job, such as the first steps of a walk and of
+/// its control.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Finished {
-    /// Number of the decision about it; the next page begins after it.
+pub struct FinishedCandidate {
+    /// Sequence number of the decision on it; the next page starts after it.
     pub decision: i64,
     /// Name of the candidate.
     pub candidate: String,
-    /// Whether it has its label; if not, all attempts failed.
+    /// Whether it has a label; otherwise all attempts failed.
     pub labelled: bool,
     /// Biased or control.
     pub origin: Origin,
@@ -124,15 +124,15 @@ pub struct Finished {
     pub gamma_nbr: Option<f64>,
     /// V/V₀.
     pub relative_volume: Option<f64>,
-    /// Class of the last attempt, if its label failed.
+    /// Failure class of the last attempt, if labelling failed.
     pub class: Option<String>,
-    /// γ and γ_nbr of its atoms under the original mixture, if its label failed.
+    /// γ and γ_nbr of its atoms under the original mixture, if labelling failed.
     pub unlabelled: Option<AtomGrades>,
 }
 
-/// A labelled structure that may be almost the same as another.
+/// A labelled structure that may nearly duplicate another.
 #[derive(Clone, Debug, PartialEq)]
-pub struct NearLabel {
+pub struct NearDuplicate {
     /// Name of the candidate.
     pub candidate: String,
     /// Its features, [n × D].

@@ -1,48 +1,49 @@
-//! Processes of a campaign, as far as this one can see them.
+//! Processes of a campaign, as this process sees them.
 
 use serde::Serialize;
 
-use crate::birth::{self, process_birth};
 use crate::database::{FromRow, Row};
 use crate::error::Result;
+use crate::process_start::{self, process_start_time};
 
-/// A process of this system may be silent for so long (ms) without having lost what it holds: the whole system slept,
-/// or its clock was put right. One that hangs for longer does not keep its jobs for ever.
-const SLEEP: i64 = 24 * 3600 * 1000;
-/// A process of another host that has been silent for so long (ms) cannot be counted on. Signs of life are seconds apart.
-const SILENCE: i64 = 60 * 1000;
+/// How long a process of this system may be silent (ms) and still keep its leases: the system may have been
+/// suspended, or its clock adjusted. A process that hangs for longer loses its jobs.
+const MAX_LOCAL_SILENCE: i64 = 24 * 3600 * 1000;
+/// A process on another host counts as unresponsive after this silence (ms). Heartbeats are seconds apart.
+const UNRESPONSIVE_AFTER: i64 = 60 * 1000;
 
 /// A process that works for the campaign.
 ///
-/// What schema version 1 does not have is filled in when such a database is read.
+/// Columns that schema version 1 lacks are filled in when such a database is read.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ProcessRecord {
-    /// Its own name, never used twice and without `/`.
+    /// Unique name, never reused and without `/`.
     pub id: String,
     /// [`Self::ORCHESTRATOR`], [`Self::WALKER`], [`Self::AGENT`] or [`Self::LABELLER`].
     pub kind: String,
-    /// Which walker or labeller it is; an orchestrator has no number.
+    /// Index of the walker or labeller; `None` for an orchestrator.
     pub number: Option<u32>,
-    /// Process number on its host.
+    /// Process id on its host.
     pub pid: u32,
-    /// See [`process_birth`]; empty if unknown.
-    pub birth: String,
-    /// Name of its host, for people.
+    /// See [`process_start_time`]; empty if unknown.
+    #[serde(rename = "birth")]
+    pub start_time: String,
+    /// Host name, for display only.
     pub host: String,
     /// When it started, ms since 1970.
     pub started: i64,
-    /// When it was last heard of, ms since 1970.
+    /// Last heartbeat, ms since 1970.
     pub last_seen: i64,
-    /// What is said of it (`running`, `stopping`, `pausing`, `given up` …), see [`crate::Store::status`].
+    /// Its state (`running`, `stopping`, `pausing`, `given up` …), see [`crate::Store::status`].
     pub state: String,
-    /// How often its predecessors were replaced in this run of the campaign.
+    /// How often it was restarted in this run of the campaign.
     pub restarts: u32,
-    /// Hash of what a labeller was started with: one that was started with something else is not adopted.
+    /// Hash of the setup that a labeller was started with. A run does not adopt labellers with another setup.
     pub setup: Option<String>,
-    /// What is worth knowing besides: the last failure, messages that were dropped.
+    /// A remark for the user: the last failure, rejected messages.
     pub remark: String,
-    /// How long it has been silent, ms by the clock of the database's server. None where the database serves one host; not
-    /// written.
+    /// Time since its last heartbeat, ms by the clock of the database server. `None` for a database of one host.
+    /// Not written.
     #[serde(skip)]
     pub silence: Option<i64>,
 }
@@ -54,7 +55,7 @@ impl FromRow for ProcessRecord {
             kind: row.get("kind")?,
             number: row.get_or_default("number")?,
             pid: row.get("pid")?,
-            birth: row.get_or_default("birth")?,
+            start_time: row.get_or_default("birth")?,
             host: row.get("host")?,
             started: row.get("started")?,
             last_seen: row.get("last_seen")?,
@@ -68,16 +69,16 @@ impl FromRow for ProcessRecord {
 }
 
 impl ProcessRecord {
-    /// Kind of the process that runs a campaign.
+    /// The process that runs a campaign.
     pub const ORCHESTRATOR: &str = "orchestrator";
-    /// Kind of a process that advances walks. It ends with its orchestrator, which also writes its record.
+    /// A process that advances walks. It ends with its orchestrator, which also writes its record.
     pub const WALKER: &str = "walker";
-    /// Kind of a process that starts walkers on another host. The orchestrator writes its record.
+    /// A process that starts walkers on another host. The orchestrator writes its record.
     pub const AGENT: &str = "agent";
-    /// Kind of a process that makes labels. It outlives its orchestrator, and writes its own record.
+    /// A process that makes labels. It outlives its orchestrator and writes its own record.
     pub const LABELLER: &str = "labeller";
 
-    /// The process `pid`, as this process numbers them, `running` since `now`.
+    /// A record for the process `pid` in this process's PID namespace, `running` since `now`.
     pub fn new(kind: &str, number: Option<u32>, pid: u32, now: i64) -> Self {
         let host = this_host();
         Self {
@@ -85,7 +86,7 @@ impl ProcessRecord {
             kind: kind.to_owned(),
             number,
             pid,
-            birth: process_birth(pid).unwrap_or_default(),
+            start_time: process_start_time(pid).unwrap_or_default(),
             host,
             started: now,
             last_seen: now,
@@ -94,50 +95,51 @@ impl ProcessRecord {
         }
     }
 
-    /// Whether its number is one that this process sees: both were born since the system was last started, and in the
-    /// same container. Names of hosts change, so they count only where there is no birth (written by version 1).
+    /// Whether its process id is valid here: both processes started since the last boot of this system and in the
+    /// same container. Host names may change, so they decide only if there is no start time (schema version 1).
     pub fn is_local(&self) -> bool {
-        birth::is_local(&self.birth).unwrap_or_else(|| self.host == this_host())
+        process_start::is_local(&self.start_time).unwrap_or_else(|| self.host == this_host())
     }
 
-    /// Whether it runs no longer, as far as can be seen from here. One without a birth is taken for whatever process has
-    /// its number now. Where several hosts share the database, a birth of another boot may be one of another host, and
-    /// only a day of silence says that it is gone.
-    pub fn is_gone(&self) -> bool {
+    /// Whether the process has ended, as far as this host can tell. Without a start time, any process with the same
+    /// id counts as this one. If several hosts share the database, a start time from another boot may belong to
+    /// another host; then only a day of silence counts as the end.
+    pub fn is_dead(&self) -> bool {
         match (self.is_local(), self.silence) {
-            (true, _) => !birth::is_running(self.pid, &self.birth),
-            (false, Some(silence)) => silence >= SLEEP,
-            (false, None) => birth::is_of_another_boot(&self.birth),
+            (true, _) => !process_start::is_running(self.pid, &self.start_time),
+            (false, Some(silence)) => silence >= MAX_LOCAL_SILENCE,
+            (false, None) => process_start::is_from_another_boot(&self.start_time),
         }
     }
 
-    /// Whether nobody here can see it, and its host has not been heard of for a minute.
-    pub fn is_silent(&self) -> bool {
-        !self.is_local() && self.silence.is_some_and(|silence| silence >= SILENCE)
+    /// Whether it runs where this host cannot see it and has sent no heartbeat for a minute.
+    pub fn is_unresponsive(&self) -> bool {
+        !self.is_local() && self.silence.is_some_and(|silence| silence >= UNRESPONSIVE_AFTER)
     }
 
-    /// Whether it may be at work on something that it leased for `seconds`, although that time is over: see
+    /// Whether it may still work on something that it leased for `seconds` although the lease has expired, see
     /// [`crate::Store::lease`].
-    pub(crate) fn may_be_at_work(&self, now: i64, seconds: u32) -> bool {
-        let allowed = if self.is_local() { SLEEP } else { 1000 * i64::from(seconds) };
+    pub(crate) fn may_be_working(&self, now: i64, seconds: u32) -> bool {
+        let allowed = if self.is_local() { MAX_LOCAL_SILENCE } else { 1000 * i64::from(seconds) };
         let silence = self.silence.unwrap_or_else(|| now.saturating_sub(self.last_seen));
-        !self.is_gone() && silence < allowed
+        !self.is_dead() && silence < allowed
     }
 
-    /// Whether it runs the campaign, and is neither gone nor silent.
+    /// Whether it runs the campaign and is neither dead nor unresponsive.
     pub fn is_leading(&self) -> bool {
-        self.kind == Self::ORCHESTRATOR && !self.is_gone() && !self.is_silent()
+        self.kind == Self::ORCHESTRATOR && !self.is_dead() && !self.is_unresponsive()
     }
 
-    /// Whether it came after `other` to do the same here, and is not gone itself.
+    /// Whether it started after `other` with the same role on this host, and is alive.
     pub fn replaces(&self, other: &Self) -> bool {
         let place = |process: &Self| (process.kind.clone(), process.number, process.is_local());
-        let age = |process: &Self| (birth::order(&process.birth), process.started, process.id.clone());
+        let age =
+            |process: &Self| (process_start::ticks(&process.start_time), process.started, process.id.clone());
         let is_later = age(self) > age(other);
-        self.number.is_some() && self.is_local() && place(self) == place(other) && is_later && !self.is_gone()
+        self.number.is_some() && self.is_local() && place(self) == place(other) && is_later && !self.is_dead()
     }
 
-    /// Whether a lease of `holder` is its own: `id`, or `id/part`.
+    /// Whether `holder` names a lease of this process: `id` or `id/part`.
     pub fn is_holder(&self, holder: &str) -> bool {
         holder.split('/').next() == Some(&self.id)
     }
@@ -156,40 +158,47 @@ mod tests {
         ProcessRecord::new(kind, Some(3), std::process::id(), 10)
     }
 
-    /// The same in another container of this system.
+    /// The same process in another container of this system.
     fn elsewhere(record: &ProcessRecord) -> ProcessRecord {
         let (boot, ticks) =
-            (record.birth.split('/').next().unwrap(), record.birth.rsplit('/').next().unwrap());
-        ProcessRecord { birth: format!("{boot}/1/{ticks}"), ..record.clone() }
+            (record.start_time.split('/').next().unwrap(), record.start_time.rsplit('/').next().unwrap());
+        ProcessRecord { start_time: format!("{boot}/1/{ticks}"), ..record.clone() }
     }
 
     #[test]
-    fn what_ran_before_the_last_boot_is_gone_wherever_it_ran() {
+    fn processes_from_before_the_last_boot_are_dead() {
         let record = own(ProcessRecord::LABELLER);
-        assert!(!record.is_gone());
+        assert!(!record.is_dead());
         let elsewhere = ProcessRecord { pid: u32::MAX, ..elsewhere(&record) };
-        assert!(!elsewhere.is_local() && !elsewhere.is_gone(), "nobody can know from here");
+        assert!(!elsewhere.is_local() && !elsewhere.is_dead(), "nobody can know from here");
         let renamed = ProcessRecord { host: "another name".into(), ..record.clone() };
-        assert!(renamed.is_local() && !renamed.is_gone());
-        assert!(ProcessRecord { pid: u32::MAX, ..renamed.clone() }.is_gone());
-        assert!(ProcessRecord { birth: "another-boot/1/1".into(), ..record.clone() }.is_gone());
-        let version_1 = |record: &ProcessRecord| ProcessRecord { birth: String::new(), ..record.clone() };
-        assert!(version_1(&record).is_local() && !version_1(&record).is_gone());
+        assert!(renamed.is_local() && !renamed.is_dead());
+        assert!(ProcessRecord { pid: u32::MAX, ..renamed.clone() }.is_dead());
+        assert!(ProcessRecord { start_time: "another-boot/1/1".into(), ..record.clone() }.is_dead());
+        let version_1 =
+            |record: &ProcessRecord| ProcessRecord { start_time: String::new(), ..record.clone() };
+        assert!(version_1(&record).is_local() && !version_1(&record).is_dead());
         assert!(!version_1(&renamed).is_local());
-        let reused = ProcessRecord { birth: format!("{}0", record.birth), ..record };
-        assert!(reused.is_gone());
+        let reused = ProcessRecord { start_time: format!("{}0", record.start_time), ..record };
+        assert!(reused.is_dead());
     }
 
     #[test]
-    fn what_was_born_on_another_host_is_gone_after_a_day_of_silence() {
-        let record = ProcessRecord { birth: "another-boot/1/1".into(), ..own(ProcessRecord::ORCHESTRATOR) };
+    fn processes_on_another_host_are_dead_after_a_day_of_silence() {
+        let record =
+            ProcessRecord { start_time: "another-boot/1/1".into(), ..own(ProcessRecord::ORCHESTRATOR) };
         let silent_for = |silence| ProcessRecord { silence: Some(silence), ..record.clone() };
-        assert!(record.is_gone(), "where there is one host");
-        assert!(silent_for(SILENCE - 1).is_leading() && !silent_for(SILENCE - 1).is_silent());
-        assert!(silent_for(SILENCE).is_silent() && !silent_for(SILENCE).is_leading());
-        assert!(!silent_for(SLEEP - 1).is_gone() && silent_for(SLEEP).is_gone());
-        let here = ProcessRecord { silence: Some(SLEEP), ..own(ProcessRecord::ORCHESTRATOR) };
-        assert!(!here.is_gone() && !here.is_silent() && here.is_leading(), "it can be seen to run");
+        assert!(record.is_dead(), "where there is one host");
+        assert!(
+            silent_for(UNRESPONSIVE_AFTER - 1).is_leading()
+                && !silent_for(UNRESPONSIVE_AFTER - 1).is_unresponsive()
+        );
+        assert!(
+            silent_for(UNRESPONSIVE_AFTER).is_unresponsive() && !silent_for(UNRESPONSIVE_AFTER).is_leading()
+        );
+        assert!(!silent_for(MAX_LOCAL_SILENCE - 1).is_dead() && silent_for(MAX_LOCAL_SILENCE).is_dead());
+        let here = ProcessRecord { silence: Some(MAX_LOCAL_SILENCE), ..own(ProcessRecord::ORCHESTRATOR) };
+        assert!(!here.is_dead() && !here.is_unresponsive() && here.is_leading(), "it can be seen to run");
     }
 
     #[test]
@@ -197,10 +206,10 @@ mod tests {
         let first = own(ProcessRecord::LABELLER);
         let second = ProcessRecord { id: "later".into(), started: 11, ..first.clone() };
         assert!(second.replaces(&first) && !first.replaces(&second) && !first.replaces(&first));
-        // The clock was put back in between.
-        let (place, ticks) = first.birth.rsplit_once('/').unwrap();
+        // The clock was set back in between.
+        let (place, ticks) = first.start_time.rsplit_once('/').unwrap();
         let earlier = format!("{place}/{}", ticks.parse::<u64>().unwrap() - 1);
-        let earlier = ProcessRecord { birth: earlier, started: 3_600_000, ..first.clone() };
+        let earlier = ProcessRecord { start_time: earlier, started: 3_600_000, ..first.clone() };
         assert!(!earlier.replaces(&first));
         let gone = ProcessRecord { pid: u32::MAX, ..second.clone() };
         assert!(!gone.replaces(&first), "the first one is needed again");

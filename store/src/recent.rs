@@ -1,8 +1,8 @@
-//! Decisions in short.
+//! Summaries of recent decisions.
 
 use wire::Origin;
 
-/// A decision as those who watch see it.
+/// A summary of a decision.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RecentDecision {
     /// Its number.
@@ -13,20 +13,20 @@ pub struct RecentDecision {
     pub walk: Option<u32>,
     /// Version of the mixture after it.
     pub mixture_version: u64,
-    /// What it says, if it is about no candidate; null otherwise.
+    /// Its details, if it concerns no candidate; null otherwise.
     pub detail: serde_json::Value,
     /// The candidate, if it is about one.
     pub candidate: Option<DecidedCandidate>,
 }
 
-/// A candidate that was decided about.
+/// The candidate of a decision.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DecidedCandidate {
     /// Its name.
     pub candidate: String,
     /// Biased or control.
     pub origin: Origin,
-    /// Why it was declined; none if it was not.
+    /// Why it was declined; `None` if it was not.
     pub reason: Option<String>,
     /// Step of its walk, equilibration included.
     pub step: u64,

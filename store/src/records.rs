@@ -1,4 +1,4 @@
-//! What goes into the store and comes out of it.
+//! Records that are written to the store and read from it.
 
 use std::fmt;
 
@@ -8,27 +8,28 @@ use serde::{Deserialize, Serialize};
 use wire::messages::{Decline, Progress};
 use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
-/// What a campaign is, as written when it is begun.
+/// Properties of a campaign, written when it is created.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Campaign {
     /// Its id.
     pub id: CampaignId,
-    /// Version of the program that began it.
+    /// Version of the program that created it.
     pub program_version: String,
     /// `reproducible` or `live`.
     pub mode: String,
-    /// The text of the configuration with which it was begun.
+    /// The text of the configuration with which it was created.
     pub configuration: String,
-    /// The same with every default filled in, JSON.
+    /// The same configuration with every default filled in, JSON.
     pub resolved_configuration: String,
-    /// The configuration by which it runs now: it may differ in what does not change the campaign.
+    /// The configuration now in force. It may differ from the original one in settings that do not change the
+    /// campaign.
     pub configuration_in_force: String,
 }
 
-/// Where walks start.
+/// A structure where walks start.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SeedStructure {
-    /// Its number in the campaign, from 0.
+    /// Its index in the campaign, from 0.
     pub index: u32,
     /// Its name.
     pub name: String,
@@ -47,17 +48,17 @@ pub struct AtomGrades {
     pub gamma_nbr: Vec<f64>,
 }
 
-/// What became of a candidate.
+/// The decision on a candidate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fate {
     /// In the data set, with a label job.
     Accepted,
-    /// Not taken.
+    /// Not in the data set.
     Declined(Decline),
 }
 
 impl Fate {
-    /// `accepted`, or why not.
+    /// `accepted`, or the reason of the decline.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Accepted => "accepted",
@@ -66,7 +67,7 @@ impl Fate {
     }
 }
 
-/// A candidate with what the selector found. The walker's own grades are in the block.
+/// A candidate with the selector's grades. The walker's own grades are in the block.
 #[derive(Clone, Debug)]
 pub struct CandidateRecord {
     /// The block as the walker sent it.
@@ -79,16 +80,16 @@ pub struct CandidateRecord {
     pub selector: AtomGrades,
     /// Under the original mixture.
     pub original: AtomGrades,
-    /// Whether the feature vectors are to be kept (declined ones have a byte budget).
+    /// Whether to store the feature vectors (those of declined candidates have a byte budget).
     pub keep_features: bool,
     /// Priority of the label job, if accepted: higher first.
     pub priority: i32,
 }
 
-/// A candidate as it comes out of the store again.
+/// A candidate as read from the store.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredCandidate {
-    /// Number of the decision about it.
+    /// Sequence number of the decision on it.
     pub decision: i64,
     /// The block without features.
     pub block: CandidateBlock,
@@ -100,33 +101,33 @@ pub struct StoredCandidate {
     pub selector: AtomGrades,
     /// Under the original mixture.
     pub original: AtomGrades,
-    /// Features, [n × D], if they were kept.
+    /// Features, [n × D], if they were stored.
     pub features: Option<Vec<f64>>,
 }
 
-/// One entry of the decision log. Holds nothing that differs between two runs of the same campaign: no time, no
-/// process, no host.
+/// An entry of the decision log. It holds nothing that differs between two runs of the same campaign: no time,
+/// process or host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decision {
     /// Round (reproducible mode) or 0.
     pub round: u64,
-    /// `accepted`, `declined`, `control`, `segment` (a return to a checkpoint), `ended`, `begun`, `resumed`, `imported`,
-    /// `configuration`.
+    /// `accepted`, `declined`, `control`, `segment` (a roll back to a checkpoint), `ended`, `begun`, `resumed`,
+    /// `imported`, `configuration`.
     pub kind: &'static str,
-    /// The walk, if it is about one.
+    /// The walk, if the decision concerns one.
     pub walk: Option<WalkId>,
-    /// The candidate, if it is about one.
+    /// The candidate, if the decision concerns one.
     pub candidate: Option<CandidateId>,
-    /// Version of the mixture after it.
+    /// Version of the mixture after the decision.
     pub mixture_version: u64,
-    /// The numbers behind it, a JSON object with keys in a fixed order.
+    /// The numbers on which it rests, a JSON object with keys in a fixed order.
     pub detail: serde_json::Value,
 }
 
-/// A line of the decision log, as stored.
+/// An entry of the decision log, as stored.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LoggedDecision {
-    /// Its number, from 1, without gaps.
+    /// Sequence number, from 1, without gaps.
     pub sequence: i64,
     /// See [`Decision`].
     pub round: u64,
@@ -142,7 +143,7 @@ pub struct LoggedDecision {
     pub detail: serde_json::Value,
 }
 
-/// A line of the operations log.
+/// An entry of the operations log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Operation {
     /// Its number.
@@ -151,7 +152,7 @@ pub struct Operation {
     pub time: i64,
     /// What happened.
     pub kind: String,
-    /// More of it, a JSON object.
+    /// Details, a JSON object.
     pub detail: serde_json::Value,
 }
 
@@ -169,15 +170,15 @@ pub struct ComponentRecord {
 /// The mixture after a decision.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NewestMixture {
-    /// Number of the decision, 0 before the first.
+    /// Sequence number of the decision, 0 before the first.
     pub decision: i64,
     /// Version of the mixture after it.
     pub version: u64,
-    /// The components that ever changed (since the mixture last began anew), by element and slot.
+    /// Every component that has changed since the mixture was last restarted, by element and slot.
     pub components: Vec<ComponentRecord>,
 }
 
-/// How a walk stands, as the store keeps it.
+/// The state of a walk.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WalkRecord {
     /// The walk.
@@ -190,47 +191,47 @@ pub struct WalkRecord {
     pub seed_structure: u32,
     /// `waiting`, `running`, or the name of its [`wire::messages::End`].
     pub state: String,
-    /// Why it ended, in words; empty while it runs.
+    /// Why it ended, as text; empty while it runs.
     pub reason: String,
-    /// Turns done.
+    /// Assignments done.
     pub turn: u64,
     /// Structures accepted from it.
     pub accepted: u32,
-    /// Where it stands.
+    /// Its progress.
     pub progress: Progress,
-    /// The selector's own memory of the walk (verdict still to be delivered, wanted steps …), JSON.
+    /// The selector's own state of the walk (undelivered decision, requested steps …), JSON.
     pub selector_state: String,
-    /// The walker's checkpoint; `None` before the first turn.
+    /// The walker's checkpoint; `None` before the first assignment.
     pub checkpoint: Option<Vec<u8>>,
 }
 
-/// What is committed in one transaction, and only then answered.
+/// Everything that one transaction commits before the walkers get their replies.
 #[derive(Clone, Debug, Default)]
 pub struct Commit {
     /// In decision order.
     pub decisions: Vec<Decision>,
-    /// Candidates that the decisions are about, in the same order.
+    /// The candidates that the decisions concern, in the same order.
     pub candidates: Vec<CandidateRecord>,
     /// Components that changed, newest last.
     pub components: Vec<ComponentRecord>,
-    /// The whole mixture begins anew (update protocol "restarted"): stored components are dropped first.
+    /// Restart the whole mixture (update protocol "restarted"): stored components are deleted first.
     pub restart_mixture: bool,
-    /// Walks that moved.
+    /// Walks whose state changed.
     pub walks: Vec<WalkRecord>,
-    /// Small named values of the selector (round, mixture version, byte budget used …).
+    /// Small named values of the selector (round, mixture version, used byte budget …).
     pub values: Vec<(String, String)>,
 }
 
-/// A label: what a reference calculation gives for a structure.
+/// A label: the result of a reference calculation for a structure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Label {
-    /// Energy, eV (the free energy where there is smearing).
+    /// Energy, eV (the free energy if the calculation uses smearing).
     pub energy: f64,
     /// Forces, [n], eV/Å.
     pub forces: Vec<Vec3>,
-    /// Stress, eV/Å³, tension positive; none for a cluster or where the source gives none.
+    /// Stress, eV/Å³, tension positive; `None` for a cluster or if the source gives none.
     pub stress: Option<Matrix3>,
-    /// What else the calculation says.
+    /// Further results of the calculation.
     pub details: LabelDetails,
 }
 
@@ -241,11 +242,11 @@ impl Label {
     }
 }
 
-/// What is known of a label besides its numbers.
+/// Results of a label besides energy, forces and stress.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct LabelDetails {
-    /// The energy extrapolated to no smearing, eV.
+    /// The energy extrapolated to zero smearing, eV.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy_without_smearing: Option<f64>,
     /// Magnetic moment of each atom, [n], μ_B.
@@ -254,7 +255,7 @@ pub struct LabelDetails {
     /// Magnetic moment of the cell, μ_B.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub magnetisation: Option<f64>,
-    /// Electronic steps that it took.
+    /// Number of electronic (SCF) steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub electronic_steps: Option<u32>,
 }
@@ -266,36 +267,36 @@ pub struct Protocol {
     pub hash: ContentHash,
     /// Short name, unique in a campaign.
     pub name: String,
-    /// The settings, for people (JSON).
+    /// The settings in readable form (JSON).
     pub settings: serde_json::Value,
 }
 
 /// A leased label job.
 #[derive(Clone, Debug)]
 pub struct Lease {
-    /// Number of the job.
+    /// Id of the job.
     pub job: i64,
     /// Number of this attempt, from 1.
     pub attempt: u32,
-    /// Whose lease it is.
+    /// The holder of the lease.
     pub holder: String,
-    /// The protocol by which to label.
+    /// The protocol to label with.
     pub protocol: ContentHash,
-    /// What the last attempts said of their own calculations ([`crate::Store::record_calculation`]), newest first, as far
-    /// back as they ended without a result: look there before starting another.
+    /// Calculations that earlier attempts recorded ([`crate::Store::record_calculation`]), newest first, back to
+    /// the last attempt that ended with a result. Look for them before starting another calculation.
     pub earlier_calculations: Vec<String>,
-    /// Classes of the attempts that failed since the job was last put into the queue by hand, and of those that were lost
-    /// with a class, oldest first.
+    /// Failure classes of the attempts that failed since the job was last requeued by hand, and of lost attempts
+    /// that have a class, oldest first.
     pub failures: Vec<String>,
-    /// What the attempts that failed said of their own calculations, in the end.
+    /// The last records of the calculations of failed attempts.
     pub failed_calculations: Vec<String>,
-    /// Somebody has put the job into the queue by hand: guards let it pass.
+    /// The job was requeued by hand: guards let it pass.
     pub overruled: bool,
     /// The structure to label.
     pub structure: Structure,
-    /// Its candidate's name.
+    /// Name of its candidate.
     pub candidate: String,
-    /// Its energy by the potential, eV, if that is a finite number.
+    /// Its energy by the potential, eV, if it is finite.
     pub model_energy: Option<f64>,
 }
 
@@ -303,17 +304,17 @@ pub struct Lease {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum JobState {
-    /// Waits for a labeller.
+    /// Waiting for a labeller.
     Queued,
-    /// A labeller holds it.
+    /// Held by a labeller.
     Leased,
-    /// Done.
+    /// Its label is there.
     Labelled,
-    /// Given up after the allowed attempts.
+    /// Failed in all allowed attempts.
     Failed,
-    /// Taken out by hand.
+    /// Removed by hand.
     Dropped,
-    /// A job of another protocol is in its place.
+    /// Replaced by a job of another protocol.
     Superseded,
 }
 
@@ -334,7 +335,7 @@ impl JobState {
         }
     }
 
-    /// The state of that name.
+    /// The state with this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|state| state.name() == name)
     }

@@ -1,20 +1,20 @@
-//! Labels that are made anew.
+//! Requests to make labels again.
 
 use serde_json::Value;
 use wire::ContentHash;
 
 use crate::records::{JobState, Protocol};
 
-/// A structure that has its label, and may get another.
+/// A structure with a label that may get another one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Relabellable {
     /// Its hash.
     pub content: ContentHash,
-    /// Number of the decision about its candidate.
+    /// Sequence number of the decision on its candidate.
     pub decision: i64,
     /// Name of the protocol of its label.
     pub protocol: String,
-    /// State of its job by the protocol for which was asked, if it has one.
+    /// State of its job under the requested protocol, if it has one.
     pub job: Option<JobState>,
     /// Index of the seed structure.
     pub seed_structure: u32,
@@ -26,35 +26,35 @@ pub struct Relabellable {
 
 /// What is to be labelled again.
 #[derive(Clone, Debug)]
-pub struct Relabel<'a> {
+pub struct RelabelRequest<'a> {
     /// Which structures.
     pub structures: &'a [ContentHash],
-    /// Also those that have their label by the protocol in force.
+    /// Also structures whose label was made under the protocol in force.
     pub again: bool,
-    /// Why, for those who look at the labels later.
+    /// The reason, stored with the superseded labels.
     pub reason: &'a str,
-    /// A protocol that is to be in force from now on.
+    /// A new protocol to bring into force.
     pub protocol: Option<NewProtocol<'a>>,
 }
 
-/// A protocol that takes the place of the one in force, and what goes with it.
+/// A new protocol, with the changes that come with it.
 #[derive(Clone, Debug)]
 pub struct NewProtocol<'a> {
     /// The protocol.
     pub protocol: &'a Protocol,
-    /// The configuration by which the campaign runs from now on, JSON.
+    /// The configuration from now on, JSON.
     pub configuration: &'a str,
-    /// What makes it another, JSON objects for the operations log.
+    /// The changed settings, as JSON objects for the operations log.
     pub changes: &'a [Value],
-    /// What the leader leaves for others ([`crate::Store::leave_note`]): names and texts.
+    /// Metadata of the campaign to set with it ([`crate::Store::set_metadata`]): names and values.
     pub notes: &'a [(&'a str, String)],
 }
 
-/// What came of it.
+/// The effect of a request.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Requeued {
-    /// Structures that are labelled again.
+pub struct RelabelCounts {
+    /// Structures to be labelled again.
     pub again: u64,
-    /// Structures without a label that went over to another protocol.
+    /// Structures without a label whose jobs moved to the new protocol.
     pub moved: u64,
 }

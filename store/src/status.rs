@@ -1,4 +1,4 @@
-//! The state of a campaign at a glance, for people and as JSON.
+//! A summary of the campaign's state, for display and as JSON.
 
 use serde::Serialize;
 
@@ -16,34 +16,34 @@ pub struct Status {
     pub candidates: Candidates,
     /// The label queue.
     pub labels: Labels,
-    /// The label attempt under way that began first.
+    /// The running label attempt that started first.
     pub oldest_lease: Option<OldestLease>,
     /// Labels made within the last hour.
     pub labels_last_hour: u64,
-    /// Structures that came with their labels.
+    /// Structures imported with their labels.
     pub imported: u64,
-    /// Whether a process runs the campaign, as far as can be seen from here.
+    /// Whether a process runs the campaign, as far as this host can tell.
     pub led: bool,
     /// Version of the mixture.
     pub mixture_version: u64,
     /// Round (reproducible mode) or 0.
     pub round: u64,
-    /// Steps that all walks together make a second; none if that was not heard of within the last minute.
+    /// Steps per second of all walks together; `None` without a report in the last minute.
     pub steps_per_second: Option<f64>,
     /// Every walk, in order.
     pub walks: Vec<WalkStatus>,
-    /// Processes that said that they work for the campaign.
+    /// Processes registered for the campaign.
     pub processes: Vec<ProcessRecord>,
-    /// Limits, what was used of them, and which of them ended the campaign.
+    /// Limits, use, and the limit that ended the campaign.
     pub budget: BudgetStatus,
-    /// Every walk is over, or stopped by a limit of time, and no label is under way or will be begun.
+    /// Every walk is over or stopped by a time limit, no label is in progress and none will be started.
     pub finished: bool,
 }
 
-/// Numbers of candidates.
+/// Candidate counts.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Candidates {
-    /// Those of biased walks that reached the selector.
+    /// Candidates of biased walks that reached the selector.
     pub seen: u64,
     /// Of them, in the data set.
     pub accepted: u64,
@@ -51,11 +51,11 @@ pub struct Candidates {
     pub declined: Declined,
     /// Frames of control walks.
     pub control: u64,
-    /// Structures that walkers' own guards refused.
+    /// Structures refused by the walkers' guards.
     pub refused_by_walkers: u64,
 }
 
-/// Numbers of declined candidates by reason.
+/// Number of declined candidates, by reason.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Declined {
     /// The newest mixture covered them.
@@ -66,11 +66,11 @@ pub struct Declined {
     pub guard: u64,
     /// As many as there may be.
     pub budget: u64,
-    /// New, but not so new as it had to be while so many waited for labels.
+    /// Below the raised threshold that holds while the label queue is long.
     pub backlog: u64,
 }
 
-/// Numbers of label jobs by state.
+/// Number of label jobs, by state.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Labels {
     /// Waiting.
@@ -81,17 +81,17 @@ pub struct Labels {
     pub labelled: u64,
     /// Given up.
     pub failed: u64,
-    /// Taken out by hand.
+    /// Removed by hand.
     pub dropped: u64,
-    /// Of an earlier protocol: a job of a later one has taken their place.
+    /// Of an earlier protocol: a job of a later protocol replaces them.
     pub superseded: u64,
-    /// Of those that wait or are in work: there is a label, which stays until the new one has come.
+    /// Queued or leased jobs whose structure has a label, which stays until the new one arrives.
     pub again: u64,
-    /// Labels that were to be made again and could not be: those that there are stay.
+    /// Labels that could not be made again: the existing labels stay.
     pub again_in_vain: u64,
-    /// Of them, those that were to be made by another protocol: their jobs count as failed.
+    /// Of these, labels to be made under another protocol: their jobs count as failed.
     pub failed_again: u64,
-    /// Labels that were taken out of the data set by hand; the jobs of those that were made here count as labelled.
+    /// Labels excluded from the data set by hand. Their jobs in this campaign count as labelled.
     pub excluded: u64,
 }
 
@@ -104,11 +104,11 @@ pub struct WalkStatus {
     pub seed_structure: String,
     /// `biased` or `control`.
     pub origin: String,
-    /// `waiting`, `running`, or how it ended.
+    /// `waiting`, `running`, or the reason why it ended.
     pub state: String,
-    /// Why it ended, in words.
+    /// Why it ended, as text.
     pub reason: String,
-    /// Somebody has paused it: it gets no turn until it is resumed.
+    /// Paused by hand: it gets no assignments until it is resumed.
     pub paused: bool,
     /// Step.
     pub step: u64,
@@ -122,8 +122,8 @@ pub struct WalkStatus {
     pub relative_volume: Option<f64>,
     /// Largest γ of the last graded step.
     pub gamma_max: Option<f64>,
-    /// Steps per second, with the time between its turns; none if it was not heard of within the last minute, is paused, or nobody leads the
-    /// campaign.
+    /// Steps per second, including the time between assignments; `None` without a report in the last minute, while
+    /// it is paused or while nothing runs the campaign.
     pub steps_per_second: Option<f64>,
     /// Structures accepted.
     pub accepted: u32,
@@ -135,7 +135,7 @@ pub struct WalkStatus {
 
 impl WalkStatus {
     /// Whether it has more steps to make.
-    pub fn is_under_way(&self) -> bool {
+    pub fn is_active(&self) -> bool {
         matches!(self.state.as_str(), "waiting" | "running")
     }
 }

@@ -1,4 +1,4 @@
-//! Beginning a campaign, and opening one.
+//! Creating and opening a campaign.
 
 use std::time::Duration;
 
@@ -11,9 +11,9 @@ use crate::records::{Campaign, SeedStructure};
 use crate::sqlite::DatabaseFile;
 use crate::tables::protocols;
 
-/// How long a server that is away is waited for by those who run a campaign, and by every commit. Whoever waits has nothing
-/// else to do; a campaign that failed goes on from here just as well, but somebody has to start it.
-pub const SERVER_AWAY: Duration = Duration::from_secs(3600);
+/// How long a run and every commit wait for a server that cannot be reached. A run has nothing else to do
+/// meanwhile; a run that gives up continues later from the same state, but somebody has to start it.
+pub const SERVER_RECONNECT_TIMEOUT: Duration = Duration::from_secs(3600);
 
 /// The database of one campaign. Clones share its connections.
 #[derive(Clone, Debug)]
@@ -22,16 +22,17 @@ pub struct Store {
 }
 
 impl Store {
-    /// Begins a campaign in a directory, which must exist, or on a server. The caller holds its
-    /// [`crate::CampaignLock`]. Either the whole campaign is there afterwards, or none.
+    /// Creates a campaign on a server or in an existing directory. The caller holds its [`crate::CampaignLock`].
+    /// The campaign is created as a whole or not at all.
     pub async fn create(
         location: impl Into<Location>,
         campaign: &Campaign,
-        seeds: &[SeedStructure],
+        seed_structures: &[SeedStructure],
         now: i64,
     ) -> Result<Self> {
-        let fill =
-            async |database: &Database| protocols::write_campaign(database, campaign, seeds, now).await;
+        let fill = async |database: &Database| {
+            protocols::write_campaign(database, campaign, seed_structures, now).await
+        };
         let database = match location.into() {
             Location::Directory(directory) => Database::Sqlite(DatabaseFile::create(&directory, fill).await?),
             Location::Server(url) => {
@@ -43,7 +44,7 @@ impl Store {
         Ok(Self { database })
     }
 
-    /// Opens a campaign, and brings its tables up to date.
+    /// Opens a campaign and migrates its tables to the newest version.
     pub async fn open(location: impl Into<Location>) -> Result<Self> {
         let database = match location.into() {
             Location::Directory(directory) => Database::Sqlite(DatabaseFile::open(&directory).await?),
@@ -52,8 +53,8 @@ impl Store {
         Ok(Self { database })
     }
 
-    /// Opens a campaign to look at it, also where nothing may be written. Tables of an earlier version stay as they
-    /// are: what they lack is filled in where they are read.
+    /// Opens a campaign for reading, also where nothing may be written. Tables of an earlier version are not
+    /// migrated: reading functions fill in what they lack.
     pub async fn open_read_only(location: impl Into<Location>) -> Result<Self> {
         let database = match location.into() {
             Location::Directory(directory) => {
@@ -64,36 +65,36 @@ impl Store {
         Ok(Self { database })
     }
 
-    /// The same store for whoever holds `lock`: on a server, what leads the campaign ([`Self::commit`],
-    /// [`Self::take_over`], its configuration, protocols and seed structures) fails from the moment on at which another
-    /// process has the lock. On this host the system sees to it that there is no other.
-    pub fn led_by(mut self, lock: &CampaignLock) -> Self {
+    /// Ties this store to `lock`. On a server, everything that leads the campaign ([`Self::commit`],
+    /// [`Self::reclaim_leases`], changes to its configuration, protocols and seed structures) fails as soon as
+    /// another process takes the lock. For a directory the operating system guarantees a single holder.
+    pub fn fenced_by(mut self, lock: &CampaignLock) -> Self {
         if let Database::Postgres(server) = &mut self.database {
             server.generation = lock.generation();
         }
         self
     }
 
-    /// The same store, which waits for a server that is away for so long, and not some seconds, before it says so. What
-    /// breaks in the middle of a transaction fails at once in any case, but for [`Self::commit`].
-    pub fn patient(mut self, patience: Duration) -> Self {
+    /// Sets how long to wait for a server that cannot be reached before a call fails (default: some seconds). An
+    /// operation interrupted inside a transaction fails at once in any case, except [`Self::commit`].
+    pub fn with_reconnect_timeout(mut self, timeout: Duration) -> Self {
         if let Database::Postgres(server) = &mut self.database {
-            server.patience = patience;
+            server.reconnect_timeout = timeout;
         }
         self
     }
 
-    /// The same store, whose leases go by the times that callers give also on a server: to tell it what time it is.
+    /// Makes leases on a server use the times that callers pass, so that tests can set the clock.
     #[doc(hidden)]
-    pub fn by_the_callers_clock(mut self) -> Self {
+    pub fn with_caller_clock(mut self) -> Self {
         if let Database::Postgres(server) = &mut self.database {
             server.clock = Clock::Caller;
         }
         self
     }
 
-    /// Waits until there may be new label jobs, or for `longest`. A server tells when there are; that may be lost like
-    /// any message, so the queue is to be looked at in any case. In a file nobody tells.
+    /// Waits until there may be new label jobs, but no longer than `longest`. A server sends notifications, which
+    /// may be lost: poll the queue afterwards in any case. SQLite sends none.
     pub async fn wait_for_jobs(&self, longest: Duration) {
         match &self.database {
             Database::Sqlite(_) => tokio::time::sleep(longest).await,
@@ -101,12 +102,12 @@ impl Store {
         }
     }
 
-    /// Whether [`Self::wait_for_jobs`] is told of jobs.
-    pub fn tells_of_jobs(&self) -> bool {
+    /// Whether the database notifies [`Self::wait_for_jobs`] of new jobs.
+    pub fn has_job_notifications(&self) -> bool {
         matches!(self.database, Database::Postgres(_))
     }
 
-    /// Closes every connection. What was committed is safe without it.
+    /// Closes every connection. Committed data is safe without this call.
     pub async fn close(&self) {
         self.database.close().await;
     }

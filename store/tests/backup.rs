@@ -1,4 +1,4 @@
-//! Copies of campaigns, made while they go on.
+//! Backups of running campaigns.
 
 use std::fs;
 use std::path::Path;
@@ -44,7 +44,7 @@ async fn back_up(store: &Store, target: &Path) -> Result<(), StoreError> {
 }
 
 #[tokio::test]
-async fn a_backup_is_a_campaign_of_its_own() {
+async fn a_backup_is_an_independent_campaign() {
     let (home, elsewhere) = (Home::new(), tempfile::tempdir().unwrap());
     let store = home.create().await;
     for k in 1..=200 {
@@ -64,7 +64,7 @@ async fn a_backup_is_a_campaign_of_its_own() {
     assert_eq!(copy.seed_structures().await.unwrap(), store.seed_structures().await.unwrap());
     assert_eq!(copy.candidate_ids(0, 500).await.unwrap().len(), 400);
     assert_eq!(copy.check(|_, _| ()).await.unwrap(), []);
-    // Who works for the original is left alone.
+    // The original's processes stay registered.
     assert_eq!(copy.processes(None).await.unwrap(), []);
     assert_eq!(store.processes(None).await.unwrap().len(), 1);
     let job = copy.queue_show(&leased.candidate).await.unwrap();
@@ -74,7 +74,7 @@ async fn a_backup_is_a_campaign_of_its_own() {
     );
     assert_eq!(store.queue_show(&leased.candidate).await.unwrap().job.state, JobState::Leased);
     assert_eq!(copy.operations(0, 100).await.unwrap().pop().unwrap().kind, "copied");
-    // It goes on by itself.
+    // The copy continues independently.
     copy.commit(&numbered(201)).await.unwrap();
     let again = copy.lease(protocol("dft").hash, "other", 9, 600).await.unwrap().unwrap();
     assert_eq!((again.job, again.attempt), (leased.job, 2));
@@ -100,9 +100,9 @@ async fn nothing_is_overwritten() {
     assert_eq!(fs::read_dir(elsewhere.path()).unwrap().count(), 2);
 }
 
-/// Whatever the instant, the copy is whole.
+/// A copy is complete at any time.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn copies_are_made_while_the_campaign_goes_on() {
+async fn backups_are_made_while_the_campaign_runs() {
     let (home, elsewhere) = (Home::new(), tempfile::tempdir().unwrap());
     let (store, stop) = (home.create().await, Arc::new(AtomicBool::new(false)));
     let committing = tokio::spawn({
@@ -135,7 +135,7 @@ async fn copies_are_made_while_the_campaign_goes_on() {
 }
 
 #[tokio::test]
-async fn compacting_gives_space_back_and_changes_nothing() {
+async fn compacting_frees_space_and_changes_nothing() {
     let home = Home::new();
     let store = home.create().await;
     let long = |k: u32, length: usize| {
@@ -150,15 +150,15 @@ async fn compacting_gives_space_back_and_changes_nothing() {
     }
     store.commit(&numbered(1)).await.unwrap();
     let (before, size) = (contents(&store).await, store.size().await.unwrap());
-    // On a server, rows that a transaction of anybody may still see stay: other tests have some.
-    let begun = Instant::now();
+    // On a server, rows that another transaction may still see stay; other tests hold some.
+    let started = Instant::now();
     loop {
         store.compact().await.unwrap();
         let compacted = store.size().await.unwrap();
         if compacted + 3_000_000 < size {
             break;
         }
-        assert!(begun.elapsed() < Duration::from_secs(60), "{compacted} of {size}");
+        assert!(started.elapsed() < Duration::from_secs(60), "{compacted} of {size}");
         tokio::time::sleep(Duration::from_millis(200)).await;
     }
     assert_eq!(contents(&store).await, before);

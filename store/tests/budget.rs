@@ -1,4 +1,4 @@
-//! Budgets: what was used, and that no attempt begins where nothing is left.
+//! Budgets: their use, and that no attempt starts once a limit is reached.
 
 use store::{Budget, Store};
 
@@ -16,7 +16,7 @@ async fn limit(store: &Store, budget: Budget) {
 }
 
 #[tokio::test]
-async fn no_more_labels_are_begun_than_there_may_be() {
+async fn no_more_labels_start_than_the_budget_permits() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 4).await;
@@ -24,26 +24,26 @@ async fn no_more_labels_are_begun_than_there_may_be() {
     let lease = async || store.lease(protocol("dft").hash, "a", 0, 1000).await.unwrap();
     let (first, second) = (lease().await.unwrap(), lease().await.unwrap());
     assert!(lease().await.is_none(), "two are under way");
-    assert!(store.awaits_labels(0).await.unwrap());
+    assert!(store.has_pending_labels(0).await.unwrap());
     store.complete(&first, &label(-1.0), 10).await.unwrap();
     store.fail(&second, "unconverged", "", 9, 20).await.unwrap();
-    // One that failed is none.
+    // A failed attempt makes no label.
     let third = lease().await.unwrap();
     store.complete(&third, &label(-2.0), 30).await.unwrap();
     assert!(lease().await.is_none());
-    assert!(!store.awaits_labels(40).await.unwrap(), "what is queued waits for a larger budget");
+    assert!(!store.has_pending_labels(40).await.unwrap(), "what is queued waits for a larger budget");
     let (_, used) = store.budget(40).await.unwrap();
     assert_eq!((used.labels, used.under_way), (2, 0));
     limit(&store, Budget { labels: Some(3), ..Budget::default() }).await;
-    assert!(store.awaits_labels(40).await.unwrap() && lease().await.is_some());
+    assert!(store.has_pending_labels(40).await.unwrap() && lease().await.is_some());
     limit(&store, Budget::default()).await;
     assert!(lease().await.is_some());
 }
 
 #[tokio::test]
-async fn hours_are_those_of_all_attempts_and_of_all_runs() {
+async fn hours_sum_over_all_attempts_and_runs() {
     let home = Home::new();
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     accept(&store, 4).await;
     let lease = async |now| store.lease(protocol("dft").hash, "a", now, 100_000).await.unwrap().unwrap();
     let failed = lease(0).await;
@@ -61,9 +61,9 @@ async fn hours_are_those_of_all_attempts_and_of_all_runs() {
 
     limit(&store, Budget { wall_hours: Some(1.0), ..Budget::default() }).await;
     assert!(is_given(&store, 4 * HOUR).await);
-    store.add_time_under_way(HOUR as u64 / 2).await.unwrap();
+    store.add_running_time(HOUR as u64 / 2).await.unwrap();
     assert_eq!(store.status().await.unwrap().budget.used_up, None);
-    store.add_time_under_way(HOUR as u64 / 2).await.unwrap();
+    store.add_running_time(HOUR as u64 / 2).await.unwrap();
     assert!(!is_given(&store, 5 * HOUR).await);
     let status = store.status().await.unwrap();
     assert_eq!(

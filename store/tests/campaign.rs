@@ -1,4 +1,4 @@
-//! Beginning and opening campaigns; what is committed is what comes back.
+//! Creating and opening campaigns; what is committed is read back.
 
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
@@ -9,7 +9,7 @@ use wire::{Origin, WalkId};
 use crate::common::*;
 
 #[tokio::test]
-async fn a_campaign_is_begun_once_and_opened_often() {
+async fn a_campaign_is_created_once_and_opened_often() {
     let home = Home::new();
     let error = Store::open(home.location()).await.unwrap_err();
     assert!(matches!(error, StoreError::Missing { .. }), "{error}");
@@ -19,9 +19,9 @@ async fn a_campaign_is_begun_once_and_opened_often() {
 
     let store = home.open().await;
     assert_eq!(store.campaign().await.unwrap(), campaign());
-    let seeds = store.seed_structures().await.unwrap();
-    assert_eq!((seeds.len(), seeds[0].name.as_str()), (1, "diamond"));
-    assert_eq!(seeds[0].structure, structure(0.0));
+    let seed_structures = store.seed_structures().await.unwrap();
+    assert_eq!((seed_structures.len(), seed_structures[0].name.as_str()), (1, "diamond"));
+    assert_eq!(seed_structures[0].structure, structure(0.0));
     assert_eq!(store.protocols().await.unwrap(), [protocol("dft")]);
     let change = serde_json::json!({ "key": "walkers", "before": 1, "after": 2 });
     store.set_configuration_in_force("{\"walkers\":2}", std::slice::from_ref(&change), 7).await.unwrap();
@@ -53,7 +53,7 @@ fn mixed_commit() -> Commit {
 }
 
 #[tokio::test]
-async fn what_is_committed_comes_back() {
+async fn committed_data_is_read_back() {
     let home = Home::new();
     let store = home.create().await;
     let commit = mixed_commit();
@@ -130,7 +130,7 @@ async fn a_contradictory_commit_leaves_nothing() {
     assert_eq!(store.commit(&commit_of(vec![fresh()])).await.unwrap(), 5..6);
 }
 
-/// A walk that is interrupted in its turn is committed without any decision.
+/// A walk interrupted during an assignment is committed without a decision.
 #[tokio::test]
 async fn a_checkpoint_is_kept_between_decisions() {
     let home = Home::new();
@@ -192,7 +192,7 @@ async fn status_counts_everything_once() {
     assert_eq!(status["finished"], false);
     assert!(matches!(reader.commit(&Commit::default()).await, Err(StoreError::ReadOnly)));
 
-    // A new process of its kind takes the place of a dead one; the end of everything is seen.
+    // A new process of a kind replaces a dead one, and the record is removed at the end.
     let next = ProcessRecord { id: "c".into(), ..process("b", std::process::id()) };
     store.upsert_process(&next).await.unwrap();
     store.remove_process("a").await.unwrap();
@@ -209,7 +209,7 @@ async fn status_counts_everything_once() {
 }
 
 #[tokio::test]
-async fn what_is_not_known_of_a_walk_is_no_zero() {
+async fn unknown_values_of_a_walk_are_not_zero() {
     let home = Home::new();
     let store = home.create().await;
     let progress = |tau, gamma_max| Progress {
@@ -224,14 +224,14 @@ async fn what_is_not_known_of_a_walk_is_no_zero() {
     store.commit(&Commit { walks: walks.collect(), ..Commit::default() }).await.unwrap();
     let known = |walk: store::WalkStatus| (walk.tau, walk.temperature, walk.relative_volume, walk.gamma_max);
     let walks = store.status().await.unwrap().walks.into_iter().map(known).collect::<Vec<_>>();
-    // One with a bias, one without, one that has not begun.
-    let begun = (Some(0.5), Some(300.0), Some(1.1), Some(1.2));
+    // One with a bias, one without, one that has not started.
+    let started = (Some(0.5), Some(300.0), Some(1.1), Some(1.2));
     let unbiased = (Some(0.0), Some(300.0), Some(1.1), None);
-    assert_eq!(walks, [begun, unbiased, (None, None, None, None)]);
+    assert_eq!(walks, [started, unbiased, (None, None, None, None)]);
 }
 
 #[tokio::test]
-async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
+async fn walks_can_be_paused_and_resumed_at_any_time() {
     let home = Home::new();
     let store = home.create().await;
     let pause = async |walks: &[u32], paused| {
@@ -240,15 +240,15 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
         Ok::<_, StoreError>(changed.into_iter().map(|walk| walk.0).collect::<Vec<_>>())
     };
     let error = pause(&[0], true).await.unwrap_err();
-    assert_eq!(error.to_string(), "the campaign has no walk 0; none has begun yet");
+    assert_eq!(error.to_string(), "the campaign has no walk 0; no walk has started yet");
     let ended = WalkRecord { state: "blew_up".into(), ..walk(2, 1) };
     store.commit(&Commit { walks: vec![walk(0, 1), walk(1, 1), ended], ..Commit::default() }).await.unwrap();
     assert_eq!(pause(&[1, 0, 1], true).await.unwrap(), [1, 0]);
     assert_eq!(pause(&[1], true).await.unwrap(), [0_u32; 0], "it is paused already");
     assert_eq!(pause(&[0, 2], false).await.unwrap(), [0]);
-    // Nothing is changed where one of them cannot be.
+    // Nothing changes if one of them cannot be paused.
     let error = pause(&[0, 2], true).await.unwrap_err().to_string();
-    assert_eq!(error, "walk 2 has ended (blew up): only those that have more steps to make can be paused");
+    assert_eq!(error, "walk 2 has ended (blew up): only running walks can be paused");
     let error = pause(&[0, 3], true).await.unwrap_err().to_string();
     assert_eq!(error, "the campaign has no walk 3; they are 0 to 2");
 
@@ -261,7 +261,7 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
     let log = reader.operations(0, 100).await.unwrap();
     let log = log.iter().filter(|line| line.time == 5).map(|line| format!("{} {}", line.kind, line.detail));
     assert_eq!(log.collect::<Vec<_>>(), ["pause {\"walk\":1}", "pause {\"walk\":0}", "resume {\"walk\":0}"]);
-    // Its end is the end of its pause.
+    // The end of a walk ends its pause.
     store
         .commit(&Commit {
             walks: vec![WalkRecord { state: "steps".into(), ..walk(1, 2) }],
@@ -273,7 +273,7 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
 }
 
 #[tokio::test]
-async fn the_newest_decisions_come_in_short() {
+async fn the_newest_decisions_are_summarized() {
     let home = Home::new();
     let store = home.create().await;
     let records = vec![
@@ -306,7 +306,7 @@ async fn the_newest_decisions_come_in_short() {
         |decisions: Vec<store::RecentDecision>| decisions.iter().map(|d| d.sequence).collect::<Vec<_>>();
     assert_eq!(numbers(store.newest_decisions(1, 10).await.unwrap()), [3, 2]);
     assert_eq!(numbers(store.newest_decisions(0, 1).await.unwrap()), [3]);
-    // Jobs say as much of what they are for.
+    // Jobs describe their candidates.
     let job = store.queue_list(None, 10, 0).await.unwrap().remove(0);
     assert_eq!(
         (job.walk, job.step, job.seed_structure.as_str(), job.origin.as_str()),

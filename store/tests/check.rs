@@ -1,4 +1,4 @@
-//! What `Store::check` finds, each in a campaign that is damaged in one way.
+//! Findings of `Store::check`, each in a campaign with one kind of damage.
 
 use store::{Commit, Decision, Fate, Finding, Store};
 use wire::Origin;
@@ -6,7 +6,7 @@ use wire::messages::Decline;
 
 use crate::common::*;
 
-/// Two walks with a structure each, one of them labelled, a declined candidate and a decision about none.
+/// Two walks with a structure each, one of them labelled, a declined candidate, and a decision without a candidate.
 pub async fn whole(home: &Home) -> Store {
     let store = home.create().await;
     let records = vec![
@@ -20,7 +20,7 @@ pub async fn whole(home: &Home) -> Store {
     store.commit(&commit).await.unwrap();
     let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
     store.complete(&lease, &label(-1.0), 1).await.unwrap();
-    // An empty tar file, compressed.
+    // An empty compressed tar file.
     let packed = zstd::encode_all(&[0; 1024][..], 3).unwrap();
     store.keep_archive(lease.job, lease.attempt, &packed, "").await.unwrap();
     store
@@ -34,14 +34,14 @@ async fn check(store: &Store) -> Vec<Finding> {
 }
 
 #[tokio::test]
-async fn nothing_is_found_in_a_whole_campaign() {
+async fn an_intact_campaign_has_no_findings() {
     let home = Home::new();
     assert_eq!(check(&whole(&home).await).await, []);
     assert_eq!(check(&home.open_read_only().await).await, []);
 }
 
 #[tokio::test]
-async fn each_damage_is_found_and_told_in_words() {
+async fn each_kind_of_damage_is_found_and_described() {
     for (damage, words) in [
         (
             "DELETE FROM decision WHERE sequence = 4",
@@ -49,24 +49,18 @@ async fn each_damage_is_found_and_told_in_words() {
         ),
         (
             "UPDATE decision SET candidate = 'x' WHERE sequence = 1",
-            "1 candidates whose decision says something else",
+            "1 candidates that contradict their decision",
         ),
-        (
-            "UPDATE decision SET candidate = 'x' WHERE sequence = 5",
-            "1 decisions about candidates that are not there",
-        ),
+        ("UPDATE decision SET candidate = 'x' WHERE sequence = 5", "1 decisions on missing candidates"),
         (
             "UPDATE decision SET kind = 'declined' WHERE sequence = 3",
-            "1 candidates whose decision says something else",
+            "1 candidates that contradict their decision",
         ),
         ("DELETE FROM candidate_data WHERE decision = 2", "1 candidates without their structure and grades"),
-        ("UPDATE walk SET accepted = 7 WHERE walk = 0", "1 walks that count other accepted structures"),
-        ("DELETE FROM walk WHERE walk = 1", "1 candidates of walks that are not there"),
+        ("UPDATE walk SET accepted = 7 WHERE walk = 0", "1 walks with a wrong count of accepted structures"),
+        ("DELETE FROM walk WHERE walk = 1", "1 candidates of missing walks"),
         ("DELETE FROM job WHERE state = 'queued'", "1 accepted candidates without a label job"),
-        (
-            "UPDATE job SET state = 'queued'",
-            "1 jobs that are labelled without a label, or have one and are not",
-        ),
+        ("UPDATE job SET state = 'queued'", "1 jobs labelled without a label, or not labelled despite one"),
         (
             "UPDATE candidate_count SET number = 7 WHERE fate = 'covered'",
             "1 kinds of candidates are counted wrongly (such as biased covered)",
@@ -79,19 +73,13 @@ async fn each_damage_is_found_and_told_in_words() {
             "UPDATE job_count SET number = 7 WHERE state = 'queued'",
             "1 kinds of label jobs are counted wrongly (such as queued)",
         ),
-        ("DELETE FROM label", "1 jobs that are labelled without a label, or have one and are not"),
+        ("DELETE FROM label", "1 jobs labelled without a label, or not labelled despite one"),
         ("DELETE FROM archive; DELETE FROM attempt", "1 labels that do not belong to their job"),
-        (
-            "UPDATE job SET attempts = 5 WHERE state = 'queued'",
-            "1 jobs that count other attempts than there are",
-        ),
-        (
-            "UPDATE attempt SET ended = NULL, outcome = NULL",
-            "1 attempts that seem to be under way although nobody has the job",
-        ),
+        ("UPDATE job SET attempts = 5 WHERE state = 'queued'", "1 jobs with a wrong count of attempts"),
+        ("UPDATE attempt SET ended = NULL, outcome = NULL", "1 running attempts at jobs that are not leased"),
         (
             "UPDATE structure SET data = substr(data, 1, 80) WHERE number = 2",
-            "structure 2: it does not have its hash",
+            "structure 2: it does not match its hash",
         ),
         ("UPDATE candidate_data SET block = substr(block, 1, 300) WHERE decision = 1", "candidate 1: "),
         (
@@ -103,7 +91,7 @@ async fn each_damage_is_found_and_told_in_words() {
             "candidate 2: its features: ",
         ),
         ("UPDATE label SET forces = substr(forces, 1, 24)", "label 1: 1 forces for 2 atoms"),
-        ("UPDATE decision SET detail = '{' WHERE sequence = 5", "decision 5: its text is no JSON"),
+        ("UPDATE decision SET detail = '{' WHERE sequence = 5", "decision 5: its text is not valid JSON"),
         (
             "UPDATE archive SET bytes = substr(bytes, 1, 8)",
             "files of job 1, attempt 1: it cannot be unpacked",
@@ -121,7 +109,7 @@ async fn each_damage_is_found_and_told_in_words() {
 }
 
 #[tokio::test]
-async fn leases_of_nobody_are_found() {
+async fn leases_without_a_holder_are_found() {
     let home = Home::new();
     let store = whole(&home).await;
     store.lease(protocol("dft").hash, "nobody", 0, 600).await.unwrap().unwrap();
@@ -130,6 +118,6 @@ async fn leases_of_nobody_are_found() {
     assert!(
         found[0].to_string().contains("1 jobs are leased to processes that are gone (such as 2 to nobody)")
     );
-    store.release_leases_of_gone_processes(1).await.unwrap();
+    store.release_leases_of_dead_processes(1).await.unwrap();
     assert_eq!(check(&store).await, []);
 }

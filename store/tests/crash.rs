@@ -1,4 +1,4 @@
-//! A process that commits and labels without end is killed at random instants: whatever it was told to be safe is there,
+//! Kills a process that commits and labels without end at random times: whatever it reported as committed is there,
 //! and everything else is there as a whole or not at all.
 
 use std::env;
@@ -9,7 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use store::{
-    CampaignLock, Commit, Completed, ComponentRecord, ExportFilter, Fate, JobState, Store, StoreError,
+    CampaignLock, Commit, CompleteOutcome, ComponentRecord, ExportFilter, Fate, JobState, Store, StoreError,
 };
 use wire::Origin;
 use wire::messages::Decline;
@@ -20,7 +20,7 @@ const KILLS: u64 = 20;
 const DIRECTORY: &str = "STORE_CRASH_TEST_DIRECTORY";
 const LIMIT: u32 = 3;
 
-/// The commit with number `k`, from 1: three candidates, a component, a walk and a value that all tell `k`.
+/// Commit `k`, from 1: three candidates, a component, a walk and a value that all contain `k`.
 fn numbered_commit(k: u64) -> Commit {
     let mut commit = commit_of(vec![
         candidate(0, 3 * k, Origin::Biased, Fate::Accepted),
@@ -38,7 +38,7 @@ async fn commits(store: &Store) -> u64 {
     values.iter().find(|(name, _)| name == "commits").map_or(0, |(_, value)| value.parse().unwrap())
 }
 
-/// What is killed: restart is the same command as start.
+/// The process to kill: restart is the same command as start.
 async fn work(directory: &Path) {
     let _lock = CampaignLock::acquire(directory, "crash test").unwrap();
     let store = match Store::open(directory).await {
@@ -46,7 +46,7 @@ async fn work(directory: &Path) {
         opened => opened.unwrap(),
     };
     store.add_protocol(&protocol("dft"), 0).await.unwrap();
-    store.release_leases_of_gone_processes(0).await.unwrap();
+    store.release_leases_of_dead_processes(0).await.unwrap();
     let mut next = commits(&store).await + 1;
     loop {
         store.commit(&numbered_commit(next)).await.unwrap();
@@ -58,7 +58,7 @@ async fn work(directory: &Path) {
                 continue;
             }
             let completed = store.complete(&lease, &label(-1.0), 0).await.unwrap();
-            assert_eq!(completed, Completed::Label);
+            assert_eq!(completed, CompleteOutcome::Label);
             tell("labelled", lease.job as u64);
         }
         next += 1;
@@ -73,19 +73,19 @@ fn tell(what: &str, number: u64) {
 
 fn start(directory: &Path) -> Child {
     Command::new(env::current_exe().unwrap())
-        .args(["--exact", "crash::a_killed_process_leaves_whole_commits", "--nocapture"])
+        .args(["--exact", "crash::a_killed_process_leaves_complete_commits", "--nocapture"])
         .env(DIRECTORY, directory)
         .stdout(Stdio::piped())
         .spawn()
         .unwrap()
 }
 
-/// Kills the process `delay` after its start, or after its first commit, and returns the last numbers that it told.
+/// Kills the process `delay` after its start, or after its first commit. Returns the last numbers that it reported.
 fn kill(mut child: Child, after_first_commit: bool, delay: Duration) -> (u64, Vec<u64>) {
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
     let (mut committed, mut labelled) = (0, Vec::new());
     let mut hear = |line: String| {
-        // The harness writes to the same stream, without an end of line before ours.
+        // The test harness writes to the same stream, without a newline before our output.
         let number = |word: &str| line.rsplit_once(word).and_then(|(_, number)| number.trim().parse().ok());
         committed = number("committed ").unwrap_or(committed);
         labelled.extend(number("labelled "));
@@ -106,7 +106,7 @@ fn kill(mut child: Child, after_first_commit: bool, delay: Duration) -> (u64, Ve
 async fn check(store: &Store, committed: u64, labelled: &[u64]) -> u64 {
     let k = commits(store).await;
     assert!(k >= committed, "commit {committed} was safe, {k} is the last");
-    // Every commit is there as a whole.
+    // Every commit is complete.
     let text = store.decision_log_text().await.unwrap();
     let mut expected = String::new();
     for (n, candidate) in (1..=k).flat_map(|k| numbered_commit(k).candidates).enumerate() {
@@ -125,7 +125,7 @@ async fn check(store: &Store, committed: u64, labelled: &[u64]) -> u64 {
         assert_eq!(store.load_walks().await.unwrap(), numbered_commit(k).walks);
     }
 
-    // One job for every accepted candidate; a label for exactly those that are labelled.
+    // One job for every accepted candidate; labels exactly for the labelled ones.
     let mut jobs = store.queue_list(None, u32::MAX, 0).await.unwrap();
     jobs.sort_by_key(|job| job.job);
     let accepted = (1..=k).flat_map(|k| {
@@ -153,7 +153,7 @@ async fn check(store: &Store, committed: u64, labelled: &[u64]) -> u64 {
 }
 
 #[test]
-fn a_killed_process_leaves_whole_commits() {
+fn a_killed_process_leaves_complete_commits() {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     if let Some(directory) = env::var_os(DIRECTORY) {
         runtime.block_on(work(directory.as_ref()));
@@ -161,7 +161,7 @@ fn a_killed_process_leaves_whole_commits() {
     let directory = tempfile::tempdir().unwrap();
     let mut last = 0;
     for kill_number in 0..KILLS {
-        // While it begins or opens the campaign, and while it works, at times spread over 60 ms.
+        // While it creates or opens the campaign and while it works, at times spread over 60 ms.
         let delay = Duration::from_millis(kill_number * 37 % 60);
         let (committed, labelled) = kill(start(directory.path()), kill_number % 2 == 1, delay);
         drop(CampaignLock::acquire(directory.path(), "check").expect("free, for its holder is dead"));

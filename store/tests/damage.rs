@@ -1,4 +1,4 @@
-//! Damage that nobody has announced: flipped bits in stored numbers, and bytes of the file that are others.
+//! Silent damage: flipped bits in stored numbers, and changed bytes in the file.
 //!
 //! `CALMWALK_FLIPS=1000 CALMWALK_DAMAGES=200 cargo test -p store --test store damage::` tries more.
 
@@ -14,8 +14,8 @@ use wire::messages::Decline;
 
 use crate::common::*;
 
-/// Columns whose bits are flipped: numbers of labels, structures, features, grades, decisions, the mixture, walks, archives, seed
-/// structures and imports. Keys are left alone: with foreign keys and the other rows they are checked by SQLite.
+/// Columns whose bits are flipped: numbers of labels, structures, features, grades, decisions, the mixture, walks,
+/// archives, seed structures and imports. Keys are left out: foreign keys and other rows check them.
 const COLUMNS: [(&str, &[&str]); 12] = [
     ("structure", &["hash", "atoms", "data", "checksum"]),
     ("seed_structure", &["structure", "checksum"]),
@@ -96,9 +96,9 @@ impl Random {
     }
 }
 
-/// A campaign with some of everything, so many accepted candidates.
+/// A campaign with rows in every table and this many accepted candidates.
 async fn full(directory: &Path, accepted: u64) -> Store {
-    let store = create(directory).await.by_the_callers_clock();
+    let store = create(directory).await.with_caller_clock();
     for step in 1..=accepted {
         let kind = if step % 3 == 0 { Origin::Control } else { Origin::Biased };
         let mut records = vec![candidate(0, step, kind, Fate::Accepted)];
@@ -132,7 +132,7 @@ async fn connect(directory: &Path) -> SqliteConnection {
     options.connect().await.unwrap()
 }
 
-/// Flips a bit of a value of a random row, and returns what undoes it; none where there is no number.
+/// Flips a bit of a value in a random row. Returns SQL that undoes it; `None` if the value has no number.
 async fn flip(connection: &mut SqliteConnection, random: &mut Random) -> Option<(String, String)> {
     let (table, columns) = COLUMNS[random.below(COLUMNS.len())];
     let column = columns[random.below(columns.len())];
@@ -153,7 +153,7 @@ async fn flip(connection: &mut SqliteConnection, random: &mut Random) -> Option<
             let sql = AssertSqlSafe(format!("SELECT {column} FROM {table} WHERE {keys} = '{key}'"));
             let value: f64 = sqlx::query_scalar(sql).fetch_one(&mut *connection).await.unwrap();
             let flipped = f64::from_bits(value.to_bits() ^ (1 << random.below(64)));
-            // SQLite has no number that is none; what is there is NULL.
+            // SQLite has no NaN; the value becomes NULL.
             if flipped.is_finite() { format!("{flipped:e}") } else { "9e999".to_owned() }
         }
         "blob" | "text" => {
@@ -164,7 +164,7 @@ async fn flip(connection: &mut SqliteConnection, random: &mut Random) -> Option<
                 return None;
             }
             let at = random.below(bytes.len());
-            // Texts stay texts: what is none is found by whoever reads it.
+            // Only valid text: readers detect invalid text anyway.
             bytes[at] ^= 1 << random.below(if kind == "text" { 7 } else { 8 });
             let hex: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
             if kind == "text" { format!("CAST(x'{hex}' AS TEXT)") } else { format!("x'{hex}'") }
@@ -174,7 +174,7 @@ async fn flip(connection: &mut SqliteConnection, random: &mut Random) -> Option<
     // A key of two numbers is compared as text.
     let set = |value: &str| format!("UPDATE {table} SET {column} = {value} WHERE {keys} = '{key}'");
     let undo = match kind.as_str() {
-        // Its text has fewer digits than it.
+        // Its text form has fewer digits.
         "real" => {
             let sql = AssertSqlSafe(format!("SELECT {column} FROM {table} WHERE {keys} = '{key}'"));
             let value: f64 = sqlx::query_scalar(sql).fetch_one(&mut *connection).await.unwrap();
@@ -183,7 +183,7 @@ async fn flip(connection: &mut SqliteConnection, random: &mut Random) -> Option<
         _ => set(&before),
     };
     let changed = sqlx::query(AssertSqlSafe(set(&after))).execute(&mut *connection).await;
-    // A value that no row may have is none that a bit could leave there unseen: SQLite's own check finds it.
+    // Values that violate a constraint are skipped: SQLite's own check finds them.
     match changed {
         Ok(changed) => assert_eq!(changed.rows_affected(), 1, "{}", set(&after)),
         Err(error) => panic!("{}: {error}", set(&after)),
@@ -209,7 +209,7 @@ async fn every_flipped_bit_in_a_stored_number_is_found() {
     assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
 }
 
-/// What whoever reads labels gets; in the end in the order of an export.
+/// What a reader of labels gets, then the export in order.
 async fn exported(directory: &Path) -> Result<BTreeMap<String, String>, StoreError> {
     let store = Store::open_read_only(directory).await?;
     let exported = read(&store).await;
@@ -220,26 +220,26 @@ async fn exported(directory: &Path) -> Result<BTreeMap<String, String>, StoreErr
 async fn read(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
     let filter = ExportFilter { protocol: protocol("dft").hash, biased: true, control: true, imported: true };
     store.check_for_export().await?;
-    let (mut missing, mut last, mut rows) = (store.labelled_places(&filter).await?, None, BTreeMap::new());
+    let (mut missing, mut last, mut rows) = (store.labelled_cursors(&filter).await?, None, BTreeMap::new());
     loop {
         let page = store.labelled(&filter, last, 7).await?;
         let Some(row) = page.last() else { break };
-        last = Some(row.place);
+        last = Some(row.cursor);
         for row in page {
-            missing.remove(&row.place);
-            rows.insert(format!("{:?}", row.place), format!("{row:?}"));
+            missing.remove(&row.cursor);
+            rows.insert(format!("{:?}", row.cursor), format!("{row:?}"));
         }
     }
     match missing.is_empty() {
         true => Ok(rows),
-        // As `calmwalk export` refuses it.
+        // Refused as by `calmwalk export`.
         false => {
             Err(StoreError::Damaged { what: "an export".into(), reason: format!("{missing:?} are missing") })
         }
     }
 }
 
-/// Does something to the file as a disk may do, and says what.
+/// Damages the file as a disk may do, and describes how.
 fn damage(bytes: &mut Vec<u8>, page: usize, random: &mut Random) -> String {
     let pages = bytes.len() / page;
     let of = |number: usize| number * page..(number + 1) * page;
@@ -264,7 +264,8 @@ fn damage(bytes: &mut Vec<u8>, page: usize, random: &mut Random) -> String {
             bytes.truncate(end);
             format!("the file ends at {end}")
         }
-        // How many cells a page has, or the page behind its last cell: rows or whole subtrees are passed over.
+        // Changes the number of cells of a page, or the page after its last cell: rows or whole subtrees are
+        // skipped.
         _ => {
             let (number, at) = (1 + random.below(pages - 1), [3, 4, 8, 9, 10, 11][random.below(6)]);
             bytes[number * page + at] = bytes[number * page + at].wrapping_sub(1 + random.below(3) as u8);
@@ -274,7 +275,7 @@ fn damage(bytes: &mut Vec<u8>, page: usize, random: &mut Random) -> String {
 }
 
 #[tokio::test]
-async fn a_damaged_database_is_exported_as_it_was_or_not_at_all() {
+async fn a_damaged_database_exports_the_original_data_or_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let store = full(directory.path(), 60).await;
     store.close().await;
@@ -283,7 +284,7 @@ async fn a_damaged_database_is_exported_as_it_was_or_not_at_all() {
     connection.close().await.unwrap();
     let whole = fs::read(directory.path().join(DATABASE)).unwrap();
     let expected = exported(directory.path()).await.unwrap();
-    // 45 of 60 labelled by jobs, 15 imported.
+    // 45 of 60 are labelled by jobs, 15 imported.
     assert_eq!(expected.len(), 60);
     let (mut random, mut refused) = (Random(200), 0);
     for _ in 0..wanted("CALMWALK_DAMAGES", 30) {
@@ -299,9 +300,9 @@ async fn a_damaged_database_is_exported_as_it_was_or_not_at_all() {
     assert!(refused > 0);
 }
 
-/// An entry of an index is missing, as after damage to its page.
+/// An index entry is missing, as after damage to its page.
 #[tokio::test]
-async fn a_label_that_its_index_has_lost_is_missed() {
+async fn a_label_missing_in_its_index_is_detected() {
     let directory = tempfile::tempdir().unwrap();
     let store = full(directory.path(), 12).await;
     store.close().await;
@@ -311,7 +312,7 @@ async fn a_label_that_its_index_has_lost_is_missed() {
     assert!(error.contains("label_of") && error.contains("would be missing in an export"), "{error}");
 }
 
-/// The index of labels has no entry for this one any more.
+/// Removes the entry of this label from the index.
 async fn lose_from_index(directory: &Path, label: i64) {
     let mut connection = connect(directory).await;
     let take = "PRAGMA writable_schema = ON; CREATE TABLE kept AS SELECT * FROM sqlite_schema WHERE name = 'label_of';";
@@ -326,10 +327,10 @@ async fn lose_from_index(directory: &Path, label: i64) {
     connection.close().await.unwrap();
 }
 
-/// What was not damage when it was written is none: every row that is there gets its checksum when the tables are brought up to
-/// date, and is read as it was.
+/// Rows written before there were checksums are not damaged: each gets its checksum during the migration and is
+/// read as before.
 #[tokio::test]
-async fn an_earlier_database_gets_its_checksums() {
+async fn a_database_of_an_earlier_version_gets_checksums() {
     let directory = tempfile::tempdir().unwrap();
     let store = full(directory.path(), 12).await;
     store.close().await;
@@ -345,7 +346,7 @@ async fn an_earlier_database_gets_its_checksums() {
     assert_eq!((exported(directory.path()).await.unwrap(), missing), (expected, 0));
 }
 
-/// Makes it a database of version 8: what later versions add goes.
+/// Turns it into a database of version 8 by removing what later versions add.
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
     let mut sql = "DROP TRIGGER label_has_checksum; DROP INDEX label_excluded;
@@ -376,7 +377,7 @@ async fn without_checksums(directory: &Path) {
     connection.close().await.unwrap();
 }
 
-/// A labeller of an earlier version that is still at work is told.
+/// A running labeller of an earlier version gets an error.
 #[tokio::test]
 async fn a_label_without_a_checksum_is_refused() {
     let directory = tempfile::tempdir().unwrap();

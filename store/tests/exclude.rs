@@ -1,9 +1,9 @@
-//! Labels that are taken out of the data set by hand, and in again.
+//! Excluding labels by hand and including them again.
 
 use serde_json::json;
 use store::{
-    Commit, Completed, ExclusionChange, ExportFilter, Fate, JobState, Lease, ListOrder, ListedCandidate,
-    Protocol, Relabel, Standing, Store, StoreError, WalkRecord,
+    Commit, CompleteOutcome, ExclusionChange, ExportFilter, Fate, JobState, LabelStatus, Lease, ListOrder,
+    ListedCandidate, Protocol, RelabelRequest, Store, StoreError, WalkRecord,
 };
 use wire::messages::Decline;
 use wire::{ContentHash, Origin};
@@ -14,9 +14,9 @@ async fn lease(store: &Store, now: i64) -> Lease {
     store.lease(protocol("dft").hash, "host/a", now, 10).await.unwrap().unwrap()
 }
 
-/// Candidates that all have their labels, with energies −1, −2, … Their names.
+/// Labelled candidates with energies −1, −2, … Returns their names.
 async fn labelled(home: &Home, number: u64) -> (Store, Vec<String>) {
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     let names = accept(&store, number).await;
     let walk = WalkRecord { accepted: number as u32, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -42,10 +42,10 @@ async fn exported(store: &Store, protocol: &Protocol) -> Vec<f64> {
     rows.iter().map(|row| row.label.energy).collect()
 }
 
-/// Standing, energy, and why it is excluded of every label of a structure.
-async fn history(store: &Store, structure: ContentHash) -> Vec<(Standing, f64, Option<String>)> {
+/// Status, energy and reason of exclusion of every label of a structure.
+async fn history(store: &Store, structure: ContentHash) -> Vec<(LabelStatus, f64, Option<String>)> {
     let labels = store.labels_of(structure).await.unwrap().into_iter().map(|label| label.record);
-    labels.map(|record| (record.standing, record.label.energy, record.excluded.map(|e| e.reason))).collect()
+    labels.map(|record| (record.status, record.label.energy, record.excluded.map(|e| e.reason))).collect()
 }
 
 async fn whole(store: &Store) {
@@ -59,7 +59,7 @@ fn change(id: &str, changed: bool, excluded: Option<&str>) -> ExclusionChange {
 }
 
 #[tokio::test]
-async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
+async fn an_excluded_label_counts_nowhere_until_it_is_included_again() {
     let home = Home::new();
     let (store, candidates) = labelled(&home, 3).await;
     let dft = protocol("dft");
@@ -67,7 +67,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     let ids = names(&["0.0.2"]);
     let expected = [change(second, true, Some("it has a hole"))];
     assert_eq!(store.exclude(&ids, "it has a hole", 100).await.unwrap(), expected);
-    // Whoever asks twice changes nothing, and the first reason stays.
+    // Repeating it changes nothing; the first reason stays.
     let expected = [change(second, false, Some("it has a hole"))];
     assert_eq!(store.exclude(&ids, "another", 200).await.unwrap(), expected);
 
@@ -82,7 +82,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     assert_eq!((labels.labelled, labels.excluded), (3, 1));
     let shown = store.queue_show(second).await.unwrap();
     assert_eq!(shown.job.excluded.as_deref(), Some("it has a hole"));
-    assert_eq!(shown.energies, [(Standing::Excluded, -2.0)]);
+    assert_eq!(shown.energies, [(LabelStatus::Excluded, -2.0)]);
     let listed = store.queue_list(Some(JobState::Labelled), 9, 0).await.unwrap();
     assert_eq!(listed.iter().filter(|job| job.excluded.is_some()).count(), 1);
     let table = store.list_candidates(ListOrder::Decision, false, None, 9).await.unwrap();
@@ -94,15 +94,15 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     let all = store.excluded().await.unwrap();
     assert_eq!((all.len(), all[0].id.as_str(), all[0].exclusion.time), (1, second, 100));
     whole(&store).await;
-    // Its job is done: nobody labels it again by himself.
+    // Its job is done: it is not labelled again automatically.
     assert!(store.lease(dft.hash, "host/a", 300, 10).await.unwrap().is_none());
 
     assert_eq!(store.include(&ids, 400).await.unwrap(), [change(second, true, None)]);
     assert_eq!(store.include(&ids, 500).await.unwrap(), [change(second, false, None)]);
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0, -3.0]);
-    assert_eq!(history(&store, content(2)).await, [(Standing::Label, -2.0, None)]);
+    assert_eq!(history(&store, content(2)).await, [(LabelStatus::Label, -2.0, None)]);
     assert_eq!(store.status().await.unwrap().labels.excluded, 0);
-    let operations = store.done_by_hand(shown.job.job).await.unwrap();
+    let operations = store.manual_operations(shown.job.job).await.unwrap();
     let kinds: Vec<_> =
         operations.iter().map(|done| (done.kind.as_str(), done.time, &done.detail["reason"])).collect();
     assert_eq!(kinds, [("exclude", 100, &json!("it has a hole")), ("include", 400, &json!(null))]);
@@ -110,7 +110,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
 }
 
 #[tokio::test]
-async fn all_that_are_named_are_excluded_or_none() {
+async fn either_all_named_structures_are_excluded_or_none() {
     let home = Home::new();
     let (store, candidates) = labelled(&home, 2).await;
     let covered = candidate(0, 7, Origin::Biased, Fate::Declined(Decline::Covered));
@@ -132,7 +132,7 @@ async fn all_that_are_named_are_excluded_or_none() {
         );
     }
     assert_eq!(store.status().await.unwrap().labels.excluded, 0);
-    // One that is named twice is one.
+    // Naming it twice counts once.
     let ids = [candidates[0].clone(), "0.0.1".to_owned(), "0.0.2".to_owned()];
     let changes = store.exclude(&ids, "bad", 1).await.unwrap();
     assert_eq!(
@@ -143,9 +143,9 @@ async fn all_that_are_named_are_excluded_or_none() {
 }
 
 #[tokio::test]
-async fn only_a_label_that_was_asked_for_comes_in_its_place() {
+async fn only_a_requested_label_replaces_an_excluded_one() {
     let home = Home::new();
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     let (names, dft) = (accept(&store, 1).await, protocol("dft"));
     let walk = WalkRecord { accepted: 1, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -153,29 +153,30 @@ async fn only_a_label_that_was_asked_for_comes_in_its_place() {
     let first = lease(&store, 20_000).await;
     store.complete(&first, &label(-1.0), 20_001).await.unwrap();
     store.exclude(&names, "bad", 20_002).await.unwrap();
-    assert_eq!(store.complete(&late, &label(-9.0), 20_003).await.unwrap(), Completed::KeptAsCheck);
+    assert_eq!(store.complete(&late, &label(-9.0), 20_003).await.unwrap(), CompleteOutcome::KeptAsCheck);
     let frames = [(0, structure(1e-6), label(-8.0))];
     assert_eq!(store.import(dft.hash, "x", &frames, 20_004).await.unwrap().checks, 1);
     assert_eq!(exported(&store, &dft).await, [0.0; 0]);
     whole(&store).await;
 
-    let order = Relabel { structures: &[content(1)], again: true, reason: "better", protocol: None };
+    let order = RelabelRequest { structures: &[content(1)], again: true, reason: "better", protocol: None };
     assert_eq!(store.relabel(&order, 20_005).await.unwrap().again, 1);
     whole(&store).await;
-    // Until it comes, the other stays excluded; in vain, it stays so as well.
+    // Until the new label arrives, the other one stays excluded, also if it never arrives.
     let failing = lease(&store, 20_006).await;
     store.fail(&failing, "crashed", "", 1, 20_007).await.unwrap();
     assert_eq!(store.queue_show(&names[0]).await.unwrap().job.state, JobState::Labelled);
     assert_eq!(store.status().await.unwrap().labels.excluded, 1);
     store.relabel(&order, 20_008).await.unwrap();
     let again = lease(&store, 20_009).await;
-    assert_eq!(store.complete(&again, &label(-1.5), 20_010).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&again, &label(-1.5), 20_010).await.unwrap(), CompleteOutcome::Label);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     let bad = Some("bad".to_owned());
-    let (superseded, check) = ((Standing::Superseded, -1.0, bad), |energy| (Standing::Check, energy, None));
-    let expected = [superseded, check(-9.0), check(-8.0), (Standing::Label, -1.5, None)];
+    let (superseded, check) =
+        ((LabelStatus::Superseded, -1.0, bad), |energy| (LabelStatus::Check, energy, None));
+    let expected = [superseded, check(-9.0), check(-8.0), (LabelStatus::Label, -1.5, None)];
     assert_eq!(history(&store, content(1)).await, expected);
-    // There is nothing to take in again.
+    // There is nothing to include.
     assert_eq!(store.include(&names, 20_011).await.unwrap(), [change(&names[0], false, None)]);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;
@@ -192,7 +193,7 @@ async fn imported_structures_have_labels_to_exclude() {
     assert_eq!(store.exclude(&ids, "bad", 20).await.unwrap(), [change("import-2", true, Some("bad"))]);
     assert_eq!(exported(&store, &dft).await, [-1.0, -5.0]);
     assert_eq!(store.excluded().await.unwrap()[0].id, "import-2");
-    // The same numbers once more change nothing.
+    // Identical results change nothing.
     assert_eq!(store.import(dft.hash, "known.extxyz", &frames, 30).await.unwrap().known, 2);
     assert_eq!(exported(&store, &dft).await, [-1.0, -5.0]);
     store.include(&ids, 40).await.unwrap();

@@ -1,4 +1,4 @@
-//! What is peculiar to a database that is a file.
+//! Properties of a database that is a file.
 
 use std::fs;
 
@@ -7,9 +7,9 @@ use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError};
 use crate::common::*;
 
 #[tokio::test]
-async fn a_database_is_there_as_a_whole_or_not_at_all() {
+async fn a_database_is_created_as_a_whole_or_not_at_all() {
     let directory = tempfile::tempdir().unwrap();
-    // What a creation that was killed may leave behind does not matter.
+    // Leftovers of a killed creation are ignored.
     fs::write(directory.path().join("campaign.sqlite.new"), b"half a file").unwrap();
     create(directory.path()).await.close().await;
     let files = fs::read_dir(directory.path()).unwrap().count();
@@ -17,12 +17,12 @@ async fn a_database_is_there_as_a_whole_or_not_at_all() {
 }
 
 #[tokio::test]
-async fn other_files_and_versions_are_refused_with_what_was_found() {
+async fn other_files_and_versions_are_refused_with_a_description() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join(DATABASE);
     fs::write(&path, "units metal\natom_style atomic\n").unwrap();
     let message = Store::open(directory.path()).await.unwrap_err().to_string();
-    assert!(message.contains("no SQLite database") && message.contains("units metal"), "{message}");
+    assert!(message.contains("not an SQLite database") && message.contains("units metal"), "{message}");
     fs::write(&path, "").unwrap();
     assert!(matches!(Store::open(directory.path()).await, Err(StoreError::NotADatabase { .. })));
     fs::remove_file(&path).unwrap();
@@ -35,7 +35,8 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     fs::write(&path, &newer).unwrap();
     let message = Store::open(directory.path()).await.unwrap_err().to_string();
     assert!(
-        message.contains(&format!("version {}; this program reads version {known}", newer[63])),
+        message
+            .contains(&format!("schema version {}, and this program reads up to version {known}", newer[63])),
         "{message}"
     );
     assert!(matches!(
@@ -47,7 +48,7 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     fs::write(&path, &foreign).unwrap();
     assert!(matches!(Store::open(directory.path()).await, Err(StoreError::Foreign { found: 9, .. })));
     assert_eq!(fs::read(&path).unwrap(), foreign, "a foreign database is left as it is");
-    // Bytes of a page in disorder.
+    // Scrambles the bytes of a page.
     let mut damaged = whole;
     damaged[4096..].fill(0x55);
     fs::write(&path, &damaged).unwrap();
@@ -70,7 +71,7 @@ async fn a_directory_that_cannot_be_written_is_named() {
 
 #[cfg(unix)]
 #[tokio::test]
-async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
+async fn a_campaign_opens_read_only_where_nothing_may_be_written() {
     use std::os::unix::fs::PermissionsExt;
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
@@ -83,7 +84,7 @@ async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
     let seen = Store::open_read_only(directory.path()).await.unwrap().status().await.unwrap();
     permit(0o755);
     assert_eq!(seen.labels.queued, 2);
-    // Nothing is forbidden to the superuser.
+    // The superuser may do anything.
     if !rustix::process::geteuid().is_root() {
         assert!(matches!(lock, Err(StoreError::Directory { .. })), "{lock:?}");
         let error = refused.unwrap_err();
@@ -92,7 +93,7 @@ async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
 }
 
 #[tokio::test]
-async fn nothing_is_written_into_a_file_that_is_not_there_any_more() {
+async fn nothing_is_written_to_a_deleted_file() {
     let directory = tempfile::tempdir().unwrap();
     let (path, moved) = (directory.path().join(DATABASE), directory.path().join("moved"));
     let store = create(directory.path()).await;
@@ -105,7 +106,7 @@ async fn nothing_is_written_into_a_file_that_is_not_there_any_more() {
         assert!(matches!(&error, StoreError::Removed { path: found } if *found == path), "{error}");
         let refused = store.lease(protocol("dft").hash, "l", 0, 9).await;
         assert!(matches!(refused, Err(StoreError::Removed { .. })));
-        // Another file in its place is not the same.
+        // Another file in its place is detected.
         fs::copy(&moved, &path).unwrap();
     }
     fs::rename(&moved, &path).unwrap();

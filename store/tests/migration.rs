@@ -1,4 +1,4 @@
-//! Campaigns that earlier versions of the program began.
+//! Campaigns created by earlier versions of the program.
 
 use std::fs;
 use std::path::Path;
@@ -21,20 +21,20 @@ async fn version(directory: &Path) -> i64 {
     sqlx::query_scalar("PRAGMA user_version").fetch_one(&mut connection).await.unwrap()
 }
 
-/// Candidates, as they were counted.
+/// Counted candidates.
 async fn counts(directory: &Path) -> i64 {
     let mut connection = connect(&directory.join(DATABASE)).await;
     sqlx::query_scalar("SELECT sum(number) FROM candidate_count").fetch_one(&mut connection).await.unwrap()
 }
 
-/// Label jobs by state, as they were counted.
+/// Counted label jobs by state.
 async fn job_counts(directory: &Path) -> Vec<(String, i64)> {
     let mut connection = connect(&directory.join(DATABASE)).await;
     let sql = "SELECT state, sum(number) FROM job_count GROUP BY state ORDER BY state";
     sqlx::query_as(sql).fetch_all(&mut connection).await.unwrap()
 }
 
-/// A campaign as version 1 leaves it when it is killed: one job is leased. Returns its decision log.
+/// A campaign as left by a killed version 1, with one leased job. Returns its decision log.
 async fn version_1(directory: &Path) -> String {
     let now = tempfile::tempdir().unwrap();
     let store = create(now.path()).await;
@@ -91,7 +91,7 @@ fn old_process() -> ProcessRecord {
 }
 
 #[tokio::test]
-async fn a_campaign_of_version_1_is_looked_at_as_it_is() {
+async fn a_campaign_of_version_1_opens_read_only_without_migration() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let before = fs::read(directory.path().join(DATABASE)).unwrap();
@@ -106,7 +106,7 @@ async fn a_campaign_of_version_1_is_looked_at_as_it_is() {
 }
 
 #[tokio::test]
-async fn a_campaign_of_version_1_goes_on() {
+async fn a_campaign_of_version_1_continues() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
@@ -115,9 +115,9 @@ async fn a_campaign_of_version_1_goes_on() {
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
     assert_eq!(store.processes(None).await.unwrap(), [old_process()]);
-    // Its number is in use again, but the lock says that it cannot be the same process.
-    assert!(!old_process().is_gone());
-    assert_eq!(store.take_over(7).await.unwrap(), 1);
+    // Its process id is in use again, but the lock proves that it is another process.
+    assert!(!old_process().is_dead());
+    assert_eq!(store.reclaim_leases(7).await.unwrap(), 1);
     assert_eq!(store.processes(None).await.unwrap(), []);
     let queued = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
     assert_eq!((queued.len(), queued[0].failures), (2, 0));
@@ -129,7 +129,7 @@ async fn a_campaign_of_version_1_goes_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn several_processes_may_bring_it_up_to_date() {
+async fn several_processes_may_migrate_it() {
     for _ in 0..10 {
         let directory = tempfile::tempdir().unwrap();
         version_1(directory.path()).await;

@@ -1,6 +1,8 @@
-//! What became of label jobs, as the cost model, `status` and the table of force errors read it.
+//! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
-use store::{FailureCount, Fate, FateCount, JobState, Lease, Range, Store, Unlabelled, Waiting, Work};
+use store::{
+    FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs, Store, Unlabelled, ValueRange,
+};
 use wire::{Candidate, CandidateBlock, ContentHash, Origin};
 
 use crate::common::*;
@@ -9,7 +11,7 @@ async fn lease(store: &Store, now: i64) -> Lease {
     store.lease(protocol("dft").hash, "a", now, 1000).await.unwrap().unwrap()
 }
 
-/// Accepts a structure with this largest γ under the original mixture, and V/V₀.
+/// Accepts a structure with this largest γ under the original mixture and this V/V₀.
 async fn accept_with(store: &Store, step: u64, gamma: f64, relative_volume: f64) -> String {
     let mut record = candidate(0, step, Origin::Biased, Fate::Accepted);
     let candidate = Candidate { relative_volume, ..record.block.view().to_candidate() };
@@ -19,9 +21,9 @@ async fn accept_with(store: &Store, step: u64, gamma: f64, relative_volume: f64)
     name_of(&record)
 }
 
-/// Three labels, of which the second takes two attempts; two that fail for good, and one that waits.
+/// Three labels, the second of which takes two attempts; two failed jobs, and one that waits.
 async fn filled(home: &Home) -> (Store, Vec<String>) {
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     let mut names = Vec::new();
     for (step, gamma, volume) in
         [(1, 1.5, 1.0), (2, 1.6, 1.1), (3, 1.7, 1.2), (4, 4.0, 1.4), (5, 3.0, 1.35), (6, 2.0, 1.3)]
@@ -44,7 +46,7 @@ async fn filled(home: &Home) -> (Store, Vec<String>) {
 }
 
 #[tokio::test]
-async fn costs_are_those_of_the_attempts_that_brought_labels() {
+async fn costs_are_those_of_successful_attempts() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     let costs = store.label_costs(protocol("dft").hash, 10).await.unwrap();
@@ -53,19 +55,25 @@ async fn costs_are_those_of_the_attempts_that_brought_labels() {
     assert_eq!((costs[0].atoms, costs[0].formula.as_str(), costs[0].seed_structure), (2, "Si2", 0));
     assert_eq!(store.label_costs(protocol("dft").hash, 1).await.unwrap(), costs[..1]);
     let waiting = store.waiting_jobs(protocol("dft").hash).await.unwrap();
-    assert_eq!(waiting, [Waiting { seed_structure: 0, formula: "Si2".into(), atoms: 2, jobs: 1 }]);
-    // Three attempts in vain: 5 s, and twice 1 s.
-    let expected = Work { core_seconds: Some(21.0), label_core_seconds: Some(14.0), cores: 0 };
-    assert_eq!(store.label_work().await.unwrap(), expected);
-    // There are no walks here; but the sums are those of the attempts.
+    assert_eq!(waiting, [PendingJobs { seed_structure: 0, formula: "Si2".into(), atoms: 2, jobs: 1 }]);
+    // Three failed attempts: 5 s, and twice 1 s.
+    let expected = LabelUsage { core_seconds: Some(21.0), label_core_seconds: Some(14.0), cores: 0 };
+    assert_eq!(store.label_usage().await.unwrap(), expected);
+    // There are no walks here, but the totals are those of the attempts.
     let findings = store.check(|_, _| ()).await.unwrap();
-    assert!(findings.iter().all(|finding| finding.what.contains("walks that are not there")), "{findings:?}");
+    assert!(
+        findings.iter().all(|finding| finding.what.contains("candidates of missing walks")),
+        "{findings:?}"
+    );
     lease(&store, 30_000).await;
-    assert_eq!(store.label_work().await.unwrap(), Work { cores: 1, ..store.label_work().await.unwrap() });
+    assert_eq!(
+        store.label_usage().await.unwrap(),
+        LabelUsage { cores: 1, ..store.label_usage().await.unwrap() }
+    );
 }
 
 #[tokio::test]
-async fn failures_are_counted_by_class_and_by_what_became_of_the_job() {
+async fn failures_are_counted_by_class_and_outcome() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     let found = store.failures(protocol("dft").hash).await.unwrap();
@@ -79,13 +87,13 @@ async fn failures_are_counted_by_class_and_by_what_became_of_the_job() {
 }
 
 #[tokio::test]
-async fn what_failed_is_a_part_of_the_collected_space() {
+async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
     let home = Home::new();
     let (store, names) = filled(&home).await;
     let unlabelled = store.unlabelled(protocol("dft").hash, true).await.unwrap();
     let without = |part: &Unlabelled| Unlabelled {
-        gamma_labelled: Range::default(),
-        relative_volume_labelled: Range::default(),
+        gamma_labelled: ValueRange::default(),
+        relative_volume_labelled: ValueRange::default(),
         ..part.clone()
     };
     let expected: Vec<_> = unlabelled.iter().map(without).collect();
@@ -93,11 +101,11 @@ async fn what_failed_is_a_part_of_the_collected_space() {
     let [only] = unlabelled.as_slice() else { panic!("{unlabelled:?}") };
     assert_eq!((only.seed_structure.as_str(), only.formula.as_str()), ("diamond", "Si2"));
     assert_eq!((only.failed, only.labelled), (2, 3));
-    let range = |low, high| Range { low: Some(low), high: Some(high) };
+    let range = |low, high| ValueRange { low: Some(low), high: Some(high) };
     assert_eq!((only.gamma, only.gamma_labelled), (range(3.0, 4.0), range(1.5, 1.7)));
     assert_eq!((only.relative_volume, only.relative_volume_labelled), (range(1.35, 1.4), range(1.0, 1.2)));
 
-    // Page by page, whatever its length.
+    // In pages of any length.
     let (mut after, mut jobs) = (0, Vec::new());
     loop {
         let page = store.finished(protocol("dft").hash, after, 2).await.unwrap();
@@ -114,7 +122,7 @@ async fn what_failed_is_a_part_of_the_collected_space() {
     assert_eq!((jobs[0].class.as_deref(), jobs[3].class.as_deref()), (None, Some("crashed")));
     assert!(jobs[1].unlabelled.is_none());
     assert_eq!(jobs[3].unlabelled.as_ref().unwrap().gamma, [4.0, 0.8]);
-    // Of a protocol without jobs nothing is told.
+    // A protocol without jobs has no results.
     store.add_protocol(&protocol("other"), 0).await.unwrap();
     assert!(store.finished(protocol("other").hash, 0, 9).await.unwrap().is_empty());
     assert!(store.unlabelled(protocol("other").hash, true).await.unwrap().is_empty());
@@ -122,9 +130,9 @@ async fn what_failed_is_a_part_of_the_collected_space() {
 }
 
 #[tokio::test]
-async fn structures_that_may_be_the_same_are_those_nearest_in_energy_that_have_labels() {
+async fn near_duplicates_are_the_labelled_structures_nearest_in_energy() {
     let home = Home::new();
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     let mut names = Vec::new();
     for (step, energy) in [(1, -8.0), (2, -7.0), (3, -8.4), (4, -9.0)] {
         let mut record = candidate(0, step, Origin::Biased, Fate::Accepted);
@@ -134,17 +142,17 @@ async fn structures_that_may_be_the_same_are_those_nearest_in_energy_that_have_l
         names.push(name_of(&record));
     }
     let first = lease(&store, 0).await;
-    let (own, others) = store.labelled_near(&first, 9).await.unwrap().unwrap();
+    let (own, others) = store.near_duplicates(&first, 9).await.unwrap().unwrap();
     assert_eq!((own.len(), others.len()), (3 * ATOMS, 0), "nothing has its label");
     store.complete(&first, &label(-1.0), 1).await.unwrap();
     for _ in 0..2 {
         store.complete(&lease(&store, 2).await, &label(-1.0), 3).await.unwrap();
     }
     let last = lease(&store, 4).await;
-    let near = |others: Vec<store::NearLabel>| -> Vec<_> {
+    let near = |others: Vec<store::NearDuplicate>| -> Vec<_> {
         others.into_iter().map(|other| other.candidate).collect()
     };
-    let (_, others) = store.labelled_near(&last, 2).await.unwrap().unwrap();
+    let (_, others) = store.near_duplicates(&last, 2).await.unwrap().unwrap();
     let mut found = near(others);
     found.sort();
     let mut expected = [names[0].clone(), names[2].clone()];
@@ -153,7 +161,7 @@ async fn structures_that_may_be_the_same_are_those_nearest_in_energy_that_have_l
 }
 
 #[tokio::test]
-async fn everything_that_was_collected_comes_with_its_label_if_it_has_one() {
+async fn collected_structures_come_with_their_labels() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     store.commit(&commit_of(vec![candidate(1, 9, Origin::Control, Fate::Accepted)])).await.unwrap();
@@ -162,8 +170,11 @@ async fn everything_that_was_collected_comes_with_its_label_if_it_has_one() {
     let dft = protocol("dft").hash;
     let mut found = Vec::new();
     loop {
-        let page =
-            store.collected(Some(dft), found.last().map_or(0, |last: &store::Collected| last.decision), 3);
+        let page = store.collected(
+            Some(dft),
+            found.last().map_or(0, |last: &store::CollectedStructure| last.decision),
+            3,
+        );
         let page = page.await.unwrap();
         if page.is_empty() {
             break;

@@ -1,6 +1,6 @@
-//! Who works for a campaign, and what comes back of those who are gone.
+//! Processes of a campaign, and the leases of dead ones.
 
-use store::{JobState, Lease, ProcessRecord, Store, process_birth};
+use store::{JobState, Lease, ProcessRecord, Store, process_start_time};
 
 use crate::common::*;
 
@@ -9,10 +9,10 @@ fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     ProcessRecord { id: id.into(), ..ProcessRecord::new(kind, number, std::process::id(), 1) }
 }
 
-/// Its number belongs to another process by now.
+/// Its process id belongs to another process now.
 fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     let living = living(id, kind, number);
-    ProcessRecord { birth: format!("{}0", living.birth), ..living }
+    ProcessRecord { start_time: format!("{}0", living.start_time), ..living }
 }
 
 async fn names(store: &Store) -> Vec<String> {
@@ -32,11 +32,11 @@ async fn holders(store: &Store) -> Vec<String> {
 }
 
 #[tokio::test]
-async fn a_record_comes_back_as_it_was_written() {
+async fn a_record_is_read_as_it_was_written() {
     let home = Home::new();
     let store = home.create().await;
     let mut record = living("l", ProcessRecord::LABELLER, Some(7));
-    assert_eq!(Some(&record.birth), process_birth(std::process::id()).as_ref());
+    assert_eq!(Some(&record.start_time), process_start_time(std::process::id()).as_ref());
     record.restarts = 2;
     record.setup = Some("hash".into());
     record.remark = "killed by signal 9".into();
@@ -51,7 +51,7 @@ async fn a_record_comes_back_as_it_was_written() {
 }
 
 #[tokio::test]
-async fn a_replacement_takes_the_place_of_its_predecessor() {
+async fn a_process_replaces_its_dead_predecessor() {
     let home = Home::new();
     let store = home.create().await;
     let walkers =
@@ -61,7 +61,7 @@ async fn a_replacement_takes_the_place_of_its_predecessor() {
     let mut found = names(&store).await;
     found.sort();
     assert_eq!(found, ["o", "w0", "w1 again"]);
-    // One that lives on keeps its record.
+    // A predecessor that is alive keeps its record.
     store.upsert_process(&living("w1 again again", "walker", Some(1))).await.unwrap();
     assert_eq!(names(&store).await.len(), 4);
     store.upsert_process(&living("l", "labeller", Some(1))).await.unwrap();
@@ -72,7 +72,7 @@ async fn a_replacement_takes_the_place_of_its_predecessor() {
 }
 
 #[tokio::test]
-async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
+async fn leases_of_living_processes_last_and_those_of_dead_ones_are_released() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 5).await;
@@ -85,9 +85,9 @@ async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
     for holder in ["living", "gone", "gone/3", "leading/0", "without record"] {
         lease(&store, holder, 0).await;
     }
-    assert_eq!(store.release_leases_of_gone_processes(1).await.unwrap(), 3);
+    assert_eq!(store.release_leases_of_dead_processes(1).await.unwrap(), 3);
     assert_eq!(holders(&store).await, ["leading/0", "living"]);
-    assert_eq!(store.release_leases_of_gone_processes(1).await.unwrap(), 0);
+    assert_eq!(store.release_leases_of_dead_processes(1).await.unwrap(), 0);
     let waiting = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
     assert!(waiting.len() == 3 && waiting.iter().all(|job| job.failures == 0));
     let attempts = store.queue_show(&waiting[0].candidate).await.unwrap().attempts_made;
@@ -95,15 +95,15 @@ async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
 }
 
 #[tokio::test]
-async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
+async fn an_expired_lease_continues_while_its_holder_may_be_at_work() {
     const HOUR: i64 = 3_600_000;
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 6).await;
     let elsewhere = |id: &str, last_seen| {
         let here = living(id, "labeller", Some(7));
-        let (place, ticks) = here.birth.rsplit_once('/').unwrap();
-        ProcessRecord { birth: format!("{place}0/{ticks}"), last_seen, ..here }
+        let (place, ticks) = here.start_time.rsplit_once('/').unwrap();
+        ProcessRecord { start_time: format!("{place}0/{ticks}"), last_seen, ..here }
     };
     let hangs = ProcessRecord { last_seen: -20 * HOUR, ..living("hangs", "labeller", Some(1)) };
     let processes = [
@@ -118,7 +118,7 @@ async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
         lease(&store, holder, 0).await;
     }
     let asleep = lease(&store, "asleep", 0).await;
-    // The computer slept for eight hours.
+    // The computer was suspended for eight hours.
     lease(&store, "first awake", 8 * HOUR).await;
     assert_eq!(holders(&store).await, ["asleep", "asleep/3", "first awake", "heard elsewhere"]);
     assert!(store.renew(&asleep, 8 * HOUR, 600).await.unwrap());
@@ -127,14 +127,14 @@ async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
 }
 
 #[tokio::test]
-async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
+async fn a_starting_run_keeps_living_labellers_and_reclaims_other_leases() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 5).await;
     let processes = [
         living("living", "labeller", Some(0)),
         gone("gone", "labeller", Some(1)),
-        // Whoever holds the lock knows better than the table.
+        // The holder of the lock knows better than the table.
         living("earlier", "orchestrator", None),
         living("w", "walker", Some(0)),
     ];
@@ -143,19 +143,19 @@ async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
     for holder in ["gone", "earlier/0", "earlier/1", "without record"] {
         lease(&store, holder, 0).await;
     }
-    assert_eq!(store.take_over(1).await.unwrap(), 4);
+    assert_eq!(store.reclaim_leases(1).await.unwrap(), 4);
     assert_eq!((names(&store).await, holders(&store).await), (vec!["living".into()], vec!["living".into()]));
     assert!(store.renew(&kept, 2, 600).await.unwrap());
     let logged = store.operations(0, 100).await.unwrap().pop().unwrap();
     assert_eq!((logged.time, logged.kind.as_str()), (1, "lost"));
     assert_eq!(logged.detail, serde_json::json!({ "processes": ["earlier", "gone"], "leases": 4 }));
-    // Nothing more to take over, and nothing to tell.
-    assert_eq!(store.take_over(2).await.unwrap(), 0);
+    // Nothing more to reclaim or to report.
+    assert_eq!(store.reclaim_leases(2).await.unwrap(), 0);
     assert_eq!(store.operations(logged.number, 100).await.unwrap(), []);
 }
 
 #[tokio::test]
-async fn status_says_who_is_gone_and_who_was_given_up() {
+async fn status_shows_dead_and_failed_processes() {
     let home = Home::new();
     let store = home.create().await;
     let said = |id: &str, number, state: &str| ProcessRecord {
@@ -173,7 +173,7 @@ async fn status_says_who_is_gone_and_who_was_given_up() {
         store.status().await.unwrap().processes.into_iter().map(|process| process.state).collect()
     };
     assert_eq!(states().await, ["running", "gone", "given up", "pausing"]);
-    // Without its orchestrator nobody starts the third again.
+    // Without its orchestrator the third is not restarted.
     store.upsert_process(&gone("o", "orchestrator", None)).await.unwrap();
     assert_eq!(states().await, ["gone", "gone", "given up", "gone"]);
 }

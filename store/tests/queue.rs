@@ -3,8 +3,9 @@
 use std::collections::BTreeSet;
 
 use store::{
-    Archive, CalculationRecord, Completed, ExportFilter, ExportPlace, ExportSource, Failed, Fate, Imported,
-    JobState, Label, LabelDetails, LabelSource, Lease, Standing, Store, StoreError, Whereabouts,
+    Archive, CalculationRecord, CompleteOutcome, ExportCursor, ExportFilter, ExportSource, FailOutcome, Fate,
+    ImportCounts, JobState, Label, LabelDetails, LabelSource, LabelStatus, Lease, LeaseStatus, Store,
+    StoreError,
 };
 use wire::{ContentHash, Origin};
 
@@ -21,7 +22,7 @@ async fn state(store: &Store, candidate: &str) -> JobState {
 }
 
 #[tokio::test]
-async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
+async fn jobs_are_leased_by_priority_then_age_and_return_on_expiry() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 3).await;
@@ -36,7 +37,7 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
     assert!(store.renew(&first, 5_000, 60).await.unwrap());
     assert_eq!(store.unfinished_jobs().await.unwrap(), 3);
 
-    // The two others ran out of time; the renewed one did not.
+    // The two others expired; the renewed one did not.
     assert_eq!(lease(&store, "c", 10_000).await.unwrap().candidate, names[0]);
     assert_eq!(state(&store, &names[1]).await, JobState::Queued);
     assert_eq!(state(&store, &names[2]).await, JobState::Leased);
@@ -44,7 +45,7 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
     assert_eq!((again.candidate.as_str(), again.attempt), (names[2].as_str(), 2));
     assert_eq!(again.earlier_calculations, ["slurm 17"]);
     assert!(!store.renew(&first, 65_000, 60).await.unwrap());
-    // That time ran out says nothing about the job.
+    // Expiry says nothing about the job.
     let details = store.queue_show(&names[0]).await.unwrap();
     assert_eq!((details.job.state, details.job.failures), (JobState::Queued, 0));
     let outcomes: Vec<_> = details.attempts_made.iter().map(|a| a.outcome.as_deref()).collect();
@@ -52,27 +53,27 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
 }
 
 #[tokio::test]
-async fn the_first_result_is_the_label_whoever_brings_it() {
+async fn the_first_result_becomes_the_label() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 1).await;
     let lost = lease(&store, "a", 0).await.unwrap();
     let holds = lease(&store, "b", 10_000).await.unwrap();
-    assert_eq!(store.complete(&lost, &label(-1.0), 11_000).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&lost, &label(-1.0), 11_000).await.unwrap(), CompleteOutcome::Label);
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
-    assert_eq!(store.complete(&holds, &label(-2.0), 12_000).await.unwrap(), Completed::KeptAsCheck);
-    assert_eq!(store.complete(&lost, &label(-3.0), 13_000).await.unwrap(), Completed::Label);
-    assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), Failed::LeaseLost);
+    assert_eq!(store.complete(&holds, &label(-2.0), 12_000).await.unwrap(), CompleteOutcome::KeptAsCheck);
+    assert_eq!(store.complete(&lost, &label(-3.0), 13_000).await.unwrap(), CompleteOutcome::Label);
+    assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), FailOutcome::LeaseLost);
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
 
     let history = store.label_history(ContentHash::of(&holds.structure), protocol("dft").hash).await.unwrap();
-    let lines: Vec<_> = history.iter().map(|record| (record.standing, record.label.energy)).collect();
-    assert_eq!(lines, [(Standing::Label, -1.0), (Standing::Check, -2.0)]);
+    let lines: Vec<_> = history.iter().map(|record| (record.status, record.label.energy)).collect();
+    assert_eq!(lines, [(LabelStatus::Label, -1.0), (LabelStatus::Check, -2.0)]);
     assert_eq!(history[0].source, LabelSource::Attempt { job: lost.job, attempt: lost.attempt });
 }
 
 #[tokio::test]
-async fn results_that_cannot_be_true_are_refused() {
+async fn impossible_results_are_rejected() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 1).await;
@@ -85,7 +86,7 @@ async fn results_that_cannot_be_true_are_refused() {
         let refused = store.complete(&lease, &wrong, 1).await;
         assert!(matches!(refused, Err(StoreError::InvalidLabel(_))));
     }
-    assert_eq!(store.complete(&lease, &label(-1.0), 2).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&lease, &label(-1.0), 2).await.unwrap(), CompleteOutcome::Label);
 }
 
 #[tokio::test]
@@ -100,14 +101,14 @@ async fn failures_count_and_releases_do_not() {
         assert_eq!(released.await.unwrap(), 1);
     }
     lease(&store, "h-1/c", 1).await.unwrap();
-    assert_eq!(store.release_leases_of_gone_processes(2).await.unwrap(), 1);
+    assert_eq!(store.release_leases_of_dead_processes(2).await.unwrap(), 1);
     let first = lease(&store, "h", 2).await.unwrap();
     assert_eq!(first.attempt, 5);
-    assert_eq!(store.fail(&first, "not converged", "SCF", LIMIT, 3).await.unwrap(), Failed::Requeued);
+    assert_eq!(store.fail(&first, "not converged", "SCF", LIMIT, 3).await.unwrap(), FailOutcome::Requeued);
     let second = lease(&store, "h", 3).await.unwrap();
     assert!(second.earlier_calculations.is_empty(), "that one ended");
     assert_eq!(second.failures, ["not converged"]);
-    assert_eq!(store.fail(&second, "not converged", "SCF", LIMIT, 4).await.unwrap(), Failed::GivenUp);
+    assert_eq!(store.fail(&second, "not converged", "SCF", LIMIT, 4).await.unwrap(), FailOutcome::GivenUp);
     let details = store.queue_show(&names[0]).await.unwrap();
     assert_eq!((details.job.state, details.job.failures), (JobState::Failed, 2));
     let outcomes: Vec<_> = details.attempts_made.iter().map(|a| a.outcome.as_deref().unwrap()).collect();
@@ -119,7 +120,7 @@ async fn failures_count_and_releases_do_not() {
 }
 
 #[tokio::test]
-async fn a_job_that_crashes_its_labellers_is_given_up() {
+async fn a_job_that_crashes_its_labellers_fails() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 2).await;
@@ -138,7 +139,7 @@ async fn a_job_that_crashes_its_labellers_is_given_up() {
 }
 
 #[tokio::test]
-async fn a_job_that_is_lost_again_and_again_is_given_up() {
+async fn a_job_that_is_lost_repeatedly_fails() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 1).await;
@@ -148,8 +149,8 @@ async fn a_job_that_is_lost_again_and_again_is_given_up() {
             lease(&store, "h", now).await.unwrap();
             let released = match loss % 3 {
                 0 => store.release_all("h", now).await.unwrap(),
-                1 => store.release_leases_of_gone_processes(now).await.unwrap(),
-                // It runs out.
+                1 => store.release_leases_of_dead_processes(now).await.unwrap(),
+                // It expires.
                 _ => continue,
             };
             assert_eq!(released, 1);
@@ -157,8 +158,8 @@ async fn a_job_that_is_lost_again_and_again_is_given_up() {
     };
     lose(24).await;
     let failing = lease(&store, "h", 240_000).await.unwrap();
-    assert_eq!(store.fail(&failing, "not converged", "SCF", LIMIT, 0).await.unwrap(), Failed::Requeued);
-    // Each time with as many attempts as at first: after a failure, and when it is queued by hand.
+    assert_eq!(store.fail(&failing, "not converged", "SCF", LIMIT, 0).await.unwrap(), FailOutcome::Requeued);
+    // Each time with as many attempts as at first: after a failure, and when it is requeued by hand.
     for attempts in [50, 75] {
         lose(25).await;
         let details = store.queue_show(&names[0]).await.unwrap();
@@ -175,7 +176,7 @@ async fn a_job_that_is_lost_again_and_again_is_given_up() {
 }
 
 #[tokio::test]
-async fn jobs_are_found_by_name_or_a_beginning_of_it() {
+async fn jobs_are_found_by_name_or_prefix() {
     let home = Home::new();
     let store = home.create().await;
     let error = store.drop_job("0.0.1", 0).await.unwrap_err();
@@ -229,13 +230,13 @@ async fn all_jobs_are_listed_by_state_and_priority() {
 }
 
 #[tokio::test]
-async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
+async fn a_dropped_job_stays_dropped_until_it_is_requeued() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 1).await;
     let lease = lease(&store, "a", 0).await.unwrap();
     store.drop_job(&names[0], 1).await.unwrap();
-    assert_eq!(store.complete(&lease, &label(-1.0), 2).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&lease, &label(-1.0), 2).await.unwrap(), CompleteOutcome::Label);
     assert_eq!(state(&store, &names[0]).await, JobState::Dropped);
     let all = ExportFilter { protocol: lease.protocol, biased: true, control: true, imported: true };
     assert!(store.labelled(&all, None, 10).await.unwrap().is_empty());
@@ -245,9 +246,9 @@ async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
 }
 
 #[tokio::test]
-async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
+async fn candidates_found_before_there_is_a_protocol_get_jobs_later() {
     let home = Home::new();
-    let store = Store::create(home.location(), &campaign(), &[], 0).await.unwrap().by_the_callers_clock();
+    let store = Store::create(home.location(), &campaign(), &[], 0).await.unwrap().with_caller_clock();
     let names = accept(&store, 2).await;
     assert_eq!(store.unfinished_jobs().await.unwrap(), 0);
     let unknown = store.lease(protocol("dft").hash, "a", 0, 10).await;
@@ -260,25 +261,25 @@ async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
     let mut other = protocol("other");
     other.name = "dft".into();
     assert!(matches!(store.add_protocol(&other, 3).await, Err(StoreError::ProtocolName(_))));
-    // A new protocol holds for new candidates only.
+    // A new protocol applies to new candidates only.
     store.add_protocol(&protocol("finer"), 4).await.unwrap();
     assert!(store.lease(protocol("finer").hash, "a", 5, 10).await.unwrap().is_none());
 }
 
 #[tokio::test]
-async fn imports_label_what_waits_and_can_be_repeated() {
+async fn imports_label_waiting_jobs_and_can_be_repeated() {
     let home = Home::new();
     let store = home.create().await;
     let names = accept(&store, 2).await;
     let dft = protocol("dft").hash;
     let frames = [(0, structure(50.0), label(-5.0)), (1, structure(1e-6), label(-1.0))];
     let first = store.import(dft, "old.extxyz", &frames, 1).await.unwrap();
-    assert_eq!(first, Imported { labels: 2, ..Imported::default() });
+    assert_eq!(first, ImportCounts { labels: 2, ..ImportCounts::default() });
     let second = store.import(dft, "old.extxyz", &frames, 2).await.unwrap();
-    assert_eq!(second, Imported { known: 2, ..Imported::default() });
+    assert_eq!(second, ImportCounts { known: 2, ..ImportCounts::default() });
     let other = [(0, structure(50.0), label(-5.1))];
     let third = store.import(dft, "other.extxyz", &other, 3).await.unwrap();
-    assert_eq!(third, Imported { checks: 1, ..Imported::default() });
+    assert_eq!(third, ImportCounts { checks: 1, ..ImportCounts::default() });
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
     assert_eq!(state(&store, &names[1]).await, JobState::Queued);
     let known = store.known_hashes().await.unwrap();
@@ -292,7 +293,7 @@ async fn imports_label_what_waits_and_can_be_repeated() {
     assert_eq!(store.status().await.unwrap().imported, 2);
 }
 
-/// A campaign whose labels come in the order `order`; the text of its export, read in pages of `page`.
+/// A campaign whose labels arrive in the order `order`. Returns the text of its export, read in pages of `page`.
 async fn export_text(order: &[usize], page: u32, filter: &ExportFilter) -> Vec<String> {
     let home = Home::new();
     let store = home.create().await;
@@ -308,12 +309,12 @@ async fn export_text(order: &[usize], page: u32, filter: &ExportFilter) -> Vec<S
         let energy = leases[*k].structure.positions[0][0];
         store.complete(&leases[*k], &label(energy), 1).await.unwrap();
     }
-    let (mut rows, mut after): (Vec<String>, Option<ExportPlace>) = (Vec::new(), None);
+    let (mut rows, mut after): (Vec<String>, Option<ExportCursor>) = (Vec::new(), None);
     loop {
         let found = store.labelled(filter, after, page).await.unwrap();
         let Some(last) = found.last() else { return rows };
-        assert!(after < Some(last.place));
-        after = Some(last.place);
+        assert!(after < Some(last.cursor));
+        after = Some(last.cursor);
         rows.extend(found.iter().map(|row| format!("{row:?}")));
     }
 }
@@ -336,7 +337,7 @@ async fn exports_do_not_depend_on_the_order_of_labels() {
 }
 
 #[tokio::test]
-async fn an_exported_row_tells_all_that_is_known() {
+async fn an_exported_row_has_all_data() {
     let home = Home::new();
     let store = home.create().await;
     let record = candidate(0, 1, Origin::Biased, Fate::Accepted);
@@ -385,11 +386,11 @@ async fn two_connections_never_lease_the_same_job() {
     assert_eq!(store.status().await.unwrap().labels.labelled, 60);
 }
 
-/// A calculation that was taken over counts once, with the attempt that brought its result.
+/// A calculation that was taken over counts once, with the attempt that delivered its result.
 #[tokio::test]
-async fn what_calculations_take_is_kept_and_counted_once() {
+async fn the_cost_of_a_calculation_is_counted_once() {
     let home = Home::new();
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     let names = accept(&store, 2).await;
     let made = CalculationRecord {
         cores: Some(4),
@@ -410,7 +411,7 @@ async fn what_calculations_take_is_kept_and_counted_once() {
     assert_eq!((second.earlier_calculations.as_slice(), second.attempt), (&["here".to_owned()][..], 2));
     store.record_calculation(&second, "here", &made).await.unwrap();
     assert_eq!(core_seconds(3000).await, 0.0);
-    store.account(&second, 17.25, "the end").await.unwrap();
+    store.record_cost(&second, 17.25, "the end").await.unwrap();
     let details = LabelDetails {
         energy_without_smearing: Some(-3.25),
         magnetic_moments: Some(vec![1.5, -1.5]),
@@ -426,24 +427,24 @@ async fn what_calculations_take_is_kept_and_counted_once() {
     let hash = ContentHash::of(&second.structure);
     assert_eq!(store.label_history(hash, protocol("dft").hash).await.unwrap()[0].label, label);
 
-    // Another time of a calculation that has ended changes the sum by the difference.
-    store.account(&second, 18.0, "the end").await.unwrap();
+    // A corrected time of a finished calculation changes the total by the difference.
+    store.record_cost(&second, 18.0, "the end").await.unwrap();
     let third = lease(&store, "c", 6000).await.unwrap();
     store.record_calculation(&third, "there", &made).await.unwrap();
-    store.account(&third, 1.5, "").await.unwrap();
-    assert_eq!(store.lose(&third, "lost_node", "gone", 9000).await.unwrap(), Failed::Requeued);
+    store.record_cost(&third, 1.5, "").await.unwrap();
+    assert_eq!(store.release_lost(&third, "lost_node", "gone", 9000).await.unwrap(), FailOutcome::Requeued);
     assert_eq!(core_seconds(9000).await, 19.5);
     let fourth = lease(&store, "c", 9000).await.unwrap();
     assert_eq!((fourth.failures.as_slice(), fourth.overruled), (&["lost_node".to_owned()][..], false));
     let found = store.check(|_, _| ()).await.unwrap();
     assert!(found.iter().all(|finding| !finding.what.contains("sum of")), "{found:?}");
-    assert_eq!(store.whereabouts(&third).await.unwrap(), Whereabouts::LeasedAgain { calculation: None });
-    assert_eq!(store.whereabouts(&fourth).await.unwrap(), Whereabouts::Held);
-    assert_eq!(store.whereabouts(&second).await.unwrap(), Whereabouts::Over);
+    assert_eq!(store.lease_status(&third).await.unwrap(), LeaseStatus::LeasedAgain { calculation: None });
+    assert_eq!(store.lease_status(&fourth).await.unwrap(), LeaseStatus::Held);
+    assert_eq!(store.lease_status(&second).await.unwrap(), LeaseStatus::Over);
 }
 
 #[tokio::test]
-async fn directories_of_calculations_are_kept_with_their_attempts() {
+async fn archives_are_stored_with_their_attempts() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 1).await;
@@ -460,7 +461,7 @@ async fn directories_of_calculations_are_kept_with_their_attempts() {
         Archive { attempt: 1, bytes: b"second".to_vec(), left_out: "work/large (5 bytes)\n".into() };
     assert_eq!(store.archives(lease.job).await.unwrap(), std::slice::from_ref(&archive));
     assert_eq!(store.past_calculation(lease.job, 2).await.unwrap(), None);
-    // It goes with a copy, and so does what was used up.
+    // A copy keeps the limits and their use.
     let elsewhere = tempfile::tempdir().unwrap();
     let target = elsewhere.path().join("copy");
     store.backup(&target, 7, |_, _| ()).await.unwrap();
@@ -469,9 +470,9 @@ async fn directories_of_calculations_are_kept_with_their_attempts() {
     assert_eq!(copy.budget(9).await.unwrap(), store.budget(9).await.unwrap());
 }
 
-/// The answer to the commit of a lease was lost: its holder lives, and knows nothing of it.
+/// The reply to the commit of a lease was lost: its holder is alive and does not know of it.
 #[tokio::test]
-async fn what_a_holder_does_not_state_comes_back() {
+async fn leases_that_a_holder_does_not_state_are_released() {
     let home = Home::new();
     let store = home.create().await;
     accept(&store, 4).await;
@@ -486,12 +487,12 @@ async fn what_a_holder_does_not_state_comes_back() {
         assert!(store.renew(held, 2, 600).await.unwrap(), "{}", held.holder);
     }
     assert!(!store.renew(&unknown, 2, 600).await.unwrap());
-    // It waits again, and nobody has failed.
+    // It waits again, and no attempt has failed.
     let again = lease("a").await;
     assert_eq!((again.job, again.attempt, again.failures.len()), (unknown.job, 2, 0));
     let details = store.queue_show(&again.candidate).await.unwrap();
     assert_eq!(details.attempts_made[0].outcome.as_deref(), Some("lost"));
-    // One of an earlier attempt is another lease.
+    // The lease of an earlier attempt is a different one.
     assert_eq!(store.state_leases("a", &[&known, &unknown], 3).await.unwrap(), 1);
     assert_eq!(store.state_leases("a", &[], 3).await.unwrap(), 1);
     assert_eq!((store.state_leases("a/0", &[&part], 3).await.unwrap(), details.job.failures), (0, 0));

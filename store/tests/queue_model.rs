@@ -1,10 +1,10 @@
-//! The queue against a model of a few lines, under random operations and a clock of its own.
+//! Compares the queue with a small model, under random operations and a simulated clock.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use store::{Completed, ExportFilter, Failed, JobState, Lease, Store, StoreError};
+use store::{CompleteOutcome, ExportFilter, FailOutcome, JobState, Lease, Store, StoreError};
 
 use crate::common::*;
 
@@ -49,7 +49,7 @@ struct ModelJob {
     expires: Option<i64>,
     attempts: u32,
     failures: u32,
-    /// Attempts that brought a result; the first one's is the label.
+    /// Attempts that delivered a result; the first one's is the label.
     results: Vec<u32>,
 }
 
@@ -58,7 +58,7 @@ impl ModelJob {
         (self.state, self.holder, self.expires) = (state, None, None);
     }
 
-    /// In so few steps no job is lost so often that it is given up.
+    /// There are too few steps for a job to reach the limit of losses.
     fn lose(&mut self) {
         self.change_to(JobState::Queued);
     }
@@ -69,7 +69,7 @@ impl ModelJob {
     }
 }
 
-/// Jobs by their place in decision order.
+/// Jobs by index in decision order.
 struct Model(BTreeMap<usize, ModelJob>);
 
 impl Model {
@@ -152,7 +152,7 @@ impl Run {
                 if job.state != JobState::Dropped {
                     job.change_to(JobState::Labelled);
                 }
-                let expected = if first { Completed::Label } else { Completed::KeptAsCheck };
+                let expected = if first { CompleteOutcome::Label } else { CompleteOutcome::KeptAsCheck };
                 let energy = -f64::from(lease.attempt);
                 assert_eq!(store.complete(&lease, &label(energy), now).await.unwrap(), expected);
             }
@@ -160,9 +160,9 @@ impl Run {
                 let Some((job, lease)) = self.pick(which) else { return };
                 let expected = if job.state == JobState::Leased && job.attempts == lease.attempt {
                     job.fail();
-                    if job.state == JobState::Failed { Failed::GivenUp } else { Failed::Requeued }
+                    if job.state == JobState::Failed { FailOutcome::GivenUp } else { FailOutcome::Requeued }
                 } else {
-                    Failed::LeaseLost
+                    FailOutcome::LeaseLost
                 };
                 assert_eq!(store.fail(&lease, "class", "log", LIMIT, now).await.unwrap(), expected);
             }
@@ -173,11 +173,11 @@ impl Run {
                 assert_eq!(store.release_all(&holder, now).await.unwrap(), held.len());
                 held.into_iter().for_each(ModelJob::lose);
             }
-            by_hand => self.by_hand(by_hand).await,
+            queue_admin => self.queue_admin(queue_admin).await,
         }
     }
 
-    async fn by_hand(&mut self, step: Step) {
+    async fn queue_admin(&mut self, step: Step) {
         use JobState::{Dropped, Failed, Labelled, Leased, Queued};
         let (Step::Drop(which) | Step::Retry(which) | Step::Prioritise(which, _)) = step else { return };
         let place = which % JOBS as usize;
@@ -257,7 +257,7 @@ proptest! {
     })]
 
     #[test]
-    fn the_queue_does_what_its_model_does(steps in proptest::collection::vec(step(), 1..50)) {
+    fn the_queue_agrees_with_its_model(steps in proptest::collection::vec(step(), 1..50)) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let mut run = Run::new().await;

@@ -1,55 +1,55 @@
-//! Labels that are made anew, by the same protocol and by another.
+//! Making labels again, under the same protocol and under another.
 
 use serde_json::json;
 use store::{
-    Commit, Completed, ExportFilter, Failed, JobState, LabelSource, Lease, NewProtocol, Protocol, Relabel,
-    Requeued, Standing, Store, StoreError, WalkRecord, Whereabouts,
+    Commit, CompleteOutcome, ExportFilter, FailOutcome, JobState, LabelSource, LabelStatus, Lease,
+    LeaseStatus, NewProtocol, Protocol, RelabelCounts, RelabelRequest, Store, StoreError, WalkRecord,
 };
 use wire::ContentHash;
 
 use crate::common::*;
 
-const AGAIN: Requeued = Requeued { again: 1, moved: 0 };
+const AGAIN: RelabelCounts = RelabelCounts { again: 1, moved: 0 };
 
 async fn lease(store: &Store, protocol: &Protocol, now: i64) -> Option<Lease> {
     store.lease(protocol.hash, "host/a", now, 10).await.unwrap()
 }
 
-/// Leases what is next by a protocol, and labels it.
-async fn label_next(store: &Store, protocol: &Protocol, energy: f64, now: i64) -> Completed {
+/// Leases and labels the next job of a protocol.
+async fn label_next(store: &Store, protocol: &Protocol, energy: f64, now: i64) -> CompleteOutcome {
     let lease = lease(store, protocol, now).await.unwrap();
     store.complete(&lease, &label(energy), now + 1).await.unwrap()
 }
 
-/// Candidates of which the first `labelled` have their labels by "dft", with energies −1, −2, …
+/// Candidates of which the first `labelled` have labels under "dft", with energies −1, −2, …
 async fn campaign_with(home: &Home, candidates: u64, labelled: u64) -> (Store, Vec<ContentHash>) {
     let store = home.create().await;
     accept(&store, candidates).await;
     let walk = WalkRecord { accepted: candidates as u32, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
     for energy in 1..=labelled {
-        assert_eq!(label_next(&store, &protocol("dft"), -(energy as f64), 0).await, Completed::Label);
+        assert_eq!(label_next(&store, &protocol("dft"), -(energy as f64), 0).await, CompleteOutcome::Label);
     }
     (store, (1..=candidates).map(|step| ContentHash::of(&structure(1e-6 * step as f64))).collect())
 }
 
-async fn again(store: &Store, structures: &[ContentHash], again: bool) -> Requeued {
-    let order = Relabel { structures, again, reason: "a sick node", protocol: None };
+async fn again(store: &Store, structures: &[ContentHash], again: bool) -> RelabelCounts {
+    let order = RelabelRequest { structures, again, reason: "a sick node", protocol: None };
     store.relabel(&order, 100).await.unwrap()
 }
 
-async fn change_to(store: &Store, to: &Protocol, structures: &[ContentHash]) -> Requeued {
+async fn change_to(store: &Store, to: &Protocol, structures: &[ContentHash]) -> RelabelCounts {
     let notes = [("label_method", format!("how {} is made", to.name))];
     let changes = [json!({ "key": "label.protocol", "before": "dft", "after": to.name })];
     let new = NewProtocol { protocol: to, configuration: "{\"new\":1}", changes: &changes, notes: &notes };
-    let order = Relabel { structures, again: false, reason: "cutoff", protocol: Some(new) };
+    let order = RelabelRequest { structures, again: false, reason: "cutoff", protocol: Some(new) };
     store.relabel(&order, 200).await.unwrap()
 }
 
-/// Standing, energy and protocol of every label of a structure.
-async fn history(store: &Store, structure: ContentHash) -> Vec<(Standing, f64, String)> {
+/// Status, energy and protocol of every label of a structure.
+async fn history(store: &Store, structure: ContentHash) -> Vec<(LabelStatus, f64, String)> {
     let labels = store.labels_of(structure).await.unwrap().into_iter();
-    labels.map(|label| (label.record.standing, label.record.label.energy, label.protocol.name)).collect()
+    labels.map(|label| (label.record.status, label.record.label.energy, label.protocol.name)).collect()
 }
 
 /// Energies in an export.
@@ -73,13 +73,13 @@ async fn whole(store: &Store) {
 }
 
 #[tokio::test]
-async fn a_doubtful_label_stays_until_the_new_one_comes() {
+async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 2, 1).await;
     let dft = protocol("dft");
-    assert_eq!(again(&store, &structures, false).await, Requeued::default(), "it has its label");
+    assert_eq!(again(&store, &structures, false).await, RelabelCounts::default(), "it has its label");
     assert_eq!(again(&store, &structures, true).await, AGAIN);
-    assert_eq!(again(&store, &structures, true).await, Requeued::default(), "it waits already");
+    assert_eq!(again(&store, &structures, true).await, RelabelCounts::default(), "it waits already");
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.queued, labels.labelled, labels.again, labels.again_in_vain), (2, 0, 1, 0));
@@ -90,9 +90,13 @@ async fn a_doubtful_label_stays_until_the_new_one_comes() {
     let found = lease(&store, &dft, 300).await.unwrap();
     assert_eq!(ContentHash::of(&found.structure), structures[0]);
     assert!(found.overruled && found.failures.is_empty() && found.attempt == 2);
-    assert_eq!(store.complete(&found, &label(-1.5), 400).await.unwrap(), Completed::Label);
-    assert_eq!(store.complete(&found, &label(-1.5), 500).await.unwrap(), Completed::Label, "brought twice");
-    let expected = [(Standing::Superseded, -1.0, "dft".into()), (Standing::Label, -1.5, "dft".into())];
+    assert_eq!(store.complete(&found, &label(-1.5), 400).await.unwrap(), CompleteOutcome::Label);
+    assert_eq!(
+        store.complete(&found, &label(-1.5), 500).await.unwrap(),
+        CompleteOutcome::Label,
+        "brought twice"
+    );
+    let expected = [(LabelStatus::Superseded, -1.0, "dft".into()), (LabelStatus::Label, -1.5, "dft".into())];
     assert_eq!(history(&store, structures[0]).await, expected);
     let old = store.label_history(structures[0], dft.hash).await.unwrap().remove(0);
     assert_eq!(old.superseded.map(|s| (s.time, s.reason)), Some((400, "a sick node".into())));
@@ -106,55 +110,55 @@ async fn a_doubtful_label_stays_until_the_new_one_comes() {
 }
 
 #[tokio::test]
-async fn a_label_that_cannot_be_made_again_stays_as_it_was() {
+async fn a_label_that_cannot_be_remade_stays() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 1).await;
     let dft = protocol("dft");
     again(&store, &structures, true).await;
     let first = lease(&store, &dft, 300).await.unwrap();
-    assert_eq!(store.fail(&first, "crashed", "", 2, 301).await.unwrap(), Failed::Requeued);
+    assert_eq!(store.fail(&first, "crashed", "", 2, 301).await.unwrap(), FailOutcome::Requeued);
     let second = lease(&store, &dft, 302).await.unwrap();
-    assert_eq!(store.fail(&second, "crashed", "", 2, 303).await.unwrap(), Failed::GivenUp);
+    assert_eq!(store.fail(&second, "crashed", "", 2, 303).await.unwrap(), FailOutcome::GivenUp);
     assert_eq!(jobs(&store, structures[0]).await, [("dft".into(), JobState::Labelled)]);
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.labelled, labels.failed, labels.again, labels.again_in_vain), (1, 0, 0, 1));
     whole(&store).await;
-    // It may be asked for once more, and a result that comes late is the one that was asked for.
+    // It may be requested again, and a late result satisfies the request.
     assert_eq!(again(&store, &structures, true).await, AGAIN);
     let third = lease(&store, &dft, 400).await.unwrap();
     assert!(third.failures.is_empty());
     assert_eq!(store.release_all("host", 401).await.unwrap(), 1);
-    assert_eq!(store.complete(&third, &label(-1.5), 402).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&third, &label(-1.5), 402).await.unwrap(), CompleteOutcome::Label);
     assert_eq!(store.status().await.unwrap().labels.again_in_vain, 0);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;
 }
 
 #[tokio::test]
-async fn what_began_before_is_only_a_check() {
+async fn an_attempt_from_before_the_request_gives_a_check() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 0).await;
     let dft = protocol("dft");
     let late = lease(&store, &dft, 0).await.unwrap();
-    assert_eq!(label_next(&store, &dft, -1.0, 20_000).await, Completed::Label);
+    assert_eq!(label_next(&store, &dft, -1.0, 20_000).await, CompleteOutcome::Label);
     again(&store, &structures, true).await;
-    assert_eq!(store.complete(&late, &label(-9.0), 30_000).await.unwrap(), Completed::KeptAsCheck);
+    assert_eq!(store.complete(&late, &label(-9.0), 30_000).await.unwrap(), CompleteOutcome::KeptAsCheck);
     let frames = [(0, structure(1e-6), label(-8.0))];
     assert_eq!(store.import(dft.hash, "x", &frames, 30_001).await.unwrap().checks, 1);
     assert_eq!(jobs(&store, structures[0]).await, [("dft".into(), JobState::Queued)], "it still waits");
     assert_eq!(exported(&store, &dft).await, [-1.0]);
-    assert_eq!(label_next(&store, &dft, -1.5, 30_002).await, Completed::Label);
+    assert_eq!(label_next(&store, &dft, -1.5, 30_002).await, CompleteOutcome::Label);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;
 }
 
 #[tokio::test]
-async fn another_protocol_takes_over_label_by_label() {
+async fn another_protocol_supersedes_label_by_label() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 5, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
-    // One is under way, one failed, one waits.
+    // One is running, one failed, one waits.
     let under_way = lease(&store, &dft, 10).await.unwrap();
     let failing = lease(&store, &dft, 10).await.unwrap();
     store.fail(&failing, "crashed", "", 1, 11).await.unwrap();
@@ -163,20 +167,20 @@ async fn another_protocol_takes_over_label_by_label() {
         all.iter().map(|one| (one.content, one.job)).collect::<Vec<_>>(),
         [(structures[0], None), (structures[1], None)]
     );
-    assert_eq!(store.unlabelled_by_others(fine.hash).await.unwrap(), 3);
+    assert_eq!(store.unlabelled_under_other_protocols(fine.hash).await.unwrap(), 3);
 
-    for expected in [Requeued { again: 2, moved: 3 }, Requeued::default()] {
+    for expected in [RelabelCounts { again: 2, moved: 3 }, RelabelCounts::default()] {
         assert_eq!(change_to(&store, &fine, &structures).await, expected, "asking twice is asking once");
         assert_eq!(store.protocol_in_force().await.unwrap().unwrap(), fine);
         whole(&store).await;
     }
     assert_eq!(store.campaign().await.unwrap().configuration_in_force, "{\"new\":1}");
-    assert_eq!(store.note("label_method").await.unwrap().unwrap(), "how fine is made");
+    assert_eq!(store.metadata("label_method").await.unwrap().unwrap(), "how fine is made");
     assert!(store.is_in_force(fine.hash).await.unwrap() && !store.is_in_force(dft.hash).await.unwrap());
-    // Nobody waits for what was under way, and nothing is begun by the old protocol.
+    // The running one is no longer needed, and nothing starts under the old protocol.
     assert!(!store.renew(&under_way, 210, 10).await.unwrap());
-    assert_eq!(store.whereabouts(&under_way).await.unwrap(), Whereabouts::Over);
-    assert_eq!(store.complete(&under_way, &label(-7.0), 211).await.unwrap(), Completed::KeptAsCheck);
+    assert_eq!(store.lease_status(&under_way).await.unwrap(), LeaseStatus::Over);
+    assert_eq!(store.complete(&under_way, &label(-7.0), 211).await.unwrap(), CompleteOutcome::KeptAsCheck);
     assert!(lease(&store, &dft, 220).await.is_none());
     let old = ("dft".to_owned(), JobState::Labelled);
     assert_eq!(jobs(&store, structures[0]).await, [old.clone(), ("fine".into(), JobState::Queued)]);
@@ -184,26 +188,26 @@ async fn another_protocol_takes_over_label_by_label() {
     assert_eq!((labels.queued, labels.labelled, labels.failed, labels.again), (5, 2, 0, 2));
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0]);
 
-    // The first gets its label by the new protocol, the second finally fails.
-    assert_eq!(label_next(&store, &fine, -1.5, 300).await, Completed::Label);
+    // The first is labelled under the new protocol, the second fails.
+    assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     let in_vain = lease(&store, &fine, 310).await.unwrap();
-    assert_eq!(store.fail(&in_vain, "crashed", "", 1, 311).await.unwrap(), Failed::GivenUp);
+    assert_eq!(store.fail(&in_vain, "crashed", "", 1, 311).await.unwrap(), FailOutcome::GivenUp);
     let superseded = ("dft".to_owned(), JobState::Superseded);
     assert_eq!(jobs(&store, structures[0]).await, [superseded, ("fine".into(), JobState::Labelled)]);
     assert_eq!(jobs(&store, structures[1]).await, [old, ("fine".into(), JobState::Failed)]);
-    let expected = [(Standing::Superseded, -1.0, "dft".into()), (Standing::Label, -1.5, "fine".into())];
+    let expected = [(LabelStatus::Superseded, -1.0, "dft".into()), (LabelStatus::Label, -1.5, "fine".into())];
     assert_eq!(history(&store, structures[0]).await, expected);
     assert_eq!((exported(&store, &dft).await, exported(&store, &fine).await), (vec![-2.0], vec![-1.5]));
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.labelled, labels.failed, labels.again, labels.again_in_vain), (2, 1, 0, 1));
     whole(&store).await;
 
-    // Those without a label get their first by the new protocol; the one that failed is asked for once more.
+    // Those without a label get their first under the new protocol; the failed one is requested again.
     for energy in [-3.0, -4.0, -5.0] {
-        assert_eq!(label_next(&store, &fine, energy, 400).await, Completed::Label);
+        assert_eq!(label_next(&store, &fine, energy, 400).await, CompleteOutcome::Label);
     }
     assert_eq!(again(&store, &structures, false).await, AGAIN);
-    assert_eq!(label_next(&store, &fine, -2.5, 500).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -2.5, 500).await, CompleteOutcome::Label);
     assert_eq!(exported(&store, &dft).await, [0.0; 0]);
     assert_eq!(exported(&store, &fine).await, [-1.5, -2.5, -3.0, -4.0, -5.0]);
     let labels = store.status().await.unwrap().labels;
@@ -212,12 +216,12 @@ async fn another_protocol_takes_over_label_by_label() {
 }
 
 #[tokio::test]
-async fn a_campaign_may_go_back_to_its_first_protocol() {
+async fn a_campaign_may_return_to_its_first_protocol() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 3, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
     change_to(&store, &fine, &structures).await;
-    assert_eq!(label_next(&store, &fine, -1.5, 300).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     // The second waits for its second label, the third for its first.
     assert_eq!(change_to(&store, &dft, &structures).await.again, 1);
     whole(&store).await;
@@ -226,45 +230,45 @@ async fn a_campaign_may_go_back_to_its_first_protocol() {
         [("dft".into(), JobState::Labelled), ("fine".into(), JobState::Superseded)]
     );
     for energy in [-1.0, -3.0] {
-        assert_eq!(label_next(&store, &dft, energy, 400).await, Completed::Label);
+        assert_eq!(label_next(&store, &dft, energy, 400).await, CompleteOutcome::Label);
     }
     assert!(lease(&store, &dft, 500).await.is_none() && lease(&store, &fine, 500).await.is_none());
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0, -3.0]);
     assert_eq!(exported(&store, &fine).await, [0.0; 0]);
     let expected = [
-        (Standing::Superseded, -1.0, "dft".into()),
-        (Standing::Label, -1.0, "dft".into()),
-        (Standing::Superseded, -1.5, "fine".into()),
+        (LabelStatus::Superseded, -1.0, "dft".into()),
+        (LabelStatus::Label, -1.0, "dft".into()),
+        (LabelStatus::Superseded, -1.5, "fine".into()),
     ];
     assert_eq!(history(&store, structures[0]).await, expected);
     whole(&store).await;
 }
 
 #[tokio::test]
-async fn what_was_dropped_is_left_alone() {
+async fn dropped_jobs_are_not_relabelled() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 1).await;
     let fine = protocol("fine");
     change_to(&store, &fine, &structures).await;
     let lease = lease(&store, &fine, 300).await.unwrap();
     let name = store.drop_job("0.0.1", 301).await.unwrap();
-    assert_eq!(store.complete(&lease, &label(-1.5), 302).await.unwrap(), Completed::KeptAsCheck);
-    assert_eq!(again(&store, &structures, true).await, Requeued::default());
+    assert_eq!(store.complete(&lease, &label(-1.5), 302).await.unwrap(), CompleteOutcome::KeptAsCheck);
+    assert_eq!(again(&store, &structures, true).await, RelabelCounts::default());
     whole(&store).await;
-    // Wanted again, it waits for the label that was asked for.
+    // Requested again, it waits for the new label.
     store.retry_job(&name, 303).await.unwrap();
-    assert_eq!(label_next(&store, &fine, -1.6, 304).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -1.6, 304).await, CompleteOutcome::Label);
     let expected = [
-        (Standing::Superseded, -1.0, "dft".into()),
-        (Standing::Check, -1.5, "fine".into()),
-        (Standing::Label, -1.6, "fine".into()),
+        (LabelStatus::Superseded, -1.0, "dft".into()),
+        (LabelStatus::Check, -1.5, "fine".into()),
+        (LabelStatus::Label, -1.6, "fine".into()),
     ];
     assert_eq!(history(&store, structures[0]).await, expected);
     whole(&store).await;
 }
 
 #[tokio::test]
-async fn an_imported_label_may_be_the_one_that_is_superseded_or_the_one_that_was_asked_for() {
+async fn an_imported_label_may_be_superseded_or_satisfy_a_request() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 2, 0).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
@@ -275,7 +279,7 @@ async fn an_imported_label_may_be_the_one_that_is_superseded_or_the_one_that_was
     import(&dft, 1.0, -1.0).await;
     import(&dft, 2.0, -2.0).await;
     assert_eq!(change_to(&store, &fine, &structures).await.again, 2);
-    assert_eq!(label_next(&store, &fine, -1.5, 300).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     assert_eq!(import(&fine, 2.0, -2.5).await.labels, 1);
     assert!(lease(&store, &fine, 400).await.is_none());
     assert_eq!((exported(&store, &dft).await, exported(&store, &fine).await), (vec![], vec![-1.5, -2.5]));
@@ -285,13 +289,13 @@ async fn an_imported_label_may_be_the_one_that_is_superseded_or_the_one_that_was
 }
 
 #[tokio::test]
-async fn two_protocols_do_not_share_a_name() {
+async fn two_protocols_cannot_share_a_name() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 1).await;
     let mut other = protocol("other");
     other.name = "dft".into();
     let new = NewProtocol { protocol: &other, configuration: "{}", changes: &[], notes: &[] };
-    let order = Relabel { structures: &structures, again: false, reason: "", protocol: Some(new) };
+    let order = RelabelRequest { structures: &structures, again: false, reason: "", protocol: Some(new) };
     assert!(matches!(store.relabel(&order, 1).await, Err(StoreError::ProtocolName(_))));
     assert_eq!(store.protocol_in_force().await.unwrap().unwrap(), protocol("dft"));
     assert_eq!(store.status().await.unwrap().labels.again, 0, "all or nothing");

@@ -177,7 +177,7 @@ fn guards_stand_before_abinit() {
     is_refused(here, &short, "label.guard.shortest_bond of Si-Si is 1.8");
     is_refused(here, &flat, "label.guard.least_height is 3");
     is_refused(here, &many, "9 atoms, where label.guard.most_atoms is 8");
-    is_refused(here, &near, &format!("from those of {good}, which has its label"));
+    is_refused(here, &near, &format!("from those of {good}, which has a label"));
     succeed(here, ["queue", "campaign", "retry", &near]);
     succeed(here, ["label", "--store", "campaign", "--until-empty"]);
     assert!(is_labelled(&near));
@@ -187,7 +187,7 @@ fn guards_stand_before_abinit() {
     succeed(here, ["run", "campaign.toml"]);
     let dear = add(8, pair(1.5), 4.0);
     succeed(here, ["label", "--store", "campaign", "--until-empty"]);
-    is_refused(here, &dear, "core-seconds, as 4 others did, where label.guard.largest_cost is 0.000001");
+    is_refused(here, &dear, "core-seconds, judging by 4 labels, where label.guard.largest_cost is 0.000001");
 }
 
 /// When ABINIT has made the first label, its pseudopotential becomes another, with which it would calculate as well.

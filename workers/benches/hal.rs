@@ -1,8 +1,10 @@
-//! Biased steps a second against gracemaker's walker, `grace_uq hal`: the same model (al_eam_1l), 108 atoms, 600 K, 2 fs, Langevin
-//! friction 0.01/fs, τ = 0.15, no updates of the mixture. The two are under way together and have the machine in turn.
+//! Biased steps per second against gracemaker's walker, `grace_uq hal`: the same model (al_eam_1l), 108 atoms, 600
+//! K, 2 fs, Langevin friction 0.01/fs, τ = 0.15, no updates of the mixture. Both run at the same time and use the
+//! machine alternately.
 //!
-//! `CALMWALK_PEER_DATA=… CALMWALK_GRACEMAKER_PYTHON=…/bin/python cargo bench -p workers --bench hal [-- ENSEMBLE… CORES…]`;
-//! ensembles are those of `grace_uq`, `nvt_ramp` and `npt_stress` if none is given, and one core and two. Our walk has the volume ramp's integrator in both.
+//! `CALMWALK_PEER_DATA=… CALMWALK_GRACEMAKER_PYTHON=…/bin/python cargo bench -p workers --bench hal [-- ENSEMBLE…
+//! CORES…]`. Ensembles are those of `grace_uq`, by default `nvt_ramp` and `npt_stress`, on one and two cores by
+//! default. Our walk uses the integrator of the volume ramp in both.
 
 mod common;
 
@@ -15,18 +17,18 @@ use std::time::Instant;
 use atoms::Structure;
 use atoms::extxyz::{Frame, write_frame};
 use calm::Artifact;
-use common::{Turn, crystal, quartiles};
+use common::{TimedWalk, crystal, quartiles};
 use potentials::grace::GraceModel;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
-/// Times that each is measured.
+/// Number of measurements of each.
 const ROUNDS: usize = 9;
 
-/// Steps of a turn of ours.
+/// Steps per measurement of our walk.
 const STEPS: u64 = 250;
 
-/// Steps between the lines of gracemaker's walker, and so of a turn of its own.
+/// Steps between lines of gracemaker's walker, and so per measurement of it.
 const PEER_STEPS: u64 = 20;
 
 fn main() {
@@ -49,16 +51,16 @@ fn main() {
     }
     let model = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
     let mixture = Arc::new(Artifact::load_export(folder.join("kokkos.npz")).expect("a CALM mixture").mixture);
-    let seed = crystal(model.elements(), 4.05);
-    let walk = Turn::new(&model, &mixture, seed.clone());
+    let seed_structure = crystal(model.elements(), 4.05);
+    let walk = TimedWalk::new(&model, &mixture, seed_structure.clone());
     for ensemble in ensembles {
         for &cores in &cores {
-            let mut peer = Peer::start(&python, &folder, &seed, &ensemble, cores);
+            let mut peer = Peer::start(&python, &folder, &seed_structure, &ensemble, cores);
             let mut walks = vec![walk.clone(); cores];
             let (mut ours, mut theirs, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
             for round in 0..=ROUNDS {
                 let (their, our) = (peer.rate(), rate(&mut walks));
-                // The first round warms up.
+                // The first round is a warm-up.
                 if round > 0 {
                     ours.push(our);
                     theirs.push(their);
@@ -76,8 +78,8 @@ fn main() {
     }
 }
 
-/// Steps a second of all walks side by side, each on a thread of its own.
-fn rate(walks: &mut [Turn]) -> f64 {
+/// Steps per second of all walks in parallel, one thread each.
+fn rate(walks: &mut [TimedWalk]) -> f64 {
     let (count, start) = (walks.len() as f64, Instant::now());
     std::thread::scope(|scope| {
         for walk in walks {
@@ -95,11 +97,11 @@ struct Peer {
 }
 
 impl Peer {
-    /// On one core with one thread, or on all of them with as many threads as it likes.
-    fn start(python: &Path, folder: &Path, seed: &Structure, ensemble: &str, cores: usize) -> Self {
+    /// On one core with one thread, or on all cores with any number of threads.
+    fn start(python: &Path, folder: &Path, seed_structure: &Structure, ensemble: &str, cores: usize) -> Self {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let mut text = Vec::new();
-        write_frame(&mut text, &Frame::from(seed.clone())).expect("a crystal");
+        write_frame(&mut text, &Frame::from(seed_structure.clone())).expect("a crystal");
         let structure = directory.path().join("seed.extxyz");
         std::fs::write(&structure, text).expect("a file");
         let program = python.with_file_name("grace_uq");
@@ -133,7 +135,7 @@ impl Peer {
         peer
     }
 
-    /// Steps a second between two of its lines.
+    /// Steps per second between two of its lines.
     fn rate(&mut self) -> f64 {
         self.signal(Signal::CONT);
         self.wait_for_a_line();

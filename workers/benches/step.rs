@@ -1,7 +1,8 @@
-//! A whole biased step of a walk against the call of its potential alone: neighbour list, both gradients, mixture, bias, repulsion,
-//! integrator, guards and grades, over energies, forces, γ and ∇Σγ. Turns of the walk and as many calls are made in turn.
+//! A complete biased step of a walk against an evaluation of its potential alone: neighbour list, both gradients,
+//! mixture, bias, repulsion, integrator, guards and grades, over energies, forces, γ and ∇Σγ. Measures the walk and
+//! as many evaluations alternately.
 //!
-//! `cargo bench -p workers --bench step`; grace1l_paper is in the folder that `CALMWALK_PEER_DATA` names.
+//! `cargo bench -p workers --bench step`; grace1l_paper is in the folder given by `CALMWALK_PEER_DATA`.
 
 mod common;
 
@@ -11,10 +12,10 @@ use std::time::Instant;
 
 use atoms::{Evaluation, NeighbourList, Structure};
 use calm::{Artifact, BatchedGrades, Mixture};
-use common::{Turn, crystal, quartiles};
+use common::{TimedWalk, crystal, quartiles};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
-/// Times that a turn and as many calls are measured.
+/// Number of measurements of a walk and of as many calls.
 const ROUNDS: usize = 41;
 
 fn main() {
@@ -35,7 +36,7 @@ fn main() {
 fn report(name: &str, folder: &Path, edge: f64, steps: u64) {
     let model = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
     let mixture = Arc::new(Artifact::load_export(folder.join("kokkos.npz")).expect("a CALM mixture").mixture);
-    let mut turn = Turn::new(&model, &mixture, crystal(model.elements(), edge));
+    let mut turn = TimedWalk::new(&model, &mixture, crystal(model.elements(), edge));
     let mut call = Call::new(model, mixture, turn.structure.clone());
     let (mut ratios, mut step_times, mut call_times) = (Vec::new(), Vec::new(), Vec::new());
     for round in 0..=ROUNDS {
@@ -46,7 +47,7 @@ fn report(name: &str, folder: &Path, edge: f64, steps: u64) {
             let alone = call.seconds(steps);
             (turn.seconds(steps), alone)
         };
-        // The first round warms up.
+        // The first round is a warm-up.
         if round > 0 {
             ratios.push(step / alone);
             step_times.push(1e3 * step);
@@ -89,7 +90,7 @@ impl Call {
         }
     }
 
-    /// Of one call, among so many.
+    /// Time per call, averaged over `calls`.
     fn seconds(&mut self, calls: u64) -> f64 {
         let start = Instant::now();
         for _ in 0..calls {

@@ -1,6 +1,6 @@
-//! The agent of a host: deals the turns of a campaign that is led from another host to the walkers here.
+//! The agent of a host: dispatches assignments of a campaign on another host to local walkers.
 
-mod numbers;
+mod metrics;
 mod pool;
 
 use std::collections::BTreeMap;
@@ -19,324 +19,330 @@ use wire::messages::{Progress, Report};
 use wire::net::{Joined, Parted, Slot, Told, Uplink};
 use wire::transport::{Incoming, Work};
 
-pub use self::numbers::{Numbers, Turns};
-use self::pool::Pool;
+pub use self::metrics::{AgentMetrics, AssignmentCounts};
+use self::pool::AssignmentPool;
 
-/// Between two questions whether the orchestrator wants its agents to stop.
-const LOOK: Duration = Duration::from_secs(2);
-/// Between two pieces of news about a walk.
-const NEWS: Duration = Duration::from_secs(1);
-/// An orchestrator that is there answers sooner.
-const SILENT: Duration = Duration::from_secs(5);
-/// What walkers delivered last may take so long on its way when the agent is asked to stop.
-const LAST_WORDS: Duration = Duration::from_secs(20);
+/// Time between two queries whether the orchestrator wants its agents to stop.
+const POLL_INTERVAL: Duration = Duration::from_secs(2);
+/// Minimum time between two progress messages of a walk.
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
+/// An orchestrator that has not replied for this time counts as unresponsive.
+const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(5);
+/// How long an agent that is asked to stop waits for its last reports to be delivered.
+const FLUSH_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// How an agent's work ended.
+/// Why an agent ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ended {
+pub enum AgentExit {
     /// The campaign has no more work.
     Done,
-    /// It was asked to stop, or every walker is gone.
+    /// It was asked to stop, or has lost all its walkers.
     Stopped,
 }
 
-/// What an agent tells those who watch it.
+/// Events of an agent, for monitoring.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum News {
+pub enum AgentEvent {
     /// The orchestrator wants its agents to stop.
     Stop,
-    /// It does not answer.
-    Silent {
-        /// Reports that are kept for it.
-        untold: usize,
-        /// Walkers that have nothing to do.
+    /// The orchestrator does not respond.
+    Unresponsive {
+        /// Reports that wait to be delivered.
+        unsent: usize,
+        /// Walkers without an assignment.
         idle: usize,
     },
-    /// It answers again.
-    Back,
+    /// The orchestrator responds again.
+    Recovered,
 }
 
-/// Deals turns.
+/// Runs the agent's part of a campaign.
 pub struct Agent {
-    /// The line to the orchestrator.
+    /// The connection to the orchestrator.
     pub uplink: Arc<Uplink>,
-    /// The place that it has been given there.
+    /// The registration with the orchestrator.
     pub joined: Joined,
-    /// What comes from the walkers of this host.
+    /// Messages from the walkers of this host.
     pub incoming: mpsc::Receiver<Incoming>,
-    /// Set from outside: walkers are sent home with their turns where they stand.
+    /// Set from outside to stop: walkers are dismissed, with their assignments as they are.
     pub stopping: Arc<AtomicBool>,
-    /// An orchestrator that has been silent for so long will not come back.
-    pub patience: Duration,
-    /// Kept for those who watch.
-    pub numbers: Arc<Mutex<Numbers>>,
+    /// How long the orchestrator may be unresponsive before the agent gives up.
+    pub orchestrator_timeout: Duration,
+    /// Updated for monitoring.
+    pub metrics: Arc<Mutex<AgentMetrics>>,
 }
 
-/// What an exchange about a slot came to.
-type Exchanged = (Slot, Told, Result<Option<Work>, Parted>);
+/// The result of an exchange about a slot.
+type ExchangeResult = (Slot, Told, Result<Option<Work>, Parted>);
 
-/// The answer to the question whether to stop, and how long it took.
-type Asked = (Result<Option<bool>, Parted>, Duration);
+/// The reply to the query whether to stop, and how long it took.
+type StopReply = (Result<Option<bool>, Parted>, Duration);
 
-/// What an agent has to say and to ask.
-struct Desk {
+/// State of the agent's exchange with the orchestrator.
+struct AgentState {
     uplink: Arc<Uplink>,
     joined: Arc<Joined>,
-    pool: Pool,
-    asking: FuturesUnordered<BoxFuture<'static, Exchanged>>,
-    /// Those of them that deliver something.
-    telling: usize,
-    /// Whether the orchestrator wants its agents to stop.
-    question: Option<BoxFuture<'static, Asked>>,
-    /// A new place, when this one has been lost …
+    pool: AssignmentPool,
+    in_flight: FuturesUnordered<BoxFuture<'static, ExchangeResult>>,
+    /// Number of exchanges in flight that deliver something.
+    delivering: usize,
+    /// The pending query whether to stop.
+    stop_query: Option<BoxFuture<'static, StopReply>>,
+    /// A new registration in progress, after this one was lost …
     joining: Option<BoxFuture<'static, Result<Joined, Parted>>>,
-    /// … which is taken when all that was asked from the old one has been answered.
-    next_place: Option<Joined>,
-    /// When the orchestrator was last heard.
+    /// … which takes effect when every exchange of the old one is complete.
+    next_joined: Option<Joined>,
+    /// When the orchestrator last replied.
     heard: Instant,
-    numbers: Arc<Mutex<Numbers>>,
-    /// What was told of its silence.
-    silence: Option<News>,
-    /// When there was last news of a walk.
-    news: BTreeMap<WalkId, Instant>,
+    metrics: Arc<Mutex<AgentMetrics>>,
+    /// The last event reported about its silence.
+    silence: Option<AgentEvent>,
+    /// When progress of a walk was last sent.
+    last_progress: BTreeMap<WalkId, Instant>,
 }
 
 impl Agent {
-    /// Works until there is no more work or it is asked to stop.
+    /// Runs until there is no more work or the agent is asked to stop.
     ///
     /// # Errors
-    /// The orchestrator is silent, or it and this program do not understand each other.
-    pub async fn run(mut self, mut watch: impl FnMut(News)) -> Result<Ended, Parted> {
+    /// The orchestrator is unresponsive, or its program is incompatible with this one.
+    pub async fn run(mut self, mut watch: impl FnMut(AgentEvent)) -> Result<AgentExit, Parted> {
         let slots = self.joined.slots();
         let uplink = Arc::clone(&self.uplink);
         let mut over = pin!(uplink.address().over());
-        let mut desk = Desk::new(self.uplink, self.joined, self.numbers);
-        desk.numbers().mixture_version = Some(desk.joined.newest().await.version());
-        desk.begin(slots);
-        let mut look = interval(LOOK);
-        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut state = AgentState::new(self.uplink, self.joined, self.metrics);
+        state.metrics().mixture_version = Some(state.joined.newest().await.version());
+        state.start(slots);
+        let mut ticks = interval(POLL_INTERVAL);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 message = self.incoming.recv() => match message {
-                    Some(message) => desk.take_in(message),
+                    Some(message) => state.handle(message),
                     None => break,
                 },
-                Some(exchanged) = desk.asking.next() => desk.exchanged(exchanged)?,
-                joined = answered(&mut desk.joining) => desk.has_joined(joined?),
-                (told, took) = answered(&mut desk.question) => if desk.is_to_stop(told, took)? { watch(News::Stop) },
-                _ = look.tick() => desk.look(self.patience)?.into_iter().for_each(&mut watch),
-                // Of this agent the orchestrator knew nothing any more, or it would have waited.
+                Some(exchanged) = state.in_flight.next() => state.exchanged(exchanged)?,
+                joined = answer_to(&mut state.joining) => state.has_joined(joined?),
+                (told, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(told, took)? { watch(AgentEvent::Stop) },
+                _ = ticks.tick() => state.poll(self.orchestrator_timeout)?.into_iter().for_each(&mut watch),
+                // The orchestrator no longer knew of this agent, or it would have waited.
                 () = &mut over => {
-                    desk.pool.send_home();
-                    return Ok(Ended::Done);
+                    state.pool.dismiss_idle();
+                    return Ok(AgentExit::Done);
                 }
             }
             if self.stopping.load(Ordering::Relaxed) {
-                desk.pool.send_home();
-                if desk.pool.is_idle() {
+                state.pool.dismiss_idle();
+                if state.pool.is_idle() {
                     break;
                 }
-            } else if desk.pool.is_over() {
-                // Of a campaign that is over, or of one that is being stopped.
-                let stopped = matches!(desk.joined.is_stopping().await, Ok(Some(true)));
-                desk.pool.send_home();
-                desk.joined.leave().await;
-                return Ok(if stopped { Ended::Stopped } else { Ended::Done });
+            } else if state.pool.is_over() {
+                // The campaign is over or being stopped.
+                let stopped = matches!(state.joined.is_stopping().await, Ok(Some(true)));
+                state.pool.dismiss_idle();
+                state.joined.leave().await;
+                return Ok(if stopped { AgentExit::Stopped } else { AgentExit::Done });
             }
         }
-        // Not for ever: a line that is down must not keep a batch job beyond its time.
-        let _ = timeout(LAST_WORDS, desk.last_words()).await;
-        desk.joined.leave().await;
-        Ok(Ended::Stopped)
+        // With a timeout: a broken connection must not keep a batch job beyond its time limit.
+        let _ = timeout(FLUSH_TIMEOUT, state.flush()).await;
+        state.joined.leave().await;
+        Ok(AgentExit::Stopped)
     }
 }
 
-/// The answer to a question, if one was asked.
-async fn answered<T>(question: &mut Option<BoxFuture<'static, T>>) -> T {
-    match question {
+/// Waits for the reply to a pending query; never ends without one.
+async fn answer_to<T>(stop_query: &mut Option<BoxFuture<'static, T>>) -> T {
+    match stop_query {
         Some(asked) => {
             let answer = asked.await;
-            *question = None;
+            *stop_query = None;
             answer
         }
         None => std::future::pending().await,
     }
 }
 
-impl Desk {
-    fn new(uplink: Arc<Uplink>, joined: Joined, numbers: Arc<Mutex<Numbers>>) -> Self {
+impl AgentState {
+    fn new(uplink: Arc<Uplink>, joined: Joined, metrics: Arc<Mutex<AgentMetrics>>) -> Self {
         Self {
             uplink,
             joined: Arc::new(joined),
-            pool: Pool::default(),
-            asking: FuturesUnordered::new(),
-            telling: 0,
-            question: None,
+            pool: AssignmentPool::default(),
+            in_flight: FuturesUnordered::new(),
+            delivering: 0,
+            stop_query: None,
             joining: None,
-            next_place: None,
+            next_joined: None,
             heard: Instant::now(),
-            numbers,
+            metrics,
             silence: None,
-            news: BTreeMap::new(),
+            last_progress: BTreeMap::new(),
         }
     }
 
-    fn numbers(&self) -> MutexGuard<'_, Numbers> {
-        self.numbers.lock().unwrap_or_else(PoisonError::into_inner)
+    fn metrics(&self) -> MutexGuard<'_, AgentMetrics> {
+        self.metrics.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Somebody is there.
-    fn hear(&mut self) {
+    /// Notes that the orchestrator has replied.
+    fn mark_heard(&mut self) {
         self.heard = Instant::now();
-        self.numbers().heard = Some(self.heard);
+        self.metrics().heard = Some(self.heard);
     }
 
-    fn begin(&mut self, slots: Vec<Slot>) {
-        self.hear();
-        self.numbers().places += 1;
-        for (slot, told) in self.pool.begin(slots) {
+    fn start(&mut self, slots: Vec<Slot>) {
+        self.mark_heard();
+        self.metrics().joins += 1;
+        for (slot, told) in self.pool.start(slots) {
             self.exchange(slot, told);
         }
     }
 
-    /// Begins to deliver what came of a slot's turn, and to ask for the next.
+    /// Starts to deliver the result of a slot's assignment and to ask for the next one.
     fn exchange(&mut self, mut slot: Slot, told: Told) {
-        self.telling += usize::from(!matches!(told, Told::Nothing));
+        self.delivering += usize::from(!matches!(told, Told::Nothing));
         let joined = Arc::clone(&self.joined);
-        self.asking.push(Box::pin(async move {
+        self.in_flight.push(Box::pin(async move {
             let result = slot.exchange(&joined, &told).await;
             (slot, told, result)
         }));
     }
 
-    fn take_in(&mut self, message: Incoming) {
+    fn handle(&mut self, message: Incoming) {
         let next = match message {
             Incoming::Progress(walk, progress) => {
-                self.numbers().at(walk, &progress);
-                self.news(walk, progress);
+                self.metrics().record_progress(walk, &progress);
+                self.forward_progress(walk, progress);
                 None
             }
             Incoming::Free { walker, report, reply } => {
                 if let Some(Report { walk, progress, .. }) = &report {
-                    self.numbers().at(*walk, progress);
+                    self.metrics().record_progress(*walk, progress);
                 }
-                self.pool.free(walker, report, reply)
+                self.pool.walker_idle(walker, report, reply)
             }
-            Incoming::Gone { walker, fault } => self.pool.gone(walker, fault),
+            Incoming::Gone { walker, fault } => self.pool.walker_lost(walker, fault),
         };
         if let Some((slot, told)) = next {
             self.exchange(slot, told);
         }
-        self.count();
+        self.update_metrics();
     }
 
-    /// What is kept, and who waits.
-    fn count(&self) {
-        let mut numbers = self.numbers();
-        (numbers.untold, numbers.idle) = (self.untold(), self.pool.idle());
+    /// Updates the number of waiting reports and idle walkers.
+    fn update_metrics(&self) {
+        let mut metrics = self.metrics();
+        (metrics.unsent, metrics.idle) = (self.unsent(), self.pool.idle());
     }
 
-    /// Reports that the orchestrator has not taken yet.
-    fn untold(&self) -> usize {
-        self.telling + self.pool.untold()
+    /// Reports that the orchestrator has not accepted yet.
+    fn unsent(&self) -> usize {
+        self.delivering + self.pool.unsent()
     }
 
-    fn exchanged(&mut self, (slot, told, result): Exchanged) -> Result<(), Parted> {
-        self.hear();
-        self.telling -= usize::from(!matches!(told, Told::Nothing));
+    fn exchanged(&mut self, (slot, told, result): ExchangeResult) -> Result<(), Parted> {
+        self.mark_heard();
+        self.delivering -= usize::from(!matches!(told, Told::Nothing));
         if result.is_ok() {
-            self.numbers().told(&told);
+            self.metrics().delivered(&told);
         }
         match result {
             Ok(Some(work)) => {
-                self.numbers().taken(&work.assignment, work.mixture.version());
-                self.pool.turn(slot, work);
+                self.metrics().received(&work.assignment, work.mixture.version());
+                self.pool.assign(slot, work);
             }
-            Ok(None) => self.pool.sent_home(),
+            Ok(None) => self.pool.slot_closed(),
             Err(Parted::Stranger(_)) => {
-                self.pool.keep(told);
-                self.join_anew();
+                self.pool.keep_unsent(told);
+                self.rejoin();
             }
             Err(parted) => return Err(parted),
         }
-        self.take_next_place();
-        self.count();
+        self.switch_session();
+        self.update_metrics();
         Ok(())
     }
 
-    /// This agent was taken for dead, or the orchestrator was started again: what it has to tell it tells in a new place.
-    fn join_anew(&mut self) {
-        if self.joining.is_none() && self.next_place.is_none() {
+    /// Registers again: this agent was taken for dead, or the orchestrator was restarted. Waiting reports are
+    /// delivered under the new registration.
+    fn rejoin(&mut self) {
+        if self.joining.is_none() && self.next_joined.is_none() {
             let uplink = Arc::clone(&self.uplink);
             self.joining = Some(Box::pin(async move { uplink.join().await }));
         }
     }
 
     fn has_joined(&mut self, joined: Joined) {
-        self.next_place = Some(joined);
-        self.take_next_place();
+        self.next_joined = Some(joined);
+        self.switch_session();
     }
 
-    fn take_next_place(&mut self) {
-        if !self.asking.is_empty() {
+    fn switch_session(&mut self) {
+        if !self.in_flight.is_empty() {
             return;
         }
-        if let Some(joined) = self.next_place.take() {
+        if let Some(joined) = self.next_joined.take() {
             let slots = joined.slots();
             self.joined = Arc::new(joined);
-            self.begin(slots);
+            self.start(slots);
         }
     }
 
-    /// Asks whether to stop, unless the orchestrator has been silent for so long that it is of no use. Returns what is new
-    /// of its silence.
-    fn look(&mut self, patience: Duration) -> Result<Option<News>, Parted> {
+    /// Queries whether to stop. Fails if the orchestrator has been unresponsive for longer than
+    /// `orchestrator_timeout`. Returns an event if its responsiveness changed.
+    fn poll(&mut self, orchestrator_timeout: Duration) -> Result<Option<AgentEvent>, Parted> {
         let silence = self.heard.elapsed();
-        if silence > patience {
-            return Err(Parted::Silence { minutes: patience.as_secs_f64() / 60.0 });
+        if silence > orchestrator_timeout {
+            return Err(Parted::Silence { minutes: orchestrator_timeout.as_secs_f64() / 60.0 });
         }
         let joined = Arc::clone(&self.joined);
-        self.question.get_or_insert_with(|| {
+        self.stop_query.get_or_insert_with(|| {
             Box::pin(async move {
                 let asked = Instant::now();
                 (joined.is_stopping().await, asked.elapsed())
             })
         });
-        let now = (silence > SILENT).then(|| News::Silent { untold: self.untold(), idle: self.pool.idle() });
+        let now = (silence > UNRESPONSIVE_AFTER)
+            .then(|| AgentEvent::Unresponsive { unsent: self.unsent(), idle: self.pool.idle() });
         let before = std::mem::replace(&mut self.silence, now);
-        Ok(if now.is_none() { before.map(|_| News::Back) } else { now.filter(|_| now != before) })
+        Ok(if now.is_none() { before.map(|_| AgentEvent::Recovered) } else { now.filter(|_| now != before) })
     }
 
-    fn is_to_stop(&mut self, told: Result<Option<bool>, Parted>, took: Duration) -> Result<bool, Parted> {
+    fn handle_stop_reply(
+        &mut self,
+        told: Result<Option<bool>, Parted>,
+        took: Duration,
+    ) -> Result<bool, Parted> {
         match told {
             Ok(None) => return Ok(false),
-            Err(Parted::Stranger(_)) => self.join_anew(),
+            Err(Parted::Stranger(_)) => self.rejoin(),
             Err(parted) => return Err(parted),
             Ok(Some(_)) => {}
         }
-        self.hear();
-        self.numbers().round_trip = Some(took);
+        self.mark_heard();
+        self.metrics().round_trip = Some(took);
         Ok(matches!(told, Ok(Some(true))))
     }
 
-    /// Where a walk stands, once a second.
-    fn news(&mut self, walk: WalkId, progress: Progress) {
+    /// Sends the progress of a walk, once a second.
+    fn forward_progress(&mut self, walk: WalkId, progress: Progress) {
         let now = Instant::now();
-        if self.news.get(&walk).is_some_and(|last| now.duration_since(*last) < NEWS) {
+        if self.last_progress.get(&walk).is_some_and(|last| now.duration_since(*last) < PROGRESS_INTERVAL) {
             return;
         }
         if let Some(slot) = self.pool.slot_of(walk) {
-            self.news.insert(walk, now);
+            self.last_progress.insert(walk, now);
             tokio::spawn(slot.progress(Arc::clone(&self.joined), walk, progress));
         }
     }
 
-    /// Waits until everything that is to be told has been taken. From a place that is lost it is not told: as far as the
-    /// orchestrator knows nobody has those turns in hand, and they begin again where they began.
-    async fn last_words(&mut self) {
-        while self.telling > 0 {
-            let Some((_, told, _)) = self.asking.next().await else { return };
-            self.telling -= usize::from(!matches!(told, Told::Nothing));
+    /// Waits until every report is delivered. Reports under a lost registration are not: the orchestrator treats
+    /// their assignments as not started, and they start again.
+    async fn flush(&mut self) {
+        while self.delivering > 0 {
+            let Some((_, told, _)) = self.in_flight.next().await else { return };
+            self.delivering -= usize::from(!matches!(told, Told::Nothing));
         }
     }
 }

@@ -1,8 +1,8 @@
-//! The HAL force: the potential, driven along the gradient of the extrapolation grade.
+//! The HAL force: the potential biased along the gradient of the extrapolation grade.
 //!
-//! F_i^HAL = F_i^phys + τ_r ∇_i 𝒰, 𝒰 = Σ_j γ_j, τ_r = τ Σ_i‖F_i^phys‖ / Σ_i‖∇_i 𝒰‖, both sums exponentially averaged
-//! (paper, Eq. hal-force). Energy and grade share one forward pass and one reverse sweep. A switched ZBL repulsion is
-//! added after the biased force and virial have been formed, so it does not enter τ_r.
+//! F_i^HAL = F_i^phys + τ_r ∇_i 𝒰, 𝒰 = Σ_j γ_j, τ_r = τ Σ_i‖F_i^phys‖ / Σ_i‖∇_i 𝒰‖, both sums exponentially
+//! averaged (paper, Eq. hal-force). Energy and grade share one forward pass and one reverse sweep. A switched ZBL
+//! repulsion is added after the biased force and virial, so it does not enter τ_r.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use potentials::Zbl;
 use potentials::grace::{Grace, PullBack};
 use serde::{Deserialize, Serialize};
 
-/// The bias's own memory, part of a walk's checkpoint.
+/// State of the bias, part of a walk's checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct BiasState {
     /// Evaluations with the bias switched on.
@@ -24,8 +24,8 @@ pub struct BiasState {
 }
 
 impl BiasState {
-    /// Takes in one step's sums and gives τ_r / τ, eV. The averages start at the first values; the bias is silent for
-    /// the first `steps` evaluations, while they settle.
+    /// Adds one step's sums to the averages and returns τ_r / τ, eV. The averages start at the first values. The
+    /// bias is zero for the first `steps` evaluations, while they settle.
     fn advance(&mut self, force_norm: f64, gradient_norm: f64, steps: u64) -> f64 {
         let weight = if self.evaluations == 0 { 1.0 } else { 1.0 / steps.max(1) as f64 };
         self.force_norm += weight * (force_norm - self.force_norm);
@@ -36,18 +36,18 @@ impl BiasState {
     }
 }
 
-/// Why there are no grades of a structure.
+/// Why a structure has no grades.
 #[derive(Debug, thiserror::Error)]
 pub enum UngradedError {
-    /// It has no features.
+    /// Its features cannot be computed.
     #[error(transparent)]
     Potential(#[from] PotentialError),
-    /// Its features have no grades.
+    /// Its features cannot be graded.
     #[error(transparent)]
     Grade(#[from] GradeError),
 }
 
-/// A GRACE potential with its bias and its short-range repulsion.
+/// A GRACE potential with bias and short-range repulsion.
 pub struct BiasedPotential {
     grace: Grace,
     elements: Vec<usize>,
@@ -55,7 +55,7 @@ pub struct BiasedPotential {
     mixture: Arc<Mixture>,
     /// τ; 0 leaves the dynamics unbiased and computes no grades.
     pub tau: f64,
-    /// Memory of the running averages.
+    /// State of the running averages.
     pub state: BiasState,
     average_steps: u64,
     pull_back: PullBack,
@@ -109,7 +109,8 @@ impl BiasedPotential {
         &self.elements
     }
 
-    /// Grades at the last evaluation, which was of this structure; with the bias off they are computed here.
+    /// Grades at the last evaluation, which must have been of this structure. With the bias off, they are computed
+    /// here.
     ///
     /// # Errors
     /// Features that are not finite.
@@ -186,7 +187,7 @@ impl Potential for BiasedPotential {
     }
 }
 
-/// `from` into `to`, whose memory is used again.
+/// Copies `from` to `to`, whose memory is reused.
 fn copy(from: &Evaluation, to: &mut Evaluation) {
     to.atomic_energies.clone_from(&from.atomic_energies);
     to.forces.clone_from(&from.forces);

@@ -1,4 +1,4 @@
-//! What keeps a walk physical: which structures are not offered, and when a walk is over.
+//! Guards that keep a walk physical: which structures are refused as candidates, and when a walk ends.
 
 use atoms::{Evaluation, Neighbour, NeighbourList, Structure, cell, shortest_distance};
 
@@ -18,8 +18,8 @@ pub fn too_close(structure: &Structure, neighbours: &NeighbourList, least: f64) 
     shortest_distance(structure, neighbours).is_some_and(|(_, _, d)| d < least)
 }
 
-/// Why a walk cannot go on, if so: forces that are not finite, an absurd temperature (K), an atom that has lost
-/// every neighbour within the cutoff.
+/// The reason to end a walk, if there is one: forces that are not finite, a temperature (K) above the limit, or an
+/// atom without neighbours within the cutoff.
 pub fn blown_up(
     settings: &GuardSettings,
     structure: &Structure,
@@ -35,7 +35,7 @@ pub fn blown_up(
         return Some(format!("{temperature:.0} K is above the allowed {highest:.0} K"));
     }
     if structure.len() > 1 {
-        // The list itself also holds pairs within its skin, and those depend on when it was built.
+        // The list also holds pairs within its skin, which depend on when it was built.
         let lost = (0..structure.len()).find(|i| {
             let distance = |neighbour: &Neighbour| cell::norm(neighbour.displacement(structure, *i));
             !neighbours.neighbours_of(*i).iter().any(|neighbour| distance(neighbour) < neighbours.cutoff())

@@ -1,4 +1,5 @@
-//! The actors that do the work: the walker runs biased dynamics, the labeller gives structures their labels.
+//! Workers of a campaign: walkers run biased dynamics, labellers make labels, and agents run walkers on other
+//! hosts.
 
 pub mod agent;
 pub mod bias;

@@ -1,4 +1,4 @@
-//! What walks need to know of the configuration.
+//! Settings of walks.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,17 +23,17 @@ pub enum ThermostatKind {
 /// Dynamics, bias and guards of every walk of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct WalkSettings {
-    /// Keys the random numbers.
+    /// Random seed.
     pub rng_seed: u64,
-    /// K.
+    /// Temperature, K.
     pub temperature: f64,
     /// Thermostat.
     pub thermostat: ThermostatKind,
-    /// fs; `None` for the paper's rule (2 fs; 0.5 fs with H, He, Li or Be).
+    /// Time step, fs; `None` for the paper's rule (2 fs; 0.5 fs with H, He, Li or Be).
     pub time_step: Option<f64>,
     /// Unbiased steps at the start, at V₀.
     pub equilibration: u64,
-    /// Biased steps after that.
+    /// Biased steps after equilibration.
     pub steps: u64,
     /// Uncertainty-force scale τ.
     pub tau: f64,
@@ -43,11 +43,11 @@ pub struct WalkSettings {
     pub volume_ramp: Option<(f64, f64)>,
     /// Neighbour-list skin, Å.
     pub skin: f64,
-    /// When a structure is a candidate.
+    /// When a structure becomes a candidate.
     pub collection: calm::CollectionRule,
-    /// Least steps between two accepted structures of a walk.
+    /// Minimum number of steps between two accepted structures of a walk.
     pub gap: u64,
-    /// Least steps between two candidates after one that was declined or refused.
+    /// Minimum number of steps between two candidates after one that was declined or refused.
     pub declined_gap: u64,
     /// Switched ZBL repulsion: inner and outer radius of the switch, Å.
     pub zbl: Option<(f64, f64)>,
@@ -55,21 +55,21 @@ pub struct WalkSettings {
     pub guard: GuardSettings,
 }
 
-/// What keeps a walk physical.
+/// Settings of the guards.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GuardSettings {
-    /// Shortest distance below which a structure is refused, Å.
+    /// A structure with a shorter distance is refused, Å.
     pub least_distance: f64,
-    /// The same as a fraction of the seed structure's shortest distance; the larger of the two holds.
+    /// The same limit as a fraction of the seed structure's shortest distance; the larger of the two applies.
     pub least_distance_fraction: f64,
-    /// A walk hotter than this ends, K.
+    /// Temperature above which a walk ends, K.
     pub highest_temperature: f64,
-    /// Refusals in a row by the same guard after which the walk goes back to a checkpoint.
+    /// Consecutive refusals by the same guard after which the walk rolls back to a checkpoint.
     pub refusals_in_a_row: u32,
-    /// Returns after which it ends instead.
+    /// Number of roll backs after which the walk ends instead.
     pub most_returns: u32,
-    /// Factor on τ at each return.
+    /// Factor on τ at each roll back.
     pub tau_factor: f64,
-    /// Steps between the checkpoints that it may go back to.
+    /// Steps between checkpoints for roll backs.
     pub checkpoint_interval: u64,
 }

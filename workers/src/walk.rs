@@ -1,7 +1,7 @@
-//! One turn of a walk: a function from an assignment to a report, with no state of its own.
+//! Runs one assignment of a walk: a function from an assignment to a report, without state.
 //!
-//! Whatever a walk remembers is in its [checkpoint](WalkState), so the same assignment gives the same report, whoever
-//! works on it and however often.
+//! Everything that a walk remembers is in its [checkpoint](WalkState), so the same assignment gives the same
+//! report, on any walker and any number of times.
 
 mod candidate;
 mod state;
@@ -19,14 +19,14 @@ use wire::{Candidate, Origin};
 use crate::bias::{BiasedPotential, UngradedError};
 use crate::guard;
 use crate::settings::WalkSettings;
-use state::{Collected, WalkState, begin};
+use state::{CollectionPoint, WalkState, start};
 
-/// What every walk of a campaign shares.
+/// Data shared by every walk of a campaign.
 #[derive(Clone)]
 pub struct WalkContext {
     /// The model.
     pub model: Arc<GraceModel>,
-    /// The threads that evaluate it.
+    /// The threads that evaluate the model.
     pub threads: Threads,
     /// The settings.
     pub settings: Arc<WalkSettings>,
@@ -49,17 +49,17 @@ enum WalkError {
     BlewUp(String),
 }
 
-/// Works on a turn until it ends: with a candidate, at its last step, with the walk itself, or when `stopping` says so.
-/// `watch` is told after each step where the walk stands.
+/// Runs an assignment until it ends: with a candidate, at its last step, with the end of the walk, or when
+/// `stopping` returns true. Calls `on_progress` with the progress after each step.
 pub fn advance(
     context: &WalkContext,
     assignment: &Assignment,
     mixture: Arc<Mixture>,
     stopping: impl Fn() -> bool,
-    watch: impl Fn(Progress),
+    on_progress: impl Fn(Progress),
 ) -> Report<Candidate> {
     let (walk, turn) = (assignment.walk, assignment.turn);
-    let mut running = match Walk::open(context, assignment, mixture) {
+    let mut running = match Walk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(error) => {
             let end = End::BadStart { reason: error.to_string() };
@@ -73,19 +73,19 @@ pub fn advance(
             };
         }
     };
-    let outcome = running.run(&stopping, &watch).unwrap_or_else(|error| {
+    let outcome = running.run(&stopping, &on_progress).unwrap_or_else(|error| {
         Outcome::Ended(End::BlewUp { reason: format!("at step {}: {error}", running.step()) })
     });
     Report { walk, turn, outcome, checkpoint: running.encode(), progress: running.progress() }
 }
 
-/// A walk in the hands of a walker.
+/// A walk during an assignment.
 struct Walk<'a> {
     settings: &'a WalkSettings,
     assignment: &'a Assignment,
     model: &'a GraceModel,
     mixture_version: u64,
-    /// When a structure is a candidate in this turn.
+    /// The collection rule of this assignment.
     collection: CollectionRule,
     dynamics: Dynamics,
     potential: BiasedPotential,
@@ -93,7 +93,7 @@ struct Walk<'a> {
 }
 
 impl<'a> Walk<'a> {
-    fn open(
+    fn start_or_resume(
         context: &'a WalkContext,
         assignment: &'a Assignment,
         mixture: Arc<Mixture>,
@@ -106,7 +106,7 @@ impl<'a> Walk<'a> {
         let grace = Grace::with(Arc::clone(model), Instructions::best(), threads.clone());
         let mut potential = BiasedPotential::new(grace, mixture, zbl, average_steps, species)?;
         let (dynamics, state) = match &assignment.checkpoint {
-            None => begin(settings, assignment, &mut potential)?,
+            None => start(settings, assignment, &mut potential)?,
             Some(bytes) => {
                 let state: WalkState = postcard::from_bytes(bytes)?;
                 let cutoff = atoms::Potential::cutoff(&potential);
@@ -117,17 +117,18 @@ impl<'a> Walk<'a> {
         let collection = settings.collection.with_threshold_factor(assignment.raised);
         let mut walk =
             Self { settings, assignment, model, mixture_version, collection, dynamics, potential, state };
-        walk.take_verdict();
+        walk.apply_verdict();
         Ok(walk)
     }
 
-    /// After a collection the walk waits out the gap; after a refusal by the selector, a shorter one.
-    fn take_verdict(&mut self) {
+    /// Sets the earliest step of the next candidate: after a collection the walk waits out the full interval, after
+    /// a decline a shorter one.
+    fn apply_verdict(&mut self) {
         let step = self.step();
         match &self.assignment.verdict {
             None => {}
             Some(Verdict::Accepted) => {
-                self.state.collected.push(Collected { branch: step, beyond: 0 });
+                self.state.collected.push(CollectionPoint { branch: step, beyond: 0 });
                 self.state.next_offer = step + self.settings.gap;
             }
             Some(Verdict::Declined(_)) => self.state.next_offer = step + self.settings.declined_gap,
@@ -137,7 +138,7 @@ impl<'a> Walk<'a> {
     fn run(
         &mut self,
         stopping: &impl Fn() -> bool,
-        watch: &impl Fn(Progress),
+        on_progress: &impl Fn(Progress),
     ) -> Result<Outcome<Candidate>, WalkError> {
         let last = self.settings.equilibration + self.settings.steps;
         loop {
@@ -151,10 +152,10 @@ impl<'a> Walk<'a> {
                 return Ok(Outcome::Paused);
             }
             self.advance_one_step()?;
-            if let Some(outcome) = self.look()? {
+            if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);
             }
-            watch(self.progress());
+            on_progress(self.progress());
         }
     }
 
@@ -178,8 +179,8 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// What the new step means: a wanted frame, a candidate, a refusal, or nothing.
-    fn look(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
+    /// Evaluates the new step: a requested frame, a candidate, a refusal by the guard, or nothing.
+    fn inspect_step(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let step = self.step();
         if self.is_control() {
             let wanted = self.assignment.wanted.contains(&step);
@@ -190,10 +191,10 @@ impl<'a> Walk<'a> {
         let too_close = self.is_too_close();
         if biased_steps % self.settings.guard.checkpoint_interval == 0 && !too_close {
             if biased_steps == 0 {
-                // From here on the start of the walk, which needs equilibration, is no place to go back to.
+                // The start of the walk needs equilibration, so from here on it is no target for a roll back.
                 self.state.good.clear();
             }
-            self.keep_checkpoint();
+            self.save_checkpoint();
         }
         if biased_steps == 0 {
             return Ok(None);
@@ -203,7 +204,7 @@ impl<'a> Walk<'a> {
         let collects = step >= self.state.next_offer && self.collection.is_met(gamma);
         match (collects, too_close) {
             (false, _) => Ok(None),
-            (true, true) => self.refuse(),
+            (true, true) => self.record_refusal(),
             (true, false) => {
                 self.state.refusals_in_a_row = 0;
                 Ok(Some(Outcome::Candidate(self.candidate()?)))
@@ -216,12 +217,12 @@ impl<'a> Walk<'a> {
         guard::too_close(self.dynamics.structure(), self.dynamics.neighbours(), least)
     }
 
-    fn keep_checkpoint(&mut self) {
-        self.state.keep(self.dynamics.checkpoint(), self.potential.state);
+    fn save_checkpoint(&mut self) {
+        self.state.keep_checkpoint(self.dynamics.checkpoint(), self.potential.state);
     }
 
-    /// Counts a refusal by the shortest-bond guard; after too many in a row the walk goes back, or ends.
-    fn refuse(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
+    /// Counts a refusal by the shortest-bond guard. After too many in a row the walk rolls back, or ends.
+    fn record_refusal(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let guard = &self.settings.guard;
         self.state.refused += 1;
         self.state.refusals_in_a_row += 1;
@@ -232,12 +233,12 @@ impl<'a> Walk<'a> {
         if self.state.returns == guard.most_returns || self.state.good.is_empty() {
             return Ok(Some(Outcome::Ended(End::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
         }
-        self.go_back()?;
+        self.roll_back()?;
         Ok(None)
     }
 
-    /// Goes back to the oldest good checkpoint as a new segment: smaller τ, new random numbers.
-    fn go_back(&mut self) -> Result<(), WalkError> {
+    /// Rolls back to the oldest good checkpoint as a new segment, with smaller τ and new random numbers.
+    fn roll_back(&mut self) -> Result<(), WalkError> {
         let (mut checkpoint, bias) = self.state.good.swap_remove(0);
         self.state.good.clear();
         self.state.segment += 1;
@@ -249,8 +250,8 @@ impl<'a> Walk<'a> {
         self.state.last_return = Some((self.step(), checkpoint.state.step));
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
-        self.state.next_offer = self.state.offer_after_return(self.step(), self.settings);
-        self.keep_checkpoint();
+        self.state.next_offer = self.state.offer_after_rollback(self.step(), self.settings);
+        self.save_checkpoint();
         Ok(())
     }
 
@@ -285,7 +286,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// γ of each atom where the walk stands.
+/// γ of each atom at the current step.
 fn gamma<'a>(potential: &'a mut BiasedPotential, dynamics: &Dynamics) -> Result<&'a [f64], UngradedError> {
     Ok(&potential.grades(dynamics.structure(), dynamics.neighbours())?.gamma)
 }

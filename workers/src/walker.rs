@@ -1,4 +1,4 @@
-//! A walker: asks for a turn, works on it, delivers what came of it.
+//! The walker loop: asks for an assignment, works on it and reports the result.
 
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -11,50 +11,50 @@ use wire::transport::{Transport, Work};
 
 use crate::walk::{WalkContext, advance};
 
-/// Time between two signs of life, at least; a longer step makes it longer.
+/// Minimum time between two progress reports; longer steps make it longer.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
 
-/// How a walker's work ended.
+/// Why a walker ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ended {
-    /// There was no more work for it.
-    SentHome,
-    /// It was asked to stop; its last turn, if it got one, is somebody else's.
+pub enum WalkerExit {
+    /// There was no more work.
+    Dismissed,
+    /// It was asked to stop. Another walker gets its last assignment, if it had one.
     Stopped,
 }
 
-/// Works until there is nothing more to do or the walker is asked to stop.
-pub fn run(context: &WalkContext, transport: &mut impl Transport) -> Ended {
+/// Works on assignments until there are no more or the walker is asked to stop.
+pub fn run(context: &WalkContext, transport: &mut impl Transport) -> WalkerExit {
     let mut report = None;
     while let Some(work) = transport.exchange(report.take()) {
         if transport.stopping() {
-            return Ended::Stopped;
+            return WalkerExit::Stopped;
         }
-        // A crash is a defect of this program; it ends the walk that met it, not the campaign.
-        let begun = Instant::now();
-        let turn = catch_unwind(AssertUnwindSafe(|| work_on(context, &work, transport)));
-        let made = turn.unwrap_or_else(|_| crashed(&work));
-        tell(&work, &made, begun.elapsed());
+        // A panic is a defect of this program. It ends the walk that caused it, not the campaign.
+        let started = Instant::now();
+        let turn = catch_unwind(AssertUnwindSafe(|| run_assignment(context, &work, transport)));
+        let made = turn.unwrap_or_else(|_| crash_report(&work));
+        log_outcome(&work, &made, started.elapsed());
         report = Some(made);
     }
-    Ended::SentHome
+    WalkerExit::Dismissed
 }
 
-fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report<Candidate> {
+fn run_assignment(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report<Candidate> {
     let walk = work.assignment.walk;
     let stopping = || transport.stopping();
     let last = Cell::new(Instant::now());
-    let watch = |progress| {
+    let on_progress = |progress| {
         if last.get().elapsed() >= PROGRESS_INTERVAL {
             last.set(Instant::now());
             transport.progress(walk, progress);
         }
     };
-    advance(context, &work.assignment, work.mixture.clone(), stopping, watch)
+    advance(context, &work.assignment, work.mixture.clone(), stopping, on_progress)
 }
 
-/// Says in the log what came of a turn.
-fn tell(work: &Work, made: &Report<Candidate>, time: Duration) {
+/// Logs the outcome of an assignment.
+fn log_outcome(work: &Work, made: &Report<Candidate>, time: Duration) {
     let (walk, turn, seconds) = (made.walk.0, made.turn, time.as_secs_f64());
     let Progress { step, gamma_max, .. } = made.progress;
     let version = work.mixture.version();
@@ -67,7 +67,7 @@ fn tell(work: &Work, made: &Report<Candidate>, time: Duration) {
     debug!(walk, turn, step, gamma_max, mixture_version = version, seconds, outcome, "made a turn");
 }
 
-fn crashed(work: &Work) -> Report<Candidate> {
+fn crash_report(work: &Work) -> Report<Candidate> {
     let end = End::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
     Report {
         walk: work.assignment.walk,

@@ -1,4 +1,4 @@
-//! A biased step takes no memory from the system: work arrays are used again.
+//! A biased step allocates no memory: work arrays are reused.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -13,7 +13,7 @@ use potentials::grace::{Grace, GraceModel, Precision, RadialPath};
 use workers::bias::BiasedPotential;
 
 thread_local! {
-    /// Of this thread alone: what runs the tests may allocate beside it.
+    /// Counts this thread only: the test runner may allocate on others.
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
@@ -22,7 +22,7 @@ fn count() {
     let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
 }
 
-/// The system's allocator with a count.
+/// The system allocator with a counter.
 struct Counting;
 
 #[allow(unsafe_code)] // The only way to see allocations; everything goes to the system's allocator as it came.
@@ -49,7 +49,7 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
 }
 
-fn seed() -> Structure {
+fn seed_structure() -> Structure {
     read_extxyz(&data("aluminium_seeds.extxyz")).unwrap().swap_remove(0).structure
 }
 
@@ -60,7 +60,7 @@ fn a_biased_step_allocates_nothing() {
 }
 
 fn check(precision: Precision) {
-    let structure = seed();
+    let structure = seed_structure();
     let file = data("al_eam_1l/kokkos.npz");
     let model = Arc::new(GraceModel::load_in(&file, precision, RadialPath::default()).unwrap());
     let mixture = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
@@ -74,7 +74,7 @@ fn check(precision: Precision) {
         thermostat: Thermostat::Langevin(Langevin { temperature: 50.0, friction: 0.01 }),
         ramp: None,
         stream,
-        // At 50 K no atom moves by half of this in a few steps, so the list is not made anew.
+        // At 50 K no atom moves by half the skin in a few steps, so the list is not rebuilt.
         skin: 1.0,
     };
     for tau in [0.0, 0.15] {

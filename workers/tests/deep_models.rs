@@ -1,4 +1,4 @@
-//! The bias on models whose atoms send messages: the grade's gradient, and a walk that does not know the difference.
+//! The bias on models with message passing: the gradient of the grade, and a walk that works as with any model.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -50,7 +50,7 @@ fn evaluate(potential: &mut BiasedPotential, structure: &Structure) -> (f64, Eva
 }
 
 /// f′(0) from f(±h) and f(±2h).
-fn difference(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
+fn derivative(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
     (8.0 * (f(h) - f(-h)) - (f(2.0 * h) - f(-2.0 * h))) / (12.0 * h)
 }
 
@@ -68,7 +68,7 @@ fn check(name: &str) {
     let mut gradient: Vec<Vec3> = Vec::new();
     for atom in 0..structure.len() {
         gradient.push(std::array::from_fn(|axis| {
-            difference(1e-3, |shift| {
+            derivative(1e-3, |shift| {
                 let mut moved = structure.clone();
                 moved.positions[atom][axis] += shift;
                 sum_of_grades(&moved)
@@ -84,7 +84,7 @@ fn check(name: &str) {
         assert!(error <= 1e-7 * largest, "{name}: atom {atom}: {error:e} of {largest}");
     }
 
-    let strain = difference(1e-4, |strain| {
+    let strain = derivative(1e-4, |strain| {
         let mut moved = structure.clone();
         moved.positions.iter_mut().chain(&mut moved.cell.0).for_each(|x| x[1] += strain * x[0]);
         sum_of_grades(&moved)

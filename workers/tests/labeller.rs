@@ -1,4 +1,4 @@
-//! Labellers: leases that last as long as the label takes, and processes that outlive their orchestrator.
+//! Labellers: leases that last as long as a label takes, and processes that outlive their orchestrator.
 
 use std::fs;
 use std::path::Path;
@@ -10,14 +10,15 @@ use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Struc
 use sqlx::ConnectOptions;
 use sqlx::sqlite::SqliteConnectOptions;
 use store::{
-    DATABASE, JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
+    DATABASE, JobState, LabelRecord, LabelStatus, ProcessRecord, Store, StoreError, this_host,
+    unix_milliseconds,
 };
 use tokio::task::JoinHandle;
-use workers::labeller::{Closing, LabelBounds, LabellerSettings, Method, Stay, Timing, run, serve};
+use workers::labeller::{ExitPolicy, LabelBounds, LabellerSettings, Method, Shutdown, Timing, run, serve};
 
 use crate::common::*;
 
-/// A method that begins labels at once and ends them only while it is open.
+/// A method that starts labels at once and finishes them only while it is open.
 #[derive(Clone, Default)]
 struct Gate {
     open: Arc<AtomicBool>,
@@ -40,7 +41,7 @@ impl Gate {
     }
 }
 
-/// No runtime waits for a label that never ends.
+/// A label that never ends must not block the runtime.
 impl Drop for Gate {
     fn drop(&mut self) {
         self.open.store(true, Ordering::Relaxed);
@@ -71,7 +72,7 @@ impl Potential for Gate {
     }
 }
 
-/// A method whose energies (eV an atom) are given, one a label.
+/// A method with given energies, eV/atom, one per label.
 struct Energies(std::vec::IntoIter<f64>);
 
 impl Potential for Energies {
@@ -95,17 +96,17 @@ impl Potential for Energies {
     }
 }
 
-/// Has the first structures of a campaign labelled with these energies, eV an atom, each attempted once. Returns, in that order, energies of
-/// the labels that were believed and class and log of the others.
+/// Labels the first structures of a campaign with these energies, eV/atom, one attempt each. Returns, in that
+/// order, the energies of valid labels, and class and log of the others.
 async fn labelled_with(energies: &[f64]) -> Vec<Result<f64, (String, String)>> {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     let candidates = accept(&store, energies.len() as u64).await;
-    let closing = Closing::default();
-    closing.set_no_more_jobs(true);
+    let shutdown = Shutdown::default();
+    shutdown.set_no_more_jobs(true);
     let method = Method::reference(Box::new(Energies(Vec::from(energies).into_iter())));
     let settings = LabellerSettings { attempts: 1, ..settings("a/0") };
-    run(store.clone(), method, settings, &closing, unix_milliseconds, |_| ()).await.unwrap();
+    run(store.clone(), method, settings, &shutdown, unix_milliseconds, |_| ()).await.unwrap();
     let mut outcomes = Vec::new();
     for candidate in candidates {
         let mut details = store.queue_show(&candidate).await.unwrap();
@@ -118,9 +119,9 @@ async fn labelled_with(energies: &[f64]) -> Vec<Result<f64, (String, String)>> {
 }
 
 async fn until(or: &str, condition: impl AsyncFn() -> bool) {
-    let begun = Instant::now();
+    let started = Instant::now();
     while !condition().await {
-        assert!(begun.elapsed() < Duration::from_secs(60), "{or}");
+        assert!(started.elapsed() < Duration::from_secs(60), "{or}");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
@@ -131,11 +132,11 @@ fn settings(holder: &str) -> LabellerSettings {
         protocol: protocol("dft"),
         attempts: 3,
         bounds: LabelBounds::default(),
-        stay: Stay::UntilEmpty,
+        exit_policy: ExitPolicy::UntilEmpty,
         timing: Timing {
             lease: Duration::from_secs(1),
             idle: Duration::from_millis(5),
-            sign_of_life: Duration::from_millis(20),
+            heartbeat_interval: Duration::from_millis(20),
             grace: None,
         },
     }
@@ -147,30 +148,30 @@ fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     ProcessRecord { id: id.into(), ..process }
 }
 
-/// Its number belongs to another process by now.
+/// Its process id belongs to another process now.
 fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     let living = living(id, kind, number);
-    ProcessRecord { birth: format!("{}0", living.birth), ..living }
+    ProcessRecord { start_time: format!("{}0", living.start_time), ..living }
 }
 
 struct Labeller {
-    closing: Arc<Closing>,
+    shutdown: Arc<Shutdown>,
     task: JoinHandle<Result<(), StoreError>>,
 }
 
 impl Labeller {
-    /// A labeller "l" with number 0 and its own connections, as a process has them.
+    /// A labeller "l" with number 0 and its own connections, as in a process.
     async fn serving(directory: &Path, gate: &Gate) -> Self {
         Self::with(directory, gate, settings("l")).await
     }
 
     async fn with(directory: &Path, gate: &Gate, settings: LabellerSettings) -> Self {
         let store = Store::open(directory).await.unwrap();
-        let (method, closing) = (gate.method(), Arc::new(Closing::default()));
-        let (process, asked) = (living("l", ProcessRecord::LABELLER, Some(0)), Arc::clone(&closing));
+        let (method, shutdown) = (gate.method(), Arc::new(Shutdown::default()));
+        let (process, asked) = (living("l", ProcessRecord::LABELLER, Some(0)), Arc::clone(&shutdown));
         let task =
             async move { serve(store, method, settings, process, &asked, unix_milliseconds, |_| ()).await };
-        Self { closing, task: tokio::spawn(task) }
+        Self { shutdown, task: tokio::spawn(task) }
     }
 
     async fn ended(self) -> Result<(), StoreError> {
@@ -198,15 +199,15 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
     let store = create(directory.path()).await;
     let candidates = accept(&store, 1).await;
     let gate = Gate::default();
-    let closing = Closing::default();
-    closing.set_no_more_jobs(true);
+    let shutdown = Shutdown::default();
+    shutdown.set_no_more_jobs(true);
     let (method, own, mut settings) = (gate.method(), store.clone(), settings("a/0"));
     settings.timing.lease = Duration::from_secs(10);
     let labeller =
-        tokio::spawn(async move { run(own, method, settings, &closing, unix_milliseconds, |_| ()).await });
+        tokio::spawn(async move { run(own, method, settings, &shutdown, unix_milliseconds, |_| ()).await });
     gate.wait_for_labels(1).await;
-    let begun = Instant::now();
-    while begun.elapsed() < Duration::from_secs(15) {
+    let started = Instant::now();
+    while started.elapsed() < Duration::from_secs(15) {
         let now = unix_milliseconds();
         assert!(store.lease(protocol("dft").hash, "b", now, 1).await.unwrap().is_none());
         tokio::time::sleep(Duration::from_millis(50)).await;
@@ -218,7 +219,7 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn energies_beyond_all_bounds_are_failed_attempts_from_the_first_label_on() {
+async fn energies_out_of_bounds_fail_from_the_first_label_on() {
     let outcomes = labelled_with(&[1e300, -106.0, f64::INFINITY]).await;
     let (class, log) = outcomes[0].as_ref().unwrap_err();
     assert_eq!(class, "implausible");
@@ -232,9 +233,9 @@ async fn energies_beyond_all_bounds_are_failed_attempts_from_the_first_label_on(
     assert!(log.contains("an energy of inf, which is not a finite number"), "{log}");
 }
 
-/// The second is believed, since nothing is known by then, and spoils nothing.
+/// The second is accepted, since nothing is known at that point, and does no harm.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn energies_are_held_against_the_potential_when_its_zero_is_known() {
+async fn energies_are_compared_with_the_potential_once_offsets_are_known() {
     let energies = [-106.0, 1e6, -106.1, -105.9, -106.0, -105.0, 1e4, -107.0, -206.5, -204.0];
     let outcomes = labelled_with(&energies).await;
     let believed: Vec<_> = outcomes.iter().filter_map(|outcome| outcome.clone().ok()).collect();
@@ -258,16 +259,16 @@ async fn a_result_whose_lease_was_lost_becomes_a_check() {
     store.release_all("l", now).await.unwrap();
     let other = store.lease(protocol("dft").hash, "other", now, 600).await.unwrap().unwrap();
     store.complete(&other, &label(-1.0), now).await.unwrap();
-    // It has found out by now.
+    // It has noticed by now.
     tokio::time::sleep(Duration::from_millis(500)).await;
     gate.open.store(true, Ordering::Relaxed);
     labeller.ended().await.unwrap();
     let history = history(&store).await;
-    let found: Vec<_> = history.iter().map(|record| (record.standing, record.label.energy)).collect();
-    assert_eq!(found, [(Standing::Label, -1.0), (Standing::Check, 0.0)]);
+    let found: Vec<_> = history.iter().map(|record| (record.status, record.label.energy)).collect();
+    assert_eq!(found, [(LabelStatus::Label, -1.0), (LabelStatus::Check, 0.0)]);
 }
 
-/// For longer than a connection waits for the database; the labeller is asked to stop meanwhile.
+/// Longer than a connection waits for the database; the labeller is asked to stop meanwhile.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_label_is_not_lost_while_the_database_is_locked() {
     let directory = tempfile::tempdir().unwrap();
@@ -280,7 +281,7 @@ async fn a_label_is_not_lost_while_the_database_is_locked() {
     let mut other = other.connect().await.unwrap();
     sqlx::query("BEGIN IMMEDIATE").execute(&mut other).await.unwrap();
     gate.open.store(true, Ordering::Relaxed);
-    labeller.closing.stop();
+    labeller.shutdown.stop();
     tokio::time::sleep(Duration::from_secs(35)).await;
     assert!(!labeller.task.is_finished());
     assert_eq!(number(&store, JobState::Labelled).await, 0);
@@ -290,7 +291,7 @@ async fn a_label_is_not_lost_while_the_database_is_locked() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_labeller_stays_while_an_orchestrator_lives_and_goes_when_it_is_gone() {
+async fn a_labeller_stays_while_an_orchestrator_lives_and_exits_after_it() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     store.upsert_process(&living("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
@@ -307,13 +308,13 @@ async fn a_labeller_stays_while_an_orchestrator_lives_and_goes_when_it_is_gone()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn without_an_orchestrator_the_queue_is_emptied_first() {
+async fn without_an_orchestrator_the_queue_is_emptied_before_exit() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     accept(&store, 4).await;
     let lost = [gone("o", ProcessRecord::ORCHESTRATOR, None), gone("dead", ProcessRecord::LABELLER, Some(1))];
     store.upsert_processes(&lost).await.unwrap();
-    // Longer than this test has time: they come back because their holders are gone.
+    // Longer than this test: they are released because their holders are dead.
     for holder in ["dead", "o/0"] {
         let now = unix_milliseconds();
         store.lease(protocol("dft").hash, holder, now, 86_400).await.unwrap().unwrap();
@@ -325,14 +326,14 @@ async fn without_an_orchestrator_the_queue_is_emptied_first() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
+async fn a_stop_waits_for_the_current_label_while_heartbeats_continue() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     accept(&store, 2).await;
     let gate = Gate::default();
     let labeller = Labeller::serving(directory.path(), &gate).await;
     gate.wait_for_labels(1).await;
-    labeller.closing.stop();
+    labeller.shutdown.stop();
     let own = async || store.processes(Some("labeller")).await.unwrap().remove(0);
     until("nobody can see that it stops", async || own().await.state == "stopping").await;
     let first = own().await.last_seen;
@@ -345,7 +346,7 @@ async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
+async fn a_label_that_outlasts_the_grace_period_is_released() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     let candidates = accept(&store, 1).await;
@@ -354,10 +355,10 @@ async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
     settings.timing.grace = Some(Duration::from_millis(300));
     let labeller = Labeller::with(directory.path(), &gate, settings).await;
     gate.wait_for_labels(1).await;
-    let begun = Instant::now();
-    labeller.closing.stop();
+    let started = Instant::now();
+    labeller.shutdown.stop();
     labeller.ended().await.unwrap();
-    assert!(begun.elapsed() >= Duration::from_millis(300));
+    assert!(started.elapsed() >= Duration::from_millis(300));
     assert_eq!((number(&store, JobState::Queued).await, names(&store).await), (1, vec![]));
     let job = store.queue_show(&candidates[0]).await.unwrap();
     assert_eq!((job.job.failures, job.attempts_made[0].outcome.as_deref()), (0, Some("released")));
@@ -365,10 +366,11 @@ async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
 
 /// Also without an orchestrator, until every walk is over.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_labeller_that_is_to_stay_waits_for_the_end_of_the_campaign() {
+async fn a_labeller_may_wait_for_the_end_of_the_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
-    let (gate, settings) = (Gate::opened(), LabellerSettings { stay: Stay::UntilFinished, ..settings("l") });
+    let (gate, settings) =
+        (Gate::opened(), LabellerSettings { exit_policy: ExitPolicy::UntilFinished, ..settings("l") });
     let labeller = Labeller::with(directory.path(), &gate, settings).await;
     for (labelled, walks) in [(2, vec![]), (4, vec![walk(0, 1)])] {
         store.commit(&store::Commit { walks, ..store::Commit::default() }).await.unwrap();
@@ -384,7 +386,7 @@ async fn a_labeller_that_is_to_stay_waits_for_the_end_of_the_campaign() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn of_two_labellers_with_one_number_the_earlier_goes_home() {
+async fn of_two_labellers_with_one_number_the_earlier_exits() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     store.upsert_process(&living("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
@@ -414,7 +416,7 @@ async fn a_labeller_ends_when_its_campaign_was_deleted() {
         }
         until("it is not known", async || names(&store).await.contains(&"l".to_owned())).await;
         fs::remove_dir_all(directory.path()).unwrap();
-        // Not even another campaign in the same place is its own.
+        // Another campaign in the same directory is not its own.
         fs::create_dir(directory.path()).unwrap();
         let other = create(directory.path()).await;
         let error = labeller.ended().await.unwrap_err();
@@ -424,7 +426,7 @@ async fn a_labeller_ends_when_its_campaign_was_deleted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_ends_a_labeller_is_kept_in_its_record() {
+async fn the_error_that_ends_a_labeller_is_recorded() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     accept(&store, 1).await;

@@ -1,4 +1,4 @@
-//! Turns of a walk: pure functions, the bias force, and the way out of a trap.
+//! Assignments of a walk: pure functions, the bias force, and leaving a trap.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
 }
 
-fn seed(name: &str) -> Structure {
+fn seed_structure(name: &str) -> Structure {
     let frames = read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
     frames.into_iter().find(|frame| frame.info["name"].text() == Some(name)).unwrap().structure
 }
@@ -76,18 +76,18 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
     }
 }
 
-fn go(settings: &WalkSettings, assignment: &Assignment) -> Report<Candidate> {
+fn run(settings: &WalkSettings, assignment: &Assignment) -> Report<Candidate> {
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
     advance(&context, assignment, mixture(), || false, |_| {})
 }
 
-/// Works on a walk turn by turn, with every candidate accepted, until it ends.
+/// Runs a walk, one assignment after the other, with every candidate accepted, until it ends.
 fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) -> Vec<Report<Candidate>> {
     let mut turn = assignment(structure, turn_steps);
     let mut reports = Vec::new();
     loop {
-        let report = go(settings, &turn);
+        let report = run(settings, &turn);
         turn.checkpoint = Some(report.checkpoint.clone());
         turn.until = report.progress.step + turn_steps;
         turn.turn += 1;
@@ -101,24 +101,24 @@ fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) ->
 }
 
 #[test]
-fn a_turn_in_pieces_is_the_same_turn() {
+fn a_split_assignment_gives_the_same_result() {
     let settings = WalkSettings { collection: never(), ..settings() };
-    let whole = go(&settings, &assignment(seed("vacancy"), 120));
+    let whole = run(&settings, &assignment(seed_structure("vacancy"), 120));
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::Turn, 120));
-    let mut turn = assignment(seed("vacancy"), 0);
+    let mut turn = assignment(seed_structure("vacancy"), 0);
     for until in [1, 19, 20, 21, 33, 90, 120] {
         turn.until = until;
-        turn.checkpoint = Some(go(&settings, &turn).checkpoint);
+        turn.checkpoint = Some(run(&settings, &turn).checkpoint);
     }
     assert_eq!(turn.checkpoint, Some(whole.checkpoint));
 }
 
-/// A checkpoint that is damaged goes on, or ends its walk: `CALMWALK_MUTATIONS=5000` for the long version.
+/// A damaged checkpoint continues or ends its walk. `CALMWALK_MUTATIONS=5000` runs the long version.
 #[test]
-fn damaged_checkpoints_stop_no_walker() {
+fn damaged_checkpoints_do_not_stop_a_walker() {
     let settings = WalkSettings { collection: never(), ..settings() };
-    let mut turn = assignment(seed("vacancy"), 110);
-    let checkpoint = go(&settings, &turn).checkpoint;
+    let mut turn = assignment(seed_structure("vacancy"), 110);
+    let checkpoint = run(&settings, &turn).checkpoint;
     let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
     let mixture = mixture();
     turn.until = 115;
@@ -139,7 +139,7 @@ fn never() -> CollectionRule {
 
 #[test]
 fn the_bias_is_the_hal_force() {
-    let (model, mixture, structure) = (model(), mixture(), seed("slab-111"));
+    let (model, mixture, structure) = (model(), mixture(), seed_structure("slab-111"));
     let species = &structure.species;
     let mut biased =
         BiasedPotential::new(Grace::new(Arc::clone(&model)), Arc::clone(&mixture), None, 10, species)
@@ -187,11 +187,11 @@ fn reference(
     (evaluation, pull_back)
 }
 
-/// The trap that the reference's walker fell into: τ = 2.0 on a model of one phase, and a ZBL that ends at 1.8 Å.
+/// The trap of the reference's walker: τ = 2.0 on a model of one phase, and a ZBL that ends at 1.8 Å.
 #[test]
-fn a_trapped_walk_goes_back_with_a_smaller_bias() {
+fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), ..settings() };
-    let reports = whole_walk(&settings, seed("fcc-100"), 150);
+    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
     let last = reports.last().unwrap();
     assert!(last.progress.returns >= 1, "{last:?}");
     assert_eq!(last.progress.segment, last.progress.returns);
@@ -202,12 +202,12 @@ fn a_trapped_walk_goes_back_with_a_smaller_bias() {
     assert!(candidates >= 2, "after its return the walk collects again");
 }
 
-/// Steps between two candidates along the path that joins them, whatever returns lie between.
+/// Steps between two candidates along the path that joins them, across roll backs.
 #[test]
-fn the_gap_between_collections_holds_across_returns() {
+fn the_interval_between_collections_holds_across_roll_backs() {
     let guard = GuardSettings { tau_factor: 0.8, most_returns: 6, ..settings().guard };
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), gap: 120, guard, ..settings() };
-    let reports = whole_walk(&settings, seed("fcc-097"), 150);
+    let reports = whole_walk(&settings, seed_structure("fcc-097"), 150);
     let candidate = |report: &Report<Candidate>| match &report.outcome {
         Outcome::Candidate(candidate) => Some((candidate.id.segment, candidate.id.step)),
         _ => None,
@@ -215,7 +215,8 @@ fn the_gap_between_collections_holds_across_returns() {
     let candidates: Vec<_> = reports.iter().filter_map(candidate).collect();
     let segments = reports.last().unwrap().progress.segment;
     assert!(segments >= 2 && candidates.len() >= 2, "{segments} {candidates:?}");
-    // Two candidates of one segment are on one path; of two segments, at least as far apart as their steps.
+    // Two candidates of one segment are on one path; those of two segments are at least as far apart as their
+    // steps.
     for (k, (segment, step)) in candidates.iter().enumerate() {
         for (earlier, at) in &candidates[..k] {
             let apart = if segment == earlier {
@@ -230,15 +231,15 @@ fn the_gap_between_collections_holds_across_returns() {
 
 #[test]
 fn the_skin_changes_nothing() {
-    // A cluster that loses an atom: when that is noticed must not depend on when the list was built.
-    let mut cluster = seed("fcc-100");
+    // A cluster that loses an atom: when this is noticed must not depend on when the list was built.
+    let mut cluster = seed_structure("fcc-100");
     cluster.periodic = [false; 3];
     cluster.species.truncate(5);
     cluster.positions.truncate(5);
     let ends = [0.1, 0.5, 3.0].map(|skin| {
         let settings =
             WalkSettings { skin, temperature: 6000.0, steps: 4000, collection: never(), ..settings() };
-        let report = go(&settings, &assignment(cluster.clone(), 4020));
+        let report = run(&settings, &assignment(cluster.clone(), 4020));
         (report.outcome, report.progress.step)
     });
     let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(End::BlewUp { reason }) if reason.contains("no neighbour"));
@@ -247,11 +248,11 @@ fn the_skin_changes_nothing() {
 }
 
 #[test]
-fn a_walk_without_a_way_out_ends() {
+fn a_walk_that_cannot_leave_a_trap_ends() {
     let guard = GuardSettings { least_distance: 3.0, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
     let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
-    let reports = whole_walk(&settings, seed("fcc-100"), 150);
+    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
     let last = reports.last().unwrap();
     assert!(
         matches!(&last.outcome, Outcome::Ended(End::Trapped { guard }) if guard == "shortest-bond"),
@@ -262,33 +263,33 @@ fn a_walk_without_a_way_out_ends() {
 }
 
 #[test]
-fn a_walk_that_blows_up_ends_with_its_reason() {
+fn a_diverging_walk_ends_with_its_reason() {
     let guard = GuardSettings { highest_temperature: 900.0, ..settings().guard };
     let settings = WalkSettings { temperature: 2500.0, collection: never(), guard, ..settings() };
-    let report = go(&settings, &assignment(seed("fcc-100"), 600));
+    let report = run(&settings, &assignment(seed_structure("fcc-100"), 600));
     let Outcome::Ended(End::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };
     assert!(reason.contains("above the allowed 900 K"), "{reason}");
 }
 
 #[test]
-fn a_control_walk_gives_the_wanted_frames_and_follows_the_biased_one_until_the_bias_speaks() {
+fn a_control_walk_gives_the_requested_frames_and_follows_the_biased_one_until_the_bias_acts() {
     let settings = settings();
-    let mut control = assignment(seed("slab-111"), 90);
+    let mut control = assignment(seed_structure("slab-111"), 90);
     control.origin = Origin::Control;
     control.walk = WalkId(9);
     control.wanted = vec![25, 90];
-    let report = go(&settings, &control);
+    let report = run(&settings, &control);
     let Outcome::Candidate(candidate) = &report.outcome else { panic!("{report:?}") };
     assert_eq!((candidate.id.step, candidate.origin), (25, Origin::Control));
-    // The bias is silent for its first ten evaluations: up to step 30 both are the same trajectory.
+    // The bias is zero for its first ten evaluations: up to step 30 both trajectories agree.
     let same = |until: u64| {
         let quiet = WalkSettings { collection: never(), ..settings.clone() };
-        let biased = go(&quiet, &assignment(seed("slab-111"), until));
+        let biased = run(&quiet, &assignment(seed_structure("slab-111"), until));
         let mut control = Assignment { wanted: Vec::new(), ..control.clone() };
         control.until = until;
         let state =
             |report: &Report<Candidate>| (report.progress.temperature, report.progress.relative_volume);
-        state(&biased) == state(&go(&quiet, &control))
+        state(&biased) == state(&run(&quiet, &control))
     };
     assert!(same(30));
     assert!(!same(60));

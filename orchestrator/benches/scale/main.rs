@@ -160,7 +160,7 @@ async fn look_at_the_queue(location: Location, decisions: usize) {
     })
     .await;
     looks("is there a job?", async || {
-        assert!(store.awaits_labels(store::unix_milliseconds()).await.unwrap())
+        assert!(store.has_pending_labels(store::unix_milliseconds()).await.unwrap())
     })
     .await;
     looks("how many are there?", async || assert!(store.unfinished_jobs().await.unwrap() > 0)).await;

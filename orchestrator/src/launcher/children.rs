@@ -82,7 +82,7 @@ impl Children {
         }
     }
 
-    /// Takes the process `pid` that was born at `birth` ([`store::process_birth`]) for a child that was not started yet.
+    /// Takes the process `pid` that was born at `birth` ([`store::process_start_time`]) for a child that was not started yet.
     /// It need not be a child of this process; of its end no more can be known than that it came. To be called inside the
     /// runtime.
     pub fn adopt(&mut self, number: u32, pid: u32, birth: &str) -> Result<(), AdoptError> {

@@ -49,14 +49,14 @@ impl Process {
         Ok(Self { handle: open(pid)? })
     }
 
-    /// The handle of the process with this number that was born then, [`store::process_birth`] has it.
+    /// The handle of the process with this number that was born then, [`store::process_start_time`] has it.
     pub fn find(pid: u32, birth: &str) -> Result<Self, AdoptError> {
         let handle = open(pid).map_err(|error| match error {
             Errno::SRCH | Errno::INVAL => AdoptError::Gone { pid },
             error => AdoptError::Refused { pid, error: error.into() },
         })?;
         // Only now, since from here on the handle keeps to one process whatever becomes of the number.
-        match store::process_birth(pid) {
+        match store::process_start_time(pid) {
             Some(found) if found == birth => Ok(Self { handle }),
             _ => Err(AdoptError::Gone { pid }),
         }
@@ -80,7 +80,7 @@ impl Process {
     }
 }
 
-/// Asks the process `pid` that was born at `birth` ([`store::process_birth`]) to end in order (SIGTERM), and does not wait
+/// Asks the process `pid` that was born at `birth` ([`store::process_start_time`]) to end in order (SIGTERM), and does not wait
 /// for it: a labeller of an earlier run, say, that cannot be adopted because it works to another protocol.
 pub fn ask_to_end(pid: u32, birth: &str) -> Result<(), AdoptError> {
     let sent = Process::find(pid, birth)?.signal(Signal::TERM);

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use store::{Attempt, Exclusion, Job, Superseded, unix_milliseconds};
+use store::{Attempt, Exclusion, Job, Supersession, unix_milliseconds};
 
 use super::line;
 use crate::candidate_details::{CandidateDetails, CandidateLabel, ForceError, LabelJob};
@@ -90,7 +90,7 @@ fn write_label(out: &mut dyn Write, label: &CandidateLabel, atoms: usize) -> io:
             &format!("excluded from exports and statistics {} ago: {reason}", elapsed_since(*time)),
         )?;
     }
-    if let Some(Superseded { time, reason }) = &label.superseded {
+    if let Some(Supersession { time, reason }) = &label.superseded {
         line(out, "", &format!("superseded {} ago: {reason}", elapsed_since(*time)))?;
     }
     let Some(model) = &label.model else { return Ok(()) };

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 use atoms::extxyz::{LabelKeys, write_frame};
 use store::records::Protocol;
-use store::{DATABASE, ExportFilter, ExportPlace, ExportRow, ExportSource, JobState, LOCK, Store};
+use store::{DATABASE, ExportCursor, ExportFilter, ExportRow, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
@@ -112,18 +112,18 @@ struct Part {
 async fn check_completeness(
     store: &Store,
     filter: &ExportFilter,
-    mut missing: BTreeSet<ExportPlace>,
+    mut missing: BTreeSet<ExportCursor>,
 ) -> Result<(), Failure> {
     if missing.is_empty() {
         return Ok(());
     }
     // Structures that were dropped or relabelled since the first count are not missing.
-    let now = store.labelled_places(filter).await?;
+    let now = store.labelled_cursors(filter).await?;
     missing.retain(|place| now.contains(place));
     let place = match missing.first() {
         None => return Ok(()),
-        Some(ExportPlace::Candidate(decision)) => format!("that of decision {decision}"),
-        Some(ExportPlace::Import(number)) => format!("import-{number}"),
+        Some(ExportCursor::Candidate(decision)) => format!("that of decision {decision}"),
+        Some(ExportCursor::Import(number)) => format!("import-{number}"),
     };
     Err(Failure::Failed(format!(
         "damaged database: {} of {} labelled structures are missing, the first is {place}; nothing was written. calmwalk store \
@@ -187,14 +187,14 @@ impl Export {
         let protocol = self.select_protocol(&store).await?;
         let (filter, campaign) = (self.filter(&protocol), store.campaign().await?.id.to_string());
         let (mut parts, assigned) = self.parts(&store).await?;
-        let mut missing = store.labelled_places(&filter).await?;
+        let mut missing = store.labelled_cursors(&filter).await?;
         let (mut frames, mut last, bar) = (0, None, Bar::new(None, BAR));
         loop {
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
-            last = Some(row.place);
+            last = Some(row.cursor);
             for row in page {
-                missing.remove(&row.place);
+                missing.remove(&row.cursor);
                 if self.condition.as_ref().is_some_and(|condition| !condition.matches(&frame::facts(&row))) {
                     continue;
                 }

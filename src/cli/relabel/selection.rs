@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use store::{ExportFilter, JobState, Relabellable, Store, Waiting};
+use store::{ExportFilter, JobState, PendingJobs, Relabellable, Store};
 use wire::ContentHash;
 
 use super::Failure;
@@ -67,13 +67,13 @@ impl Selection {
     }
 
     /// Numbers of selected structures by size.
-    pub fn sizes(&self) -> Vec<Waiting> {
+    pub fn sizes(&self) -> Vec<PendingJobs> {
         let mut sizes: BTreeMap<_, u64> = BTreeMap::new();
         for Relabellable { seed_structure, formula, atoms, .. } in &self.selected {
             *sizes.entry((*seed_structure, formula.clone(), *atoms)).or_default() += 1;
         }
         let waiting =
-            |((seed_structure, formula, atoms), jobs)| Waiting { seed_structure, formula, atoms, jobs };
+            |((seed_structure, formula, atoms), jobs)| PendingJobs { seed_structure, formula, atoms, jobs };
         sizes.into_iter().map(waiting).collect()
     }
 
@@ -117,7 +117,7 @@ pub async fn matching(
         loop {
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
-            last = Some(row.place);
+            last = Some(row.cursor);
             let rows = page.iter().filter(|row| condition.matches(&facts(row)));
             matching.extend(rows.map(|row| ContentHash::of(&row.structure).0));
         }

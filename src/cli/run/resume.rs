@@ -65,7 +65,7 @@ async fn in_force(store: &Store) -> Result<Value, Failure> {
 
 async fn record(store: &Store, origin: &Provenance) -> Result<(), Failure> {
     let text = serde_json::to_string(origin).map_err(Failure::failed)?;
-    Ok(store.leave_note(provenance::METADATA_KEY, &text).await?)
+    Ok(store.set_metadata(provenance::METADATA_KEY, &text).await?)
 }
 
 /// Reports where the campaign resumes.
@@ -73,7 +73,7 @@ async fn report_progress(store: &Store, origin: &Provenance, location: &Location
     let status = store.status().await?;
     let decisions = store.newest_mixture().await?.decision;
     let steps: u64 = status.walks.iter().map(|walk| walk.step).sum();
-    let ended = status.walks.iter().filter(|walk| !walk.is_under_way()).count() as u64;
+    let ended = status.walks.iter().filter(|walk| !walk.is_active()).count() as u64;
     let progress = if decisions == 0 {
         "no decisions yet".to_owned()
     } else {

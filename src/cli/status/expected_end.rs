@@ -27,7 +27,7 @@ impl ExpectedEnd {
         }
         let steps = |key: &str| configuration["walk"][key].as_u64().unwrap_or_default();
         let steps_per_walk = steps("equilibration") + steps("steps");
-        let under_way = status.walks.iter().filter(|walk| walk.is_under_way());
+        let under_way = status.walks.iter().filter(|walk| walk.is_active());
         let left: u64 = under_way.map(|walk| steps_per_walk.saturating_sub(walk.step)).sum();
         let speed = status.steps_per_second.filter(|speed| status.led && *speed > 0.0);
         let walks_hours = match left {

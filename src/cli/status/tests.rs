@@ -6,8 +6,8 @@ use std::path::Path;
 use orchestrator::slurm::{Job, Role};
 use serde_json::json;
 use store::{
-    Budget, BudgetStatus, BudgetUse, Declined, FailureCount, Labels, OldestLease, ProcessRecord, Range,
-    Unlabelled, WalkStatus, unix_milliseconds,
+    Budget, BudgetStatus, BudgetUse, Declined, FailureCount, Labels, OldestLease, ProcessRecord, Unlabelled,
+    ValueRange, WalkStatus, unix_milliseconds,
 };
 use wire::CampaignId;
 
@@ -32,7 +32,7 @@ pub fn large() -> Snapshot {
     };
     let failure =
         |class: &str| FailureCount { class: class.into(), labelled: 1000, given_up: 2000, unfinished: 300 };
-    let range = |low, high| Range { low: Some(low), high: Some(high) };
+    let range = |low, high| ValueRange { low: Some(low), high: Some(high) };
     let unlabelled = Unlabelled {
         seed_structure: "bcc-100".into(),
         formula: "Mo54".into(),

@@ -21,7 +21,7 @@ fn select(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
     let mut shown: Vec<_> = walks.iter().collect();
     if shown.len() > most {
         let gamma = |walk: &WalkStatus| (1e6 * walk.gamma_max.unwrap_or_default().clamp(0.0, 1e9)) as u64;
-        shown.sort_by_cached_key(|walk| match walk.is_under_way() {
+        shown.sort_by_cached_key(|walk| match walk.is_active() {
             true => (0, walk.steps_per_second.is_none(), Reverse(gamma(walk)), Reverse(walk.walk)),
             false => (1, true, Reverse(0), Reverse(walk.walk)),
         });

@@ -31,7 +31,7 @@ impl Compact {
         // Fails if there is no campaign, before the lock creates files.
         Store::open_read_only(&location).await?.close().await;
         let lock = CampaignLock::acquire_at(&location, "calmwalk store compact").await?;
-        let store = Store::open(&location).await?.led_by(&lock);
+        let store = Store::open(&location).await?.fenced_by(&lock);
         let before = store.size().await?;
         if self.drop_declined_features {
             let dropped = store.drop_declined_features(unix_milliseconds()).await?;

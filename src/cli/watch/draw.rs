@@ -98,7 +98,7 @@ fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut State, theme: &Them
 
 fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
     let (campaign, status) = (state.snapshot.campaign(), state.snapshot.status());
-    let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
+    let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let paused = status.walks.iter().filter(|walk| walk.paused).count();
     let paused = if paused == 0 { String::new() } else { format!(" ({paused} paused)") };
     let ended = status.walks.len() - under_way;

@@ -1,7 +1,7 @@
 //! Force errors by grade, failures, and unlabelled structures.
 
 use analysis::ForceErrors;
-use store::{FailureCount, Range, Unlabelled};
+use store::{FailureCount, Unlabelled, ValueRange};
 
 use super::{Cell, Table, count, percent, real, text};
 use crate::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
@@ -151,6 +151,6 @@ pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
     table
 }
 
-fn range_cells(range: &Range, decimals: usize) -> [Cell; 2] {
+fn range_cells(range: &ValueRange, decimals: usize) -> [Cell; 2] {
     [range.low, range.high].map(|end| real(end, decimals))
 }

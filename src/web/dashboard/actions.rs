@@ -89,7 +89,7 @@ pub async fn act_on_walks(
         _ => return Err(ApiError::new(StatusCode::NOT_FOUND, "unknown action; expected pause or resume")),
     };
     let walks = match walk.as_str() {
-        "all" => store.walks_under_way().await?,
+        "all" => store.active_walks().await?,
         number => {
             vec![WalkId(
                 number.parse().map_err(|_| ApiError::bad_request("expected the number of a walk, or all"))?,

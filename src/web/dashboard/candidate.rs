@@ -7,7 +7,7 @@ use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use serde_json::json;
-use store::{Standing, Store, StoreError, StoredCandidate};
+use store::{LabelStatus, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
 use super::Dashboard;
@@ -80,7 +80,7 @@ async fn find(store: &Store, id: &str) -> Result<StructureRecord, ApiError> {
 async fn frame(store: &Store, found: StructureRecord) -> Result<Frame, StoreError> {
     let mut frame = Frame::from(found.structure);
     let labels = store.labels_of(found.content).await?;
-    if let Some(labelled) = labels.into_iter().find(|label| label.record.standing == Standing::Label) {
+    if let Some(labelled) = labels.into_iter().find(|label| label.record.status == LabelStatus::Label) {
         let label = labelled.record.label;
         let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
         frame.set_labels(&labels, LabelKeys::Ase);

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use atoms::Species;
 use axum::extract::{RawQuery, State};
 use serde_json::json;
-use store::{JobState, ListOrder, ListPlace, ListedCandidate, Store, StoreError};
+use store::{JobState, ListCursor, ListOrder, ListedCandidate, Store, StoreError};
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult, json};
@@ -27,7 +27,7 @@ struct Query {
     fate: Option<String>,
     state: Option<JobState>,
     filter: Option<Filter>,
-    after: Option<ListPlace>,
+    after: Option<ListCursor>,
     limit: Option<u32>,
 }
 
@@ -47,7 +47,7 @@ enum Order {
 struct Page {
     rows: Vec<ListedCandidate>,
     /// Cursor of the next page. `None` at the end.
-    next: Option<ListPlace>,
+    next: Option<ListCursor>,
     scanned: usize,
 }
 
@@ -126,7 +126,7 @@ impl Query {
     async fn rows(
         &self,
         store: &Store,
-        after: Option<ListPlace>,
+        after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>, StoreError> {
         let descending = !self.ascending;
@@ -151,14 +151,14 @@ impl Query {
         store.list_candidates(order, descending, after, limit).await
     }
 
-    fn cursor_of(&self, row: &ListedCandidate) -> ListPlace {
+    fn cursor_of(&self, row: &ListedCandidate) -> ListCursor {
         let value = match self.order {
             Order::Decision => None,
             Order::Gamma => row.gamma,
             Order::Volume => row.relative_volume,
             Order::Queue => row.priority.map(f64::from),
         };
-        ListPlace { value: value.unwrap_or_default(), decision: row.decision }
+        ListCursor { value: value.unwrap_or_default(), decision: row.decision }
     }
 
     /// `elements` caches the species of formulas.
@@ -210,10 +210,10 @@ impl FromStr for Order {
     }
 }
 
-fn parse_cursor(text: &str) -> Result<ListPlace, ApiError> {
+fn parse_cursor(text: &str) -> Result<ListCursor, ApiError> {
     let read = |(value, decision): (&str, &str)| {
         let value = value.parse().ok().filter(|value: &f64| value.is_finite())?;
-        Some(ListPlace { value, decision: decision.parse().ok()? })
+        Some(ListCursor { value, decision: decision.parse().ok()? })
     };
     let wrong = || ApiError::bad_request(format!("after is '{text}', expected 'next' of the previous page"));
     text.split_once(':').and_then(read).ok_or_else(wrong)
@@ -237,7 +237,7 @@ mod tests {
         let query = Query::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17").unwrap();
         assert!(query.order == Order::Gamma && query.ascending && query.fate.is_none());
         assert_eq!(query.filter.unwrap().to_string(), "gamma > 2.0");
-        assert_eq!(query.after, Some(ListPlace { value: 2.5, decision: 17 }));
+        assert_eq!(query.after, Some(ListCursor { value: 2.5, decision: 17 }));
         for (query, why) in [
             ("order=size", "expected one of decision"),
             ("order=queue", "give 'state'"),

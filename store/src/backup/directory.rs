@@ -1,4 +1,4 @@
-//! A directory that gets its name when it is complete.
+//! A directory that gets its final name once it is complete.
 
 use std::fs::{self, DirBuilder, File};
 use std::io;
@@ -10,13 +10,13 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
 
-/// A directory beside the one that it is to be, under another name. Dropped before it is published, it is removed.
-pub(super) struct Unfinished {
+/// A directory under a temporary name beside its target. Removed on drop unless published.
+pub(super) struct StagedDirectory {
     path: PathBuf,
 }
 
-impl Unfinished {
-    /// Makes it. What a killed process left under that name is removed.
+impl StagedDirectory {
+    /// Creates it. Removes what a killed process left under the temporary name.
     pub fn beside(target: &Path) -> Result<Self> {
         if target.symlink_metadata().is_ok() {
             return Err(StoreError::BackupExists { path: target.into() });
@@ -38,7 +38,7 @@ impl Unfinished {
         &self.path
     }
 
-    /// Gives it its name, if nobody else has taken that meanwhile.
+    /// Renames it to its final name, unless that exists meanwhile.
     pub fn publish(self, target: &Path) -> Result<()> {
         let failed = |source: io::Error| StoreError::File { path: target.into(), source };
         for entry in fs::read_dir(&self.path).map_err(failed)? {
@@ -54,9 +54,9 @@ impl Unfinished {
     }
 }
 
-impl Drop for Unfinished {
+impl Drop for StagedDirectory {
     fn drop(&mut self) {
-        // Under its own name no more, once it is published.
+        // Once published, it no longer has this name.
         let _ = fs::remove_dir_all(&self.path);
     }
 }

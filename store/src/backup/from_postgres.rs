@@ -1,18 +1,18 @@
-//! From the tables of a server into those of a file, in one transaction that sees everything at one instant.
+//! Copies the tables of a server into an SQLite file, from one snapshot.
 
 use std::path::Path;
 
 use sqlx::{AssertSqlSafe, Executor, Postgres};
 
 use crate::database::value::Kind;
-use crate::database::{Database, Row, Transaction, Value, for_rows, query};
+use crate::database::{Database, Row, Transaction, Value, execute_rows, query};
 use crate::error::{Result, StoreError};
 use crate::postgres::Server;
 use crate::sqlite::DatabaseFile;
-use crate::tables::budget::sum_up;
+use crate::tables::budget::rebuild_totals;
 use crate::tables::checksums;
 
-/// Pages in a transaction of the copy.
+/// Pages per transaction of the copy.
 const PAGES: usize = 32;
 
 use Kind::{Bytes as B, Integer as I, Real as R, Text as T};
@@ -22,12 +22,12 @@ struct Table {
     columns: &'static [&'static str],
     kinds: &'static [Kind],
     insert: &'static str,
-    /// Rows that are on their way at a time: a row of a large structure has megabytes.
+    /// Rows fetched at a time: a row of a large structure has megabytes.
     page: usize,
     fetch: &'static str,
 }
 
-/// One of the tables, with the types of its columns.
+/// A table with the types of its columns.
 macro_rules! table {
     ($name:literal { $($columns:tt)* }) => { table!($name 64 { $($columns)* }) };
     ($name:literal $page:literal { $($column:ident: $kind:ident),* $(,)? }) => {
@@ -42,9 +42,8 @@ macro_rules! table {
     };
 }
 
-/// Every table but those of the leader, of processes and their pace, and of the numbers of jobs, which are counted again as
-/// jobs come in; each after those that it refers to. Some rows of the campaign's
-/// are there from the beginning.
+/// All tables except those of the leader, of processes and their progress, and of job counts, which triggers count
+/// again. Each table comes after those that it references. A new database already has some rows of `campaign`.
 const TABLES: [Table; 16] = [
     table!("campaign" { key: T, value: T, checksum: I }),
     table!("value" { name: T, value: T, checksum: I }),
@@ -88,10 +87,10 @@ const TABLES: [Table; 16] = [
 ];
 const OPERATIONS: Table = table!("operation" { number: I, time: I, kind: T, detail: T });
 
-/// Makes the copy in a directory.
+/// Writes the copy into a directory.
 pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
-    let mut from = server.begin_to_read().await?;
-    // They have the mark of those that are unknown.
+    let mut from = server.begin_read().await?;
+    // Their checksums are marked as unknown.
     let without_checksums = !from.has_column("label", "checksum").await?;
     let tables = || TABLES.iter().chain([&OPERATIONS]);
     let mut all = 0;
@@ -107,7 +106,7 @@ pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut
             })
             .await?;
         }
-        sum_up(into).await?;
+        rebuild_totals(into).await?;
         if without_checksums {
             let mut transaction = into.begin().await?;
             checksums::fill(&mut transaction).await?;
@@ -146,7 +145,7 @@ async fn copy_table(
             let page = query(table.fetch).rows(&mut *from).await?;
             let (rows, end) = (page.len(), page.len() < table.page);
             let page = page.iter().map(|row| values(row, table)).collect::<Result<_>>()?;
-            for_rows(&mut transaction, table.insert, table.columns, page).await?;
+            execute_rows(&mut transaction, table.insert, table.columns, page).await?;
             told(rows as u64);
             if end {
                 return transaction.commit().await;
@@ -163,7 +162,7 @@ fn postgres(transaction: &mut Transaction) -> Result<&mut sqlx::Transaction<'sta
     }
 }
 
-/// What tables of an earlier version do not have is NULL.
+/// Columns that tables of an earlier version lack are NULL.
 fn values(row: &Row, table: &Table) -> Result<Vec<Value>> {
     let value = |(name, kind): (&&str, &Kind)| {
         Ok(match kind {
@@ -176,7 +175,7 @@ fn values(row: &Row, table: &Table) -> Result<Vec<Value>> {
     table.columns.iter().zip(table.kinds).map(value).collect()
 }
 
-/// Whether the server has a table, which earlier versions may lack.
+/// Whether the server has the table; earlier versions lack some.
 async fn exists(from: &mut Transaction, table: &Table) -> Result<bool> {
     query("SELECT to_regclass($1) IS NOT NULL").bind(table.name).fetch_one(from).await
 }

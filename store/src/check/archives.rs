@@ -1,4 +1,4 @@
-//! Whether packed directories of calculations can be unpacked. Nothing is written: each is read through, one at a time.
+//! Checks that packed directories of calculations can be unpacked. Reads them one at a time and writes nothing.
 
 use std::io::{self, Read};
 
@@ -27,7 +27,7 @@ impl FromRow for Packed {
 }
 
 impl Packed {
-    /// The one after that of this attempt.
+    /// The first archive after this attempt.
     pub async fn after(transaction: &mut Transaction, job: i64, attempt: u32) -> Result<Option<Self>> {
         query(NEXT_ARCHIVE).bind(job).bind(attempt).fetch_optional(transaction).await
     }
@@ -41,7 +41,7 @@ impl Packed {
     }
 }
 
-/// Reads a compressed tar file to its end, however large it is unpacked.
+/// Reads a compressed tar file to its end, whatever its unpacked size.
 fn unpack(bytes: &[u8]) -> io::Result<()> {
     if bytes.is_empty() {
         return Err(io::ErrorKind::UnexpectedEof.into());
@@ -54,7 +54,7 @@ fn unpack(bytes: &[u8]) -> io::Result<()> {
             return Err(io::Error::other(format!("{found} bytes of a file of {expected}")));
         }
     }
-    // What follows the last file is only read for the sake of the checksum.
+    // The rest after the last file is read only for the checksum.
     io::copy(&mut archive.into_inner().by_ref(), &mut io::sink()).map(drop)
 }
 
@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_or_changed_anywhere_is_found() {
+    fn truncated_or_changed_archives_are_detected() {
         let content: Vec<u8> =
             (0..20_000_u32).flat_map(|n| n.wrapping_mul(2_654_435_761).to_le_bytes()).collect();
         let whole = packed(&content);

@@ -1,11 +1,11 @@
-//! What stands in the long columns: structures, candidates, labels, texts of JSON, packed directories.
+//! Checks the content of long columns: structures, candidates, labels, JSON texts, packed directories.
 
 use wire::{CandidateBlock, ContentHash};
 
 use super::Finding;
 use super::archives::Packed;
 use crate::checksum::{
-    CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG, Names, PROTOCOL, STRUCTURE,
+    CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG_COLUMNS, Names, PROTOCOL, STRUCTURE,
 };
 use crate::database::{FromRow, Row, Transaction, from_columns, query};
 use crate::encoding::decode_structure;
@@ -16,8 +16,8 @@ use crate::tables::labels::decode_label;
 
 /// Rows read at a time: a row of a large structure has megabytes.
 const PAGE: u32 = 16;
-/// Findings of a kind that are told one by one.
-const TOLD: usize = 5;
+/// Number of findings of a kind that are listed one by one.
+const MAX_LISTED: usize = 5;
 
 const STRUCTURES: &str =
     "SELECT number AS place, structure.* FROM structure WHERE number > $1 ORDER BY number LIMIT $2";
@@ -70,16 +70,16 @@ from_columns!(Candidate { id, content, block, features, selector_grades, origina
 from_columns!(Label { atoms, energy, forces, stress, details });
 from_columns!(Text { text });
 
-/// A row that can be looked into.
+/// A row whose content can be checked.
 trait Content: FromRow {
     /// What is wrong with it.
     fn fault(&self) -> Option<String>;
 }
 
-/// The table of rows, and which of their long columns have checksums of their own.
+/// The table of the rows, and its long columns that have checksums of their own.
 type Checked = (&'static CheckedTable, &'static [&'static CheckedColumn]);
 
-/// What is wrong with a row: what it holds, or that it is not what was written.
+/// The fault of a row: invalid content or a wrong checksum.
 fn fault<C: Content>(row: &Row, (table, columns): Checked) -> Option<String> {
     let content = match C::from_row(row) {
         Ok(content) => content.fault(),
@@ -96,7 +96,7 @@ fn fault<C: Content>(row: &Row, (table, columns): Checked) -> Option<String> {
     content.or_else(verify)
 }
 
-/// Looks into rows, and remembers what is wrong.
+/// Checks rows and collects findings.
 pub(super) struct Contents<'a> {
     transaction: &'a mut Transaction,
     tell: &'a mut dyn FnMut(u64, u64),
@@ -113,7 +113,7 @@ impl<'a> Contents<'a> {
         let all = query(ROWS).fetch_one(&mut *transaction).await?;
         let mut contents = Self { transaction, tell, read: 0, all, findings: Vec::new() };
         contents.table::<Structure>((&STRUCTURE, &[]), STRUCTURES).await?;
-        contents.table::<Candidate>((&CANDIDATE, &LONG), CANDIDATES).await?;
+        contents.table::<Candidate>((&CANDIDATE, &LONG_COLUMNS), CANDIDATES).await?;
         contents.table::<Label>((&LABEL, &[]), LABELS).await?;
         contents.table::<Text>((&DECISION, &[]), DECISIONS).await?;
         contents.table::<Text>((&PROTOCOL, &[]), PROTOCOLS).await?;
@@ -140,7 +140,7 @@ impl<'a> Contents<'a> {
         Ok(())
     }
 
-    /// One at a time: each may have as much as a calculation may leave.
+    /// One at a time: each may be as large as the work directory of a calculation.
     async fn archives(&mut self) -> Result<()> {
         let (mut last, mut faults) = ((0, 0), Vec::new());
         while let Some(packed) = Packed::after(self.transaction, last.0, last.1).await? {
@@ -160,17 +160,17 @@ impl<'a> Contents<'a> {
 
     fn found(&mut self, faults: Vec<String>) {
         let then = "its content is damaged; restore the campaign from a backup";
-        if faults.len() > TOLD {
-            let more = format!("{} more rows of the same table are like the following", faults.len() - TOLD);
+        if faults.len() > MAX_LISTED {
+            let more = format!("{} more rows of the same table have such faults", faults.len() - MAX_LISTED);
             self.findings.push(Finding { what: more, then });
         }
-        self.findings.extend(faults.into_iter().take(TOLD).map(|what| Finding { what, then }));
+        self.findings.extend(faults.into_iter().take(MAX_LISTED).map(|what| Finding { what, then }));
     }
 }
 
 impl Content for Structure {
     fn fault(&self) -> Option<String> {
-        decode_structure(&self.data, &self.hash).err().map(|_| "it does not have its hash".to_owned())
+        decode_structure(&self.data, &self.hash).err().map(|_| "it does not match its hash".to_owned())
     }
 }
 
@@ -185,7 +185,7 @@ impl Content for Candidate {
             return Some(format!("its block is that of {}", view.id()));
         }
         if ContentHash::of(&view.structure()) != view.id().content {
-            return Some("its structure does not have its hash".to_owned());
+            return Some("its structure does not match its hash".to_owned());
         }
         let n = view.numbers.len();
         let numbers =
@@ -219,13 +219,13 @@ impl Content for Label {
         if moments as u64 != self.atoms {
             return Some(format!("{moments} magnetic moments for {} atoms", self.atoms));
         }
-        (!finite || !label.energy.is_finite()).then(|| "it has numbers that are not finite".to_owned())
+        (!finite || !label.energy.is_finite()).then(|| "it has non-finite numbers".to_owned())
     }
 }
 
 impl Content for Text {
     fn fault(&self) -> Option<String> {
         let parsed: serde_json::Result<serde_json::Value> = serde_json::from_str(&self.text);
-        parsed.err().map(|error| format!("its text is no JSON ({error})"))
+        parsed.err().map(|error| format!("its text is not valid JSON ({error})"))
     }
 }

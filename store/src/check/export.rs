@@ -1,4 +1,4 @@
-//! What an export relies on: that nothing is missing in what it reads. It would not be seen in what it finds.
+//! Checks that an export relies on: no row is missing. The export itself would not notice.
 
 use std::collections::{BTreeSet, HashSet};
 
@@ -6,32 +6,32 @@ use super::{Finding, own_check_of, rules};
 use crate::Store;
 use crate::database::{Transaction, query};
 use crate::error::{Result, StoreError};
-use crate::export::{ExportFilter, ExportPlace};
+use crate::export::{ExportCursor, ExportFilter};
 use crate::tables::protocols;
 
 /// Rows read at a time.
 const PAGE: u32 = 4096;
 
-/// Every label of a protocol, in the order of the table and through no index.
+/// Every label of a protocol, in table order and without an index.
 const LABELLED: &str = "SELECT number, structure FROM label NOT INDEXED
     WHERE number > $1 AND protocol = $2 AND standing = 'label' ORDER BY number LIMIT $3";
 
 const DROPPED: &str = "SELECT structure FROM job NOT INDEXED WHERE protocol = $1 AND state = 'dropped'";
 
-/// Through the index of structures: an export goes through the table.
+/// Uses the index of structures, while an export uses the table.
 pub(crate) const CANDIDATES: &str = "SELECT structure, decision, origin FROM candidate
     WHERE (structure, decision) > ($1, $2) AND structure IS NOT NULL ORDER BY structure, decision LIMIT $3";
 
 const IMPORTS: &str = "SELECT number, structure FROM import ORDER BY structure";
 
 impl Store {
-    /// Checks that no row is missing in the tables that [`Self::labelled`] reads: in SQLite that tables and indexes agree, and
-    /// everywhere that there are as many rows as were counted, and that rows agree with each other.
+    /// Checks that no row is missing in the tables that [`Self::labelled`] reads: in SQLite, that tables and
+    /// indexes agree; in both databases, that rows agree with their counts and with each other.
     ///
     /// # Errors
     /// [`StoreError::Damaged`], which names the first finding.
     pub async fn check_for_export(&self) -> Result<()> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let mut findings = own_check_of(&mut transaction, &TABLES).await?;
         if findings.is_empty() {
             findings = rules::losses(&mut transaction).await?;
@@ -45,11 +45,11 @@ impl Store {
         Err(StoreError::damaged(what, others))
     }
 
-    /// Where everything stands that [`Self::labelled`] should find, found in another way: labels and candidates are read apart, and
-    /// not through the indexes that it uses.
-    pub async fn labelled_places(&self, filter: &ExportFilter) -> Result<BTreeSet<ExportPlace>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, filter.protocol).await?;
+    /// Positions of all rows that [`Self::labelled`] should find, determined in another way: labels and candidates
+    /// are read separately and without the indexes that it uses.
+    pub async fn labelled_cursors(&self, filter: &ExportFilter) -> Result<BTreeSet<ExportCursor>> {
+        let mut transaction = self.database.begin_read().await?;
+        let protocol = protocols::protocol_id(&mut transaction, filter.protocol).await?;
         let labelled = labelled(&mut transaction, protocol).await?;
         let dropped: Vec<i64> = query(DROPPED).bind(protocol).fetch_all(&mut transaction).await?;
         let dropped: HashSet<_> = dropped.into_iter().collect();
@@ -63,7 +63,7 @@ impl Store {
                 of_candidates.insert(structure);
                 let wanted = if origin == "biased" { filter.biased } else { filter.control };
                 if wanted && labelled.contains(&structure) && !dropped.contains(&structure) {
-                    places.insert(ExportPlace::Candidate(decision));
+                    places.insert(ExportCursor::Candidate(decision));
                 }
             }
         }
@@ -71,16 +71,16 @@ impl Store {
             let imports: Vec<(i64, i64)> = query(IMPORTS).fetch_all(&mut transaction).await?;
             let only = |structure: &i64| labelled.contains(structure) && !of_candidates.contains(structure);
             let imports = imports.into_iter().filter(|(_, structure)| only(structure));
-            places.extend(imports.map(|(number, _)| ExportPlace::Import(number)));
+            places.extend(imports.map(|(number, _)| ExportCursor::Import(number)));
         }
         transaction.commit().await?;
         Ok(places)
     }
 }
 
-/// What an export reads, as SQLite checks it. Candidates are many, and the indexes by which it does not go are left out: it reads
-/// the table, and a row that is only in the index of structures is missed. Rows of `candidate_data` are long, and have checksums:
-/// each is looked up, and missed if it is not there.
+/// The tables that an export reads, for SQLite's own check. Indexes of the many candidates that an export does not
+/// use are left out: it reads the table, and rows that exist only in the index of structures are detected as
+/// missing. Rows of `candidate_data` are long and have checksums: each is looked up, and detected if missing.
 const TABLES: [&str; 9] = [
     "PRAGMA quick_check(candidate)",
     "PRAGMA integrity_check(candidate_count)",
@@ -93,7 +93,7 @@ const TABLES: [&str; 9] = [
     "PRAGMA integrity_check(structure)",
 ];
 
-/// Structures with a label by this protocol.
+/// Structures with a label under this protocol.
 async fn labelled(transaction: &mut Transaction, protocol: i64) -> Result<HashSet<i64>> {
     let (mut labelled, mut after) = (HashSet::new(), 0);
     loop {

@@ -1,6 +1,6 @@
-//! Whether a database holds what it should: the database's own check, then what this program promises of it.
+//! Checks a database: first the database's own check, then the invariants of this program.
 //!
-//! Everything is seen at one instant and only read, so a campaign may run meanwhile. Rows are read some at a time.
+//! Reads a snapshot in pages and writes nothing, so a campaign may run meanwhile.
 
 mod archives;
 mod contents;
@@ -14,12 +14,12 @@ use crate::Store;
 use crate::database::{Transaction, query};
 use crate::error::{Result, StoreError};
 
-/// Something that is not as it should be.
+/// A violation found by a check.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {
-    /// What was found, with an example.
+    /// The finding, with an example.
     pub what: String,
-    /// What it means, and what to do.
+    /// Its consequence, and what to do.
     pub then: &'static str,
 }
 
@@ -32,14 +32,14 @@ impl fmt::Display for Finding {
 const RESTORE: &str = "the file is damaged; restore the campaign from a backup";
 
 impl Store {
-    /// Checks everything; `tell` hears how many rows were read, and of how many. Components of the mixture are bytes to
-    /// this crate: whoever knows them checks [`Store::load_components`].
+    /// Checks everything. `tell` receives the number of rows read and the total. This crate treats components of
+    /// the mixture as bytes: check those of [`Store::load_components`] with the crate that decodes them.
     pub async fn check(&self, mut tell: impl FnMut(u64, u64)) -> Result<Vec<Finding>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let mut findings = Vec::new();
         own_check(&mut transaction, &mut findings).await?;
         match ours(&mut transaction, &mut findings, &mut tell).await {
-            // What the database itself cannot read: that was said, or is now.
+            // An error of the database itself: it is reported already, or here.
             Err(StoreError::Damaged { what, reason }) => {
                 findings.push(Finding { what: format!("{what} cannot be read ({reason})"), then: RESTORE });
             }
@@ -66,7 +66,7 @@ async fn ours(
     Ok(())
 }
 
-/// What SQLite finds with some of its checks; a server looks after its files itself.
+/// Runs some of SQLite's own checks. A server takes care of its files itself.
 async fn own_check_of(transaction: &mut Transaction, checks: &[&'static str]) -> Result<Vec<Finding>> {
     let mut findings = Vec::new();
     if matches!(transaction, Transaction::Sqlite(_)) {
@@ -79,8 +79,8 @@ async fn own_check_of(transaction: &mut Transaction, checks: &[&'static str]) ->
     Ok(findings)
 }
 
-/// SQLite looks at every page, at its indexes and at references. A server looks after its files itself, and keeps
-/// references whole.
+/// SQLite checks every page, indexes and references. A server takes care of its files itself and enforces
+/// references.
 async fn own_check(transaction: &mut Transaction, findings: &mut Vec<Finding>) -> Result<()> {
     if !matches!(transaction, Transaction::Sqlite(_)) {
         return Ok(());
@@ -89,7 +89,7 @@ async fn own_check(transaction: &mut Transaction, findings: &mut Vec<Finding>) -
     let sql = "SELECT count(*), min(\"table\" || ' to ' || parent) FROM pragma_foreign_key_check";
     let (count, example): (u64, Option<String>) = query(sql).fetch_one(&mut *transaction).await?;
     if count > 0 {
-        let what = format!("{count} rows refer to rows that are not there ({})", example.unwrap_or_default());
+        let what = format!("{count} rows refer to missing rows ({})", example.unwrap_or_default());
         findings.push(Finding { what, then: RESTORE });
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! What holds between rows.
+//! Invariants between rows.
 
 use super::Finding;
 use crate::database::{Transaction, query};
@@ -9,7 +9,7 @@ use crate::tables::job_counts;
 use crate::tables::processes::{LEASED, all};
 use crate::tables::relabel;
 
-/// A query that counts what must not be, with an example.
+/// A query that counts violations, with an example.
 pub(super) struct Rule {
     pub finds: &'static str,
     pub what: &'static str,
@@ -26,9 +26,9 @@ impl Rule {
 
 const LOST: &str = "something was lost or changed by hand; restore the campaign from a backup";
 const QUEUE: &str =
-    "the label queue was changed by hand; calmwalk queue shows the jobs, and a backup has them whole";
+    "the label queue was changed by hand; calmwalk queue shows the jobs; a backup has the original ones";
 
-/// What lets structures or labels be missing in an export, which does not see them itself.
+/// Violations that make structures or labels missing in an export without being noticed there.
 const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence > 1
@@ -44,7 +44,7 @@ const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), min(candidate) FROM decision WHERE candidate IS NOT NULL
                 AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.decision = decision.sequence)",
-        what: "decisions about candidates that are not there",
+        what: "decisions on missing candidates",
         then: LOST,
     },
     Rule {
@@ -56,7 +56,7 @@ const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM label WHERE file IS NOT NULL
                 AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = label.structure)",
-        what: "labels that came with structures which are not there",
+        what: "labels imported with structures that are missing",
         then: LOST,
     },
     Rule {
@@ -71,7 +71,7 @@ const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
                 SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.standing IN ('label', 'excluded'))",
-        what: "labels that were superseded by none, of the structure",
+        what: "superseded labels of structures without another label, of the structure",
         then: LOST,
     },
 ];
@@ -82,7 +82,7 @@ const RULES: [Rule; 10] = [
         finds: "SELECT count(*), min(id) FROM candidate JOIN decision ON sequence = decision
                 WHERE candidate.id IS DISTINCT FROM decision.candidate OR kind <>
                 CASE origin WHEN 'control' THEN 'control' ELSE fate END",
-        what: "candidates whose decision says something else",
+        what: "candidates that contradict their decision",
         then: LOST,
     },
     Rule {
@@ -100,7 +100,7 @@ const RULES: [Rule; 10] = [
     Rule {
         finds: "SELECT count(*), min(id) FROM candidate JOIN structure ON structure.number = candidate.structure
                 WHERE content <> hash",
-        what: "candidates that lead to another structure than their own",
+        what: "candidates that refer to another structure than their own",
         then: LOST,
     },
     Rule {
@@ -113,32 +113,32 @@ const RULES: [Rule; 10] = [
     Rule {
         finds: "SELECT count(*), CAST(min(walk.walk) AS TEXT) FROM walk WHERE accepted <>
                 (SELECT count(*) FROM candidate WHERE candidate.walk = walk.walk AND fate = 'accepted')",
-        what: "walks that count other accepted structures than there are",
+        what: "walks with a wrong count of accepted structures",
         then: LOST,
     },
     Rule {
         finds: "SELECT count(*), min(id) FROM candidate
                 WHERE NOT EXISTS (SELECT 1 FROM walk WHERE walk.walk = candidate.walk)",
-        what: "candidates of walks that are not there",
+        what: "candidates of missing walks",
         then: LOST,
     },
     Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job WHERE state = 'superseded' AND NOT EXISTS (
                 SELECT 1 FROM job AS other WHERE other.structure = job.structure AND other.state <> 'superseded')",
-        what: "jobs that were superseded by none",
+        what: "superseded jobs of structures without another job",
         then: QUEUE,
     },
     Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job
                 WHERE attempts <> (SELECT coalesce(max(attempt), 0) FROM attempt WHERE attempt.job = job.number)
                 OR attempts <> (SELECT count(*) FROM attempt WHERE attempt.job = job.number)",
-        what: "jobs that count other attempts than there are",
+        what: "jobs with a wrong count of attempts",
         then: QUEUE,
     },
     Rule {
         finds: "SELECT count(*), CAST(min(attempt.job) AS TEXT) FROM attempt JOIN job ON job.number = attempt.job
                 WHERE outcome IS NULL AND NOT (state = 'leased' AND attempt = attempts)",
-        what: "attempts that seem to be under way although nobody has the job",
+        what: "running attempts at jobs that are not leased",
         then: QUEUE,
     },
 ];
@@ -147,7 +147,7 @@ pub(super) fn all_rules() -> impl Iterator<Item = &'static Rule> {
     LOSSES.iter().chain(&RULES)
 }
 
-/// What is missing, whatever the rest of the campaign says.
+/// Checks for missing rows.
 pub(super) async fn losses(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let mut findings = Vec::new();
     for rule in &LOSSES {
@@ -159,7 +159,7 @@ pub(super) async fn losses(transaction: &mut Transaction) -> Result<Vec<Finding>
     Ok(findings)
 }
 
-/// Jobs that do not agree with their labels.
+/// Jobs that contradict their labels.
 macro_rules! disagreeing {
     ($but:literal) => {
         concat!(
@@ -171,27 +171,27 @@ macro_rules! disagreeing {
     };
 }
 
-/// Jobs that are labelled have a label; others have one only if another was asked for.
+/// Labelled jobs have a label; other jobs have one only if a new label was requested.
 pub(super) async fn labelled_jobs(transaction: &mut Transaction) -> Result<Vec<Finding>> {
-    let sql = match relabel::is_known(transaction).await? {
+    let sql = match relabel::has_relabel_columns(transaction).await? {
         true => disagreeing!(" AND NOT (state IN ('queued', 'leased') AND relabel IS NOT NULL)"),
         false => disagreeing!(""),
     };
     let (count, example): (u64, Option<String>) = query(sql).fetch_one(&mut *transaction).await?;
     let what = || {
         let example = example.unwrap_or_default();
-        format!("{count} jobs that are labelled without a label, or have one and are not (such as {example})")
+        format!("{count} jobs labelled without a label, or not labelled despite one (such as {example})")
     };
     Ok((count > 0).then(|| Finding { what: what(), then: QUEUE }).into_iter().collect())
 }
 
-/// What is counted of candidates, against what is there.
+/// Compares the counts of candidates with the rows.
 const COUNTS: &str = "SELECT count(*), min(coalesce(found.origin, kept.origin) || ' ' || coalesce(found.fate, kept.fate))
     FROM (SELECT origin, coalesce(reason, fate) AS fate, count(*) AS number FROM candidate GROUP BY 1, 2) AS found
     FULL JOIN candidate_count AS kept ON kept.origin = found.origin AND kept.fate = found.fate
     WHERE found.number IS DISTINCT FROM kept.number";
 
-/// Counts that are kept and are not those of the rows.
+/// Checks stored counts against the rows.
 pub(super) async fn counts(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     if !transaction.has_table("candidate_count").await? {
         return Ok(Vec::new());
@@ -203,9 +203,9 @@ pub(super) async fn counts(transaction: &mut Transaction) -> Result<Vec<Finding>
     Ok((count > 0).then(|| Finding { what: what(), then: LOST }).into_iter().collect())
 }
 
-/// The same of label jobs.
+/// The same for label jobs.
 pub(super) async fn job_counts(transaction: &mut Transaction) -> Result<Vec<Finding>> {
-    if !job_counts::are_kept(transaction).await? {
+    if !job_counts::have_counts(transaction).await? {
         return Ok(Vec::new());
     }
     let (count, example): (u64, Option<String>) =
@@ -216,11 +216,11 @@ pub(super) async fn job_counts(transaction: &mut Transaction) -> Result<Vec<Find
     Ok((count > 0).then(|| Finding { what: what(), then: QUEUE }).into_iter().collect())
 }
 
-/// Leases of processes that do not exist any more.
+/// Checks for leases of processes that no longer exist.
 pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let leased: Vec<(i64, String)> = query(LEASED).fetch_all(&mut *transaction).await?;
     let mut living = all(transaction).await?;
-    living.retain(|process: &ProcessRecord| !process.is_gone());
+    living.retain(|process: &ProcessRecord| !process.is_dead());
     let is_lost = |holder: &str| !living.iter().any(|process| process.is_holder(holder));
     let lost: Vec<_> = leased.iter().filter(|(_, holder)| is_lost(holder)).collect();
     let Some((job, holder)) = lost.first() else { return Ok(Vec::new()) };
@@ -229,7 +229,7 @@ pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>
     Ok(vec![Finding { what, then: "the next calmwalk run, or calmwalk label, takes them back" }])
 }
 
-/// The sums by which budgets are held. Tables of an earlier version have none.
+/// Checks the totals that budgets use. Tables of an earlier version have none.
 pub(super) async fn sums(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let mut findings = Vec::new();
     for (name, sum) in SUMS {

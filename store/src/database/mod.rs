@@ -1,9 +1,9 @@
-//! One way to two databases.
+//! One interface to two databases.
 //!
-//! SQLite and PostgreSQL get the same SQL, with `$1` for what is bound, and the same four types: BIGINT (also for truth:
-//! 0 and 1), DOUBLE PRECISION, TEXT and BYTEA. What differs stands here, each in its place: how a transaction begins
-//! (this file), how rows are locked ([`query`]), how many rows are written at once ([`rows`]), what values are
-//! ([`value`]). Making and opening a database is in `sqlite` and `postgres`.
+//! SQLite and PostgreSQL execute the same SQL, with `$1` for bound values and four types: BIGINT (also for
+//! booleans: 0 and 1), DOUBLE PRECISION, TEXT and BYTEA. Each difference is handled in one place: beginning a
+//! transaction (this file), locking rows ([`query`]), writing many rows at once ([`rows`]), values ([`value`]). The
+//! modules `sqlite` and `postgres` create and open databases.
 
 pub mod query;
 pub mod row;
@@ -15,7 +15,7 @@ use sqlx::{Postgres, Sqlite};
 pub use query::{Query, query};
 pub(crate) use row::from_columns;
 pub use row::{FromRow, Row};
-pub use rows::for_rows;
+pub use rows::execute_rows;
 pub use value::Value;
 
 use crate::error::{Result, StoreError};
@@ -29,24 +29,24 @@ pub enum Database {
     Postgres(Server),
 }
 
-/// Statements that are made as a whole, or not at all: dropped without [`Transaction::commit`], they are not.
+/// A transaction. Dropped without [`Transaction::commit`], it is rolled back.
 pub enum Transaction {
     Sqlite(sqlx::Transaction<'static, Sqlite>),
-    /// With how this server tells the time.
+    /// With the clock that leases on this server use.
     Postgres(sqlx::Transaction<'static, Postgres>, Clock),
 }
 
-/// Whose clock leases go by.
+/// The clock that leases use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Clock {
-    /// The server's: hosts need not agree about the time.
+    /// The server's clock: hosts need not agree on the time.
     Server,
-    /// The caller's, as in SQLite, which serves one host.
+    /// The caller's clock, as in SQLite, which serves one host.
     Caller,
 }
 
 impl Database {
-    /// A transaction that may write.
+    /// Begins a transaction that may write.
     pub async fn begin(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.begin().await?)),
@@ -54,36 +54,36 @@ impl Database {
         }
     }
 
-    /// A transaction of whoever leads the campaign; no other one of these is under way.
+    /// Begins a transaction of the process that leads the campaign. Only one of these runs at a time.
     ///
     /// # Errors
-    /// [`StoreError::LockLost`] if another process leads it by now.
-    pub async fn begin_to_lead(&self) -> Result<Transaction> {
+    /// [`StoreError::LockLost`] if another process leads the campaign now.
+    pub async fn begin_as_leader(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.begin().await?)),
-            Self::Postgres(server) => server.begin_to_lead().await,
+            Self::Postgres(server) => server.begin_as_leader().await,
         }
     }
 
-    /// The same for a commit with this mark; the second is whether it was made already, which is looked up if an earlier
-    /// try may have come through.
-    pub async fn begin_to_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
+    /// Begins the transaction of a commit with this mark. The second value says whether an earlier try has already
+    /// made the commit; that is looked up only if `again` is set.
+    pub async fn begin_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
         match self {
             Self::Sqlite(file) => Ok((Transaction::Sqlite(file.begin().await?), false)),
-            Self::Postgres(server) => server.begin_to_commit(mark, again).await,
+            Self::Postgres(server) => server.begin_commit(mark, again).await,
         }
     }
 
-    /// A transaction that sees everything at one instant.
-    pub async fn begin_to_read(&self) -> Result<Transaction> {
+    /// Begins a transaction that reads a snapshot.
+    pub async fn begin_read(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.readers.begin().await?)),
-            Self::Postgres(server) => server.begin_to_read().await,
+            Self::Postgres(server) => server.begin_read().await,
         }
     }
 
-    /// Whether leases go by the clock of a server.
-    pub fn has_a_clock(&self) -> bool {
+    /// Whether leases use the clock of a server.
+    pub fn has_clock(&self) -> bool {
         matches!(self, Self::Postgres(server) if server.clock == Clock::Server)
     }
 
@@ -103,7 +103,7 @@ impl Transaction {
         }
     }
 
-    /// The time by which leases begin and end, ms since 1970; `now` is the caller's.
+    /// The time that leases use, ms since 1970; `now` is the caller's time.
     pub async fn time(&mut self, now: i64) -> Result<i64> {
         match self {
             Self::Postgres(_, Clock::Server) => query("SELECT server_clock()").fetch_one(self).await,
@@ -111,12 +111,12 @@ impl Transaction {
         }
     }
 
-    /// Whether leases go by the clock of a server.
-    pub fn has_a_clock(&self) -> bool {
+    /// Whether leases use the clock of a server.
+    pub fn has_clock(&self) -> bool {
         matches!(self, Self::Postgres(_, Clock::Server))
     }
 
-    /// Whether there is a table of this name: those of an earlier version lack some.
+    /// Whether the table exists: earlier versions lack some.
     pub async fn has_table(&mut self, name: &str) -> Result<bool> {
         let sql = match self {
             Self::Sqlite(_) => "SELECT count(*) FROM sqlite_schema WHERE type = 'table' AND name = $1",
@@ -128,7 +128,7 @@ impl Transaction {
         Ok(found > 0)
     }
 
-    /// The same of a column.
+    /// The same for a column.
     pub async fn has_column(&mut self, table: &str, name: &str) -> Result<bool> {
         let sql = match self {
             Self::Sqlite(_) => "SELECT count(*) FROM pragma_table_info($1) WHERE name = $2",
@@ -142,7 +142,7 @@ impl Transaction {
     }
 }
 
-/// Where a query may be sent.
+/// The target of a query.
 pub enum Target<'a> {
     Database(&'a Database),
     Transaction(&'a mut Transaction),
@@ -160,7 +160,7 @@ impl<'a> From<&'a mut Transaction> for Target<'a> {
     }
 }
 
-/// The error for a row that has to be there.
+/// The error for a missing row that must exist.
 fn missing_row() -> StoreError {
     StoreError::Database(sqlx::Error::RowNotFound)
 }

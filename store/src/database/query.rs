@@ -9,9 +9,9 @@ use super::row::{FromRow, Row};
 use super::value::Value;
 use super::{Database, Target, Transaction, missing_row};
 use crate::error::{Result, StoreError};
-use crate::postgres::{PAUSE, Server};
+use crate::postgres::{RETRY_INTERVAL, Server};
 
-/// SQL with its values.
+/// SQL with its bound values.
 #[derive(Clone)]
 pub struct Query {
     sql: &'static str,
@@ -19,7 +19,7 @@ pub struct Query {
     values: Vec<Value>,
 }
 
-/// One statement; `$1` is what is bound first.
+/// A statement; `$1` is the first bound value.
 pub fn query(sql: &'static str) -> Query {
     Query { sql, lock: "", values: Vec::new() }
 }
@@ -31,24 +31,24 @@ impl Query {
         self
     }
 
-    /// Binds several, one after the other.
+    /// Binds several values in order.
     pub fn bind_all(mut self, values: Vec<Value>) -> Self {
         self.values.extend(values);
         self
     }
 
-    /// Nobody else changes the rows that this finds until the end of the transaction. SQLite has one transaction that
-    /// writes at a time.
+    /// Locks the rows that the query finds until the end of the transaction. SQLite has a single writer and needs
+    /// no row locks.
     pub fn locked(self) -> Self {
         Self { lock: " FOR NO KEY UPDATE", ..self }
     }
 
-    /// The same, and leaves out rows that somebody else has locked.
-    pub fn unless_locked(self) -> Self {
+    /// Locks like [`Self::locked`], but skips rows that others have locked.
+    pub fn skip_locked(self) -> Self {
         Self { lock: " FOR NO KEY UPDATE SKIP LOCKED", ..self }
     }
 
-    /// Returns the number of rows that were written.
+    /// Executes the statement and returns the number of rows written.
     pub async fn execute(self, target: impl Into<Target<'_>>) -> Result<u64> {
         match target.into() {
             Target::Database(Database::Sqlite(file)) => self.execute_sqlite(&file.readers).await,
@@ -82,7 +82,7 @@ impl Query {
         }
     }
 
-    /// The first row, if there is one: queries that are asked for one find no more.
+    /// The first row, if there is one: such queries find at most one row.
     pub async fn fetch_optional<T: FromRow>(self, target: impl Into<Target<'_>>) -> Result<Option<T>> {
         Ok(self.fetch_all(target).await?.into_iter().next())
     }
@@ -91,17 +91,17 @@ impl Query {
         self.fetch_optional(target).await?.ok_or_else(missing_row)
     }
 
-    /// What a connection that breaks does not bring is read again through another.
+    /// Reads again over another connection if one breaks.
     async fn read_from(self, server: &Server) -> Result<Vec<Row>> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             let read = match server.connection().await {
                 Ok(mut connection) => self.clone().fetch_postgres(&mut *connection).await,
                 Err(error) => Err(error),
             };
             match read {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < server.patience => {
-                    tokio::time::sleep(PAUSE).await
+                Err(StoreError::Unreachable(_)) if started.elapsed() < server.reconnect_timeout => {
+                    tokio::time::sleep(RETRY_INTERVAL).await
                 }
                 read => return read,
             }
@@ -133,10 +133,11 @@ impl Query {
     }
 }
 
-/// What tells SQLite how to find rows, and what stands in its place for PostgreSQL, which needs no telling.
+/// Query plan hints for SQLite, and their replacements for PostgreSQL, which needs none.
 const HINTS: [(&str, &str); 2] = [("CROSS JOIN", "JOIN"), (" NOT INDEXED", "")];
 
-/// `CROSS JOIN … ON` tells SQLite in which order to join, `NOT INDEXED` to go through the table. PostgreSQL knows neither.
+/// In SQLite, `CROSS JOIN … ON` fixes the join order and `NOT INDEXED` forces a table scan. PostgreSQL knows
+/// neither.
 pub(super) fn for_postgres(sql: &'static str, lock: &'static str) -> String {
     let mut sql = Cow::from(sql);
     for (hint, instead) in HINTS {

@@ -1,4 +1,4 @@
-//! What comes out of a query.
+//! Results of queries.
 
 use sqlx::postgres::PgRow;
 use sqlx::sqlite::SqliteRow;
@@ -12,16 +12,16 @@ pub enum Row {
     Postgres(PgRow),
 }
 
-/// The name of a column, or its place from 0 on.
+/// The name of a column, or its index from 0.
 pub trait Index: ColumnIndex<SqliteRow> + ColumnIndex<PgRow> + std::fmt::Display + Copy {}
 impl<I: ColumnIndex<SqliteRow> + ColumnIndex<PgRow> + std::fmt::Display + Copy> Index for I {}
 
-/// What a column can be read as.
+/// A type that a column can be read as.
 pub trait FromColumn: Sized {
     fn from_column(row: &Row, index: impl Index) -> Result<Self>;
 }
 
-/// What a row can be read as: a struct, a tuple, or the only column.
+/// A type that a row can be read as: a struct, a tuple, or a single column.
 pub trait FromRow: Sized {
     fn from_row(row: &Row) -> Result<Self>;
 }
@@ -32,7 +32,7 @@ impl Row {
         T::from_column(self, index)
     }
 
-    /// The value of a column that earlier versions of the tables do not have.
+    /// The value of a column that tables of earlier versions lack.
     pub fn get_or_default<T: FromColumn + Default>(&self, name: &str) -> Result<T> {
         let is_there = match self {
             Self::Sqlite(row) => row.try_column(name).is_ok(),
@@ -104,7 +104,7 @@ tuples! {
     (A 0, B 1, C 2, D 3)
 }
 
-/// Reads a struct from the columns that bear the names of its fields.
+/// Reads a struct from the columns with the names of its fields.
 macro_rules! from_columns {
     ($type:ty { $($field:ident),* $(,)? }) => {
         impl $crate::database::FromRow for $type {

@@ -1,7 +1,7 @@
-//! Many rows in one statement.
+//! Writes many rows with one statement.
 //!
-//! To PostgreSQL every statement is a journey, so all rows go along with the first, as one array a column. SQLite is in
-//! this process: there, one row after the other is the fastest.
+//! For PostgreSQL every statement is a round trip, so all rows travel together as one array per column. SQLite runs
+//! in this process, where one row after the other is fastest.
 
 use std::sync::Arc;
 
@@ -10,16 +10,16 @@ use sqlx::query::Query;
 use sqlx::{AssertSqlSafe, Postgres};
 
 use super::Transaction;
-use super::value::{Value, without_zeros};
+use super::value::{Value, replace_nul};
 use crate::error::{Result, StoreError};
 
-/// Bytes that go along at once, about: arrays of PostgreSQL hold 1 GB, and its server copies them.
-const LOAD: usize = 1 << 25;
+/// Approximate number of bytes sent at once: PostgreSQL arrays hold up to 1 GB, and the server copies them.
+const BATCH_BYTES: usize = 1 << 25;
 
-/// Executes `sql` for every row: `{rows}` in it is a table named `new` of the rows, `{columns}` the names of its columns,
-/// separated by commas, `{excluded}` what takes over the new values of all columns but the first. Values of a column are
-/// all of one type. Returns the number of rows that were written.
-pub async fn for_rows(
+/// Executes `sql` for every row. In it, `{rows}` stands for a table `new` of the rows, `{columns}` for its column
+/// names, separated by commas, and `{excluded}` for the assignments that overwrite all columns except the first.
+/// The values of a column have one type. Returns the number of rows written.
+pub async fn execute_rows(
     transaction: &mut Transaction,
     sql: &'static str,
     columns: &'static [&'static str],
@@ -42,7 +42,7 @@ pub async fn for_rows(
             let sql = sql.replace("{rows}", &arrays(columns, first)).replace("CROSS JOIN", "JOIN");
             let mut rows = rows.into_iter().peekable();
             while rows.peek().is_some() {
-                let load = load(&mut rows);
+                let load = next_batch(&mut rows);
                 let mut query = sqlx::query(AssertSqlSafe(sql.clone()));
                 for column in transpose(columns.len(), load) {
                     query = bind_column(query, column)?;
@@ -75,10 +75,10 @@ fn arrays(columns: &[&str], first: &[Value]) -> String {
     format!("unnest({}) AS new ({})", arrays.join(", "), columns.join(", "))
 }
 
-/// The next rows, as many as go along at once.
-fn load(rows: &mut impl Iterator<Item = Vec<Value>>) -> Vec<Vec<Value>> {
+/// The next rows to send at once.
+fn next_batch(rows: &mut impl Iterator<Item = Vec<Value>>) -> Vec<Vec<Value>> {
     let (mut load, mut bytes) = (Vec::new(), 0);
-    while bytes < LOAD
+    while bytes < BATCH_BYTES
         && let Some(row) = rows.next()
     {
         bytes += row.iter().map(Value::len).sum::<usize>();
@@ -97,7 +97,7 @@ fn transpose(columns: usize, rows: Vec<Vec<Value>>) -> Vec<Vec<Value>> {
 
 type PostgresQuery<'q> = Query<'q, Postgres, PgArguments>;
 
-/// Binds a column as an array; its values are all of the type of the first.
+/// Binds a column as an array; its values have the type of the first.
 fn bind_column(query: PostgresQuery<'_>, column: Vec<Value>) -> Result<PostgresQuery<'_>> {
     macro_rules! array {
         ($variant:ident) => {{
@@ -113,7 +113,7 @@ fn bind_column(query: PostgresQuery<'_>, column: Vec<Value>) -> Result<PostgresQ
         Some(Value::Real(_)) => query.bind(array!(Real)),
         Some(Value::Text(_)) => {
             let texts = array!(Text);
-            query.bind(texts.into_iter().map(|text| text.map(without_zeros)).collect::<Vec<_>>())
+            query.bind(texts.into_iter().map(|text| text.map(replace_nul)).collect::<Vec<_>>())
         }
         Some(Value::Bytes(_)) => query.bind(array!(Bytes)),
         None => query,

@@ -1,4 +1,4 @@
-//! What is bound to a query.
+//! Values bound to a query.
 
 use std::borrow::Cow;
 
@@ -10,11 +10,11 @@ use sqlx::{Postgres, Sqlite};
 use super::row::Row;
 use crate::error::Result;
 
-/// A value of one of the types that both databases have. `None` is NULL.
+/// A value of a type that both databases have. `None` is NULL.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
     Integer(Option<i64>),
-    /// Not a number is NULL, as SQLite has it.
+    /// NaN is stored as NULL, as in SQLite.
     Real(Option<f64>),
     Text(Option<String>),
     Bytes(Option<Vec<u8>>),
@@ -65,12 +65,12 @@ impl Value {
         match self {
             Self::Integer(value) => query.bind(value),
             Self::Real(value) => query.bind(value),
-            Self::Text(value) => query.bind(value.map(without_zeros)),
+            Self::Text(value) => query.bind(value.map(replace_nul)),
             Self::Bytes(value) => query.bind(value),
         }
     }
 
-    /// Bytes that it holds, about.
+    /// Its approximate size in bytes.
     pub(super) fn len(&self) -> usize {
         match self {
             Self::Integer(_) | Self::Real(_) => 8,
@@ -80,8 +80,8 @@ impl Value {
     }
 }
 
-/// PostgreSQL takes no zero bytes in text; last words of processes may hold some.
-pub fn without_zeros(text: String) -> String {
+/// Replaces NUL characters: PostgreSQL rejects them in text, and the output of programs may contain some.
+pub fn replace_nul(text: String) -> String {
     if text.contains('\0') { text.replace('\0', "\u{fffd}") } else { text }
 }
 

@@ -1,18 +1,18 @@
-//! What goes to a server must not be read or changed on its way: TLS, or not a step outside this host. Words as in libpq, but
-//! no way by which a connection is protected only if it happens to be.
+//! Protects connections to a server: TLS, unless the traffic stays on this host. The terms are those of libpq,
+//! without the modes that protect a connection only if the server offers it.
 
 use std::fs::File;
 use std::net::IpAddr;
 
 use sqlx::postgres::{PgConnectOptions, PgSslMode};
 
-/// The parameter of a URL, and its variable in the environment, that say how a connection is protected.
+/// The URL parameter and the environment variable that select the protection.
 const MODE: &str = "sslmode";
 const ROOT: (&str, &str) = ("sslrootcert", "PGSSLROOTCERT");
-const MODES: &str = "disable, require and verify-full";
+const MODES: &str = "disable, require or verify-full";
 
-/// Refuses what does not mean here what it means to libpq, and files that cannot be read: whoever connects would take that
-/// for a server that is away.
+/// Refuses parameters that have another meaning here than in libpq, and unreadable files: later, these would look
+/// like an unreachable server.
 pub fn check_parameters(url: &str) -> Result<(), String> {
     let parameters = url.split_once('?').unwrap_or_default().1;
     let (mut mode, mut has_root) = (std::env::var("PGSSLMODE").ok(), std::env::var_os(ROOT.1).is_some());
@@ -25,7 +25,7 @@ pub fn check_parameters(url: &str) -> Result<(), String> {
             }
             "ssl-mode" | "ssl-root-cert" | "ssl-ca" | "ssl-cert" | "ssl-key" => {
                 return Err(format!(
-                    "'{key}' is written as libpq does: {MODE}, sslrootcert, sslcert, sslkey"
+                    "unknown parameter '{key}': use the names of libpq, {MODE}, sslrootcert, sslcert and sslkey"
                 ));
             }
             _ => {}
@@ -33,23 +33,23 @@ pub fn check_parameters(url: &str) -> Result<(), String> {
     }
     match mode.as_deref() {
         Some("require") if has_root => Err(format!(
-            "{MODE}=require does not look at the server's certificate, so sslrootcert would be without use: say \
+            "{MODE}=require does not verify the server's certificate, so sslrootcert would have no effect: use \
              {MODE}=verify-full"
         )),
         Some("verify-ca") => Err(format!(
-            "{MODE}=verify-ca would believe any server with a certificate of a public authority: say {MODE}=verify-full"
+            "{MODE}=verify-ca would trust any server with a certificate of a public authority: use {MODE}=verify-full"
         )),
         None | Some("disable" | "allow" | "prefer" | "require" | "verify-full") => Ok(()),
-        Some(mode) => Err(format!("{MODE}={mode} is not known: there are {MODES}")),
+        Some(mode) => Err(format!("unknown {MODE}={mode}, expected {MODES}")),
     }
 }
 
-/// The options, and whether a connection leaves this host without protection because its user says so; an error if it would by
-/// default.
-pub fn settle(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), String> {
+/// Returns the options, and whether a connection leaves this host unprotected because the user asks for it. Without
+/// such a request an unprotected connection is an error.
+pub fn resolve(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), String> {
     let by_default = matches!(options.get_ssl_mode(), PgSslMode::Allow | PgSslMode::Prefer);
     match (is_local(&options), by_default) {
-        // Within a host it would cost time and protect nothing.
+        // Within a host, TLS costs time and protects nothing.
         (true, true) => Ok((options.ssl_mode(PgSslMode::Disable), false)),
         (true, false) => Ok((options, false)),
         (false, false) => {
@@ -57,15 +57,15 @@ pub fn settle(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), Str
             Ok((options, unprotected))
         }
         (false, true) => Err(format!(
-            "the server '{}' is another host, and what goes there must be protected: add {MODE}=verify-full, and \
+            "the server '{}' is another host, so the connection must be protected: add {MODE}=verify-full, and \
              sslrootcert=FILE with the authority that signed the server's certificate unless that is a public one \
-             ({MODE}=require encrypts without knowing to whom; {MODE}=disable is for a network that nobody else is on)",
+             ({MODE}=require encrypts without verifying the server; {MODE}=disable is for a private network)",
             options.get_host()
         )),
     }
 }
 
-/// A Unix socket, or this host by an address that no other one has.
+/// A Unix socket, or a loopback address of this host.
 fn is_local(options: &PgConnectOptions) -> bool {
     let host = options.get_host().trim_matches(['[', ']']);
     options.get_socket().is_some()
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn off_this_host_nothing_goes_unprotected_by_default() {
+    fn connections_to_other_hosts_must_be_protected() {
         for local in ["localhost", "127.0.0.1", "127.8.0.1:5433", "[::1]:5433", "%2Frun%2Fpostgresql"] {
             assert_eq!(unprotected(&format!("postgres://anna@{local}/lab")), Ok(false), "{local}");
         }
@@ -103,12 +103,12 @@ mod tests {
                 assert!(message.contains("sslmode=verify-full"), "{message}");
             }
         }
-        // The last word counts.
+        // The last value counts.
         assert!(unprotected("postgres://anna@localhost/lab?host=head").is_err());
     }
 
     #[test]
-    fn what_means_something_else_than_it_says_is_refused() {
+    fn misleading_parameters_are_refused() {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path().join("an authority.pem");
         std::fs::write(&root, "certificate").unwrap();

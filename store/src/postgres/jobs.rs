@@ -1,4 +1,4 @@
-//! Being told of new label jobs.
+//! Notifications of new label jobs.
 
 use std::sync::Mutex;
 use std::time::Duration;
@@ -7,16 +7,16 @@ use sqlx::postgres::{PgConnectOptions, PgListener, PgPoolOptions};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-/// Between two tries to reach a server that is away.
-const PAUSE: Duration = Duration::from_secs(1);
+/// Time between two tries to reach the server.
+const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
-/// The channel on which jobs are announced, see `migrations/postgres`.
+/// The channel of the notifications, see `migrations/postgres`.
 pub struct Jobs {
     options: PgConnectOptions,
     channel: String,
-    /// Number of announcements.
+    /// Number of notifications received.
     heard: watch::Sender<u64>,
-    /// Announcements that some wait knows of.
+    /// Number of notifications that an earlier wait has seen.
     seen: Mutex<u64>,
     /// Listens from the first wait on.
     listener: Mutex<Option<JoinHandle<()>>>,
@@ -28,7 +28,7 @@ impl Jobs {
         Self { options, channel, heard, seen: Mutex::default(), listener: Mutex::default() }
     }
 
-    /// Waits for an announcement that came after the last wait ended, or for `longest`.
+    /// Waits for a notification that arrived after the last wait ended, but no longer than `longest`.
     pub async fn wait(&self, longest: Duration) {
         self.listen();
         let mut heard = self.heard.subscribe();
@@ -60,12 +60,13 @@ impl Drop for Jobs {
     }
 }
 
-/// Never ends: a connection that breaks is made again. What came before it listens is unknown, so whoever waits looks then.
+/// Never ends: reconnects after a break. Notifications before it listens are lost, so waiting callers are woken
+/// then.
 async fn listen(options: PgConnectOptions, channel: String, heard: watch::Sender<u64>) {
     loop {
-        // Errors need no answer: without a listener a wait takes its longest time.
+        // Errors need no handling: without a listener, a wait lasts as long as it may.
         let _ = hear(options.clone(), &channel, &heard).await;
-        tokio::time::sleep(PAUSE).await;
+        tokio::time::sleep(RETRY_INTERVAL).await;
     }
 }
 
@@ -84,7 +85,7 @@ async fn hear(
     Ok(())
 }
 
-/// Whoever panicked with it in hand left a whole number or task.
+/// A panic while the lock was held left a valid number or task.
 fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }

@@ -1,8 +1,9 @@
-//! One process leads a campaign: an advisory lock of the server, which belongs to a connection.
+//! Leader election: an advisory lock of the server, which belongs to a connection.
 //!
-//! A connection may break while the process lives, and somebody else may have the lock then. So each who takes it adds one to
-//! the generation in the table `leader`, under which it writes ([`Server::begin_to_lead`]): nobody of an earlier generation
-//! writes any more. Who loses the connection takes the lock again if nobody had it meanwhile.
+//! A connection may break while its process lives, and another process may then take the lock. Each new holder
+//! therefore increments the generation in the table `leader`, a fencing token under which it writes
+//! ([`Server::begin_as_leader`]): holders of an earlier generation can no longer write. A process that loses the
+//! connection takes the lock again if nobody had it meanwhile.
 
 use std::time::{Duration, Instant};
 
@@ -13,30 +14,30 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use super::{Server, make_tables, options};
-use crate::birth::process_birth;
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
+use crate::process_start::process_start_time;
 use crate::processes::this_host;
 
-/// Between two looks at the connection, and between two tries to have it again.
-const LOOK: Duration = Duration::from_secs(1);
-/// Longest time for an answer.
-const ANSWER: Duration = Duration::from_secs(10);
-/// How long it may take until a server notices that the last holder has left.
-const LEAVING: Duration = Duration::from_secs(1);
-const LEAVING_PAUSE: Duration = Duration::from_millis(50);
+/// Time between two checks of the connection, and between two tries to take the lock again.
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
+/// Longest time to wait for a reply.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long a server may take to notice that the last holder has left.
+const RELEASE_TIMEOUT: Duration = Duration::from_secs(1);
+const RELEASE_POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Returns whether the lock is this connection's now.
-const TAKE: &str = "SELECT pg_try_advisory_lock(hashtextextended('calmwalk ' || $1, 0))";
+/// Returns whether this connection now has the lock.
+const TRY_LOCK: &str = "SELECT pg_try_advisory_lock(hashtextextended('calmwalk ' || $1, 0))";
 
 /// The right to lead the campaign in one schema.
 #[derive(Debug)]
 pub struct Leadership {
     pub generation: i64,
     location: String,
-    /// Who leads it instead.
+    /// The new leader, if there is one.
     successor: watch::Receiver<Option<String>>,
-    keeper: JoinHandle<()>,
+    holder_task: JoinHandle<()>,
 }
 
 impl Leadership {
@@ -44,25 +45,25 @@ impl Leadership {
         let server = Server::connect(url, true);
         make_tables(url, &server).await?;
         server.close().await;
-        let (options, begun) = (options(url), Instant::now());
+        let (options, started) = (options(url), Instant::now());
         let mut connection = options.connect().await?;
-        while !take(&mut connection, &url.schema).await? {
-            if begun.elapsed() > LEAVING {
+        while !try_lock(&mut connection, &url.schema).await? {
+            if started.elapsed() > RELEASE_TIMEOUT {
                 let holder: String =
                     sqlx::query_scalar("SELECT holder FROM leader").fetch_one(&mut connection).await?;
                 return Err(StoreError::Locked { location: url.to_string(), holder });
             }
-            tokio::time::sleep(LEAVING_PAUSE).await;
+            tokio::time::sleep(RELEASE_POLL_INTERVAL).await;
         }
         let pid = std::process::id();
         let sql =
             "UPDATE leader SET generation = generation + 1, holder = $1, birth = $2 RETURNING generation";
         let query = sqlx::query_scalar(sql).bind(format!("process {pid} ({who}) on {}", this_host()));
-        let query = query.bind(process_birth(pid).unwrap_or_default());
+        let query = query.bind(process_start_time(pid).unwrap_or_default());
         let generation = query.fetch_one(&mut connection).await?;
         let (tell, successor) = watch::channel(None);
-        let keeper = keep(connection, options, url.schema.clone(), generation, tell);
-        Ok(Self { generation, location: url.to_string(), successor, keeper: tokio::spawn(keeper) })
+        let holder = hold(connection, options, url.schema.clone(), generation, tell);
+        Ok(Self { generation, location: url.to_string(), successor, holder_task: tokio::spawn(holder) })
     }
 
     /// Waits until another process leads the campaign.
@@ -70,7 +71,7 @@ impl Leadership {
         let mut successor = self.successor.clone();
         let holder = match successor.wait_for(Option::is_some).await {
             Ok(holder) => holder.clone().unwrap_or_default(),
-            // The keeper ends with the lock or with the runtime.
+            // The task ends with the lock or with the runtime.
             Err(_) => std::future::pending().await,
         };
         StoreError::LockLost { location: self.location.clone(), holder }
@@ -79,16 +80,16 @@ impl Leadership {
 
 impl Drop for Leadership {
     fn drop(&mut self) {
-        self.keeper.abort();
+        self.holder_task.abort();
     }
 }
 
-async fn take(connection: &mut PgConnection, schema: &str) -> Result<bool> {
-    Ok(sqlx::query_scalar(TAKE).bind(schema).fetch_one(connection).await?)
+async fn try_lock(connection: &mut PgConnection, schema: &str) -> Result<bool> {
+    Ok(sqlx::query_scalar(TRY_LOCK).bind(schema).fetch_one(connection).await?)
 }
 
-/// Holds the lock until another process has it.
-async fn keep(
+/// Holds the lock until another process takes it.
+async fn hold(
     mut connection: PgConnection,
     options: PgConnectOptions,
     schema: String,
@@ -96,38 +97,38 @@ async fn keep(
     tell: watch::Sender<Option<String>>,
 ) {
     loop {
-        while matches!(timeout(ANSWER, connection.ping()).await, Ok(Ok(()))) {
-            tokio::time::sleep(LOOK).await;
+        while matches!(timeout(ANSWER_TIMEOUT, connection.ping()).await, Ok(Ok(()))) {
+            tokio::time::sleep(POLL_INTERVAL).await;
         }
         connection = loop {
-            match timeout(ANSWER, take_again(&options, &schema, generation)).await {
-                Ok(Ok(Again::Held(connection))) => break connection,
-                Ok(Ok(Again::Lost(holder))) => {
-                    // Nobody may ask any more.
+            match timeout(ANSWER_TIMEOUT, reacquire(&options, &schema, generation)).await {
+                Ok(Ok(Reacquired::Held(connection))) => break connection,
+                Ok(Ok(Reacquired::Lost(holder))) => {
+                    // The receiver may be gone.
                     let _ = tell.send(Some(holder));
                     return;
                 }
-                // Not yet: the server is away, or has not noticed yet that the old connection broke.
-                _ => tokio::time::sleep(LOOK).await,
+                // Not yet: the server cannot be reached, or has not noticed that the old connection broke.
+                _ => tokio::time::sleep(POLL_INTERVAL).await,
             }
         };
     }
 }
 
-enum Again {
+enum Reacquired {
     Held(PgConnection),
     NotYet,
     Lost(String),
 }
 
-async fn take_again(options: &PgConnectOptions, schema: &str, generation: i64) -> Result<Again> {
+async fn reacquire(options: &PgConnectOptions, schema: &str, generation: i64) -> Result<Reacquired> {
     let mut connection = options.connect().await?;
-    let held = take(&mut connection, schema).await?;
+    let held = try_lock(&mut connection, schema).await?;
     let leader = sqlx::query_as("SELECT generation, holder FROM leader").fetch_one(&mut connection).await?;
     let (newest, holder): (i64, String) = leader;
     Ok(match (newest == generation, held) {
-        (true, true) => Again::Held(connection),
-        (true, false) => Again::NotYet,
-        (false, _) => Again::Lost(holder),
+        (true, true) => Reacquired::Held(connection),
+        (true, false) => Reacquired::NotYet,
+        (false, _) => Reacquired::Lost(holder),
     })
 }

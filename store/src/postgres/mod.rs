@@ -1,4 +1,4 @@
-//! The database on a PostgreSQL server: making it and opening it.
+//! Creates and opens a database on a PostgreSQL server.
 
 mod jobs;
 pub mod leadership;
@@ -22,22 +22,22 @@ use crate::location::ServerUrl;
 use crate::migrations::{Step, migrator};
 use crate::tables::checksums;
 
-/// The newest of the migrations.
+/// The newest migration.
 const SCHEMA: i64 = 10;
 /// The first version whose rows have checksums.
-const WITH_CHECKSUMS: i64 = 9;
-/// Connections of a process, at most: one that writes and some that read.
-const CONNECTIONS: u32 = 5;
-/// Connections that nobody needs are closed after this time: a server has few.
-const IDLE: Duration = Duration::from_secs(60);
-/// How long a server may be away before what needs it fails, and how long a connection is waited for.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// How long a server is asked why there is no connection.
-const ANSWER: Duration = Duration::from_secs(3);
-/// Between two tries to reach a server that is away.
-pub const PAUSE: Duration = Duration::from_millis(100);
+const FIRST_WITH_CHECKSUMS: i64 = 9;
+/// Maximum number of connections per process: one writer and some readers.
+const MAX_CONNECTIONS: u32 = 5;
+/// Idle connections are closed after this time: a server has few.
+const IDLE_TIMEOUT: Duration = Duration::from_secs(60);
+/// How long to wait for an unreachable server, and for a connection, before an operation fails.
+const RECONNECT_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long to probe the server for the reason of a missing connection.
+const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
+/// Time between two tries to reach the server.
+pub const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
-/// The steps to the newest version.
+/// The migrations in order.
 pub(crate) static STEPS: [Step; 9] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
@@ -60,15 +60,15 @@ pub struct Server {
     shown: Arc<str>,
     writes: bool,
     pub clock: Clock,
-    /// That of the lock which its user holds, if it does.
+    /// Fencing token of the lock that the user of this store holds, if any.
     pub generation: Option<i64>,
-    /// How long a server that is away is waited for.
-    pub patience: Duration,
+    /// How long to wait for an unreachable server.
+    pub reconnect_timeout: Duration,
     jobs: Arc<Jobs>,
 }
 
 impl Server {
-    /// Makes the tables, which must not hold a campaign yet.
+    /// Creates the tables, which must not hold a campaign yet.
     pub async fn create(url: &ServerUrl, campaign: CampaignId) -> Result<Self> {
         let server = Self::connect(url, true);
         make_tables(url, &server).await?;
@@ -80,7 +80,7 @@ impl Server {
         }
     }
 
-    /// Opens the campaign, and brings its tables up to date if it is to write.
+    /// Opens the campaign, and migrates its tables if it is opened for writing.
     pub async fn open(url: &ServerUrl, writes: bool) -> Result<Self> {
         let mut server = Self::connect(url, writes);
         let missing = || StoreError::Missing {
@@ -89,9 +89,9 @@ impl Server {
         };
         let found = version(url, &mut *server.connection().await?).await?.ok_or_else(missing)?;
         if found < SCHEMA && writes {
-            server.bring_up_to_date(url).await?;
+            server.migrate(url).await?;
         }
-        if found < WITH_CHECKSUMS && !writes {
+        if found < FIRST_WITH_CHECKSUMS && !writes {
             let views = checksums::views(&url.schema).into();
             server.pool = pool(options(url), Some(views));
         }
@@ -109,22 +109,23 @@ impl Server {
             writes,
             clock: Clock::Server,
             generation: None,
-            patience: PATIENCE,
+            reconnect_timeout: RECONNECT_TIMEOUT,
             jobs,
         }
     }
 
-    /// Brings the tables to the newest version: all steps and the checksums of rows, or nothing. One process at a time does.
-    async fn bring_up_to_date(&self, url: &ServerUrl) -> Result<()> {
+    /// Migrates the tables to the newest version, checksums included, in one transaction. Only one process does so
+    /// at a time.
+    async fn migrate(&self, url: &ServerUrl) -> Result<()> {
         let mut transaction = self.begin().await?;
         let one = "SELECT 1::BIGINT FROM pg_advisory_xact_lock(hashtext($1))";
         let one = query(one).bind(format!("{}: new version", url.schema));
         one.rows(&mut transaction).await?;
         let Transaction::Postgres(connection, _) = &mut transaction else { return Ok(()) };
         let found = version(url, &mut *connection).await?;
-        // What `run` calls. With a borrowed connection it makes no future that another thread may go on with.
+        // The function that `run` calls. With a borrowed connection, `run` gives a future that is not `Send`.
         MIGRATIONS.run_direct(None, &mut **connection, false).await.map_err(schema_error)?;
-        if found < Some(WITH_CHECKSUMS) {
+        if found < Some(FIRST_WITH_CHECKSUMS) {
             checksums::fill(&mut transaction).await?;
         }
         transaction.commit().await
@@ -136,20 +137,20 @@ impl Server {
         id.fetch_optional(&Database::Postgres(self.clone())).await
     }
 
-    /// A connection to read with, or to begin with.
+    /// A connection for reading or for beginning a transaction.
     pub async fn connection(&self) -> Result<PoolConnection<Postgres>> {
-        self.told(self.pool.acquire().await).await
+        self.explain_timeout(self.pool.acquire().await).await
     }
 
-    /// What came of waiting for a connection. The pool tries on where a server refuses one or has none left, and in the end says
-    /// only that its time is over: the server itself is asked why.
-    async fn told<T>(&self, waited: sqlx::Result<T>) -> Result<T> {
+    /// Replaces a timeout of the connection pool by its reason. The pool retries if a server refuses connections or
+    /// has none left, and finally reports only the timeout; so this asks the server itself.
+    async fn explain_timeout<T>(&self, waited: sqlx::Result<T>) -> Result<T> {
         let Err(sqlx::Error::PoolTimedOut) = waited else { return Ok(waited?) };
         let timed_out = |why: &str| sqlx::Error::Io(io::Error::new(ErrorKind::TimedOut, why));
         let connect = async { self.pool.connect_options().connect().await?.close().await };
-        Err(match timeout(ANSWER, connect).await {
+        Err(match timeout(PROBE_TIMEOUT, connect).await {
             Ok(Ok(())) => StoreError::Unreachable(timed_out(
-                "it takes new connections, but all of this process waited for it: for its disk, or for what somebody has locked",
+                "it accepts connections, but all connections of this process are waiting, for its disk or for locks",
             )),
             Ok(Err(error)) => error.into(),
             Err(_) => StoreError::Unreachable(timed_out("no answer")),
@@ -163,32 +164,34 @@ impl Server {
         self.begin_with("BEGIN ISOLATION LEVEL READ COMMITTED").await
     }
 
-    pub async fn begin_to_read(&self) -> Result<Transaction> {
+    pub async fn begin_read(&self) -> Result<Transaction> {
         self.begin_with("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY").await
     }
 
-    /// Nothing has happened before a transaction begins: it may be tried again.
+    /// Before a transaction begins nothing has happened, so a failed start can be retried.
     async fn begin_with(&self, statement: &'static str) -> Result<Transaction> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
-            match self.told(self.pool.begin_with(statement).await).await {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < self.patience => sleep(PAUSE).await,
-                begun => return Ok(Transaction::Postgres(begun?, self.clock)),
+            match self.explain_timeout(self.pool.begin_with(statement).await).await {
+                Err(StoreError::Unreachable(_)) if started.elapsed() < self.reconnect_timeout => {
+                    sleep(RETRY_INTERVAL).await
+                }
+                result => return Ok(Transaction::Postgres(result?, self.clock)),
             }
         }
     }
 
-    /// A transaction that holds the leader's row, which must be that of its own lock, if it has one.
-    pub async fn begin_to_lead(&self) -> Result<Transaction> {
+    /// Begins a transaction that locks the leader's row and checks the fencing token, if there is one.
+    pub async fn begin_as_leader(&self) -> Result<Transaction> {
         let mut transaction = self.begin().await?;
         let leader = query("SELECT generation, holder FROM leader").locked();
         self.check_leader(leader.fetch_one(&mut transaction).await?)?;
         Ok(transaction)
     }
 
-    /// See [`Database::begin_to_commit`]. The row of the leader is held from the first statement on, so this waits for an
-    /// earlier try that the server is still at.
-    pub async fn begin_to_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
+    /// See [`Database::begin_commit`]. The first statement locks the leader's row, so this waits for an earlier
+    /// try that the server still executes.
+    pub async fn begin_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
         let mut transaction = self.begin().await?;
         if again {
             let last: i64 = query("SELECT mark FROM leader").locked().fetch_one(&mut transaction).await?;
@@ -210,7 +213,7 @@ impl Server {
         }
     }
 
-    /// Bytes of the tables with their indexes and long columns.
+    /// Size of the tables in bytes, with their indexes and long columns.
     pub async fn size(&self) -> Result<u64> {
         let sql =
             "SELECT CAST(coalesce(sum(pg_total_relation_size(pg_class.oid)), 0) AS BIGINT) FROM pg_class
@@ -219,7 +222,7 @@ impl Server {
         query(sql).fetch_one(&Database::Postgres(self.clone())).await
     }
 
-    /// Writes every table of the campaign anew.
+    /// Rewrites every table of the campaign.
     pub async fn compact(&self) -> Result<()> {
         let mut connection = self.connection().await?;
         let sql = "SELECT tablename::TEXT FROM pg_tables WHERE schemaname = current_schema() ORDER BY 1";
@@ -247,9 +250,12 @@ impl fmt::Debug for Server {
     }
 }
 
-/// Connections, which make these views first, if there are any.
+/// A connection pool whose connections create these views first, if there are any.
 fn pool(options: PgConnectOptions, views: Option<Arc<str>>) -> PgPool {
-    let pool = PgPoolOptions::new().max_connections(CONNECTIONS).acquire_timeout(PATIENCE).idle_timeout(IDLE);
+    let pool = PgPoolOptions::new()
+        .max_connections(MAX_CONNECTIONS)
+        .acquire_timeout(RECONNECT_TIMEOUT)
+        .idle_timeout(IDLE_TIMEOUT);
     let pool = pool.after_connect(move |connection, _| {
         let views = views.clone();
         Box::pin(async move {
@@ -262,12 +268,12 @@ fn pool(options: PgConnectOptions, views: Option<Arc<str>>) -> PgPool {
     pool.connect_lazy_with(options)
 }
 
-/// How to connect: names without a schema are those of the campaign's.
+/// Connection options. Names without a schema refer to the campaign's schema.
 fn options(url: &ServerUrl) -> PgConnectOptions {
     let name = url.options.get_application_name().unwrap_or("calmwalk").to_owned();
     PgConnectOptions::clone(&url.options)
         .application_name(&name)
-        // What a server whose host is gone holds for us comes free within half a minute.
+        // If this host is lost, the server frees its locks within half a minute.
         .options([
             ("tcp_keepalives_idle", "10"),
             ("tcp_keepalives_interval", "5"),
@@ -276,20 +282,20 @@ fn options(url: &ServerUrl) -> PgConnectOptions {
         .options([("search_path", url.schema.as_str()), ("synchronous_commit", "on")])
 }
 
-/// Makes the schema and the tables in it, where they are not there yet.
+/// Creates the schema and its tables if they do not exist.
 async fn make_tables(url: &ServerUrl, server: &Server) -> Result<()> {
     let mut connection = server.connection().await?;
     if version(url, &mut connection).await? == Some(SCHEMA) {
         return Ok(());
     }
-    // Its name is made of letters, digits and underscores.
+    // The name consists of letters, digits and underscores.
     let create = AssertSqlSafe(format!("CREATE SCHEMA IF NOT EXISTS \"{}\"", url.schema));
     let sql = "SELECT EXISTS (SELECT 1 FROM pg_namespace WHERE nspname = $1)";
     let exists: bool = sqlx::query_scalar(sql).bind(&url.schema).fetch_one(&mut *connection).await?;
     if !exists {
         match connection.execute(create).await {
             Ok(_) => {}
-            // Another process was faster.
+            // Another process created it first.
             Err(sqlx::Error::Database(error)) if error.is_unique_violation() => {}
             Err(error) => return Err(error.into()),
         }
@@ -298,14 +304,14 @@ async fn make_tables(url: &ServerUrl, server: &Server) -> Result<()> {
     MIGRATIONS.run(&server.pool).await.map_err(schema_error)
 }
 
-/// Version of the tables of a campaign in the schema; `None` without any.
+/// Version of the campaign's tables in the schema; `None` without tables.
 async fn version(url: &ServerUrl, connection: &mut PgConnection) -> Result<Option<i64>> {
     let sql =
         "SELECT tablename::TEXT FROM pg_tables WHERE schemaname = $1 ORDER BY tablename = 'leader' DESC, 1";
     let tables: Vec<String> = sqlx::query_scalar(sql).bind(&url.schema).fetch_all(&mut *connection).await?;
     match tables.first() {
         None => return Ok(None),
-        // What a process that was killed while it made the tables leaves, at most.
+        // This may be left by a process that was killed while it created the tables.
         Some(first) if first == "_sqlx_migrations" && tables.len() == 1 => return Ok(None),
         Some(first) if first != "leader" => {
             return Err(StoreError::ForeignSchema { location: url.to_string(), found: first.clone() });

@@ -1,8 +1,8 @@
-//! The database in one SQLite file: making it and opening it.
+//! Creates and opens a database in one SQLite file.
 
-mod earlier;
-mod in_place;
-mod room;
+mod disk_space;
+mod file_identity;
+mod old_schema;
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
@@ -19,40 +19,40 @@ use sqlx::sqlite::{
 };
 use sqlx::{ConnectOptions, Connection, Executor};
 
-use self::in_place::InPlace;
+use self::file_identity::FileIdentity;
 use crate::database::{Database, Transaction};
 use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
 use crate::migrations::{Step, migrator};
 use crate::tables::checksums;
 
-/// Name of the database, in the campaign's directory.
+/// File name of the database in the campaign's directory.
 pub const DATABASE: &str = "campaign.sqlite";
-/// The database while it is being made.
+/// Temporary name of the database while it is created.
 const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
-/// `PRAGMA user_version` that the newest migration leaves behind.
+/// `PRAGMA user_version` after the newest migration.
 const SCHEMA: i64 = 10;
 /// The first version whose rows have checksums.
-const WITH_CHECKSUMS: i64 = 9;
-/// How long another connection may hold the database.
-const PATIENCE: Duration = Duration::from_secs(30);
-const READERS: u32 = 4;
-/// How often a database of an earlier version is brought up to date, against others that try the same.
-const MIGRATION_TRIES: u32 = 50;
-/// Between two tries to open a database.
-const OPENING_PAUSE: Duration = Duration::from_millis(20);
-/// Between two looks at how far a copy is.
-const LOOK: Duration = Duration::from_millis(200);
-/// Bytes of a page of a new database. A candidate with features is some 100 kB, and every page has its price; with
-/// larger ones short rows would cost too much.
-const PAGE: u32 = 1 << 14;
-/// Pages in the write-ahead log from which on they are copied into the database, with which commits wait: 64 MB, some
-/// 0.1 s. Pages that are written again until then, as those of walks, are copied once.
-const LOG_PAGES: u32 = 1 << 12;
+const FIRST_WITH_CHECKSUMS: i64 = 9;
+/// How long to wait for another connection that holds the database.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
+const MAX_READERS: u32 = 4;
+/// Tries to migrate a database while other processes try the same.
+const MIGRATION_ATTEMPTS: u32 = 50;
+/// Time between two tries to open a database.
+const OPEN_RETRY_INTERVAL: Duration = Duration::from_millis(20);
+/// Time between two progress reports of a copy.
+const COPY_PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
+/// Page size of a new database in bytes. A candidate with features has about 100 kB and every page costs time;
+/// larger pages would cost too much for short rows.
+const PAGE_SIZE: u32 = 1 << 14;
+/// Number of pages in the write-ahead log at which they are copied into the database, while commits wait: 64 MB,
+/// about 0.1 s. Pages that are rewritten in between, such as those of walks, are copied once.
+const WAL_PAGES: u32 = 1 << 12;
 
-/// The steps to the newest version.
+/// The migrations in order.
 pub(crate) static STEPS: [Step; 10] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
@@ -71,16 +71,16 @@ static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
 /// An open database file. Clones share its connections.
 #[derive(Clone, Debug)]
 pub struct DatabaseFile {
-    /// One connection: who writes waits in line. None in a store that was opened to be read.
+    /// A single connection: writers queue for it. `None` in a store opened read-only.
     writer: Option<SqlitePool>,
     pub readers: SqlitePool,
-    /// What every transaction that writes looks at first.
-    file: InPlace,
+    /// Checked before every write transaction.
+    file: FileIdentity,
 }
 
 impl DatabaseFile {
-    /// Makes the database in `directory`, which must exist; `fill` writes what it begins with. Either the whole
-    /// database is there afterwards, or none.
+    /// Creates the database in the existing directory `directory`; `fill` writes its initial rows. The database is
+    /// created as a whole or not at all.
     pub async fn create(directory: &Path, fill: impl AsyncFnOnce(&Database) -> Result<()>) -> Result<Self> {
         check_directory(directory)?;
         let path = directory.join(DATABASE);
@@ -92,7 +92,7 @@ impl DatabaseFile {
         make_private(&unfinished)?;
         let writer = writer(&unfinished).await?;
         MIGRATIONS.run(&writer).await.map_err(schema_error)?;
-        let file = InPlace::of(&unfinished)?;
+        let file = FileIdentity::read(&unfinished)?;
         let made = Self { readers: writer.clone(), writer: Some(writer), file };
         fill(&Database::Sqlite(made.clone())).await?;
         made.empty_log().await?;
@@ -101,14 +101,14 @@ impl DatabaseFile {
         Self::open(directory).await
     }
 
-    /// Opens the database in `directory`, and brings its tables up to date.
+    /// Opens the database in `directory` and migrates its tables to the newest version.
     pub async fn open(directory: &Path) -> Result<Self> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             match Self::open_now(directory).await {
-                // Others that open or close it at this moment: SQLite does not always wait for those by itself.
-                Err(StoreError::Busy) if begun.elapsed() < PATIENCE => {
-                    tokio::time::sleep(OPENING_PAUSE).await;
+                // Another process opens or closes it at this moment; SQLite does not always wait for that.
+                Err(StoreError::Busy) if started.elapsed() < BUSY_TIMEOUT => {
+                    tokio::time::sleep(OPEN_RETRY_INTERVAL).await;
                 }
                 opened => return opened,
             }
@@ -121,33 +121,34 @@ impl DatabaseFile {
         let found = identify(&path, false).await?;
         let writer = writer(&path).await?;
         let mut tries = 1;
-        while let Err(error) = bring_up_to_date(&writer).await {
-            // Others that opened it at the same time are at it: once they are done there is nothing left to do.
-            if found == SCHEMA || tries == MIGRATION_TRIES {
+        while let Err(error) = migrate(&writer).await {
+            // Another process that opened it at the same time is migrating it; when it is done, nothing is left to
+            // do.
+            if found == SCHEMA || tries == MIGRATION_ATTEMPTS {
                 return Err(error);
             }
             tries += 1;
-            tokio::time::sleep(OPENING_PAUSE).await;
+            tokio::time::sleep(OPEN_RETRY_INTERVAL).await;
         }
         let readers = readers(options(&path).read_only(true), None);
-        Ok(Self { writer: Some(writer), readers, file: InPlace::of(&path)? })
+        Ok(Self { writer: Some(writer), readers, file: FileIdentity::read(&path)? })
     }
 
-    /// Opens the database in `directory` to look at it, also where nothing may be written. Tables of an earlier
-    /// version stay as they are: what they lack is filled in where they are read.
+    /// Opens the database in `directory` for reading, also where nothing may be written. Tables of an earlier
+    /// version are not migrated: reading functions fill in what they lack.
     pub async fn open_read_only(directory: &Path) -> Result<Self> {
         let path = existing(directory)?;
         let immutable = match check_directory(directory) {
             Ok(()) => false,
-            // Without a write-ahead log the file is all there is, and it can be read without a lock.
+            // Without a write-ahead log the file is complete and can be read without a lock.
             Err(StoreError::Directory { .. }) => !directory.join(format!("{DATABASE}-wal")).exists(),
             Err(error) => return Err(error),
         };
         identify(&path, immutable).await?;
         let options = options(&path).read_only(true).immutable(immutable);
-        let views = earlier::views(&options).await?;
+        let views = old_schema::views(&options).await?;
         let readers = readers(options, views);
-        Ok(Self { writer: None, readers, file: InPlace::of(&path)? })
+        Ok(Self { writer: None, readers, file: FileIdentity::read(&path)? })
     }
 
     pub async fn close(&self) {
@@ -157,8 +158,8 @@ impl DatabaseFile {
         }
     }
 
-    /// Moves the write-ahead log into the database: it bears the database's name and would be lost under another.
-    /// Closing does the same, but says nothing when the disk is full.
+    /// Moves the write-ahead log into the database. The log is named after the database and would be lost if that
+    /// were renamed. Closing does the same, but reports no error if the disk is full.
     pub async fn empty_log(&self) -> Result<()> {
         let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
         let checkpoint = sqlx::query_as("PRAGMA wal_checkpoint(TRUNCATE)").fetch_one(writer);
@@ -166,8 +167,8 @@ impl DatabaseFile {
         if busy { Err(StoreError::Busy) } else { Ok(()) }
     }
 
-    /// Copies the database as it is at one instant into another directory, which has none. `tell` hears how many bytes of how
-    /// many, about, are written. The copy is not yet known to be on the disk.
+    /// Copies a snapshot of the database into another directory, which has none. `tell` receives the approximate
+    /// number of bytes written, and the total. Does not sync the copy to disk.
     pub async fn copy_into(&self, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
         let (unfinished, path) = (directory.join(UNFINISHED), directory.join(DATABASE));
         let failed = |source| StoreError::File { path: path.clone(), source };
@@ -178,7 +179,7 @@ impl DatabaseFile {
         loop {
             tokio::select! {
                 copied = &mut copying => break copied.map(drop)?,
-                () = tokio::time::sleep(LOOK) => {
+                () = tokio::time::sleep(COPY_PROGRESS_INTERVAL) => {
                     tell(fs::metadata(&unfinished).map_or(0, |file| file.len()).min(all), all);
                 }
             }
@@ -186,7 +187,7 @@ impl DatabaseFile {
         fs::rename(&unfinished, &path).map_err(failed)
     }
 
-    /// Bytes of the database and its log.
+    /// Size of the database and its log in bytes.
     pub fn size(&self) -> Result<u64> {
         let path = self.file.path();
         let log = path.with_file_name(format!("{DATABASE}-wal"));
@@ -195,18 +196,18 @@ impl DatabaseFile {
         Ok(database + size(&log).unwrap_or(0))
     }
 
-    /// Writes the database anew without gaps, which takes room for two more of it: in the directory for temporary files,
-    /// and in the log.
+    /// Rewrites the database without gaps. Needs space for two copies: one in the directory for temporary files,
+    /// one in the log.
     pub async fn compact(&self) -> Result<()> {
         let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
         self.file.check()?;
-        room::check(self.file.path(), self.size()?)?;
+        disk_space::check(self.file.path(), self.size()?)?;
         sqlx::query("VACUUM").execute(writer).await?;
         self.empty_log().await
     }
 
-    /// A transaction that has the right to write from its first statement on: one that asked for it later could be
-    /// refused in spite of the time limit.
+    /// Begins a transaction that locks the database for writing at once. Locking it later could fail without
+    /// waiting for the timeout.
     pub async fn begin(&self) -> Result<sqlx::Transaction<'static, Sqlite>> {
         let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
         self.file.check()?;
@@ -215,19 +216,19 @@ impl DatabaseFile {
 }
 
 fn options(path: &Path) -> SqliteConnectOptions {
-    SqliteConnectOptions::new().filename(path).foreign_keys(true).busy_timeout(PATIENCE)
+    SqliteConnectOptions::new().filename(path).foreign_keys(true).busy_timeout(BUSY_TIMEOUT)
 }
 
 async fn writer(path: &Path) -> Result<SqlitePool> {
     let options = options(path)
         .create_if_missing(true)
-        .page_size(PAGE)
+        .page_size(PAGE_SIZE)
         .journal_mode(SqliteJournalMode::Wal)
-        .pragma("wal_autocheckpoint", LOG_PAGES.to_string())
+        .pragma("wal_autocheckpoint", WAL_PAGES.to_string())
         .synchronous(SqliteSynchronous::Full);
     let pool = SqlitePoolOptions::new().max_connections(1).idle_timeout(None).max_lifetime(None);
-    // SQLite itself rolls back after a full disk or a failed write. The connection is then out of step with its
-    // driver, which fails to roll back once more, and could not begin another transaction: it is closed.
+    // After a full disk or a failed write SQLite itself rolls back. The driver does not know this, fails to roll
+    // back once more and could not begin another transaction, so the connection is closed.
     let pool = pool.after_release(|connection, _| {
         Box::pin(async move {
             connection.ping().await?;
@@ -237,9 +238,9 @@ async fn writer(path: &Path) -> Result<SqlitePool> {
     Ok(pool.connect_with(options).await?)
 }
 
-/// `views` are made in each connection, see [`earlier`].
+/// Each connection creates `views`, see [`old_schema`].
 fn readers(options: SqliteConnectOptions, views: Option<&'static str>) -> SqlitePool {
-    let pool = SqlitePoolOptions::new().max_connections(READERS).max_lifetime(None);
+    let pool = SqlitePoolOptions::new().max_connections(MAX_READERS).max_lifetime(None);
     let pool = pool.after_connect(move |connection, _| {
         Box::pin(async move {
             match views {
@@ -251,14 +252,14 @@ fn readers(options: SqliteConnectOptions, views: Option<&'static str>) -> Sqlite
     pool.connect_lazy_with(options)
 }
 
-/// Brings the tables to the newest version: all steps and the checksums of rows, or nothing.
-async fn bring_up_to_date(writer: &SqlitePool) -> Result<()> {
+/// Migrates the tables to the newest version, checksums included, in one transaction.
+async fn migrate(writer: &SqlitePool) -> Result<()> {
     let mut transaction = writer.begin_with("BEGIN IMMEDIATE").await?;
     let found: i64 = sqlx::query_scalar("PRAGMA user_version").fetch_one(&mut *transaction).await?;
-    // What `run` calls. With a borrowed connection it makes no future that another thread may go on with.
+    // The function that `run` calls. With a borrowed connection, `run` gives a future that is not `Send`.
     MIGRATIONS.run_direct(None, &mut *transaction, false).await.map_err(schema_error)?;
     let mut transaction = Transaction::Sqlite(transaction);
-    if found < WITH_CHECKSUMS {
+    if found < FIRST_WITH_CHECKSUMS {
         checksums::fill(&mut transaction).await?;
     }
     transaction.commit().await
@@ -273,8 +274,8 @@ fn existing(directory: &Path) -> Result<PathBuf> {
     }
 }
 
-/// Checks that the file is a campaign that this program can read, without changing a byte of it. Returns the version of
-/// its schema.
+/// Checks, without changing the file, that it is a campaign which this program can read. Returns the schema
+/// version.
 async fn identify(path: &Path, immutable: bool) -> Result<i64> {
     let mut begin = Vec::new();
     let read = File::open(path).and_then(|file| file.take(16).read_to_end(&mut begin));
@@ -307,7 +308,7 @@ fn schema_error(error: sqlx::migrate::MigrateError) -> StoreError {
     }
 }
 
-/// Makes an empty file that only its owner may read, and which SQLite fills; its log and the log's index get the same mode.
+/// Creates an empty file for SQLite that only its owner may read. The log and its index get the same mode.
 fn make_private(path: &Path) -> Result<()> {
     let made = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path);
     made.map(drop).map_err(|source| StoreError::File { path: path.into(), source })
@@ -328,7 +329,7 @@ fn remove_database(path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Gives the finished database its name, once and for all.
+/// Renames the finished database to its final name.
 fn publish(directory: &Path, unfinished: &Path, path: &Path) -> Result<()> {
     let failed = |source| StoreError::File { path: path.into(), source };
     fs::rename(unfinished, path).map_err(failed)?;

@@ -1,4 +1,4 @@
-//! What cannot be seen from outside: plans of queries, settings of connections, a full disk.
+//! Tests of internals: query plans, connection settings, a full disk.
 
 use sqlx::AssertSqlSafe;
 use wire::CampaignId;
@@ -8,7 +8,8 @@ use crate::Store;
 use crate::check;
 use crate::records::{Campaign, Commit, ComponentRecord};
 use crate::tables::{
-    by_hand, exclude, export, history, job_counts, labels, listing, outcomes, queue, recent, status,
+    candidate_history, exclude, export, job_counts, labels, listing, outcomes, queue, queue_admin, recent,
+    status,
 };
 
 /// The store in a directory, and its file.
@@ -34,7 +35,7 @@ async fn plan(file: &DatabaseFile, sql: &str) -> String {
 }
 
 #[tokio::test]
-async fn what_is_asked_often_goes_through_indexes() {
+async fn frequent_queries_use_indexes() {
     let directory = tempfile::tempdir().unwrap();
     let (_store, file) = store(directory.path()).await;
     for sql in [
@@ -44,40 +45,40 @@ async fn what_is_asked_often_goes_through_indexes() {
         queue::HELD,
         queue::HELD_BY,
         queue::LOSSES,
-        by_hand::FIND,
+        queue_admin::FIND,
         export::CANDIDATES,
         export::IMPORTS,
-        history::NUMBERED,
-        history::BEGINNING,
-        history::FIRST,
-        history::LAST,
-        history::SAME_STRUCTURE,
-        history::JOBS,
-        history::LABELS,
-        history::AT_STEP,
-        history::BEFORE,
-        history::AFTER,
+        candidate_history::NUMBERED,
+        candidate_history::BEGINNING,
+        candidate_history::FIRST,
+        candidate_history::LAST,
+        candidate_history::SAME_STRUCTURE,
+        candidate_history::JOBS,
+        candidate_history::LABELS,
+        candidate_history::AT_STEP,
+        candidate_history::BEFORE,
+        candidate_history::AFTER,
         labels::CURRENT,
-        exclude::STANDING,
+        exclude::LABEL_STATUS,
         listing::NEWEST,
         listing::OLDEST,
         listing::NEWEST_OF_FATE,
         listing::OLDEST_OF_FATE,
         listing::LARGEST_GAMMA,
-        listing::LEAST_GAMMA,
+        listing::SMALLEST_GAMMA,
         listing::LARGEST_VOLUME,
-        listing::LEAST_VOLUME,
+        listing::SMALLEST_VOLUME,
         listing::OF_WALK,
-        job_counts::MADE_SINCE,
-        outcomes::AT_WORK,
+        job_counts::LABELS_SINCE,
+        outcomes::CORES_IN_USE,
         outcomes::FINISHED,
         recent::NEWEST,
     ] {
-        // A page is what an index found, and no longer than was asked for.
+        // A page is a result of an index and has a bounded length.
         let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "").replace("SCAN page", "");
         assert!(!plan.contains("SCAN") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
     }
-    for sql in [by_hand::LIST, listing::QUEUE] {
+    for sql in [queue_admin::LIST, listing::QUEUE] {
         let page = plan(&file, sql).await;
         assert!(page.contains("USING COVERING INDEX job_order (state=?"), "{page}");
     }
@@ -90,7 +91,7 @@ async fn what_is_asked_often_goes_through_indexes() {
 }
 
 #[tokio::test]
-async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
+async fn connections_survive_power_loss_and_use_large_pages() {
     let directory = tempfile::tempdir().unwrap();
     let (_store, file) = store(directory.path()).await;
     let pool = file.writer.as_ref().unwrap();
@@ -99,8 +100,8 @@ async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
     for (sql, expected) in [
         ("PRAGMA synchronous", 2),
         ("PRAGMA foreign_keys", 1),
-        ("PRAGMA page_size", i64::from(PAGE)),
-        ("PRAGMA wal_autocheckpoint", i64::from(LOG_PAGES)),
+        ("PRAGMA page_size", i64::from(PAGE_SIZE)),
+        ("PRAGMA wal_autocheckpoint", i64::from(WAL_PAGES)),
         ("PRAGMA application_id", APPLICATION),
         ("PRAGMA user_version", SCHEMA),
     ] {
@@ -111,7 +112,7 @@ async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
 }
 
 #[tokio::test]
-async fn a_full_disk_says_so_and_loses_nothing() {
+async fn a_full_disk_is_reported_and_loses_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let (store, file) = store(directory.path()).await;
     let component = |size| Commit {
@@ -119,7 +120,7 @@ async fn a_full_disk_says_so_and_loses_nothing() {
         ..Commit::default()
     };
     store.commit(&component(10)).await.unwrap();
-    // SQLite answers a limit on the size of the file as it answers a full disk.
+    // SQLite reports a limit on the file size like a full disk.
     let pool = file.writer.as_ref().unwrap();
     let pages: i64 = sqlx::query_scalar("PRAGMA page_count").fetch_one(pool).await.unwrap();
     sqlx::query(AssertSqlSafe(format!("PRAGMA max_page_count = {}", pages + 2))).execute(pool).await.unwrap();

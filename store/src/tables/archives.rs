@@ -1,4 +1,4 @@
-//! The directories of calculations, packed.
+//! Packed work directories of calculations.
 
 use crate::Store;
 use crate::checksum::{ARCHIVE, Names};
@@ -7,8 +7,8 @@ use crate::error::Result;
 use crate::jobs::{Archive, PastCalculation};
 
 impl Store {
-    /// Keeps the packed directory of an attempt's calculation, in the place of an earlier one. `left_out` names the files
-    /// that are not in it.
+    /// Stores the packed directory of an attempt's calculation, replacing an earlier one. `left_out` names the
+    /// files that are not in it.
     pub async fn keep_archive(&self, job: i64, attempt: u32, bytes: &[u8], left_out: &str) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let sql = "INSERT INTO archive (job, attempt, bytes, left_out, checksum) VALUES ($1, $2, $3, $4, $5)
@@ -19,13 +19,13 @@ impl Store {
         transaction.commit().await
     }
 
-    /// The packed directories of a job's calculations, by attempt.
+    /// Packed directories of a job's calculations, by attempt.
     pub async fn archives(&self, job: i64) -> Result<Vec<Archive>> {
         let sql = "SELECT * FROM archive WHERE job = $1 ORDER BY attempt";
         query(sql).bind(job).fetch_all(&self.database).await
     }
 
-    /// What has become of an attempt and its calculation; none if there was no such attempt.
+    /// The state of an attempt and its calculation; `None` if there was no such attempt.
     pub async fn past_calculation(&self, job: i64, attempt: u32) -> Result<Option<PastCalculation>> {
         let sql = "SELECT calculation,
                    CAST(CASE WHEN outcome = 'failed' THEN 1 ELSE 0 END AS BIGINT) AS failed,

@@ -1,4 +1,4 @@
-//! Budgets: what was used up is found from what is there, and no further label is begun where there is nothing left.
+//! Budgets: use is computed from what is stored, and no label starts once a limit is reached.
 
 use super::protocols::set_campaign_value;
 use crate::Store;
@@ -8,22 +8,22 @@ use crate::error::{Result, StoreError};
 
 const MILLISECONDS_PER_HOUR: f64 = 3.6e6;
 
-/// The sums that the database keeps of attempts that ended (`migrations`): labels made, and milliseconds of cores.
-const KEPT: &str = "SELECT CAST((SELECT value FROM campaign WHERE key = 'labels_made') AS BIGINT),
+/// The totals of finished attempts that triggers keep (`migrations`): labels made, and core-milliseconds.
+const TOTALS: &str = "SELECT CAST((SELECT value FROM campaign WHERE key = 'labels_made') AS BIGINT),
         CAST((SELECT value FROM campaign WHERE key = 'core_milliseconds') AS BIGINT)";
 
-/// Attempts under way, and milliseconds of their cores so far.
+/// Running attempts, and their core-milliseconds so far.
 pub(crate) const UNDER_WAY: &str = "SELECT count(*),
         CAST(coalesce(sum(CASE WHEN $1 > started THEN ($1 - started) * coalesce(cores, 1) ELSE 0 END), 0) AS BIGINT)
     FROM attempt WHERE outcome IS NULL";
 
-/// All of it in tables of an earlier version, which are only looked at.
+/// All attempts, for tables of an earlier version that are opened read-only.
 const ATTEMPTS: &str = "SELECT CAST(coalesce(sum(CASE WHEN outcome IN ('labelled', 'check') THEN 1 ELSE 0 END), 0) AS BIGINT),
         CAST(coalesce(sum(CASE WHEN outcome IS NULL THEN 1 ELSE 0 END), 0) AS BIGINT),
         CAST(coalesce(sum(CASE WHEN coalesce(ended, $1) > started THEN coalesce(ended, $1) - started ELSE 0 END), 0) AS BIGINT)
     FROM attempt";
 
-/// What the kept sums have to be, by their names.
+/// The values that the totals must have, by name.
 pub(crate) const SUMS: [(&str, &str); 3] = [
     ("labels_made", "SELECT CAST(count(*) AS TEXT) FROM attempt WHERE outcome IN ('labelled', 'check')"),
     (
@@ -40,8 +40,8 @@ pub(crate) const SUMS: [(&str, &str); 3] = [
     ),
 ];
 
-/// Writes the sums anew, where attempts were copied.
-pub(crate) async fn sum_up(database: &Database) -> Result<()> {
+/// Recomputes the totals after attempts were copied.
+pub(crate) async fn rebuild_totals(database: &Database) -> Result<()> {
     let mut transaction = database.begin().await?;
     for (name, sum) in SUMS {
         let sum: String = query(sum).fetch_one(&mut transaction).await?;
@@ -51,46 +51,46 @@ pub(crate) async fn sum_up(database: &Database) -> Result<()> {
 }
 
 impl Store {
-    /// From now on these limits hold, for every labeller.
+    /// Sets the limits for every labeller from now on.
     pub async fn set_budget(&self, budget: &Budget) -> Result<()> {
         let text = serde_json::to_string(budget).expect("plain data becomes JSON");
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, "budget", &text).await?;
         transaction.commit().await
     }
 
-    /// The limits, and what was used of them until `now`.
+    /// The limits, and their use until `now`.
     pub async fn budget(&self, now: i64) -> Result<(Budget, BudgetUse)> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let read = read(&mut transaction, now).await?;
         transaction.commit().await?;
         Ok(read)
     }
 
-    /// The campaign was under way for so long again.
-    pub async fn add_time_under_way(&self, milliseconds: u64) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+    /// Adds to the running time of the campaign.
+    pub async fn add_running_time(&self, milliseconds: u64) -> Result<()> {
+        let mut transaction = self.database.begin_as_leader().await?;
         let before = time_under_way(&mut transaction).await?;
         let now = before.saturating_add(milliseconds).to_string();
         set_campaign_value(&mut transaction, "time_under_way", &now).await?;
         transaction.commit().await
     }
 
-    /// Whether a label is being made, or waits to be and may be.
-    pub async fn awaits_labels(&self, now: i64) -> Result<bool> {
-        let mut transaction = self.database.begin_to_read().await?;
+    /// Whether a label is in progress, or waits and may be started.
+    pub async fn has_pending_labels(&self, now: i64) -> Result<bool> {
+        let mut transaction = self.database.begin_read().await?;
         let some = |state: &'static str| {
             query("SELECT count(*) FROM (SELECT 1 FROM job WHERE state = $1 LIMIT 1) AS one").bind(state)
         };
         let leased: u64 = some("leased").fetch_one(&mut transaction).await?;
         let queued: u64 = some("queued").fetch_one(&mut transaction).await?;
-        let awaits = leased > 0 || (queued > 0 && !allows_no_attempt(&mut transaction, now).await?);
+        let awaits = leased > 0 || (queued > 0 && !forbids_attempts(&mut transaction, now).await?);
         transaction.commit().await?;
         Ok(awaits)
     }
 }
 
-/// Limits and use. Where there is a server, its clock counts.
+/// Limits and use. On a server, its clock counts.
 pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Budget, BudgetUse)> {
     let limits = limits(transaction).await?;
     let now = transaction.time(now).await?;
@@ -104,9 +104,9 @@ pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Bud
     Ok((limits, used))
 }
 
-/// Labels made, attempts under way, and milliseconds of the cores of all attempts until `now`.
+/// Labels made, running attempts, and core-milliseconds of all attempts until `now`.
 async fn attempts(transaction: &mut Transaction, now: i64) -> Result<(u64, u64, u64)> {
-    let kept: (Option<u64>, Option<u64>) = query(KEPT).fetch_one(&mut *transaction).await?;
+    let kept: (Option<u64>, Option<u64>) = query(TOTALS).fetch_one(&mut *transaction).await?;
     let (Some(labels), Some(ended)) = kept else {
         return query(ATTEMPTS).bind(now).fetch_one(&mut *transaction).await;
     };
@@ -114,13 +114,13 @@ async fn attempts(transaction: &mut Transaction, now: i64) -> Result<(u64, u64, 
     Ok((labels, under_way, ended + so_far))
 }
 
-/// Whether no further attempt may begin. Attempts are counted only where there is a limit.
-pub(super) async fn allows_no_attempt(transaction: &mut Transaction, now: i64) -> Result<bool> {
+/// Whether no further attempt may start. Attempts are counted only if there is a limit.
+pub(super) async fn forbids_attempts(transaction: &mut Transaction, now: i64) -> Result<bool> {
     if limits(transaction).await?.is_none() {
         return Ok(false);
     }
     let (limits, used) = read(transaction, now).await?;
-    Ok(limits.allows_no_attempt(&used))
+    Ok(limits.forbids_attempts(&used))
 }
 
 async fn limits(transaction: &mut Transaction) -> Result<Budget> {

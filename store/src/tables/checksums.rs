@@ -1,17 +1,17 @@
-//! Checksums for rows that have none, and a look at every row of tables that are read for nothing else.
+//! Computes missing checksums, and verifies every row of tables that no other check reads.
 
 use crate::Store;
 use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
-    LABEL, LONG, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK,
+    LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK,
 };
-use crate::database::{Row, Transaction, Value, for_rows, query};
+use crate::database::{Row, Transaction, Value, execute_rows, query};
 use crate::error::Result;
 
-/// Rows read at a time: one of a large structure has megabytes.
+/// Rows read at a time: a row of a large structure has megabytes.
 const PAGE: u32 = 64;
 
-/// Tables that earlier versions have without checksums, with the columns for these.
+/// Tables that have no checksums in earlier versions, with their checksum columns.
 const WITHOUT: [(&str, &[&str]); 12] = [
     ("campaign", &["checksum"]),
     ("value", &["checksum"]),
@@ -27,7 +27,7 @@ const WITHOUT: [(&str, &[&str]); 12] = [
     ("archive", &["checksum"]),
 ];
 
-/// Keys of the campaign's own values that are written once in a while, and by this program alone.
+/// Keys of campaign values that change rarely and only through this program.
 pub(crate) const CAMPAIGN_KEYS: [&str; 7] = [
     "id",
     "program_version",
@@ -42,7 +42,7 @@ const CAMPAIGN_VALUE: &str = "SELECT * FROM campaign WHERE key = $1";
 const SET_CAMPAIGN: &str = "UPDATE campaign SET checksum = $1 WHERE key = $2";
 const VALUES: &str = "SELECT * FROM value ORDER BY name";
 const SET_VALUE: &str = "UPDATE value SET checksum = $1 WHERE name = $2";
-/// Of these tables a row is read at a time, after the one with a key of two numbers.
+/// These tables have a key of two numbers and are read one row at a time.
 const NEXT_COMPONENT: &str =
     "SELECT * FROM component WHERE (element, slot) > ($1, $2) ORDER BY element, slot LIMIT 1";
 const SET_COMPONENT: &str = "UPDATE component SET checksum = $1 WHERE element = $2 AND slot = $3";
@@ -50,7 +50,7 @@ pub(crate) const NEXT_ARCHIVE: &str =
     "SELECT * FROM archive WHERE (job, attempt) > ($1, $2) ORDER BY job, attempt LIMIT 1";
 const SET_ARCHIVE: &str = "UPDATE archive SET checksum = $1 WHERE job = $2 AND attempt = $3";
 
-/// A table of one number as its key: how its rows are read page by page, and how they get their checksums.
+/// A table with a key of one number: how to read its pages and set its checksums.
 struct Paged {
     table: &'static CheckedTable,
     key: &'static str,
@@ -106,18 +106,18 @@ static CANDIDATES: Paged = Paged {
 
 impl Paged {
     async fn fill(&self, transaction: &mut Transaction, long: &[&CheckedColumn]) -> Result<()> {
-        // Seed structures and walks are numbered from 0 on.
+        // Seed structures and walks are numbered from 0.
         let mut after = -1;
         loop {
             let page = query(self.page).bind(after).bind(PAGE).rows(&mut *transaction).await?;
             let Some(last) = page.last() else { return Ok(()) };
             after = last.get(self.key)?;
             let rows = page.iter().map(|row| self.checksums(row, long)).collect::<Result<_>>()?;
-            for_rows(transaction, self.update, self.columns, rows).await?;
+            execute_rows(transaction, self.update, self.columns, rows).await?;
         }
     }
 
-    /// Number of the row, and its checksums.
+    /// Key of the row, and its checksums.
     fn checksums(&self, row: &Row, long: &[&CheckedColumn]) -> Result<Vec<Value>> {
         let mut values: Vec<Value> =
             vec![row.get::<i64>(self.key)?.into(), self.table.compute(row, Names::Plain)?.into()];
@@ -139,24 +139,24 @@ impl Paged {
             let Some(last) = page.last() else { return Ok(()) };
             after = last.get(self.key)?;
             for row in &page {
-                note(self.table.verify(row, Names::Plain), faults);
-                long.iter().for_each(|column| note(column.verify(row), faults));
+                collect_fault(self.table.verify(row, Names::Plain), faults);
+                long.iter().for_each(|column| collect_fault(column.verify(row), faults));
             }
         }
     }
 }
 
-fn note(verified: Result<()>, faults: &mut Vec<String>) {
+fn collect_fault(verified: Result<()>, faults: &mut Vec<String>) {
     faults.extend(verified.err().map(|error| error.to_string()));
 }
 
-/// Computes every checksum anew from what is stored.
+/// Computes every checksum from what is stored.
 pub(crate) async fn fill(transaction: &mut Transaction) -> Result<()> {
     for paged in [&STRUCTURES, &SEED_STRUCTURES, &PROTOCOLS, &DECISIONS, &LABELS, &IMPORTS] {
         paged.fill(transaction, &[]).await?;
     }
     WALKS.fill(transaction, &[&CHECKPOINT]).await?;
-    CANDIDATES.fill(transaction, &LONG).await?;
+    CANDIDATES.fill(transaction, &LONG_COLUMNS).await?;
     for key in CAMPAIGN_KEYS {
         for row in query(CAMPAIGN_VALUE).bind(key).rows(&mut *transaction).await? {
             let checksum = CAMPAIGN.compute(&row, Names::Plain)?;
@@ -182,7 +182,7 @@ pub(crate) async fn fill(transaction: &mut Transaction) -> Result<()> {
     Ok(())
 }
 
-/// The row after one with a key of two numbers, and its own.
+/// The next row of a table with a key of two numbers, and its key.
 async fn next(
     transaction: &mut Transaction,
     sql: &'static str,
@@ -195,8 +195,8 @@ async fn next(
     Ok(Some((row, key)))
 }
 
-/// What is wrong with rows that no other check looks into: those of the campaign itself, seed structures, walks, imports, the
-/// selector's values and the mixture.
+/// Verifies rows that no other check reads: campaign values, seed structures, walks, imports, the selector's values
+/// and the mixture. Returns the faults.
 pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<String>> {
     let mut faults = Vec::new();
     for paged in [&SEED_STRUCTURES, &IMPORTS] {
@@ -205,22 +205,22 @@ pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<S
     WALKS.verify(transaction, &[&CHECKPOINT], &mut faults).await?;
     for key in CAMPAIGN_KEYS {
         for row in query(CAMPAIGN_VALUE).bind(key).rows(&mut *transaction).await? {
-            note(CAMPAIGN.verify(&row, Names::Plain), &mut faults);
+            collect_fault(CAMPAIGN.verify(&row, Names::Plain), &mut faults);
         }
     }
     for row in query(VALUES).rows(&mut *transaction).await? {
-        note(VALUE.verify(&row, Names::Plain), &mut faults);
+        collect_fault(VALUE.verify(&row, Names::Plain), &mut faults);
     }
     let mut last = (-1, -1);
     while let Some((row, key)) = next(transaction, NEXT_COMPONENT, ["element", "slot"], last).await? {
-        note(COMPONENT.verify(&row, Names::Plain), &mut faults);
+        collect_fault(COMPONENT.verify(&row, Names::Plain), &mut faults);
         last = key;
     }
     Ok(faults)
 }
 
-/// Statements that make temporary views in the place of tables without checksums. They bear the names of the tables, which
-/// stand in `schema`.
+/// SQL that creates temporary views which replace tables without checksums. They have the names of the tables in
+/// `schema`.
 pub(crate) fn views(schema: &str) -> String {
     let view = |(table, columns): &(&str, &[&str])| {
         let columns: String =
@@ -231,10 +231,10 @@ pub(crate) fn views(schema: &str) -> String {
 }
 
 impl Store {
-    /// Computes the checksum of every row anew, for whoever has written rows past this program.
+    /// Recomputes the checksum of every row, after rows were written without this program.
     #[doc(hidden)]
     pub async fn write_checksums(&self) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         fill(&mut transaction).await?;
         transaction.commit().await
     }

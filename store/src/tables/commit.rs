@@ -1,4 +1,4 @@
-//! Accept is one transaction: what the selector decided is written as a whole or not at all.
+//! Commits: everything that the selector decided is written in one transaction.
 
 mod rows;
 
@@ -16,17 +16,18 @@ use self::rows::{
 use super::protocols;
 use crate::Store;
 use crate::checksum;
-use crate::database::{Transaction, for_rows, query};
+use crate::database::{Transaction, execute_rows, query};
 use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
 use crate::records::Commit;
-use crate::store::SERVER_AWAY;
+use crate::store::SERVER_RECONNECT_TIMEOUT;
 
-const PAUSE: Duration = Duration::from_secs(1);
+const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
 const INSERT_DECISIONS: &str = "INSERT INTO decision ({columns}) SELECT * FROM {rows}";
 
-/// One that is there already is not changed but locked: whether it has a label must not change until its job is written.
+/// An existing structure is not changed but locked: whether it has a label must not change until its job is
+/// written.
 const INSERT_STRUCTURES: &str = "INSERT INTO structure ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (hash) DO UPDATE SET atoms = excluded.atoms";
 
@@ -36,7 +37,7 @@ const INSERT_CANDIDATES: &str = "INSERT INTO candidate ({columns}, structure)
 
 const INSERT_CANDIDATE_DATA: &str = "INSERT INTO candidate_data ({columns}) SELECT * FROM {rows}";
 
-/// A job for each structure, unless it has one; done already if the label is there.
+/// Adds a job for each structure that has none. It is done at once if the label exists.
 const INSERT_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state)
     SELECT structure.number, new.protocol, new.decision, new.priority, CASE WHEN EXISTS (
         SELECT 1 FROM label WHERE label.structure = structure.number AND label.protocol = new.protocol
@@ -57,33 +58,36 @@ const UPSERT_VALUES: &str = "INSERT INTO value ({columns}) SELECT * FROM {rows} 
     ON CONFLICT (name) DO UPDATE SET value = excluded.value, checksum = excluded.checksum";
 
 impl Store {
-    /// Writes everything that was decided in one transaction, on the disk when this returns. Decisions get
-    /// consecutive numbers, which are returned. An accepted candidate gets a label job under the protocol in force,
-    /// if there is one.
+    /// Writes all decisions of a commit in one transaction, which is on disk when this returns. Returns the
+    /// consecutive sequence numbers of the decisions. An accepted candidate gets a label job under the protocol in
+    /// force, if there is one.
     ///
-    /// A server that is away for a while is waited for. Where the answer to a commit was lost, it is found out whether it
-    /// was made: it is never made twice.
+    /// Waits for a server that cannot be reached. If the reply to a commit was lost, looks up whether the commit
+    /// was made: no commit is made twice.
     ///
     /// # Errors
-    /// [`StoreError::DuplicateCandidate`] and [`StoreError::Inconsistent`] are errors of the caller. Nothing is
-    /// written after any error. [`StoreError::LockLost`] if somebody else leads the campaign, see [`Store::led_by`].
+    /// [`StoreError::DuplicateCandidate`] and [`StoreError::Inconsistent`] are errors of the caller.
+    /// [`StoreError::LockLost`] if another process leads the campaign, see [`Store::fenced_by`]. After any error
+    /// nothing is written.
     pub async fn commit(&self, commit: &Commit) -> Result<Range<i64>> {
         let mark = RandomState::new().hash_one("mark").cast_signed();
-        let (begun, mut again) = (Instant::now(), false);
+        let (started, mut again) = (Instant::now(), false);
         loop {
             match self.commit_once(commit, mark, again).await {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < SERVER_AWAY => again = true,
+                Err(StoreError::Unreachable(_)) if started.elapsed() < SERVER_RECONNECT_TIMEOUT => {
+                    again = true
+                }
                 done => return done,
             }
-            tokio::time::sleep(PAUSE).await;
+            tokio::time::sleep(RETRY_INTERVAL).await;
         }
     }
 
-    /// One try; `again` if an earlier one may have come through.
+    /// Tries once; `again` is set if an earlier try may have succeeded.
     async fn commit_once(&self, commit: &Commit, mark: i64, again: bool) -> Result<Range<i64>> {
-        // Everything is copied before anyone has to wait for the transaction.
-        let mut rows = Rows::of(commit)?;
-        let (mut transaction, made) = self.database.begin_to_commit(mark, again).await?;
+        // Copies everything before the transaction begins, so that nobody waits for the copying.
+        let mut rows = Rows::from_commit(commit)?;
+        let (mut transaction, made) = self.database.begin_commit(mark, again).await?;
         let last = query("SELECT coalesce(max(sequence), 0) FROM decision");
         let last: i64 = last.fetch_one(&mut transaction).await?;
         let decisions = integer("number of decisions", commit.decisions.len() as u64)?;
@@ -99,27 +103,27 @@ impl Store {
     }
 }
 
-/// `last` is the number of the last decision before.
+/// `last` is the sequence number of the previous decision.
 async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last: i64) -> Result<()> {
-    for_rows(transaction, INSERT_DECISIONS, &DECISION, rows.decisions).await?;
-    for_rows(transaction, INSERT_STRUCTURES, &STRUCTURE, rows.structures).await?;
-    let written = for_rows(transaction, INSERT_CANDIDATES, &CANDIDATE, rows.candidates).await?;
+    execute_rows(transaction, INSERT_DECISIONS, &DECISION, rows.decisions).await?;
+    execute_rows(transaction, INSERT_STRUCTURES, &STRUCTURE, rows.structures).await?;
+    let written = execute_rows(transaction, INSERT_CANDIDATES, &CANDIDATE, rows.candidates).await?;
     if written < commit.candidates.len() as u64 {
         return Err(duplicate(transaction, commit, last).await?);
     }
-    for_rows(transaction, COUNT_CANDIDATES, &CANDIDATE_COUNT, rows.candidate_counts).await?;
-    for_rows(transaction, INSERT_CANDIDATE_DATA, &CANDIDATE_DATA, rows.candidate_data).await?;
-    for_rows(transaction, INSERT_JOBS, &JOB, rows.jobs).await?;
+    execute_rows(transaction, COUNT_CANDIDATES, &CANDIDATE_COUNT, rows.candidate_counts).await?;
+    execute_rows(transaction, INSERT_CANDIDATE_DATA, &CANDIDATE_DATA, rows.candidate_data).await?;
+    execute_rows(transaction, INSERT_JOBS, &JOB, rows.jobs).await?;
     if commit.restart_mixture {
         query("DELETE FROM component").execute(&mut *transaction).await?;
     }
-    for_rows(transaction, UPSERT_COMPONENTS, &COMPONENT, rows.components).await?;
-    for_rows(transaction, UPSERT_WALKS, &WALK, rows.walks).await?;
-    for_rows(transaction, UPSERT_VALUES, &VALUE, rows.values).await?;
+    execute_rows(transaction, UPSERT_COMPONENTS, &COMPONENT, rows.components).await?;
+    execute_rows(transaction, UPSERT_WALKS, &WALK, rows.walks).await?;
+    execute_rows(transaction, UPSERT_VALUES, &VALUE, rows.values).await?;
     Ok(())
 }
 
-/// Which of the candidates was there before.
+/// Finds the candidate that was committed before.
 async fn duplicate(transaction: &mut Transaction, commit: &Commit, last: i64) -> Result<StoreError> {
     for id in commit.candidates.iter().map(|candidate| candidate.block.view().id().to_string()) {
         let before = query("SELECT id FROM candidate WHERE id = $1 AND decision <= $2").bind(&id).bind(last);
@@ -130,9 +134,9 @@ async fn duplicate(transaction: &mut Transaction, commit: &Commit, last: i64) ->
     Ok(StoreError::Inconsistent("candidates were not written".into()))
 }
 
-/// Number of the structure's row, which is made if there is none. Until the end of the transaction nobody else adds a
-/// label or a job for it.
-pub(super) async fn structure_number(
+/// Row number of the structure, which is inserted if it does not exist. Until the end of the transaction, no other
+/// label or job is added for it.
+pub(super) async fn structure_id(
     transaction: &mut Transaction,
     structure: &Structure,
     hash: ContentHash,
@@ -149,7 +153,7 @@ pub(super) async fn structure_number(
     insert.fetch_one(&mut *transaction).await
 }
 
-/// Jobs for candidates that are there already, as (structure, decision).
+/// Adds jobs for existing candidates, given as (structure, decision).
 pub(super) async fn enqueue(
     transaction: &mut Transaction,
     candidates: &[(Vec<u8>, i64)],
@@ -159,11 +163,11 @@ pub(super) async fn enqueue(
     let row = |(hash, decision): &(Vec<u8>, i64)| {
         vec![hash.clone().into(), protocol.into(), (*decision).into(), priority.into()]
     };
-    for_rows(transaction, INSERT_JOBS, &JOB, candidates.iter().map(row).collect()).await?;
+    execute_rows(transaction, INSERT_JOBS, &JOB, candidates.iter().map(row).collect()).await?;
     Ok(())
 }
 
-/// Of what has the same key only the newest, in order: one statement writes a row once.
+/// Only the newest record for each key, in order: a statement may write a row only once.
 fn newest<'a, T, K: Eq + std::hash::Hash>(
     records: &'a [T],
     key: impl Fn(&'a T) -> K,

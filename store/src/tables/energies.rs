@@ -1,4 +1,4 @@
-//! Energies of labelled structures by the potential and by their labels.
+//! Energies of labelled structures, by the potential and by their labels.
 
 use atoms::Species;
 use wire::ContentHash;
@@ -26,19 +26,19 @@ struct EnergyRow {
 from_columns!(EnergyRow { decision, formula, model, label });
 
 impl Store {
-    /// Energies of the structures that got their labels of this protocol last, `limit` at most, in decision order. Without what
-    /// was dropped or excluded by hand.
+    /// Energies of the structures most recently labelled under this protocol, at most `limit`, in decision order.
+    /// Leaves out labels dropped or excluded by hand.
     pub async fn labelled_energies(
         &self,
         protocol: ContentHash,
         limit: u32,
     ) -> Result<Vec<LabelledEnergies>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let mut transaction = self.database.begin_read().await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let rows = query(ENERGIES).bind(protocol).bind(limit);
         let mut rows: Vec<EnergyRow> = rows.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
-        // Sums over them do not depend on when labels came.
+        // Decision order makes sums over them independent of when labels arrived.
         rows.sort_by_key(|row| row.decision);
         rows.into_iter().map(EnergyRow::into_energies).collect()
     }
@@ -53,7 +53,7 @@ impl EnergyRow {
     }
 }
 
-/// Elements and numbers of a formula as [`atoms::Structure::formula`] writes it; `None` for another text.
+/// Elements and counts of a formula written by [`atoms::Structure::formula`]; `None` for another text.
 fn composition(formula: &str) -> Option<Vec<(Species, u32)>> {
     let mut composition = Vec::new();
     let mut rest = formula;
@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_formula_has_its_elements_and_numbers() {
+    fn a_formula_is_parsed_into_elements_and_counts() {
         let found = |formula: &str| {
             let composition = composition(formula)?.into_iter();
             Some(composition.map(|(species, number)| (species.symbol(), number)).collect::<Vec<_>>())

@@ -1,7 +1,7 @@
-//! Labels that people take out of the data set, and in again.
+//! Excludes labels from the data set and includes them again.
 //!
-//! An excluded label has the standing `excluded`: whatever asks for labels does not see it. Its job stays done, and a further result of the
-//! structure is a check; only a label that was asked for anew comes in its place.
+//! An excluded label has the status `excluded`, and no reader of labels sees it. Its job stays done, and further
+//! results for the structure are checks; only a requested new label replaces it.
 
 use std::collections::BTreeMap;
 
@@ -14,11 +14,11 @@ use crate::error::{Result, StoreError};
 use crate::exclude::{ExcludedLabel, Exclusion, ExclusionChange};
 
 /// The structure of a candidate, if it was accepted.
-const OF_CANDIDATE: &str = "SELECT coalesce(structure, 0) FROM candidate WHERE decision = $1";
-const OF_IMPORT: &str = "SELECT structure FROM import WHERE number = $1";
+const STRUCTURE_OF_CANDIDATE: &str = "SELECT coalesce(structure, 0) FROM candidate WHERE decision = $1";
+const STRUCTURE_OF_IMPORT: &str = "SELECT structure FROM import WHERE number = $1";
 
-/// Labels of a structure that count, and those that are excluded.
-pub(crate) const STANDING: &str = "SELECT protocol.name AS protocol, standing, exclusion FROM label
+/// Labels of a structure that count or are excluded.
+pub(crate) const LABEL_STATUS: &str = "SELECT protocol.name AS protocol, standing, exclusion FROM label
     CROSS JOIN protocol ON protocol.number = label.protocol
     WHERE label.structure = $1 AND standing IN ('label', 'excluded')
     ORDER BY label.protocol, label.number";
@@ -40,12 +40,12 @@ const ALL: &str = "SELECT coalesce((SELECT id FROM candidate WHERE candidate.str
     WHERE standing = 'excluded' ORDER BY excluded, label.number";
 
 /// Why labels of jobs are excluded.
-const OF_JOBS: &str = "SELECT job.number, exclusion FROM label
+const EXCLUSIONS_BY_JOB: &str = "SELECT job.number, exclusion FROM label
     CROSS JOIN job ON job.structure = label.structure AND job.protocol = label.protocol WHERE standing = 'excluded'";
 
 const COUNT: &str = "SELECT count(*) FROM label WHERE standing = 'excluded'";
 
-struct StandingRow {
+struct LabelStatusRow {
     protocol: String,
     standing: String,
     exclusion: Option<String>,
@@ -58,38 +58,39 @@ struct ExcludedRow {
     exclusion: String,
 }
 
-from_columns!(StandingRow { protocol, standing, exclusion });
+from_columns!(LabelStatusRow { protocol, standing, exclusion });
 from_columns!(ExcludedRow { id, protocol, excluded, exclusion });
 
-/// A structure that somebody named.
-struct Named {
+/// A structure named by the user.
+struct NamedStructure {
     structure: i64,
     id: String,
 }
 
 impl Store {
-    /// Takes the labels of structures out of the data set, of whatever protocol: nobody who asks for labels sees them until
-    /// [`Store::include`]. All of the structures or none; those whose labels are excluded already keep their reason. Structures are named as
-    /// [`Store::find_candidate`] takes them, or `import-N`. Leaves a line `exclude` in the operations log for each.
+    /// Excludes the labels of structures from the data set, under every protocol: readers of labels do not see them
+    /// until [`Store::include`]. Applies to all of the structures or to none; already excluded labels keep their
+    /// reason. Structures are named as for [`Store::find_candidate`], or `import-N`. Adds a line `exclude` to the
+    /// operations log for each.
     ///
     /// # Errors
-    /// [`StoreError::NoLabel`] for a structure without a label, and those of names that fit none or several.
+    /// [`StoreError::NoLabel`] for a structure without a label, and errors for names that fit none or several.
     pub async fn exclude(&self, ids: &[String], reason: &str, now: i64) -> Result<Vec<ExclusionChange>> {
-        self.change_standing(ids, Some(reason), now).await
+        self.change_status(ids, Some(reason), now).await
     }
 
-    /// Takes excluded labels in again. Leaves a line `include` in the operations log for each structure.
+    /// Includes excluded labels again. Adds a line `include` to the operations log for each structure.
     ///
     /// # Errors
     /// As [`Store::exclude`].
     pub async fn include(&self, ids: &[String], now: i64) -> Result<Vec<ExclusionChange>> {
-        self.change_standing(ids, None, now).await
+        self.change_status(ids, None, now).await
     }
 
-    /// Every excluded label, in the order in which they were excluded.
+    /// Every excluded label, in order of exclusion.
     pub async fn excluded(&self) -> Result<Vec<ExcludedLabel>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        if !is_known(&mut transaction).await? {
+        let mut transaction = self.database.begin_read().await?;
+        if !has_exclusion_columns(&mut transaction).await? {
             return Ok(Vec::new());
         }
         let rows: Vec<ExcludedRow> = query(ALL).fetch_all(&mut transaction).await?;
@@ -99,13 +100,13 @@ impl Store {
         Ok(excluded.collect())
     }
 
-    async fn change_standing(
+    async fn change_status(
         &self,
         ids: &[String],
         reason: Option<&str>,
         now: i64,
     ) -> Result<Vec<ExclusionChange>> {
-        let mut named: Vec<Named> = Vec::new();
+        let mut named: Vec<NamedStructure> = Vec::new();
         for id in ids {
             let found = self.named(id).await?;
             if named.iter().all(|other| other.structure != found.structure) {
@@ -114,7 +115,7 @@ impl Store {
         }
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
-        // Always in this order: two of these commands do not wait for each other.
+        // A fixed lock order, so that two of these commands do not deadlock.
         let mut structures: Vec<_> = named.iter().map(|named| named.structure).collect();
         structures.sort_unstable();
         for structure in structures {
@@ -129,34 +130,36 @@ impl Store {
         Ok(changes)
     }
 
-    /// The structure of that name.
-    async fn named(&self, id: &str) -> Result<Named> {
+    /// The structure with that name.
+    async fn named(&self, id: &str) -> Result<NamedStructure> {
         if let Some(number) = id.strip_prefix("import-") {
             let structure = match number.parse::<i64>() {
-                Ok(number) => query(OF_IMPORT).bind(number).fetch_optional(&self.database).await?,
+                Ok(number) => query(STRUCTURE_OF_IMPORT).bind(number).fetch_optional(&self.database).await?,
                 Err(_) => None,
             };
             let imported = self.imported_structures().await?;
             let structure = structure.ok_or(StoreError::UnknownImport { id: id.to_owned(), imported })?;
-            return Ok(Named { structure, id: id.to_owned() });
+            return Ok(NamedStructure { structure, id: id.to_owned() });
         }
         let found = self.find_candidate(id).await?;
-        let structure: i64 = query(OF_CANDIDATE).bind(found.decision).fetch_one(&self.database).await?;
+        let structure: i64 =
+            query(STRUCTURE_OF_CANDIDATE).bind(found.decision).fetch_one(&self.database).await?;
         if structure == 0 {
             return Err(StoreError::NoLabel { id: found.candidate, why: "it was declined".to_owned() });
         }
-        Ok(Named { structure, id: found.candidate })
+        Ok(NamedStructure { structure, id: found.candidate })
     }
 }
 
 /// Excludes the labels of a structure, or includes them without a `reason`.
 async fn change(
     transaction: &mut Transaction,
-    Named { structure, id }: Named,
+    NamedStructure { structure, id }: NamedStructure,
     reason: Option<&str>,
     now: i64,
 ) -> Result<ExclusionChange> {
-    let labels: Vec<StandingRow> = query(STANDING).bind(structure).fetch_all(&mut *transaction).await?;
+    let labels: Vec<LabelStatusRow> =
+        query(LABEL_STATUS).bind(structure).fetch_all(&mut *transaction).await?;
     let job = query(JOB).bind(structure).fetch_optional(&mut *transaction).await?;
     let job: Option<(i64, String)> = job;
     if labels.is_empty() {
@@ -183,24 +186,24 @@ async fn change(
     Ok(ExclusionChange { id, protocols, changed, excluded })
 }
 
-/// Whether the tables are not those of an earlier version, in which nothing is excluded.
-async fn is_known(transaction: &mut Transaction) -> Result<bool> {
+/// Whether the tables have the columns for exclusions; those of an earlier version do not.
+async fn has_exclusion_columns(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_column("label", "exclusion").await
 }
 
 /// Number of excluded labels.
 pub(super) async fn count(transaction: &mut Transaction) -> Result<u64> {
-    match is_known(transaction).await? {
+    match has_exclusion_columns(transaction).await? {
         true => query(COUNT).fetch_one(transaction).await,
         false => Ok(0),
     }
 }
 
-/// Why labels are excluded, by the number of their job.
+/// Reasons of exclusions, by job id.
 pub(super) async fn by_job(transaction: &mut Transaction) -> Result<BTreeMap<i64, String>> {
-    if !is_known(transaction).await? {
+    if !has_exclusion_columns(transaction).await? {
         return Ok(BTreeMap::new());
     }
-    let rows: Vec<(i64, String)> = query(OF_JOBS).fetch_all(transaction).await?;
+    let rows: Vec<(i64, String)> = query(EXCLUSIONS_BY_JOB).fetch_all(transaction).await?;
     Ok(rows.into_iter().collect())
 }

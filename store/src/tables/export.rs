@@ -1,4 +1,4 @@
-//! Labelled structures, page by page.
+//! Pages of labelled structures.
 
 use std::collections::HashSet;
 
@@ -11,7 +11,7 @@ use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_
 use crate::database::{FromRow, Row, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
-use crate::export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
+use crate::export::{ExportCursor, ExportFilter, ExportRow, ExportSource};
 
 pub(crate) const CANDIDATES: &str = concat!(
     "SELECT candidate.decision AS decision, original_checksum, block, original_grades, seed_structure.seed AS seed, ",
@@ -35,7 +35,7 @@ pub(crate) const CANDIDATES: &str = concat!(
     ORDER BY candidate.decision LIMIT $5"
 );
 
-/// Imported structures that are not rows of candidates already.
+/// Imported structures that are not exported as candidates.
 pub(crate) const IMPORTS: &str = concat!(
     "SELECT import.number AS place, ",
     joined!(import),
@@ -50,25 +50,25 @@ pub(crate) const IMPORTS: &str = concat!(
     ORDER BY import.number LIMIT $3"
 );
 
-/// Hashes of structures that were collected of biased walks and of controls.
+/// Hashes of structures collected from both biased and control walks.
 const OF_BOTH_ORIGINS: &str = "SELECT DISTINCT content FROM candidate WHERE origin = 'control'
     AND EXISTS (SELECT 1 FROM candidate other WHERE other.structure = candidate.structure AND other.origin = 'biased')";
 
 impl Store {
-    /// Structures that a biased walk and a control walk have both found: a control has the random numbers of its biased walk, and
-    /// is at the same place until the bias tells them apart. Such a structure has one label.
+    /// Structures found by both a biased walk and its control: the two share random numbers and agree until the
+    /// bias acts. Such a structure has one label.
     pub async fn structures_of_both_origins(&self) -> Result<HashSet<ContentHash>> {
         let hashes: Vec<Vec<u8>> = query(OF_BOTH_ORIGINS).fetch_all(&self.database).await?;
         hashes.iter().map(|hash| decode_hash(hash)).collect()
     }
 
-    /// At most `limit` labelled structures behind `after` (`None`: from the first on): candidates in decision order, then
-    /// imports as they came, whatever the order in which the labels came. An empty page is the end. What was dropped by
-    /// hand is left out.
+    /// At most `limit` labelled structures after `after` (`None`: from the first): candidates in decision order,
+    /// then imports in import order, independent of when labels arrived. Leaves out structures dropped by hand. An
+    /// empty page is the end.
     pub async fn labelled(
         &self,
         filter: &ExportFilter,
-        after: Option<ExportPlace>,
+        after: Option<ExportCursor>,
         limit: u32,
     ) -> Result<Vec<ExportRow>> {
         let name = query("SELECT name FROM protocol WHERE hash = $1").bind(filter.protocol.0.to_vec());
@@ -79,8 +79,8 @@ impl Store {
         let number: i64 = number.fetch_one(&self.database).await?;
         let (decision, last_import) = match after {
             None => (Some(0), 0),
-            Some(ExportPlace::Candidate(decision)) => (Some(decision), 0),
-            Some(ExportPlace::Import(import)) => (None, import),
+            Some(ExportCursor::Candidate(decision)) => (Some(decision), 0),
+            Some(ExportCursor::Import(import)) => (None, import),
         };
         let mut rows = Vec::new();
         if let Some(decision) = decision {
@@ -107,7 +107,7 @@ fn candidate(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<Ex
     ORIGINAL_GRADES.verify(row)?;
     let id: String = row.get("candidate__id")?;
     if row.get::<Vec<u8>>("candidate__content")? != row.get::<Vec<u8>>("structure__hash")? {
-        return Err(StoreError::damaged(format!("candidate {id}"), "its structure is another one"));
+        return Err(StoreError::damaged(format!("candidate {id}"), "its structure is a different one"));
     }
     let seed_structure_name = match row.get::<Option<i64>>("seed")? {
         None => String::new(),
@@ -125,24 +125,24 @@ fn candidate(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<Ex
         mixture_version_after: row.get("decision__mixture_version")?,
         original: grades(row.get::<Option<Vec<u8>>>("original_grades")?.as_deref())?,
     };
-    labelled(row, ExportPlace::Candidate(row.get("decision")?), source, protocol_name, protocol)
+    labelled(row, ExportCursor::Candidate(row.get("decision")?), source, protocol_name, protocol)
 }
 
 fn import(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
     IMPORT.verify(row, Names::Joined)?;
     let source = ExportSource::Import { file: row.get("import__file")?, frame: row.get("import__frame")? };
-    labelled(row, ExportPlace::Import(row.get("place")?), source, protocol_name, protocol)
+    labelled(row, ExportCursor::Import(row.get("place")?), source, protocol_name, protocol)
 }
 
 fn labelled(
     row: &Row,
-    place: ExportPlace,
+    cursor: ExportCursor,
     source: ExportSource,
     protocol_name: &str,
     protocol: ContentHash,
 ) -> Result<ExportRow> {
     Ok(ExportRow {
-        place,
+        cursor,
         source,
         structure: read_structure(row)?,
         label: LabelRow::from_row(row)?.into_record()?.label,

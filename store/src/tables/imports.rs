@@ -1,9 +1,9 @@
-//! Labelled structures that exist already.
+//! Import of labelled structures.
 
 use atoms::Structure;
 use wire::ContentHash;
 
-use super::commit::structure_number;
+use super::commit::structure_id;
 use super::labels::{add, check, finish_job};
 use super::protocols;
 use crate::Store;
@@ -11,25 +11,25 @@ use crate::checksum::IMPORT;
 use crate::database::{Transaction, query};
 use crate::encoding::{encode_vectors, integer};
 use crate::error::Result;
-use crate::jobs::{Imported, LabelSource, Standing};
+use crate::jobs::{ImportCounts, LabelSource, LabelStatus};
 use crate::records::Label;
 
 impl Store {
-    /// Takes in frames of `file` that are labelled by `protocol` (see [`Store::add_protocol`]), each with its number
-    /// in the file. Numbers that are there already are left as they are, so an import can be repeated; other numbers
-    /// for a structure that has a label become checks. A job that waits for one of the labels is done. All frames or none.
+    /// Imports frames of `file` labelled under `protocol` (see [`Store::add_protocol`]), each with its index in the
+    /// file. An import can be repeated: identical results stay as they are. Different results for a structure with
+    /// a label become checks. Jobs that wait for one of the labels are done. All frames are imported, or none.
     pub async fn import(
         &self,
         protocol: ContentHash,
         file: &str,
         frames: &[(u64, Structure, Label)],
         now: i64,
-    ) -> Result<Imported> {
+    ) -> Result<ImportCounts> {
         let mut transaction = self.database.begin().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
-        let mut imported = Imported::default();
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
+        let mut imported = ImportCounts::default();
         for (frame, structure, label) in frames {
-            let number = structure_number(&mut transaction, structure, ContentHash::of(structure)).await?;
+            let number = structure_id(&mut transaction, structure, ContentHash::of(structure)).await?;
             check(&mut transaction, number, label).await?;
             let sql = "INSERT INTO import (structure, file, frame, checksum) VALUES ($1, $2, $3, $4)
                        ON CONFLICT (structure) DO NOTHING";
@@ -41,7 +41,7 @@ impl Store {
             }
             let source = LabelSource::Import { file: file.to_owned(), frame: *frame };
             match add(&mut transaction, number, protocol, label, &source, now).await? {
-                Standing::Label => imported.labels += 1,
+                LabelStatus::Label => imported.labels += 1,
                 _ => imported.checks += 1,
             }
             finish_job(&mut transaction, number, protocol, now).await?;
@@ -51,7 +51,7 @@ impl Store {
     }
 }
 
-/// Whether the very same numbers are there, as label, check or superseded.
+/// Whether identical results are stored already, as label, check or superseded label.
 async fn is_known(
     transaction: &mut Transaction,
     structure: i64,

@@ -1,18 +1,18 @@
-//! Labels: the first valid result is the label, later ones are checks, and one that was asked for anew supersedes what was there.
-//! Nothing is overwritten. One that is excluded still is in the way of other results.
+//! Labels: the first valid result is the label, later results are checks, and a requested new label supersedes the
+//! old one. Nothing is overwritten. An excluded label still makes later results checks.
 
 use atoms::Vec3;
 use wire::ContentHash;
 
 use super::queue::{end_attempt, job_row};
-use super::relabel::standing;
+use super::relabel::status_of_result;
 use crate::Store;
 use crate::checksum::{LABEL, Names};
 use crate::database::{FromRow, Row, Transaction, query};
 use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
 use crate::error::{Result, StoreError};
 use crate::exclude::Exclusion;
-use crate::jobs::{Completed, LabelRecord, LabelSource, Standing, Superseded};
+use crate::jobs::{CompleteOutcome, LabelRecord, LabelSource, LabelStatus, Supersession};
 use crate::records::{Label, LabelDetails, Lease};
 
 /// Whether there is a label, excluded or not.
@@ -60,18 +60,19 @@ impl FromRow for LabelRow {
 }
 
 impl Store {
-    /// Brings the result of a leased job. The first valid one for structure and protocol is the label, whether or not
-    /// the lease still lasts; later ones are kept as checks. Where another was asked for ([`Store::relabel`]), the first of the
-    /// attempts that began since then is the label, and what was there is superseded. A job that was dropped or superseded
-    /// meanwhile stays so. Bringing the result of one attempt twice changes nothing.
+    /// Delivers the result of a leased job. The first valid result for structure and protocol becomes the label,
+    /// whether or not the lease is still held; later results are stored as checks. If a new label was requested
+    /// ([`Store::relabel`]), the first result of an attempt that began after the request becomes the label and
+    /// supersedes the old one. A job that was dropped or superseded meanwhile stays so. Delivering the result of an
+    /// attempt twice changes nothing.
     ///
     /// # Errors
-    /// [`StoreError::InvalidLabel`] for a wrong number of forces, or numbers that are not finite.
-    pub async fn complete(&self, lease: &Lease, label: &Label, now: i64) -> Result<Completed> {
+    /// [`StoreError::InvalidLabel`] for a wrong number of forces, or for numbers that are not finite.
+    pub async fn complete(&self, lease: &Lease, label: &Label, now: i64) -> Result<CompleteOutcome> {
         let mut transaction = self.database.begin().await?;
         let structure = query("SELECT structure FROM job WHERE number = $1").bind(lease.job);
         let structure: Option<i64> = structure.fetch_optional(&mut transaction).await?;
-        // First the structure, then its job: always in this order.
+        // Lock order: the structure first, then its job.
         if let Some(structure) = structure {
             check(&mut transaction, structure, label).await?;
         }
@@ -82,18 +83,18 @@ impl Store {
         let before = before.bind(lease.job).bind(lease.attempt).fetch_optional(&mut transaction).await?;
         let before: Option<String> = before;
         if let Some(standing) = before {
-            let check = standing == Standing::Check.name();
-            return Ok(if check { Completed::KeptAsCheck } else { Completed::Label });
+            let check = standing == LabelStatus::Check.name();
+            return Ok(if check { CompleteOutcome::KeptAsCheck } else { CompleteOutcome::Label });
         }
         let source = LabelSource::Attempt { job: lease.job, attempt: lease.attempt };
-        let standing = add(&mut transaction, job.structure, job.protocol, label, &source, now).await?;
-        let outcome = if standing == Standing::Label { "labelled" } else { "check" };
+        let status = add(&mut transaction, job.structure, job.protocol, label, &source, now).await?;
+        let outcome = if status == LabelStatus::Label { "labelled" } else { "check" };
         let sql = "UPDATE attempt SET ended = $1, outcome = $2 WHERE job = $3 AND attempt = $4";
         let query = query(sql).bind(now).bind(outcome).bind(lease.job).bind(lease.attempt);
         query.execute(&mut transaction).await?;
         finish_job(&mut transaction, job.structure, job.protocol, now).await?;
         transaction.commit().await?;
-        Ok(if standing == Standing::Label { Completed::Label } else { Completed::KeptAsCheck })
+        Ok(if status == LabelStatus::Label { CompleteOutcome::Label } else { CompleteOutcome::KeptAsCheck })
     }
 
     /// Every label and check of a structure under a protocol, oldest first.
@@ -112,8 +113,8 @@ impl Store {
     }
 }
 
-/// Whether the label can be one of that structure. Until the end of the transaction nobody else adds a label or a job for
-/// the structure.
+/// Checks that the label fits the structure. Locks the structure: until the end of the transaction, no other label
+/// or job is added for it.
 pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: &Label) -> Result<()> {
     let atoms = query("SELECT atoms FROM structure WHERE number = $1").bind(structure);
     let atoms: u64 = atoms.locked().fetch_one(&mut *transaction).await?;
@@ -128,7 +129,7 @@ pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: 
     if label.forces.iter().chain(stress).flatten().any(|x| !x.is_finite()) {
         return invalid("forces or stress have entries that are not finite".into());
     }
-    // JSON knows no others, and they would come back as none.
+    // JSON cannot represent them; they would be read back as null.
     let LabelDetails { energy_without_smearing, magnetic_moments, magnetisation, .. } = &label.details;
     let details =
         energy_without_smearing.iter().chain(magnetisation).chain(magnetic_moments.iter().flatten());
@@ -138,7 +139,7 @@ pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: 
     Ok(())
 }
 
-/// Adds a result: the label if there is none or another was asked for, otherwise a check.
+/// Adds a result: the label if there is none or a new one was requested, otherwise a check.
 pub(super) async fn add(
     transaction: &mut Transaction,
     structure: i64,
@@ -146,8 +147,8 @@ pub(super) async fn add(
     label: &Label,
     source: &LabelSource,
     now: i64,
-) -> Result<Standing> {
-    let standing = standing(transaction, structure, protocol, source, now).await?;
+) -> Result<LabelStatus> {
+    let status = status_of_result(transaction, structure, protocol, source, now).await?;
     let (mut job, mut attempt, mut file, mut frame) = (None, None, None, None);
     match source {
         LabelSource::Attempt { job: j, attempt: a } => (job, attempt) = (Some(*j), Some(*a)),
@@ -172,12 +173,12 @@ pub(super) async fn add(
         now.into(),
         encode_details(&label.details).into(),
     ];
-    let insert = query(sql).bind_all(LABEL.with_checksum(row)).bind(standing.name());
+    let insert = query(sql).bind_all(LABEL.with_checksum(row)).bind(status.name());
     insert.execute(&mut *transaction).await?;
-    Ok(standing)
+    Ok(status)
 }
 
-/// The structure has its label: its job, if it has one that was not dropped and waits for no other label, is done.
+/// Marks the structure's job as done, unless it was dropped or waits for another label.
 pub(super) async fn finish_job(
     transaction: &mut Transaction,
     structure: i64,
@@ -195,9 +196,9 @@ pub(super) async fn finish_job(
 }
 
 impl LabelRow {
-    /// None for an unknown standing.
-    pub(super) fn standing_and_energy(&self) -> Option<(Standing, f64)> {
-        Some((Standing::named(&self.standing)?, self.energy))
+    /// `None` for an unknown status.
+    pub(super) fn status_and_energy(&self) -> Option<(LabelStatus, f64)> {
+        Some((LabelStatus::named(&self.standing)?, self.energy))
     }
 
     /// Forces, [n], eV/Å.
@@ -207,21 +208,21 @@ impl LabelRow {
     }
 
     pub(super) fn into_record(self) -> Result<LabelRecord> {
-        let unknown = || StoreError::damaged("a label", "unknown standing or source");
-        let standing = Standing::named(&self.standing).ok_or_else(unknown)?;
+        let unknown = || StoreError::damaged("a label", "unknown status or source");
+        let status = LabelStatus::named(&self.standing).ok_or_else(unknown)?;
         let source = match (self.job, self.attempt, self.file, self.frame) {
             (Some(job), Some(attempt), None, None) => LabelSource::Attempt { job, attempt },
             (None, None, Some(file), Some(frame)) => LabelSource::Import { file, frame },
             _ => return Err(unknown()),
         };
         let label = decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref())?;
-        let superseded = self.superseded.zip(self.reason).map(|(time, reason)| Superseded { time, reason });
+        let superseded = self.superseded.zip(self.reason).map(|(time, reason)| Supersession { time, reason });
         let excluded = self.excluded.zip(self.exclusion).map(|(time, reason)| Exclusion { time, reason });
-        Ok(LabelRecord { standing, label, source, received: self.received, superseded, excluded })
+        Ok(LabelRecord { status, label, source, received: self.received, superseded, excluded })
     }
 }
 
-/// A label from its columns.
+/// Decodes a label from its columns.
 pub(crate) fn decode_label(
     energy: f64,
     forces: &[u8],

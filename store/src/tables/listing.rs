@@ -1,11 +1,12 @@
-//! Pages of the table of candidates. Each goes through an index from its first row on, however many rows there are.
+//! Pages of the candidate table. Each query reads an index from the first row of the page, so its cost does not
+//! depend on the number of rows.
 
 use super::labels::LabelRow;
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, Names, joined};
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
-use crate::listing::{ListOrder, ListPlace, ListedCandidate};
+use crate::listing::{ListCursor, ListOrder, ListedCandidate};
 use crate::records::{JobState, Label};
 
 impl FromRow for ListedCandidate {
@@ -94,7 +95,7 @@ pub(crate) const LARGEST_GAMMA: &str = page!(
     "original_gamma DESC, candidate.decision DESC",
     "$3"
 );
-pub(crate) const LEAST_GAMMA: &str =
+pub(crate) const SMALLEST_GAMMA: &str =
     page!("(original_gamma, candidate.decision) > ($1, $2)", "original_gamma, candidate.decision", "$3");
 
 pub(crate) const LARGEST_VOLUME: &str = page!(
@@ -102,13 +103,13 @@ pub(crate) const LARGEST_VOLUME: &str = page!(
     "relative_volume DESC, candidate.decision DESC",
     "$3"
 );
-pub(crate) const LEAST_VOLUME: &str =
+pub(crate) const SMALLEST_VOLUME: &str =
     page!("(relative_volume, candidate.decision) > ($1, $2)", "relative_volume, candidate.decision", "$3");
 
-/// Of one walk, in the order of their names.
+/// Candidates of a walk, ordered by name.
 pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2");
 
-/// The jobs are found in the index, and only those of the page are looked at.
+/// The index gives the jobs; only those of the page are read.
 pub(crate) const QUEUE: &str = lines!(
     "FROM (SELECT number AS place FROM job WHERE state = $1 AND priority <= $2
               AND (priority < $2 OR decision > $3) ORDER BY priority DESC, decision LIMIT $4) AS page
@@ -122,27 +123,27 @@ pub(crate) const QUEUE: &str = lines!(
 );
 
 impl Store {
-    /// At most `limit` candidates behind a place (none: from the first on), the largest first if `descending`.
+    /// At most `limit` candidates after a cursor (`None`: from the first), in descending order if `descending`.
     pub async fn list_candidates(
         &self,
         order: ListOrder,
         descending: bool,
-        after: Option<ListPlace>,
+        after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>> {
-        let ListPlace { value, decision } = after.unwrap_or(first(descending));
+        let ListCursor { value, decision } = after.unwrap_or(first(descending));
         let query = match (order, descending) {
             (ListOrder::Decision, true) => query(NEWEST),
             (ListOrder::Decision, false) => query(OLDEST),
             (ListOrder::Gamma, true) => query(LARGEST_GAMMA).bind(value),
-            (ListOrder::Gamma, false) => query(LEAST_GAMMA).bind(value),
+            (ListOrder::Gamma, false) => query(SMALLEST_GAMMA).bind(value),
             (ListOrder::Volume, true) => query(LARGEST_VOLUME).bind(value),
-            (ListOrder::Volume, false) => query(LEAST_VOLUME).bind(value),
+            (ListOrder::Volume, false) => query(SMALLEST_VOLUME).bind(value),
         };
         query.bind(decision).bind(limit).fetch_all(&self.database).await
     }
 
-    /// The same in the order of decisions, only those of this origin and fate; `reason` belongs to `declined`.
+    /// The same in decision order, for one origin and fate. `reason` belongs to `declined`.
     pub async fn list_fate(
         &self,
         origin: &str,
@@ -157,7 +158,8 @@ impl Store {
         query.bind(reason).bind(limit).fetch_all(&self.database).await
     }
 
-    /// Those whose jobs are in a state, in the order in which they would be leased. `after`: priority and decision.
+    /// Candidates whose jobs have a state, in the order in which they would be leased. `after` holds priority and
+    /// decision.
     pub async fn list_queue(
         &self,
         state: JobState,
@@ -169,7 +171,7 @@ impl Store {
         query.bind(limit).fetch_all(&self.database).await
     }
 
-    /// Candidates of a walk in the order of its steps; of walks that offered more than `limit`, some.
+    /// Candidates of a walk, ordered by step. Returns only some if the walk has more than `limit`.
     pub async fn list_walk(&self, walk: u32, limit: u32) -> Result<Vec<ListedCandidate>> {
         let campaign = self.campaign_value("id").await?;
         let begin = format!("{}-{walk}.", campaign.get(..8).unwrap_or_default());
@@ -181,9 +183,9 @@ impl Store {
 }
 
 /// Before everything.
-fn first(descending: bool) -> ListPlace {
+fn first(descending: bool) -> ListCursor {
     match descending {
-        true => ListPlace { value: f64::MAX, decision: i64::MAX },
-        false => ListPlace { value: f64::MIN, decision: 0 },
+        true => ListCursor { value: f64::MAX, decision: i64::MAX },
+        false => ListCursor { value: f64::MIN, decision: 0 },
     }
 }

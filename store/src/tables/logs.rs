@@ -1,4 +1,5 @@
-//! The decision log, the same bytes for two runs of one campaign, and the operations log, which is not.
+//! The decision log, which is identical for two runs of a reproducible campaign, and the operations log, which is
+//! not.
 
 use std::fmt::Write;
 use std::ops::RangeInclusive;
@@ -40,7 +41,7 @@ impl FromRow for Row {
 }
 
 impl Store {
-    /// The decisions with numbers (from 1) in `range`, in order.
+    /// Decisions with sequence numbers (from 1) in `range`, in order.
     pub async fn decisions(&self, range: RangeInclusive<i64>) -> Result<Vec<LoggedDecision>> {
         let decision = |row: Row| {
             let detail = serde_json::from_str(&row.detail);
@@ -57,8 +58,8 @@ impl Store {
         query.fetch_all(&self.database).await
     }
 
-    /// The whole decision log, one JSON object a line, keys in a fixed order: equal for two runs of a campaign in
-    /// reproducible mode, byte by byte.
+    /// The whole decision log, one JSON object per line with keys in a fixed order. Byte-identical for two runs of
+    /// a campaign in reproducible mode.
     pub async fn decision_log_text(&self) -> Result<String> {
         let mut text = String::new();
         for first in (1..).step_by(PAGE) {
@@ -71,14 +72,14 @@ impl Store {
         Ok(text)
     }
 
-    /// Adds a line to the operations log. What `kind` is, is up to the caller; `detail` is a JSON object.
+    /// Adds a line to the operations log. The caller chooses `kind`; `detail` is a JSON object.
     pub async fn log_operation(&self, now: i64, kind: &str, detail: &Value) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         insert_operation(&mut transaction, now, kind, detail).await?;
         transaction.commit().await
     }
 
-    /// At most `limit` lines of the operations log after number `after`, in order.
+    /// At most `limit` lines of the operations log after line `after`, in order.
     pub async fn operations(&self, after: i64, limit: u32) -> Result<Vec<Operation>> {
         let sql =
             "SELECT number, time, kind, detail FROM operation WHERE number > $1 ORDER BY number LIMIT $2";

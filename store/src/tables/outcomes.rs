@@ -1,4 +1,4 @@
-//! What became of label jobs: what the cost model, `status` and the table of force errors read.
+//! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
 use wire::ContentHash;
 
@@ -8,20 +8,20 @@ use crate::Store;
 use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
-use crate::outcomes::{FailureCount, Finished, LabelCost, Range, Unlabelled, Work};
+use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
 
-/// The newest first: what labels cost may change with the machine.
+/// The newest first: the cost of labels may change with the machine.
 pub(crate) const COSTS: &str =
     "SELECT attempt.*, candidate.seed_structure, candidate.formula, candidate.atoms AS size
     FROM label CROSS JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
     CROSS JOIN job ON job.number = label.job CROSS JOIN candidate ON candidate.decision = job.decision
     WHERE label.protocol = $1 ORDER BY label.number DESC LIMIT $2";
 
-pub(crate) const AT_WORK: &str =
+pub(crate) const CORES_IN_USE: &str =
     "SELECT attempt.* FROM job CROSS JOIN attempt ON attempt.job = job.number AND attempt.attempt = job.attempts
     WHERE job.state = 'leased'";
 
-pub(crate) const CLASSES: &str = "SELECT class,
+pub(crate) const FAILURE_CLASSES: &str = "SELECT class,
         count(DISTINCT CASE WHEN state = 'labelled' THEN job.number END),
         count(DISTINCT CASE WHEN state = 'failed' THEN job.number END),
         count(DISTINCT CASE WHEN state IN ('queued', 'leased') THEN job.number END)
@@ -48,7 +48,7 @@ pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, for
     HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
     ORDER BY candidate.seed_structure, formula";
 
-/// The same without ranges of what is labelled.
+/// The same, without the ranges of labelled structures.
 const FAILED: &str = "SELECT coalesce(name, '') AS seed_name, candidate.formula AS formula, count(*) AS failed,
         (SELECT CAST(coalesce(sum(job_count.number), 0) AS BIGINT) FROM job_count
          WHERE job_count.protocol = $1 AND job_count.state = 'labelled'
@@ -84,27 +84,27 @@ pub(crate) const FINISHED: &str = concat!(
     ORDER BY candidate.decision LIMIT $3"
 );
 
-/// A label takes some time, whatever the clock says.
-const LEAST_MILLISECONDS: i64 = 1;
+/// Minimum duration of a label, whatever the clock says.
+const MIN_MILLISECONDS: i64 = 1;
 
 impl Store {
-    /// What the newest labels took that were made by this protocol, `limit` at most.
+    /// Costs of the newest labels made under this protocol, at most `limit`.
     pub async fn label_costs(&self, protocol: ContentHash, limit: u32) -> Result<Vec<LabelCost>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let mut transaction = self.database.begin_read().await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let costs = query(COSTS).bind(protocol).bind(limit).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         Ok(costs)
     }
 
-    /// What attempts have used, and how many cores are at work now.
-    pub async fn label_work(&self) -> Result<Work> {
-        let mut transaction = self.database.begin_to_read().await?;
+    /// Resources used by attempts so far, and cores in use now.
+    pub async fn label_usage(&self) -> Result<LabelUsage> {
+        let mut transaction = self.database.begin_read().await?;
         let kept =
             "SELECT key, value FROM campaign WHERE key IN ('core_milliseconds', 'label_core_milliseconds')";
         let kept: Vec<(String, String)> = query(kept).fetch_all(&mut transaction).await?;
         let mut cores = 0;
-        for row in query(AT_WORK).rows(&mut transaction).await? {
+        for row in query(CORES_IN_USE).rows(&mut transaction).await? {
             cores += row.get_or_default::<Option<u64>>("cores")?.unwrap_or(1);
         }
         transaction.commit().await?;
@@ -113,38 +113,43 @@ impl Store {
             Some(milliseconds.parse::<f64>().ok()? / 1000.0)
         };
         let label_core_seconds = seconds("label_core_milliseconds");
-        Ok(Work { core_seconds: seconds("core_milliseconds"), label_core_seconds, cores })
+        Ok(LabelUsage { core_seconds: seconds("core_milliseconds"), label_core_seconds, cores })
     }
 
-    /// The failures that attempts of this protocol met, by class.
+    /// Failures of attempts under this protocol, by class.
     pub async fn failures(&self, protocol: ContentHash) -> Result<Vec<FailureCount>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let mut transaction = self.database.begin_read().await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let rows: Vec<(String, u64, u64, u64)> =
-            query(CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
+            query(FAILURE_CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let count =
             |(class, labelled, given_up, unfinished)| FailureCount { class, labelled, given_up, unfinished };
         Ok(rows.into_iter().map(count).collect())
     }
 
-    /// What is unlabelled because labels of this protocol finally failed, by seed structure and formula. Without `ranges` of
-    /// those that have their labels no more rows are read than failed.
+    /// Structures without a label because labelling under this protocol failed, by seed structure and formula.
+    /// Without `ranges` of the labelled ones, this reads only as many rows as there are failures.
     pub async fn unlabelled(&self, protocol: ContentHash, ranges: bool) -> Result<Vec<Unlabelled>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
-        let ranges = ranges || !job_counts::are_kept(&mut transaction).await?;
+        let mut transaction = self.database.begin_read().await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
+        let ranges = ranges || !job_counts::have_counts(&mut transaction).await?;
         let sql = if ranges { UNLABELLED } else { FAILED };
         let rows = query(sql).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         Ok(rows)
     }
 
-    /// At most `limit` candidates whose jobs of this protocol have come to their ends, labelled or failed, behind the decision
-    /// `after` (0: from the first on). An empty page is the end.
-    pub async fn finished(&self, protocol: ContentHash, after: i64, limit: u32) -> Result<Vec<Finished>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+    /// At most `limit` candidates with finished jobs (labelled or failed) under this protocol, after decision
+    /// `after` (0: from the first). An empty page is the end.
+    pub async fn finished(
+        &self,
+        protocol: ContentHash,
+        after: i64,
+        limit: u32,
+    ) -> Result<Vec<FinishedCandidate>> {
+        let mut transaction = self.database.begin_read().await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let page = query(FINISHED).bind(after).bind(protocol).bind(limit);
         let page = page.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
@@ -156,7 +161,7 @@ impl FromRow for LabelCost {
     fn from_row(row: &Row) -> Result<Self> {
         let (started, ended): (i64, Option<i64>) = (row.get("started")?, row.get("ended")?);
         let cores = row.get_or_default::<Option<u32>>("cores")?.unwrap_or(1);
-        let milliseconds = ended.unwrap_or(started).saturating_sub(started).max(LEAST_MILLISECONDS);
+        let milliseconds = ended.unwrap_or(started).saturating_sub(started).max(MIN_MILLISECONDS);
         let by_the_clock = milliseconds as f64 / 1000.0 * f64::from(cores);
         Ok(Self {
             seed_structure: row.get("seed_structure")?,
@@ -171,7 +176,8 @@ impl FromRow for LabelCost {
 
 impl FromRow for Unlabelled {
     fn from_row(row: &Row) -> Result<Self> {
-        let range = |low, high| -> Result<Range> { Ok(Range { low: row.get(low)?, high: row.get(high)? }) };
+        let range =
+            |low, high| -> Result<ValueRange> { Ok(ValueRange { low: row.get(low)?, high: row.get(high)? }) };
         Ok(Self {
             seed_structure: row.get("seed_name")?,
             formula: row.get("formula")?,
@@ -185,7 +191,7 @@ impl FromRow for Unlabelled {
     }
 }
 
-impl FromRow for Finished {
+impl FromRow for FinishedCandidate {
     fn from_row(row: &Row) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         let labelled = row.get::<String>("job_state")? == "labelled";

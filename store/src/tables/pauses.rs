@@ -1,4 +1,4 @@
-//! Walks that people have paused: a request that stands in the database, and that whoever runs the campaign obeys.
+//! Walks paused by the user: a request in the database that the run obeys.
 
 use std::collections::BTreeSet;
 
@@ -11,33 +11,33 @@ use crate::Store;
 use crate::database::{Transaction, query};
 use crate::error::{Result, StoreError};
 
-/// Under which name the campaign has the list of them.
+/// The campaign key of the list.
 const KEY: &str = "paused_walks";
 
 const SELECT: &str = "SELECT value FROM campaign WHERE key = $1";
 
 impl Store {
-    /// Walks that get no turn until somebody resumes them.
+    /// Walks that get no assignments until they are resumed.
     pub async fn paused_walks(&self) -> Result<BTreeSet<WalkId>> {
         let found: Option<String> = query(SELECT).bind(KEY).fetch_optional(&self.database).await?;
         decode(found)
     }
 
     /// Walks that have more steps to make.
-    pub async fn walks_under_way(&self) -> Result<Vec<WalkId>> {
+    pub async fn active_walks(&self) -> Result<Vec<WalkId>> {
         let sql = "SELECT walk FROM walk WHERE state IN ('waiting', 'running') ORDER BY walk";
         let walks: Vec<u32> = query(sql).fetch_all(&self.database).await?;
         Ok(walks.into_iter().map(WalkId).collect())
     }
 
-    /// Asks that these walks get no turn until they are resumed, or that they get turns again. Each change leaves a line in the
-    /// operations log; what is so already is none. Returns the walks that were changed.
+    /// Pauses or resumes walks: paused walks get no assignments. Adds a line to the operations log for each change;
+    /// walks already in that state do not change. Returns the changed walks.
     ///
     /// # Errors
-    /// [`StoreError::UnknownWalk`]; [`StoreError::EndedWalk`] if it is to be paused. Nothing is changed then.
+    /// [`StoreError::UnknownWalk`], or [`StoreError::EndedWalk`] when pausing. Nothing is changed then.
     pub async fn pause_walks(&self, walks: &[WalkId], paused: bool, now: i64) -> Result<Vec<WalkId>> {
         let mut transaction = self.database.begin().await?;
-        // So that there is a row to lock.
+        // Ensures that there is a row to lock.
         let sql = "INSERT INTO campaign (key, value) VALUES ($1, '[]') ON CONFLICT (key) DO NOTHING";
         query(sql).bind(KEY).execute(&mut transaction).await?;
         let found = query(SELECT).bind(KEY).locked().fetch_optional(&mut transaction).await?;
@@ -57,7 +57,7 @@ impl Store {
     }
 }
 
-/// Whether it is there, and may be paused.
+/// Checks that the walk exists and may be paused.
 async fn check(transaction: &mut Transaction, walk: WalkId, paused: bool) -> Result<()> {
     let state = query("SELECT state FROM walk WHERE walk = $1").bind(walk.0);
     let state: Option<String> = state.fetch_optional(&mut *transaction).await?;
@@ -72,7 +72,7 @@ async fn check(transaction: &mut Transaction, walk: WalkId, paused: bool) -> Res
     }
 }
 
-/// The same as [`Store::paused_walks`], in a transaction.
+/// [`Store::paused_walks`] in a transaction.
 pub(super) async fn read(transaction: &mut Transaction) -> Result<BTreeSet<WalkId>> {
     decode(query(SELECT).bind(KEY).fetch_optional(transaction).await?)
 }

@@ -1,9 +1,9 @@
-//! The processes of a campaign, and what comes back of those that are gone.
+//! Processes of a campaign, and the leases of dead ones.
 
 use serde_json::json;
 
 use super::logs::insert_operation;
-use super::queue::{InVain, end_in_vain};
+use super::queue::{AttemptEnd, end_without_label};
 use crate::Store;
 use crate::database::{Query, Transaction, query};
 use crate::error::Result;
@@ -13,14 +13,14 @@ pub(crate) const LEASED: &str = "SELECT number, holder FROM job WHERE state = 'l
 
 const PROCESSES: &str = "SELECT * FROM process WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
 
-/// The same on a server, which knows how long each has been silent.
+/// The same on a server, which knows how long each process has been silent.
 const PROCESSES_WITH_SILENCE: &str = "SELECT process.*, server_clock() - heard AS silence FROM process
     WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
 
 impl Store {
-    /// The processes of a kind, or all, in the order in which they started.
+    /// Processes of a kind, or all, ordered by start.
     pub async fn processes(&self, kind: Option<&str>) -> Result<Vec<ProcessRecord>> {
-        of_kind(kind, self.database.has_a_clock()).fetch_all(&self.database).await
+        select_kind(kind, self.database.has_clock()).fetch_all(&self.database).await
     }
 
     /// See [`Self::upsert_processes`].
@@ -28,9 +28,8 @@ impl Store {
         self.upsert_processes(std::slice::from_ref(process)).await
     }
 
-    /// Says that these processes work for the campaign, or how they are now. Each takes the place of those of its
-    /// kind and number that are gone. A predecessor that still lives keeps its record, since its leases count
-    /// for as long as it has one.
+    /// Registers these processes or updates their records. Each replaces dead processes of its kind and number. A
+    /// predecessor that is alive keeps its record, since its leases count only as long as it has one.
     pub async fn upsert_processes(&self, processes: &[ProcessRecord]) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let known = all(&mut transaction).await?;
@@ -38,7 +37,7 @@ impl Store {
             let place = |record: &ProcessRecord| (record.kind.clone(), record.number);
             let others =
                 known.iter().filter(|other| other.id != process.id && place(other) == place(process));
-            for other in others.filter(|other| other.is_gone()) {
+            for other in others.filter(|other| other.is_dead()) {
                 remove(&mut transaction, &other.id).await?;
             }
             insert(&mut transaction, process).await?;
@@ -46,7 +45,7 @@ impl Store {
         transaction.commit().await
     }
 
-    /// A process ended in order. With an orchestrator go the walkers that it started.
+    /// Removes a process that ended in order. With an orchestrator, its walkers are removed as well.
     pub async fn remove_process(&self, id: &str) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let sql = "DELETE FROM process WHERE kind = 'walker'
@@ -56,33 +55,32 @@ impl Store {
         transaction.commit().await
     }
 
-    /// Takes back the leases whose holders are gone, or are no processes of this campaign at all: a process has its
-    /// record before it leases anything, and only one that is gone loses it. Does not count as failed attempts.
-    /// Returns their number.
-    pub async fn release_leases_of_gone_processes(&self, now: i64) -> Result<usize> {
+    /// Releases leases whose holders are dead or not registered: a process is registered before it leases anything,
+    /// and only a dead one loses its record. Does not count as failed attempts. Returns their number.
+    pub async fn release_leases_of_dead_processes(&self, now: i64) -> Result<usize> {
         let mut transaction = self.database.begin().await?;
         let leased = leased(&mut transaction).await?;
         let mut living = all(&mut transaction).await?;
-        living.retain(|process| !process.is_gone());
-        let released = release_all_but_of(&living, leased, &mut transaction, now).await?;
+        living.retain(|process| !process.is_dead());
+        let released = release_all_except(&living, leased, &mut transaction, now).await?;
         transaction.commit().await?;
         Ok(released)
     }
 
-    /// What a process does that begins to run the campaign: it holds the [`crate::CampaignLock`], and is not among the
-    /// processes yet. So none of them works for the campaign any longer but labellers that live on. The records of all
-    /// others are removed, and what they had leased comes back, see [`Self::release_leases_of_gone_processes`].
-    /// Returns the number of leases that came back.
-    pub async fn take_over(&self, now: i64) -> Result<usize> {
-        let mut transaction = self.database.begin_to_lead().await?;
+    /// Reclaims leases at the start of a run. The caller holds the [`crate::CampaignLock`] and is not registered
+    /// yet, so no registered process works for the campaign, except labellers that are alive. Removes the records
+    /// of all others and releases their leases, see [`Self::release_leases_of_dead_processes`]. Returns the number
+    /// of leases released.
+    pub async fn reclaim_leases(&self, now: i64) -> Result<usize> {
+        let mut transaction = self.database.begin_as_leader().await?;
         let leased = leased(&mut transaction).await?;
         let lives_on =
-            |process: &ProcessRecord| process.kind == ProcessRecord::LABELLER && !process.is_gone();
+            |process: &ProcessRecord| process.kind == ProcessRecord::LABELLER && !process.is_dead();
         let (living, gone): (Vec<_>, Vec<_>) = all(&mut transaction).await?.into_iter().partition(lives_on);
         for process in &gone {
             remove(&mut transaction, &process.id).await?;
         }
-        let leases = release_all_but_of(&living, leased, &mut transaction, now).await?;
+        let leases = release_all_except(&living, leased, &mut transaction, now).await?;
         let lost = gone.iter().filter(|process| process.kind != ProcessRecord::WALKER);
         let lost: Vec<_> = lost.map(|process| process.id.as_str()).collect();
         if leases > 0 || !lost.is_empty() {
@@ -96,11 +94,11 @@ impl Store {
 
 /// Every process.
 pub(crate) async fn all(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
-    of_kind(None, transaction.has_a_clock()).fetch_all(transaction).await
+    select_kind(None, transaction.has_clock()).fetch_all(transaction).await
 }
 
-fn of_kind(kind: Option<&str>, has_a_clock: bool) -> Query {
-    query(if has_a_clock { PROCESSES_WITH_SILENCE } else { PROCESSES }).bind(kind)
+fn select_kind(kind: Option<&str>, has_clock: bool) -> Query {
+    query(if has_clock { PROCESSES_WITH_SILENCE } else { PROCESSES }).bind(kind)
 }
 
 async fn insert(transaction: &mut Transaction, process: &ProcessRecord) -> Result<()> {
@@ -110,7 +108,7 @@ async fn insert(transaction: &mut Transaction, process: &ProcessRecord) -> Resul
         ON CONFLICT (id) DO UPDATE SET kind = $2, number = $3, pid = $4, birth = $5, host = $6, started = $7,
             last_seen = $8, state = $9, restarts = $10, setup = $11, remark = $12";
     let query = query(sql).bind(&process.id).bind(&process.kind).bind(process.number);
-    let query = query.bind(process.pid).bind(&process.birth).bind(&process.host);
+    let query = query.bind(process.pid).bind(&process.start_time).bind(&process.host);
     let query = query.bind(process.started).bind(process.last_seen).bind(&process.state);
     let query = query.bind(process.restarts).bind(process.setup.as_deref()).bind(&process.remark);
     query.execute(&mut *transaction).await?;
@@ -122,12 +120,12 @@ async fn remove(transaction: &mut Transaction, id: &str) -> Result<()> {
     Ok(())
 }
 
-/// Every lease, before anybody asks for processes: who leases something has its record already.
+/// Reads leases before processes: a holder is registered before it leases anything.
 async fn leased(transaction: &mut Transaction) -> Result<Vec<(i64, String)>> {
     query(LEASED).locked().fetch_all(transaction).await
 }
 
-async fn release_all_but_of(
+async fn release_all_except(
     living: &[ProcessRecord],
     leased: Vec<(i64, String)>,
     transaction: &mut Transaction,
@@ -137,7 +135,7 @@ async fn release_all_but_of(
     let is_lost = |holder: &str| !living.iter().any(|process| process.is_holder(holder));
     let lost: Vec<_> = leased.iter().filter(|(_, holder)| is_lost(holder)).collect();
     for (job, _) in &lost {
-        end_in_vain(transaction, *job, InVain::Lost("lost"), now).await?;
+        end_without_label(transaction, *job, AttemptEnd::Lost("lost"), now).await?;
     }
     Ok(lost.len())
 }

@@ -1,9 +1,9 @@
-//! The campaign itself, its seed structures, and the protocols of its labels.
+//! The campaign's properties, seed structures and label protocols.
 
 use wire::ContentHash;
 
 use super::checksums::CAMPAIGN_KEYS;
-use super::commit::{enqueue, structure_number};
+use super::commit::{enqueue, structure_id};
 use super::logs::insert_operation;
 use crate::Store;
 use crate::checksum::{CAMPAIGN, Names, PROTOCOL, SEED_STRUCTURE, joined};
@@ -12,10 +12,10 @@ use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::records::{Campaign, Protocol, SeedStructure};
 
-/// Priority of jobs that are made later than their candidate.
+/// Priority of jobs added later than their candidate.
 const LATE_PRIORITY: i32 = 0;
 
-macro_rules! seeds {
+macro_rules! seed_structures {
     ($rest:literal) => {
         concat!(
             "SELECT ",
@@ -40,14 +40,14 @@ impl FromRow for SeedStructure {
     }
 }
 
-/// What a database begins with.
+/// Writes the initial rows of a database.
 pub(crate) async fn write_campaign(
     database: &Database,
     campaign: &Campaign,
-    seeds: &[SeedStructure],
+    seed_structures: &[SeedStructure],
     now: i64,
 ) -> Result<()> {
-    let mut transaction = database.begin_to_lead().await?;
+    let mut transaction = database.begin_as_leader().await?;
     for (key, value) in [
         ("id", campaign.id.to_string().as_str()),
         ("program_version", &campaign.program_version),
@@ -58,8 +58,8 @@ pub(crate) async fn write_campaign(
     ] {
         set_campaign_value(&mut transaction, key, value).await?;
     }
-    for seed in seeds {
-        insert_seed_structure(&mut transaction, seed).await?;
+    for seed_structure in seed_structures {
+        insert_seed_structure(&mut transaction, seed_structure).await?;
     }
     let detail = serde_json::json!({ "program_version": campaign.program_version });
     insert_operation(&mut transaction, now, "created", &detail).await?;
@@ -67,7 +67,7 @@ pub(crate) async fn write_campaign(
 }
 
 impl Store {
-    /// What the campaign is.
+    /// The properties of the campaign.
     pub async fn campaign(&self) -> Result<Campaign> {
         let id = self.campaign_value("id").await?;
         Ok(Campaign {
@@ -90,15 +90,15 @@ impl Store {
         row.get("value")
     }
 
-    /// From now on the campaign runs by another configuration (JSON). Each of the changes (JSON objects) that make it
-    /// another gets a line `configuration` in the operations log.
+    /// Changes the configuration in force (JSON). Adds a line `configuration` to the operations log for each of the
+    /// changes (JSON objects).
     pub async fn set_configuration_in_force(
         &self,
         configuration: &str,
         changes: &[serde_json::Value],
         now: i64,
     ) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, "configuration_in_force", configuration).await?;
         for change in changes {
             insert_operation(&mut transaction, now, "configuration", change).await?;
@@ -106,33 +106,33 @@ impl Store {
         transaction.commit().await
     }
 
-    /// What the leader of the campaign last left for others under that name.
-    pub async fn note(&self, name: &str) -> Result<Option<String>> {
+    /// Metadata that the leader of the campaign stored under that name.
+    pub async fn metadata(&self, name: &str) -> Result<Option<String>> {
         let note = query("SELECT value FROM campaign WHERE key = $1").bind(format!("note/{name}"));
         note.fetch_optional(&self.database).await
     }
 
-    /// Leaves something for others.
-    pub async fn leave_note(&self, name: &str, note: &str) -> Result<()> {
-        if self.note(name).await?.as_deref() == Some(note) {
+    /// Stores metadata for other processes.
+    pub async fn set_metadata(&self, name: &str, note: &str) -> Result<()> {
+        if self.metadata(name).await?.as_deref() == Some(note) {
             return Ok(());
         }
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, &format!("note/{name}"), note).await?;
         transaction.commit().await
     }
 
     /// The protocol of new label jobs, if there is one.
     pub async fn protocol_in_force(&self) -> Result<Option<Protocol>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let Some(number) = in_force(&mut transaction).await? else { return Ok(None) };
         let row = query("SELECT * FROM protocol WHERE number = $1").bind(number);
         row.fetch_one(&mut transaction).await.map(Some)
     }
 
-    /// Where the leader of the campaign has the files that grades depend on, as it last said: a JSON object of paths.
+    /// Stores where the leader has the files that grades depend on: a JSON object of paths.
     pub async fn set_grade_files(&self, files: &serde_json::Value) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
+        let mut transaction = self.database.begin_as_leader().await?;
         set_campaign_value(&mut transaction, "grade_files", &files.to_string()).await?;
         transaction.commit().await
     }
@@ -145,32 +145,32 @@ impl Store {
         Ok(files.map_err(|error| StoreError::damaged("the campaign's files", error))?.unwrap_or_default())
     }
 
-    /// Adds seed structures; those with the index of one that is there replace it.
-    pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
-        for seed in seeds {
-            insert_seed_structure(&mut transaction, seed).await?;
+    /// Adds seed structures, or replaces those with the same index.
+    pub async fn add_seed_structures(&self, seed_structures: &[SeedStructure]) -> Result<()> {
+        let mut transaction = self.database.begin_as_leader().await?;
+        for seed_structure in seed_structures {
+            insert_seed_structure(&mut transaction, seed_structure).await?;
         }
         transaction.commit().await
     }
 
     /// Every seed structure, by index.
     pub async fn seed_structures(&self) -> Result<Vec<SeedStructure>> {
-        query(seeds!("ORDER BY seed")).fetch_all(&self.database).await
+        query(seed_structures!("ORDER BY seed")).fetch_all(&self.database).await
     }
 
-    /// The seed structure of that index.
+    /// The seed structure with that index.
     pub async fn seed_structure(&self, index: u32) -> Result<Option<SeedStructure>> {
-        query(seeds!("WHERE seed = $1")).bind(index).fetch_optional(&self.database).await
+        query(seed_structures!("WHERE seed = $1")).bind(index).fetch_optional(&self.database).await
     }
 
-    /// Makes `protocol` the one of new label jobs. Accepted candidates that have no job at all (there was no protocol
-    /// when they were found) get one; those with a job of an earlier protocol keep that.
+    /// Makes `protocol` the protocol of new label jobs. Accepted candidates without any job (found before there was
+    /// a protocol) get one; existing jobs keep their protocol.
     pub async fn add_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
-        know(&mut transaction, protocol, now).await?;
+        let mut transaction = self.database.begin_as_leader().await?;
+        insert_protocol(&mut transaction, protocol, now).await?;
         set_campaign_value(&mut transaction, "protocol", &protocol.hash.to_string()).await?;
-        let number = number(&mut transaction, protocol.hash).await?;
+        let number = protocol_id(&mut transaction, protocol.hash).await?;
         let sql = "SELECT content, min(decision) FROM candidate WHERE structure IS NOT NULL
                    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure)
                    GROUP BY content ORDER BY min(decision)";
@@ -179,10 +179,10 @@ impl Store {
         transaction.commit().await
     }
 
-    /// Adds a protocol by which no new label is made.
-    pub async fn know_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
-        let mut transaction = self.database.begin_to_lead().await?;
-        know(&mut transaction, protocol, now).await?;
+    /// Adds a protocol that is not used for new labels.
+    pub async fn register_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
+        let mut transaction = self.database.begin_as_leader().await?;
+        insert_protocol(&mut transaction, protocol, now).await?;
         transaction.commit().await
     }
 
@@ -209,8 +209,12 @@ impl FromRow for Protocol {
     }
 }
 
-/// Adds a protocol, unless it is there.
-pub(super) async fn know(transaction: &mut Transaction, protocol: &Protocol, now: i64) -> Result<()> {
+/// Adds a protocol if it does not exist.
+pub(super) async fn insert_protocol(
+    transaction: &mut Transaction,
+    protocol: &Protocol,
+    now: i64,
+) -> Result<()> {
     let sql = "INSERT INTO protocol (hash, name, settings, checksum) VALUES ($1, $2, $3, $4)
                ON CONFLICT (hash) DO NOTHING";
     let row = vec![protocol.hash.0[..].into(), (&protocol.name).into(), protocol.settings.to_string().into()];
@@ -240,27 +244,34 @@ pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str,
     Ok(())
 }
 
-async fn insert_seed_structure(transaction: &mut Transaction, seed: &SeedStructure) -> Result<()> {
-    let structure = structure_number(transaction, &seed.structure, ContentHash::of(&seed.structure)).await?;
+async fn insert_seed_structure(transaction: &mut Transaction, seed_structure: &SeedStructure) -> Result<()> {
+    let structure =
+        structure_id(transaction, &seed_structure.structure, ContentHash::of(&seed_structure.structure))
+            .await?;
     let sql =
         "INSERT INTO seed_structure (seed, name, source, structure, checksum) VALUES ($1, $2, $3, $4, $5)
                ON CONFLICT (seed) DO UPDATE SET name = $2, source = $3, structure = $4, checksum = $5";
-    let row = vec![seed.index.into(), (&seed.name).into(), (&seed.source).into(), structure.into()];
+    let row = vec![
+        seed_structure.index.into(),
+        (&seed_structure.name).into(),
+        (&seed_structure.source).into(),
+        structure.into(),
+    ];
     query(sql).bind_all(SEED_STRUCTURE.with_checksum(row)).execute(&mut *transaction).await?;
     Ok(())
 }
 
-/// Number of the protocol of new jobs.
+/// Row number of the protocol of new jobs.
 pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64>> {
     let hash = query("SELECT value FROM campaign WHERE key = 'protocol'");
     let hash: Option<String> = hash.fetch_optional(&mut *transaction).await?;
     let Some(hash) = hash else { return Ok(None) };
     let hash = hash.parse().map_err(|error| StoreError::damaged("the protocol in force", error))?;
-    number(transaction, hash).await.map(Some)
+    protocol_id(transaction, hash).await.map(Some)
 }
 
-/// Number of the protocol's row.
-pub(crate) async fn number(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
+/// Row number of the protocol.
+pub(crate) async fn protocol_id(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
     let number = query("SELECT number FROM protocol WHERE hash = $1").bind(hash.0.to_vec());
     let number: Option<i64> = number.fetch_optional(&mut *transaction).await?;
     number.ok_or_else(|| StoreError::UnknownProtocol(hash.to_string()))

@@ -1,9 +1,9 @@
 //! The label queue: leases, and how they end.
 //!
-//! An attempt that brings nothing ends in one of two ways. It *failed* if its labeller says so, or crashed over it: a few
-//! of these and the job is given up. It was *lost* if its labeller went away or fell silent, which says nothing about
-//! the job. But a job that costs its labellers all their memory looks like that too, since the system kills them: one
-//! that is lost [`LOSS_LIMIT`] times in a row is given up as well.
+//! An attempt without a label ends in one of two ways. It *failed* if its labeller says so or crashed because of
+//! it; after a few failures the job fails. It was *lost* if its labeller ended or stopped responding, which says
+//! nothing about the job. A job that exhausts the memory of its labellers looks the same, since the system kills
+//! them: after [`LOSS_LIMIT`] losses in a row, the job fails as well.
 
 use atoms::Structure;
 use wire::ContentHash;
@@ -15,7 +15,7 @@ use crate::checksum::joined;
 use crate::database::{Transaction, from_columns, query};
 use crate::encoding::read_structure;
 use crate::error::{Result, StoreError};
-use crate::jobs::{CalculationRecord, Failed, Whereabouts};
+use crate::jobs::{CalculationRecord, FailOutcome, LeaseStatus};
 use crate::processes::ProcessRecord;
 use crate::records::{JobState, Lease};
 
@@ -31,27 +31,27 @@ pub(crate) const UNFINISHED: &str = "SELECT (SELECT count(*) FROM job WHERE stat
 pub(crate) const HELD: &str = "SELECT number FROM job WHERE state = 'leased'
     AND (holder = $1 OR substr(holder, 1, length($1) + 1) = $1 || '/')";
 
-/// Of exactly this holder, not of its parts.
+/// Leases of exactly this holder, not of its parts.
 pub(crate) const HELD_BY: &str = "SELECT number, attempts FROM job WHERE state = 'leased' AND holder = $1";
 
-/// Attempts of a job that were lost in a row; those before it was last given up for that do not count.
+/// Number of attempts of a job lost in a row, counted from the last time it failed for that reason.
 pub(crate) const LOSSES: &str = "SELECT count(*) FROM attempt WHERE job = $1 AND attempt > (
         SELECT coalesce(max(attempt), 0) FROM attempt WHERE job = $1
         AND (outcome NOT IN ('released', 'lost', 'expired') OR class = 'lost_too_often'))";
 
-/// So many attempts in a row may be lost. Labellers that are killed at random while they make a label in half of the
-/// cases lose one job so often once in thirty million.
+/// Attempts that may be lost in a row. If labellers are killed at random during half of the attempts, one job
+/// reaches this number with probability 3 × 10⁻⁸.
 const LOSS_LIMIT: u32 = 25;
 
-/// Class of the attempt with which that was reached.
+/// Failure class of the attempt that reaches the limit.
 const LOST_TOO_OFTEN: &str = "lost_too_often";
 
-/// How an attempt ended that brought nothing.
+/// How an attempt without a label ended.
 #[derive(Clone, Copy)]
-pub(crate) enum InVain<'a> {
-    /// It failed: the job is given up after `limit` of these.
+pub(crate) enum AttemptEnd<'a> {
+    /// It failed: the job fails after `limit` of these.
     Failed { class: &'a str, log: &'a str, limit: u32 },
-    /// Nobody works on it any longer: `released`, `lost` or `expired`.
+    /// Its labeller no longer works on it: `released`, `lost` or `expired`.
     Lost(&'static str),
 }
 
@@ -67,7 +67,7 @@ struct NextJob {
 
 from_columns!(NextJob { number, structure, decision, attempts, failures, overruled });
 
-/// A job as the ends of its leases need it.
+/// The columns of a job that the end of a lease needs.
 pub(super) struct JobRow {
     pub structure: i64,
     pub protocol: i64,
@@ -79,14 +79,14 @@ pub(super) struct JobRow {
 from_columns!(JobRow { structure, protocol, state, attempts, failures });
 
 impl Store {
-    /// The next job of that protocol for `holder` (`process` or `process/part`), for `seconds` from `now` on. None if the
-    /// campaign's budget ([`Store::set_budget`]) is used up.
+    /// Leases the next job of that protocol to `holder` (`process` or `process/part`), for `seconds` from `now` on.
+    /// Returns `None` if the queue is empty or the campaign's budget ([`Store::set_budget`]) is used up.
     ///
-    /// Leases that ran out end first, and their jobs go back into the queue, which does not count as failed attempts. But
-    /// a clock on the wall is no proof: after the sleep of a computer every lease has run out, and whoever is first
-    /// awake must not take the others' work from them. So a lease lasts on while its holder is a process that may be
-    /// at work: on this system one that runs and gave a sign of life within a day, elsewhere one that gave a sign of
-    /// life within `seconds`. Where the database has a server, its clock counts, and `now` does not.
+    /// First, expired leases end and their jobs return to the queue; this does not count as a failed attempt. The
+    /// wall clock alone does not end a lease: after a suspend every lease has expired, and the first process to
+    /// resume must not take the jobs of the others. A lease therefore continues while its holder may be at work: a
+    /// local process that runs and sent a heartbeat within a day, or a process elsewhere that sent a heartbeat
+    /// within `seconds`. On a server, the server's clock counts instead of `now`.
     pub async fn lease(
         &self,
         protocol: ContentHash,
@@ -95,14 +95,14 @@ impl Store {
         seconds: u32,
     ) -> Result<Option<Lease>> {
         let mut transaction = self.database.begin().await?;
-        let protocol_number = protocols::number(&mut transaction, protocol).await?;
+        let protocol_number = protocols::protocol_id(&mut transaction, protocol).await?;
         let now = transaction.time(now).await?;
         end_expired(&mut transaction, now, seconds).await?;
-        if budget::allows_no_attempt(&mut transaction, now).await? {
+        if budget::forbids_attempts(&mut transaction, now).await? {
             transaction.commit().await?;
             return Ok(None);
         }
-        let next = query(NEXT).bind(protocol_number).unless_locked();
+        let next = query(NEXT).bind(protocol_number).skip_locked();
         let next: Option<NextJob> = next.fetch_optional(&mut transaction).await?;
         let Some(next) = next else {
             transaction.commit().await?;
@@ -111,11 +111,11 @@ impl Store {
         let (job, attempt) = (next.number, next.attempts + 1);
         let sql =
             "UPDATE job SET state = 'leased', holder = $1, expires = $2, attempts = $3 WHERE number = $4";
-        let lease = query(sql).bind(holder).bind(end_of_lease(now, seconds)).bind(attempt).bind(job);
+        let lease = query(sql).bind(holder).bind(lease_expiry(now, seconds)).bind(attempt).bind(job);
         lease.execute(&mut transaction).await?;
         let sql = "INSERT INTO attempt (job, attempt, holder, started) VALUES ($1, $2, $3, $4)";
-        let begun = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
-        begun.execute(&mut transaction).await?;
+        let insert = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
+        insert.execute(&mut transaction).await?;
         let (candidate, model_energy) = candidate_of(&mut transaction, next.decision).await?;
         let lease = Lease {
             job,
@@ -134,16 +134,17 @@ impl Store {
         Ok(Some(lease))
     }
 
-    /// States that `holder` holds these leases and no others. What it does not state is given back: a lease whose taking or giving
-    /// back was committed while the answer got lost, which its holder knows nothing of, would last for as long as that lives. Does
-    /// not count as failed attempts. Returns how many were given back.
+    /// Declares that `holder` holds these leases and no others. All its other leases return to the queue, without
+    /// counting as failed attempts: a lease or a release whose reply was lost is unknown to its holder and would
+    /// otherwise last as long as the holder. Returns the number of leases released.
     ///
-    /// A holder calls this and [`Self::lease`] one after the other: it would give back what it is just being given.
+    /// A holder must not call this and [`Self::lease`] concurrently: it would release the lease that it is about to
+    /// get.
     pub async fn state_leases(&self, holder: &str, held: &[&Lease], now: i64) -> Result<usize> {
         let is_stated = |(job, attempt): &(i64, u32)| {
             held.iter().any(|lease| (lease.job, lease.attempt) == (*job, *attempt))
         };
-        // Mostly there is nothing to give back, and then nothing is written.
+        // Usually there is nothing to release, and nothing is written.
         let found: Vec<(i64, u32)> = query(HELD_BY).bind(holder).fetch_all(&self.database).await?;
         if found.iter().all(is_stated) {
             return Ok(0);
@@ -154,27 +155,27 @@ impl Store {
             query(HELD_BY).bind(holder).locked().fetch_all(&mut transaction).await?;
         found.retain(|lease| !is_stated(lease));
         for (job, _) in &found {
-            end_in_vain(&mut transaction, *job, InVain::Lost("lost"), now).await?;
+            end_without_label(&mut transaction, *job, AttemptEnd::Lost("lost"), now).await?;
         }
         transaction.commit().await?;
         Ok(found.len())
     }
 
-    /// Makes a lease last for `seconds` from `now` on. Returns whether it is still held: if not, somebody else may
-    /// have the job, but a result may still be brought.
+    /// Extends a lease to `seconds` from `now` on. Returns whether it is still held. If not, another holder may
+    /// have the job, but a result may still be delivered.
     pub async fn renew(&self, lease: &Lease, now: i64, seconds: u32) -> Result<bool> {
         let mut transaction = self.database.begin().await?;
         let sql = "UPDATE job SET expires = $1 WHERE number = $2 AND state = 'leased' AND attempts = $3";
-        let expires = end_of_lease(transaction.time(now).await?, seconds);
+        let expires = lease_expiry(transaction.time(now).await?, seconds);
         let renewed = query(sql).bind(expires).bind(lease.job).bind(lease.attempt);
         let renewed = renewed.execute(&mut transaction).await? > 0;
         transaction.commit().await?;
         Ok(renewed)
     }
 
-    /// Stores what finds a calculation again (process, number in a batch system), and what it is, before it is started.
-    /// Whoever leases the job next gets it among [`Lease::earlier_calculations`]. One that an earlier attempt had
-    /// started is this one's from now on: its core-seconds count here.
+    /// Records what identifies a calculation (process, id in a batch system) and its properties, before it is
+    /// started. The next holder of the job finds it in [`Lease::earlier_calculations`]. A calculation that an
+    /// earlier attempt started belongs to this attempt from now on: its core-seconds count here.
     pub async fn record_calculation(
         &self,
         lease: &Lease,
@@ -195,8 +196,8 @@ impl Store {
         transaction.commit().await
     }
 
-    /// A calculation has ended: the core-seconds that it took, and the end of what it said.
-    pub async fn account(&self, lease: &Lease, core_seconds: f64, log: &str) -> Result<()> {
+    /// Records the core-seconds of a calculation that has ended, and the end of its output.
+    pub async fn record_cost(&self, lease: &Lease, core_seconds: f64, log: &str) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let sql = "UPDATE attempt SET core_seconds = $1, log = $2 WHERE job = $3 AND attempt = $4";
         let account = query(sql).bind(core_seconds).bind(log).bind(lease.job).bind(lease.attempt);
@@ -204,8 +205,8 @@ impl Store {
         transaction.commit().await
     }
 
-    /// What has become of the job of a lease that was lost.
-    pub async fn whereabouts(&self, lease: &Lease) -> Result<Whereabouts> {
+    /// The state of a lease that may have been lost.
+    pub async fn lease_status(&self, lease: &Lease) -> Result<LeaseStatus> {
         let sql = "SELECT state, attempts, calculation FROM job
                    LEFT JOIN attempt ON attempt.job = job.number AND attempt.attempt = attempts
                    WHERE job.number = $1";
@@ -214,33 +215,36 @@ impl Store {
         let unknown = || StoreError::UnknownJob { id: lease.candidate.clone(), near: Vec::new() };
         let (state, attempts, calculation) = row.ok_or_else(unknown)?;
         Ok(match state.as_str() {
-            "leased" if attempts == lease.attempt => Whereabouts::Held,
-            "leased" => Whereabouts::LeasedAgain { calculation },
-            "queued" => Whereabouts::Queued,
-            _ => Whereabouts::Over,
+            "leased" if attempts == lease.attempt => LeaseStatus::Held,
+            "leased" => LeaseStatus::LeasedAgain { calculation },
+            "queued" => LeaseStatus::Queued,
+            _ => LeaseStatus::Over,
         })
     }
 
-    /// An attempt was lost through no fault of the job, and it is known why: the job waits for another.
-    pub async fn lose(&self, lease: &Lease, class: &str, log: &str, now: i64) -> Result<Failed> {
+    /// Ends an attempt that was lost for a known reason that is not the job's fault: the job waits for another
+    /// attempt.
+    pub async fn release_lost(&self, lease: &Lease, class: &str, log: &str, now: i64) -> Result<FailOutcome> {
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
         let job = job_row(&mut transaction, lease.job).await?;
         let held = job.state == "leased" && job.attempts == lease.attempt;
-        explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
+        record_failure(&mut transaction, lease.job, lease.attempt, class, log).await?;
         let lost = match held {
-            false => Failed::LeaseLost,
-            true => match end_in_vain(&mut transaction, lease.job, InVain::Lost("lost"), now).await? {
-                JobState::Queued => Failed::Requeued,
-                _ => Failed::GivenUp,
-            },
+            false => FailOutcome::LeaseLost,
+            true => {
+                match end_without_label(&mut transaction, lease.job, AttemptEnd::Lost("lost"), now).await? {
+                    JobState::Queued => FailOutcome::Requeued,
+                    _ => FailOutcome::GivenUp,
+                }
+            }
         };
         transaction.commit().await?;
         Ok(lost)
     }
 
-    /// An attempt failed: the job waits for another, or is given up after `attempt_limit` failed ones. Class and
-    /// log are kept with the attempt in any case.
+    /// Ends an attempt that failed: the job waits for another attempt, or fails after `attempt_limit` of them.
+    /// Class and log are stored with the attempt in any case.
     pub async fn fail(
         &self,
         lease: &Lease,
@@ -248,33 +252,33 @@ impl Store {
         log: &str,
         attempt_limit: u32,
         now: i64,
-    ) -> Result<Failed> {
+    ) -> Result<FailOutcome> {
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
         let job = job_row(&mut transaction, lease.job).await?;
         let failed = if job.state == "leased" && job.attempts == lease.attempt {
-            let how = InVain::Failed { class, log, limit: attempt_limit };
-            match end_in_vain(&mut transaction, lease.job, how, now).await? {
-                JobState::Queued => Failed::Requeued,
-                _ => Failed::GivenUp,
+            let how = AttemptEnd::Failed { class, log, limit: attempt_limit };
+            match end_without_label(&mut transaction, lease.job, how, now).await? {
+                JobState::Queued => FailOutcome::Requeued,
+                _ => FailOutcome::GivenUp,
             }
         } else {
-            explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
-            Failed::LeaseLost
+            record_failure(&mut transaction, lease.job, lease.attempt, class, log).await?;
+            FailOutcome::LeaseLost
         };
         transaction.commit().await?;
         Ok(failed)
     }
 
-    /// Gives back every lease of `holder` and of its parts (`holder/part`), at a stop in order. Does not count as failed
-    /// attempts. Returns their number.
+    /// Releases every lease of `holder` and of its parts (`holder/part`) at an orderly stop. Does not count as
+    /// failed attempts. Returns their number.
     pub async fn release_all(&self, holder: &str, now: i64) -> Result<usize> {
-        self.release(holder, InVain::Lost("released"), now).await
+        self.release(holder, AttemptEnd::Lost("released"), now).await
     }
 
-    /// Takes back every lease of `process` and of its parts, which crashed with them in hand: each counts as a failed
-    /// attempt of that class, and a job that has `attempt_limit` of them is given up. But one whose calculation is a process
-    /// of its own is only lost: that goes on. Returns their number.
+    /// Ends every lease of `process` and of its parts after a crash of that process. Each counts as a failed
+    /// attempt of that class, and a job with `attempt_limit` of them fails. An attempt whose calculation is a
+    /// process of its own counts only as lost: the calculation goes on. Returns the number of leases.
     pub async fn fail_leases_of(
         &self,
         process: &str,
@@ -283,70 +287,71 @@ impl Store {
         attempt_limit: u32,
         now: i64,
     ) -> Result<usize> {
-        self.release(process, InVain::Failed { class, log, limit: attempt_limit }, now).await
+        self.release(process, AttemptEnd::Failed { class, log, limit: attempt_limit }, now).await
     }
 
-    async fn release(&self, holder: &str, how: InVain<'_>, now: i64) -> Result<usize> {
+    async fn release(&self, holder: &str, how: AttemptEnd<'_>, now: i64) -> Result<usize> {
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
         let jobs: Vec<i64> = query(HELD).bind(holder).locked().fetch_all(&mut transaction).await?;
         for job in &jobs {
             let how = match how {
-                InVain::Failed { .. } if has_calculation(&mut transaction, *job).await? => {
-                    InVain::Lost("lost")
+                AttemptEnd::Failed { .. } if has_calculation(&mut transaction, *job).await? => {
+                    AttemptEnd::Lost("lost")
                 }
                 how => how,
             };
-            end_in_vain(&mut transaction, *job, how, now).await?;
+            end_without_label(&mut transaction, *job, how, now).await?;
         }
         transaction.commit().await?;
         Ok(jobs.len())
     }
 
-    /// Whether every walk is over. None has begun in a campaign that is just being made.
-    pub async fn all_walks_are_over(&self) -> Result<bool> {
+    /// Whether every walk is over; false in a new campaign without walks.
+    pub async fn all_walks_ended(&self) -> Result<bool> {
         let sql = "SELECT EXISTS (SELECT 1 FROM walk)
                    AND NOT EXISTS (SELECT 1 FROM walk WHERE state IN ('waiting', 'running'))";
         query(sql).fetch_one(&self.database).await
     }
 
-    /// Number of jobs that are queued or leased for a first label: those that are labelled again do not come from walks.
+    /// Number of jobs that are queued or leased for a first label. Labels made again do not come from walks and do
+    /// not count.
     pub async fn unfinished_jobs(&self) -> Result<u64> {
         query(UNFINISHED).fetch_one(&self.database).await
     }
 }
 
-/// Whether the attempt that is under way has started a calculation.
+/// Whether the running attempt has started a calculation.
 async fn has_calculation(transaction: &mut Transaction, job: i64) -> Result<bool> {
     let sql = "SELECT count(*) FROM attempt WHERE job = $1 AND outcome IS NULL AND calculation IS NOT NULL";
     let found: u64 = query(sql).bind(job).fetch_one(&mut *transaction).await?;
     Ok(found > 0)
 }
 
-fn end_of_lease(now: i64, seconds: u32) -> i64 {
+fn lease_expiry(now: i64, seconds: u32) -> i64 {
     now.saturating_add(1000 * i64::from(seconds))
 }
 
-/// Ends the leases that ran out and whose holders cannot be at work.
+/// Ends expired leases whose holders cannot be at work.
 async fn end_expired(transaction: &mut Transaction, now: i64, seconds: u32) -> Result<()> {
-    // Somebody else ends those that are locked.
-    let expired = query(EXPIRED).bind(now).unless_locked();
+    // Another process is ending the locked ones.
+    let expired = query(EXPIRED).bind(now).skip_locked();
     let expired: Vec<(i64, String)> = expired.fetch_all(&mut *transaction).await?;
     if expired.is_empty() {
         return Ok(());
     }
     let processes = processes::all(transaction).await?;
-    let holds_on = |process: &&ProcessRecord| process.may_be_at_work(now, seconds);
+    let holds_on = |process: &&ProcessRecord| process.may_be_working(now, seconds);
     let at_work: Vec<_> = processes.iter().filter(holds_on).collect();
     for (job, holder) in expired {
         if !at_work.iter().any(|process| process.is_holder(&holder)) {
-            end_in_vain(transaction, job, InVain::Lost("expired"), now).await?;
+            end_without_label(transaction, job, AttemptEnd::Lost("expired"), now).await?;
         }
     }
     Ok(())
 }
 
-/// Ends the attempt that is under way, if any.
+/// Ends the running attempt, if any.
 pub(super) async fn end_attempt(
     transaction: &mut Transaction,
     job: i64,
@@ -359,34 +364,35 @@ pub(super) async fn end_attempt(
     Ok(())
 }
 
-/// Ends the attempt that is under way without a result: the job waits for another, or is given up. Returns its state.
-pub(crate) async fn end_in_vain(
+/// Ends the running attempt without a label: the job waits for another, or fails. Returns the state of the job.
+pub(crate) async fn end_without_label(
     transaction: &mut Transaction,
     job: i64,
-    how: InVain<'_>,
+    how: AttemptEnd<'_>,
     now: i64,
 ) -> Result<JobState> {
     let JobRow { structure, protocol, attempts, mut failures, .. } = job_row(transaction, job).await?;
     let given_up = match how {
-        InVain::Failed { class, log, limit } => {
+        AttemptEnd::Failed { class, log, limit } => {
             end_attempt(transaction, job, "failed", now).await?;
-            explain(transaction, job, attempts, class, log).await?;
+            record_failure(transaction, job, attempts, class, log).await?;
             failures += 1;
             failures >= limit
         }
-        InVain::Lost(outcome) => {
+        AttemptEnd::Lost(outcome) => {
             end_attempt(transaction, job, outcome, now).await?;
             let losses: u32 = query(LOSSES).bind(job).fetch_one(&mut *transaction).await?;
             if losses >= LOSS_LIMIT {
-                let log = format!("{losses} attempts in a row ended without a word from their labellers");
-                explain(transaction, job, attempts, LOST_TOO_OFTEN, &log).await?;
+                let log =
+                    format!("{losses} attempts in a row were lost without a message from their labellers");
+                record_failure(transaction, job, attempts, LOST_TOO_OFTEN, &log).await?;
             }
             losses >= LOSS_LIMIT
         }
     };
     let state = match given_up {
         false => JobState::Queued,
-        // Another label was asked for in vain, and the one that there is stays.
+        // The requested new label could not be made; the existing one stays.
         true if has_label(transaction, structure, protocol).await? => JobState::Labelled,
         true => JobState::Failed,
     };
@@ -400,8 +406,8 @@ async fn has_label(transaction: &mut Transaction, structure: i64, protocol: i64)
     query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await
 }
 
-/// Keeps with an attempt why it failed.
-async fn explain(
+/// Stores with an attempt why it failed.
+async fn record_failure(
     transaction: &mut Transaction,
     job: i64,
     attempt: u32,
@@ -414,7 +420,7 @@ async fn explain(
     Ok(())
 }
 
-/// Nobody else changes the job until the end of the transaction.
+/// Reads a job and locks it until the end of the transaction.
 pub(super) async fn job_row(transaction: &mut Transaction, job: i64) -> Result<JobRow> {
     let sql = "SELECT structure, protocol, state, attempts, failures FROM job WHERE number = $1";
     let row = query(sql).bind(job).locked().fetch_optional(&mut *transaction).await?;
@@ -429,7 +435,7 @@ async fn earlier_calculations(transaction: &mut Transaction, job: i64, attempt: 
     query(sql).bind(job).bind(attempt).fetch_all(&mut *transaction).await
 }
 
-/// Of those that failed, and of those that were lost and it is known why.
+/// Of failed attempts, and of lost attempts with a known reason.
 async fn failed_calculations(transaction: &mut Transaction, job: i64) -> Result<Vec<String>> {
     let sql =
         "SELECT calculation FROM attempt WHERE job = $1 AND class IS NOT NULL AND calculation IS NOT NULL
@@ -437,7 +443,8 @@ async fn failed_calculations(transaction: &mut Transaction, job: i64) -> Result<
     query(sql).bind(job).fetch_all(&mut *transaction).await
 }
 
-/// Of the last `failures` attempts that failed, and of what was lost with a class since, oldest first.
+/// Of the last `failures` failed attempts, and of the attempts since then that were lost with a class, oldest
+/// first.
 async fn classes_of_failures(transaction: &mut Transaction, job: i64, failures: u32) -> Result<Vec<String>> {
     let sql = "SELECT class, outcome FROM attempt WHERE job = $1 AND class IS NOT NULL
                AND outcome IN ('failed', 'lost') ORDER BY attempt DESC";

@@ -1,4 +1,4 @@
-//! The newest decisions, for those who watch.
+//! The newest decisions, for monitoring.
 
 use super::restore::origin;
 use crate::Store;
@@ -7,7 +7,8 @@ use crate::database::{FromRow, Row, query};
 use crate::error::{Result, StoreError};
 use crate::recent::{DecidedCandidate, RecentDecision};
 
-/// Through the decision log's own order. The numbers behind decisions about candidates are read for the sake of their checksums.
+/// Uses the primary key of the decision log. The details of decisions on candidates are read only to verify their
+/// checksums.
 pub(crate) const NEWEST: &str = concat!(
     "SELECT ",
     joined!(decision),
@@ -22,7 +23,7 @@ pub(crate) const NEWEST: &str = concat!(
 );
 
 impl Store {
-    /// At most `limit` decisions with numbers above `after`: the newest, newest first.
+    /// At most `limit` decisions after number `after`, newest first.
     pub async fn newest_decisions(&self, after: i64, limit: u32) -> Result<Vec<RecentDecision>> {
         query(NEWEST).bind(after).bind(limit).fetch_all(&self.database).await
     }

@@ -1,8 +1,9 @@
-//! Labels that are made anew: by the same protocol because they are doubtful, or by another that comes into force.
+//! Making labels again: under the same protocol because they are doubtful, or under another protocol that comes
+//! into force.
 //!
-//! A job whose `relabel` says why waits for another label while there is one. Until that comes nothing changes for anybody who
-//! reads labels; if it does not come, nothing has changed. A job by an earlier protocol is superseded when the label by the newer
-//! one is there, or if it has none itself, when the newer protocol comes into force.
+//! A job with a reason in `relabel` waits for a new label although there is one. Readers of labels see no change
+//! until the new label arrives, and none at all if it never does. A job of an earlier protocol is superseded when
+//! the newer protocol has a label for the structure, or at once if it has no label itself.
 
 use std::collections::HashSet;
 
@@ -11,16 +12,16 @@ use wire::ContentHash;
 
 use super::labels::CURRENT;
 use super::logs::insert_operation;
-use super::protocols::{in_force, know, number, set_campaign_value};
+use super::protocols::{in_force, insert_protocol, protocol_id, set_campaign_value};
 use crate::Store;
-use crate::database::{FromRow, Row, Transaction, Value, for_rows, from_columns, query};
+use crate::database::{FromRow, Row, Transaction, Value, execute_rows, from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
-use crate::jobs::{LabelSource, Standing};
+use crate::jobs::{LabelSource, LabelStatus};
 use crate::records::JobState;
-use crate::relabel::{NewProtocol, Relabel, Relabellable, Requeued};
+use crate::relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 
-/// Jobs with their labels; of a structure that has labels by several protocols, all of them.
+/// Jobs with their labels. A structure with labels under several protocols has several rows.
 pub(crate) const LABELLED: &str =
     "SELECT structure.hash AS hash, job.decision AS decision, protocol.name AS protocol, own.state AS state,
         candidate.seed_structure AS seed_structure, candidate.formula AS formula, candidate.atoms AS atoms
@@ -32,7 +33,7 @@ pub(crate) const LABELLED: &str =
     LEFT JOIN job AS own ON own.structure = job.structure AND own.protocol = $1
     WHERE job.state <> 'dropped' ORDER BY job.decision, job.number";
 
-/// Those that have no job by that protocol get one. `own` is the job by which the present label was made.
+/// Adds a job for structures that have none under that protocol. `own` is the job that made the present label.
 macro_rules! request {
     ($states:literal) => {
         concat!(
@@ -54,15 +55,16 @@ macro_rules! request {
 const REQUEST: &str = request!("'failed', 'superseded'");
 const REQUEST_AGAIN: &str = request!("'labelled', 'failed', 'superseded'");
 
-/// Other labels that were asked for by a protocol which is no longer in force: those that there are stay.
-const WITHDRAW: &str =
+/// Withdraws requests under protocols no longer in force: the existing labels stay.
+const WITHDRAW_REQUESTS: &str =
     "UPDATE job SET state = 'labelled', relabel = NULL, relabel_after = NULL, holder = NULL,
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label
         WHERE label.structure = job.structure AND label.protocol = job.protocol AND standing IN ('label', 'excluded'))";
 
-/// What has no label by an earlier protocol goes over to the one in force, unless that has a job for it which says something else.
-const GO_OVER: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
+/// Moves jobs of earlier protocols without a label to the protocol in force, unless that has a job for the
+/// structure in another state.
+const MOVE_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
     SELECT structure, CAST($1 AS BIGINT), decision, priority, CASE WHEN EXISTS (SELECT 1 FROM label
             WHERE label.structure = job.structure AND label.protocol = $1 AND standing IN ('label', 'excluded'))
             THEN 'labelled' ELSE 'queued' END, overruled, relabel, 0
@@ -70,16 +72,16 @@ const GO_OVER: &str = "INSERT INTO job (structure, protocol, decision, priority,
     ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = excluded.overruled,
         relabel = excluded.relabel, relabel_after = job.attempts WHERE job.state = 'superseded'";
 
-const LEAVE_BEHIND: &str =
+const SUPERSEDE_UNLABELLED: &str =
     "UPDATE job SET state = 'superseded', relabel = NULL, relabel_after = NULL, holder = NULL,
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')";
 
-/// Attempts at jobs that nobody has any more.
+/// Ends attempts at jobs that are no longer leased.
 const END_ATTEMPTS: &str = "UPDATE attempt SET ended = $1, outcome = 'dropped' WHERE outcome IS NULL
     AND EXISTS (SELECT 1 FROM job WHERE job.number = attempt.job AND state <> 'leased')";
 
-/// Labels that were made or taken in for a job of the structure; others belong to other data sets.
+/// Labels that belong to a job of the structure. Others belong to other data sets.
 const SUPERSEDE: &str = "UPDATE label SET standing = 'superseded', superseded = $2, reason = $3
     WHERE structure = $1 AND standing IN ('label', 'excluded') AND EXISTS (SELECT 1 FROM job
         WHERE job.structure = label.structure AND job.protocol = label.protocol)";
@@ -89,18 +91,18 @@ const SUPERSEDE_JOBS: &str =
         expires = NULL
     WHERE structure = $1 AND protocol <> $2 AND state NOT IN ('dropped', 'superseded')";
 
-/// Jobs for which another label was asked, by state.
-const ASKED: &str = "SELECT state, count(*) FROM job WHERE relabel IS NOT NULL GROUP BY state";
+/// Number of jobs with a request for a new label, by state.
+const REQUESTED: &str = "SELECT state, count(*) FROM job WHERE relabel IS NOT NULL GROUP BY state";
 
-/// A job, as far as it decides what a result is.
-struct Asked {
+/// The columns of a job that decide the status of a result.
+struct RelabelRow {
     number: i64,
     state: String,
     relabel: Option<String>,
     relabel_after: Option<u32>,
 }
 
-from_columns!(Asked { number, state, relabel, relabel_after });
+from_columns!(RelabelRow { number, state, relabel, relabel_after });
 
 impl FromRow for Relabellable {
     fn from_row(row: &Row) -> Result<Self> {
@@ -121,10 +123,10 @@ impl FromRow for Relabellable {
 }
 
 impl Store {
-    /// Every structure that has its label and was not dropped, in decision order, with its job by that protocol, which the campaign
-    /// need not know.
+    /// Every structure that has a label and was not dropped, in decision order, with its job under that protocol.
+    /// The campaign need not know the protocol.
     pub async fn relabellable(&self, protocol: ContentHash) -> Result<Vec<Relabellable>> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let own = query("SELECT number FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
         let own: Option<i64> = own.fetch_optional(&mut transaction).await?;
         let found: Vec<Relabellable> =
@@ -133,7 +135,7 @@ impl Store {
         let mut structures: Vec<Relabellable> = Vec::with_capacity(found.len());
         for one in found {
             match structures.last_mut().filter(|last| last.content == one.content) {
-                // The newest job is the one that counts.
+                // The newest job counts.
                 Some(last) => *last = one,
                 None => structures.push(one),
             }
@@ -141,9 +143,9 @@ impl Store {
         Ok(structures)
     }
 
-    /// Number of structures without a label whose jobs are of another protocol than this: they go over to it when it comes into
-    /// force.
-    pub async fn unlabelled_by_others(&self, protocol: ContentHash) -> Result<u64> {
+    /// Number of structures without a label whose jobs have another protocol. They move to this one when it comes
+    /// into force.
+    pub async fn unlabelled_under_other_protocols(&self, protocol: ContentHash) -> Result<u64> {
         let sql = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed')
                    AND protocol <> coalesce((SELECT number FROM protocol WHERE hash = $1), 0)
                    AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
@@ -151,19 +153,20 @@ impl Store {
         query(sql).bind(protocol.0.to_vec()).fetch_one(&self.database).await
     }
 
-    /// Asks for other labels of structures that have theirs: by the protocol in force, or by one that comes into force. In that
-    /// case all that has no label goes over to it, and calculations under way are for nothing. Structures that wait already, or were
-    /// dropped, are left alone, so asking twice is asking once. Leaves a line `relabel` in the operations log.
+    /// Requests new labels for labelled structures, under the protocol in force or under a new protocol that comes
+    /// into force. In the latter case all structures without a label move to the new protocol, and running
+    /// calculations are lost. Structures that wait already or were dropped stay as they are, so repeating a request
+    /// changes nothing. Adds a line `relabel` to the operations log.
     ///
     /// # Errors
-    /// [`StoreError::ProtocolName`] if another protocol has the name of the new one. [`StoreError::LockLost`] if a protocol is to
-    /// come into force and somebody else leads the campaign.
-    pub async fn relabel(&self, order: &Relabel<'_>, now: i64) -> Result<Requeued> {
+    /// [`StoreError::ProtocolName`] if another protocol has the name of the new one. [`StoreError::LockLost`] if
+    /// there is a new protocol and another process leads the campaign.
+    pub async fn relabel(&self, order: &RelabelRequest<'_>, now: i64) -> Result<RelabelCounts> {
         let mut transaction = match order.protocol {
-            Some(_) => self.database.begin_to_lead().await?,
+            Some(_) => self.database.begin_as_leader().await?,
             None => self.database.begin().await?,
         };
-        let mut requeued = Requeued::default();
+        let mut requeued = RelabelCounts::default();
         if let Some(new) = &order.protocol {
             requeued.moved = change_protocol(&mut transaction, new, now).await?;
         }
@@ -172,13 +175,13 @@ impl Store {
         let row = |content: &ContentHash| -> Vec<Value> {
             vec![content.0.to_vec().into(), protocol.into(), order.reason.into()]
         };
-        // One statement writes a row once.
+        // A statement may write a row only once.
         let mut seen = HashSet::new();
         let rows = order.structures.iter().filter(|content| seen.insert(content.0)).map(row).collect();
         let sql = if order.again { REQUEST_AGAIN } else { REQUEST };
-        requeued.again = for_rows(&mut transaction, sql, &["hash", "protocol", "reason"], rows).await?;
+        requeued.again = execute_rows(&mut transaction, sql, &["hash", "protocol", "reason"], rows).await?;
         if order.protocol.is_some() || requeued.again > 0 {
-            let Requeued { again, moved } = requeued;
+            let RelabelCounts { again, moved } = requeued;
             let detail = json!({ "reason": order.reason, "again": again, "moved": moved });
             insert_operation(&mut transaction, now, "relabel", &detail).await?;
         }
@@ -187,22 +190,22 @@ impl Store {
     }
 }
 
-/// Whether the tables are not those of an earlier version, in which nothing is labelled again.
-pub(crate) async fn is_known(transaction: &mut Transaction) -> Result<bool> {
+/// Whether the tables have the columns for requests; those of an earlier version do not.
+pub(crate) async fn has_relabel_columns(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_column("job", "relabel").await
 }
 
-/// Numbers of jobs for which another label was asked and has not come, by state.
-pub(super) async fn asked(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
-    if !is_known(transaction).await? {
+/// Number of jobs with an open request for a new label, by state.
+pub(super) async fn relabel_requests(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
+    if !has_relabel_columns(transaction).await? {
         return Ok(Vec::new());
     }
-    query(ASKED).fetch_all(transaction).await
+    query(REQUESTED).fetch_all(transaction).await
 }
 
-/// Brings a protocol into force. Returns how many structures without a label went over to it.
+/// Brings a protocol into force. Returns the number of structures without a label that moved to it.
 async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, now: i64) -> Result<u64> {
-    know(transaction, new.protocol, now).await?;
+    insert_protocol(transaction, new.protocol, now).await?;
     set_campaign_value(transaction, "protocol", &new.protocol.hash.to_string()).await?;
     set_campaign_value(transaction, "configuration_in_force", new.configuration).await?;
     for (name, note) in new.notes {
@@ -211,45 +214,45 @@ async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, n
     for change in new.changes {
         insert_operation(transaction, now, "configuration", change).await?;
     }
-    let protocol = number(transaction, new.protocol.hash).await?;
-    query(WITHDRAW).bind(protocol).execute(&mut *transaction).await?;
-    query(GO_OVER).bind(protocol).execute(&mut *transaction).await?;
-    let moved = query(LEAVE_BEHIND).bind(protocol).execute(&mut *transaction).await?;
+    let protocol = protocol_id(transaction, new.protocol.hash).await?;
+    query(WITHDRAW_REQUESTS).bind(protocol).execute(&mut *transaction).await?;
+    query(MOVE_JOBS).bind(protocol).execute(&mut *transaction).await?;
+    let moved = query(SUPERSEDE_UNLABELLED).bind(protocol).execute(&mut *transaction).await?;
     let now = transaction.time(now).await?;
     query(END_ATTEMPTS).bind(now).execute(&mut *transaction).await?;
     Ok(moved)
 }
 
-/// What a result is. If it is the label that was asked for, those in whose place it comes are superseded.
-pub(super) async fn standing(
+/// Determines the status of a result. A requested label supersedes the labels that it replaces.
+pub(super) async fn status_of_result(
     transaction: &mut Transaction,
     structure: i64,
     protocol: i64,
     source: &LabelSource,
     now: i64,
-) -> Result<Standing> {
+) -> Result<LabelStatus> {
     let labelled: bool = query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await?;
-    let first = if labelled { Standing::Check } else { Standing::Label };
+    let first = if labelled { LabelStatus::Check } else { LabelStatus::Label };
     let sql = "SELECT number, state, relabel, relabel_after FROM job WHERE structure = $1 AND protocol = $2";
     let job = query(sql).bind(structure).bind(protocol).locked();
-    let job: Option<Asked> = job.fetch_optional(&mut *transaction).await?;
-    let Some(Asked { number, state, relabel, relabel_after }) = job else { return Ok(first) };
+    let job: Option<RelabelRow> = job.fetch_optional(&mut *transaction).await?;
+    let Some(RelabelRow { number, state, relabel, relabel_after }) = job else { return Ok(first) };
     if state == JobState::Superseded.name() {
-        return Ok(Standing::Check);
+        return Ok(LabelStatus::Check);
     }
     let Some(reason) = relabel else { return Ok(first) };
     let began_since = match source {
         LabelSource::Attempt { attempt, .. } => *attempt > relabel_after.unwrap_or(0),
-        // It may be the very one that is doubted.
+        // It may be the doubtful label itself.
         LabelSource::Import { .. } => !labelled,
     };
     if !began_since || state == JobState::Dropped.name() {
-        return Ok(Standing::Check);
+        return Ok(LabelStatus::Check);
     }
     query(SUPERSEDE).bind(structure).bind(now).bind(reason).execute(&mut *transaction).await?;
     let came = query("UPDATE job SET relabel = NULL, relabel_after = NULL WHERE number = $1");
     came.bind(number).execute(&mut *transaction).await?;
     query(SUPERSEDE_JOBS).bind(structure).bind(protocol).execute(&mut *transaction).await?;
     query(END_ATTEMPTS).bind(now).execute(&mut *transaction).await?;
-    Ok(Standing::Label)
+    Ok(LabelStatus::Label)
 }

@@ -1,11 +1,11 @@
-//! What a selector needs to go on, and candidates as a whole.
+//! The state from which a selector continues, and complete candidates.
 
 use wire::messages::{Decline, Progress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkId};
 
 use crate::Store;
 use crate::checksum::{
-    CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG, Names, STRUCTURE, VALUE, WALK, joined,
+    CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG_COLUMNS, Names, STRUCTURE, VALUE, WALK, joined,
 };
 use crate::database::{FromRow, Row, Target, from_columns, query};
 use crate::encoding::decode_hash;
@@ -26,7 +26,7 @@ macro_rules! candidates {
 const CANDIDATES: &str = candidates!(
     "WHERE candidate.decision > $1 AND (origin = 'biased' OR $2 = 1) ORDER BY candidate.decision LIMIT $3"
 );
-/// Rows without their long columns read at a time.
+/// Number of rows without their long columns read at a time.
 const PAGE: u32 = 1000;
 
 const ACCEPTED: &str =
@@ -90,7 +90,7 @@ impl Store {
         query("SELECT * FROM walk ORDER BY walk").fetch_all(&self.database).await
     }
 
-    /// Every component that ever changed (since the mixture last began anew), by element and slot.
+    /// Every component that has changed since the mixture was last restarted, by element and slot.
     pub async fn load_components(&self) -> Result<Vec<ComponentRecord>> {
         components(&self.database).await
     }
@@ -105,7 +105,7 @@ impl Store {
         rows.iter().map(value).collect()
     }
 
-    /// Hashes of the structures that a new candidate must not repeat: accepted candidates of biased walks, in decision
+    /// Hashes of structures that a new candidate must not repeat: accepted candidates of biased walks in decision
     /// order, then imported structures.
     pub async fn known_hashes(&self) -> Result<Vec<ContentHash>> {
         let (mut hashes, mut after) = (Vec::new(), 0);
@@ -122,7 +122,7 @@ impl Store {
         Ok(hashes)
     }
 
-    /// Hashes of imported structures, in the order in which they came.
+    /// Hashes of imported structures, in import order.
     pub async fn imported_hashes(&self) -> Result<Vec<ContentHash>> {
         let (mut hashes, mut after) = (Vec::new(), 0);
         loop {
@@ -136,9 +136,9 @@ impl Store {
         }
     }
 
-    /// How far the decisions have come, and the mixture at that instant.
+    /// The last decision and the mixture after it, read as a snapshot.
     pub async fn newest_mixture(&self) -> Result<NewestMixture> {
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let last =
             query("SELECT * FROM decision ORDER BY sequence DESC LIMIT 1").rows(&mut transaction).await?;
         let (decision, version) = match last.first() {
@@ -153,19 +153,19 @@ impl Store {
         Ok(NewestMixture { decision, version, components })
     }
 
-    /// At most `limit` candidates behind decision number `after`, in decision order and whole; those of control walks only
-    /// if `control` says so.
+    /// At most `limit` complete candidates after decision `after`, in decision order; those of control walks only
+    /// if `control` is set.
     pub async fn candidates(&self, after: i64, control: bool, limit: u32) -> Result<Vec<StoredCandidate>> {
         let query = query(CANDIDATES).bind(after).bind(control).bind(limit);
         query.fetch_all(&self.database).await
     }
 
-    /// The candidate of that name, `None` if there is none.
+    /// The candidate with that name, `None` if there is none.
     pub async fn candidate(&self, id: &str) -> Result<Option<StoredCandidate>> {
         query(CANDIDATE_OF_NAME).bind(id).fetch_optional(&self.database).await
     }
 
-    /// Names of all candidates in decision order, at most `limit` after decision number `after`.
+    /// Names of all candidates in decision order, at most `limit` after decision `after`.
     pub async fn candidate_ids(&self, after: i64, limit: u32) -> Result<Vec<(i64, String)>> {
         let sql = "SELECT decision, id FROM candidate WHERE decision > $1 ORDER BY decision LIMIT $2";
         query(sql).bind(after).bind(limit).fetch_all(&self.database).await
@@ -193,7 +193,7 @@ impl FromRow for WalkRecord {
 
 impl WalkRow {
     fn into_record(self) -> Result<WalkRecord> {
-        // What is not finite has no other form in a column.
+        // Columns hold NULL for numbers that are not finite.
         let number = |column: Option<f64>| column.unwrap_or(f64::NAN);
         Ok(WalkRecord {
             walk: WalkId(self.walk),
@@ -224,7 +224,7 @@ impl WalkRow {
 impl FromRow for StoredCandidate {
     fn from_row(row: &Row) -> Result<Self> {
         CANDIDATE.verify(row, Names::Plain)?;
-        LONG.iter().try_for_each(|column| column.verify(row))?;
+        LONG_COLUMNS.iter().try_for_each(|column| column.verify(row))?;
         let (fate, reason): (String, Option<String>) = (row.get("fate")?, row.get("reason")?);
         let fate = match (fate.as_str(), reason.as_deref()) {
             ("accepted", None) => Some(Fate::Accepted),
@@ -244,7 +244,7 @@ impl FromRow for StoredCandidate {
     }
 }
 
-/// The block of a row, which must be that of the candidate of this name.
+/// The block of a row. It must belong to the candidate of this name.
 pub(super) fn block(row: &Row, id: &str) -> Result<CandidateBlock> {
     let block = CandidateBlock::from_bytes(&row.get::<Vec<u8>>("block")?)?;
     let found = block.view().id().to_string();
@@ -259,7 +259,7 @@ pub(super) fn origin(name: &str) -> Result<Origin> {
     known.ok_or_else(|| StoreError::damaged("an origin", name))
 }
 
-/// γ and γ_nbr, one behind the other in the column.
+/// γ and γ_nbr, one after the other in the column.
 pub(super) fn grades(column: Option<&[u8]>) -> Result<AtomGrades> {
     let Some(bytes) = column else { return Ok(AtomGrades::default()) };
     let mut gamma = decode_numbers(bytes)?;

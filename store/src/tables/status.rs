@@ -1,27 +1,28 @@
-//! The state of a campaign, from indexes.
+//! The state of a campaign, read from indexes.
 
 use wire::WalkId;
 
-use super::{budget, exclude, job_counts, pace, pauses, processes, relabel};
+use super::{budget, exclude, job_counts, pauses, processes, relabel, walk_progress};
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
 use crate::checksum::joined;
 use crate::database::query;
 use crate::error::Result;
-use crate::pace::Pace;
 use crate::processes::ProcessRecord;
 use crate::status::{Candidates, Labels, Status, WalkStatus};
 use crate::unix_milliseconds;
+use crate::walk_progress::WalkProgress;
 
 const END_BY_BUDGET: &str = "budget";
 
 const FATES: &str = "SELECT origin, fate, number FROM candidate_count";
 
-/// The same where nobody has kept count: in tables of an earlier version.
+/// The same for tables of an earlier version, which keep no counts.
 pub(crate) const COUNTED_FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
-/// The question for [`WalkStatus`], ended by which walks are meant. The table has zeros before a walk begins, and where it is not graded.
+/// The query for [`WalkStatus`]; its end selects the walks. The table has zeros before a walk starts and where it
+/// is not graded.
 macro_rules! walks {
     ($which:literal) => {
         concat!(
@@ -39,22 +40,22 @@ macro_rules! walks {
 pub(super) use walks;
 
 impl Store {
-    /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the
-    /// state `gone`, whatever was said of it before, unless it was `given up`, or is `pausing` and an orchestrator lives. One
-    /// of another host that has said nothing for a minute is `silent`.
-    /// A walk that a limit of time has stopped has the state `budget`. While nobody leads the campaign, walks stand at their
-    /// checkpoints and have no pace.
+    /// A snapshot of the campaign's state. Processes are ordered by kind and number. A dead process has the state
+    /// `gone`, whatever state it reported last, unless it was `given up`, or is `pausing` and an orchestrator
+    /// lives. A process on another host without a heartbeat for a minute is `silent`. A walk stopped by a time
+    /// limit has the state `budget`. While no process leads the campaign, walks are shown at their checkpoints and
+    /// have no speed.
     pub async fn status(&self) -> Result<Status> {
         let now = unix_milliseconds();
-        let mut transaction = self.database.begin_to_read().await?;
+        let mut transaction = self.database.begin_read().await?;
         let are_counted = transaction.has_table("candidate_count").await?;
         let fates = query(if are_counted { FATES } else { COUNTED_FATES });
         let fates: Vec<(String, String, u64)> = fates.fetch_all(&mut transaction).await?;
         let states = job_counts::states(&mut transaction).await?;
-        let asked = relabel::asked(&mut transaction).await?;
+        let asked = relabel::relabel_requests(&mut transaction).await?;
         let excluded = exclude::count(&mut transaction).await?;
         let oldest_lease = job_counts::oldest_lease(&mut transaction).await?;
-        let labels_last_hour = job_counts::made_in_the_last_hour(&mut transaction, now).await?;
+        let labels_last_hour = job_counts::labels_in_last_hour(&mut transaction, now).await?;
         let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
         let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
         let refused: u64 = refused.fetch_one(&mut transaction).await?;
@@ -68,52 +69,52 @@ impl Store {
         let paused = pauses::read(&mut transaction).await?;
         let mut steps_per_second = None;
         if led {
-            advance(&mut walks, &pace::fresh(&mut transaction, now).await?);
-            steps_per_second = pace::of_all(&mut transaction, now).await?;
+            apply_progress(&mut walks, &walk_progress::recent(&mut transaction, now).await?);
+            steps_per_second = walk_progress::total_steps_per_second(&mut transaction, now).await?;
         }
         transaction.commit().await?;
         let labels = Labels { excluded, ..labels(&states, &asked) };
         let time_used_up = limits.time_used_up(&used);
-        name_budget(&mut walks, time_used_up, &limits);
+        set_budget_reason(&mut walks, time_used_up, &limits);
         for walk in &mut walks {
-            walk.paused = walk.is_under_way() && paused.contains(&WalkId(walk.walk));
+            walk.paused = walk.is_active() && paused.contains(&WalkId(walk.walk));
             walk.steps_per_second = walk.steps_per_second.filter(|_| !walk.paused);
         }
-        let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.allows_no_attempt(&used));
+        let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.forbids_attempts(&used));
         Ok(Status {
             candidates: candidates(&fates, refused),
             imported,
             led,
             mixture_version,
             round,
-            finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_under_way) && no_more_labels,
+            finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_active) && no_more_labels,
             budget: BudgetStatus { used_up: used_up(time_used_up, &walks), limits, used },
             labels,
             oldest_lease,
             labels_last_hour,
             steps_per_second,
             walks,
-            processes: seen_from_here(processes),
+            processes: with_visible_state(processes),
         })
     }
 }
 
-/// Says of walks under way how fast they are, and where they are between their checkpoints.
-fn advance(walks: &mut [WalkStatus], paces: &[Pace]) {
-    for walk in walks.iter_mut().filter(|walk| walk.is_under_way()) {
-        let Ok(found) = paces.binary_search_by_key(&walk.walk, |pace| pace.walk) else { continue };
-        let pace = &paces[found];
-        walk.steps_per_second = pace.steps_per_second;
-        if (pace.segment, pace.step) > (walk.segment, walk.step) {
-            (walk.segment, walk.step, walk.tau) = (pace.segment, pace.step, pace.tau);
-            (walk.temperature, walk.relative_volume) = (pace.temperature, pace.relative_volume);
-            walk.gamma_max = pace.gamma_max;
+/// Adds the speed of running walks, and their progress since the last checkpoint.
+fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
+    for walk in walks.iter_mut().filter(|walk| walk.is_active()) {
+        let Ok(found) = progress.binary_search_by_key(&walk.walk, |latest| latest.walk) else { continue };
+        let latest = &progress[found];
+        walk.steps_per_second = latest.steps_per_second;
+        if (latest.segment, latest.step) > (walk.segment, walk.step) {
+            (walk.segment, walk.step, walk.tau) = (latest.segment, latest.step, latest.tau);
+            (walk.temperature, walk.relative_volume) = (latest.temperature, latest.relative_volume);
+            walk.gamma_max = latest.gamma_max;
         }
     }
 }
 
-/// Says of walks which budget has ended them. Those that are under way are stopped while a limit of time is reached.
-fn name_budget(walks: &mut [WalkStatus], time: Option<&'static str>, limits: &Budget) {
+/// Sets the budget that ended walks. Running walks count as stopped while a time limit is reached.
+fn set_budget_reason(walks: &mut [WalkStatus], time: Option<&'static str>, limits: &Budget) {
     let structures = limits.structures_by.as_deref().unwrap_or("collect.total");
     for walk in walks {
         if walk.state == END_BY_BUDGET {
@@ -125,7 +126,7 @@ fn name_budget(walks: &mut [WalkStatus], time: Option<&'static str>, limits: &Bu
     }
 }
 
-/// The limit that ended walks: of time, or what the walks say.
+/// The limit that ended walks: a time limit, or the one that the walks name.
 fn used_up(time: Option<&'static str>, walks: &[WalkStatus]) -> Option<String> {
     let ended = || walks.iter().rfind(|walk| walk.state == END_BY_BUDGET).map(|walk| walk.reason.clone());
     time.map(str::to_owned).or_else(ended)
@@ -172,9 +173,9 @@ fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> Labels {
     }
 }
 
-/// In order of kind and number. One that is gone has no other state, but for what the orchestrator says of those that it does not start again: they
-/// were given up, or their pause is not over.
-fn seen_from_here(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
+/// Orders processes by kind and number. A dead process keeps its own state only if the orchestrator has given it up
+/// or waits before it restarts it.
+fn with_visible_state(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
     let ranks = [ProcessRecord::ORCHESTRATOR, ProcessRecord::WALKER, ProcessRecord::LABELLER];
     let rank = |kind: &str| ranks.iter().position(|k| *k == kind).unwrap_or(ranks.len());
     processes.sort_by_key(|process| (rank(&process.kind), process.number));
@@ -182,9 +183,9 @@ fn seen_from_here(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
     for process in &mut processes {
         let state = process.state.as_str();
         let stays = state.starts_with("given up") || (led && state.starts_with("pausing"));
-        if process.is_gone() && !stays {
+        if process.is_dead() && !stays {
             process.state = "gone".to_owned();
-        } else if process.is_silent() && matches!(state, "running" | "stopping") {
+        } else if process.is_unresponsive() && matches!(state, "running" | "stopping") {
             process.state = "silent".to_owned();
         }
     }

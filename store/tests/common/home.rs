@@ -1,4 +1,4 @@
-//! Where a test keeps its campaign.
+//! The database of a test.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -8,13 +8,14 @@ use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
 use store::{Location, Store};
 use tempfile::TempDir;
 
-/// A directory; a schema of its own on the server that `CALMWALK_POSTGRES` names, which the test target `postgres` asks for.
+/// A directory, or a schema of its own on the server given by `CALMWALK_POSTGRES`, which the test target `postgres`
+/// uses.
 pub struct Home {
     directory: TempDir,
     schema: Option<String>,
 }
 
-/// URL of the server to test with.
+/// URL of the test server.
 pub fn server() -> String {
     std::env::var("CALMWALK_POSTGRES")
         .expect("CALMWALK_POSTGRES must be the URL of a PostgreSQL server; '.ci/postgres start' makes one")
@@ -31,7 +32,7 @@ impl Home {
         Self { directory: tempfile::tempdir().unwrap(), schema }
     }
 
-    /// The schema, on a server.
+    /// The schema on a server.
     pub fn schema(&self) -> &str {
         self.schema.as_deref().expect("a directory has no schema")
     }
@@ -46,7 +47,7 @@ impl Home {
         }
     }
 
-    /// Does something to the tables behind the back of the program.
+    /// Executes SQL on the tables without the store.
     pub async fn execute(&self, sql: &'static str) {
         if let Some(schema) = &self.schema {
             let options: PgConnectOptions = server().parse().unwrap();
@@ -59,17 +60,17 @@ impl Home {
         }
     }
 
-    /// A campaign with one seed structure and the protocol "dft" in force, in which it is as late as the caller says.
+    /// Creates a campaign with one seed structure and the protocol "dft" in force, which uses the caller's clock.
     pub async fn create(&self) -> Store {
-        super::create_at(self.location()).await.by_the_callers_clock()
+        super::create_at(self.location()).await.with_caller_clock()
     }
 
     pub async fn open(&self) -> Store {
-        Store::open(self.location()).await.unwrap().by_the_callers_clock()
+        Store::open(self.location()).await.unwrap().with_caller_clock()
     }
 
     pub async fn open_read_only(&self) -> Store {
-        Store::open_read_only(self.location()).await.unwrap().by_the_callers_clock()
+        Store::open_read_only(self.location()).await.unwrap().with_caller_clock()
     }
 }
 
@@ -79,14 +80,14 @@ impl Drop for Home {
         let remove = async move {
             let options: PgConnectOptions = server().parse().unwrap();
             let mut connection = options.connect().await.unwrap();
-            // What the test dropped may not have been rolled back yet.
+            // A transaction that the test dropped may not be rolled back yet.
             let end =
                 "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity WHERE application_name = $1";
             sqlx::query(end).bind(&schema).execute(&mut connection).await.unwrap();
             let sql = AssertSqlSafe(format!("DROP SCHEMA IF EXISTS {schema} CASCADE"));
             connection.execute(sql).await.unwrap();
         };
-        // A test has a runtime of its own, in which nothing can be waited for now.
+        // The test's runtime cannot wait for anything at this point.
         let thread = std::thread::spawn(|| {
             tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(remove);
         });

@@ -1,4 +1,4 @@
-//! A small campaign to test with.
+//! A small campaign for tests.
 #![allow(dead_code, unused_imports, reason = "each test file uses its part")]
 
 mod home;
@@ -50,13 +50,13 @@ pub async fn create(directory: &std::path::Path) -> Store {
 }
 
 pub async fn create_at(location: Location) -> Store {
-    let seed = SeedStructure {
+    let seed_structure = SeedStructure {
         index: 0,
         name: "diamond".into(),
         source: "seeds.extxyz".into(),
         structure: structure(0.0),
     };
-    let store = Store::create(location, &campaign(), &[seed], 0).await.unwrap();
+    let store = Store::create(location, &campaign(), &[seed_structure], 0).await.unwrap();
     store.add_protocol(&protocol("dft"), 0).await.unwrap();
     store
 }
@@ -70,7 +70,7 @@ pub fn label(energy: f64) -> Label {
     }
 }
 
-/// The candidate of a walk at a step; its structure follows from both.
+/// The candidate of a walk at a step; both determine its structure.
 pub fn candidate(walk: u32, step: u64, origin: Origin, fate: Fate) -> CandidateRecord {
     let structure = structure(f64::from(walk) + 1e-6 * step as f64);
     let content = ContentHash::of(&structure);
@@ -105,7 +105,7 @@ pub fn name_of(candidate: &CandidateRecord) -> String {
     candidate.block.view().id().to_string()
 }
 
-/// A commit of these candidates with a decision about each.
+/// A commit of these candidates with a decision on each.
 pub fn commit_of(candidates: Vec<CandidateRecord>) -> Commit {
     let decisions = candidates.iter().map(|candidate| {
         let id = candidate.block.view().id();
@@ -153,7 +153,7 @@ pub async fn accept(store: &Store, number: u64) -> Vec<String> {
     accept_from(store, 1, number).await
 }
 
-/// The same from a step on.
+/// The same from a given step.
 pub async fn accept_from(store: &Store, first: u64, number: u64) -> Vec<String> {
     let mut names = Vec::new();
     for step in first..first + number {

@@ -1,4 +1,4 @@
-//! What is said when there is no connection to be had.
+//! Error messages for missing connections.
 
 use std::time::Duration;
 
@@ -9,9 +9,9 @@ use store::{Commit, Location, Store};
 use super::common::*;
 use super::leading::connect;
 
-/// A server that refuses new connections, though it is there.
+/// A server that refuses new connections.
 #[tokio::test]
-async fn a_server_without_a_connection_left_is_waited_for_and_says_so() {
+async fn a_server_without_free_connections_is_waited_for_and_named() {
     let home = Home::new();
     let store = home.create().await;
     store.close().await;
@@ -34,9 +34,9 @@ async fn a_server_without_a_connection_left_is_waited_for_and_says_so() {
     connection.execute(AssertSqlSafe(leave)).await.unwrap();
 }
 
-/// Somebody holds what all connections of a process wait for.
+/// All connections of a process wait for a lock.
 #[tokio::test]
-async fn who_waits_for_a_lock_is_not_told_that_the_server_is_away() {
+async fn waiting_for_a_lock_is_not_reported_as_an_unreachable_server() {
     let home = Home::new();
     let store = home.create().await;
     let mut other = connect(&home).await;
@@ -47,11 +47,11 @@ async fn who_waits_for_a_lock_is_not_told_that_the_server_is_away() {
     });
     let commits: Vec<_> = commits.collect();
     tokio::time::sleep(Duration::from_secs(1)).await;
-    let error = store.add_time_under_way(1).await.unwrap_err();
+    let error = store.add_running_time(1).await.unwrap_err();
     assert!(error.is_transient() && error.to_string().contains("locked"), "{error}");
     other.execute("ROLLBACK").await.unwrap();
     for commit in commits {
         commit.await.unwrap().unwrap();
     }
-    store.add_time_under_way(1).await.unwrap();
+    store.add_running_time(1).await.unwrap();
 }

@@ -1,4 +1,4 @@
-//! One process leads a campaign, and one schema holds one.
+//! Only one process leads a campaign, and a schema holds only one campaign.
 
 use std::time::Duration;
 
@@ -9,13 +9,13 @@ use wire::{CampaignId, Origin};
 
 use super::common::*;
 
-/// A connection to see and do what a store does not.
+/// A connection for what a store does not do.
 pub async fn connect(home: &Home) -> PgConnection {
     let options: PgConnectOptions = server().parse().unwrap();
     options.options([("search_path", home.schema())]).connect().await.unwrap()
 }
 
-/// Ends the connection that holds the lock, as a break of the network would.
+/// Ends the connection that holds the lock, like a network failure.
 async fn break_the_lock(home: &Home) {
     let sql = "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity
                WHERE application_name = $1 AND pid IN (SELECT pid FROM pg_locks WHERE locktype = 'advisory')";
@@ -25,7 +25,7 @@ async fn break_the_lock(home: &Home) {
 }
 
 #[tokio::test]
-async fn a_second_holder_is_told_the_first_and_the_lock_comes_free() {
+async fn a_second_holder_learns_of_the_first_and_the_lock_is_released() {
     let home = Home::new();
     let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
     let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
@@ -44,7 +44,7 @@ async fn a_second_holder_is_told_the_first_and_the_lock_comes_free() {
 async fn a_lock_whose_connection_broke_is_taken_again() {
     let home = Home::new();
     let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
-    let store = home.create().await.led_by(&lock);
+    let store = home.create().await.fenced_by(&lock);
     break_the_lock(&home).await;
     let lost = tokio::time::timeout(Duration::from_secs(4), lock.lost()).await;
     assert!(lost.is_err(), "nobody else took it: {lost:?}");
@@ -54,26 +54,26 @@ async fn a_lock_whose_connection_broke_is_taken_again() {
 }
 
 #[tokio::test]
-async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
+async fn a_process_that_lost_the_lock_stops_writing() {
     let home = Home::new();
     let first = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
-    let old = home.create().await.led_by(&first);
+    let old = home.create().await.fenced_by(&first);
     accept(&old, 1).await;
     let second = loop {
         break_the_lock(&home).await;
         match CampaignLock::acquire_at(home.location(), "second").await {
             Ok(lock) => break lock,
-            // The first was faster to take it again.
+            // The first took it again before.
             Err(error) => assert!(matches!(error, StoreError::Locked { .. }), "{error}"),
         }
     };
-    let new = home.open().await.led_by(&second);
+    let new = home.open().await.fenced_by(&second);
     let fresh = |step| commit_of(vec![candidate(0, step, Origin::Biased, Fate::Accepted)]);
-    // Before it learns it, too.
+    // Also before it notices.
     for error in [
         old.commit(&fresh(7)).await.unwrap_err(),
         old.add_protocol(&protocol("other"), 0).await.unwrap_err(),
-        old.take_over(0).await.unwrap_err(),
+        old.reclaim_leases(0).await.unwrap_err(),
         old.set_configuration_in_force("{}", &[], 0).await.unwrap_err(),
     ] {
         assert!(
@@ -88,7 +88,7 @@ async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
 }
 
 #[tokio::test]
-async fn another_campaign_in_the_same_schema_is_refused_with_both_names() {
+async fn another_campaign_in_the_same_schema_is_refused_with_both_ids() {
     let home = Home::new();
     home.create().await;
     let other = Campaign { id: CampaignId([3; 16]), ..campaign() };
@@ -101,7 +101,7 @@ async fn another_campaign_in_the_same_schema_is_refused_with_both_names() {
 }
 
 #[tokio::test]
-async fn foreign_tables_and_newer_versions_are_left_alone() {
+async fn foreign_tables_and_newer_versions_are_refused() {
     let home = Home::new();
     let mut connection = connect(&home).await;
     let schema = sqlx::AssertSqlSafe(format!("CREATE SCHEMA {}", home.schema()));
@@ -124,9 +124,9 @@ async fn foreign_tables_and_newer_versions_are_left_alone() {
     }
 }
 
-/// Several at once, so that none finds what another is still making.
+/// Several at once: none finds tables that another is still creating.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn several_processes_may_make_the_tables() {
+async fn several_processes_may_create_the_tables() {
     let home = Home::new();
     let create = || {
         let location = home.location();

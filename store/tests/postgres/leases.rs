@@ -1,10 +1,10 @@
-//! Leases among hosts: nobody gets a job twice, and nobody's clock counts but the server's.
+//! Leases across hosts: no job is leased twice, and only the server's clock counts.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use sqlx::Executor;
-use store::{Completed, Fate, JobState, Lease, ProcessRecord, Store};
+use store::{CompleteOutcome, Fate, JobState, Lease, ProcessRecord, Store};
 use wire::Origin;
 
 use super::common::*;
@@ -16,7 +16,7 @@ async fn lease(store: &Store, holder: &str, now: i64, seconds: u32) -> Option<Le
     store.lease(protocol("dft").hash, holder, now, seconds).await.unwrap()
 }
 
-/// A campaign with so many jobs, by the server's clock.
+/// A campaign with this many jobs that uses the server's clock.
 async fn with_jobs(home: &Home, jobs: u64) -> Store {
     let store = home.create().await;
     let records = (1..=jobs).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
@@ -37,7 +37,10 @@ async fn eight_labellers_at_once_never_get_the_same_job() {
                 assert_eq!(lease.attempt, 1);
                 jobs.push(lease.job);
                 if lease.job % 2 == 0 {
-                    assert_eq!(store.complete(&lease, &label(-1.0), 1).await.unwrap(), Completed::Label);
+                    assert_eq!(
+                        store.complete(&lease, &label(-1.0), 1).await.unwrap(),
+                        CompleteOutcome::Label
+                    );
                 }
             }
             jobs
@@ -55,9 +58,9 @@ async fn eight_labellers_at_once_never_get_the_same_job() {
     assert_eq!((labels.queued, labels.leased + labels.labelled), (0, 200));
 }
 
-/// A job that is being leased does not keep others from the next.
+/// A job that is being leased does not block the next one.
 #[tokio::test]
-async fn a_job_in_other_hands_is_passed_over() {
+async fn a_job_locked_by_another_is_skipped() {
     let home = Home::new();
     let store = with_jobs(&home, 2).await;
     let mut other = connect(&home).await;
@@ -70,7 +73,7 @@ async fn a_job_in_other_hands_is_passed_over() {
 }
 
 #[tokio::test]
-async fn labellers_whose_clocks_are_an_hour_apart_respect_each_other() {
+async fn labellers_with_clocks_an_hour_apart_respect_each_others_leases() {
     let home = Home::new();
     let (store, now) = (with_jobs(&home, 2).await, store::unix_milliseconds());
     let slow = lease(&store, "slow", now - HOUR, 600).await.unwrap();
@@ -82,31 +85,31 @@ async fn labellers_whose_clocks_are_an_hour_apart_respect_each_other() {
         let left = job.expires.unwrap() - now;
         assert!((590_000..700_000).contains(&left), "{left} ms left of {job:?}");
     }
-    assert_eq!(store.complete(&fast, &label(-1.0), now + HOUR).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&fast, &label(-1.0), now + HOUR).await.unwrap(), CompleteOutcome::Label);
 
-    // Who is silent loses its lease whatever its clock shows: its record was written by the server's.
+    // A silent process loses its lease whatever its clock shows: the server wrote the time of its record.
     let elsewhere = |id: &str, last_seen| {
         let here = ProcessRecord { id: id.into(), ..ProcessRecord::new("labeller", Some(7), 1, last_seen) };
-        let birth = store::process_birth(std::process::id()).unwrap();
-        let (place, ticks) = birth.rsplit_once('/').unwrap();
-        ProcessRecord { birth: format!("{place}0/{ticks}"), ..here }
+        let start_time = store::process_start_time(std::process::id()).unwrap();
+        let (place, ticks) = start_time.rsplit_once('/').unwrap();
+        ProcessRecord { start_time: format!("{place}0/{ticks}"), ..here }
     };
     assert!(store.renew(&slow, now - HOUR, 1).await.unwrap());
-    let begun = Instant::now();
+    let started = Instant::now();
     store.upsert_process(&elsewhere("slow", now + HOUR)).await.unwrap();
     let again = loop {
         if let Some(lease) = lease(&store, "fast", now - HOUR, 1).await {
             break lease;
         }
-        assert!(begun.elapsed() < Duration::from_secs(60), "the silent one keeps its job for ever");
+        assert!(started.elapsed() < Duration::from_secs(60), "the silent one keeps its job for ever");
         tokio::time::sleep(Duration::from_millis(50)).await;
     };
     assert_eq!((again.job, again.attempt), (slow.job, 2));
-    assert!(begun.elapsed() >= Duration::from_millis(900), "not before a second of silence");
+    assert!(started.elapsed() >= Duration::from_millis(900), "not before a second of silence");
 }
 
 #[tokio::test]
-async fn a_label_that_comes_after_its_lease_went_to_another_counts_once() {
+async fn a_label_delivered_after_its_lease_was_lost_counts_once() {
     let home = Home::new();
     let store = with_jobs(&home, 1).await;
     let late = lease(&store, "late", 0, 1).await.unwrap();
@@ -114,39 +117,39 @@ async fn a_label_that_comes_after_its_lease_went_to_another_counts_once() {
     let holds = lease(&store, "holds", 0, 600).await.unwrap();
     assert_eq!((holds.job, holds.attempt), (late.job, 2));
     assert!(!store.renew(&late, 0, 600).await.unwrap());
-    assert_eq!(store.complete(&late, &label(-1.0), 0).await.unwrap(), Completed::Label);
-    assert_eq!(store.complete(&holds, &label(-2.0), 0).await.unwrap(), Completed::KeptAsCheck);
-    assert_eq!(store.complete(&late, &label(-3.0), 0).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&late, &label(-1.0), 0).await.unwrap(), CompleteOutcome::Label);
+    assert_eq!(store.complete(&holds, &label(-2.0), 0).await.unwrap(), CompleteOutcome::KeptAsCheck);
+    assert_eq!(store.complete(&late, &label(-3.0), 0).await.unwrap(), CompleteOutcome::Label);
     let details = store.queue_show(&late.candidate).await.unwrap();
     let energies: Vec<_> = details.energies.iter().map(|(_, energy)| *energy).collect();
     assert_eq!((details.job.state, energies), (JobState::Labelled, vec![-1.0, -2.0]));
 }
 
 #[tokio::test]
-async fn whoever_waits_is_told_of_new_jobs() {
+async fn waiting_labellers_are_notified_of_new_jobs() {
     let home = Home::new();
     let store = with_jobs(&home, 1).await;
     let long = Duration::from_secs(60);
     // Until it listens.
     store.wait_for_jobs(long).await;
-    let (waiting, begun) = (store.clone(), Instant::now());
+    let (waiting, started) = (store.clone(), Instant::now());
     let wait = tokio::spawn(async move { waiting.wait_for_jobs(long).await });
     tokio::time::sleep(Duration::from_millis(100)).await;
     store.commit(&commit_of(vec![candidate(1, 1, Origin::Biased, Fate::Accepted)])).await.unwrap();
     wait.await.unwrap();
-    assert!(begun.elapsed() < long / 2);
-    // Told of it once; a job that comes back is told of as well.
+    assert!(started.elapsed() < long / 2);
+    // Notified once; a job that returns to the queue causes a notification as well.
     tokio::time::timeout(Duration::from_millis(300), store.wait_for_jobs(long)).await.unwrap_err();
     let leased = lease(&store, "a", 0, 600).await.unwrap();
     store.release_all("a", 0).await.unwrap();
     store.wait_for_jobs(long).await;
-    assert!(begun.elapsed() < long / 2);
+    assert!(started.elapsed() < long / 2);
     assert_eq!(lease(&store, "b", 0, 600).await.unwrap().job, leased.job);
 }
 
-/// The last words of a process may hold anything.
+/// The output of a process may contain anything.
 #[tokio::test]
-async fn zero_bytes_in_a_log_are_no_obstacle() {
+async fn nul_characters_in_a_log_are_replaced() {
     let home = Home::new();
     let store = with_jobs(&home, 1).await;
     let leased = lease(&store, "a", 0, 600).await.unwrap();

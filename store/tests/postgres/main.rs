@@ -1,13 +1,14 @@
-//! What is peculiar to a PostgreSQL server. The tests of `../main.rs` run on one as well if `CALMWALK_POSTGRES` names it.
+//! Properties of a PostgreSQL server. The tests of `../main.rs` also run on one if `CALMWALK_POSTGRES` is set.
 //!
-//! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres`; `restart`, which restarts the server, by itself.
+//! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres`; run `restart`, which restarts the
+//! server, separately.
 
 #[path = "../common/mod.rs"]
 mod common;
 mod connections;
-mod earlier;
 mod leading;
 mod leases;
+mod old_schema;
 mod protection;
 mod restart;
 mod secrets;

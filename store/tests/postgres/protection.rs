@@ -1,4 +1,5 @@
-//! TLS to the server that `.ci/postgres` makes, whose certificate, and that of a user who needs one, are of its own authority.
+//! TLS to the server of `.ci/postgres`. Its certificate, and that of a user who needs one, are signed by its own
+//! authority.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -16,7 +17,7 @@ async fn certificates(home: &Home) -> PathBuf {
     Path::new(&file).parent().unwrap().to_owned()
 }
 
-/// The location as `user` by an encrypted connection, to the host by that name.
+/// The location for `user` over an encrypted connection to this host name.
 fn at(home: &Home, user: &str, host: &str, parameters: &str) -> Location {
     let address = server().split_once('@').unwrap().1.replace("127.0.0.1", host);
     let schema = home.schema();
@@ -24,7 +25,7 @@ fn at(home: &Home, user: &str, host: &str, parameters: &str) -> Location {
     url.parse().unwrap()
 }
 
-/// Number of the connections of a test by which its store and its lock are used, and of those that are encrypted.
+/// Number of connections of a test's store and lock, and of the encrypted ones among them.
 async fn connections(home: &Home) -> (i64, i64) {
     let sql = "SELECT count(*), count(*) FILTER (WHERE ssl) FROM pg_stat_activity NATURAL JOIN pg_stat_ssl
                WHERE application_name = $1";
@@ -32,13 +33,13 @@ async fn connections(home: &Home) -> (i64, i64) {
 }
 
 #[tokio::test]
-async fn a_server_that_is_known_is_spoken_to_in_secret() {
+async fn a_verified_server_gets_an_encrypted_connection() {
     let home = Home::new();
     let root = certificates(&home).await.join("authority.pem");
     let location =
         at(&home, "calmwalk", "localhost", &format!("sslmode=verify-full&sslrootcert={}", root.display()));
     let lock = CampaignLock::acquire_at(&location, "protected").await.unwrap();
-    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().led_by(&lock);
+    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().fenced_by(&lock);
     store.status().await.unwrap();
     let (all, encrypted) = connections(&home).await;
     assert!(all >= 2, "the lock has one, and the store");
@@ -46,7 +47,7 @@ async fn a_server_that_is_known_is_spoken_to_in_secret() {
 }
 
 #[tokio::test]
-async fn a_server_that_is_not_known_is_not_spoken_to() {
+async fn an_unverified_server_is_refused() {
     let home = Home::new();
     let own = certificates(&home).await;
     let others = tempfile::tempdir().unwrap();
@@ -57,9 +58,9 @@ async fn a_server_that_is_not_known_is_not_spoken_to() {
     let right = format!("sslmode=verify-full&sslrootcert={}/authority.pem", own.display());
     for (host, parameters, expected) in [
         ("localhost", wrong.as_str(), "BadSignature"),
-        // Public authorities alone.
+        // Public authorities only.
         ("localhost", "sslmode=verify-full", "UnknownIssuer"),
-        // Another name than that of its certificate.
+        // Another name than in its certificate.
         ("127.0.0.1", right.as_str(), "not valid for name"),
     ] {
         let error = Store::open(at(&home, "calmwalk", host, parameters)).await.unwrap_err();
@@ -70,7 +71,7 @@ async fn a_server_that_is_not_known_is_not_spoken_to() {
 }
 
 #[tokio::test]
-async fn a_user_may_be_known_by_a_certificate() {
+async fn a_user_may_log_in_with_a_certificate() {
     let home = Home::new();
     let certificates = certificates(&home).await;
     let make = "DO $$ BEGIN CREATE ROLE anna LOGIN SUPERUSER; EXCEPTION WHEN duplicate_object THEN END $$";

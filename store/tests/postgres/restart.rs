@@ -1,12 +1,12 @@
-//! The server is restarted, as after a crash, while work goes on: nothing is lost, and nothing is there twice. By itself, since no
-//! other test can go on meanwhile: `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres restart::`.
+//! Restarts the server during work, as after a crash: nothing is lost or duplicated. Run separately, since no other
+//! test can run meanwhile: `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres restart::`.
 
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use store::{CampaignLock, Commit, Completed, ComponentRecord, Fate, JobState, Store, StoreError};
+use store::{CampaignLock, Commit, CompleteOutcome, ComponentRecord, Fate, JobState, Store, StoreError};
 use wire::Origin;
 use wire::messages::Decline;
 
@@ -21,7 +21,7 @@ fn restart() {
     assert!(Command::new("sh").args(["-c", &command]).status().unwrap().success(), "{command}");
 }
 
-/// The commit with number `k`, from 1, which all its parts tell.
+/// Commit `k`, from 1; all its parts contain `k`.
 fn numbered(k: u64) -> Commit {
     let records = vec![
         candidate(0, 2 * k, Origin::Biased, Fate::Accepted),
@@ -35,7 +35,7 @@ fn numbered(k: u64) -> Commit {
     }
 }
 
-/// Does it until the server is there.
+/// Retries until the server responds.
 async fn insist<T, F: Future<Output = Result<T, StoreError>>>(mut call: impl FnMut() -> F) -> T {
     loop {
         match call().await {
@@ -45,14 +45,14 @@ async fn insist<T, F: Future<Output = Result<T, StoreError>>>(mut call: impl FnM
     }
 }
 
-/// Labels what there is until nothing will come; returns how many labels were accepted.
+/// Labels until no more jobs will come. Returns the number of accepted labels.
 async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -> u64 {
     let (holder, mut labelled) = (format!("l{number}"), 0);
     loop {
         let last_look = no_more_jobs.load(Ordering::Relaxed);
         let found = insist(|| store.lease(protocol("dft").hash, &holder, 0, 1)).await;
         let Some(lease) = found else {
-            // A lease whose answer was lost comes back when its time is over.
+            // A lease whose reply was lost is released when it expires.
             if last_look && insist(|| store.unfinished_jobs()).await == 0 {
                 return labelled;
             }
@@ -60,18 +60,18 @@ async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -
             continue;
         };
         let made = label(-1.0);
-        if insist(|| store.complete(&lease, &made, 0)).await == Completed::Label {
+        if insist(|| store.complete(&lease, &made, 0)).await == CompleteOutcome::Label {
             labelled += 1;
         }
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
+async fn nothing_is_lost_or_duplicated_when_the_server_restarts() {
     let home = Home::new();
     let lock = CampaignLock::acquire_at(home.location(), "restart test").await.unwrap();
     drop(home.create().await);
-    let store = Store::open(home.location()).await.unwrap().led_by(&lock);
+    let store = Store::open(home.location()).await.unwrap().fenced_by(&lock);
     let (done, committed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
     let no_more_jobs = Arc::new(AtomicBool::new(false));
     let labellers: Vec<_> = (0..LABELLERS)
@@ -81,7 +81,7 @@ async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
         let (store, done, committed) = (store.clone(), Arc::clone(&done), Arc::clone(&committed));
         async move {
             for k in 1.. {
-                // Each is given once: to wait for the server is up to the store.
+                // Each call is made once: the store waits for the server.
                 let numbers = store.commit(&numbered(k)).await.unwrap();
                 assert_eq!(numbers, 2 * k as i64 - 1..2 * k as i64 + 1);
                 committed.store(k, Ordering::Relaxed);
@@ -118,7 +118,7 @@ async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
     for job in jobs {
         assert_eq!(job.state, JobState::Labelled);
         let details = store.queue_show(&job.candidate).await.unwrap();
-        let labels = details.energies.iter().filter(|(standing, _)| *standing == store::Standing::Label);
+        let labels = details.energies.iter().filter(|(standing, _)| *standing == store::LabelStatus::Label);
         assert_eq!(labels.count(), 1);
         assert_eq!(details.attempts_made.len() as u32, job.attempts);
         assert!(details.attempts_made.iter().all(|attempt| attempt.outcome.is_some()));

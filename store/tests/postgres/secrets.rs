@@ -1,4 +1,4 @@
-//! A password is nowhere to be read.
+//! The password is shown nowhere.
 
 use sqlx::Executor;
 use store::{CampaignLock, Location, Store};
@@ -8,7 +8,7 @@ use super::leading::connect;
 
 const PASSWORD: &str = "tr0ub4dor";
 
-/// The location with a user of its own, in the URL with its password.
+/// The location for a user of its own, with the password in the URL.
 async fn with_password(home: &Home) -> Location {
     let user = home.schema();
     let create = format!("CREATE ROLE {user} LOGIN SUPERUSER PASSWORD '{PASSWORD}'");
@@ -22,7 +22,7 @@ async fn a_password_is_in_no_message_and_not_in_the_database() {
     let home = Home::new();
     let location = with_password(&home).await;
     let lock = CampaignLock::acquire_at(&location, "first").await.unwrap();
-    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().led_by(&lock);
+    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().fenced_by(&lock);
     let refused = CampaignLock::acquire_at(&location, "second").await.unwrap_err();
     let exists = Store::create(&location, &campaign(), &[], 0).await.unwrap_err();
     let nowhere: Location = format!("postgres://anna:{PASSWORD}@127.0.0.1:1/lab?schema=x").parse().unwrap();

@@ -86,7 +86,8 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
         resume_processes(&held);
         assert_eq!(run.0.wait().unwrap().code(), Some(1));
         let said = disk.said();
-        let words = "the disk is full: nothing was written, and what was committed before is safe; make space and start again";
+        let words =
+            "the disk is full: nothing was written, and earlier commits are safe; free space and start again";
         assert!(said.contains(words), "{said}");
         // Nor does one begin.
         assert_eq!(disk.run().0.wait().unwrap().code(), Some(1));

@@ -123,7 +123,7 @@ fn what_slurm_has_forgotten_stands_in_the_log_of_the_job() {
     assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
     let ended = only(&jobs, "time_limit");
     let log = ended["log"].as_str().unwrap();
-    assert!(log.contains("does not know its job any more") && log.contains("DUE TO TIME LIMIT"), "{ended}");
+    assert!(log.contains("no longer knows its job") && log.contains("DUE TO TIME LIMIT"), "{ended}");
     assert!(ended["core_seconds"].as_f64() > Some(0.0), "{ended}");
 }
 

@@ -1,4 +1,4 @@
-//! A biased walk of 108 atoms that benchmarks share.
+//! A biased walk of 108 atoms for benchmarks.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -11,26 +11,26 @@ use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
-/// A turn of a walk whose bias is at work, which begins at the same checkpoint each time.
+/// An assignment of a walk with active bias, which starts at the same checkpoint each time.
 #[derive(Clone)]
-pub struct Turn {
+pub struct TimedWalk {
     context: WalkContext,
     mixture: Arc<Mixture>,
     assignment: Assignment,
-    /// Where it begins.
+    /// The structure where it starts.
     pub structure: Structure,
 }
 
-impl Turn {
-    pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed: Structure) -> Self {
+impl TimedWalk {
+    pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed_structure: Structure) -> Self {
         let context = |threshold| WalkContext {
             model: Arc::clone(model),
             threads: Threads::default(),
             settings: Arc::new(settings(threshold)),
         };
-        let mut assignment = assignment(seed, u64::MAX);
-        // Any structure is a candidate, from the first that may be offered on.
-        let report = go(&context(1e-9), &assignment, mixture);
+        let mut assignment = assignment(seed_structure, u64::MAX);
+        // Any structure is a candidate from the first permitted step on.
+        let report = run(&context(1e-9), &assignment, mixture);
         let Outcome::Candidate(candidate) = report.outcome else {
             panic!("the walk has ended before its bias began: {:?}", report.outcome)
         };
@@ -43,25 +43,25 @@ impl Turn {
         }
     }
 
-    /// Seconds a step, of so many.
+    /// Seconds per step, averaged over `steps`.
     pub fn seconds(&mut self, steps: u64) -> f64 {
         self.assignment.until = EQUILIBRATION + 1 + steps;
         let start = Instant::now();
-        let report = go(&self.context, &self.assignment, &self.mixture);
+        let report = run(&self.context, &self.assignment, &self.mixture);
         let seconds = start.elapsed().as_secs_f64();
         assert_eq!(report.outcome, Outcome::Turn, "the walk makes all its steps");
         seconds / steps as f64
     }
 }
 
-fn go(context: &WalkContext, assignment: &Assignment, mixture: &Arc<Mixture>) -> Report<Candidate> {
+fn run(context: &WalkContext, assignment: &Assignment, mixture: &Arc<Mixture>) -> Report<Candidate> {
     advance(context, assignment, Arc::clone(mixture), || false, |_| {})
 }
 
 const EQUILIBRATION: u64 = 100;
 
-/// Those of the aluminium campaign, at constant volume, so that every call has as many bonds; a structure is a candidate
-/// if its largest grade is above `threshold`.
+/// Settings of the aluminium campaign at constant volume, so that every call has as many bonds. A structure is a
+/// candidate if its largest grade is above `threshold`.
 fn settings(threshold: f64) -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
@@ -107,7 +107,7 @@ fn assignment(seed_structure: Structure, until: u64) -> Assignment {
     }
 }
 
-/// fcc, 108 atoms, elements in turn; `edge` of the cube of four atoms in Å.
+/// fcc, 108 atoms, alternating elements; `edge` of the cube of four atoms in Å.
 pub fn crystal(elements: &[Species], edge: f64) -> Structure {
     const SITES: [[f64; 3]; 4] = [[0.0; 3], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
     const CELLS: usize = 3;

@@ -1,4 +1,4 @@
-//! Who has which turn in hand. No line, no clock.
+//! Which walker works on which assignment. No network, no clock.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -8,120 +8,120 @@ use wire::messages::Report;
 use wire::net::{Slot, Told};
 use wire::transport::Work;
 
-/// The turns and walkers of a host. `S` is a slot: the place of a turn at the orchestrator.
+/// The assignments and walkers of a host. `S` is a slot: the orchestrator's entry for one assignment.
 #[derive(Debug)]
-pub(super) struct Pool<S = Slot> {
-    /// Turns that no walker has begun.
+pub(super) struct AssignmentPool<S = Slot> {
+    /// Assignments that no walker has started.
     ready: VecDeque<(S, Work)>,
-    /// Walkers that wait for one, in the order in which they came.
+    /// Walkers that wait for an assignment, in order of arrival.
     waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
-    /// What each of the others works on.
-    in_hand: BTreeMap<u32, (Option<S>, WalkId)>,
-    /// Reports whose slots are gone.
-    untold: VecDeque<Report>,
-    /// Slots for which there may be work.
-    open: usize,
+    /// The assignment of each busy walker.
+    assigned: BTreeMap<u32, (Option<S>, WalkId)>,
+    /// Reports whose slots are lost.
+    unsent: VecDeque<Report>,
+    /// Slots that may still get work.
+    open_slots: usize,
 }
 
-impl<S> Default for Pool<S> {
+impl<S> Default for AssignmentPool<S> {
     fn default() -> Self {
-        let (ready, waiting, untold) = (VecDeque::new(), VecDeque::new(), VecDeque::new());
-        Self { ready, waiting, in_hand: BTreeMap::new(), untold, open: 0 }
+        let (ready, waiting, unsent) = (VecDeque::new(), VecDeque::new(), VecDeque::new());
+        Self { ready, waiting, assigned: BTreeMap::new(), unsent, open_slots: 0 }
     }
 }
 
-impl<S> Pool<S> {
-    /// Begins with these slots, or goes on with them in place of others: what is to be told first. Turns that a walker has
-    /// in hand keep a slot; those that nobody has begun are given up.
-    pub(super) fn begin(&mut self, slots: Vec<S>) -> Vec<(S, Told)> {
-        self.open = slots.len();
+impl<S> AssignmentPool<S> {
+    /// Starts with these slots, or replaces lost ones by them. Assignments in progress keep a slot; assignments not
+    /// started are dropped. Returns the first message for each free slot.
+    pub(super) fn start(&mut self, slots: Vec<S>) -> Vec<(S, Told)> {
+        self.open_slots = slots.len();
         self.ready.clear();
         let mut slots = slots.into_iter();
-        for (slot, _) in self.in_hand.values_mut() {
+        for (slot, _) in self.assigned.values_mut() {
             *slot = slots.next();
         }
-        slots.map(|slot| (slot, self.untold.pop_front().map_or(Told::Nothing, Told::Report))).collect()
+        slots.map(|slot| (slot, self.unsent.pop_front().map_or(Told::Nothing, Told::Report))).collect()
     }
 
-    /// A walker is free: what came of its turn is to be told, and it waits for another.
-    pub(super) fn free(
+    /// Handles an idle walker: returns the report of its assignment, and queues it for another one.
+    pub(super) fn walker_idle(
         &mut self,
         walker: u32,
         report: Option<Report>,
         reply: oneshot::Sender<Option<Work>>,
     ) -> Option<(S, Told)> {
-        let slot = self.in_hand.remove(&walker).and_then(|(slot, _)| slot);
+        let slot = self.assigned.remove(&walker).and_then(|(slot, _)| slot);
         self.waiting.push_back((walker, reply));
-        self.deal();
+        self.dispatch();
         match (slot, report) {
             (Some(slot), Some(report)) => Some((slot, Told::Report(report))),
             (Some(slot), None) => Some((slot, Told::Lost { fault: false })),
             (None, report) => {
-                self.untold.extend(report);
+                self.unsent.extend(report);
                 None
             }
         }
     }
 
-    /// A walker is no more: if it had a turn in hand, that is to be told.
-    pub(super) fn gone(&mut self, walker: u32, fault: bool) -> Option<(S, Told)> {
-        let (slot, _) = self.in_hand.remove(&walker)?;
+    /// Handles a lost walker: returns the message about its assignment, if it had one.
+    pub(super) fn walker_lost(&mut self, walker: u32, fault: bool) -> Option<(S, Told)> {
+        let (slot, _) = self.assigned.remove(&walker)?;
         Some((slot?, Told::Lost { fault }))
     }
 
-    /// A turn has come.
-    pub(super) fn turn(&mut self, slot: S, work: Work) {
+    /// Adds an assignment.
+    pub(super) fn assign(&mut self, slot: S, work: Work) {
         self.ready.push_back((slot, work));
-        self.deal();
+        self.dispatch();
     }
 
-    /// There is no more work for a slot.
-    pub(super) fn sent_home(&mut self) {
-        self.open = self.open.saturating_sub(1);
+    /// Handles a slot that gets no more work.
+    pub(super) fn slot_closed(&mut self) {
+        self.open_slots = self.open_slots.saturating_sub(1);
     }
 
-    /// Keeps what could not be told.
-    pub(super) fn keep(&mut self, told: Told) {
+    /// Keeps a report that could not be delivered.
+    pub(super) fn keep_unsent(&mut self, told: Told) {
         if let Told::Report(report) = told {
-            self.untold.push_back(report);
+            self.unsent.push_back(report);
         }
     }
 
-    /// The slot of the walk's turn that a walker has in hand.
+    /// The slot of a walk that is in progress here.
     pub(super) fn slot_of(&self, walk: WalkId) -> Option<&S> {
-        self.in_hand.values().find(|(_, of)| *of == walk).and_then(|(slot, _)| slot.as_ref())
+        self.assigned.values().find(|(_, of)| *of == walk).and_then(|(slot, _)| slot.as_ref())
     }
 
-    /// Sends those home who wait.
-    pub(super) fn send_home(&mut self) {
+    /// Dismisses the waiting walkers.
+    pub(super) fn dismiss_idle(&mut self) {
         for (_, reply) in self.waiting.drain(..) {
-            // A walker that is gone already needs no answer.
+            // A walker that has ended needs no reply.
             let _ = reply.send(None);
         }
     }
 
-    /// Reports that nobody takes for the time being.
-    pub(super) fn untold(&self) -> usize {
-        self.untold.len()
+    /// Reports that wait for a slot.
+    pub(super) fn unsent(&self) -> usize {
+        self.unsent.len()
     }
 
-    /// Walkers that wait for a turn.
+    /// Walkers without an assignment.
     pub(super) fn idle(&self) -> usize {
         self.waiting.len()
     }
 
-    /// Whether no walker has a turn in hand.
+    /// Whether no walker has an assignment.
     pub(super) fn is_idle(&self) -> bool {
-        self.in_hand.is_empty()
+        self.assigned.is_empty()
     }
 
-    /// Whether nothing is left to be done.
+    /// Whether no work is left.
     pub(super) fn is_over(&self) -> bool {
-        self.open == 0 && self.in_hand.is_empty()
+        self.open_slots == 0 && self.assigned.is_empty()
     }
 
-    /// Gives turns to walkers as far as there are both.
-    fn deal(&mut self) {
+    /// Gives assignments to waiting walkers.
+    fn dispatch(&mut self) {
         while let Some((slot, work)) = self.ready.pop_front() {
             let Some((walker, reply)) = self.waiting.pop_front() else {
                 self.ready.push_front((slot, work));
@@ -129,8 +129,8 @@ impl<S> Pool<S> {
             };
             let walk = work.assignment.walk;
             match reply.send(Some(work)) {
-                Ok(()) => drop(self.in_hand.insert(walker, (Some(slot), walk))),
-                // This walker is gone; the next one gets it.
+                Ok(()) => drop(self.assigned.insert(walker, (Some(slot), walk))),
+                // This walker has ended; the next one gets the assignment.
                 Err(Some(work)) => self.ready.push_front((slot, work)),
                 Err(None) => {}
             }

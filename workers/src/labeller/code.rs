@@ -1,4 +1,4 @@
-//! Labels by another program: calculations that outlive the labeller that began them.
+//! Labels made by another program: calculations that outlive the labeller that started them.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -14,278 +14,301 @@ use store::{Store, StoreError};
 use tokio::sync::OnceCell;
 use tokio::task::spawn_blocking;
 
-use super::begun::{Begun, Found};
-use super::here;
-use super::keeper::{Calculation, End, How, WORK};
-use super::method::Made;
-use super::prepare::{Prepared, prepare, read, write};
-use super::scratch::{self, Home};
+use super::calculation_handle::{CalculationHandle, CalculationState};
+use super::calculation_runner::{Calculation, CalculationEnd, EndReason, WORK};
+use super::local;
+use super::method::LabelAttempt;
+use super::prepare::{PreparedInput, prepare, read, write};
+use super::scratch::{self, ScratchRoot};
 use super::slurm::{self, Slurm};
-use super::{BatchSystem, Closing, KeeperCommand, Once, Running, insist, log, private};
+use super::{
+    BatchSystem, ExecutionSettings, RunnerCommand, Shutdown, SingleLabel, log, private_directory,
+    retry_until_written,
+};
 
-/// How long results may be read at least, also where the calculation has taken all of its time.
-const READING: Duration = Duration::from_secs(60);
-/// And how long they are read when somebody asks to stop.
-const LAST_READING: Duration = Duration::from_secs(5);
+/// Minimum time allowed for reading results, even if the calculation used up its time limit.
+const MIN_READ_TIME: Duration = Duration::from_secs(60);
+/// Time allowed for reading results after a shutdown request.
+const READ_GRACE: Duration = Duration::from_secs(5);
 
-/// Another program, and how it is run.
+/// Labels by another program, and how to run it.
 pub struct CodeMethod {
     code: Arc<dyn DftBackend>,
-    running: Running,
-    keeper: KeeperCommand,
+    execution: ExecutionSettings,
+    runner: RunnerCommand,
     /// Where the calculations of this campaign are.
-    home: OnceCell<Home>,
-    in_hand: Mutex<Option<InHand>>,
+    root: OnceCell<ScratchRoot>,
+    current: Mutex<Option<CurrentCalculation>>,
     slurm: Slurm,
 }
 
 /// A calculation that this labeller waits for.
-struct InHand {
-    begun: Begun,
-    /// Its keeper, if this process started it, and so has to take note of its end.
-    keeper: Option<Child>,
+struct CurrentCalculation {
+    handle: CalculationHandle,
+    /// Its runner, if this process started it and must reap it.
+    runner: Option<Child>,
 }
 
 /// A calculation that has ended.
-pub(super) struct Ended {
+pub(super) struct EndedCalculation {
     pub core_seconds: f64,
-    /// The end of what the program said.
+    /// The end of the program's output.
     pub log: String,
-    /// Where it ran, if a batch system had it run.
+    /// The node where it ran, for a batch job.
     node: Option<String>,
-    begun: Begun,
+    handle: CalculationHandle,
 }
 
-/// A calculation that only waits for a word.
-enum Ready {
-    Here(here::Ready),
+/// A calculation that is ready to start.
+enum PreparedCalculation {
+    Local(local::PreparedRunner),
     Slurm(slurm::Job),
 }
 
 impl CodeMethod {
-    pub(super) fn new(keeper: KeeperCommand, code: Box<dyn DftBackend>, running: Running) -> Self {
-        let (home, in_hand, slurm) =
-            (OnceCell::new(), Mutex::default(), Slurm::new(&running.pass_environment));
-        Self { code: code.into(), running, keeper, home, in_hand, slurm }
+    pub(super) fn new(
+        runner: RunnerCommand,
+        code: Box<dyn DftBackend>,
+        execution: ExecutionSettings,
+    ) -> Self {
+        let (root, current, slurm) =
+            (OnceCell::new(), Mutex::default(), Slurm::new(&execution.pass_environment));
+        Self { code: code.into(), execution, runner, root, current, slurm }
     }
 
     pub(super) fn size(&self, structure: &Structure) -> Size {
         self.code.size(structure)
     }
 
-    /// Finds the calculation that an earlier attempt began here, or starts one, and waits for its end. None if its results could
-    /// not be read within seconds after `closing` asked to stop.
+    /// Finds the calculation that an earlier attempt started here, or starts one, and waits for its end. `None` if
+    /// its results could not be read within seconds after a shutdown request.
     ///
     /// # Errors
-    /// Of the database; and where no calculation can be started here, whatever the structure.
+    /// Errors of the database, and if no calculation can be started on this host, whatever the structure.
     pub(super) async fn make(
         &self,
         store: &Store,
         lease: &Lease,
-        closing: &Closing,
-    ) -> Result<Option<Made>, StoreError> {
-        let prepared = match self.prepare(lease.structure.clone(), classes(lease)).await {
+        shutdown: &Shutdown,
+    ) -> Result<Option<LabelAttempt>, StoreError> {
+        let prepared = match self.prepare(lease.structure.clone(), failure_classes(lease)).await {
             Ok(prepared) => prepared,
-            Err(failure) => return Ok(Some(Made { result: Err(failure), ended: None })),
+            Err(failure) => return Ok(Some(LabelAttempt { result: Err(failure), ended: None })),
         };
-        let record = async |begun: &Begun| {
-            let identity = begun.identity();
-            insist(closing, || store.record_calculation(lease, &identity, &prepared.record)).await
+        let record = async |handle: &CalculationHandle| {
+            let identity = handle.identity();
+            retry_until_written(shutdown, || store.record_calculation(lease, &identity, &prepared.record))
+                .await
         };
-        let begun = match self.find(&lease.earlier_calculations).await? {
-            Some((begun, found)) => {
-                self.take(begun.clone(), None);
-                record(&begun).await?;
-                if let (Begun::Slurm(job), Found::Ready) = (&begun, found) {
+        let handle = match self.find(&lease.earlier_calculations).await? {
+            Some((handle, found)) => {
+                self.take(handle.clone(), None);
+                record(&handle).await?;
+                if let (CalculationHandle::Slurm(job), CalculationState::Ready) = (&handle, found) {
                     self.slurm.submit(job).await?;
                 }
-                begun
+                handle
             }
             None => {
-                let directory = self.home(store, closing).await?.make(lease.job, lease.attempt)?;
-                let ready = self.ready(&directory, &prepared, &nodes(lease)).await?;
-                record(&ready.begun()).await?;
-                self.go(ready).await?
+                let directory = self.scratch_root(store, shutdown).await?.make(lease.job, lease.attempt)?;
+                let ready = self.prepare_directory(&directory, &prepared, &failed_nodes(lease)).await?;
+                record(&ready.handle()).await?;
+                self.start(ready).await?
             }
         };
-        let outcome = self.outcome(lease.structure.clone(), begun, prepared.time_limit, closing).await?;
-        let Some(made) = outcome else { return Ok(None) };
-        if let Some(failed) = failed_elsewhere(&made) {
+        let outcome = self.outcome(lease.structure.clone(), handle, prepared.time_limit, shutdown).await?;
+        let Some(attempt) = outcome else { return Ok(None) };
+        if let Some(failed) = failed_on_node(&attempt) {
             record(&failed).await?;
         }
-        Ok(Some(made))
+        Ok(Some(attempt))
     }
 
-    /// A calculation that no campaign knows of.
-    pub(super) async fn once(&self, structure: &Structure) -> Result<Once, StoreError> {
-        let none = |result| Once { result, log: String::new(), core_seconds: 0.0 };
+    /// A calculation outside a campaign.
+    pub(super) async fn single_label(&self, structure: &Structure) -> Result<SingleLabel, StoreError> {
+        let none = |result| SingleLabel { result, log: String::new(), core_seconds: 0.0 };
         let prepared = match self.prepare(structure.clone(), Vec::new()).await {
             Ok(prepared) => prepared,
             Err(failure) => return Ok(none(Err(failure))),
         };
-        let home = private::make(&self.running.scratch(), "calmwalk-once-")?;
-        let made = self.once_in(&home, structure, &prepared).await;
-        self.abandon().await?;
-        scratch::remove_empty(&home);
-        let Made { result, ended } = made?;
+        let root = private_directory::make(&self.execution.scratch(), "calmwalk-once-")?;
+        let attempt = self.single_label_in(&root, structure, &prepared).await;
+        self.cancel().await?;
+        scratch::remove_empty(&root);
+        let LabelAttempt { result, ended } = attempt?;
         Ok(match ended {
-            Some(Ended { core_seconds, log, .. }) => Once { result, log, core_seconds },
+            Some(EndedCalculation { core_seconds, log, .. }) => SingleLabel { result, log, core_seconds },
             None => none(result),
         })
     }
 
-    async fn once_in(
+    async fn single_label_in(
         &self,
-        home: &Path,
+        root: &Path,
         structure: &Structure,
-        prepared: &Prepared,
-    ) -> Result<Made, StoreError> {
-        let directory =
-            private::make_inside(home, &scratch::name(1, 1)).map_err(|error| file(home, error))?;
-        let begun = self.go(self.ready(&directory, prepared, &[]).await?).await?;
-        let never = Closing::default();
-        let made = self.outcome(structure.clone(), begun, prepared.time_limit, &never).await?;
-        Ok(made.expect("nobody asks to stop"))
+        prepared: &PreparedInput,
+    ) -> Result<LabelAttempt, StoreError> {
+        let directory = private_directory::make_inside(root, &scratch::name(1, 1))
+            .map_err(|error| file_error(root, error))?;
+        let handle = self.start(self.prepare_directory(&directory, prepared, &[]).await?).await?;
+        let never = Shutdown::default();
+        let attempt = self.outcome(structure.clone(), handle, prepared.time_limit, &never).await?;
+        Ok(attempt.expect("nobody asks to stop"))
     }
 
-    /// Everything that is known before anything is started.
-    async fn prepare(&self, structure: Structure, failures: Vec<FailureClass>) -> Result<Prepared, Failure> {
+    /// Everything that is needed before anything is started.
+    async fn prepare(
+        &self,
+        structure: Structure,
+        failures: Vec<FailureClass>,
+    ) -> Result<PreparedInput, Failure> {
         let Some(remedies) = dft::adjustments(&failures) else {
             let class = failures.last().copied().unwrap_or(FailureClass::Crashed);
             return Err(class.with_message("there is nothing left to try"));
         };
-        let (code, running) = (Arc::clone(&self.code), self.running.clone());
-        blocking(move || prepare(&*code, &running, &structure, &remedies)).await
+        let (code, execution) = (Arc::clone(&self.code), self.execution.clone());
+        blocking(move || prepare(&*code, &execution, &structure, &remedies)).await
     }
 
-    /// Where calculations of this campaign are; what killed ones have left there is tidied up first.
-    pub(super) async fn home(&self, store: &Store, closing: &Closing) -> Result<&Home, StoreError> {
+    /// The directory of this campaign's calculations, after removing what killed labellers left there.
+    pub(super) async fn scratch_root(
+        &self,
+        store: &Store,
+        shutdown: &Shutdown,
+    ) -> Result<&ScratchRoot, StoreError> {
         let make = async || {
-            let campaign = insist(closing, || store.campaign()).await?.id;
-            let home = Home::of(&self.running.scratch(), campaign);
-            home.prepare()?;
-            home.tidy(store, self.running.keep, &self.slurm, closing).await?;
-            Ok(home)
+            let campaign = retry_until_written(shutdown, || store.campaign()).await?.id;
+            let root = ScratchRoot::for_campaign(&self.execution.scratch(), campaign);
+            root.prepare()?;
+            root.cleanup(store, self.execution.keep, &self.slurm, shutdown).await?;
+            Ok(root)
         };
-        self.home.get_or_try_init(make).await
+        self.root.get_or_try_init(make).await
     }
 
-    /// Leaves no empty directory behind.
+    /// Removes empty directories.
     pub(super) fn end(&self) {
-        if let Some(home) = self.home.get() {
-            home.remove_empty();
+        if let Some(root) = self.root.get() {
+            root.remove_empty();
         }
     }
 
-    /// The newest of these calculations that goes on, or has ended and can be read. What is left of the others is removed.
-    async fn find(&self, earlier: &[String]) -> Result<Option<(Begun, Found)>, StoreError> {
-        // One that was taken over is named by each attempt that waited for it.
+    /// The newest of these calculations that is running, or has ended and can be read. Removes what is left of the
+    /// others.
+    async fn find(
+        &self,
+        earlier: &[String],
+    ) -> Result<Option<(CalculationHandle, CalculationState)>, StoreError> {
+        // A calculation that was taken over is recorded by each attempt that waited for it.
         let mut named = BTreeSet::new();
-        let known = earlier.iter().filter_map(|text| Begun::parse(text));
-        let once: Vec<_> = known.filter(|begun| named.insert(begun.directory().to_owned())).collect();
+        let known = earlier.iter().filter_map(|text| CalculationHandle::parse(text));
+        let once: Vec<_> = known.filter(|handle| named.insert(handle.directory().to_owned())).collect();
         let mut found = None;
-        for begun in once {
-            match begun.look(&self.slurm).await? {
-                Found::Elsewhere => {}
-                Found::Ended(End { how: How::NotStarted(_), .. }) | Found::Gone => {
-                    begun.clear(&self.slurm).await?;
+        for handle in once {
+            match handle.inspect(&self.slurm).await? {
+                CalculationState::Elsewhere => {}
+                CalculationState::Ended(CalculationEnd { how: EndReason::NotStarted(_), .. })
+                | CalculationState::Gone => {
+                    handle.clear(&self.slurm).await?;
                 }
-                look if found.is_none() => found = Some((begun, look)),
-                _ => begun.clear(&self.slurm).await?,
+                look if found.is_none() => found = Some((handle, look)),
+                _ => handle.clear(&self.slurm).await?,
             }
         }
         Ok(found)
     }
 
-    /// A directory with the input in it, and who waits for a word to begin.
-    async fn ready(
+    /// Writes the input into a directory and prepares the runner or job.
+    async fn prepare_directory(
         &self,
         directory: &Path,
-        prepared: &Prepared,
+        prepared: &PreparedInput,
         failed_on: &[String],
-    ) -> Result<Ready, StoreError> {
-        let Prepared { input, time_limit, memory_limit, avoids_nodes, .. } = prepared;
+    ) -> Result<PreparedCalculation, StoreError> {
+        let PreparedInput { input, time_limit, memory_limit, avoids_nodes, .. } = prepared;
         let mut environment: Vec<_> = input.environment.clone().into_iter().collect();
-        environment.push(("CALMWALK_CORES".to_owned(), self.running.cores.to_string()));
+        environment.push(("CALMWALK_CORES".to_owned(), self.execution.cores.to_string()));
         let calculation = Calculation {
             directory: directory.to_owned(),
             command: input.command.clone(),
             environment,
-            pass_environment: self.running.pass_environment.clone(),
+            pass_environment: self.execution.pass_environment.clone(),
             time_limit: *time_limit,
             memory_limit: *memory_limit,
-            keeper: self.keeper.clone(),
+            runner: self.runner.clone(),
         };
         let unused = |error| {
-            here::remove(directory);
+            local::remove(directory);
             error
         };
         write(directory, input).map_err(unused)?;
-        let ready = match self.running.batch_system {
-            None => here::Ready::start(calculation).map(Ready::Here),
+        let ready = match self.execution.batch_system {
+            None => local::PreparedRunner::spawn(calculation).map(PreparedCalculation::Local),
             Some(BatchSystem::Slurm) => {
-                let (cores, options) = (self.running.cores, self.running.batch_options.as_slice());
+                let (cores, options) = (self.execution.cores, self.execution.batch_options.as_slice());
                 let avoid = if *avoids_nodes { failed_on } else { &[] };
-                let wanted = slurm::Wanted { cores, options, avoid };
+                let requirements = slurm::JobRequirements { cores, options, avoid };
                 let job = self.slurm.job(directory).await?;
-                slurm::write(calculation, &wanted).map(|()| Ready::Slurm(job))
+                slurm::write(calculation, &requirements).map(|()| PreparedCalculation::Slurm(job))
             }
         };
-        ready.map_err(|error| unused(file(directory, error)))
+        ready.map_err(|error| unused(file_error(directory, error)))
     }
 
-    /// Has the calculation begin.
-    async fn go(&self, ready: Ready) -> Result<Begun, StoreError> {
-        let begun = ready.begun();
+    /// Starts the calculation.
+    async fn start(&self, ready: PreparedCalculation) -> Result<CalculationHandle, StoreError> {
+        let handle = ready.handle();
         match ready {
-            Ready::Here(ready) => {
-                let keeper = ready.go().map_err(|error| file(begun.directory(), error))?;
-                self.take(begun.clone(), Some(keeper));
+            PreparedCalculation::Local(ready) => {
+                let runner = ready.start().map_err(|error| file_error(handle.directory(), error))?;
+                self.take(handle.clone(), Some(runner));
             }
-            Ready::Slurm(job) => {
-                self.take(begun.clone(), None);
+            PreparedCalculation::Slurm(job) => {
+                self.take(handle.clone(), None);
                 self.slurm.submit(&job).await?;
             }
         }
-        Ok(begun)
+        Ok(handle)
     }
 
-    /// Waits for the end of a calculation of at most `time_limit` s, and reads its numbers; none if that takes too long for
-    /// somebody who wants to stop.
+    /// Waits for the end of a calculation of at most `time_limit` s and reads its results; `None` if that takes too
+    /// long after a shutdown request.
     async fn outcome(
         &self,
         structure: Structure,
-        begun: Begun,
+        handle: CalculationHandle,
         time_limit: f64,
-        closing: &Closing,
-    ) -> Result<Option<Made>, StoreError> {
-        let Some(end) = begun.end(&self.slurm).await? else { return self.broken_off(begun).await.map(Some) };
+        shutdown: &Shutdown,
+    ) -> Result<Option<LabelAttempt>, StoreError> {
+        let Some(end) = handle.wait(&self.slurm).await? else {
+            return self.lost_calculation(handle).await.map(Some);
+        };
         let left = Duration::try_from_secs_f64(time_limit - end.seconds).unwrap_or_default();
         tokio::select! {
-            made = self.read(structure, begun, end, left.max(READING)) => made.map(Some),
+            attempt = self.read(structure, handle, end, left.max(MIN_READ_TIME)) => attempt.map(Some),
             () = async {
-                closing.stopped().await;
-                tokio::time::sleep(LAST_READING).await;
+                shutdown.stop_requested().await;
+                tokio::time::sleep(READ_GRACE).await;
             } => Ok(None),
         }
     }
 
-    /// Judges a calculation that has ended, and reads its numbers, for so long.
+    /// Reads and validates the results of a calculation that has ended, within a time limit.
     async fn read(
         &self,
         structure: Structure,
-        begun: Begun,
-        end: End,
+        handle: CalculationHandle,
+        end: CalculationEnd,
         limit: Duration,
-    ) -> Result<Made, StoreError> {
-        let (code, directory) = (Arc::clone(&self.code), begun.directory().join(WORK));
+    ) -> Result<LabelAttempt, StoreError> {
+        let (code, directory) = (Arc::clone(&self.code), handle.directory().join(WORK));
         let exit = match end.how {
-            How::NotStarted(number) => {
-                begun.remove().await?;
+            EndReason::NotStarted(number) => {
+                handle.remove().await?;
                 self.reap();
-                return Err(file(&end.program, io::Error::from_raw_os_error(number)));
+                return Err(file_error(&end.program, io::Error::from_raw_os_error(number)));
             }
-            How::Ended(exit) => exit,
+            EndReason::Ended(exit) => exit,
         };
         let reading = blocking(move || (read(&*code, &structure, &directory, exit), log::tail(&directory)));
         let (mut result, log) = tokio::time::timeout(limit, reading).await.unwrap_or_else(|_| {
@@ -293,127 +316,133 @@ impl CodeMethod {
             (Err(FailureClass::TimeLimit.with_message(message)), String::new())
         });
         if let Err(Failure { class: FailureClass::OtherProgram, message }) = &result {
-            // Whatever the structure: no calculation here would be one of the protocol.
-            let error = file(&end.program, io::Error::other(message.clone()));
-            begun.remove().await?;
+            // Whatever the structure: calculations on this host would not follow the protocol.
+            let error = file_error(&end.program, io::Error::other(message.clone()));
+            handle.remove().await?;
             self.reap();
             return Err(error);
         }
         if let (Err(failure), Some(remark)) = (&mut result, &end.remark) {
             failure.message.clone_from(remark);
         }
-        let core_seconds = end.seconds * f64::from(self.running.cores);
-        Ok(Made { result, ended: Some(Ended { core_seconds, log, node: end.node, begun }) })
+        let core_seconds = end.seconds * f64::from(self.execution.cores);
+        Ok(LabelAttempt {
+            result,
+            ended: Some(EndedCalculation { core_seconds, log, node: end.node, handle }),
+        })
     }
 
-    /// Somebody killed the keeper, which says nothing about the job.
-    async fn broken_off(&self, begun: Begun) -> Result<Made, StoreError> {
-        begun.clear(&self.slurm).await?;
+    /// The runner was killed, which says nothing about the job.
+    async fn lost_calculation(&self, handle: CalculationHandle) -> Result<LabelAttempt, StoreError> {
+        handle.clear(&self.slurm).await?;
         self.reap();
         let result =
             Err(FailureClass::LostNode.with_message("the process that kept the calculation was killed"));
-        Ok(Made { result, ended: None })
+        Ok(LabelAttempt { result, ended: None })
     }
 
-    fn take(&self, begun: Begun, keeper: Option<Child>) {
-        *self.in_hand() = Some(InHand { begun, keeper });
+    fn take(&self, handle: CalculationHandle, runner: Option<Child>) {
+        *self.current() = Some(CurrentCalculation { handle, runner });
     }
 
-    /// What is said of the calculation in hand in the store.
+    /// The handle of the current calculation, in the form of the store.
     pub(super) fn calculation(&self) -> Option<String> {
-        self.in_hand().as_ref().map(|in_hand| in_hand.begun.identity())
+        self.current().as_ref().map(|current| current.handle.identity())
     }
 
-    /// It goes on without this labeller.
-    pub(super) fn let_go(&self) {
-        self.in_hand().take();
+    /// Leaves the current calculation running without this labeller.
+    pub(super) fn detach(&self) {
+        self.current().take();
     }
 
-    /// Ends it, and removes what is left of it.
-    pub(super) async fn abandon(&self) -> Result<(), StoreError> {
-        let begun = self.in_hand().as_ref().map(|in_hand| in_hand.begun.clone());
-        if let Some(begun) = begun {
-            begun.clear(&self.slurm).await?;
+    /// Ends the current calculation and removes what is left of it.
+    pub(super) async fn cancel(&self) -> Result<(), StoreError> {
+        let handle = self.current().as_ref().map(|current| current.handle.clone());
+        if let Some(handle) = handle {
+            handle.clear(&self.slurm).await?;
             self.reap();
-            if let Some(home) = begun.directory().parent() {
-                scratch::remove_empty(home);
+            if let Some(root) = handle.directory().parent() {
+                scratch::remove_empty(root);
             }
         }
         Ok(())
     }
 
-    /// Takes note of the end of a keeper, so that nothing is left of it.
+    /// Reaps the runner of the current calculation.
     fn reap(&self) {
-        let in_hand = self.in_hand().take();
-        if let Some(mut keeper) = in_hand.and_then(|in_hand| in_hand.keeper) {
+        let current = self.current().take();
+        if let Some(mut runner) = current.and_then(|current| current.runner) {
             // It has ended, or is about to.
-            let _ = keeper.wait();
+            let _ = runner.wait();
         }
     }
 
-    /// The result is where it belongs: the directory is packed into the store, or only removed.
-    pub(super) async fn put_away(
+    /// After the result is stored: packs the directory into the store if it is to be kept, and removes it.
+    pub(super) async fn archive(
         &self,
         store: &Store,
         lease: &Lease,
-        closing: &Closing,
-        ended: Ended,
+        shutdown: &Shutdown,
+        ended: EndedCalculation,
         failed: bool,
     ) -> Result<(), StoreError> {
-        if self.running.keep.keeps(failed) {
-            scratch::pack(store, lease.job, lease.attempt, closing, ended.begun.directory()).await?;
+        if self.execution.keep.keeps(failed) {
+            scratch::pack(store, lease.job, lease.attempt, shutdown, ended.handle.directory()).await?;
         }
-        ended.begun.remove().await?;
+        ended.handle.remove().await?;
         self.reap();
         Ok(())
     }
 
-    fn in_hand(&self) -> MutexGuard<'_, Option<InHand>> {
-        self.in_hand.lock().unwrap_or_else(PoisonError::into_inner)
+    fn current(&self) -> MutexGuard<'_, Option<CurrentCalculation>> {
+        self.current.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// The classes of the failures of a job so far.
-pub(super) fn classes(lease: &Lease) -> Vec<FailureClass> {
+/// The failure_classes of the failures of a job so far.
+pub(super) fn failure_classes(lease: &Lease) -> Vec<FailureClass> {
     lease.failures.iter().filter_map(|name| FailureClass::from_name(name)).collect()
 }
 
-/// Nodes on which a job failed, where another may help.
-fn nodes(lease: &Lease) -> Vec<String> {
-    let failed = lease.failed_calculations.iter().filter_map(|text| Begun::parse(text));
-    let nodes = failed.filter_map(|begun| match begun {
-        Begun::Slurm(job) => job.node,
-        Begun::Here(_) => None,
+/// Nodes where the job failed and another node may help.
+fn failed_nodes(lease: &Lease) -> Vec<String> {
+    let failed = lease.failed_calculations.iter().filter_map(|text| CalculationHandle::parse(text));
+    let nodes = failed.filter_map(|handle| match handle {
+        CalculationHandle::Slurm(job) => job.node,
+        CalculationHandle::Local(_) => None,
     });
     nodes.collect::<BTreeSet<_>>().into_iter().collect()
 }
 
-/// A calculation that failed and may do better on another node, with the node that it had.
-fn failed_elsewhere(made: &Made) -> Option<Begun> {
+/// The handle of a calculation that failed and may succeed on another node, with its node.
+fn failed_on_node(attempt: &LabelAttempt) -> Option<CalculationHandle> {
     use FailureClass::{Crashed, LostNode, OutOfMemory};
-    let Made { result: Err(failure), ended: Some(Ended { begun: Begun::Slurm(job), node, .. }) } = made
+    let LabelAttempt {
+        result: Err(failure),
+        ended: Some(EndedCalculation { handle: CalculationHandle::Slurm(job), node, .. }),
+    } = attempt
     else {
         return None;
     };
     let may_help = matches!(failure.class, Crashed | LostNode | OutOfMemory) && node.is_some();
-    may_help.then(|| Begun::Slurm(slurm::Job { node: node.clone(), ..job.clone() }))
+    may_help.then(|| CalculationHandle::Slurm(slurm::Job { node: node.clone(), ..job.clone() }))
 }
 
-impl Ready {
-    fn begun(&self) -> Begun {
+impl PreparedCalculation {
+    fn handle(&self) -> CalculationHandle {
         match self {
-            Self::Here(ready) => Begun::Here(ready.kept.clone()),
-            Self::Slurm(job) => Begun::Slurm(job.clone()),
+            Self::Local(ready) => CalculationHandle::Local(ready.handle.clone()),
+            Self::Slurm(job) => CalculationHandle::Slurm(job.clone()),
         }
     }
 }
 
-/// What takes time, in a thread of its own. If it panics, so does who waits for it.
+/// Runs slow work on a thread of its own. A panic in it propagates to the caller.
 pub(super) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
     spawn_blocking(work).await.unwrap_or_else(|crash| std::panic::resume_unwind(crash.into_panic()))
 }
 
-/// What cannot be done here fails the labeller, and not the job: another host may have room for it.
-pub(super) fn file(path: &Path, source: io::Error) -> StoreError {
+/// An error that fails the labeller and not the job: another host may be able to run it.
+pub(super) fn file_error(path: &Path, source: io::Error) -> StoreError {
     StoreError::File { path: path.to_owned(), source }
 }

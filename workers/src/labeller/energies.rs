@@ -1,4 +1,4 @@
-//! What energies of labels are compared with: the potential's, and the offsets of elements that labels show.
+//! Reference for the energies of labels: the potential's energies plus offsets of the elements, fitted to labels.
 
 use std::collections::BTreeMap;
 
@@ -9,23 +9,23 @@ use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
 use wire::ContentHash;
 
-use super::judge::Expected;
-use super::{Closing, insist};
+use super::validate::EnergyReference;
+use super::{Shutdown, retry_until_written};
 
-/// Labels that offsets are fitted to: the newest.
-const LABELS: u32 = 2_000;
-/// They are fitted again when this labeller has brought so many labels more, by those that the fit used.
-const REFIT: usize = 8;
+/// Number of labels in the fit: the newest ones.
+const MAX_FIT_LABELS: u32 = 2_000;
+/// The fit is repeated when this labeller has made 1/8 as many new labels as the last fit used.
+const REFIT_DIVISOR: usize = 8;
 
-/// Fits the energy offsets of elements to the newest labels of a protocol, without those that are excluded.
+/// Fits the energy offsets of elements to the newest labels of a protocol, without excluded ones.
 ///
 /// # Errors
-/// Of the database; inside, [`TooFewLabels`] for a fit.
+/// Errors of the database; in the inner result, [`TooFewLabels`] for a fit.
 pub async fn energy_offsets(
     store: &Store,
     protocol: ContentHash,
 ) -> Result<Result<EnergyOffsets, TooFewLabels>, StoreError> {
-    let labels = store.labelled_energies(protocol, LABELS).await?;
+    let labels = store.labelled_energies(protocol, MAX_FIT_LABELS).await?;
     let labels = labels.into_iter().map(|found| LabelledEnergy {
         composition: found.composition.iter().map(|(species, n)| (species.atomic_number(), *n)).collect(),
         model: found.model,
@@ -34,7 +34,7 @@ pub async fn energy_offsets(
     Ok(EnergyOffsets::fit(&labels.collect::<Vec<_>>()))
 }
 
-/// A structure with its energies by the potential and of its label, eV, as the fit takes it.
+/// A structure's energies by the potential and by its label, eV, for the fit.
 pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> LabelledEnergy {
     let mut counts = BTreeMap::new();
     for species in &structure.species {
@@ -43,30 +43,31 @@ pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> Labelle
     LabelledEnergy { composition: counts.into_iter().collect(), model, label }
 }
 
-/// The offsets as a labeller knows them.
+/// A labeller's current offsets.
 #[derive(Debug, Default)]
 pub(super) struct Offsets {
     fitted: Option<EnergyOffsets>,
     /// Labels until the next fit.
-    left: usize,
+    until_refit: usize,
 }
 
 impl Offsets {
-    /// What the energy of a result is compared with; `None` if nothing is known.
-    pub async fn expected(
+    /// The reference for the energy of a result; `None` if there is none yet.
+    pub async fn energy_reference(
         &mut self,
         store: &Store,
         protocol: &Protocol,
         lease: &Lease,
         result: &Result<Results, dft::Failure>,
-        closing: &Closing,
-    ) -> Result<Option<Expected<'_>>, StoreError> {
+        shutdown: &Shutdown,
+    ) -> Result<Option<EnergyReference<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };
-        if self.left == 0 {
-            self.fitted = insist(closing, || energy_offsets(store, protocol.hash)).await?.ok();
-            self.left = self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT).max(1);
+        if self.until_refit == 0 {
+            self.fitted = retry_until_written(shutdown, || energy_offsets(store, protocol.hash)).await?.ok();
+            self.until_refit =
+                self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT_DIVISOR).max(1);
         }
-        self.left -= 1;
-        Ok(self.fitted.as_ref().map(|offsets| Expected { model, offsets }))
+        self.until_refit -= 1;
+        Ok(self.fitted.as_ref().map(|offsets| EnergyReference { model, offsets }))
     }
 }

@@ -1,4 +1,4 @@
-//! What a structure must be before anything is spent on its label.
+//! Guards that refuse a structure before any cost is spent on its label.
 
 mod bonds;
 #[cfg(test)]
@@ -15,45 +15,45 @@ use store::{Store, StoreError};
 
 pub use bonds::Pair;
 
-/// Under which name the leader of a campaign leaves its guard in the store, as JSON: it holds for every labeller, from the
+/// Metadata name under which the leader stores the campaign's guard as JSON. It applies to every labeller from the
 /// next label on.
 pub const GUARD: &str = "label_guard";
 
-/// Class of an attempt that a guard has refused.
+/// Failure class of an attempt that a guard refused.
 pub(super) const REFUSED: &str = "refused";
 
-/// Structures that are compared with by their features: those nearest in energy.
-const COMPARED: u32 = 32;
-/// Labels that a cost is learned from.
-const LEARNED_FROM: u32 = 1_000;
+/// Number of structures whose features are compared: those nearest in energy.
+const MAX_COMPARED: u32 = 32;
+/// Number of labels used to estimate the cost.
+const MAX_COST_LABELS: u32 = 1_000;
 
-/// `[label.guard]`: what is left out does not count. Directions that are not periodic have no shape.
+/// `[label.guard]`: limits that are not set do not apply. Shape limits ignore non-periodic directions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LabelGuard {
-    /// Shortest bond of pairs of elements, Å.
+    /// Minimum bond length for pairs of elements, Å.
     pub shortest_bond: BTreeMap<Pair, f64>,
-    /// Least distance of opposite faces of the cell, Å.
+    /// Minimum distance between opposite faces of the cell, Å.
     pub least_height: Option<f64>,
-    /// Longest edge of the cell by its shortest, at most.
+    /// Maximum ratio of the longest to the shortest edge of the cell.
     pub largest_edge_ratio: Option<f64>,
-    /// Angles between edges of the cell are at least this and at most 180° less this, degrees.
+    /// Minimum angle α between edges of the cell; angles must be between α and 180° − α, degrees.
     pub least_angle: Option<f64>,
-    /// Volume an atom at least, Å³.
+    /// Minimum volume per atom, Å³.
     pub least_volume: Option<f64>,
-    /// Volume an atom at most, Å³.
+    /// Maximum volume per atom, Å³.
     pub largest_volume: Option<f64>,
-    /// Atoms at most.
+    /// Maximum number of atoms.
     pub most_atoms: Option<u32>,
-    /// A structure is refused whose features differ by less than this part of their norm, for each of its atoms, from
-    /// those of one that has its label.
+    /// Refuses a structure if the features of each atom differ from those of a labelled structure by less than this
+    /// fraction of their norm.
     pub near_duplicate: Option<f64>,
-    /// Core-seconds that a label is expected to take, at most.
+    /// Maximum expected cost of a label, core-seconds.
     pub largest_cost: Option<f64>,
 }
 
 impl LabelGuard {
-    /// A key with a value that no guard can have, what it is, and what was expected.
+    /// The first key with an invalid value, with that value and the expected one.
     pub fn fault(&self) -> Option<(&'static str, String, &'static str)> {
         let positive = |x: &f64| x.is_finite() && *x > 0.0;
         if let Some((pair, bond)) = self.shortest_bond.iter().find(|(_, bond)| !positive(bond)) {
@@ -80,7 +80,7 @@ impl LabelGuard {
         numbers.into_iter().find_map(wrong)
     }
 
-    /// Why a structure is refused for what it is; `None` if it may be labelled.
+    /// Why the structure itself is refused; `None` if it may be labelled.
     pub fn refuses(&self, structure: &Structure) -> Option<String> {
         let atoms = structure.len();
         if let Some(most) = self.most_atoms.filter(|most| atoms > *most as usize) {
@@ -105,7 +105,7 @@ impl LabelGuard {
         let ratio = edges().reduce(f64::max)? / edges().reduce(f64::min)?;
         if let Some(largest) = self.largest_edge_ratio.filter(|largest| ratio > *largest) {
             return Some(format!(
-                "its cell is {ratio:.2} times as long as wide, where label.guard.largest_edge_ratio is {largest}"
+                "the longest edge of its cell is {ratio:.2} times the shortest, where label.guard.largest_edge_ratio is {largest}"
             ));
         }
         let least = self.least_angle?;
@@ -119,21 +119,21 @@ impl LabelGuard {
         Some(format!("its cell has an angle of {sharp:.1}°, where label.guard.least_angle is {least}"))
     }
 
-    /// Where there is a volume: in all three directions.
+    /// Applies to cells that are periodic in all three directions.
     fn refuses_volume(&self, structure: &Structure) -> Option<String> {
         if structure.periodic != [true; 3] {
             return None;
         }
         let volume = structure.cell.volume() / structure.len() as f64;
         let too =
-            |key: &str, limit: f64| format!("{volume:.3} Å³ an atom, where label.guard.{key} is {limit}");
+            |key: &str, limit: f64| format!("{volume:.3} Å³ per atom, where label.guard.{key} is {limit}");
         let small = self.least_volume.filter(|least| volume < *least);
         let large = self.largest_volume.filter(|largest| volume > *largest);
         small.map(|limit| too("least_volume", limit)).or(large.map(|limit| too("largest_volume", limit)))
     }
 }
 
-/// Why a leased job is not worth its label by the campaign's guard; `None` if it is, or if somebody has overruled it.
+/// Why the campaign's guard refuses a leased job; `None` if it does not, or if the user has overruled it.
 pub(super) async fn refusal(
     store: &Store,
     lease: &Lease,
@@ -142,7 +142,7 @@ pub(super) async fn refusal(
     if lease.overruled {
         return Ok(None);
     }
-    let Some(text) = store.note(GUARD).await? else { return Ok(None) };
+    let Some(text) = store.metadata(GUARD).await? else { return Ok(None) };
     let guard: LabelGuard = serde_json::from_str(&text).map_err(damaged)?;
     if let Some(reason) = guard.refuses(&lease.structure) {
         return Ok(Some(reason));
@@ -151,12 +151,12 @@ pub(super) async fn refusal(
         return Ok(Some(reason));
     }
     let Some(bound) = guard.near_duplicate else { return Ok(None) };
-    let near = store.labelled_near(lease, COMPARED).await?;
+    let near = store.near_duplicates(lease, MAX_COMPARED).await?;
     let Some((own, others)) = near else { return Ok(None) };
     let like = others.iter().find(|other| is_near(&own, &other.features, lease.structure.len(), bound));
     Ok(like.map(|other| {
         format!(
-            "its features differ by less than {bound} of their norm from those of {}, which has its label \
+            "its features differ by less than {bound} of their norm from those of {}, which has a label \
              (label.guard.near_duplicate)",
             other.candidate
         )
@@ -174,7 +174,7 @@ async fn too_costly(
     guard: &LabelGuard,
 ) -> Result<Option<String>, StoreError> {
     let Some(largest) = guard.largest_cost else { return Ok(None) };
-    let costs = store.label_costs(lease.protocol, LEARNED_FROM).await?;
+    let costs = store.label_costs(lease.protocol, MAX_COST_LABELS).await?;
     let measured: Vec<_> = costs
         .iter()
         .map(|cost| Measured {
@@ -188,19 +188,19 @@ async fn too_costly(
         .collect();
     let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
     let size = Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 };
-    // Before a first label nothing is known, and nothing refused.
+    // Before the first label the cost is unknown and nothing is refused.
     let expected = CostModel::fit(&measured, None).and_then(|model| model.predict(&size));
     let too_much = expected.map(|expected| expected.core_seconds).filter(|seconds| *seconds > largest);
     Ok(too_much.map(|seconds| {
         format!(
-            "a label of it is expected to take {seconds:.0} core-seconds, as {} others did, where label.guard.largest_cost \
+            "its label is expected to take {seconds:.0} core-seconds, judging by {} labels, where label.guard.largest_cost \
              is {largest}",
             measured.len()
         )
     }))
 }
 
-/// Whether |z − z'| < bound |z| for each atom; features [n × D], of the same atoms in the same order.
+/// Whether |z − z'| < bound |z| for each atom; features [n × D] of the same atoms in the same order.
 fn is_near(own: &[f64], other: &[f64], atoms: usize, bound: f64) -> bool {
     if own.is_empty() || own.len() != other.len() || !own.len().is_multiple_of(atoms) {
         return false;

@@ -1,4 +1,4 @@
-//! What makes labels.
+//! Methods that make labels.
 
 use std::panic;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -9,29 +9,34 @@ use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
 
-use super::code::{CodeMethod, Ended, classes};
-use super::judge::{Expected, LabelBounds, judge};
-use super::{Closing, KeeperCommand, ReferenceMethod, Running};
+use super::code::{CodeMethod, EndedCalculation, failure_classes};
+use super::validate::{EnergyReference, LabelBounds, validate};
+use super::{ExecutionSettings, ReferenceMethod, RunnerCommand, Shutdown};
 
 /// A way to make labels.
 pub enum Method {
-    /// A potential, in this process.
+    /// A potential, evaluated in this process.
     Reference(Arc<Mutex<ReferenceMethod>>),
-    /// Another program, in processes of its own that outlive this one.
+    /// Another program, run in processes that outlive this one.
     Code(Box<CodeMethod>),
 }
 
-/// A result.
-pub(super) struct Made {
+/// Its result.
+pub(super) struct LabelAttempt {
     pub result: Result<Results, Failure>,
-    /// The calculation behind it, if it was a process of its own.
-    pub ended: Option<Ended>,
+    /// Its calculation behind it, if it was a process of its own.
+    pub ended: Option<EndedCalculation>,
 }
 
-impl Made {
-    /// The same, if it can be believed; otherwise why not.
-    pub fn judged(self, lease: &Lease, bounds: &LabelBounds, expected: Option<Expected<'_>>) -> Self {
-        let result = self.result.and_then(|made| judge(made, &lease.structure, bounds, expected));
+impl LabelAttempt {
+    /// The same, with an invalid result replaced by a failure.
+    pub fn validated(
+        self,
+        lease: &Lease,
+        bounds: &LabelBounds,
+        expected: Option<EnergyReference<'_>>,
+    ) -> Self {
+        let result = self.result.and_then(|results| validate(results, &lease.structure, bounds, expected));
         Self { result, ..self }
     }
 }
@@ -43,86 +48,90 @@ impl Method {
     }
 
     /// Labels by another program.
-    pub fn code(code: Box<dyn DftBackend>, running: Running) -> Self {
-        Self::kept_by(KeeperCommand::default(), code, running)
+    pub fn code(code: Box<dyn DftBackend>, execution: ExecutionSettings) -> Self {
+        Self::with_runner(RunnerCommand::default(), code, execution)
     }
 
-    /// The same with keepers ([`super::keep`]) that are started so.
-    pub fn kept_by(keeper: KeeperCommand, code: Box<dyn DftBackend>, running: Running) -> Self {
-        Self::Code(Box::new(CodeMethod::new(keeper, code, running)))
+    /// The same with keepers ([`super::run_calculation`]) that are started so.
+    pub fn with_runner(
+        runner: RunnerCommand,
+        code: Box<dyn DftBackend>,
+        execution: ExecutionSettings,
+    ) -> Self {
+        Self::Code(Box::new(CodeMethod::new(runner, code, execution)))
     }
 
-    /// Whether a calculation goes on without this labeller, and another finds it.
-    pub(super) fn outlives_its_labeller(&self) -> bool {
+    /// Whether a calculation continues without this labeller, and another labeller can find it.
+    pub(super) fn outlives_labeller(&self) -> bool {
         matches!(self, Self::Code(_))
     }
 
-    /// Ends the calculation in hand, if there is one, and removes its directory.
+    /// Ends the current calculation, if there is one, and removes its directory.
     ///
     /// # Errors
-    /// [`StoreError::File`] if that is impossible.
+    /// [`StoreError::File`] if that fails.
     pub async fn stop(&self) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.abandon().await,
+            Self::Code(method) => method.cancel().await,
         }
     }
 
-    /// Makes room for calculations, and clears away what killed labellers have left.
-    pub(super) async fn begin(&self, store: &Store, closing: &Closing) -> Result<(), StoreError> {
+    /// Prepares the scratch directory, and removes what killed labellers left.
+    pub(super) async fn start(&self, store: &Store, shutdown: &Shutdown) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.home(store, closing).await.map(drop),
+            Self::Code(method) => method.scratch_root(store, shutdown).await.map(drop),
         }
     }
 
-    /// Nothing more is to be done.
+    /// Cleans up at the end.
     pub(super) fn end(&self) {
         if let Self::Code(method) = self {
             method.end();
         }
     }
 
-    /// Leaves the calculation in hand to whoever waits for it as well.
-    pub(super) fn let_go(&self) {
+    /// Leaves the current calculation to the other labeller that waits for it.
+    pub(super) fn detach(&self) {
         if let Self::Code(method) = self {
-            method.let_go();
+            method.detach();
         }
     }
 
-    /// The result of a job is where it belongs, and what was needed for it is put away.
-    pub(super) async fn put_away(
+    /// After the result is stored: archives or removes the calculation.
+    pub(super) async fn archive(
         &self,
         store: &Store,
         lease: &Lease,
-        closing: &Closing,
-        ended: Ended,
+        shutdown: &Shutdown,
+        ended: EndedCalculation,
         failed: bool,
     ) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.put_away(store, lease, closing, ended, failed).await,
+            Self::Code(method) => method.archive(store, lease, shutdown, ended, failed).await,
         }
     }
 
-    /// Makes the result for a job. A potential takes a thread of its own. None if somebody asked to stop and it would take longer
-    /// to read it.
+    /// Makes the result of a job. A potential runs on a thread of its own. `None` if a shutdown was requested and
+    /// reading the result would take longer.
     pub(super) async fn make(
         &self,
         store: &Store,
         lease: &Lease,
-        closing: &Closing,
-    ) -> Result<Option<Made>, StoreError> {
+        shutdown: &Shutdown,
+    ) -> Result<Option<LabelAttempt>, StoreError> {
         match self {
             Self::Reference(method) => {
                 let result = evaluate(Arc::clone(method), lease.structure.clone()).await;
-                Ok(Some(Made { result, ended: None }))
+                Ok(Some(LabelAttempt { result, ended: None }))
             }
-            Self::Code(method) => method.make(store, lease, closing).await,
+            Self::Code(method) => method.make(store, lease, shutdown).await,
         }
     }
 
-    /// What the cost of a label depends on.
+    /// The properties that determine the cost of a label.
     pub(super) fn size(&self, structure: &Structure) -> Size {
         match self {
             Self::Reference(_) => Size { atoms: structure.len(), electrons: 0.0, k_points: 1 },
@@ -130,7 +139,7 @@ impl Method {
         }
     }
 
-    /// What is said of the calculation in hand in the store, if there is one.
+    /// The handle of the current calculation in the form of the store, if there is one.
     pub(super) fn calculation(&self) -> Option<String> {
         match self {
             Self::Reference(_) => None,
@@ -138,20 +147,20 @@ impl Method {
         }
     }
 
-    /// Classes of failures after which nothing is left to try.
+    /// Whether no remedy is left after this failure.
     pub(super) fn has_no_remedy(&self, lease: &Lease, failure: &Failure) -> bool {
         match self {
-            // Every attempt would be like the one before.
+            // Every attempt would give the same result.
             Self::Reference(_) => false,
             Self::Code(_) => {
-                let failures = classes(lease).into_iter().chain([failure.class]);
+                let failures = failure_classes(lease).into_iter().chain([failure.class]);
                 dft::adjustments(&failures.collect::<Vec<_>>()).is_none()
             }
         }
     }
 }
 
-/// A method that panics takes its labeller with it.
+/// A panic of the method ends its labeller.
 pub(super) async fn evaluate(
     method: Arc<Mutex<ReferenceMethod>>,
     structure: Structure,

@@ -1,100 +1,101 @@
-//! A labeller leases a job, has its method work on it, judges what comes of it and delivers.
+//! Labellers: lease a job, let a method compute it, validate the result and deliver it to the store.
 //!
-//! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
+//! [`run`] is a task within a process. [`serve`] runs a labeller as a process of its own, which outlives its
+//! orchestrator.
 
-mod begun;
-mod closing;
+mod calculation_handle;
+mod calculation_runner;
 mod code;
-mod difference;
 mod energies;
+mod execution;
 mod guard;
-mod here;
-mod insist;
-mod judge;
-mod keeper;
+mod heartbeat;
+mod input_diff;
+mod local;
 mod log;
 mod method;
-mod once;
 mod pack;
 mod prepare;
-mod presence;
-mod private;
+mod private_directory;
+mod process_tree;
 mod reference;
-mod running;
+mod remove_tree;
+mod report_line;
+mod retry;
 mod scratch;
-mod session;
+mod shutdown;
+mod single_label;
 mod slurm;
-mod told;
-mod tree;
+mod validate;
 
 use std::pin::pin;
 use std::time::{Duration, Instant};
 
 use dft::{Failure, FailureClass, Results};
 use store::records::{Label, LabelDetails, Lease, Protocol};
-use store::{Store, StoreError, Whereabouts};
+use store::{LeaseStatus, Store, StoreError};
 use tracing::{debug, info, warn};
 
-use closing::Wanted;
-use code::Ended;
+use code::EndedCalculation;
 use energies::Offsets;
-use method::Made;
-use told::Became;
+use method::LabelAttempt;
+use report_line::DeliveryOutcome;
+use shutdown::ShutdownState;
 
-pub use closing::Closing;
+pub use calculation_runner::{RunnerCommand, run_calculation};
 pub use code::CodeMethod;
 pub use energies::{energy_offsets, labelled_energy};
+pub use execution::{BatchSystem, ExecutionSettings, KeepDirectories};
 pub use guard::{GUARD, LabelGuard, Pair};
-pub use insist::insist;
-pub use judge::LabelBounds;
-pub use keeper::{KeeperCommand, keep};
+pub use heartbeat::{ExitPolicy, serve};
 pub use method::Method;
-pub use once::{Once, label_once};
-pub use presence::{Stay, serve};
 pub use reference::ReferenceMethod;
-pub use running::{BatchSystem, Keep, Running};
+pub use retry::retry_until_written;
+pub use shutdown::Shutdown;
+pub use single_label::{SingleLabel, label_structure};
+pub use validate::LabelBounds;
 
-/// Between two signs of life in the store, of every process that gives them there.
-pub const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
-/// The longest time between two looks at the queue …
-const LONGEST_IDLE: Duration = Duration::from_secs(1);
-/// … and where the database tells of new jobs: only leases that ran out are not told of.
-const TOLD_IDLE: Duration = Duration::from_secs(5);
-/// Which part of the time without work passes until the next look, and so how late work may be found.
-const IDLE_PART: u32 = 8;
+/// Time between two heartbeats in the store, for every process that sends them.
+pub const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(5);
+/// Longest time between two polls of the queue.
+const MAX_POLL_INTERVAL: Duration = Duration::from_secs(1);
+/// The same if the database sends notifications of new jobs: only expired leases need polling.
+const NOTIFIED_POLL_INTERVAL: Duration = Duration::from_secs(5);
+/// The poll interval is the idle time divided by this, which bounds the delay until new work is found.
+const IDLE_DIVISOR: u32 = 8;
 
-/// What a labeller needs to know.
+/// Settings of a labeller.
 #[derive(Clone, Debug)]
 pub struct LabellerSettings {
-    /// Whose leases these are: the name of a process that has its record in the store, or `process/part`.
+    /// Holder of its leases: the id of a registered process, or `process/part`.
     pub holder: String,
-    /// Under which settings labels are made.
+    /// The protocol of its labels.
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
-    /// What is believed of a label.
+    /// Bounds that a valid label must satisfy.
     pub bounds: LabelBounds,
-    /// For how long it is of use, if it is a process of its own, while nobody leads the campaign.
-    pub stay: Stay,
-    /// How often it does what has to be done again and again.
+    /// When a labeller process exits while nothing runs the campaign.
+    pub exit_policy: ExitPolicy,
+    /// Intervals and timeouts.
     pub timing: Timing,
 }
 
-/// How often a labeller does what has to be done again and again.
+/// Intervals and timeouts of a labeller.
 #[derive(Clone, Copy, Debug)]
 pub struct Timing {
-    /// How long a job is leased, in whole seconds. The lease is renewed at a third of it while the label is made,
-    /// however long that takes, and so also for a method that never comes to an end. It is for processes that nobody
-    /// can see to be gone, see [`Store::lease`].
+    /// Lease duration, in whole seconds. While a label is computed, the lease is renewed every third of it, without
+    /// limit, even for a method that never ends. An expired lease frees jobs of processes that no other process can
+    /// observe, see [`Store::lease`].
     pub lease: Duration,
-    /// How long a labeller that has just run out of work waits before it looks again. The longer it has had none, the
-    /// longer it waits, up to a second: each look costs some tenths of a millisecond.
+    /// Poll interval right after the queue became empty. It grows with the idle time, up to a second: each poll
+    /// costs some tenths of a millisecond.
     pub idle: Duration,
-    /// Between two signs of life of a labeller that is a process.
-    pub sign_of_life: Duration,
-    /// How long the label in hand may go on when the labeller is asked to stop, before it is given back and its calculation
-    /// ended. With none the label is finished, but a calculation that outlives the labeller is left to the next one after some
-    /// seconds.
+    /// Time between two heartbeats of a labeller process.
+    pub heartbeat_interval: Duration,
+    /// How long the current label may continue after the labeller is asked to stop, before its job is released and
+    /// its calculation ended. If `None`, the label is finished, but a calculation that outlives the labeller is
+    /// left to the next one after some seconds.
     pub grace: Option<Duration>,
 }
 
@@ -103,7 +104,7 @@ impl Default for Timing {
         Self {
             lease: Duration::from_secs(600),
             idle: Duration::from_millis(50),
-            sign_of_life: SIGN_OF_LIFE,
+            heartbeat_interval: HEARTBEAT_INTERVAL,
             grace: None,
         }
     }
@@ -115,104 +116,112 @@ impl Timing {
     }
 }
 
-/// What a look at the queue finds.
-enum Found {
+/// The result of polling the queue.
+enum QueuePoll {
     Job(Box<Lease>),
     Nothing,
-    /// Nothing, and nothing will come.
-    TheEnd,
+    /// No job, and none will come.
+    Finished,
 }
 
-/// After it was asked to stop, a labeller waits so long for a calculation that goes on without it.
-const LAST_LABEL: Duration = Duration::from_secs(5);
+/// How long a labeller that is asked to stop waits for a calculation that can continue without it.
+const DETACH_DELAY: Duration = Duration::from_secs(5);
 
-/// Labels until there is nothing more to do. `now` is asked for ms since 1970; `tell` gets a line for each job.
+/// Labels until there is no more work. `now` returns ms since 1970; `tell` receives a line for each job.
 ///
-/// A database that is busy or full is no reason to end: the queue is looked at again later, and a label that was made is
-/// brought again and again, after `closing` asks to stop for a minute more.
+/// A busy database or a full disk does not end the labeller: it polls the queue again later, and retries the
+/// delivery of a label, for up to a minute after `shutdown` was requested.
 ///
 /// # Errors
-/// Whatever else the database says; the label in hand is lost then, and its job comes back.
+/// Any other error of the database. The current label is lost then, and its job returns to the queue.
 pub async fn run(
     store: Store,
     method: Method,
     settings: LabellerSettings,
-    closing: &Closing,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
-    let done = work(&store, &method, &settings, closing, now, tell).await;
+    let done = label_jobs(&store, &method, &settings, shutdown, now, tell).await;
     method.end();
     done
 }
 
-async fn work(
+async fn label_jobs(
     store: &Store,
     method: &Method,
     settings: &LabellerSettings,
-    closing: &Closing,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
-    let say = |line: &str| {
+    let announce = |line: &str| {
         info!("{line}");
         tell(line);
     };
     let (mut idle, mut offsets) = (Duration::ZERO, Offsets::default());
-    method.begin(store, closing).await?;
+    method.start(store, shutdown).await?;
     loop {
-        let wanted = closing.wanted();
-        if wanted.stop {
+        let requested = shutdown.state();
+        if requested.stop {
             return Ok(());
         }
-        let lease = match look(store, settings, wanted.no_more_jobs, now()).await {
-            Ok(Found::Job(lease)) => lease,
-            Ok(Found::TheEnd) => return Ok(()),
+        let lease = match poll_queue(store, settings, requested.no_more_jobs, now()).await {
+            Ok(QueuePoll::Job(lease)) => lease,
+            Ok(QueuePoll::Finished) => return Ok(()),
             Err(error) if !error.is_transient() => return Err(error),
-            looked => {
-                idle += wait(store, idle, settings.timing.idle, looked.is_ok(), closing, wanted).await;
+            polled => {
+                idle += wait(store, idle, settings.timing.idle, polled.is_ok(), shutdown, requested).await;
                 continue;
             }
         };
         idle = Duration::ZERO;
         debug!(candidate = lease.candidate, job = lease.job, attempt = lease.attempt, "leased");
-        let begun = Instant::now();
+        let started = Instant::now();
         let size = method.size(&lease.structure);
-        if let Some(reason) = insist(closing, || guard::refusal(store, &lease, size)).await? {
-            // Whatever was tried before, another attempt would be refused as well.
-            insist(closing, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
-            say(&format!("{} is refused: {reason}", lease.candidate));
+        if let Some(reason) = retry_until_written(shutdown, || guard::refusal(store, &lease, size)).await? {
+            // Another attempt would be refused as well, whatever was tried before.
+            retry_until_written(shutdown, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
+            announce(&format!("refused {}: {reason}", lease.candidate));
             continue;
         }
-        let made = match make(store, method, &lease, &settings.timing, closing, &now).await? {
-            Work::Done(made) => *made,
-            Work::NotWanted => {
+        let attempt = match make_label(store, method, &lease, &settings.timing, shutdown, &now).await? {
+            LeaseOutcome::Done(attempt) => *attempt,
+            LeaseOutcome::NotWanted => {
                 method.stop().await?;
-                say(&format!("{} is given up here: it has its label, or is wanted no more", lease.candidate));
+                announce(&format!("stopped labelling {}: its result is no longer needed", lease.candidate));
                 continue;
             }
-            Work::LetGo => {
-                method.let_go();
-                say(&format!("{} is finished by somebody else here", lease.candidate));
+            LeaseOutcome::Detached => {
+                method.detach();
+                announce(&format!("{} is finished by another labeller on this host", lease.candidate));
                 continue;
             }
-            Work::LeftToOthers => {
-                method.let_go();
-                say(&format!("{} goes on and is left to the next labeller here", lease.candidate));
-                return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+            LeaseOutcome::LeftRunning => {
+                method.detach();
+                announce(&format!(
+                    "{} continues and is left to the next labeller on this host",
+                    lease.candidate
+                ));
+                return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
+                    .await
+                    .map(drop);
             }
-            Work::TooLate => {
+            LeaseOutcome::GraceExpired => {
                 method.stop().await?;
-                say(&format!("{} is given back: there is no time to finish it", lease.candidate));
-                return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+                announce(&format!("released {}: there is no time to finish it", lease.candidate));
+                return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
+                    .await
+                    .map(drop);
             }
         };
-        let expected = offsets.expected(store, &settings.protocol, &lease, &made.result, closing).await?;
-        let made = made.judged(&lease, &settings.bounds, expected);
-        let Brought { judged, became, ended } =
-            bring(store, method, &lease, settings, made, closing, &now).await?;
-        let line = told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64());
-        match &judged {
+        let reference =
+            offsets.energy_reference(store, &settings.protocol, &lease, &attempt.result, shutdown).await?;
+        let attempt = attempt.validated(&lease, &settings.bounds, reference);
+        let Delivered { validated, outcome, ended } =
+            deliver_attempt(store, method, &lease, settings, attempt, shutdown, &now).await?;
+        let line = report_line::format_report(&lease, &validated, &outcome, started.elapsed().as_secs_f64());
+        match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
             Err(failure) => {
                 warn!(job = lease.job, attempt = lease.attempt, class = failure.class.name(), "{line}");
@@ -220,118 +229,127 @@ async fn work(
         }
         tell(&line);
         if let Some(ended) = ended {
-            method.put_away(store, &lease, closing, ended, judged.is_err()).await?;
+            method.archive(store, &lease, shutdown, ended, validated.is_err()).await?;
         }
     }
 }
 
 /// A result that the store has.
-struct Brought {
-    judged: Result<Results, Failure>,
-    became: Became,
-    ended: Option<Ended>,
+struct Delivered {
+    validated: Result<Results, Failure>,
+    outcome: DeliveryOutcome,
+    ended: Option<EndedCalculation>,
 }
 
-/// Brings what was made for a job and judged to the store, with what it has cost.
-async fn bring(
+/// Stores the validated result of a job and its cost.
+async fn deliver_attempt(
     store: &Store,
     method: &Method,
     lease: &Lease,
     settings: &LabellerSettings,
-    made: Made,
-    closing: &Closing,
+    attempt: LabelAttempt,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
-) -> Result<Brought, StoreError> {
-    let Made { result: judged, ended } = made;
+) -> Result<Delivered, StoreError> {
+    let LabelAttempt { result: validated, ended } = attempt;
     let log = ended.as_ref().map_or("", |ended| &ended.log);
     if let Some(ended) = &ended {
-        insist(closing, || store.account(lease, ended.core_seconds, log)).await?;
+        retry_until_written(shutdown, || store.record_cost(lease, ended.core_seconds, log)).await?;
     }
-    // What no remedy helps against is not tried again.
-    let no_remedy = judged.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
+    // A failure without a remedy is not tried again.
+    let no_remedy = validated.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
     let attempts = if no_remedy { 1 } else { settings.attempts };
-    let became = insist(closing, || deliver(store, lease, &judged, log, attempts, now())).await?;
-    Ok(Brought { judged, became, ended })
+    let outcome =
+        retry_until_written(shutdown, || deliver(store, lease, &validated, log, attempts, now())).await?;
+    Ok(Delivered { validated, outcome, ended })
 }
 
-async fn look(
+async fn poll_queue(
     store: &Store,
     settings: &LabellerSettings,
-    last_look: bool,
+    no_more_jobs: bool,
     now: i64,
-) -> Result<Found, StoreError> {
-    // Its loop holds none now: leasing a job, working on it and the next look follow each other.
-    give_back_unknown(store, &settings.holder, &[], now).await?;
-    if !store.awaits_labels(now).await? {
-        return Ok(if last_look { Found::TheEnd } else { Found::Nothing });
+) -> Result<QueuePoll, StoreError> {
+    // The loop holds no lease at this point: leasing, labelling and polling follow each other.
+    release_unknown_leases(store, &settings.holder, &[], now).await?;
+    if !store.has_pending_labels(now).await? {
+        return Ok(if no_more_jobs { QueuePoll::Finished } else { QueuePoll::Nothing });
     }
     let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
     match store.lease(protocol, &settings.holder, now, seconds).await? {
-        Some(lease) => Ok(Found::Job(Box::new(lease))),
-        // What there is to do is for others.
-        None if !store.is_in_force(protocol).await? => Ok(Found::TheEnd),
-        None => Ok(Found::Nothing),
+        Some(lease) => Ok(QueuePoll::Job(Box::new(lease))),
+        // The remaining work is for others.
+        None if !store.is_in_force(protocol).await? => Ok(QueuePoll::Finished),
+        None => Ok(QueuePoll::Nothing),
     }
 }
 
-/// Gives back leases that the store has in the name of this labeller, and it does not know: the answer to a commit was lost.
-async fn give_back_unknown(store: &Store, holder: &str, held: &[&Lease], now: i64) -> Result<(), StoreError> {
+/// Releases leases that the store has under this labeller's name but that it does not know: the reply to a commit
+/// was lost.
+async fn release_unknown_leases(
+    store: &Store,
+    holder: &str,
+    held: &[&Lease],
+    now: i64,
+) -> Result<(), StoreError> {
     let leases = store.state_leases(holder, held, now).await?;
     if leases > 0 {
-        warn!(leases, "given back: the answer of the database to a commit was lost");
+        warn!(leases, "released leases: the database's reply to a commit was lost");
     }
     Ok(())
 }
 
-/// Waits until there may be work after `idle` without any, or until something else is `wanted`. Returns how long, at most.
+/// Waits until there may be work, or until the shutdown state differs from `requested`. `idle` is the time without
+/// work so far. Returns the longest time that it may have waited.
 async fn wait(
     store: &Store,
     idle: Duration,
     least: Duration,
     answers: bool,
-    closing: &Closing,
-    wanted: Wanted,
+    shutdown: &Shutdown,
+    requested: ShutdownState,
 ) -> Duration {
-    let wait = match answers && store.tells_of_jobs() {
-        true => TOLD_IDLE,
-        false => (idle / IDLE_PART).min(LONGEST_IDLE).max(least),
+    let wait = match answers && store.has_job_notifications() {
+        true => NOTIFIED_POLL_INTERVAL,
+        false => (idle / IDLE_DIVISOR).min(MAX_POLL_INTERVAL).max(least),
     };
     tokio::select! {
         () = store.wait_for_jobs(wait) => {}
-        () = closing.other_than(wanted) => {}
+        () = shutdown.changed_from(requested) => {}
     }
     wait
 }
 
-/// What came of a lease.
-enum Work {
-    Done(Box<Made>),
-    /// Nobody waits for the result any more.
+/// The outcome of a lease.
+enum LeaseOutcome {
+    Done(Box<LabelAttempt>),
+    /// The result is no longer needed.
     NotWanted,
-    /// Somebody else waits for this very calculation.
-    LetGo,
-    /// Somebody asked to stop, and it goes on without this labeller, or waits to be read.
-    LeftToOthers,
-    /// There was no time to end it.
-    TooLate,
+    /// Another labeller waits for the same calculation.
+    Detached,
+    /// The labeller was asked to stop; the calculation continues without it, or waits to be read.
+    LeftRunning,
+    /// The grace period ended first.
+    GraceExpired,
 }
 
-/// Works on a job, and renews the lease meanwhile. A label whose lease was lost is made to its end: if another is first, it
-/// becomes a check. But a calculation of its own is ended when nobody waits for it, and left alone when somebody else does.
-async fn make(
+/// Works on a job and renews its lease meanwhile. If the lease is lost, the label is still finished: if another
+/// result comes first, it becomes a check. But its calculation is ended when the result is no longer needed, and
+/// left alone when another labeller waits for it.
+async fn make_label(
     store: &Store,
     method: &Method,
     lease: &Lease,
     timing: &Timing,
-    closing: &Closing,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
-) -> Result<Work, StoreError> {
-    let mut making = pin!(method.make(store, lease, closing));
-    let mut too_late = pin!(end_of_grace(timing.grace, closing));
-    // Who has no time of grace is followed by others, who find the calculation.
-    let leaves = timing.grace.is_none() && method.outlives_its_labeller();
+) -> Result<LeaseOutcome, StoreError> {
+    let mut labelling = pin!(method.make(store, lease, shutdown));
+    let mut too_late = pin!(end_of_grace(timing.grace, shutdown));
+    // Labellers without a grace period are followed by others, which find the calculation.
+    let leaves = timing.grace.is_none() && method.outlives_labeller();
     let mut leave = pin!(async {
-        end_of_grace(leaves.then_some(LAST_LABEL), closing).await;
+        end_of_grace(leaves.then_some(DETACH_DELAY), shutdown).await;
         while method.calculation().is_none() {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
@@ -340,11 +358,11 @@ async fn make(
     let mut held = true;
     loop {
         tokio::select! {
-            made = &mut making => {
-                return Ok(made?.map_or(Work::LeftToOthers, |made| Work::Done(Box::new(made))));
+            attempt = &mut labelling => {
+                return Ok(attempt?.map_or(LeaseOutcome::LeftRunning, |attempt| LeaseOutcome::Done(Box::new(attempt))));
             }
-            () = &mut too_late => return Ok(Work::TooLate),
-            () = &mut leave => return Ok(Work::LeftToOthers),
+            () = &mut too_late => return Ok(LeaseOutcome::GraceExpired),
+            () = &mut leave => return Ok(LeaseOutcome::LeftRunning),
             () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3) => {}
         }
         if held {
@@ -354,16 +372,16 @@ async fn make(
                 renewed => renewed?,
             };
         }
-        // A commit that the server was still at when its connection broke may have come after the look at the queue.
-        match give_back_unknown(store, &lease.holder, &[lease], now()).await {
+        // The server may have completed a commit after its connection broke and the queue was polled.
+        match release_unknown_leases(store, &lease.holder, &[lease], now()).await {
             Err(error) if !error.is_transient() => return Err(error),
             _ => {}
         }
         let Some(own) = method.calculation().filter(|_| !held) else { continue };
-        match store.whereabouts(lease).await {
-            Ok(Whereabouts::Over) => return Ok(Work::NotWanted),
-            Ok(Whereabouts::LeasedAgain { calculation: Some(other) }) if other == own => {
-                return Ok(Work::LetGo);
+        match store.lease_status(lease).await {
+            Ok(LeaseStatus::Over) => return Ok(LeaseOutcome::NotWanted),
+            Ok(LeaseStatus::LeasedAgain { calculation: Some(other) }) if other == own => {
+                return Ok(LeaseOutcome::Detached);
             }
             Ok(_) => {}
             Err(error) if error.is_transient() => {}
@@ -372,10 +390,10 @@ async fn make(
     }
 }
 
-async fn end_of_grace(grace: Option<Duration>, closing: &Closing) {
+async fn end_of_grace(grace: Option<Duration>, shutdown: &Shutdown) {
     match grace {
         Some(grace) => {
-            closing.stopped().await;
+            shutdown.stop_requested().await;
             tokio::time::sleep(grace).await;
         }
         None => std::future::pending().await,
@@ -385,36 +403,38 @@ async fn end_of_grace(grace: Option<Duration>, closing: &Closing) {
 async fn deliver(
     store: &Store,
     lease: &Lease,
-    judged: &Result<Results, Failure>,
+    validated: &Result<Results, Failure>,
     log: &str,
     attempts: u32,
     now: i64,
-) -> Result<Became, StoreError> {
-    let failure = match judged {
-        Ok(made) => return store.complete(lease, &label(made), now).await.map(Became::Completed),
+) -> Result<DeliveryOutcome, StoreError> {
+    let failure = match validated {
+        Ok(results) => {
+            return store.complete(lease, &label(results), now).await.map(DeliveryOutcome::Completed);
+        }
         Err(failure) => failure,
     };
     let (class, text) = (failure.class.name(), format!("{failure}\n{log}"));
     let text = text.trim_end();
     let failed = match failure.class {
-        // That was no fault of the job.
-        FailureClass::LostNode => store.lose(lease, class, text, now).await,
+        // This was no fault of the job.
+        FailureClass::LostNode => store.release_lost(lease, class, text, now).await,
         _ => store.fail(lease, class, text, attempts, now).await,
     };
-    failed.map(Became::Failed)
+    failed.map(DeliveryOutcome::Failed)
 }
 
-/// A result as the store keeps it.
-fn label(made: &Results) -> Label {
+/// A result for the store keeps it.
+fn label(results: &Results) -> Label {
     Label {
-        energy: made.energy,
-        forces: made.forces.clone(),
-        stress: made.stress,
+        energy: results.energy,
+        forces: results.forces.clone(),
+        stress: results.stress,
         details: LabelDetails {
-            energy_without_smearing: made.energy_without_smearing,
-            magnetic_moments: made.magnetic_moments.clone(),
-            magnetisation: made.magnetisation,
-            electronic_steps: made.electronic_steps,
+            energy_without_smearing: results.energy_without_smearing,
+            magnetic_moments: results.magnetic_moments.clone(),
+            magnetisation: results.magnetisation,
+            electronic_steps: results.electronic_steps,
         },
     }
 }

@@ -1,4 +1,4 @@
-//! A directory as one row of the store.
+//! Packs a directory into one row of the store.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -9,46 +9,50 @@ use dft::result_file;
 
 use super::prepare::DATA;
 
-/// What VASP's licence lets nobody pass on.
+/// Files that VASP's licence forbids to redistribute.
 const LICENSED: &str = "POTCAR";
-/// Larger files stay out: charge densities and wave functions are of no use without the program, and are made again.
-const LARGEST_FILE: u64 = 16 << 20;
-/// Bytes of all files together, before they are compressed, each with its header.
-const MOST: u64 = 64 << 20;
-/// What a file takes beside its content.
-const HEADER: u64 = 1024;
-/// Directories within each other that are looked into. Paths of some thousand levels cannot be named any more.
-const DEEPEST: usize = 64;
-/// Lines about what is left out.
-const LINES: usize = 1000;
-/// More would cost time and win little.
-const LEVEL: i32 = 3;
+/// Larger files are left out: charge densities and wave functions are useless without the program and can be
+/// recomputed.
+const MAX_FILE_SIZE: u64 = 16 << 20;
+/// Maximum size of all files before compression, with headers.
+const MAX_TOTAL_SIZE: u64 = 64 << 20;
+/// Size of a file's header.
+const HEADER_SIZE: u64 = 1024;
+/// Maximum directory depth. Paths thousands of levels deep exceed the system's limit.
+const MAX_DEPTH: usize = 64;
+/// Maximum number of lines about files left out.
+const MAX_LINES: usize = 1000;
+/// Higher levels take longer and gain little.
+const COMPRESSION_LEVEL: i32 = 3;
 
-/// A tar file, compressed.
+/// A compressed tar file.
 pub(super) struct Packed {
     pub bytes: Vec<u8>,
-    /// What is not in it, with its bytes or why, a line each.
+    /// Files left out, with their size or the reason, one per line.
     pub left_out: String,
 }
 
-/// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room.
-/// Pseudopotentials stay out ([`DATA`], [`LICENSED`]): all calculations have the same. So does what cannot be read.
+/// Packs the files below a directory, ordered by name, unless a file or the sum becomes too large. Leaves out
+/// pseudopotentials ([`DATA`], [`LICENSED`]), which all calculations share, and unreadable files.
 pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
-    let mut encoder = zstd::Encoder::new(Vec::new(), LEVEL)?;
+    let mut encoder = zstd::Encoder::new(Vec::new(), COMPRESSION_LEVEL)?;
     encoder.include_checksum(true)?;
     let mut archive = tar::Builder::new(encoder);
     let mut left_out = LeftOut::default();
-    let mut room = MOST;
+    let mut room = MAX_TOTAL_SIZE;
     for path in files(directory, &mut left_out) {
         let name = path.strip_prefix(directory).unwrap_or(&path);
         let size = fs::symlink_metadata(&path).map_or(0, |file| file.len());
-        if name.starts_with(DATA) || name.ends_with(LICENSED) || size.max(HEADER) > LARGEST_FILE.min(room) {
-            left_out.note(name, &format!("{size} bytes"));
+        if name.starts_with(DATA)
+            || name.ends_with(LICENSED)
+            || size.max(HEADER_SIZE) > MAX_FILE_SIZE.min(room)
+        {
+            left_out.add(name, &format!("{size} bytes"));
             continue;
         }
         match append(&mut archive, &path, name) {
-            Ok(()) => room = room.saturating_sub(size + HEADER),
-            Err(Unpacked::Unreadable(why)) => left_out.note(name, &why),
+            Ok(()) => room = room.saturating_sub(size + HEADER_SIZE),
+            Err(Unpacked::Unreadable(why)) => left_out.add(name, &why),
             Err(Unpacked::Archive(error)) => return Err(error),
         }
     }
@@ -58,20 +62,20 @@ pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
 
 /// Why a file is not packed.
 enum Unpacked {
-    /// It stays out.
+    /// It is left out.
     Unreadable(String),
-    /// Nothing can be packed any more.
+    /// The archive is unusable.
     Archive(io::Error),
 }
 
-/// Appends a file or a link, with what it has in common with others of its kind.
+/// Appends a file or a link with its usual metadata.
 fn append<W: io::Write>(archive: &mut tar::Builder<W>, path: &Path, name: &Path) -> Result<(), Unpacked> {
     let unreadable = |error: io::Error| Unpacked::Unreadable(error.to_string());
     let metadata = fs::symlink_metadata(path).map_err(unreadable)?;
     let mut header = tar::Header::new_gnu();
     header.set_metadata(&metadata);
     if metadata.is_symlink() {
-        // It may lead anywhere, and is not followed.
+        // A link may point anywhere and is not followed.
         let target = fs::read_link(path).map_err(unreadable)?;
         header.set_size(0);
         return archive.append_link(&mut header, name, target).map_err(unreadable);
@@ -87,13 +91,13 @@ fn files(directory: &Path, left_out: &mut LeftOut) -> Vec<PathBuf> {
     while let Some((folder, depth)) = open.pop() {
         let name = folder.strip_prefix(directory).unwrap_or(&folder).to_owned();
         let entries = match fs::read_dir(&folder) {
-            Ok(entries) if depth <= DEEPEST => entries,
+            Ok(entries) if depth <= MAX_DEPTH => entries,
             Ok(_) => {
-                left_out.note(&name, &format!("more than {DEEPEST} directories deep"));
+                left_out.add(&name, &format!("more than {MAX_DEPTH} directories deep"));
                 continue;
             }
             Err(error) => {
-                left_out.note(&name, &error.to_string());
+                left_out.add(&name, &error.to_string());
                 continue;
             }
         };
@@ -101,7 +105,7 @@ fn files(directory: &Path, left_out: &mut LeftOut) -> Vec<PathBuf> {
             match entry.file_type() {
                 Ok(kind) if kind.is_dir() => open.push((entry.path(), depth + 1)),
                 Ok(kind) if kind.is_file() || kind.is_symlink() => files.push(entry.path()),
-                _ => left_out.note(&name.join(entry.file_name()), "no regular file"),
+                _ => left_out.add(&name.join(entry.file_name()), "not a regular file"),
             }
         }
     }
@@ -109,7 +113,7 @@ fn files(directory: &Path, left_out: &mut LeftOut) -> Vec<PathBuf> {
     files
 }
 
-/// What is not packed.
+/// Files left out.
 #[derive(Default)]
 struct LeftOut {
     lines: Vec<String>,
@@ -117,12 +121,12 @@ struct LeftOut {
 }
 
 impl LeftOut {
-    fn note(&mut self, name: &Path, why: &str) {
-        if self.lines.len() == LINES {
+    fn add(&mut self, name: &Path, why: &str) {
+        if self.lines.len() == MAX_LINES {
             self.more += 1;
             return;
         }
-        // A name may have line breaks in it.
+        // A name may contain line breaks.
         let name: String =
             name.to_string_lossy().chars().map(|c| if c.is_control() { '?' } else { c }).collect();
         self.lines.push(format!("{name} ({why})"));

@@ -1,4 +1,4 @@
-//! Before a calculation, and after it: files and numbers, nothing runs here.
+//! Preparing a calculation and reading its results. Runs nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -9,74 +9,74 @@ use atoms::Structure;
 use dft::{DftBackend, Exit, Failure, Input, PinnedFile, Results, RetryAdjustment};
 use store::{CalculationRecord, StoreError};
 
-use super::Running;
-use super::code::file;
-use super::difference::difference;
-use super::keeper::WORK;
+use super::ExecutionSettings;
+use super::calculation_runner::WORK;
+use super::code::file_error;
+use super::input_diff::input_diff;
 
-/// Beside [`WORK`], what the program reads and all calculations have alike.
+/// Beside [`WORK`]: input files that all calculations share.
 pub(super) const DATA: &str = "data";
 
 /// Bytes of a GB.
 const GIGABYTE: f64 = 1e9;
 
-/// What a calculation starts from, and what is said of it in the store.
-pub(super) struct Prepared {
+/// The input of a calculation and its record in the store.
+pub(super) struct PreparedInput {
     pub input: Input,
     pub record: CalculationRecord,
     /// Seconds.
     pub time_limit: f64,
     /// Bytes.
     pub memory_limit: Option<u64>,
-    /// Whether it is not to run where it failed.
+    /// Whether to avoid nodes where it failed.
     pub avoids_nodes: bool,
 }
 
-/// Everything that is known before anything is started.
+/// Prepares everything that is needed before the start.
 pub(super) fn prepare(
     code: &dyn DftBackend,
-    running: &Running,
+    execution: &ExecutionSettings,
     structure: &Structure,
     remedies: &BTreeSet<RetryAdjustment>,
-) -> Result<Prepared, Failure> {
+) -> Result<PreparedInput, Failure> {
     let input = code.input(structure, remedies)?;
     let (size, mut record) = (code.size(structure), CalculationRecord::default());
-    record.cores = Some(running.cores);
+    record.cores = Some(execution.cores);
     record.atoms = u32::try_from(size.atoms).ok();
     record.electrons = Some(size.electrons).filter(|electrons| electrons.is_finite());
     record.k_points = u32::try_from(size.k_points).ok();
     if !remedies.is_empty() {
         let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
         record.remedies = Some(names.join(","));
-        record.difference = Some(difference(&code.input(structure, &BTreeSet::new())?, &input));
+        record.difference = Some(input_diff(&code.input(structure, &BTreeSet::new())?, &input));
     }
     let twice = |remedy| if remedies.contains(&remedy) { 2.0 } else { 1.0 };
-    let memory = running.memory.map(|gigabytes| twice(RetryAdjustment::MoreMemory) * GIGABYTE * gigabytes);
-    Ok(Prepared {
+    let memory = execution.memory.map(|gigabytes| twice(RetryAdjustment::MoreMemory) * GIGABYTE * gigabytes);
+    Ok(PreparedInput {
         input,
         record,
-        time_limit: twice(RetryAdjustment::MoreTime) * running.time_limit,
+        time_limit: twice(RetryAdjustment::MoreTime) * execution.time_limit,
         // The conversion saturates.
         memory_limit: memory.map(|bytes| bytes as u64),
         avoids_nodes: remedies.contains(&RetryAdjustment::OtherNode),
     })
 }
 
-/// Writes its input into the directory of a calculation.
+/// Writes the input into the directory of a calculation.
 ///
 /// # Errors
-/// It cannot be written, or a file of which it gets a copy is not the one of the protocol any more.
+/// The input cannot be written, or a file to be copied no longer has the hash in the protocol.
 pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
     let copy = |(name, original): (&String, &PinnedFile)| match original.content() {
         Ok(content) => Ok((name.clone(), content)),
-        Err(error) => Err(file(original.path(), error)),
+        Err(error) => Err(file_error(original.path(), error)),
     };
     let data = input.data.iter().map(copy).collect::<Result<BTreeMap<_, _>, _>>()?;
     let written = fill(&directory.join(WORK), &input.files).and_then(|()| fill(&directory.join(DATA), &data));
-    written.map_err(|error| file(directory, error))
+    written.map_err(|error| file_error(directory, error))
 }
 
-/// Makes a folder with these files in it.
+/// Creates a folder with these files.
 fn fill(folder: &Path, files: &BTreeMap<String, Vec<u8>>) -> io::Result<()> {
     fs::create_dir_all(folder)?;
     for (name, bytes) in files {
@@ -87,8 +87,8 @@ fn fill(folder: &Path, files: &BTreeMap<String, Vec<u8>>) -> io::Result<()> {
     Ok(())
 }
 
-/// Judges a calculation that ended so, and reads its numbers. Where a limit has ended it, that is why it failed, whatever
-/// its files look like.
+/// Checks and reads the results of a calculation. If it reached a limit, that is the failure, whatever its files
+/// contain.
 pub(super) fn read(
     code: &dyn DftBackend,
     structure: &Structure,

@@ -1,4 +1,4 @@
-//! Labels from a potential in place of DFT, as in the paper's own tests.
+//! Labels from a potential instead of DFT, as in the paper's own tests.
 
 use atoms::{Evaluation, NeighbourList, Potential, Structure};
 use dft::{Failure, FailureClass, Results};
@@ -15,7 +15,7 @@ impl ReferenceMethod {
         Self { potential, evaluation: Evaluation::default() }
     }
 
-    /// Energy, forces and, where it is defined, stress.
+    /// Energy, forces and, where defined, stress.
     ///
     /// # Errors
     /// [`FailureClass::BadInput`] for a structure that the potential cannot evaluate.

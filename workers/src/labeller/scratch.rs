@@ -1,9 +1,9 @@
-//! Where calculations have their directories, and what becomes of those.
+//! Directories of calculations: creating, archiving and removing them.
 //!
 //! | | |
 //! | --- | --- |
-//! | `<scratch>/calmwalk-<campaign>-<random>/` | a campaign's, of this user alone: see [`private`]; whoever comes later finds it by its name and owner |
-//! | `<scratch>/calmwalk-<campaign>-<random>/<job>-<attempt>-<time>/` | a calculation's, with the folders `work` and `data` |
+//! | `<scratch>/calmwalk-<campaign>-<random>/` | directory of a campaign, for this user alone (see [`private_directory`]); later labellers find it by name and owner |
+//! | `<scratch>/calmwalk-<campaign>-<random>/<job>-<attempt>-<time>/` | directory of a calculation, with the folders `work` and `data` |
 
 use std::fs;
 use std::io;
@@ -13,105 +13,107 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use store::{Store, StoreError};
 use wire::CampaignId;
 
-use super::begun::{Begun, Found};
-use super::code::{blocking, file};
-use super::running::Keep;
+use super::calculation_handle::{CalculationHandle, CalculationState};
+use super::code::{blocking, file_error};
+use super::execution::KeepDirectories;
 use super::slurm::{self, Slurm};
-use super::{Closing, here, insist, pack, private};
+use super::{Shutdown, local, pack, private_directory, retry_until_written};
 
-/// What was left behind is only cleared away when nobody can still be at it.
-const AGE: Duration = Duration::from_secs(60);
-/// How often it is tried to make a directory where somebody else clears away empty ones.
-const TRIES: u32 = 100;
+/// Directories younger than this may still be in use and are not removed.
+const MIN_AGE: Duration = Duration::from_secs(60);
+/// Tries to create a directory while another process removes empty ones.
+const MAX_ATTEMPTS: u32 = 100;
 
-/// Where all calculations of a campaign that this user makes with this scratch directory are.
+/// The directory for all calculations of a campaign by this user, below the scratch directory.
 #[derive(Debug)]
-pub(super) struct Home {
+pub(super) struct ScratchRoot {
     scratch: PathBuf,
-    /// What the names of its directories begin with. Several labellers that begin at once may make one each.
+    /// Prefix of its name. Several labellers that start at the same time may create one each.
     prefix: String,
 }
 
-impl Home {
-    /// That of a campaign.
-    pub fn of(scratch: &Path, campaign: CampaignId) -> Self {
+impl ScratchRoot {
+    /// The scratch root of a campaign.
+    pub fn for_campaign(scratch: &Path, campaign: CampaignId) -> Self {
         Self { scratch: scratch.to_owned(), prefix: format!("calmwalk-{campaign}") }
     }
 
-    /// Makes a directory for calculations, if there is none.
+    /// Creates a directory for calculations if there is none.
     ///
     /// # Errors
-    /// None can be made in which nobody else could change anything.
+    /// No directory can be created that is safe from other users.
     pub fn prepare(&self) -> Result<PathBuf, StoreError> {
-        private::check(&self.scratch)?;
+        private_directory::check(&self.scratch)?;
         let prefix = format!("{}-", self.prefix);
-        let found = private::ours_in(&self.scratch, &prefix).map_err(|error| file(&self.scratch, error))?;
-        match found.into_iter().find(|path| private::is_closed(path)) {
-            Some(home) => Ok(home),
-            None => private::make(&self.scratch, &prefix),
+        let found = private_directory::ours_in(&self.scratch, &prefix)
+            .map_err(|error| file_error(&self.scratch, error))?;
+        match found.into_iter().find(|path| private_directory::is_closed(path)) {
+            Some(root) => Ok(root),
+            None => private_directory::make(&self.scratch, &prefix),
         }
     }
 
-    /// Makes the directory of a calculation.
+    /// Creates the directory of a calculation.
     ///
     /// # Errors
     /// The same.
     pub fn make(&self, job: i64, attempt: u32) -> Result<PathBuf, StoreError> {
         let mut tries = 0;
         loop {
-            let home = self.prepare()?;
+            let root = self.prepare()?;
             tries += 1;
-            match private::make_inside(&home, &name(job, attempt)) {
-                // Whoever ended last has cleared it away.
-                Err(error) if error.kind() == io::ErrorKind::NotFound && tries < TRIES => {}
-                made => return made.map_err(|error| file(&home, error)),
+            match private_directory::make_inside(&root, &name(job, attempt)) {
+                // The process that ended last has removed it.
+                Err(error) if error.kind() == io::ErrorKind::NotFound && tries < MAX_ATTEMPTS => {}
+                made => return made.map_err(|error| file_error(&root, error)),
             }
         }
     }
 
-    /// Clears away the directories that killed labellers have left, as far as nobody needs them: those of calculations whose
-    /// keeper is gone and whose job waits for nothing.
-    pub async fn tidy(
+    /// Removes directories that killed labellers left and nobody needs: those of calculations whose runner has
+    /// ended and whose result is not wanted.
+    pub async fn cleanup(
         &self,
         store: &Store,
-        keep: Keep,
+        keep: KeepDirectories,
         slurm: &Slurm,
-        closing: &Closing,
+        shutdown: &Shutdown,
     ) -> Result<(), StoreError> {
-        for home in self.all()? {
-            let entries = fs::read_dir(&home).map_err(|error| file(&home, error))?;
+        for root in self.all()? {
+            let entries = fs::read_dir(&root).map_err(|error| file_error(&root, error))?;
             for directory in entries.flatten().map(|entry| entry.path()).filter(|path| is_old(path)) {
-                tidy_one(store, &directory, keep, slurm, closing).await?;
+                cleanup_one(store, &directory, keep, slurm, shutdown).await?;
             }
         }
         Ok(())
     }
 
-    /// Removes directories in which no calculation is.
+    /// Removes directories without calculations.
     pub fn remove_empty(&self) {
-        for home in self.all().unwrap_or_default() {
-            remove_empty(&home);
+        for root in self.all().unwrap_or_default() {
+            remove_empty(&root);
         }
     }
 
-    /// All directories of this campaign, also those that an earlier version of this program has made.
+    /// All directories of this campaign, including those of earlier versions of this program.
     fn all(&self) -> Result<Vec<PathBuf>, StoreError> {
-        private::ours_in(&self.scratch, &self.prefix).map_err(|error| file(&self.scratch, error))
+        private_directory::ours_in(&self.scratch, &self.prefix)
+            .map_err(|error| file_error(&self.scratch, error))
     }
 }
 
-/// Removes the directory that holds those of calculations if there are none.
-pub(super) fn remove_empty(home: &Path) {
-    let is_calculation = |path: &Path| numbers(path).is_some();
-    let entries = fs::read_dir(home).into_iter().flatten().flatten();
+/// Removes the directory of a campaign if it holds no calculations.
+pub(super) fn remove_empty(root: &Path) {
+    let is_calculation = |path: &Path| job_and_attempt(path).is_some();
+    let entries = fs::read_dir(root).into_iter().flatten().flatten();
     if !entries.map(|entry| entry.path()).any(|path| is_calculation(&path)) {
-        slurm::forget(home);
-        // Another labeller may be making one there.
-        let _ = fs::remove_dir(home);
+        slurm::remove_cache(root);
+        // Another labeller may be creating one there.
+        let _ = fs::remove_dir(root);
     }
 }
 
-/// Name of the directory of a calculation. No two are alike, also if the campaign has copies.
+/// Directory name of a calculation. It is unique even if the campaign was copied.
 pub(super) fn name(job: i64, attempt: u32) -> String {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     format!("{job}-{attempt}-{:x}", now.as_nanos())
@@ -122,48 +124,48 @@ pub(super) async fn pack(
     store: &Store,
     job: i64,
     attempt: u32,
-    closing: &Closing,
+    shutdown: &Shutdown,
     directory: &Path,
 ) -> Result<(), StoreError> {
     let from = directory.to_owned();
-    let packed = blocking(move || pack::pack(&from)).await.map_err(|error| file(directory, error))?;
-    insist(closing, || store.keep_archive(job, attempt, &packed.bytes, &packed.left_out)).await
+    let packed = blocking(move || pack::pack(&from)).await.map_err(|error| file_error(directory, error))?;
+    retry_until_written(shutdown, || store.keep_archive(job, attempt, &packed.bytes, &packed.left_out)).await
 }
 
-async fn tidy_one(
+async fn cleanup_one(
     store: &Store,
     directory: &Path,
-    keep: Keep,
+    keep: KeepDirectories,
     slurm: &Slurm,
-    closing: &Closing,
+    shutdown: &Shutdown,
 ) -> Result<(), StoreError> {
-    let Some((job, attempt)) = numbers(directory) else { return Ok(()) };
-    let past = insist(closing, || store.past_calculation(job, attempt)).await?;
-    // Of a copy of this campaign.
+    let Some((job, attempt)) = job_and_attempt(directory) else { return Ok(()) };
+    let past = retry_until_written(shutdown, || store.past_calculation(job, attempt)).await?;
+    // It belongs to a copy of this campaign.
     let Some(past) = past.filter(|past| !past.wanted) else { return Ok(()) };
-    let begun = past.calculation.as_deref().and_then(Begun::parse);
-    let is_over = match begun.filter(|begun| begun.directory() == directory) {
-        Some(begun) => !matches!(begun.look(slurm).await?, Found::Running),
-        // Whoever made it was killed before anything began.
+    let handle = past.calculation.as_deref().and_then(CalculationHandle::parse);
+    let is_over = match handle.filter(|handle| handle.directory() == directory) {
+        Some(handle) => !matches!(handle.inspect(slurm).await?, CalculationState::Running),
+        // Its creator was killed before anything started.
         None => true,
     };
     if is_over && keep.keeps(past.failed) {
-        pack(store, job, attempt, closing, directory).await?;
+        pack(store, job, attempt, shutdown, directory).await?;
     }
     if is_over {
         let cleared = directory.to_owned();
-        blocking(move || here::clear(&cleared)).await.map_err(|error| file(directory, error))?;
+        blocking(move || local::clear(&cleared)).await.map_err(|error| file_error(directory, error))?;
     }
     Ok(())
 }
 
-/// Job and attempt of the directory of that name.
-fn numbers(directory: &Path) -> Option<(i64, u32)> {
+/// Job and attempt in the name of a directory.
+fn job_and_attempt(directory: &Path) -> Option<(i64, u32)> {
     let mut parts = directory.file_name()?.to_str()?.splitn(3, '-');
     Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))
 }
 
 fn is_old(directory: &Path) -> bool {
     let changed = fs::metadata(directory).and_then(|directory| directory.modified());
-    changed.is_ok_and(|changed| changed.elapsed().is_ok_and(|age| age > AGE))
+    changed.is_ok_and(|changed| changed.elapsed().is_ok_and(|age| age > MIN_AGE))
 }

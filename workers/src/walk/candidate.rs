@@ -1,4 +1,4 @@
-//! The structure that a walk offers, with all that is known of it.
+//! Builds a candidate with all its data.
 
 use atoms::NeighbourList;
 use calm::neighbourhood::{Pair, neighbourhood_average};
@@ -7,7 +7,7 @@ use wire::{Candidate, CandidateId, ContentHash};
 use super::{Walk, WalkError, gamma};
 
 impl Walk<'_> {
-    /// Where the walk stands, as a candidate.
+    /// The current state as a candidate.
     pub(super) fn candidate(&mut self) -> Result<Candidate, WalkError> {
         let gamma = gamma(&mut self.potential, &self.dynamics)?.to_vec();
         let structure = self.dynamics.structure().clone();

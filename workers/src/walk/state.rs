@@ -1,4 +1,4 @@
-//! What a walk remembers between two turns, and its beginning.
+//! The state of a walk between assignments, and its initial state.
 
 use atoms::shortest_distance;
 use md::{Checkpoint, Dynamics, Langevin, NoseHooverChain, State, Stream, Thermostat, VolumeRamp};
@@ -11,8 +11,8 @@ use crate::bias::{BiasState, BiasedPotential};
 use crate::guard;
 use crate::settings::{ThermostatKind, WalkSettings};
 
-/// Checkpoints to go back to that are kept; the oldest is used, so that a return leads out of the trap.
-const KEPT_CHECKPOINTS: usize = 2;
+/// Number of checkpoints kept for roll backs. The oldest one is used, so that a roll back leads out of the trap.
+const MAX_CHECKPOINTS: usize = 2;
 
 /// The checkpoint of a walk.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -22,40 +22,42 @@ pub(super) struct WalkState {
     pub tau: f64,
     pub segment: u32,
     pub returns: u32,
-    /// Steps from which and to which it last returned.
+    /// Steps from which and to which the walk last rolled back.
     pub last_return: Option<(u64, u64)>,
     pub refused: u64,
     pub refusals_in_a_row: u32,
-    /// First step at which a candidate may be offered again.
+    /// First step at which a candidate may be offered.
     pub next_offer: u64,
-    /// Where structures were collected.
-    pub collected: Vec<Collected>,
-    /// The guard's shortest distance, Å.
+    /// Points at which structures were collected.
+    pub collected: Vec<CollectionPoint>,
+    /// The guard's minimum distance, Å.
     pub least_distance: f64,
-    /// Places to go back to, oldest first.
+    /// Targets of roll backs, oldest first.
     pub good: Vec<(Checkpoint, BiasState)>,
     pub gamma_max: f64,
 }
 
-/// A collection, seen from the piece of the walk that goes on: it lies `beyond` steps from step `branch`.
+/// A collection, as seen from the current path of the walk: it lies `beyond` steps off the path, which it left at
+/// step `branch`.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub(super) struct Collected {
+pub(super) struct CollectionPoint {
     pub branch: u64,
     pub beyond: u64,
 }
 
 impl WalkState {
-    /// Keeps where the walk stands as a place to go back to.
-    pub fn keep(&mut self, checkpoint: &Checkpoint, bias: BiasState) {
-        if self.good.len() == KEPT_CHECKPOINTS {
+    /// Keeps the current state as a target of roll backs.
+    pub fn keep_checkpoint(&mut self, checkpoint: &Checkpoint, bias: BiasState) {
+        if self.good.len() == MAX_CHECKPOINTS {
             self.good.remove(0);
         }
         self.good.push((checkpoint.clone(), bias));
     }
 
-    /// The first offer after a return to `step`. The gap to a collection counts along the path that joins the two: back
-    /// from the collection, as far as it lies on an abandoned piece, and forward again.
-    pub fn offer_after_return(&mut self, step: u64, settings: &WalkSettings) -> u64 {
+    /// The first step at which a candidate may be offered after a roll back to `step`. The interval to a collection
+    /// counts along the path that joins the two: back from the collection along the abandoned piece, then forward
+    /// again.
+    pub fn offer_after_rollback(&mut self, step: u64, settings: &WalkSettings) -> u64 {
         for collected in self.collected.iter_mut().filter(|collected| collected.branch > step) {
             collected.beyond += collected.branch - step;
             collected.branch = step;
@@ -65,8 +67,8 @@ impl WalkState {
     }
 }
 
-/// The start of a walk: thermal velocities at the seed structure.
-pub(super) fn begin(
+/// Starts a walk at its seed structure with thermal velocities.
+pub(super) fn start(
     settings: &WalkSettings,
     assignment: &Assignment,
     potential: &mut BiasedPotential,

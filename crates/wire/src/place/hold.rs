@@ -53,7 +53,7 @@ impl Drop for Hold {
     }
 }
 
-/// Closing the file is not enough at once: a process that is just being started has it too, until its program begins.
+/// Shutdown the file is not enough at once: a process that is just being started has it too, until its program begins.
 fn unlock(file: &File) {
     // What cannot be unlocked comes free with the last who has the file.
     let _ = file.unlock();

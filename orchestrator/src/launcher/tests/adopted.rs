@@ -9,7 +9,7 @@ fn stranger() -> (u32, String) {
     let script = "sleep 1000 <&- >&- 2>&- & echo $!";
     let output = Command::new("/bin/sh").args(["-c", script]).output().unwrap();
     let pid = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
-    (pid, store::process_birth(pid).unwrap())
+    (pid, store::process_start_time(pid).unwrap())
 }
 
 #[tokio::test]
@@ -43,7 +43,7 @@ async fn an_adopted_process_that_dies_is_replaced() {
 fn a_stranger_is_asked_to_end() {
     let (pid, birth) = stranger();
     assert!(matches!(ask_to_end(pid, "another/1"), Err(AdoptError::Gone { .. })));
-    assert!(store::process_birth(pid).is_some());
+    assert!(store::process_start_time(pid).is_some());
     ask_to_end(pid, &birth).unwrap();
     let begun = std::time::Instant::now();
     let lives =

@@ -1,4 +1,4 @@
-//! A commit as the rows that it writes.
+//! The rows that a commit writes.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -80,12 +80,12 @@ pub(super) const WALK: [&str; 20] = [
     "checkpoint_checksum",
 ];
 
-/// The rows of each table. Decisions are numbered from 1 on until it is known how many there are before them.
+/// Rows of each table. Decisions are numbered from 1 until the number of earlier decisions is known.
 pub(super) struct Rows {
     pub decisions: Vec<Row>,
     pub structures: Vec<Row>,
     pub candidates: Vec<Row>,
-    /// How many there are of each kind.
+    /// Number of candidates of each kind.
     pub candidate_counts: Vec<Row>,
     pub candidate_data: Vec<Row>,
     /// For every accepted candidate.
@@ -96,7 +96,7 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub fn of(commit: &Commit) -> Result<Self> {
+    pub fn from_commit(commit: &Commit) -> Result<Self> {
         let mut rows = Self {
             decisions: commit.decisions.iter().zip(1..).map(decision).collect::<Result<_>>()?,
             structures: Vec::new(),
@@ -159,7 +159,7 @@ impl Rows {
                 ];
                 self.structures.push(STRUCTURES.with_checksum(row));
             }
-            // The protocol comes with the number of the decision.
+            // The protocol is filled in with the decision's number.
             self.jobs.push(vec![
                 hash[..].into(),
                 Value::Integer(None),
@@ -171,7 +171,7 @@ impl Rows {
         Ok(())
     }
 
-    /// Numbers the decisions from `first` on. Without a protocol there are no jobs.
+    /// Numbers the decisions from `first`. Without a protocol there are no jobs.
     pub fn number_from(&mut self, first: i64, protocol: Option<i64>) {
         let shift = |value: &mut Value| {
             if let Value::Integer(Some(number)) = value {
@@ -189,7 +189,7 @@ impl Rows {
         self.add_checksums();
     }
 
-    /// They are also of the numbers of the decisions.
+    /// The checksums cover the numbers of the decisions.
     fn add_checksums(&mut self) {
         for row in &mut self.decisions {
             *row = DECISIONS.with_checksum(std::mem::take(row));
@@ -220,21 +220,21 @@ fn candidate_counts(commit: &Commit) -> Vec<Row> {
         .collect()
 }
 
-/// Candidates with the place of the decision about each, from 1.
+/// Candidates with the index of their decision, from 1.
 fn decided(commit: &Commit) -> Result<HashMap<String, i64>> {
     let mut decided = HashMap::new();
-    for (decision, place) in commit.decisions.iter().zip(1..) {
+    for (decision, number) in commit.decisions.iter().zip(1..) {
         let id = decision.candidate.map(|id| id.to_string());
-        if let Some(twice) = id.filter(|id| decided.insert(id.clone(), place).is_some()) {
+        if let Some(twice) = id.filter(|id| decided.insert(id.clone(), number).is_some()) {
             return Err(StoreError::Inconsistent(format!("two decisions about candidate {twice}")));
         }
     }
     Ok(decided)
 }
 
-fn decision((decision, place): (&Decision, i64)) -> Result<Row> {
+fn decision((decision, number): (&Decision, i64)) -> Result<Row> {
     Ok(vec![
-        place.into(),
+        number.into(),
         integer("round", decision.round)?.into(),
         decision.kind.into(),
         decision.walk.map(|walk| walk.0).into(),
@@ -244,7 +244,7 @@ fn decision((decision, place): (&Decision, i64)) -> Result<Row> {
     ])
 }
 
-/// What summaries read of a candidate.
+/// The summary columns of a candidate.
 fn summary(
     decision: i64,
     id: String,
@@ -290,7 +290,7 @@ fn summary(
     Ok(row)
 }
 
-/// γ and γ_nbr, one behind the other; `None` without any.
+/// γ and γ_nbr, one after the other; `None` without grades.
 fn grades(id: &str, view: &CandidateView<'_>, grades: &AtomGrades) -> Result<Option<Vec<u8>>> {
     let n = view.numbers.len();
     match (grades.gamma.len(), grades.gamma_nbr.len()) {

@@ -1,4 +1,4 @@
-//! Shortest bonds of pairs of elements.
+//! Minimum bond lengths for pairs of elements.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -41,7 +41,7 @@ impl fmt::Display for Pair {
     }
 }
 
-/// The first bond that is shorter than its pair's, periodic images included; or why that cannot be told.
+/// The first bond shorter than the limit of its pair, with periodic images; or why that cannot be checked.
 pub(super) fn too_short(structure: &Structure, shortest: &BTreeMap<Pair, f64>) -> Option<String> {
     let cutoff = shortest.values().copied().reduce(f64::max)?;
     let mut neighbours = NeighbourList::new(cutoff, 0.0);

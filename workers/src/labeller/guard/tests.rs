@@ -1,4 +1,4 @@
-//! Each guard by itself, on both sides of its limit.
+//! Each guard on both sides of its limit.
 
 use atoms::Cell;
 use atoms::cell::Matrix3;
@@ -29,19 +29,19 @@ fn refused(guard_text: &str, structure: &Structure) -> bool {
 }
 
 #[test]
-fn what_is_left_out_refuses_nothing() {
+fn unset_limits_refuse_nothing() {
     assert_eq!(LabelGuard::default().refuses(&box_of(0.5, 100.0, 3.0)), None);
     assert_eq!(guard("{}"), LabelGuard::default());
     assert_eq!(LabelGuard::default().fault(), None);
 }
 
 #[test]
-fn bonds_are_those_of_their_pair_and_through_the_boundary() {
+fn bond_limits_apply_per_pair_and_across_the_boundary() {
     let apart = box_of(9.0, 9.0, 9.0);
     assert!(refused(r#"{ "shortest_bond": { "O-Si": 2.01 } }"#, &apart));
     assert!(refused(r#"{ "shortest_bond": { "Si-O": 2.01 } }"#, &apart));
     assert!(!refused(r#"{ "shortest_bond": { "Si-O": 1.99, "Si-Si": 8.0, "O-O": 8.9 } }"#, &apart));
-    // 1.5 Å through the boundary, and an atom from its own image.
+    // 1.5 Å through the boundary, and an atom to its own image.
     assert!(refused(r#"{ "shortest_bond": { "Si-O": 1.6 } }"#, &box_of(3.5, 9.0, 9.0)));
     assert!(refused(r#"{ "shortest_bond": { "O-O": 3.6 } }"#, &box_of(3.5, 9.0, 9.0)));
     let reason = guard(r#"{ "shortest_bond": { "Si-O": 2.5 } }"#).refuses(&apart).unwrap();
@@ -50,25 +50,25 @@ fn bonds_are_those_of_their_pair_and_through_the_boundary() {
 }
 
 #[test]
-fn cells_have_a_shape() {
+fn cell_shapes_have_limits() {
     let long = box_of(4.0, 5.0, 12.0);
     assert!(refused(r#"{ "least_height": 4.1 }"#, &long) && !refused(r#"{ "least_height": 3.9 }"#, &long));
     assert!(refused(r#"{ "largest_edge_ratio": 2.9 }"#, &long));
     assert!(!refused(r#"{ "largest_edge_ratio": 3.1 }"#, &long));
-    // 45°, and 135° are the same.
+    // 45° and 135° are equivalent.
     for x in [5.0, -5.0] {
         let sheared = structure([[6.0, 0.0, 0.0], [x, 5.0, 0.0], [0.0, 0.0, 6.0]]);
         assert!(refused(r#"{ "least_angle": 46 }"#, &sheared), "{x}");
         assert!(!refused(r#"{ "least_angle": 44 }"#, &sheared), "{x}");
         assert!(refused(r#"{ "least_height": 4.3 }"#, &sheared), "6 sin 45° = 4.24 Å");
     }
-    // What is not periodic has no shape.
+    // Non-periodic directions have no shape.
     let slab = Structure { periodic: [true, true, false], ..long };
     assert!(!refused(r#"{ "largest_edge_ratio": 2.9, "least_volume": 1e6 }"#, &slab));
 }
 
 #[test]
-fn volumes_and_numbers_of_atoms_have_limits() {
+fn volumes_and_atom_counts_have_limits() {
     // 60 Å³ for two atoms.
     let structure = box_of(3.0, 4.0, 5.0);
     for (text, expected) in [
@@ -84,7 +84,7 @@ fn volumes_and_numbers_of_atoms_have_limits() {
 }
 
 #[test]
-fn impossible_limits_are_faults() {
+fn impossible_limits_are_rejected() {
     for (text, key) in [
         (r#"{ "shortest_bond": { "Si-O": -1.0 } }"#, "label.guard.shortest_bond"),
         (r#"{ "least_angle": 91 }"#, "label.guard.least_angle"),
@@ -96,7 +96,7 @@ fn impossible_limits_are_faults() {
 }
 
 #[test]
-fn features_are_near_if_those_of_each_atom_are() {
+fn features_are_near_if_those_of_every_atom_are() {
     let own = [1.0, 0.0, 0.0, 2.0];
     assert!(is_near(&own, &[1.0, 0.09, 0.0, 2.1], 2, 0.1));
     assert!(!is_near(&own, &[1.0, 0.11, 0.0, 2.0], 2, 0.1), "one atom is enough");

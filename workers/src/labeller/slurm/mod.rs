@@ -1,16 +1,18 @@
-//! A calculation as a job of its own in the batch system Slurm.
+//! A calculation as a Slurm job.
 //!
-//! Its directory, which every node sees, has all that it needs: whoever finds it there, and that Slurm does not know its
-//! name, submits it (again). Of two jobs of one name the second waits for the end of the first (`singleton`), and only
-//! the one that makes the directory [`BEGUN`] calculates, so what was submitted twice, because an answer was lost, is calculated once.
+//! Its directory, which every node sees, contains everything it needs: a labeller that finds the directory, and
+//! that Slurm does not know the job's name, submits it (again). Of two jobs with the same name the second waits for
+//! the end of the first (`singleton`), and only the one that creates the directory [`BEGUN`] calculates. A job
+//! submitted twice because a reply was lost is therefore calculated once.
 //!
-//! The end is what the keeper leaves, as everywhere. Slurm is asked seldom, only to find jobs that cannot leave one any more;
-//! as long as it does not answer nothing is concluded. It knows every job that lives, and forgets others after a while
-//! (`MinJobAge`): one that it does not know is over, and what Slurm wrote into the job's log before tells why.
+//! The runner records the end, as for local calculations. Slurm is queried rarely, only to find jobs that can no
+//! longer record their end; while it does not respond, nothing is concluded. It knows every unfinished job and
+//! forgets finished ones after a while (`MinJobAge`): a job that it does not know is finished, and the job's log
+//! gives the reason if Slurm ended it.
 
 mod script;
-mod shared;
-mod told;
+mod squeue;
+mod squeue_cache;
 
 use std::ffi::OsStr;
 use std::fs;
@@ -25,77 +27,77 @@ use store::StoreError;
 use tokio::sync::OnceCell;
 use tokio::time::sleep;
 
-use super::begun::Found;
-use super::code::file;
-use super::keeper::End;
-use super::private;
-use told::{Told, Traces};
+use super::calculation_handle::CalculationState;
+use super::calculation_runner::CalculationEnd;
+use super::code::file_error;
+use super::private_directory;
+use squeue::{SqueueJob, Traces};
 
-pub(super) use script::{Wanted, write};
-pub(super) use shared::forget;
+pub(super) use script::{JobRequirements, write};
+pub(super) use squeue_cache::remove_cache;
 
-/// Made in the directory by the job that calculates.
+/// Created in the directory by the job that calculates.
 const BEGUN: &str = "begun";
-/// What the job is told to do.
+/// The batch script.
 const SCRIPT: &str = "job.sh";
-/// What its keeper reads.
-const ORDER: &str = "order.json";
-/// What Slurm and the script say.
+/// The request to its runner.
+const REQUEST: &str = "order.json";
+/// Output of Slurm and of the script.
 const LOG: &str = "slurm.log";
 
-/// No answer is waited for for longer.
-const PATIENCE: Duration = Duration::from_secs(60);
-/// Between two looks at the directory of a calculation that has just begun …
-const SHORTEST_PAUSE: Duration = Duration::from_millis(50);
-/// … and of one that has lasted for a while.
-const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-/// Between two questions to Slurm.
-const LOOK: Duration = Duration::from_secs(20);
-/// What a node has written may be seen here so much later.
-const SETTLING: Duration = Duration::from_secs(2);
-/// Between two tries to submit …
-const PAUSE: Duration = Duration::from_secs(3);
-/// … of which so many may be refused, though Slurm answers.
-const TRIES: u32 = 3;
-/// How long a cancelled job may take to end, before its directory is left for later.
-const ENDING: Duration = Duration::from_secs(5);
+/// Timeout of Slurm's commands.
+const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
+/// Initial time between two checks of a calculation's directory.
+const MIN_POLL_INTERVAL: Duration = Duration::from_millis(50);
+/// Longest time between two checks of a calculation's directory.
+const MAX_POLL_INTERVAL: Duration = Duration::from_secs(2);
+/// Time between two queries to Slurm.
+const SQUEUE_INTERVAL: Duration = Duration::from_secs(20);
+/// Delay after which files written by a node are visible here.
+const SETTLE_TIME: Duration = Duration::from_secs(2);
+/// Time between two tries to submit.
+const RETRY_INTERVAL: Duration = Duration::from_secs(3);
+/// Maximum number of refusals by a Slurm that responds.
+const MAX_REFUSALS: u32 = 3;
+/// How long a cancelled job may take to end before its directory is left for later.
+const CANCEL_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// What finds a job again.
+/// Identifies a job.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Job {
-    /// Elsewhere the name says nothing.
+    /// The cluster: elsewhere the name has no meaning.
     pub cluster: String,
     pub directory: PathBuf,
-    /// That of no other calculation.
+    /// The name, unique to the calculation.
     pub name: String,
-    /// Who has submitted it: others may not see it.
+    /// The user who submitted it: others may not see it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<u32>,
-    /// Where it failed, if it may go better on another node.
+    /// The node where it failed, if another node may help.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub node: Option<String>,
 }
 
-/// Slurm, as jobs of calculations need it.
+/// Access to Slurm for calculations.
 pub(super) struct Slurm {
     commands: SlurmClient,
     cluster: OnceCell<String>,
 }
 
 impl Slurm {
-    /// Slurm's commands, with the variables of this environment that programs get: `sbatch` gives its own to its job.
+    /// Slurm's commands, with the variables that programs get: `sbatch` passes its environment to the job.
     pub fn new(passed: &PassedEnvironment) -> Self {
-        let of_slurm = |name: &OsStr| {
+        let is_slurm_variable = |name: &OsStr| {
             let name = name.to_string_lossy();
             name.starts_with("SBATCH_") || name == "SLURM_JWT"
         };
-        let own = std::env::vars_os().filter(|(name, _)| of_slurm(name));
+        let own = std::env::vars_os().filter(|(name, _)| is_slurm_variable(name));
         let environment = passed.from_current_process().chain(own).collect();
-        let commands = SlurmClient::with_timeout(PATIENCE).with_environment(environment);
+        let commands = SlurmClient::with_timeout(COMMAND_TIMEOUT).with_environment(environment);
         Self { commands, cluster: OnceCell::new() }
     }
 
-    /// The job of the calculation in this directory, below that of its campaign.
+    /// The job of the calculation in this directory, which is below its campaign's.
     pub async fn job(&self, directory: &Path) -> Result<Job, StoreError> {
         let last = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let campaign = directory.parent().map(last).filter(|name| name.starts_with("calmwalk-"));
@@ -104,8 +106,8 @@ impl Slurm {
         Ok(Job { cluster, directory: directory.to_owned(), name, user: Some(own_user()), node: None })
     }
 
-    /// Submits a job that Slurm does not know. An answer that was lost is looked for; where Slurm answers, and will not have
-    /// the job, that fails the labeller and not the calculation.
+    /// Submits a job that Slurm does not know. If the reply is lost, looks for the job. If Slurm responds but
+    /// refuses the job, the labeller fails, not the calculation.
     pub async fn submit(&self, job: &Job) -> Result<(), StoreError> {
         let mut refused = 0;
         loop {
@@ -117,131 +119,136 @@ impl Slurm {
                 return Ok(());
             }
             refused += 1;
-            // There may be no node beside those that are avoided.
-            let again = script::avoid_none(&job.directory).map_err(|error| file(&job.directory, error))?;
-            if refused >= TRIES && !again {
-                return Err(cannot(job, format_args!("its job cannot be submitted: {error}")));
+            // All allowed nodes may be excluded.
+            let again = script::clear_excluded_nodes(&job.directory)
+                .map_err(|error| file_error(&job.directory, error))?;
+            if refused >= MAX_REFUSALS && !again {
+                return Err(job_error(job, format_args!("cannot submit its job: {error}")));
             }
-            sleep(PAUSE).await;
+            sleep(RETRY_INTERVAL).await;
         }
     }
 
-    pub async fn look(&self, job: &Job) -> Result<Found, StoreError> {
-        if job.directory.symlink_metadata().is_ok() && !private::is_own(&job.directory) {
-            // Another user has made one of that name after it was gone, or has submitted the job.
-            return Ok(Found::Elsewhere);
+    pub async fn inspect(&self, job: &Job) -> Result<CalculationState, StoreError> {
+        if job.directory.symlink_metadata().is_ok() && !private_directory::is_own(&job.directory) {
+            // Another user has created a directory of that name after it was removed, or has submitted the job.
+            return Ok(CalculationState::Elsewhere);
         }
-        if let Some(end) = End::read(&job.directory) {
-            return Ok(Found::Ended(end));
+        if let Some(end) = CalculationEnd::read(&job.directory) {
+            return Ok(CalculationState::Ended(end));
         }
         let others = job.user.is_some_and(|user| user != own_user());
         if others || self.cluster(&job.directory).await? != job.cluster {
-            return Ok(Found::Elsewhere);
+            return Ok(CalculationState::Elsewhere);
         }
         let jobs = self.jobs(job).await?;
-        let lives = jobs.iter().any(|told| told.phase() != JobPhase::Over);
+        let lives = jobs.iter().any(|reported| reported.phase() != JobPhase::Over);
         match (lives, job.directory.is_dir()) {
-            (true, true) => Ok(Found::Running),
-            (true, false) => Err(cannot(
+            (true, true) => Ok(CalculationState::Running),
+            (true, false) => Err(job_error(
                 job,
                 format_args!(
-                    "job '{}' is at work there, and it cannot be seen from here: {SHARED}",
+                    "job '{}' is running there, but its directory is not visible here: {SCRATCH_NOT_SHARED}",
                     job.name
                 ),
             )),
-            (false, false) => Ok(Found::Gone),
-            (false, true) => self.over(job, &jobs).await,
+            (false, false) => Ok(CalculationState::Gone),
+            (false, true) => self.finished_job(job, &jobs).await,
         }
     }
 
-    /// What is left of a job that is over, or that Slurm does not know.
-    async fn over(&self, job: &Job, jobs: &[Told]) -> Result<Found, StoreError> {
+    /// The state of a job that is finished or unknown to Slurm.
+    async fn finished_job(&self, job: &Job, jobs: &[SqueueJob]) -> Result<CalculationState, StoreError> {
         settle(&job.directory).await;
-        if let Some(end) = End::read(&job.directory) {
-            return Ok(Found::Ended(end));
+        if let Some(end) = CalculationEnd::read(&job.directory) {
+            return Ok(CalculationState::Ended(end));
         }
         let begun = job.directory.join(BEGUN).is_dir();
-        let told = told::last(jobs);
-        match told {
-            None if !begun => return Ok(Found::Ready),
-            Some(told) if !begun && told.ran_to_its_end() => {
-                let message = format!("{told}, where that is not seen: {SHARED}");
-                return Err(cannot(job, message));
+        let reported = squeue::most_informative(jobs);
+        match reported {
+            None if !begun => return Ok(CalculationState::Ready),
+            Some(reported) if !begun && reported.ran_to_its_end() => {
+                let message = format!("{reported}, but its files are not visible here: {SCRATCH_NOT_SHARED}");
+                return Err(job_error(job, message));
             }
             _ => {}
         }
-        // Slurm forgets it before long.
-        let end = told::end(told, &Traces::read(&job.directory));
-        end.write(&job.directory).map_err(|error| file(&job.directory, error))?;
-        Ok(Found::Ended(end))
+        // Slurm forgets it after a while.
+        let end = squeue::infer_end(reported, &Traces::read(&job.directory));
+        end.write(&job.directory).map_err(|error| file_error(&job.directory, error))?;
+        Ok(CalculationState::Ended(end))
     }
 
-    /// Waits for the end, and submits the job should Slurm not know it; `None` if it was cleared away.
-    pub async fn end(&self, job: &Job) -> Result<Option<End>, StoreError> {
-        let (mut pause, mut asked) = (SHORTEST_PAUSE, Instant::now());
+    /// Waits for the end, and submits the job if Slurm does not know it; `None` if its directory was removed.
+    pub async fn wait(&self, job: &Job) -> Result<Option<CalculationEnd>, StoreError> {
+        let (mut pause, mut asked) = (MIN_POLL_INTERVAL, Instant::now());
         loop {
-            if let Some(end) = End::read(&job.directory) {
+            if let Some(end) = CalculationEnd::read(&job.directory) {
                 return Ok(Some(end));
             }
-            if asked.elapsed() >= LOOK {
-                if !shared::lives(&self.commands, job).await {
-                    match self.look(job).await? {
-                        Found::Ended(end) => return Ok(Some(end)),
-                        Found::Ready => self.submit(job).await?,
-                        Found::Running => {}
-                        Found::Gone | Found::Elsewhere => return Ok(None),
+            if asked.elapsed() >= SQUEUE_INTERVAL {
+                if !squeue_cache::is_alive(&self.commands, job).await {
+                    match self.inspect(job).await? {
+                        CalculationState::Ended(end) => return Ok(Some(end)),
+                        CalculationState::Ready => self.submit(job).await?,
+                        CalculationState::Running => {}
+                        CalculationState::Gone | CalculationState::Elsewhere => return Ok(None),
                     }
                 }
                 asked = Instant::now();
             }
             sleep(pause).await;
-            pause = (pause * 5 / 4).min(LONGEST_PAUSE);
+            pause = (pause * 5 / 4).min(MAX_POLL_INTERVAL);
         }
     }
 
-    /// Ends a job, and waits a little for that. Where Slurm does not answer that is an error: the job goes on then, and whoever
-    /// looks for it finds it.
+    /// Cancels a job and waits briefly for its end. If Slurm does not respond, this fails: the job continues, and
+    /// whoever looks for it later finds it.
     pub async fn cancel(&self, job: &Job) -> Result<(), StoreError> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
-            let jobs = self.ask(job).await.map_err(|error| cannot(job, error))?;
-            let living = jobs.iter().filter(|told| told.phase() != JobPhase::Over);
-            // What ends was told so before.
-            let ids: Vec<_> =
-                living.filter(|told| told.phase() != JobPhase::Completing).map(|told| told.id).collect();
-            self.commands.cancel(&ids).await.map_err(|error| cannot(job, error))?;
-            if jobs.iter().all(|told| told.phase() == JobPhase::Over) || begun.elapsed() > ENDING {
+            let jobs = self.ask(job).await.map_err(|error| job_error(job, error))?;
+            let living = jobs.iter().filter(|reported| reported.phase() != JobPhase::Over);
+            // What ends was reported so before.
+            let ids: Vec<_> = living
+                .filter(|reported| reported.phase() != JobPhase::Completing)
+                .map(|reported| reported.id)
+                .collect();
+            self.commands.cancel(&ids).await.map_err(|error| job_error(job, error))?;
+            if jobs.iter().all(|reported| reported.phase() == JobPhase::Over)
+                || started.elapsed() > CANCEL_TIMEOUT
+            {
                 return Ok(());
             }
-            sleep(SHORTEST_PAUSE * 4).await;
+            sleep(MIN_POLL_INTERVAL * 4).await;
         }
     }
 
-    /// What Slurm says of the job, however long it takes to say something.
-    async fn jobs(&self, job: &Job) -> Result<Vec<Told>, StoreError> {
+    /// Queries the job, and retries until Slurm responds.
+    async fn jobs(&self, job: &Job) -> Result<Vec<SqueueJob>, StoreError> {
         loop {
             match self.ask(job).await {
                 Ok(jobs) => return Ok(jobs),
-                Err(error) if error.is_missing() => return Err(cannot(job, error)),
-                Err(_) => sleep(LOOK).await,
+                Err(error) if error.is_missing() => return Err(job_error(job, error)),
+                Err(_) => sleep(SQUEUE_INTERVAL).await,
             }
         }
     }
 
-    async fn ask(&self, job: &Job) -> Result<Vec<Told>, SlurmError> {
+    async fn ask(&self, job: &Job) -> Result<Vec<SqueueJob>, SlurmError> {
         let name = format!("--name={}", job.name);
-        let text = self.commands.queue(Told::FORMAT, &["--states=all", &name]).await?;
-        let jobs: Vec<_> = text.lines().map(Told::parse).collect::<Result<_, _>>()?;
-        Ok(jobs.into_iter().filter(|told| !told.was_refused()).collect())
+        let text = self.commands.queue(SqueueJob::FORMAT, &["--states=all", &name]).await?;
+        let jobs: Vec<_> = text.lines().map(SqueueJob::parse).collect::<Result<_, _>>()?;
+        Ok(jobs.into_iter().filter(|reported| !reported.was_refused()).collect())
     }
 
     async fn cluster(&self, directory: &Path) -> Result<&str, StoreError> {
         let ask = async || loop {
             match self.commands.cluster_name().await {
                 Err(error) if error.is_missing() => {
-                    return Err(file(directory, io::Error::other(error.to_string())));
+                    return Err(file_error(directory, io::Error::other(error.to_string())));
                 }
-                Err(_) => sleep(PAUSE).await,
+                Err(_) => sleep(RETRY_INTERVAL).await,
                 Ok(cluster) => return Ok(cluster),
             }
         };
@@ -249,21 +256,22 @@ impl Slurm {
     }
 }
 
-const SHARED: &str = "label.scratch has to be a directory that this host and every node see by the same name";
+const SCRATCH_NOT_SHARED: &str =
+    "label.scratch must be a directory that this host and every node see under the same name";
 
 fn own_user() -> u32 {
     rustix::process::getuid().as_raw()
 }
 
-fn cannot(job: &Job, why: impl ToString) -> StoreError {
-    file(&job.directory, io::Error::other(why.to_string()))
+fn job_error(job: &Job, why: impl ToString) -> StoreError {
+    file_error(&job.directory, io::Error::other(why.to_string()))
 }
 
-/// Lets what other hosts have written into a directory be seen: a network file system looks again where something was made.
+/// Makes files from other hosts visible: a network file system refreshes a directory when a file is created in it.
 async fn settle(directory: &Path) {
-    sleep(SETTLING).await;
+    sleep(SETTLE_TIME).await;
     let new = directory.join("look");
-    // A program may have left something of that name, and a pipe would hold this up.
+    // A program may have left a file of that name, and opening a pipe would block.
     let _ = fs::File::create_new(&new).and_then(|_| fs::remove_file(&new));
 }
 
@@ -272,7 +280,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn what_another_user_has_submitted_is_not_looked_for() {
+    async fn jobs_of_another_user_are_ignored() {
         let directory = tempfile::tempdir().unwrap();
         let job = Job {
             cluster: "any".to_owned(),
@@ -281,6 +289,9 @@ mod tests {
             user: Some(own_user() + 1),
             node: None,
         };
-        assert_eq!(Slurm::new(&PassedEnvironment::default()).look(&job).await.unwrap(), Found::Elsewhere);
+        assert_eq!(
+            Slurm::new(&PassedEnvironment::default()).inspect(&job).await.unwrap(),
+            CalculationState::Elsewhere
+        );
     }
 }

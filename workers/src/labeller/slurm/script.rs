@@ -1,4 +1,4 @@
-//! What a job is submitted with. All of it stands in its script, so that submitting it again needs nothing else.
+//! The batch script of a job. It contains everything needed to submit the job again.
 
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -8,71 +8,80 @@ use std::path::Path;
 
 use dft::result_file;
 
-use super::super::KeeperCommand;
-use super::super::keeper::{self, Calculation, Order};
-use super::{BEGUN, Job, LOG, ORDER, SCRIPT};
+use super::super::RunnerCommand;
+use super::super::calculation_runner::{self, Calculation, RunnerRequest};
+use super::{BEGUN, Job, LOG, REQUEST, SCRIPT};
 
-/// Slurm's limit comes so much after that of the keeper, which ends the calculation in order, s.
+/// Slurm's time limit exceeds that of the runner, which ends the calculation in order, by this, s.
 const MARGIN: f64 = 60.0;
-/// Bytes of the M of `--mem`.
+/// Bytes per unit M of `--mem`.
 const MEBIBYTE: u64 = 1 << 20;
 const EXCLUDE: &str = "#SBATCH --exclude=";
 
-/// What a job needs.
-pub(in super::super) struct Wanted<'a> {
+/// Resources of a job.
+pub(in super::super) struct JobRequirements<'a> {
     pub cores: u32,
-    /// Options of the user.
+    /// Options set by the user.
     pub options: &'a [String],
     /// Nodes on which it failed.
     pub avoid: &'a [String],
 }
 
-/// Writes all that the job of a calculation needs into its directory.
-pub(in super::super) fn write(calculation: Calculation, wanted: &Wanted<'_>) -> io::Result<()> {
+/// Writes everything that the job of a calculation needs into its directory.
+pub(in super::super) fn write(
+    calculation: Calculation,
+    requirements: &JobRequirements<'_>,
+) -> io::Result<()> {
     let directory = calculation.directory.clone();
-    fs::write(directory.join(SCRIPT), script(&calculation, wanted)?)?;
-    keeper::give(fs::File::create(directory.join(ORDER))?, &Order::Keep(calculation))
+    fs::write(directory.join(SCRIPT), script(&calculation, requirements)?)?;
+    calculation_runner::send_request(
+        fs::File::create(directory.join(REQUEST))?,
+        &RunnerRequest::Run(calculation),
+    )
 }
 
-fn script(calculation: &Calculation, wanted: &Wanted<'_>) -> io::Result<String> {
+fn script(calculation: &Calculation, requirements: &JobRequirements<'_>) -> io::Result<String> {
     let minutes = ((calculation.time_limit + MARGIN) / 60.0).ceil();
-    let mut options =
-        vec!["--nodes=1".to_owned(), format!("--ntasks={}", wanted.cores), format!("--time={minutes:.0}")];
+    let mut options = vec![
+        "--nodes=1".to_owned(),
+        format!("--ntasks={}", requirements.cores),
+        format!("--time={minutes:.0}"),
+    ];
     options.extend(calculation.memory_limit.map(|bytes| format!("--mem={}M", bytes.div_ceil(MEBIBYTE))));
-    options.extend(wanted.options.iter().cloned());
+    options.extend(requirements.options.iter().cloned());
     let mut script = "#!/bin/sh\n".to_owned();
     for option in options {
         let _ = writeln!(script, "#SBATCH {option}");
     }
-    if !wanted.avoid.is_empty() {
-        let _ = writeln!(script, "{EXCLUDE}{}", wanted.avoid.join(","));
+    if !requirements.avoid.is_empty() {
+        let _ = writeln!(script, "{EXCLUDE}{}", requirements.avoid.join(","));
     }
-    let (directory, keeper) = (quoted(&calculation.directory), keeper(&calculation.keeper)?);
+    let (directory, runner) = (shell_quoted(&calculation.directory), runner(&calculation.runner)?);
     let _ = writeln!(
         script,
-        "# Once, however often it is submitted.\ncd -- {directory} && mkdir {BEGUN} || exit 0\n{keeper} < {ORDER}\n\
+        "# Once, however often it is submitted.\ncd -- {directory} && mkdir {BEGUN} || exit 0\n{runner} < {REQUEST}\n\
          # The keeper must not be the process that Slurm has started.\nexit $?"
     );
     Ok(script)
 }
 
-/// The keeper's command as a node can call it.
-fn keeper(command: &KeeperCommand) -> io::Result<String> {
+/// The runner's command as a node can execute it.
+fn runner(command: &RunnerCommand) -> io::Result<String> {
     let program = match command.program.starts_with("/proc/self") {
         true => fs::read_link(&command.program)?,
         false => command.program.clone(),
     };
-    let words = [quoted(&program)].into_iter().chain(command.arguments.iter().map(quoted));
+    let words = [shell_quoted(&program)].into_iter().chain(command.arguments.iter().map(shell_quoted));
     Ok(words.collect::<Vec<_>>().join(" "))
 }
 
-/// A word for the shell.
-fn quoted(word: impl AsRef<Path>) -> String {
+/// Quotes a word for the shell.
+fn shell_quoted(word: impl AsRef<Path>) -> String {
     format!("'{}'", word.as_ref().display().to_string().replace('\'', r"'\''"))
 }
 
-/// Lets the job run anywhere. Returns whether there was a node that it avoided.
-pub(super) fn avoid_none(directory: &Path) -> io::Result<bool> {
+/// Permits the job to run on any node. Returns whether it excluded any before.
+pub(super) fn clear_excluded_nodes(directory: &Path) -> io::Result<bool> {
     let path = directory.join(SCRIPT);
     let script = result_file::read(&path).map_err(io::Error::other)?;
     let script = String::from_utf8_lossy(&script);
@@ -84,20 +93,20 @@ pub(super) fn avoid_none(directory: &Path) -> io::Result<bool> {
     Ok(!avoiding.is_empty())
 }
 
-/// What `sbatch` is called with: what makes this job the one that is looked for, whatever the user's options are.
+/// Arguments of `sbatch`. They identify the job, whatever options the user sets.
 pub(super) fn arguments(job: &Job) -> Vec<OsString> {
     let option = |name: &str, value: &Path| {
         let mut option = OsString::from(name);
         option.push(value);
         option
     };
-    // sbatch puts numbers of the job in the place of letters after '%'.
+    // sbatch replaces letters after '%' by numbers of the job.
     let log = job.directory.join(LOG).display().to_string().replace('%', "%%");
     vec![
         format!("--job-name={}", job.name).into(),
         "--dependency=singleton".into(),
         "--no-requeue".into(),
-        // One that comes late and does nothing must not wipe out what was said of the first.
+        // A late job that does nothing must not overwrite the log of the first.
         "--open-mode=append".into(),
         option("--chdir=", &job.directory),
         option("--output=", log.as_ref()),
@@ -117,7 +126,7 @@ mod tests {
             pass_environment: Default::default(),
             time_limit: 3600.0,
             memory_limit: Some(2_000_000_000),
-            keeper: KeeperCommand {
+            runner: RunnerCommand {
                 program: "/opt/it's/calmwalk".into(),
                 arguments: vec!["calculation-runner".to_owned()],
             },
@@ -125,22 +134,23 @@ mod tests {
     }
 
     #[test]
-    fn a_script_has_everything_that_a_job_needs() {
+    fn a_script_contains_everything_a_job_needs() {
         let home = tempfile::tempdir().unwrap();
         let options = ["--partition=long".to_owned()];
         let avoid = ["n1".to_owned(), "n2".to_owned()];
-        write(calculation(home.path()), &Wanted { cores: 4, options: &options, avoid: &avoid }).unwrap();
+        write(calculation(home.path()), &JobRequirements { cores: 4, options: &options, avoid: &avoid })
+            .unwrap();
         let text = fs::read_to_string(home.path().join(SCRIPT)).unwrap();
         let directives: Vec<_> = text.lines().filter_map(|line| line.strip_prefix("#SBATCH ")).collect();
         let expected =
             ["--nodes=1", "--ntasks=4", "--time=61", "--mem=1908M", "--partition=long", "--exclude=n1,n2"];
         assert_eq!(directives, expected);
         assert!(text.contains(r"'/opt/it'\''s/calmwalk' 'calculation-runner' < order.json"), "{text}");
-        let order = fs::read_to_string(home.path().join(ORDER)).unwrap();
+        let order = fs::read_to_string(home.path().join(REQUEST)).unwrap();
         assert!(order.starts_with("{\"Keep\"") && order.ends_with("}\n"), "{order}");
-        assert!(avoid_none(home.path()).unwrap());
+        assert!(clear_excluded_nodes(home.path()).unwrap());
         let anywhere = fs::read_to_string(home.path().join(SCRIPT)).unwrap();
         assert_eq!(anywhere, text.replace("#SBATCH --exclude=n1,n2\n", ""));
-        assert!(!avoid_none(home.path()).unwrap());
+        assert!(!clear_excluded_nodes(home.path()).unwrap());
     }
 }

@@ -1,0 +1,78 @@
+//! Progress of walks: the leader of the campaign writes it every few seconds, monitors read it.
+
+use serde_json::{Value as Json, json};
+
+use super::protocols::set_campaign_value;
+use crate::Store;
+use crate::database::{Transaction, Value, execute_rows, query};
+use crate::error::Result;
+use crate::walk_progress::WalkProgress;
+
+/// Progress older than this (ms) is ignored.
+const MAX_AGE: i64 = 60_000;
+
+/// The campaign key of the total.
+const TOTAL_KEY: &str = "pace";
+
+const COLUMNS: [&str; 9] = [
+    "walk",
+    "seen",
+    "segment",
+    "step",
+    "steps_per_second",
+    "tau",
+    "temperature",
+    "relative_volume",
+    "gamma_max",
+];
+
+const UPSERT: &str = "INSERT INTO pace ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (walk) DO UPDATE SET {excluded}";
+
+impl Store {
+    /// Stores the progress of these walks and the steps per second of all walks together.
+    pub async fn set_walk_progress(&self, walks: &[WalkProgress], all: Option<f64>, now: i64) -> Result<()> {
+        let row = |walk: &WalkProgress| {
+            let integer = |number: i64| Value::Integer(Some(number));
+            let step = i64::try_from(walk.step).unwrap_or(i64::MAX);
+            vec![
+                integer(walk.walk.into()),
+                integer(walk.seen),
+                integer(walk.segment.into()),
+                integer(step),
+                Value::Real(finite(walk.steps_per_second)),
+                Value::Real(finite(walk.tau)),
+                Value::Real(finite(walk.temperature)),
+                Value::Real(finite(walk.relative_volume)),
+                Value::Real(finite(walk.gamma_max)),
+            ]
+        };
+        let mut transaction = self.database.begin_as_leader().await?;
+        execute_rows(&mut transaction, UPSERT, &COLUMNS, walks.iter().map(row).collect()).await?;
+        let all = json!({ "time": now, "steps_per_second": all }).to_string();
+        set_campaign_value(&mut transaction, TOTAL_KEY, &all).await?;
+        transaction.commit().await
+    }
+}
+
+/// SQLite has no NaN.
+fn finite(number: Option<f64>) -> Option<f64> {
+    number.filter(|number| number.is_finite())
+}
+
+/// Progress reported within the last minute; empty for tables of an earlier version.
+pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgress>> {
+    if !transaction.has_table("pace").await? {
+        return Ok(Vec::new());
+    }
+    query("SELECT * FROM pace WHERE seen > $1 ORDER BY walk").bind(now - MAX_AGE).fetch_all(transaction).await
+}
+
+/// Steps per second of all walks together; `None` without a report in the last minute.
+pub(super) async fn total_steps_per_second(transaction: &mut Transaction, now: i64) -> Result<Option<f64>> {
+    let found = query("SELECT value FROM campaign WHERE key = $1").bind(TOTAL_KEY);
+    let found: Option<String> = found.fetch_optional(transaction).await?;
+    let found: Json = found.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
+    let is_fresh = found["time"].as_i64().is_some_and(|time| time > now - MAX_AGE);
+    Ok(found["steps_per_second"].as_f64().filter(|_| is_fresh))
+}

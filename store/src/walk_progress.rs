@@ -1,0 +1,40 @@
+//! Progress and speed of walks between checkpoints.
+
+use serde::Serialize;
+
+use crate::database::from_columns;
+
+/// The last reported progress of a walk.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct WalkProgress {
+    /// Its number.
+    pub walk: u32,
+    /// When its walker last reported, ms since 1970.
+    pub seen: i64,
+    /// Segment.
+    pub segment: u32,
+    /// Step.
+    pub step: u64,
+    /// Steps per second, including the time between assignments; `None` until it can be computed.
+    pub steps_per_second: Option<f64>,
+    /// τ.
+    pub tau: Option<f64>,
+    /// Kinetic temperature, K.
+    pub temperature: Option<f64>,
+    /// V / V₀.
+    pub relative_volume: Option<f64>,
+    /// Largest γ of the last graded step.
+    pub gamma_max: Option<f64>,
+}
+
+from_columns!(WalkProgress {
+    walk,
+    seen,
+    segment,
+    step,
+    steps_per_second,
+    tau,
+    temperature,
+    relative_volume,
+    gamma_max
+});

@@ -1,0 +1,64 @@
+//! Tables of an earlier version on a server.
+
+use store::{ExportFilter, Fate, Location, Store};
+use wire::Origin;
+
+use super::common::*;
+
+/// Turns them into tables of version 8 by removing what later versions add.
+const WITHOUT_CHECKSUMS: &str = "
+    ALTER TABLE campaign DROP COLUMN checksum; ALTER TABLE value DROP COLUMN checksum;
+    ALTER TABLE structure DROP COLUMN checksum; ALTER TABLE seed_structure DROP COLUMN checksum;
+    ALTER TABLE protocol DROP COLUMN checksum; ALTER TABLE decision DROP COLUMN checksum;
+    ALTER TABLE candidate DROP COLUMN checksum, DROP COLUMN features_checksum, DROP COLUMN selector_checksum,
+        DROP COLUMN original_checksum;
+    ALTER TABLE component DROP COLUMN checksum; DROP INDEX label_excluded;
+    ALTER TABLE label DROP COLUMN checksum, DROP COLUMN excluded, DROP COLUMN exclusion;
+    ALTER TABLE walk DROP COLUMN checksum, DROP COLUMN checkpoint_checksum;
+    ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
+    DELETE FROM _sqlx_migrations WHERE version > 8";
+
+async fn exported(location: impl Into<Location>) -> Vec<String> {
+    let store = Store::open_read_only(location).await.unwrap();
+    let filter = ExportFilter { protocol: protocol("dft").hash, biased: true, control: true, imported: true };
+    store.check_for_export().await.unwrap();
+    let rows = store.labelled(&filter, None, 100).await.unwrap();
+    assert_eq!(rows.len(), store.labelled_cursors(&filter).await.unwrap().len());
+    store.close().await;
+    rows.iter().map(|row| format!("{row:?}")).collect()
+}
+
+#[tokio::test]
+async fn tables_without_checksums_are_read_copied_and_migrated() {
+    let home = Home::new();
+    let store = home.create().await;
+    let records = (1..=3).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
+    let walks = vec![store::WalkRecord { accepted: 3, ..walk(0, 1) }];
+    store.commit(&store::Commit { walks, ..commit_of(records) }).await.unwrap();
+    let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
+    store.complete(&lease, &label(-1.0), 1).await.unwrap();
+    store.import(protocol("dft").hash, "old.extxyz", &[(0, structure(0.5), label(-9.0))], 2).await.unwrap();
+    store.close().await;
+    let expected = exported(home.location()).await;
+    assert_eq!(expected.len(), 2);
+
+    home.execute(WITHOUT_CHECKSUMS).await;
+    assert_eq!(exported(home.location()).await, expected);
+    let copies = tempfile::tempdir().unwrap();
+    let copy = copies.path().join("copy");
+    let store = home.open_read_only().await;
+    store.backup(&copy, 3, |_, _| {}).await.unwrap();
+    store.close().await;
+    assert_eq!(exported(copy.as_path()).await, expected);
+    let copied = Store::open(copy.as_path()).await.unwrap();
+    assert_eq!(copied.check(|_, _| {}).await.unwrap(), []);
+
+    let (one, other) = tokio::join!(Store::open(home.location()), Store::open(home.location()));
+    let store = one.unwrap();
+    other.unwrap().close().await;
+    assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+    home.execute("UPDATE label SET energy = -1.5 WHERE number = 1").await;
+    let found = store.check(|_, _| {}).await.unwrap();
+    assert!(found.len() == 1 && found[0].what.contains("label 1"), "{found:?}");
+    store.close().await;
+}
