@@ -10,7 +10,7 @@ use potentials::grace::{GraceModel, Precision, RadialPath};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
-use wire::ipc::Door;
+use wire::ipc::ConnectInfo;
 use workers::labeller::{LabelBounds, Method, Running};
 use workers::settings::WalkSettings;
 
@@ -26,7 +26,7 @@ pub struct WalkerSetup {
     /// The process that it works for, and with which it ends.
     pub parent: u32,
     /// Its way to the orchestrator.
-    pub door: Door,
+    pub door: ConnectInfo,
     /// The exported model.
     pub model: PathBuf,
     /// BLAKE3 of that file.

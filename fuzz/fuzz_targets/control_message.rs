@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use wire::ipc::echo;
+use wire::ipc::reencode;
 
 fuzz_target!(|bytes: &[u8]| {
     read(bytes);

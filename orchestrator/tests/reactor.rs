@@ -6,12 +6,12 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use orchestrator::reactor::{Ended, Notice, Reactor};
-use orchestrator::selector::{Mode, Settings, Snapshot};
+use orchestrator::reactor::{Notice, Reactor, RunOutcome};
+use orchestrator::selector::{Mode, SelectorSnapshot, Settings};
 use store::{Campaign, JobState, Protocol, SeedStructure, Store};
 use tokio::sync::mpsc;
 use wire::messages::{Progress, Report};
-use wire::transport::{InProcess, Incoming, Transport, Work};
+use wire::transport::{InProcess, Incoming, Transport, WorkItem};
 use wire::{ContentHash, WalkId};
 
 use crate::common::scripted::{Event, Script, advance};
@@ -44,11 +44,11 @@ async fn a_stop_before_anybody_asks_is_the_end() {
     tokio::time::sleep(Duration::from_millis(50)).await;
     stopping.store(true, Ordering::Relaxed);
     let ended = tokio::time::timeout(Duration::from_secs(60), running).await.expect("it ends");
-    assert_eq!(ended.unwrap().unwrap(), Ended::Stopped);
+    assert_eq!(ended.unwrap().unwrap(), RunOutcome::Stopped);
 }
 
 fn rounds() -> Settings {
-    Settings { per_seed: 9, control: true, ..settings(Mode::Reproducible) }
+    Settings { max_per_seed_structure: 9, control: true, ..settings(Mode::Reproducible) }
 }
 
 /// The campaign's database, made if there is none.
@@ -80,7 +80,7 @@ async fn open(directory: &Path) -> Store {
 
 /// A reactor that goes on with what the database holds, and the way to it.
 async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::Sender<Incoming>) {
-    let snapshot = Snapshot {
+    let snapshot = SelectorSnapshot {
         imported: 0,
         walks: store.load_walks().await.unwrap(),
         components: store.load_components().await.unwrap(),
@@ -88,7 +88,7 @@ async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::S
         values: store.values().await.unwrap(),
     };
     let mut selector = restore(&rounds(), 3, snapshot);
-    let begun = selector.begin_walks();
+    let begun = selector.start_walks();
     if !begun.walks.is_empty() {
         store.commit(&begun).await.unwrap();
     }
@@ -98,7 +98,7 @@ async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::S
 }
 
 /// The turn as a scripted walker does it: interrupted after a few steps if it was asked to stop.
-fn work_on(work: &Work, transport: &InProcess) -> Report {
+fn work_on(work: &WorkItem, transport: &InProcess) -> Report {
     let assignment = &work.assignment;
     let seed = (0..3).find(|number| seed(*number).structure == assignment.seed_structure).unwrap();
     let pause = transport.stopping().then_some(2);
@@ -126,13 +126,13 @@ fn start_walkers(
 }
 
 /// How a reactor ends; its walkers are freed also if it hangs.
-async fn end_of(reactor: Reactor, watch: impl FnMut(Notice<'_>)) -> Ended {
+async fn end_of(reactor: Reactor, watch: impl FnMut(Notice<'_>)) -> RunOutcome {
     let ended = tokio::time::timeout(Duration::from_secs(120), reactor.run(watch)).await;
     ended.expect("the reactor hangs").unwrap()
 }
 
 /// Runs until it is over, or until `stop_after` commits.
-async fn run(store: &Store, walkers: u32, stop_after: usize) -> Ended {
+async fn run(store: &Store, walkers: u32, stop_after: usize) -> RunOutcome {
     let stopping = Arc::new(AtomicBool::new(false));
     let (reactor, to_reactor) = reactor(store, &stopping).await;
     let threads = start_walkers(walkers, to_reactor, &stopping);
@@ -166,7 +166,7 @@ async fn content(store: &Store) -> (String, String) {
 async fn nothing_is_lost_when_a_campaign_is_stopped_again_and_again() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
     let whole = open(folders[0].path()).await;
-    assert_eq!(run(&whole, 1, usize::MAX).await, Ended::Done);
+    assert_eq!(run(&whole, 1, usize::MAX).await, RunOutcome::Finished);
     let (log, rest) = content(&whole).await;
     let log_has = |kind: &str| log.contains(kind);
     assert!(["accepted", "declined", "control", "segment", "ended"].into_iter().all(log_has), "{log}");
@@ -174,7 +174,7 @@ async fn nothing_is_lost_when_a_campaign_is_stopped_again_and_again() {
     let mut times = 0;
     let stopped = loop {
         let store = open(folders[1].path()).await;
-        if run(&store, 3, 1 + times % 3).await == Ended::Done {
+        if run(&store, 3, 1 + times % 3).await == RunOutcome::Finished {
             break store;
         }
         store.close().await;
@@ -185,7 +185,7 @@ async fn nothing_is_lost_when_a_campaign_is_stopped_again_and_again() {
     let (log_of_stopped, rest_of_stopped) = content(&stopped).await;
     assert_eq!(log_of_stopped, log);
     assert_eq!(rest_of_stopped, rest);
-    assert_eq!(run(&stopped, 2, usize::MAX).await, Ended::Done, "a campaign that is over stays so");
+    assert_eq!(run(&stopped, 2, usize::MAX).await, RunOutcome::Finished, "a campaign that is over stays so");
     assert_eq!(content(&stopped).await.0, log);
 }
 
@@ -222,7 +222,7 @@ async fn walkers_wait_while_the_label_queue_is_full() {
         times += 1;
     }
     assert!(times > 2);
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
@@ -234,7 +234,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
     let store = open(folder.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
     let (mut reactor, to_reactor) = reactor(&store, &stopping).await;
-    reactor.selector.raise_above(LIMIT);
+    reactor.selector.raise_threshold_above(LIMIT);
     let reactor = Reactor { queue_limit: LIMIT, ..reactor };
     let (full, mut seen_full) = mpsc::unbounded_channel();
     let running = tokio::spawn(end_of(reactor, move |notice| {
@@ -248,7 +248,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
     let walker = thread::spawn(move || {
         let mut report = None;
         while let Some(work) = transport.exchange(report.take()) {
-            seen.lock().unwrap().push(work.assignment.raised);
+            seen.lock().unwrap().push(work.assignment.threshold_factor);
             report = Some(work_on(&work, &transport).map_candidate(|block| block.view().to_candidate()));
         }
     });
@@ -260,7 +260,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
         }
         times += 1;
     }
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     walker.join().unwrap();
     let raised = raised.lock().unwrap().clone();
     assert!(times > 0 && raised.contains(&1.0), "{raised:?}");
@@ -295,7 +295,7 @@ async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
             stopping.store(true, Ordering::Relaxed);
         }
     };
-    assert_eq!(end_of(reactor, watch).await, Ended::Stopped);
+    assert_eq!(end_of(reactor, watch).await, RunOutcome::Stopped);
     talking.join().unwrap();
 }
 
@@ -314,7 +314,7 @@ async fn the_turn_of_a_walker_that_dies_is_done_by_another() {
     let running = tokio::spawn(end_of(reactor, |_| ()));
     tokio::task::spawn_blocking(|| dying.join().unwrap()).await.unwrap();
     let threads = start_walkers(2, to_reactor, &stopping);
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
@@ -324,7 +324,7 @@ async fn a_campaign_whose_walkers_are_all_gone_is_not_done() {
     let store = open(folder.path()).await;
     let (reactor, to_reactor) = reactor(&store, &Arc::default()).await;
     drop(to_reactor);
-    assert_eq!(end_of(reactor, |_| ()).await, Ended::Stopped);
+    assert_eq!(end_of(reactor, |_| ()).await, RunOutcome::Stopped);
 }
 
 /// Walkers that end with the first walk's first turn in hand: by their own fault again and again, or because others kill
@@ -339,12 +339,12 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
         let running = tokio::spawn(end_of(reactor, |_| {}));
         for walker in 0..walkers {
             let (reply, answer) = tokio::sync::oneshot::channel();
-            to_reactor.send(Incoming::Free { walker, report: None, reply }).await.unwrap();
+            to_reactor.send(Incoming::Idle { walker, report: None, reply }).await.unwrap();
             assert_eq!(answer.await.unwrap().expect("a turn").assignment.walk, WalkId(0));
-            to_reactor.send(Incoming::Gone { walker, fault }).await.unwrap();
+            to_reactor.send(Incoming::Lost { walker, crashed: fault }).await.unwrap();
         }
         let threads = start_walkers(1, to_reactor, &stopping);
-        assert_eq!(running.await.unwrap(), Ended::Done);
+        assert_eq!(running.await.unwrap(), RunOutcome::Finished);
         threads.into_iter().for_each(|thread| thread.join().unwrap());
         let walk = store.load_walks().await.unwrap().remove(0);
         let expected = "3 walkers crashed in this turn";
@@ -359,7 +359,7 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
 async fn a_paused_walk_stands_still_and_changes_nothing() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
     let whole = open(folders[0].path()).await;
-    assert_eq!(run(&whole, 2, usize::MAX).await, Ended::Done);
+    assert_eq!(run(&whole, 2, usize::MAX).await, RunOutcome::Finished);
 
     let store = open(folders[1].path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
@@ -374,7 +374,7 @@ async fn a_paused_walk_stands_still_and_changes_nothing() {
     tokio::time::sleep(Duration::from_millis(700)).await;
     assert_eq!((turns().await, running.is_finished()), (vec![0; 3], false), "the first round waits");
     store.pause_walks(&[WalkId(1)], false, 0).await.unwrap();
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     threads.into_iter().for_each(|thread| thread.join().unwrap());
     assert_eq!(content(&store).await, content(&whole).await);
 }

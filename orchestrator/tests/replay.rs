@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 
 use calm::CollectionRule;
-use orchestrator::selector::{Mode, Replay, Replayed, Settings, UpdateProtocol};
+use orchestrator::selector::{Mode, Replay, ReplayedDecision, Settings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
@@ -43,13 +43,16 @@ fn open(campaign: &Campaign<'_>, settings: &Settings, seeds: usize, set: &[&str]
 }
 
 /// What comes of each place of the log.
-fn follow(replay: &mut Replay, log: &[(LoggedDecision, Option<&CandidateRecord>)]) -> Vec<Option<Replayed>> {
+fn follow(
+    replay: &mut Replay,
+    log: &[(LoggedDecision, Option<&CandidateRecord>)],
+) -> Vec<Option<ReplayedDecision>> {
     let next = |(decision, candidate): &(LoggedDecision, Option<&CandidateRecord>)| {
         let examine = |record: &&CandidateRecord| {
-            replay.examiner().examine_block(record.block.clone(), replay.mixture()).unwrap()
+            replay.regrader().regrade_block(record.block.clone(), replay.mixture()).unwrap()
         };
         let examined = candidate.as_ref().map(examine);
-        replay.follow(decision, examined).unwrap()
+        replay.apply(decision, examined).unwrap()
     };
     log.iter().map(next).collect()
 }
@@ -61,7 +64,7 @@ fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
     let replayed = follow(&mut replay, &log);
     for ((recorded, candidate), now) in log.iter().zip(replayed) {
         let now = now.unwrap_or_else(|| panic!("nothing comes of {recorded:?}"));
-        let Replayed { decision, candidate: graded } = now;
+        let ReplayedDecision { decision, candidate: graded } = now;
         let found =
             (decision.kind, decision.walk.map(|walk| walk.0), decision.mixture_version, decision.round);
         assert_eq!(found, (recorded.kind.as_str(), recorded.walk, recorded.mixture_version, recorded.round));
@@ -76,7 +79,7 @@ fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
         .collect();
     let version = campaign.selector.mixture().version();
     assert_eq!(
-        (replay.mixture().version(), replay.other_component(version, &components).unwrap()),
+        (replay.mixture().version(), replay.first_different_component(version, &components).unwrap()),
         (version, None)
     );
     assert_eq!(replay.cut_short(), 0);
@@ -106,11 +109,11 @@ proptest! {
         let mode = if live { Mode::Live } else { Mode::Reproducible };
         let settings = Settings { mode, ..settings };
         let [second, third] =
-            limits.map(|(per_seed, total)| Settings { per_seed, total, ..settings.clone() });
+            limits.map(|(max_per_seed_structure, total)| Settings { max_per_seed_structure, max_structures: total, ..settings.clone() });
         let [first, middle, last] = parts;
         let mut campaign = Campaign::begin(&settings, &scripts, walkers);
         first.into_iter().for_each(|act| campaign.act(act));
-        let hash = |number| ContentHash::of(&structure(number, SHORTEST));
+        let hash = |number| ContentHash::from_structure(&structure(number, SHORTEST));
         campaign.store.imported = imports.into_iter().map(hash).collect();
         campaign.go_on(&second);
         middle.into_iter().for_each(|act| campaign.act(act));
@@ -124,7 +127,7 @@ proptest! {
     fn a_stricter_rule_accepts_what_lies_above_it(
         settings in any_settings(), scripts in scripts(), threshold in 1.5..9.0,
     ) {
-        let settings = Settings { update: UpdateProtocol::Never, per_seed: 100, total: None, ..settings };
+        let settings = Settings { update: UpdateProtocol::Never, max_per_seed_structure: 100, max_structures: None, ..settings };
         let campaign = Campaign::begin(&settings, &scripts, 1).finish(false);
         let log = log(&campaign);
         let collection = CollectionRule::MaximumGrade { threshold: positive(threshold) };
@@ -155,13 +158,18 @@ fn the_campaigns_reach_what_they_are_for() {
         let settings = any_settings().new_tree(&mut runner).unwrap().current();
         let settings = Settings { mode: Mode::Live, update: UpdateProtocol::Carried, ..settings };
         let scripts: Vec<Script> = scripts().new_tree(&mut runner).unwrap().current();
-        let more = Settings { per_seed: settings.per_seed + 3, total: None, ..settings.clone() };
+        let more = Settings {
+            max_per_seed_structure: settings.max_per_seed_structure + 3,
+            max_structures: None,
+            ..settings.clone()
+        };
         let mut campaign = Campaign::begin(&settings, &scripts, 2);
         for act in acts().new_tree(&mut runner).unwrap().current() {
             campaign.act(act);
         }
         let mut campaign = campaign.finish(false);
-        campaign.store.imported = (0..12).map(|n| ContentHash::of(&structure(n, SHORTEST))).collect();
+        campaign.store.imported =
+            (0..12).map(|n| ContentHash::from_structure(&structure(n, SHORTEST))).collect();
         campaign.go_on(&more);
         let campaign = campaign.finish(false);
         check_exact(&campaign, &settings, scripts.len());

@@ -65,10 +65,10 @@ proptest! {
         let biased = campaign.store.walks.values().filter(|walk| walk.origin == Origin::Biased);
         let accepted: Vec<u32> = biased.map(|walk| walk.accepted).collect();
         prop_assert_eq!(accepted.len(), scripts.len());
-        prop_assert!(accepted.iter().all(|accepted| *accepted <= settings.per_seed));
+        prop_assert!(accepted.iter().all(|accepted| *accepted <= settings.max_per_seed_structure));
         prop_assert_eq!(accepted.iter().sum::<u32>() as usize, count("accepted"));
         prop_assert_eq!(campaign.store.known.len(), count("accepted"));
-        prop_assert!(settings.total.is_none_or(|total| count("accepted") <= total as usize));
+        prop_assert!(settings.max_structures.is_none_or(|total| count("accepted") <= total as usize));
         prop_assert_eq!(campaign.store.walks.len(), count("begun"));
         prop_assert_eq!(campaign.store.walks.len(), count("ended"));
         let versions = campaign.store.decisions.iter().map(|decision| (decision.round, decision.mixture_version));

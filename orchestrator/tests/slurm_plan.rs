@@ -1,9 +1,9 @@
 //! What is submitted and cancelled: by hand, then whoever launches how often while jobs begin, end and come back.
 
-use orchestrator::slurm::{Job, JobNames, Phase, Plan, Role, Submission, Wanted, plan};
+use orchestrator::slurm::{DesiredJobs, Job, JobNames, Phase, Plan, Role, Submission, plan};
 use proptest::prelude::*;
 
-const WANTED: Wanted = Wanted { agents: 2, walkers: 4, labellers: 1 };
+const WANTED: DesiredJobs = DesiredJobs { agents: 2, walkers: 4, labellers: 1 };
 
 fn job(id: u64, role: Role, state: &str) -> Job {
     let walkers = matches!(role, Role::Agent(_)).then_some(WANTED.walkers);
@@ -91,7 +91,7 @@ fn agents_with_another_number_of_walkers_are_replaced() {
 fn names_of_jobs_are_what_the_plan_speaks_of() {
     let names = JobNames::new("0123456789ab");
     for role in WANTED.roles() {
-        assert_eq!(names.role(&names.of(role)), Some(role));
+        assert_eq!(names.role(&names.job_name(role)), Some(role));
     }
 }
 
@@ -110,7 +110,7 @@ struct System {
 }
 
 impl System {
-    fn submit(&mut self, wanted: &Wanted, submission: Submission) {
+    fn submit(&mut self, wanted: &DesiredJobs, submission: Submission) {
         self.last += 1;
         let mut job = job(self.last, submission.role, "PENDING");
         job.walkers = job.walkers.map(|_| wanted.walkers);
@@ -164,7 +164,7 @@ impl System {
         self.jobs.iter().map(|known| known.job.clone()).collect()
     }
 
-    fn check(&self, most: &Wanted) {
+    fn check(&self, most: &DesiredJobs) {
         let running = |role: Role| {
             let running = self.jobs.iter().filter(move |known| known.job.phase() == Phase::Running);
             running.filter(move |known| known.job.role == role).count()
@@ -184,7 +184,7 @@ impl System {
 /// Somebody who launches: what is still to be done of a plan that was made some time ago.
 #[derive(Debug, Default)]
 struct Launcher {
-    wanted: Option<Wanted>,
+    wanted: Option<DesiredJobs>,
     plan: Plan,
 }
 
@@ -208,10 +208,10 @@ proptest! {
         asked in proptest::collection::vec((0..4_u32, 1..3_u32, 0..2_u32), 1..4),
     ) {
         let asked: Vec<_> = asked.into_iter()
-            .map(|(agents, walkers, labellers)| Wanted { agents, walkers, labellers })
+            .map(|(agents, walkers, labellers)| DesiredJobs { agents, walkers, labellers })
             .collect();
-        let most = |of: fn(&Wanted) -> u32| asked.iter().map(of).max().unwrap_or(0);
-        let most = Wanted { agents: most(|w| w.agents), walkers: most(|w| w.walkers), labellers: 0 };
+        let most = |of: fn(&DesiredJobs) -> u32| asked.iter().map(of).max().unwrap_or(0);
+        let most = DesiredJobs { agents: most(|w| w.agents), walkers: most(|w| w.walkers), labellers: 0 };
         let mut system = System::default();
         let mut launchers: [Launcher; 3] = Default::default();
         for (kind, which, choice) in steps {

@@ -8,14 +8,14 @@ use std::time::Duration;
 
 use calm::Mixture;
 use orchestrator::launcher::{self, Children, Launch};
-use orchestrator::supervisor::{Limits, Standing};
+use orchestrator::supervisor::{ChildState, Limits};
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
-use wire::net::{self, Address, Joined, NetError, Parted, Tls, Uplink};
-use wire::place::Place;
+use wire::net::{self, Address, AgentClient, LinkError, Membership, NetError, Tls};
+use wire::shm_dir::ShmDir;
 use wire::transport::Incoming;
 use workers::agent::{self, Agent, News};
 
@@ -46,7 +46,7 @@ pub async fn work(
     let (uplink, joined, setup) = tokio::select! {
         joined = join(address, tls, agent, directory) => joined?,
         () = stop.notified() => return Ok(Ended::Interrupted),
-        () = address.over() => {
+        () = address.wait_until_over() => {
             say("the campaign is over");
             return Ok(Ended::Done);
         }
@@ -60,7 +60,7 @@ pub async fn work(
         count(walkers, "walker"),
         joined.newest().await.version()
     ));
-    let place = Place::of(directory).map_err(Failure::failed)?;
+    let place = ShmDir::for_campaign(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
     let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));
     let numbers = Arc::clone(&watched.numbers);
@@ -89,9 +89,9 @@ async fn join(
     tls: Option<&Tls>,
     agent: net::Agent,
     directory: &Path,
-) -> Result<(Arc<Uplink>, Joined, AgentSetup), Failure> {
+) -> Result<(Arc<AgentClient>, Membership, AgentSetup), Failure> {
     let waiting = |why: &NetError| warn(format_args!("waiting for the orchestrator: {why}"));
-    let uplink = Uplink::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
+    let uplink = AgentClient::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
     let uplink = Arc::new(uplink);
     loop {
         let joined = uplink.join().await.map_err(Failure::failed)?;
@@ -107,15 +107,19 @@ async fn join(
 
 /// The model's file: the orchestrator's own where this host sees it, else a copy; `None` if the place was lost before it was
 /// here.
-async fn model(joined: &Joined, setup: &AgentSetup, directory: &Path) -> Result<Option<PathBuf>, Failure> {
+async fn model(
+    joined: &Membership,
+    setup: &AgentSetup,
+    directory: &Path,
+) -> Result<Option<PathBuf>, Failure> {
     let hash = &setup.model_hash;
     if setup::unchanged(&setup.model, hash).is_ok() {
         return Ok(Some(setup.model.clone()));
     }
     say("this host does not see the orchestrator's model: fetching the model …");
     let path = directory.join("kokkos.npz");
-    let bytes = match joined.file(hash).await {
-        Err(Parted::Stranger(_)) => return Ok(None),
+    let bytes = match joined.fetch_file(hash).await {
+        Err(LinkError::RejoinRequired(_)) => return Ok(None),
         bytes => bytes.map_err(Failure::failed)?,
     };
     fs::write(&path, bytes)
@@ -128,17 +132,17 @@ async fn model(joined: &Joined, setup: &AgentSetup, directory: &Path) -> Result<
 struct Host {
     walkers: Children,
     watched: Watched,
-    line: ipc::Handle,
+    line: ipc::ServerHandle,
     dealing: Dealing,
     serving: JoinHandle<Result<(), IpcError>>,
     /// How the last of them failed, if all were given up.
     given_up: Option<String>,
 }
 
-type Dealing = JoinHandle<Result<agent::Ended, Parted>>;
+type Dealing = JoinHandle<Result<agent::Ended, LinkError>>;
 
 async fn work_in(
-    place: &Place,
+    place: &ShmDir,
     setup: &AgentSetup,
     (walkers, threads): (u32, usize),
     mixture: &Mixture,
@@ -154,14 +158,14 @@ async fn work_in(
     let server = Server::open(place, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
     let line = server.handle();
     let limits = Limits {
-        silence: Duration::from_secs_f64(setup.silence_limit),
-        restarts: setup.restarts,
+        heartbeat_timeout: Duration::from_secs_f64(setup.silence_limit),
+        max_restarts: setup.restarts,
         ..Limits::default()
     };
     let walkers = Children::new(walkers, limits, launch(setup, threads, line.clone()));
     let (to_agent, incoming) = mpsc::channel(CHANNEL);
-    let signs = walkers.signs();
-    let heard = move |walker, useful| if useful { signs.useful(walker) } else { signs.heard(walker) };
+    let signs = walkers.heartbeats();
+    let heard = move |walker, useful| if useful { signs.delivered(walker) } else { signs.heartbeat(walker) };
     let serving = tokio::spawn(server.run(shared, to_agent, heard));
     let dealing = deal(incoming);
     Host { walkers, watched: watched.clone(), line, dealing, serving, given_up: None }.lead(stop).await
@@ -171,14 +175,14 @@ async fn work_in(
 fn launch(
     setup: &AgentSetup,
     threads: usize,
-    line: ipc::Handle,
+    line: ipc::ServerHandle,
 ) -> impl FnMut(u32, u32) -> Launch + Send + 'static {
     let (setup, parent) = (setup.clone(), std::process::id());
     move |number, incarnation| {
         line.expect(number, incarnation);
         let setup = WalkerSetup {
             parent,
-            door: line.door(number, incarnation),
+            door: line.connect_info(number, incarnation),
             model: setup.model.clone(),
             model_hash: setup.model_hash.clone(),
             precision: setup.precision,
@@ -225,19 +229,19 @@ impl Host {
     }
 
     /// Whether nobody is left.
-    fn walker(&mut self, event: launcher::Event) -> bool {
+    fn walker(&mut self, event: launcher::ChildEvent) -> bool {
         match event {
-            launcher::Event::Started { .. } => {}
-            launcher::Event::Said { number, line } => say(format_args!("walker {number}: {line}")),
-            launcher::Event::Ended { number, ended } => {
-                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
-                if ended.then == Standing::GoneHome {
+            launcher::ChildEvent::Started { .. } => {}
+            launcher::ChildEvent::Stderr { number, line } => say(format_args!("walker {number}: {line}")),
+            launcher::ChildEvent::Ended { number, ended } => {
+                self.line.lost(number, ended.incarnation, ended.reason.is_crash());
+                if ended.then == ChildState::Exited {
                     self.walkers.close();
                 } else {
-                    warn(format_args!("walker {number}: {}; {}", ended.ending, ended.then));
+                    warn(format_args!("walker {number}: {}; {}", ended.reason, ended.then));
                 }
             }
-            launcher::Event::AllGone => {
+            launcher::ChildEvent::AllExited => {
                 self.line.close();
                 self.given_up = all_given_up(&mut self.walkers);
                 return true;

@@ -10,7 +10,7 @@ use serde_json::json;
 use store::{ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval};
-use wire::net::{self, AgentEvent, Hub, NetError, Welcome};
+use wire::net::{self, AgentBootstrap, AgentEvent, AgentServer, NetError};
 use wire::transport::Incoming;
 use workers::labeller::SIGN_OF_LIFE;
 
@@ -21,18 +21,18 @@ use crate::setup::{self, AgentSetup};
 
 /// Where they join, if they may.
 pub struct Agents {
-    hub: Option<Hub>,
+    hub: Option<AgentServer>,
     store: Store,
     mixture: Arc<Mixture>,
 }
 
 /// Ends it.
-pub struct Handle(Option<net::Handle>);
+pub struct Handle(Option<net::AgentServerHandle>);
 
 impl Handle {
     /// There is no more work.
     pub fn close(&self) {
-        self.0.iter().for_each(net::Handle::close);
+        self.0.iter().for_each(net::AgentServerHandle::close);
     }
 }
 
@@ -54,11 +54,12 @@ impl Agents {
             silence_limit: config.run.silence_limit.get(),
             restarts: config.run.restarts,
         };
-        let welcome = Welcome { setup: setup::bytes(&setup), files: BTreeMap::from([(model_hash, model)]) };
+        let welcome =
+            AgentBootstrap { setup: setup::bytes(&setup), files: BTreeMap::from([(model_hash, model)]) };
         let patience = Duration::from_secs_f64(config.run.agent_silence_limit.get());
-        let hub = Hub::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
+        let hub = AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
         let hub = hub.map_err(|error| match error {
-            NetError::Ended { .. } => Failure::failed(error),
+            NetError::SessionClosed { .. } => Failure::failed(error),
             error => Failure::input(error),
         })?;
         listen.announce(hub.endpoint())?;
@@ -67,7 +68,7 @@ impl Agents {
     }
 
     pub fn handle(&self) -> Handle {
-        Handle(self.hub.as_ref().map(Hub::handle))
+        Handle(self.hub.as_ref().map(AgentServer::handle))
     }
 
     /// Listens to them until there is no more work and the last has left.
@@ -129,11 +130,11 @@ async fn keep_record(
     let now = unix_milliseconds();
     let (agent, what, state) = match event {
         AgentEvent::Joined(agent) => (agent, "joined", "running"),
-        AgentEvent::Silent(agent) => (agent, "gives no sign of life", "silent"),
-        AgentEvent::Back(agent) => (agent, "is back", "running"),
+        AgentEvent::Unresponsive(agent) => (agent, "gives no sign of life", "silent"),
+        AgentEvent::Recovered(agent) => (agent, "is back", "running"),
         AgentEvent::Lost(agent) => (agent, "was silent for too long: others get its walks", "lost"),
         AgentEvent::Left(agent) => (agent, "left", "left"),
-        AgentEvent::Dropped(why) => {
+        AgentEvent::MessageRejected(why) => {
             warn(format_args!("a message from another host was dropped: {why}"));
             return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
         }

@@ -5,10 +5,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use orchestrator::launcher::{self, Children};
-use orchestrator::supervisor::Standing;
+use orchestrator::supervisor::ChildState;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
-use wire::ipc::Handle;
+use wire::ipc::ServerHandle;
 use workers::labeller::SIGN_OF_LIFE;
 
 use super::answers::Answers;
@@ -26,7 +26,7 @@ pub const PROVEN: Duration = Duration::from_secs(10);
 pub struct Crew<'a> {
     store: &'a Store,
     records: Records<'a>,
-    line: Handle,
+    line: ServerHandle,
     walkers: Children,
     labellers: Labellers,
     look: Interval,
@@ -43,9 +43,9 @@ pub struct Crew<'a> {
 /// What there is to react to.
 pub enum Event {
     /// A walker.
-    Walker(launcher::Event),
+    Walker(launcher::ChildEvent),
     /// A labeller.
-    Labeller(launcher::Event),
+    Labeller(launcher::ChildEvent),
     /// It is time for signs of life.
     Look,
     /// It is time to look whether every label is made.
@@ -57,7 +57,7 @@ impl<'a> Crew<'a> {
     pub fn new(
         store: &'a Store,
         process: ProcessRecord,
-        line: Handle,
+        line: ServerHandle,
         mut walkers: Children,
         labellers: Labellers,
         stopping: Arc<AtomicBool>,
@@ -82,10 +82,10 @@ impl<'a> Crew<'a> {
 
     /// To be told which walker was heard, and whether it delivered something.
     pub fn listener(&self) -> impl FnMut(u32, bool) + Send + 'static {
-        let (signs, heard) = (self.walkers.signs(), self.records.listener());
+        let (signs, heard) = (self.walkers.heartbeats(), self.records.listener());
         move |walker, useful| {
             heard(walker);
-            if useful { signs.useful(walker) } else { signs.heard(walker) }
+            if useful { signs.delivered(walker) } else { signs.heartbeat(walker) }
         }
     }
 
@@ -160,21 +160,21 @@ impl<'a> Crew<'a> {
         self.stop();
     }
 
-    async fn walker(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+    async fn walker(&mut self, event: launcher::ChildEvent) -> Result<(), StoreError> {
         match event {
-            launcher::Event::Started { number, incarnation, pid } => {
+            launcher::ChildEvent::Started { number, incarnation, pid } => {
                 self.records.walker_started(number, incarnation, pid).await?;
             }
-            launcher::Event::Said { number, line } => say(format_args!("walker {number}: {line}")),
-            launcher::Event::Ended { number, ended } => {
-                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
-                if ended.then == Standing::GoneHome {
+            launcher::ChildEvent::Stderr { number, line } => say(format_args!("walker {number}: {line}")),
+            launcher::ChildEvent::Ended { number, ended } => {
+                self.line.lost(number, ended.incarnation, ended.reason.is_crash());
+                if ended.then == ChildState::Exited {
                     // There is no more work for the others either.
                     self.walkers.close();
                 }
                 self.records.walker_ended(number, &ended).await?;
             }
-            launcher::Event::AllGone => {
+            launcher::ChildEvent::AllExited => {
                 self.gone[0] = true;
                 self.line.close();
                 let given_up = all_given_up(&mut self.walkers);
@@ -184,15 +184,15 @@ impl<'a> Crew<'a> {
         Ok(())
     }
 
-    async fn labeller(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+    async fn labeller(&mut self, event: launcher::ChildEvent) -> Result<(), StoreError> {
         match event {
-            launcher::Event::Started { number, pid, .. } => self.labellers.started(number, pid),
-            launcher::Event::Said { number, line } => say(format_args!("labeller {number}: {line}")),
-            launcher::Event::Ended { number, ended } => {
+            launcher::ChildEvent::Started { number, pid, .. } => self.labellers.started(number, pid),
+            launcher::ChildEvent::Stderr { number, line } => say(format_args!("labeller {number}: {line}")),
+            launcher::ChildEvent::Ended { number, ended } => {
                 let record = self.labellers.ended(self.store, number, &ended).await?;
                 self.records.labeller_ended(number, record, &ended).await?;
             }
-            launcher::Event::AllGone => {
+            launcher::ChildEvent::AllExited => {
                 self.gone[1] = true;
                 let given_up = all_given_up(&mut self.labellers.children);
                 self.nobody_is_left("labeller", given_up);
@@ -228,7 +228,7 @@ impl<'a> Crew<'a> {
 /// How the last of them failed, if all were given up.
 pub fn all_given_up(children: &mut Children) -> Option<String> {
     let status = children.status();
-    let given_up = status.iter().all(|child| child.standing == Standing::GivenUp);
+    let given_up = status.iter().all(|child| child.state == ChildState::Failed);
     let last = status.last().filter(|_| given_up)?;
     let how = last.last_failure.as_ref().map(ToString::to_string).unwrap_or_default();
     Some(format!("each was given up after {} restarts, number {} with {how}", last.restarts, last.number))

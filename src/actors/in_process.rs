@@ -11,7 +11,7 @@ use potentials::grace::Threads;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 use wire::transport::{InProcess, Incoming};
 use workers::labeller::{self, Closing, LabellerSettings, SIGN_OF_LIFE, Stay, Timing};
 use workers::walk::WalkContext;
@@ -27,8 +27,8 @@ use crate::campaign::Campaign;
 use crate::outcome::Failure;
 
 /// Runs the campaign until it is done or stopped.
-pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
-    if let Ok(place) = Place::of(run.directory) {
+pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
+    if let Ok(place) = ShmDir::for_campaign(run.directory) {
         // What a killed run left; this one needs nothing there.
         let _ = place.remove();
     }
@@ -83,7 +83,7 @@ impl Actors {
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign: without labels its queue only grows.
-    async fn finish(mut self) -> Result<reactor::Ended, Failure> {
+    async fn finish(mut self) -> Result<reactor::RunOutcome, Failure> {
         let mut failure = None;
         let ended = loop {
             tokio::select! {
@@ -99,7 +99,9 @@ impl Actors {
             self.stopping.store(true, Ordering::Relaxed);
             self.closing.stop();
         }
-        if let Some(store) = self.labels_of_others.filter(|_| matches!(ended, Ok(reactor::Ended::Done))) {
+        if let Some(store) =
+            self.labels_of_others.filter(|_| matches!(ended, Ok(reactor::RunOutcome::Finished)))
+        {
             wait_for_labels(&store, &self.closing).await?;
         }
         let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
@@ -113,7 +115,7 @@ impl Actors {
         match failure {
             Some(failure) => Err(failure),
             // Every walk is over, but the labellers were asked to stop and may have left jobs.
-            None if self.closing.is_stopping() => Ok(reactor::Ended::Stopped),
+            None if self.closing.is_stopping() => Ok(reactor::RunOutcome::Stopped),
             None => Ok(ended),
         }
     }

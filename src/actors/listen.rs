@@ -33,7 +33,7 @@ impl Listen {
         let Some(tls) = &self.tls else { return Ok(()) };
         let checked = tls.check_for_orchestrator().map_err(Failure::input)?;
         checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
-        let endpoint = self.endpoint.of_host(&self.host).map_err(Failure::input)?;
+        let endpoint = self.endpoint.with_host_name(&self.host).map_err(Failure::input)?;
         let host = endpoint.plain_host();
         if checked.is_for(host) {
             return Ok(());
@@ -53,8 +53,8 @@ impl Listen {
     /// Writes down where agents find this run.
     pub fn announce(&self, endpoint: &Endpoint) -> Result<(), Failure> {
         let Some(path) = &self.announce else { return Ok(()) };
-        let endpoint = endpoint.of_host(&self.host).map_err(Failure::input)?;
-        write_down(path, &Announcement::At(endpoint))
+        let endpoint = endpoint.with_host_name(&self.host).map_err(Failure::input)?;
+        write_down(path, &Announcement::Endpoint(endpoint))
     }
 
     /// What an earlier run wrote down does not hold any more.

@@ -17,7 +17,7 @@ use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Sleep, sleep};
 use wire::ipc::{Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 
 use super::agents::{self, Agents};
 use super::crew::{self, Crew};
@@ -33,8 +33,8 @@ pub const LABELLER_SILENCE: Duration = Duration::from_secs(60);
 
 /// Runs the campaign until it is done or stopped. To be awaited on the main thread: the walkers end with the thread that
 /// starts them.
-pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
-    let place = Place::of(run.directory).map_err(Failure::failed)?;
+pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
+    let place = ShmDir::for_campaign(run.directory).map_err(Failure::failed)?;
     let ended = work_in(&place, run, selector).await;
     // Nobody is left who could need it. What cannot be removed now is at the next start.
     let removed = place.remove().map_err(Failure::failed);
@@ -43,7 +43,7 @@ pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Fa
     Ok(ended)
 }
 
-async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
+async fn work_in(place: &ShmDir, run: Run<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
     let Run { campaign, store, process, .. } = run;
     let walkers = wanted_walkers(campaign);
     let mixture = Arc::clone(selector.mixture());
@@ -62,13 +62,17 @@ async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reac
         asked.1.notify_one();
     });
     let limits = Limits {
-        silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
-        restarts: campaign.config.run.restarts,
+        heartbeat_timeout: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
+        max_restarts: campaign.config.run.restarts,
         ..Limits::default()
     };
     let line = server.handle();
     let walkers = Children::new(walkers, limits, starts::walker(campaign, line.clone())?);
-    let limits = Limits { silence: limits.silence.max(LABELLER_SILENCE), outlives: true, ..limits };
+    let limits = Limits {
+        heartbeat_timeout: limits.heartbeat_timeout.max(LABELLER_SILENCE),
+        detached: true,
+        ..limits
+    };
     let labellers = starts::labellers(run, limits).await?;
     let crew = Crew::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
 
@@ -98,7 +102,7 @@ enum Happened {
     /// Somebody asked to stop.
     Asked,
     /// The reactor has ended.
-    Decided(Result<reactor::Ended, Failure>),
+    Decided(Result<reactor::RunOutcome, Failure>),
     /// The transport has ended.
     Closed(Result<(), Failure>),
 }
@@ -111,7 +115,7 @@ async fn lead(
     agents: agents::Handle,
     mut serving: JoinHandle<Result<(), Failure>>,
     stop: &Notify,
-) -> Result<reactor::Ended, Failure> {
+) -> Result<reactor::RunOutcome, Failure> {
     let (mut decided, mut closed, mut asked) = (None, None, false);
     let mut last_words = None;
     while decided.is_none() || closed.is_none() || !crew.is_gone() {
@@ -134,7 +138,7 @@ async fn lead(
             Happened::Decided(ended) => {
                 agents.close();
                 match ended {
-                    Ok(reactor::Ended::Done) => crew.wait_for_labels(),
+                    Ok(reactor::RunOutcome::Finished) => crew.wait_for_labels(),
                     _ => crew.stop(),
                 }
                 decided = Some(ended);
@@ -150,9 +154,9 @@ async fn lead(
     closed.transpose()?;
     crew.failure()?;
     match decided.transpose()? {
-        Some(reactor::Ended::Done) if !asked => Ok(reactor::Ended::Done),
+        Some(reactor::RunOutcome::Finished) if !asked => Ok(reactor::RunOutcome::Finished),
         // Every walk may be over, but the labellers were asked to stop and may have left jobs.
-        _ => Ok(reactor::Ended::Stopped),
+        _ => Ok(reactor::RunOutcome::Stopped),
     }
 }
 

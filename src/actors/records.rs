@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
 
-use orchestrator::supervisor::{Ended, Standing};
+use orchestrator::supervisor::{ChildExit, ChildState};
 use serde_json::json;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use wire::ipc::Traffic;
@@ -55,11 +55,11 @@ impl<'a> Records<'a> {
     }
 
     /// A walker's process ended.
-    pub async fn walker_ended(&mut self, number: u32, ended: &Ended) -> Result<(), StoreError> {
+    pub async fn walker_ended(&mut self, number: u32, ended: &ChildExit) -> Result<(), StoreError> {
         let record = self.walkers.remove(&number);
         // One that could not even be started has none.
         let record = record.unwrap_or_else(|| new_record(ProcessRecord::WALKER, number, 0));
-        if ended.then != Standing::GoneHome {
+        if ended.then != ChildState::Exited {
             self.walkers.insert(number, judged(record.clone(), ended));
         }
         tell(ProcessRecord::WALKER, number, ended);
@@ -71,7 +71,7 @@ impl<'a> Records<'a> {
         &self,
         number: u32,
         record: Option<ProcessRecord>,
-        ended: &Ended,
+        ended: &ChildExit,
     ) -> Result<(), StoreError> {
         let record = record.unwrap_or_else(|| new_record(ProcessRecord::LABELLER, number, 0));
         tell(ProcessRecord::LABELLER, number, ended);
@@ -86,9 +86,9 @@ impl<'a> Records<'a> {
             let heard = self.heard.get(*number as usize).map_or(0, |heard| heard.load(Ordering::Relaxed));
             record.last_seen = record.last_seen.max(heard);
         }
-        let strangers = (traffic.dropped > self.dropped).then(|| {
-            let last = traffic.last_dropped.unwrap_or_default();
-            format!("{} messages dropped; the last: {last}", traffic.dropped)
+        let strangers = (traffic.rejected > self.dropped).then(|| {
+            let last = traffic.last_rejected.unwrap_or_default();
+            format!("{} messages dropped; the last: {last}", traffic.rejected)
         });
         if let Some(strangers) = &strangers {
             self.process.remark.clone_from(strangers);
@@ -97,31 +97,31 @@ impl<'a> Records<'a> {
         self.store.upsert_processes(&records).await?;
         if let Some(strangers) = strangers {
             warn(&strangers);
-            let detail = json!({ "dropped": traffic.dropped, "remark": strangers });
+            let detail = json!({ "dropped": traffic.rejected, "remark": strangers });
             self.store.log_operation(now, "messages_dropped", &detail).await?;
-            self.dropped = traffic.dropped;
+            self.dropped = traffic.rejected;
         }
         Ok(())
     }
 }
 
 /// Writes down how a process ended that has this record.
-pub async fn write_down(store: &Store, record: ProcessRecord, ended: &Ended) -> Result<(), StoreError> {
-    if ended.then == Standing::GoneHome {
+pub async fn write_down(store: &Store, record: ProcessRecord, ended: &ChildExit) -> Result<(), StoreError> {
+    if ended.then == ChildState::Exited {
         return store.remove_process(&record.id).await;
     }
     let record = judged(record, ended);
     store.upsert_process(&record).await?;
     let detail = json!({
         "kind": record.kind, "number": record.number, "incarnation": ended.incarnation,
-        "how": ended.ending.to_string(), "then": ended.then.to_string(),
+        "how": ended.reason.to_string(), "then": ended.then.to_string(),
     });
     store.log_operation(unix_milliseconds(), "process_ended", &detail).await
 }
 
-fn tell(kind: &str, number: u32, ended: &Ended) {
-    if ended.then != Standing::GoneHome {
-        warn(format_args!("{kind} {number}: {}; {}", ended.ending, ended.then));
+fn tell(kind: &str, number: u32, ended: &ChildExit) {
+    if ended.then != ChildState::Exited {
+        warn(format_args!("{kind} {number}: {}; {}", ended.reason, ended.then));
     }
 }
 
@@ -130,11 +130,11 @@ fn new_record(kind: &str, number: u32, pid: u32) -> ProcessRecord {
 }
 
 /// The record of a process that ended.
-fn judged(mut record: ProcessRecord, ended: &Ended) -> ProcessRecord {
+fn judged(mut record: ProcessRecord, ended: &ChildExit) -> ProcessRecord {
     record.state = match ended.then {
-        Standing::Pausing { .. } => "pausing".to_owned(),
+        ChildState::BackingOff { .. } => "pausing".to_owned(),
         then => then.to_string(),
     };
-    record.remark = ended.ending.to_string();
+    record.remark = ended.reason.to_string();
     record
 }

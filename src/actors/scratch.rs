@@ -6,7 +6,7 @@ use std::io::{ErrorKind, Result};
 use std::path::Path;
 
 use tempfile::{Builder, TempDir};
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 
 /// Their names begin with this.
 const PREFIX: &str = "calmwalk-agent-";
@@ -43,7 +43,7 @@ impl Scratch {
 
 /// Removes what agents left that were killed on this host, as far as it may be removed.
 pub fn clean() {
-    for place in Place::all().unwrap_or_default() {
+    for place in ShmDir::all().unwrap_or_default() {
         let Some(directory) = place.campaign_directory() else { continue };
         // Those of the living are in use and stay.
         if is_scratch(directory) && place.remove().is_ok() {

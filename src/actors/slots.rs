@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use orchestrator::launcher::{Children, Event, Launch};
-use orchestrator::supervisor::{Limits, Standing};
+use orchestrator::launcher::{ChildEvent, Children, Launch};
+use orchestrator::supervisor::{ChildState, Limits};
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval};
@@ -61,7 +61,7 @@ pub async fn work(
     loop {
         let done = tokio::select! {
             event = crew.labellers.children.next() => match event {
-                Event::AllGone => break,
+                ChildEvent::AllExited => break,
                 event => crew.take_in(event).await,
             },
             _ = look.tick() => crew.look().await,
@@ -84,7 +84,11 @@ pub async fn work(
 }
 
 fn children(slots: Slots) -> Children {
-    let limits = Limits { silence: LABELLER_SILENCE, grace: slots.grace + GIVING_BACK, ..Limits::default() };
+    let limits = Limits {
+        heartbeat_timeout: LABELLER_SILENCE,
+        grace_period: slots.grace + GIVING_BACK,
+        ..Limits::default()
+    };
     let Slots { number, location, labelling, until_empty, grace } = slots;
     let slot = SlotSetup { parent: std::process::id(), until_empty, grace: grace.as_secs_f64() };
     let setup = LabellerSetup::new(location, labelling);
@@ -105,20 +109,20 @@ struct Crew<'a> {
 }
 
 impl Crew<'_> {
-    async fn take_in(&mut self, event: Event) -> Result<(), StoreError> {
+    async fn take_in(&mut self, event: ChildEvent) -> Result<(), StoreError> {
         match event {
-            Event::Started { number, pid, .. } => self.labellers.started(number, pid),
-            Event::Said { number, line } => self.display.said(number, &line),
-            Event::Ended { number, ended } => {
-                if !matches!(ended.then, Standing::GoneHome) {
-                    self.display.line(&format!("slot {number}: {}; {}", ended.ending, ended.then));
+            ChildEvent::Started { number, pid, .. } => self.labellers.started(number, pid),
+            ChildEvent::Stderr { number, line } => self.display.said(number, &line),
+            ChildEvent::Ended { number, ended } => {
+                if !matches!(ended.then, ChildState::Exited) {
+                    self.display.line(&format!("slot {number}: {}; {}", ended.reason, ended.then));
                 }
                 let record = self.labellers.ended(self.store, number, &ended).await?;
                 if let Some(record) = record {
                     records::write_down(self.store, record, &ended).await?;
                 }
             }
-            Event::AllGone => {}
+            ChildEvent::AllExited => {}
         }
         Ok(())
     }

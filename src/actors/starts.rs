@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use orchestrator::launcher::{Children, Launch, ask_to_end};
+use orchestrator::launcher::{Children, Launch, request_exit};
 use orchestrator::supervisor::Limits;
 use store::{ProcessRecord, Store, StoreError};
-use wire::ipc::Handle;
+use wire::ipc::ServerHandle;
 
 use super::Run;
 use super::labellers::Labellers;
@@ -20,7 +20,7 @@ use crate::setup::{self, LabellerSetup, WalkerSetup};
 /// How walkers are started.
 pub fn walker(
     campaign: &Campaign,
-    line: Handle,
+    line: ServerHandle,
 ) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, Failure> {
     let (model, model_hash) =
         (absolute(campaign.config.potential.model.get_ref())?, campaign.hash_of("potential.model"));
@@ -31,7 +31,7 @@ pub fn walker(
         line.expect(number, incarnation);
         let setup = WalkerSetup {
             parent,
-            door: line.door(number, incarnation),
+            door: line.connect_info(number, incarnation),
             model: model.clone(),
             model_hash: model_hash.clone(),
             precision,
@@ -71,7 +71,7 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
         match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
             Some(number) => drop(adopted.insert(number, found.pid)),
             // One that ended meanwhile needs no asking.
-            None => drop(ask_to_end(found.pid, &found.birth)),
+            None => drop(request_exit(found.pid, &found.birth)),
         }
     }
     Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
@@ -80,7 +80,7 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
 /// Asks the labellers that an earlier run left to end: this run makes its labels itself.
 pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
     for found in left_by_runs(store).await? {
-        let _ = ask_to_end(found.pid, &found.birth);
+        let _ = request_exit(found.pid, &found.birth);
     }
     Ok(())
 }

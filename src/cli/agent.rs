@@ -55,7 +55,7 @@ impl Agent {
         self.log.begin("agent")?;
         let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));
         let patience = Duration::from_secs_f64(60.0 * self.patience);
-        let tls = self.tls.as_deref().map(Tls::in_directory);
+        let tls = self.tls.as_deref().map(Tls::from_directory);
         if let Some(tls) = &tls {
             let checked = tls.check_for_agent().map_err(Failure::input)?;
             checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
@@ -75,7 +75,7 @@ impl Agent {
             pid: process.pid,
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
             walkers,
-            ahead: self.ahead,
+            prefetch: self.ahead,
         };
         let watched = Watched::default();
         block_on(async {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use store::CampaignLock;
-use wire::place::{Place, PlaceError, Removed};
+use wire::shm_dir::{Removed, ShmDir, ShmDirError};
 
 use super::{Ended, Failure};
 use crate::output::{count, print};
@@ -22,7 +22,7 @@ pub struct Clean {
 impl Clean {
     pub fn run(self) -> Result<Ended, Failure> {
         if self.directories.is_empty() {
-            for place in Place::all().map_err(Failure::failed)? {
+            for place in ShmDir::all().map_err(Failure::failed)? {
                 let campaign = place.campaign_directory();
                 match clean(&place, campaign) {
                     Ok(removed) => report(campaign.unwrap_or(place.directory()), removed)?,
@@ -32,7 +32,7 @@ impl Clean {
             }
         }
         for directory in &self.directories {
-            let place = Place::of(directory).map_err(Failure::input)?;
+            let place = ShmDir::for_campaign(directory).map_err(Failure::input)?;
             report(directory, clean(&place, Some(directory))?)?;
         }
         Ok(Ended::Done)
@@ -40,13 +40,13 @@ impl Clean {
 }
 
 /// Removes a place while nobody can begin to run its campaign.
-fn clean(place: &Place, campaign: Option<&Path>) -> Result<Removed, Failure> {
+fn clean(place: &ShmDir, campaign: Option<&Path>) -> Result<Removed, Failure> {
     // Where the directory is gone there is no campaign left to run.
     let campaign = campaign.filter(|directory| directory.is_dir());
     let _lock = campaign.map(|directory| CampaignLock::acquire(directory, "calmwalk clean")).transpose()?;
     place.remove().map_err(|error| match error {
         // Its directory may not be visible here, or may have been renamed.
-        PlaceError::InUse { .. } => Failure::input(error),
+        ShmDirError::InUse { .. } => Failure::input(error),
         error => Failure::failed(error),
     })
 }

@@ -13,7 +13,7 @@ pub struct Keep {}
 
 impl Keep {
     pub fn run(self) -> Result<Ended, Failure> {
-        launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
+        launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
         keep().map_err(Failure::failed)?;
         Ok(Ended::Done)
     }

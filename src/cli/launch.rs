@@ -8,7 +8,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use orchestrator::slurm::{JobNames, Phase, Plan, Slurm, SlurmError, Wanted, plan};
+use orchestrator::slurm::{DesiredJobs, JobNames, Phase, Plan, Slurm, SlurmError, plan};
 use store::Location;
 
 use self::order::Order;
@@ -104,7 +104,7 @@ impl Launch {
     pub fn run(self) -> Result<Ended, Failure> {
         let System::Slurm = self.on;
         let directory = self.directory()?;
-        let slurm = Slurm::with_patience(PATIENCE);
+        let slurm = Slurm::with_timeout(PATIENCE);
         if self.stop {
             let config = Config::load(&self.config)?.config;
             let names = job_names(&config.location(&directory)?);
@@ -138,7 +138,7 @@ impl Launch {
         })
     }
 
-    fn wanted(&self, location: &Location) -> Wanted {
+    fn wanted(&self, location: &Location) -> DesiredJobs {
         let mut labellers = self.labellers;
         if let Location::Directory(_) = location
             && labellers > 0
@@ -150,7 +150,7 @@ impl Launch {
             );
             labellers = 0;
         }
-        Wanted { agents: self.agents.unwrap_or(0), walkers: self.walkers, labellers }
+        DesiredJobs { agents: self.agents.unwrap_or(0), walkers: self.walkers, labellers }
     }
 
     async fn launch(
@@ -158,7 +158,7 @@ impl Launch {
         slurm: &Slurm,
         names: &JobNames,
         order: &Order,
-        wanted: Wanted,
+        wanted: DesiredJobs,
     ) -> Result<(), Failure> {
         let jobs = |error: SlurmError| match self.dry_run && error.is_missing() {
             true => Ok(Vec::new()),

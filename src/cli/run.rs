@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
-use orchestrator::selector::{Selector, Snapshot};
+use orchestrator::selector::{Selector, SelectorSnapshot};
 use serde_json::json;
 use store::{DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
@@ -87,7 +87,7 @@ impl Run {
         make(&directory)?;
         let listen = self.listen.map(|endpoint| actors::Listen {
             endpoint,
-            tls: self.tls.as_deref().map(Tls::in_directory),
+            tls: self.tls.as_deref().map(Tls::from_directory),
             announce: self.announce,
             host: self.host.unwrap_or_else(store::this_host),
         });
@@ -171,7 +171,7 @@ async fn run(
     let work = async {
         if used_up.is_some() {
             // Nothing may be begun.
-            return Ok(reactor::Ended::Stopped);
+            return Ok(reactor::RunOutcome::Stopped);
         }
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };
@@ -300,19 +300,19 @@ async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
 }
 
 /// Gives back what is held, at an end in order.
-async fn leave(store: &Store, process: &ProcessRecord, ended: reactor::Ended) -> Result<(), StoreError> {
+async fn leave(store: &Store, process: &ProcessRecord, ended: reactor::RunOutcome) -> Result<(), StoreError> {
     let now = unix_milliseconds();
     store.release_all(&process.id, now).await?;
     store.remove_process(&process.id).await?;
     let how = match ended {
-        reactor::Ended::Done => "done",
-        reactor::Ended::Stopped => "stopped",
+        reactor::RunOutcome::Finished => "done",
+        reactor::RunOutcome::Stopped => "stopped",
     };
     store.log_operation(now, "ended", &json!({ "process": process.id, "how": how })).await
 }
 
 async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, Failure> {
-    let snapshot = Snapshot {
+    let snapshot = SelectorSnapshot {
         walks: store.load_walks().await?,
         components: store.load_components().await?,
         known: store.known_hashes().await?,
@@ -329,7 +329,7 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
         snapshot,
     )
     .map_err(Failure::failed)?;
-    let begun = selector.begin_walks();
+    let begun = selector.start_walks();
     if !begun.decisions.is_empty() {
         store.commit(&begun).await?;
     }

@@ -8,7 +8,7 @@ use axum::extract::State;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use orchestrator::supervisor::{ChildStatus, Standing};
+use orchestrator::supervisor::{ChildState, ChildStatus};
 use workers::agent::Numbers;
 
 use super::exposition::{CONTENT_TYPE, Text};
@@ -48,7 +48,7 @@ fn text(numbers: &Numbers, walkers: &[ChildStatus]) -> String {
 
 fn of_walkers(text: &mut Text, numbers: &Numbers, walkers: &[ChildStatus]) {
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
-    walkers.iter().for_each(|walker| *states.entry(state(walker.standing)).or_default() += 1);
+    walkers.iter().for_each(|walker| *states.entry(state(walker.state)).or_default() += 1);
     let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
     let samples: Vec<_> =
         labels.iter().zip(states.values()).map(|(labels, count)| (&labels[..], *count as f64)).collect();
@@ -120,13 +120,13 @@ fn gauge(text: &mut Text, name: &str, help: &str, value: Option<f64>) {
     }
 }
 
-fn state(standing: Standing) -> &'static str {
+fn state(standing: ChildState) -> &'static str {
     match standing {
-        Standing::Starting => "starting",
-        Standing::Running => "running",
-        Standing::Pausing { .. } => "pausing",
-        Standing::Ending => "ending",
-        Standing::GoneHome => "gone_home",
-        Standing::GivenUp => "given_up",
+        ChildState::Starting => "starting",
+        ChildState::Running => "running",
+        ChildState::BackingOff { .. } => "pausing",
+        ChildState::Stopping => "ending",
+        ChildState::Exited => "gone_home",
+        ChildState::Failed => "given_up",
     }
 }

@@ -5,7 +5,7 @@ use std::fmt;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
-use wire::messages::{Decline, Progress};
+use wire::messages::{DeclineReason, Progress};
 use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 /// What a campaign is, as written when it is begun.
@@ -53,7 +53,7 @@ pub enum Fate {
     /// In the data set, with a label job.
     Accepted,
     /// Not taken.
-    Declined(Decline),
+    Declined(DeclineReason),
 }
 
 impl Fate {

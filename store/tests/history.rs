@@ -1,7 +1,7 @@
 //! What is told of one candidate: found by number, name or the beginning of it, with what stands around it.
 
 use store::{Commit, Covered, Fate, JobState, Named, Standing, StoreError};
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 use wire::{Origin, WalkId};
 
 use crate::common::*;
@@ -11,11 +11,11 @@ async fn a_candidate_is_found_with_what_stands_around_it() {
     let home = Home::new();
     let store = home.create().await.by_the_callers_clock();
     // Their walkers saw version 3; after the decisions there are as many versions as steps.
-    let covered = Fate::Declined(Decline::Covered);
+    let covered = Fate::Declined(DeclineReason::Covered);
     let records = [
         candidate(0, 4, Origin::Biased, Fate::Accepted),
         candidate(1, 5, Origin::Biased, covered),
-        candidate(1, 6, Origin::Biased, Fate::Declined(Decline::Guard)),
+        candidate(1, 6, Origin::Biased, Fate::Declined(DeclineReason::Guard)),
         candidate(11, 7, Origin::Biased, covered),
     ];
     let named = |k: usize| Named { decision: k as i64 + 1, candidate: name_of(&records[k]) };

@@ -16,8 +16,8 @@ use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use wire::WalkId;
 use wire::messages::{Progress, Report};
-use wire::net::{Joined, Parted, Slot, Told, Uplink};
-use wire::transport::{Incoming, Work};
+use wire::net::{AgentClient, LinkError, Membership, Slot, SlotReport};
+use wire::transport::{Incoming, WorkItem};
 
 pub use self::numbers::{Numbers, Turns};
 use self::pool::Pool;
@@ -59,9 +59,9 @@ pub enum News {
 /// Deals turns.
 pub struct Agent {
     /// The line to the orchestrator.
-    pub uplink: Arc<Uplink>,
+    pub uplink: Arc<AgentClient>,
     /// The place that it has been given there.
-    pub joined: Joined,
+    pub joined: Membership,
     /// What comes from the walkers of this host.
     pub incoming: mpsc::Receiver<Incoming>,
     /// Set from outside: walkers are sent home with their turns where they stand.
@@ -73,15 +73,15 @@ pub struct Agent {
 }
 
 /// What an exchange about a slot came to.
-type Exchanged = (Slot, Told, Result<Option<Work>, Parted>);
+type Exchanged = (Slot, SlotReport, Result<Option<WorkItem>, LinkError>);
 
 /// The answer to the question whether to stop, and how long it took.
-type Asked = (Result<Option<bool>, Parted>, Duration);
+type Asked = (Result<Option<bool>, LinkError>, Duration);
 
 /// What an agent has to say and to ask.
 struct Desk {
-    uplink: Arc<Uplink>,
-    joined: Arc<Joined>,
+    uplink: Arc<AgentClient>,
+    joined: Arc<Membership>,
     pool: Pool,
     asking: FuturesUnordered<BoxFuture<'static, Exchanged>>,
     /// Those of them that deliver something.
@@ -89,9 +89,9 @@ struct Desk {
     /// Whether the orchestrator wants its agents to stop.
     question: Option<BoxFuture<'static, Asked>>,
     /// A new place, when this one has been lost …
-    joining: Option<BoxFuture<'static, Result<Joined, Parted>>>,
+    joining: Option<BoxFuture<'static, Result<Membership, LinkError>>>,
     /// … which is taken when all that was asked from the old one has been answered.
-    next_place: Option<Joined>,
+    next_place: Option<Membership>,
     /// When the orchestrator was last heard.
     heard: Instant,
     numbers: Arc<Mutex<Numbers>>,
@@ -106,10 +106,10 @@ impl Agent {
     ///
     /// # Errors
     /// The orchestrator is silent, or it and this program do not understand each other.
-    pub async fn run(mut self, mut watch: impl FnMut(News)) -> Result<Ended, Parted> {
+    pub async fn run(mut self, mut watch: impl FnMut(News)) -> Result<Ended, LinkError> {
         let slots = self.joined.slots();
         let uplink = Arc::clone(&self.uplink);
-        let mut over = pin!(uplink.address().over());
+        let mut over = pin!(uplink.address().wait_until_over());
         let mut desk = Desk::new(self.uplink, self.joined, self.numbers);
         desk.numbers().mixture_version = Some(desk.joined.newest().await.version());
         desk.begin(slots);
@@ -164,7 +164,7 @@ async fn answered<T>(question: &mut Option<BoxFuture<'static, T>>) -> T {
 }
 
 impl Desk {
-    fn new(uplink: Arc<Uplink>, joined: Joined, numbers: Arc<Mutex<Numbers>>) -> Self {
+    fn new(uplink: Arc<AgentClient>, joined: Membership, numbers: Arc<Mutex<Numbers>>) -> Self {
         Self {
             uplink,
             joined: Arc::new(joined),
@@ -200,8 +200,8 @@ impl Desk {
     }
 
     /// Begins to deliver what came of a slot's turn, and to ask for the next.
-    fn exchange(&mut self, mut slot: Slot, told: Told) {
-        self.telling += usize::from(!matches!(told, Told::Nothing));
+    fn exchange(&mut self, mut slot: Slot, told: SlotReport) {
+        self.telling += usize::from(!matches!(told, SlotReport::Empty));
         let joined = Arc::clone(&self.joined);
         self.asking.push(Box::pin(async move {
             let result = slot.exchange(&joined, &told).await;
@@ -216,13 +216,13 @@ impl Desk {
                 self.news(walk, progress);
                 None
             }
-            Incoming::Free { walker, report, reply } => {
+            Incoming::Idle { walker, report, reply } => {
                 if let Some(Report { walk, progress, .. }) = &report {
                     self.numbers().at(*walk, progress);
                 }
                 self.pool.free(walker, report, reply)
             }
-            Incoming::Gone { walker, fault } => self.pool.gone(walker, fault),
+            Incoming::Lost { walker, crashed } => self.pool.gone(walker, crashed),
         };
         if let Some((slot, told)) = next {
             self.exchange(slot, told);
@@ -241,9 +241,9 @@ impl Desk {
         self.telling + self.pool.untold()
     }
 
-    fn exchanged(&mut self, (slot, told, result): Exchanged) -> Result<(), Parted> {
+    fn exchanged(&mut self, (slot, told, result): Exchanged) -> Result<(), LinkError> {
         self.hear();
-        self.telling -= usize::from(!matches!(told, Told::Nothing));
+        self.telling -= usize::from(!matches!(told, SlotReport::Empty));
         if result.is_ok() {
             self.numbers().told(&told);
         }
@@ -253,7 +253,7 @@ impl Desk {
                 self.pool.turn(slot, work);
             }
             Ok(None) => self.pool.sent_home(),
-            Err(Parted::Stranger(_)) => {
+            Err(LinkError::RejoinRequired(_)) => {
                 self.pool.keep(told);
                 self.join_anew();
             }
@@ -272,7 +272,7 @@ impl Desk {
         }
     }
 
-    fn has_joined(&mut self, joined: Joined) {
+    fn has_joined(&mut self, joined: Membership) {
         self.next_place = Some(joined);
         self.take_next_place();
     }
@@ -290,10 +290,10 @@ impl Desk {
 
     /// Asks whether to stop, unless the orchestrator has been silent for so long that it is of no use. Returns what is new
     /// of its silence.
-    fn look(&mut self, patience: Duration) -> Result<Option<News>, Parted> {
+    fn look(&mut self, patience: Duration) -> Result<Option<News>, LinkError> {
         let silence = self.heard.elapsed();
         if silence > patience {
-            return Err(Parted::Silence { minutes: patience.as_secs_f64() / 60.0 });
+            return Err(LinkError::Timeout { minutes: patience.as_secs_f64() / 60.0 });
         }
         let joined = Arc::clone(&self.joined);
         self.question.get_or_insert_with(|| {
@@ -307,10 +307,14 @@ impl Desk {
         Ok(if now.is_none() { before.map(|_| News::Back) } else { now.filter(|_| now != before) })
     }
 
-    fn is_to_stop(&mut self, told: Result<Option<bool>, Parted>, took: Duration) -> Result<bool, Parted> {
+    fn is_to_stop(
+        &mut self,
+        told: Result<Option<bool>, LinkError>,
+        took: Duration,
+    ) -> Result<bool, LinkError> {
         match told {
             Ok(None) => return Ok(false),
-            Err(Parted::Stranger(_)) => self.join_anew(),
+            Err(LinkError::RejoinRequired(_)) => self.join_anew(),
             Err(parted) => return Err(parted),
             Ok(Some(_)) => {}
         }
@@ -336,7 +340,7 @@ impl Desk {
     async fn last_words(&mut self) {
         while self.telling > 0 {
             let Some((_, told, _)) = self.asking.next().await else { return };
-            self.telling -= usize::from(!matches!(told, Told::Nothing));
+            self.telling -= usize::from(!matches!(told, SlotReport::Empty));
         }
     }
 }

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use tracing::debug;
 use wire::Candidate;
-use wire::messages::{End, Outcome, Progress, Report};
-use wire::transport::{Transport, Work};
+use wire::messages::{Outcome, Progress, Report, WalkEnd};
+use wire::transport::{Transport, WorkItem};
 
 use crate::walk::{WalkContext, advance};
 
@@ -40,7 +40,7 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) -> Ended {
     Ended::SentHome
 }
 
-fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report<Candidate> {
+fn work_on(context: &WalkContext, work: &WorkItem, transport: &impl Transport) -> Report<Candidate> {
     let walk = work.assignment.walk;
     let stopping = || transport.stopping();
     let last = Cell::new(Instant::now());
@@ -54,24 +54,24 @@ fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Re
 }
 
 /// Says in the log what came of a turn.
-fn tell(work: &Work, made: &Report<Candidate>, time: Duration) {
-    let (walk, turn, seconds) = (made.walk.0, made.turn, time.as_secs_f64());
+fn tell(work: &WorkItem, made: &Report<Candidate>, time: Duration) {
+    let (walk, turn, seconds) = (made.walk.0, made.assignment, time.as_secs_f64());
     let Progress { step, gamma_max, .. } = made.progress;
     let version = work.mixture.version();
     let outcome = match &made.outcome {
         Outcome::Candidate(_) => "candidate",
-        Outcome::Turn => "turn",
-        Outcome::Paused => "paused",
+        Outcome::StepsDone => "turn",
+        Outcome::Interrupted => "paused",
         Outcome::Ended(_) => "ended",
     };
     debug!(walk, turn, step, gamma_max, mixture_version = version, seconds, outcome, "made a turn");
 }
 
-fn crashed(work: &Work) -> Report<Candidate> {
-    let end = End::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
+fn crashed(work: &WorkItem) -> Report<Candidate> {
+    let end = WalkEnd::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
     Report {
         walk: work.assignment.walk,
-        turn: work.assignment.turn,
+        assignment: work.assignment.number,
         outcome: Outcome::Ended(end),
         checkpoint: work.assignment.checkpoint.clone().unwrap_or_default(),
         progress: Progress::default(),

@@ -16,11 +16,11 @@ use std::time::{Duration, Instant};
 use atoms::{Cell, Species, Structure};
 use calm::{Component, Mixture};
 use tokio::sync::mpsc;
-use wire::ipc::{Door, IpcWalker, Server, Sizes, space_needed};
+use wire::ipc::{ConnectInfo, IpcWalker, Server, Sizes, space_needed};
 use wire::messages::{Assignment, Outcome, Progress, Report};
 use wire::mixture::SharedMixture;
-use wire::place::Place;
-use wire::transport::{Incoming, Transport, Work};
+use wire::shm_dir::ShmDir;
+use wire::transport::{Incoming, Transport, WorkItem};
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
 const DOOR: &str = "CALMWALK_BENCH_DOOR";
@@ -89,9 +89,9 @@ fn bare_wake_ups() {
 }
 
 /// The walker's process: all sizes one after the other.
-fn walk(door: &Door) {
+fn walk(door: &ConnectInfo) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
-    let mut checked = walker.exchange(None).expect("a turn").assignment.turn;
+    let mut checked = walker.exchange(None).expect("a turn").assignment.number;
     println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
     for (atoms, features) in SIZES {
         let candidate = candidate(atoms, features);
@@ -100,13 +100,13 @@ fn walk(door: &Door) {
             let outcome = Outcome::Candidate(candidate.clone());
             let checkpoint = vec![0; CHECKPOINT];
             let progress = Progress::default();
-            let report = Report { walk: WalkId(0), turn: trip as u64, outcome, checkpoint, progress };
+            let report = Report { walk: WalkId(0), assignment: trip as u64, outcome, checkpoint, progress };
             let (begin, encoding) = (Instant::now(), walker.encoding());
             let work = walker.exchange(Some(report)).expect("a turn");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);
             // The server's clock comes with the turn.
             let check = Duration::from_nanos(
-                work.assignment.turn - std::mem::replace(&mut checked, work.assignment.turn),
+                work.assignment.number - std::mem::replace(&mut checked, work.assignment.number),
             );
             if trip >= WARM_UP {
                 times.push([whole, encode, check, whole.saturating_sub(encode + check)]);
@@ -137,32 +137,32 @@ fn quantiles(mut times: Vec<Duration>) -> (f64, f64) {
 async fn orchestrate() {
     tokio::task::spawn_blocking(bare_wake_ups).await.expect("a measurement");
     let directory = tempfile::tempdir().expect("a directory");
-    let place = Place::of(directory.path()).expect("a place");
+    let place = ShmDir::for_campaign(directory.path()).expect("a place");
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
     let prepared = place.prepare(space_needed(&sizes)).expect("enough shared memory");
     let mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
     let server = Server::open(&place, sizes, 1).expect("a transport");
     let handle = server.handle();
     handle.expect(0, 1);
-    let door = serde_json::to_string(&handle.door(0, 1)).expect("plain data");
+    let door = serde_json::to_string(&handle.connect_info(0, 1)).expect("plain data");
     let (to_reactor, mut incoming) = mpsc::channel(64);
     let running = tokio::spawn(server.run(mixtures, to_reactor, |_, _| {}));
     let clock = handle.clone();
     let deciding = tokio::spawn(async move {
         let mixture = Arc::new(mixture());
         while let Some(incoming) = incoming.recv().await {
-            if let Incoming::Free { report, reply, .. } = incoming {
+            if let Incoming::Idle { report, reply, .. } = incoming {
                 drop(report);
                 let checking = clock.traffic().checking.as_nanos() as u64;
                 let _ = reply
-                    .send(Some(Work { assignment: assignment(checking), mixture: Arc::clone(&mixture) }));
+                    .send(Some(WorkItem { assignment: assignment(checking), mixture: Arc::clone(&mixture) }));
             }
         }
     });
     let this = std::env::current_exe().expect("this program");
     let mut walker = Command::new(this).env(DOOR, door).stdin(Stdio::null()).spawn().expect("a process");
     tokio::task::spawn_blocking(move || walker.wait()).await.expect("a wait").expect("a process");
-    handle.gone(0, 1, false);
+    handle.lost(0, 1, false);
     handle.close();
     running.await.expect("a task").expect("a transport");
     deciding.await.expect("a task");
@@ -182,22 +182,22 @@ fn assignment(turn: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([7; 16]),
         walk: WalkId(0),
-        turn,
+        number: turn,
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure: structure(108),
         checkpoint: Some(vec![1; CHECKPOINT]),
         verdict: None,
-        until: 1000,
-        wanted: Vec::new(),
-        raised: 1.0,
+        last_step: 1000,
+        frame_steps: Vec::new(),
+        threshold_factor: 1.0,
     }
 }
 
 fn candidate(atoms: usize, features: usize) -> Candidate {
     let structure = structure(atoms);
     let numbers = |count: usize| (0..count).map(|k| (k as f64).sin()).collect();
-    let content = ContentHash::of(&structure);
+    let content = ContentHash::from_structure(&structure);
     Candidate {
         id: CandidateId { campaign: CampaignId([7; 16]), walk: WalkId(0), segment: 0, step: 1, content },
         origin: Origin::Biased,

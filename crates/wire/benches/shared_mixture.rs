@@ -221,7 +221,7 @@ fn start(path: &Path, number: u32) -> Child {
     command.spawn().expect("a process")
 }
 
-/// End of the evaluation, time of the pin, time of the evaluation, ns.
+/// WalkEnd of the evaluation, time of the pin, time of the evaluation, ns.
 fn answer(reader: &mut Child) -> [u64; 3] {
     let mut bytes = [[0; 8]; 3];
     let pipe = reader.stdout.as_mut().expect("piped");

@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 use zerocopy::IntoBytes;
 
-use layout::{Counts, HEADER, Header, VERSION, length, seal};
+use layout::{Counts, HEADER, Header, VERSION, length, write_checksum};
 
 pub use candidate::Candidate;
 pub use view::CandidateView;
@@ -77,7 +77,7 @@ pub struct CandidateBlock {
 }
 
 /// Memory of this process, aligned to 8.
-struct Words(Vec<u64>);
+struct AlignedBytes(Vec<u64>);
 
 impl CandidateBlock {
     /// Encodes a candidate into memory of this process.
@@ -88,7 +88,7 @@ impl CandidateBlock {
         let mut words = vec![0_u64; candidate.encoded_len() / 8];
         candidate.encode_into(words.as_mut_bytes());
         let counts = Counts { atoms: candidate.structure.len(), features: candidate.feature_dimension() };
-        Self { owner: Arc::new(Words(words)), counts }
+        Self { owner: Arc::new(AlignedBytes(words)), counts }
     }
 
     /// Checks a block where it stands and keeps its owner, copying nothing. The bytes must not change any more.
@@ -106,7 +106,7 @@ impl CandidateBlock {
         let (copy, _) = words.as_mut_bytes().split_at_mut(bytes.len());
         copy.copy_from_slice(bytes);
         let counts = CandidateView::new(copy)?.counts;
-        Ok(Self { owner: Arc::new(Words(words)), counts })
+        Ok(Self { owner: Arc::new(AlignedBytes(words)), counts })
     }
 
     /// The bytes, 8-byte aligned.
@@ -141,8 +141,8 @@ impl CandidateBlock {
         place.copy_from_slice(features.as_bytes());
         let header = Header { length, features: counts.features as u64, ..header.clone() };
         bytes[..HEADER].copy_from_slice(header.as_bytes());
-        seal(bytes);
-        Ok(Self { owner: Arc::new(Words(words)), counts })
+        write_checksum(bytes);
+        Ok(Self { owner: Arc::new(AlignedBytes(words)), counts })
     }
 
     /// The same block without its features, for a store that keeps those apart.
@@ -151,7 +151,7 @@ impl CandidateBlock {
     }
 }
 
-impl AsRef<[u8]> for Words {
+impl AsRef<[u8]> for AlignedBytes {
     fn as_ref(&self) -> &[u8] {
         self.0.as_bytes()
     }

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::block::CandidateBlock;
 use crate::ids::{CandidateId, Origin, WalkId};
-use crate::messages::{Assignment, End, Outcome, Progress, Report};
+use crate::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 
 const MAGIC: [u8; 4] = *b"CALM";
 const VERSION: u8 = 2;
@@ -59,20 +59,20 @@ pub(crate) enum ControlError {
         source: StructureError,
     },
     /// Wanted frames that are not in order, or of a walk that has none.
-    #[error("the {origin} walk {walk} is to give the frames of steps {wanted:?}: expected {expected}")]
-    Wanted {
+    #[error("the {origin} walk {walk} is to give the frames of steps {frame_steps:?}: expected {expected}")]
+    FrameSteps {
         /// The walk.
         walk: WalkId,
         /// Biased or control.
         origin: Origin,
         /// The steps.
-        wanted: Vec<u64>,
+        frame_steps: Vec<u64>,
         /// What they should be.
         expected: &'static str,
     },
     /// A threshold that is lowered, or none.
     #[error("walk {walk} is to multiply its threshold by {found}: expected a finite number, 1 or more")]
-    Raised {
+    ThresholdFactor {
         /// The walk.
         walk: WalkId,
         /// The factor.
@@ -90,14 +90,14 @@ pub(crate) enum ControlError {
     },
     /// A candidate that nothing names.
     #[error("{0} bytes of a candidate beside a message that names none")]
-    Beside(usize),
+    UnexpectedCandidate(usize),
 }
 
 /// A [`Report`] with the name of the candidate in its place.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct EncodedReport<'a> {
     walk: WalkId,
-    turn: u64,
+    assignment: u64,
     outcome: EncodedOutcome<'a>,
     #[serde(serialize_with = "crate::bytes::serialize")]
     checkpoint: &'a [u8],
@@ -108,9 +108,9 @@ pub(crate) struct EncodedReport<'a> {
 #[derive(Serialize, Deserialize)]
 enum EncodedOutcome<'a> {
     Candidate(CandidateId),
-    Turn,
-    Paused,
-    Ended(Cow<'a, End>),
+    StepsDone,
+    Interrupted,
+    Ended(Cow<'a, WalkEnd>),
 }
 
 impl<'a> EncodedReport<'a> {
@@ -118,31 +118,37 @@ impl<'a> EncodedReport<'a> {
     pub(crate) fn new<C>(report: &'a Report<C>, id: impl FnOnce(&C) -> CandidateId) -> Self {
         let outcome = match &report.outcome {
             Outcome::Candidate(candidate) => EncodedOutcome::Candidate(id(candidate)),
-            Outcome::Turn => EncodedOutcome::Turn,
-            Outcome::Paused => EncodedOutcome::Paused,
+            Outcome::StepsDone => EncodedOutcome::StepsDone,
+            Outcome::Interrupted => EncodedOutcome::Interrupted,
             Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),
         };
         let (checkpoint, progress) = (report.checkpoint.as_slice(), Cow::Borrowed(&report.progress));
-        Self { walk: report.walk, turn: report.turn, outcome, checkpoint, progress }
+        Self { walk: report.walk, assignment: report.assignment, outcome, checkpoint, progress }
     }
 
     /// The report with the candidate that came beside it.
-    pub(crate) fn complete(self, candidate: Option<CandidateBlock>) -> Result<Report, ControlError> {
-        let Self { walk, turn, outcome, checkpoint, progress } = self;
+    pub(crate) fn attach_candidate(self, candidate: Option<CandidateBlock>) -> Result<Report, ControlError> {
+        let Self { walk, assignment, outcome, checkpoint, progress } = self;
         let outcome = checked_outcome(walk, outcome, candidate)?;
-        Ok(Report { walk, turn, outcome, checkpoint: checkpoint.to_vec(), progress: progress.into_owned() })
+        Ok(Report {
+            walk,
+            assignment,
+            outcome,
+            checkpoint: checkpoint.to_vec(),
+            progress: progress.into_owned(),
+        })
     }
 }
 
 /// Encodes plain data and puts the fixed part before it.
-pub(crate) fn seal(content: &impl Serialize) -> Vec<u8> {
+pub(crate) fn encode(content: &impl Serialize) -> Vec<u8> {
     let content = postcard::to_stdvec(content).expect("plain data is encoded into memory");
     let checksum = crc32fast::hash(&content).to_le_bytes();
     [MAGIC.as_slice(), &[VERSION], &checksum, &content].concat()
 }
 
 /// Checks the fixed part and decodes what is behind it.
-pub(crate) fn unseal<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, ControlError> {
+pub(crate) fn decode<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, ControlError> {
     let (message, rest) = postcard::take_from_bytes(content(bytes)?)?;
     if rest.is_empty() { Ok(message) } else { Err(ControlError::Trailing(rest.len())) }
 }
@@ -165,17 +171,18 @@ fn content(bytes: &[u8]) -> Result<&[u8], ControlError> {
 
 /// An assignment that can be worked on.
 pub(crate) fn checked_assignment(assignment: Assignment) -> Result<Assignment, ControlError> {
-    let Assignment { walk, origin, ref wanted, ref seed_structure, .. } = assignment;
+    let Assignment { walk, origin, ref frame_steps, ref seed_structure, .. } = assignment;
     seed_structure.validate().map_err(|source| ControlError::SeedStructure { walk, source })?;
-    let wrong = |expected| Err(ControlError::Wanted { walk, origin, wanted: wanted.clone(), expected });
-    if origin == Origin::Biased && !wanted.is_empty() {
+    let wrong =
+        |expected| Err(ControlError::FrameSteps { walk, origin, frame_steps: frame_steps.clone(), expected });
+    if origin == Origin::Biased && !frame_steps.is_empty() {
         return wrong("none of a biased walk");
     }
-    if !wanted.is_sorted_by(|a, b| a < b) {
+    if !frame_steps.is_sorted_by(|a, b| a < b) {
         return wrong("ascending steps");
     }
-    if !(assignment.raised.is_finite() && assignment.raised >= 1.0) {
-        return Err(ControlError::Raised { walk, found: assignment.raised });
+    if !(assignment.threshold_factor.is_finite() && assignment.threshold_factor >= 1.0) {
+        return Err(ControlError::ThresholdFactor { walk, found: assignment.threshold_factor });
     }
     Ok(assignment)
 }
@@ -186,8 +193,8 @@ fn checked_outcome(
     candidate: Option<CandidateBlock>,
 ) -> Result<Outcome, ControlError> {
     match (outcome, candidate) {
-        (EncodedOutcome::Turn, None) => Ok(Outcome::Turn),
-        (EncodedOutcome::Paused, None) => Ok(Outcome::Paused),
+        (EncodedOutcome::StepsDone, None) => Ok(Outcome::StepsDone),
+        (EncodedOutcome::Interrupted, None) => Ok(Outcome::Interrupted),
         (EncodedOutcome::Ended(end), None) => Ok(Outcome::Ended(end.into_owned())),
         (EncodedOutcome::Candidate(id), Some(block)) if id == block.view().id() && id.walk == walk => {
             Ok(Outcome::Candidate(block))

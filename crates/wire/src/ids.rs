@@ -49,7 +49,7 @@ pub struct ContentHash(pub [u8; 32]);
 
 impl ContentHash {
     /// The hash of a structure. Two structures share it only if every number has the same bits.
-    pub fn of(structure: &Structure) -> Self {
+    pub fn from_structure(structure: &Structure) -> Self {
         let mut hasher = blake3::Hasher::new();
         hasher.update(b"calmwalk structure 1");
         hasher.update(&(structure.len() as u64).to_le_bytes());

@@ -8,13 +8,13 @@ extern crate self as wire;
 pub mod block;
 mod bytes;
 mod control;
-mod exchange;
 pub mod ids;
 pub mod ipc;
 pub mod messages;
 pub mod mixture;
 pub mod net;
-pub mod place;
+mod protocol;
+pub mod shm_dir;
 pub mod transport;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};

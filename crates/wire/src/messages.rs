@@ -16,7 +16,7 @@ pub struct Assignment {
     /// The walk.
     pub walk: WalkId,
     /// Counts the turns of the walk; a report of another turn is out of date.
-    pub turn: u64,
+    pub number: u64,
     /// What kind of walk.
     pub origin: Origin,
     /// The walk whose random numbers it uses: itself, or the biased walk that a control matches.
@@ -29,11 +29,11 @@ pub struct Assignment {
     /// What became of the candidate that its last turn ended with.
     pub verdict: Option<Verdict>,
     /// Stop at this step at the latest.
-    pub until: u64,
+    pub last_step: u64,
     /// A control walk: the steps whose frames are wanted, ascending. Otherwise empty.
-    pub wanted: Vec<u64>,
+    pub frame_steps: Vec<u64>,
     /// Factor on the threshold of the collection rule: 1, or more while many structures wait for labels.
-    pub raised: f64,
+    pub threshold_factor: f64,
 }
 
 /// The answer to a candidate.
@@ -43,13 +43,13 @@ pub enum Verdict {
     /// Taken into the data set; the mixture covers it from now on.
     Accepted,
     /// Not taken.
-    Declined(Decline),
+    Declined(DeclineReason),
 }
 
 /// Why a candidate is not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Decline {
+pub enum DeclineReason {
     /// The newest mixture covers it: another walk found its like meanwhile.
     Covered,
     /// The very same structure is known already.
@@ -62,7 +62,7 @@ pub enum Decline {
     Backlog,
 }
 
-impl Decline {
+impl DeclineReason {
     /// Every reason, in the order of summaries.
     pub const ALL: [Self; 5] = [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget, Self::Backlog];
 
@@ -85,17 +85,17 @@ pub enum Outcome<C = CandidateBlock> {
     /// With a candidate (or, in a control walk, a wanted frame).
     Candidate(C),
     /// At its last step.
-    Turn,
+    StepsDone,
     /// Before that, because the process was asked to stop: the same turn goes on later.
-    Paused,
+    Interrupted,
     /// The walk is over.
-    Ended(End),
+    Ended(WalkEnd),
 }
 
 /// Why a walk is over.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum End {
+pub enum WalkEnd {
     /// It made all its steps.
     Steps,
     /// Its seed structure has given as many structures as it may.
@@ -119,7 +119,7 @@ pub enum End {
     },
 }
 
-impl End {
+impl WalkEnd {
     /// `"steps"`, `"collected"`, `"budget"`, `"trapped"`, `"blew_up"`, `"bad_start"`.
     pub fn name(&self) -> &'static str {
         match self {
@@ -139,7 +139,7 @@ pub struct Report<C = CandidateBlock> {
     /// The walk.
     pub walk: WalkId,
     /// The turn it answers.
-    pub turn: u64,
+    pub assignment: u64,
     /// How it ended.
     pub outcome: Outcome<C>,
     /// The walker's state of the walk from which the next turn goes on.
@@ -153,12 +153,12 @@ impl<C> Report<C> {
     pub fn map_candidate<D>(self, form: impl FnOnce(C) -> D) -> Report<D> {
         let outcome = match self.outcome {
             Outcome::Candidate(candidate) => Outcome::Candidate(form(candidate)),
-            Outcome::Turn => Outcome::Turn,
-            Outcome::Paused => Outcome::Paused,
+            Outcome::StepsDone => Outcome::StepsDone,
+            Outcome::Interrupted => Outcome::Interrupted,
             Outcome::Ended(end) => Outcome::Ended(end),
         };
-        let Self { walk, turn, checkpoint, progress, .. } = self;
-        Report { walk, turn, outcome, checkpoint, progress }
+        let Self { walk, assignment, checkpoint, progress, .. } = self;
+        Report { walk, assignment, outcome, checkpoint, progress }
     }
 }
 

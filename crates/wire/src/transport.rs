@@ -14,7 +14,7 @@ use crate::messages::{Assignment, Progress, Report};
 
 /// A turn and the mixture that holds in it.
 #[derive(Clone, Debug)]
-pub struct Work {
+pub struct WorkItem {
     /// The turn.
     pub assignment: Assignment,
     /// The mixture, evaluated in place.
@@ -25,7 +25,7 @@ pub struct Work {
 pub trait Transport: Send {
     /// Delivers what came of the last turn (nothing at first) and waits for the next; `None` when there is
     /// no more work, or nobody to give it. A report is safe only once this has returned `Some`.
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work>;
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem>;
 
     /// Tells those who watch where a walk stands. May be lost.
     fn progress(&self, walk: WalkId, progress: Progress);
@@ -38,23 +38,23 @@ pub trait Transport: Send {
 #[derive(Debug)]
 pub enum Incoming {
     /// A walker is free.
-    Free {
+    Idle {
         /// Which walker.
         walker: u32,
         /// What came of its last turn.
         report: Option<Report>,
         /// Where its next turn goes; `None` sends it home.
-        reply: oneshot::Sender<Option<Work>>,
+        reply: oneshot::Sender<Option<WorkItem>>,
     },
     /// Where a walk stands.
     Progress(WalkId, Progress),
     /// A walker is no more, with or without a turn in hand.
-    Gone {
+    Lost {
         /// Which walker.
         walker: u32,
         /// Whether it died by its own fault, as in a crash, and was not killed from outside: the turn in its hand may do
         /// the same to the next one.
-        fault: bool,
+        crashed: bool,
     },
 }
 
@@ -74,11 +74,11 @@ impl InProcess {
 }
 
 impl Transport for InProcess {
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work> {
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem> {
         let report =
             report.map(|report| report.map_candidate(|candidate| CandidateBlock::encode(&candidate)));
         let (reply, answer) = oneshot::channel();
-        let message = Incoming::Free { walker: self.walker, report, reply };
+        let message = Incoming::Idle { walker: self.walker, report, reply };
         self.to_reactor.blocking_send(message).ok()?;
         answer.blocking_recv().ok().flatten()
     }
@@ -96,9 +96,9 @@ impl Transport for InProcess {
 /// Also when the walker's thread panics: its turn must not be waited for.
 impl Drop for InProcess {
     fn drop(&mut self) {
-        let gone = Incoming::Gone { walker: self.walker, fault: false };
-        if let Err(TrySendError::Full(gone)) = self.to_reactor.try_send(gone) {
-            let _ = self.to_reactor.blocking_send(gone);
+        let lost = Incoming::Lost { walker: self.walker, crashed: false };
+        if let Err(TrySendError::Full(lost)) = self.to_reactor.try_send(lost) {
+            let _ = self.to_reactor.blocking_send(lost);
         }
     }
 }

@@ -25,8 +25,8 @@ proptest! {
     /// Any one number of a structure changes its hash; nothing else does.
     #[test]
     fn a_hash_tells_structures_apart(structure in usable_structure(), at in any::<prop::sample::Index>()) {
-        let hash = ContentHash::of(&structure);
-        prop_assert_eq!(ContentHash::of(&structure.clone()), hash);
+        let hash = ContentHash::from_structure(&structure);
+        prop_assert_eq!(ContentHash::from_structure(&structure.clone()), hash);
         let mut others = vec![structure.clone(); 4];
         let x = &mut others[0].positions.as_flattened_mut()[at.index(3 * structure.len())];
         *x = f64::from_bits(x.to_bits() ^ 1);
@@ -35,7 +35,7 @@ proptest! {
         let species = &mut others[3].species[at.index(structure.len())];
         *species = atoms::Species::from_atomic_number(species.atomic_number() % 118 + 1).unwrap();
         for other in others {
-            prop_assert_ne!(ContentHash::of(&other), hash);
+            prop_assert_ne!(ContentHash::from_structure(&other), hash);
         }
     }
 }

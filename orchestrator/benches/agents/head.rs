@@ -10,7 +10,7 @@ use orchestrator::selector::Settings;
 use store::Fate;
 use tokio::sync::mpsc;
 use tokio::time::{interval, sleep};
-use wire::net::{Hub, Welcome};
+use wire::net::{AgentBootstrap, AgentServer};
 
 use crate::database::Database;
 use crate::recording::Model;
@@ -36,8 +36,8 @@ pub async fn lead(plan: Plan) {
     let settings = Settings { declined_feature_bytes: 0, ..campaign::settings(1.5) };
     let mut selector = campaign::selector(&model, WALKERS, &settings);
     let store = campaign::create_store(room.location, WALKERS).await;
-    store.commit(&selector.begin_walks()).await.unwrap();
-    let hub = Hub::open(&endpoint(plan), None, 1, PATIENCE, Welcome::default()).await.unwrap();
+    store.commit(&selector.start_walks()).await.unwrap();
+    let hub = AgentServer::open(&endpoint(plan), None, 1, PATIENCE, AgentBootstrap::default()).await.unwrap();
     let (handle, stopping) = (hub.handle(), Arc::new(AtomicBool::new(false)));
     // As in `calmwalk run`.
     let (to_reactor, incoming) = mpsc::channel(64);

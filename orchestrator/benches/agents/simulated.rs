@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use tokio::time::{Instant, sleep};
 use wire::messages::Assignment;
 use wire::mixture::SharedMixture;
-use wire::net::{Address, Agent, Joined, Slot, Told, Uplink};
+use wire::net::{Address, Agent, AgentClient, Membership, Slot, SlotReport};
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash};
 
 use crate::random::Random;
@@ -34,7 +34,7 @@ pub struct Seen {
 
 /// A host.
 struct Host {
-    joined: Joined,
+    joined: Membership,
     shared: Mutex<(SharedMixture, Vec<(u64, f64)>)>,
 }
 
@@ -77,10 +77,10 @@ impl Host {
             pid: std::process::id(),
             program_version: "bench".into(),
             walkers,
-            ahead: 0,
+            prefetch: 0,
         };
-        let address = Address::At(endpoint(plan));
-        let uplink = Uplink::open(&address, None, agent, |why| eprintln!("waiting: {why}")).await;
+        let address = Address::Endpoint(endpoint(plan));
+        let uplink = AgentClient::open(&address, None, agent, |why| eprintln!("waiting: {why}")).await;
         let joined = Arc::new(uplink.unwrap()).join().await.unwrap();
         let newest = joined.newest().await;
         let shared = SharedMixture::create(&directory.join(number.to_string()), &newest, walkers).unwrap();
@@ -108,7 +108,7 @@ struct Walker {
 impl Walker {
     /// Offers until it is sent home. When it offered, and how long it waited, s.
     async fn work(mut self, mut slot: Slot, plan: Plan) -> Vec<(f64, f64)> {
-        let (mut told, mut waits) = (Told::Nothing, Vec::new());
+        let (mut told, mut waits) = (SlotReport::Empty, Vec::new());
         loop {
             let (offered, begun) = (now(), Instant::now());
             let work = slot.exchange(&self.host.joined, &told).await.unwrap();
@@ -118,18 +118,21 @@ impl Walker {
             let walk = if plan.rate > 0.0 { WALKERS as f64 / plan.rate } else { 0.0 };
             sleep(Duration::from_secs_f64(walk * (0.5 + self.random.uniform()))).await;
             let candidate = self.candidate(&work.assignment, &work.mixture);
-            told = Told::Report(campaign::report(&work.assignment, Some(CandidateBlock::encode(&candidate))));
+            told = SlotReport::Report(campaign::report(
+                &work.assignment,
+                Some(CandidateBlock::encode(&candidate)),
+            ));
         }
     }
 
     /// One that was recorded, moved a little as a whole, so that it is no duplicate.
     fn candidate(&mut self, assignment: &Assignment, mixture: &Mixture) -> Candidate {
-        let (walk, turn) = (u64::from(assignment.walk.0), assignment.turn);
+        let (walk, turn) = (u64::from(assignment.walk.0), assignment.number);
         let mut candidate = self.recorded[(walk + turn) as usize % RECORDED].clone();
         let shift = 1e-9 * (walk + WALKERS as u64 * turn) as f64;
         candidate.structure.positions.iter_mut().for_each(|position| position[0] += shift);
         let step = progress(turn).step;
-        let content = ContentHash::of(&candidate.structure);
+        let content = ContentHash::from_structure(&candidate.structure);
         candidate.id = CandidateId { walk: assignment.walk, step, content, ..candidate.id };
         candidate.mixture_version = mixture.version();
         if (walk + turn).is_multiple_of(NEW) {

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use atoms::{Cell, Structure};
 use database::Database;
-use orchestrator::selector::{Next, Selector, Snapshot};
+use orchestrator::selector::{Scheduling, Selector, SelectorSnapshot};
 use recording::{CAMPAIGN, Model, crystal};
 use store::{
     AtomGrades, CandidateRecord, Commit, ComponentRecord, Decision, Fate, JobState, Label, Location, Store,
@@ -56,7 +56,7 @@ async fn fill(model: &Model, location: Location, decisions: usize) -> Duration {
     for first in (0..decisions).step_by(GROUP) {
         store.commit(&group(first..(first + GROUP).min(decisions))).await.unwrap();
     }
-    let mut walks = campaign::selector(model, WALKS, &campaign::settings(1.5)).begin_walks();
+    let mut walks = campaign::selector(model, WALKS, &campaign::settings(1.5)).start_walks();
     for walk in &mut walks.walks {
         walk.checkpoint = Some(vec![1; campaign::CHECKPOINT]);
         walk.accepted = (decisions / WALKS) as u32;
@@ -95,7 +95,7 @@ fn record(number: usize) -> CandidateRecord {
         walk: WalkId((number % WALKS) as u32),
         segment: 0,
         step: (number / WALKS) as u64,
-        content: ContentHash::of(&structure),
+        content: ContentHash::from_structure(&structure),
     };
     let block = CandidateBlock::encode(&Candidate {
         id,
@@ -126,7 +126,7 @@ fn record(number: usize) -> CandidateRecord {
 async fn recover(model: &Model, location: Location) {
     let begun = Instant::now();
     let store = Store::open(location).await.unwrap();
-    let snapshot = Snapshot {
+    let snapshot = SelectorSnapshot {
         walks: store.load_walks().await.unwrap(),
         components: store.load_components().await.unwrap(),
         known: store.known_hashes().await.unwrap(),
@@ -139,8 +139,8 @@ async fn recover(model: &Model, location: Location) {
     let settings = campaign::settings(1.5);
     let mut selector =
         Selector::restore(settings, CAMPAIGN, seeds, grader, original, training, snapshot).unwrap();
-    selector.begin_walks();
-    assert!(matches!(selector.next_turn(), Next::Turn(_)));
+    selector.start_walks();
+    assert!(matches!(selector.next_assignment(), Scheduling::Assign(_)));
     println!("  gone on after {:.2} s", begun.elapsed().as_secs_f64());
     store.close().await;
 }

@@ -7,10 +7,10 @@ use calm::rules::Positive;
 use calm::watch::ForgettingAlarm;
 use calm::{CollectionRule, Combination, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
-use orchestrator::selector::{Mode, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
+use orchestrator::selector::{Mode, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use store::{Campaign, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
-use wire::messages::{Assignment, End, Outcome, Report};
+use wire::messages::{Assignment, Outcome, Report, WalkEnd};
 use wire::transport::Incoming;
 use wire::{CandidateBlock, ContentHash};
 
@@ -27,7 +27,7 @@ pub fn settings(threshold: f64) -> Settings {
     Settings {
         mode: Mode::Live,
         walks_per_round: 1,
-        turn_steps: 1000,
+        steps_per_assignment: 1000,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
             combination: Combination::Convex,
@@ -36,10 +36,10 @@ pub fn settings(threshold: f64) -> Settings {
         },
         forgetting_alarm: ForgettingAlarm::default(),
         collection: CollectionRule::MaximumGrade { threshold: positive(threshold) },
-        per_seed: u32::MAX,
-        total: None,
+        max_per_seed_structure: u32::MAX,
+        max_structures: None,
         control: false,
-        least_distance: (1.2, 0.75),
+        min_distance: (1.2, 0.75),
         declined_feature_bytes: 1_000_000_000,
     }
 }
@@ -49,8 +49,16 @@ pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
     let seeds = seeds(walks);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
     let training = Some(model.training.clone());
-    Selector::restore(settings.clone(), CAMPAIGN, seeds, grader, original, training, Snapshot::default())
-        .unwrap()
+    Selector::restore(
+        settings.clone(),
+        CAMPAIGN,
+        seeds,
+        grader,
+        original,
+        training,
+        SelectorSnapshot::default(),
+    )
+    .unwrap()
 }
 
 /// Where walks start.
@@ -85,13 +93,13 @@ pub async fn create_store(location: Location, walks: usize) -> Store {
 /// What a walk offers next, or its end.
 pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Report {
     let mut checkpoint = vec![0; CHECKPOINT];
-    checkpoint[..8].copy_from_slice(&assignment.turn.to_le_bytes());
+    checkpoint[..8].copy_from_slice(&assignment.number.to_le_bytes());
     Report {
         walk: assignment.walk,
-        turn: assignment.turn,
-        outcome: block.map_or(Outcome::Ended(End::Steps), Outcome::Candidate),
+        assignment: assignment.number,
+        outcome: block.map_or(Outcome::Ended(WalkEnd::Steps), Outcome::Candidate),
         checkpoint,
-        progress: progress(assignment.turn),
+        progress: progress(assignment.number),
     }
 }
 
@@ -117,7 +125,7 @@ pub async fn run(
     let walks = recording.len();
     let store = create_store(location, walks).await;
     let mut selector = selector(model, walks, settings);
-    store.commit(&selector.begin_walks()).await.unwrap();
+    store.commit(&selector.start_walks()).await.unwrap();
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let reactor =
         Reactor { selector, store: store.clone(), incoming, stopping: Arc::default(), queue_limit: u64::MAX };
@@ -151,7 +159,7 @@ async fn walk(
     let mut next = None;
     loop {
         let (reply, answer) = oneshot::channel();
-        to_reactor.send(Incoming::Free { walker, report: next.take(), reply }).await.unwrap();
+        to_reactor.send(Incoming::Idle { walker, report: next.take(), reply }).await.unwrap();
         let Ok(Some(work)) = answer.await else { return };
         let block = offers[work.assignment.walk.0 as usize].lock().unwrap().next();
         next = Some(report(&work.assignment, block.map(checked)));
@@ -179,7 +187,7 @@ impl Run {
             self.candidates += 1;
             match candidate.fate {
                 Fate::Accepted => self.accepted += 1,
-                Fate::Declined(wire::messages::Decline::Covered) => self.covered += 1,
+                Fate::Declined(wire::messages::DeclineReason::Covered) => self.covered += 1,
                 Fate::Declined(_) => {}
             }
         }

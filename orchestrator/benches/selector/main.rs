@@ -32,7 +32,7 @@ fn main() {
         kinds: 200,
         of_kind: 12,
         collection: campaign::settings(THRESHOLD).collection,
-        least_distance: 2.15,
+        min_distance: 2.15,
     };
     let recording = model.record(plan);
     println!("mostly covered");

@@ -45,7 +45,7 @@ pub struct Plan {
     /// When a walker takes a structure for a candidate.
     pub collection: CollectionRule,
     /// Shortest distance that the walker's guard lets pass, Å.
-    pub least_distance: f64,
+    pub min_distance: f64,
 }
 
 impl Model {
@@ -94,7 +94,7 @@ impl Model {
         let mut structure = crystal();
         displace(&mut structure, LIKENESS, &mut Random::new(number));
         let any = CollectionRule::MaximumGrade { threshold: Positive::try_from(f64::MIN_POSITIVE).unwrap() };
-        let plan = Plan { walks: 1, kinds: 1, of_kind: 1, collection: any, least_distance: 1.0 };
+        let plan = Plan { walks: 1, kinds: 1, of_kind: 1, collection: any, min_distance: 1.0 };
         let candidate = self.candidate(plan, number, structure, &mut Evaluator::new(&self.grace));
         candidate.expect("any structure is collected")
     }
@@ -125,7 +125,7 @@ impl Model {
         evaluator: &mut Evaluator,
     ) -> Option<Candidate> {
         let bonds = self.grader.bonds(&structure).unwrap();
-        if bonds.shortest < plan.least_distance {
+        if bonds.shortest < plan.min_distance {
             return None;
         }
         evaluator.forward(&structure);
@@ -142,7 +142,7 @@ impl Model {
                 walk: WalkId((number % plan.walks as u64) as u32),
                 segment: progress.segment,
                 step: progress.step,
-                content: ContentHash::of(&structure),
+                content: ContentHash::from_structure(&structure),
             },
             origin: Origin::Biased,
             mixture_version: 0,

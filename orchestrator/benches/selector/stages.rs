@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use calm::Mixture;
 use calm::watch::grade_distribution;
-use orchestrator::reactor::group;
-use orchestrator::selector::{Next, Settings};
+use orchestrator::reactor::commit_batch;
+use orchestrator::selector::{Scheduling, Settings};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection};
 use store::{Commit, Location};
@@ -58,11 +58,11 @@ impl Stages {
         recording: &[Vec<CandidateBlock>],
     ) -> Vec<Commit> {
         let mut selector = selector(model, recording.len(), settings);
-        let mut commits = vec![selector.begin_walks()];
+        let mut commits = vec![selector.start_walks()];
         let mut offers: Vec<_> = recording.iter().map(|blocks| blocks.iter()).collect();
         let mut turns = Vec::new();
         loop {
-            while let Next::Turn(assignment) = selector.next_turn() {
+            while let Scheduling::Assign(assignment) = selector.next_assignment() {
                 turns.push(assignment);
             }
             if turns.is_empty() {
@@ -110,7 +110,7 @@ impl Stages {
         let mut commits = commits.into_iter().peekable();
         while commits.peek().is_some() {
             let mut whole = Commit::default();
-            commits.by_ref().take(size).for_each(|commit| group::append(&mut whole, commit));
+            commits.by_ref().take(size).for_each(|commit| commit_batch::append(&mut whole, commit));
             let begun = Instant::now();
             store.commit(&whole).await.unwrap();
             self.commit += begun.elapsed();

@@ -5,18 +5,18 @@
 //! [`Children`] starts processes where [`Children::next`] is awaited: that has to be the future that `block_on` runs on the
 //! main thread, not a spawned task.
 //!
-//! **A child that outlives its parent** ([`own_session`]) has nobody any more who reads its standard error: what it
+//! **A child that outlives its parent** ([`start_own_session`]) has nobody any more who reads its standard error: what it
 //! writes there fails from then on (`EPIPE`), and `eprintln!` panics of that. It has to use `writeln!` and let it fail.
 
-mod child_side;
+mod child_monitor;
 mod children;
 mod descriptors;
-mod lines;
+mod heartbeats;
+mod line_splitter;
 mod process;
-mod signs;
+mod process_setup;
 #[cfg(test)]
 mod tests;
-mod watch;
 
 use std::ffi::{OsStr, OsString};
 use std::io;
@@ -25,11 +25,11 @@ use std::process::Stdio;
 
 use tokio::process::{Child, Command};
 
-pub use child_side::{ParentGone, be_called, end_with_parent, own_session};
-pub use children::{Children, Event};
+pub use children::{ChildEvent, Children};
 pub use descriptors::raise_descriptor_limit;
-pub use process::{AdoptError, ask_to_end};
-pub use signs::Signs;
+pub use heartbeats::Heartbeats;
+pub use process::{AdoptError, request_exit};
+pub use process_setup::{ParentExited, end_with_parent, set_process_name, start_own_session};
 
 /// What to start.
 #[derive(Clone, Debug)]
@@ -59,7 +59,7 @@ impl Launch {
         }
     }
 
-    /// Leaves it in the process group of its parent, as whoever calls [`own_session`] needs it: the leader of a group
+    /// Leaves it in the process group of its parent, as whoever calls [`start_own_session`] needs it: the leader of a group
     /// cannot begin a session.
     pub fn for_own_session(self) -> Self {
         Self { own_group: false, ..self }
@@ -76,7 +76,7 @@ impl Launch {
         command.arg0(&self.name).args(&self.arguments);
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
         if !self.has_database {
-            std::env::vars_os().map(|(name, _)| name).filter(|name| is_for_databases(name)).for_each(
+            std::env::vars_os().map(|(name, _)| name).filter(|name| is_postgres_variable(name)).for_each(
                 |name| {
                     command.env_remove(name);
                 },
@@ -85,20 +85,20 @@ impl Launch {
         if self.own_group {
             command.process_group(0);
         }
-        keep_to_ourselves(&mut command);
+        limit_inheritance(&mut command);
         Ok((command.spawn()?, self.setup))
     }
 }
 
 /// Whether an environment variable of this name is one of PostgreSQL's.
-fn is_for_databases(name: &OsStr) -> bool {
+fn is_postgres_variable(name: &OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b"PG")
 }
 
 /// Gives the child the user's limit of descriptors, and nothing to inherit but its three standard streams. What is opened for
 /// shared memory is not marked to be closed, and a labeller, which outlives this process, would keep that memory.
 #[allow(unsafe_code)]
-fn keep_to_ourselves(command: &mut Command) {
+fn limit_inheritance(command: &mut Command) {
     let close_the_rest = || {
         // SAFETY: a system call that takes numbers and touches no memory.
         match unsafe { libc::close_range(3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC as libc::c_int) } {

@@ -21,7 +21,7 @@ pub enum AdoptError {
     #[error(
         "process {pid} cannot be taken for number {number}: it had a process before, or there is no such number"
     )]
-    Taken {
+    NotAdoptable {
         /// Its process number.
         pid: u32,
         /// The child.
@@ -82,7 +82,7 @@ impl Process {
 
 /// Asks the process `pid` that was born at `birth` ([`store::process_birth`]) to end in order (SIGTERM), and does not wait
 /// for it: a labeller of an earlier run, say, that cannot be adopted because it works to another protocol.
-pub fn ask_to_end(pid: u32, birth: &str) -> Result<(), AdoptError> {
+pub fn request_exit(pid: u32, birth: &str) -> Result<(), AdoptError> {
     let sent = Process::find(pid, birth)?.signal(Signal::TERM);
     sent.map_err(|error| AdoptError::Refused { pid, error })
 }

@@ -1,7 +1,7 @@
 //! What a long label queue does to the threshold above which structures are collected.
 
 /// Above so many times the limit the threshold rises no more, and walkers wait.
-const MOST: u64 = 2;
+const MAX_FACTOR: u64 = 2;
 
 /// The threshold while structures wait for labels: as configured up to `limit` unfinished jobs, above it times
 ///
@@ -23,7 +23,7 @@ impl Backlog {
 
     /// Walkers wait while more jobs than this are unfinished, so the queue cannot grow much beyond it.
     pub fn bound(self) -> u64 {
-        self.limit.saturating_mul(MOST)
+        self.limit.saturating_mul(MAX_FACTOR)
     }
 
     /// The factor on the threshold while so many jobs are unfinished.

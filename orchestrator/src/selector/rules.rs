@@ -15,12 +15,12 @@ pub(super) const CONFIGURATION: &str = "configuration";
 /// Those of the settings that may change and that decisions depend on, by the keys of the configuration.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ChangeableRules {
-    /// See [`Settings::per_seed`].
+    /// See [`Settings::max_per_seed_structure`].
     #[serde(rename = "collect.per_seed")]
-    pub per_seed: u32,
-    /// See [`Settings::total`]: the least of what the keys say that limit it.
+    pub max_per_seed_structure: u32,
+    /// See [`Settings::max_structures`]: the least of what the keys say that limit it.
     #[serde(rename = "collect.total")]
-    pub total: Option<u32>,
+    pub max_structures: Option<u32>,
     /// See [`ForgettingAlarm`].
     #[serde(rename = "calm.forgetting_alarm")]
     pub forgetting_alarm: Fraction,
@@ -36,18 +36,18 @@ impl ChangeableRules {
 
 impl Settings {
     /// Those that may change.
-    pub fn changeable(&self) -> ChangeableRules {
+    pub fn changeable_rules(&self) -> ChangeableRules {
         ChangeableRules {
-            per_seed: self.per_seed,
-            total: self.total,
+            max_per_seed_structure: self.max_per_seed_structure,
+            max_structures: self.max_structures,
             forgetting_alarm: self.forgetting_alarm.share_above_one,
         }
     }
 
     /// Takes others from now on.
-    pub fn change(&mut self, rules: &ChangeableRules) {
-        let ChangeableRules { per_seed, total, forgetting_alarm } = *rules;
-        (self.per_seed, self.total) = (per_seed, total);
+    pub fn apply_rules(&mut self, rules: &ChangeableRules) {
+        let ChangeableRules { max_per_seed_structure, max_structures, forgetting_alarm } = *rules;
+        (self.max_per_seed_structure, self.max_structures) = (max_per_seed_structure, max_structures);
         self.forgetting_alarm = ForgettingAlarm { share_above_one: forgetting_alarm };
     }
 }

@@ -17,7 +17,7 @@ pub struct Slurm {
 
 /// Everything about a submission that is the same for all jobs of a kind.
 #[derive(Clone, Debug)]
-pub struct Request<'a> {
+pub struct JobOptions<'a> {
     /// The job's script.
     pub script: PathBuf,
     /// What it says goes here.
@@ -34,8 +34,8 @@ pub struct Request<'a> {
 
 impl Slurm {
     /// Who does not wait for an answer for longer than this.
-    pub fn with_patience(patience: Duration) -> Self {
-        Self { commands: Commands::with_patience(patience) }
+    pub fn with_timeout(timeout: Duration) -> Self {
+        Self { commands: Commands::with_patience(timeout) }
     }
 
     /// The jobs of a campaign that this user has: all that wait or run, and those that have ended within the last minutes
@@ -60,7 +60,7 @@ impl Slurm {
         &self,
         names: &JobNames,
         submission: &Submission,
-        request: &Request<'_>,
+        request: &JobOptions<'_>,
     ) -> Result<u64, SlurmError> {
         self.commands.submit(&request.arguments(names, submission)).await
     }
@@ -72,7 +72,7 @@ impl Slurm {
     }
 }
 
-impl Request<'_> {
+impl JobOptions<'_> {
     /// What `sbatch` is called with. Options on the command line go before those of the script.
     pub fn arguments(&self, names: &JobNames, submission: &Submission) -> Vec<OsString> {
         let role = submission.role;
@@ -82,7 +82,7 @@ impl Request<'_> {
             dependency.push(format!("after:{id}"));
         }
         let mut arguments: Vec<OsString> = self.options.iter().map(Into::into).collect();
-        arguments.push(format!("--job-name={}", names.of(role)).into());
+        arguments.push(format!("--job-name={}", names.job_name(role)).into());
         arguments.push(format!("--dependency={}", dependency.join(",")).into());
         if let Role::Agent(_) = role {
             arguments.push(format!("--comment={}", comment(self.walkers)).into());

@@ -55,7 +55,7 @@ impl Role {
         }
     }
 
-    fn of(name: &str) -> Option<Self> {
+    fn from_name(name: &str) -> Option<Self> {
         let number = |text: &str| text.parse().ok();
         match name.split_once('-') {
             None => (name == "orchestrator").then_some(Self::Orchestrator),
@@ -83,13 +83,13 @@ impl JobNames {
     }
 
     /// The name of the job that does this.
-    pub fn of(&self, role: Role) -> String {
+    pub fn job_name(&self, role: Role) -> String {
         format!("{}{}", self.prefix, role.name())
     }
 
     /// What the job of this name does, if it is one of the campaign.
     pub fn role(&self, name: &str) -> Option<Role> {
-        Role::of(name.strip_prefix(&self.prefix)?)
+        Role::from_name(name.strip_prefix(&self.prefix)?)
     }
 }
 
@@ -136,14 +136,14 @@ mod tests {
     fn names_belong_to_one_campaign() {
         let names = JobNames::new("1a2b");
         for role in [Role::Orchestrator, Role::Agent(0), Role::Agent(4000), Role::Labeller(7)] {
-            assert_eq!(names.role(&names.of(role)), Some(role));
-            assert_eq!(JobNames::new("1a2").role(&names.of(role)), None);
-            assert_eq!(JobNames::new("1a2b3").role(&names.of(role)), None);
+            assert_eq!(names.role(&names.job_name(role)), Some(role));
+            assert_eq!(JobNames::new("1a2").role(&names.job_name(role)), None);
+            assert_eq!(JobNames::new("1a2b3").role(&names.job_name(role)), None);
         }
         for name in ["", "calmwalk-1a2b-", "calmwalk-1a2b-agent", "calmwalk-1a2b-agent-x", "agent-1"] {
             assert_eq!(names.role(name), None, "{name}");
         }
-        assert_eq!(names.of(Role::Agent(3)), "calmwalk-1a2b-agent-3");
+        assert_eq!(names.job_name(Role::Agent(3)), "calmwalk-1a2b-agent-3");
     }
 
     #[test]

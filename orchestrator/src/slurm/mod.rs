@@ -14,6 +14,6 @@ mod plan;
 mod stop;
 
 pub use ::slurm::{Phase, SlurmError};
-pub use commands::{Request, Slurm};
+pub use commands::{JobOptions, Slurm};
 pub use job::{Job, JobNames, Role};
-pub use plan::{Plan, Submission, Wanted, plan};
+pub use plan::{DesiredJobs, Plan, Submission, plan};

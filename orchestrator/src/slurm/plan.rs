@@ -8,7 +8,7 @@ use super::job::{Job, Role};
 
 /// What is asked for, beside an orchestrator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Wanted {
+pub struct DesiredJobs {
     /// Jobs with an agent.
     pub agents: u32,
     /// Walkers of each.
@@ -36,7 +36,7 @@ pub struct Plan {
     pub submit: Vec<Submission>,
 }
 
-impl Wanted {
+impl DesiredJobs {
     /// Every job that there is to be.
     pub fn roles(&self) -> impl Iterator<Item = Role> + use<> {
         let agents = (0..self.agents).map(Role::Agent);
@@ -57,7 +57,7 @@ impl Wanted {
 /// What is to be done so that the jobs that live are those that are wanted, each once.
 ///
 /// The same is decided for the same jobs, so that two who launch at the same moment agree about which of two jobs is to stay.
-pub fn plan(wanted: &Wanted, jobs: &[Job]) -> Plan {
+pub fn plan(wanted: &DesiredJobs, jobs: &[Job]) -> Plan {
     let mut plan = Plan::default();
     let mut living: Vec<_> = jobs.iter().filter(|job| job.phase() != Phase::Over).collect();
     // Those that run before those that wait, and of these the first.

@@ -9,10 +9,10 @@ use super::commands::Slurm;
 use super::job::{Job, JobNames, Role};
 
 /// Between two looks at jobs that are ending.
-const LOOK: Duration = Duration::from_secs(1);
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// What does not end by itself is killed by Slurm (`KillWait`, 30 s by default); one whose node is lost stays for longer,
 /// and is not waited for.
-const PATIENCE: Duration = Duration::from_secs(90);
+const STOP_TIMEOUT: Duration = Duration::from_secs(90);
 
 impl Slurm {
     /// Ends agents and labellers, and when they are gone the orchestrator, but for the job that this is called from.
@@ -26,16 +26,16 @@ impl Slurm {
                 .iter()
                 .filter(|job| job.phase() != Phase::Over && Some(job.id) != own)
                 .partition(|job| job.role == Role::Orchestrator);
-            let last = working.is_empty() || begun.elapsed() > PATIENCE;
+            let last = working.is_empty() || begun.elapsed() > STOP_TIMEOUT;
             let now = if last { leading } else { working };
             // One that was about to be requeued waits again now.
-            let asked: Vec<_> = now.iter().filter(|job| is_left(job)).map(|job| job.id).collect();
+            let asked: Vec<_> = now.iter().filter(|job| is_active(job)).map(|job| job.id).collect();
             self.cancel(&asked).await?;
             ended.extend(asked);
-            if now.is_empty() || begun.elapsed() > 2 * PATIENCE {
+            if now.is_empty() || begun.elapsed() > 2 * STOP_TIMEOUT {
                 return Ok(ended.len());
             }
-            sleep(LOOK).await;
+            sleep(POLL_INTERVAL).await;
         }
     }
 
@@ -50,6 +50,6 @@ impl Slurm {
 }
 
 /// Whether it has not been asked to end, or was and is requeued.
-fn is_left(job: &Job) -> bool {
+fn is_active(job: &Job) -> bool {
     job.phase() != Phase::Completing
 }

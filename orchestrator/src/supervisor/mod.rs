@@ -11,49 +11,49 @@
 //! after pauses that double likewise, and never ends in giving up.
 
 mod child;
-mod ending;
+mod exit_reason;
 
 use std::time::Duration;
 
 use child::{Child, State};
-pub use ending::Ending;
+pub use exit_reason::ExitReason;
 
 /// How patient a supervisor is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// A child that gave no sign of life for so long, from its start on, hangs and is killed.
-    pub silence: Duration,
+    pub heartbeat_timeout: Duration,
     /// Pause before the start after a first failure; it doubles with each further one in a row.
-    pub first_pause: Duration,
+    pub initial_backoff: Duration,
     /// No pause is longer.
-    pub longest_pause: Duration,
+    pub max_backoff: Duration,
     /// A child is started again so many times in a row without having been useful; the failure after that is its last.
-    pub restarts: u32,
+    pub max_restarts: u32,
     /// What is left so long after it was told to end is killed; if it outlives its parent, it is left to itself.
-    pub grace: Duration,
+    pub grace_period: Duration,
     /// The children work for the campaign, not for the parent: they may go on without it, and one that leaves while
     /// there is work has failed, whatever its exit code.
-    pub outlives: bool,
+    pub detached: bool,
 }
 
 impl Default for Limits {
     fn default() -> Self {
         let seconds = Duration::from_secs;
         Self {
-            silence: seconds(120),
-            first_pause: seconds(1),
-            longest_pause: seconds(60),
-            restarts: 5,
-            grace: seconds(30),
-            outlives: false,
+            heartbeat_timeout: seconds(120),
+            initial_backoff: seconds(1),
+            max_backoff: seconds(60),
+            max_restarts: 5,
+            grace_period: seconds(30),
+            detached: false,
         }
     }
 }
 
 /// What is to be done with a process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Order {
-    /// Start it. It counts as started from here on; if that fails, it has ended as [`Ending::NotStarted`].
+pub enum Action {
+    /// Start it. It counts as started from here on; if that fails, it has ended as [`ExitReason::StartFailed`].
     Start {
         /// Which child.
         number: u32,
@@ -74,33 +74,33 @@ pub enum Order {
 
 /// Where a child stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Standing {
+pub enum ChildState {
     /// Started, and not heard of yet.
     Starting,
     /// At work.
     Running,
     /// To be started again in a while.
-    Pausing {
+    BackingOff {
         /// For so long yet.
         left: Duration,
     },
     /// Told to end, or killed, and not gone yet.
-    Ending,
+    Stopping,
     /// Ended in order; it will not be started again.
-    GoneHome,
+    Exited,
     /// Failed too often in a row; it will not be started again.
-    GivenUp,
+    Failed,
 }
 
-impl std::fmt::Display for Standing {
+impl std::fmt::Display for ChildState {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Starting => f.write_str("starting"),
             Self::Running => f.write_str("running"),
-            Self::Pausing { left } => write!(f, "pausing for {} s", left.as_secs_f64().ceil()),
-            Self::Ending => f.write_str("ending"),
-            Self::GoneHome => f.write_str("gone home"),
-            Self::GivenUp => f.write_str("given up"),
+            Self::BackingOff { left } => write!(f, "pausing for {} s", left.as_secs_f64().ceil()),
+            Self::Stopping => f.write_str("ending"),
+            Self::Exited => f.write_str("gone home"),
+            Self::Failed => f.write_str("given up"),
         }
     }
 }
@@ -113,22 +113,22 @@ pub struct ChildStatus {
     /// Starts so far; 0 if the process was adopted and is still that one.
     pub incarnation: u32,
     /// Where it stands.
-    pub standing: Standing,
+    pub state: ChildState,
     /// Starts that followed a failure.
     pub restarts: u32,
     /// How it failed last, if it ever did.
-    pub last_failure: Option<Ending>,
+    pub last_failure: Option<ExitReason>,
 }
 
 /// The end of a process, as the supervisor judges it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Ended {
+pub struct ChildExit {
     /// Which start it was; 0 for an adopted process.
     pub incarnation: u32,
     /// How it ended: in place of the signal, why it was sent.
-    pub ending: Ending,
+    pub reason: ExitReason,
     /// What becomes of the child: pausing, gone home or given up.
-    pub then: Standing,
+    pub then: ChildState,
 }
 
 /// Watches the children of one kind, numbered from 0.
@@ -158,7 +158,7 @@ impl Supervisor {
     }
 
     /// A sign of life.
-    pub fn heard(&mut self, number: u32, now: Duration) {
+    pub fn heartbeat(&mut self, number: u32, now: Duration) {
         // Signs of a process that is dead or being killed come late and mean nothing.
         if let Some(State::Running { heard, yet }) = self.child(number).map(|child| &mut child.state) {
             *heard = now.max(*heard);
@@ -167,8 +167,8 @@ impl Supervisor {
     }
 
     /// The child delivered something: whatever failed before, its next failure is a first one.
-    pub fn useful(&mut self, number: u32, now: Duration) {
-        self.heard(number, now);
+    pub fn delivered(&mut self, number: u32, now: Duration) {
+        self.heartbeat(number, now);
         // It may have died since: what it delivered counts all the same.
         if let Some(child) = self.child(number) {
             child.failures = 0;
@@ -176,12 +176,12 @@ impl Supervisor {
     }
 
     /// The process of a child is gone (and reaped, if it was a child). `None` if it had none.
-    pub fn ended(&mut self, number: u32, ending: Ending, now: Duration) -> Option<Ended> {
+    pub fn ended(&mut self, number: u32, reason: ExitReason, now: Duration) -> Option<ChildExit> {
         let (limits, stopping) = (self.limits, self.stopping);
         let child = self.child(number)?;
-        let ending = child.judge(ending)?;
-        child.leave(&ending, &limits, stopping, now);
-        Some(Ended { incarnation: child.incarnation, ending, then: child.standing(now) })
+        let reason = child.exit_reason(reason)?;
+        child.exited(&reason, &limits, stopping, now);
+        Some(ChildExit { incarnation: child.incarnation, reason, then: child.public_state(now) })
     }
 
     /// There is no more work: nothing is started any more.
@@ -189,43 +189,43 @@ impl Supervisor {
         self.stopping = true;
         for child in &mut self.children {
             if let State::Waiting { .. } = child.state {
-                child.state = State::Home;
+                child.state = State::Exited;
             }
         }
     }
 
-    /// The whole set is to end: nothing is started any more, what runs is told to end, and killed by [`Self::due`]
+    /// The whole set is to end: nothing is started any more, what runs is told to end, and killed by [`Self::due_actions`]
     /// when its time of grace is over.
-    pub fn stop(&mut self, now: Duration) -> Vec<Order> {
+    pub fn stop(&mut self, now: Duration) -> Vec<Action> {
         self.close();
-        let mut orders = Vec::new();
+        let mut actions = Vec::new();
         for (number, child) in (0..).zip(&mut self.children) {
             if let State::Running { .. } = child.state {
-                child.state = State::Leaving { since: now };
-                orders.push(Order::Terminate { number });
+                child.state = State::Stopping { since: now };
+                actions.push(Action::Terminate { number });
             }
         }
-        orders
+        actions
     }
 
-    /// What is due by now. To be asked at [`Self::next`], and after anything else that happened.
-    pub fn due(&mut self, now: Duration) -> Vec<Order> {
+    /// What is due by now. To be asked at [`Self::next_deadline`], and after anything else that happened.
+    pub fn due_actions(&mut self, now: Duration) -> Vec<Action> {
         let limits = self.limits;
-        if self.overslept(now) {
-            self.listen_anew(now);
+        if self.was_suspended(now) {
+            self.reset_heartbeats(now);
         }
-        let due = |(number, child): (u32, &mut Child)| child.due(number, &limits, now);
+        let due = |(number, child): (u32, &mut Child)| child.due_action(number, &limits, now);
         (0..).zip(&mut self.children).filter_map(due).collect()
     }
 
     /// When something will be due if nothing happens until then.
-    pub fn next(&self) -> Option<Duration> {
-        self.children.iter().filter_map(|child| child.next(&self.limits)).min()
+    pub fn next_deadline(&self) -> Option<Duration> {
+        self.children.iter().filter_map(|child| child.next_deadline(&self.limits)).min()
     }
 
     /// Whether no process is left and none will be started.
     pub fn is_over(&self) -> bool {
-        self.children.iter().all(|child| matches!(child.state, State::Home | State::GivenUp))
+        self.children.iter().all(|child| matches!(child.state, State::Exited | State::Failed))
     }
 
     /// Where each of the children stands.
@@ -237,13 +237,13 @@ impl Supervisor {
         self.children.get_mut(usize::try_from(number).ok()?)
     }
 
-    /// Whether whoever was to ask at [`Self::next`] was itself held up, by Ctrl-Z or a host that was suspended.
+    /// Whether whoever was to ask at [`Self::next_deadline`] was itself held up, by Ctrl-Z or a host that was suspended.
     /// Nobody listened in that time, so that no silence is proved.
-    fn overslept(&self, now: Duration) -> bool {
-        self.next().is_some_and(|due| now.saturating_sub(due) > self.limits.silence / 10)
+    fn was_suspended(&self, now: Duration) -> bool {
+        self.next_deadline().is_some_and(|due| now.saturating_sub(due) > self.limits.heartbeat_timeout / 10)
     }
 
-    fn listen_anew(&mut self, now: Duration) {
+    fn reset_heartbeats(&mut self, now: Duration) {
         for child in &mut self.children {
             if let State::Running { heard, .. } = &mut child.state {
                 *heard = now;

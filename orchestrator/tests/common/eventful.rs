@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
-use orchestrator::selector::{Mode, Next, Selector, Settings, Snapshot, UpdateProtocol};
+use orchestrator::selector::{Mode, Scheduling, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use store::records::Commit;
 use wire::messages::Outcome;
-use wire::transport::Work;
+use wire::transport::WorkItem;
 
 use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
@@ -16,10 +16,10 @@ use super::{restore, settings};
 /// Label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
 
-fn open(settings: &Settings, seeds: usize, snapshot: Snapshot) -> Selector {
+fn open(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     let mut selector = restore(settings, seeds, snapshot);
     if settings.mode == Mode::Live {
-        selector.raise_above(QUEUE_LIMIT);
+        selector.raise_threshold_above(QUEUE_LIMIT);
     }
     selector
 }
@@ -81,11 +81,11 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
     let update =
         prop::sample::select(vec![UpdateProtocol::Carried, UpdateProtocol::Restarted, UpdateProtocol::Never]);
     (1..5_usize, update, 1..6_u32, prop::option::of(1..12_u32), any::<bool>(), 0..300_u64).prop_map(
-        |(walks, update, per_seed, total, control, declined_feature_bytes)| Settings {
+        |(walks, update, max_per_seed_structure, total, control, declined_feature_bytes)| Settings {
             walks_per_round: if update == UpdateProtocol::Restarted { 1 } else { walks },
             update,
-            per_seed,
-            total,
+            max_per_seed_structure,
+            max_structures: total,
             control,
             declined_feature_bytes,
             ..settings(Mode::Reproducible)
@@ -100,17 +100,17 @@ pub struct Campaign<'a> {
     walkers: usize,
     pub selector: Selector,
     pub store: MemoryStore,
-    at_work: Vec<Work>,
+    at_work: Vec<WorkItem>,
     /// All commits but those that only keep where an interrupted walk stands.
     pub commits: Vec<Commit>,
 }
 
 impl<'a> Campaign<'a> {
     pub fn begin(settings: &'a Settings, scripts: &'a [Script], walkers: usize) -> Self {
-        let selector = open(settings, scripts.len(), Snapshot::default());
+        let selector = open(settings, scripts.len(), SelectorSnapshot::default());
         let (store, at_work, commits) = (MemoryStore::default(), Vec::new(), Vec::new());
         let mut campaign = Self { settings, scripts, walkers, selector, store, at_work, commits };
-        let commit = campaign.selector.begin_walks();
+        let commit = campaign.selector.start_walks();
         campaign.commit(commit);
         campaign
     }
@@ -128,31 +128,31 @@ impl<'a> Campaign<'a> {
         if self.at_work.len() == self.walkers {
             return false;
         }
-        match self.selector.next_turn() {
-            Next::Turn(assignment) => {
+        match self.selector.next_assignment() {
+            Scheduling::Assign(assignment) => {
                 let mixture = Arc::clone(self.selector.mixture());
-                self.at_work.push(Work { assignment: *assignment, mixture });
+                self.at_work.push(WorkItem { assignment: *assignment, mixture });
                 true
             }
-            Next::Wait => {
+            Scheduling::Wait => {
                 assert!(!self.at_work.is_empty(), "nothing to wait for");
                 false
             }
-            Next::Done => {
+            Scheduling::Done => {
                 assert!(self.selector.is_done() && self.at_work.is_empty());
                 false
             }
         }
     }
 
-    fn take(&mut self, index: prop::sample::Index) -> Option<Work> {
+    fn take(&mut self, index: prop::sample::Index) -> Option<WorkItem> {
         (!self.at_work.is_empty()).then(|| self.at_work.remove(index.index(self.at_work.len())))
     }
 
-    fn deliver(&mut self, work: &Work, pause_after: Option<u64>) {
+    fn deliver(&mut self, work: &WorkItem, pause_after: Option<u64>) {
         let seed = self.store.walks[&work.assignment.walk].seed_structure as usize;
         let report = advance(&self.scripts[seed], &work.assignment, &work.mixture, pause_after);
-        let paused = report.outcome == Outcome::Paused;
+        let paused = report.outcome == Outcome::Interrupted;
         let commit = self.selector.report(report).unwrap();
         assert!(!paused || commit.is_some(), "an interrupted walk is kept at once");
         if let Some(commit) = commit {
@@ -163,7 +163,7 @@ impl<'a> Campaign<'a> {
     fn crash(&mut self) {
         self.at_work.clear();
         self.selector = open(self.settings, self.scripts.len(), self.store.snapshot());
-        assert!(self.selector.begin_walks().walks.is_empty());
+        assert!(self.selector.start_walks().walks.is_empty());
     }
 
     /// Everybody dies, and the campaign goes on by other settings.
@@ -171,7 +171,7 @@ impl<'a> Campaign<'a> {
         self.at_work.clear();
         self.settings = settings;
         self.selector = open(self.settings, self.scripts.len(), self.store.snapshot());
-        let commit = self.selector.begin_walks();
+        let commit = self.selector.start_walks();
         self.commit(commit);
     }
 
@@ -187,7 +187,7 @@ impl<'a> Campaign<'a> {
         };
         let Some(work) = self.take(index) else { return };
         match act {
-            Act::Lose(_) => self.selector.lost(work.assignment.walk),
+            Act::Lose(_) => self.selector.assignment_lost(work.assignment.walk),
             Act::Interrupt(_, steps) => self.deliver(&work, Some(steps)),
             _ => self.deliver(&work, None),
         }

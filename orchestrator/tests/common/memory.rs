@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use orchestrator::selector::Snapshot;
+use orchestrator::selector::SelectorSnapshot;
 use store::records::{Commit, ComponentRecord, Decision, Fate, WalkRecord};
 use wire::{ContentHash, Origin, WalkId};
 
@@ -41,9 +41,9 @@ impl MemoryStore {
         self.values.extend(commit.values.iter().cloned());
     }
 
-    pub fn snapshot(&self) -> Snapshot {
+    pub fn snapshot(&self) -> SelectorSnapshot {
         let components = self.components.iter();
-        Snapshot {
+        SelectorSnapshot {
             imported: self.imported.len() as u64,
             walks: self.walks.values().cloned().collect(),
             components: components

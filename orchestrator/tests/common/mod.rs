@@ -11,10 +11,10 @@ use calm::watch::ForgettingAlarm;
 use calm::{CollectionRule, Combination, Component, Mixture, Statistics, UpdateRule, UpdateSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    Mode, Next, SeedStructure, Selector, Settings, Snapshot, TrainingFrames, UpdateProtocol,
+    Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol,
 };
 use store::records::Commit;
-use wire::messages::{Assignment, End, Outcome, Progress, Report};
+use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
@@ -71,7 +71,7 @@ pub fn settings(mode: Mode) -> Settings {
     Settings {
         mode,
         walks_per_round: 2,
-        turn_steps: 10,
+        steps_per_assignment: 10,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
             combination: Combination::Convex,
@@ -80,15 +80,15 @@ pub fn settings(mode: Mode) -> Settings {
         },
         forgetting_alarm: ForgettingAlarm::default(),
         collection: CollectionRule::MaximumGrade { threshold: positive(1.5) },
-        per_seed: 3,
-        total: None,
+        max_per_seed_structure: 3,
+        max_structures: None,
         control: false,
-        least_distance: (1.2, 0.75),
+        min_distance: (1.2, 0.75),
         declined_feature_bytes: 1 << 20,
     }
 }
 
-pub fn restore(settings: &Settings, seeds: usize, snapshot: Snapshot) -> Selector {
+pub fn restore(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     try_restore(settings, seeds, None, snapshot).unwrap()
 }
 
@@ -96,7 +96,7 @@ pub fn try_restore(
     settings: &Settings,
     seeds: usize,
     training: Option<TrainingFrames>,
-    snapshot: Snapshot,
+    snapshot: SelectorSnapshot,
 ) -> Result<Selector, orchestrator::selector::SelectorError> {
     let seeds = (0..seeds).map(seed).collect();
     Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), training, snapshot)
@@ -104,15 +104,15 @@ pub fn try_restore(
 
 /// A selector at the start of a campaign, its walks begun.
 pub fn begin(settings: &Settings, seeds: usize) -> Selector {
-    let mut selector = restore(settings, seeds, Snapshot::default());
-    selector.begin_walks();
+    let mut selector = restore(settings, seeds, SelectorSnapshot::default());
+    selector.start_walks();
     selector
 }
 
 /// The next turn, which there must be.
 pub fn turn(selector: &mut Selector) -> Assignment {
-    match selector.next_turn() {
-        Next::Turn(assignment) => *assignment,
+    match selector.next_assignment() {
+        Scheduling::Assign(assignment) => *assignment,
         other => panic!("expected a turn, found {other:?}"),
     }
 }
@@ -145,7 +145,7 @@ pub fn block(
             walk: assignment.walk,
             segment: progress.segment,
             step: progress.step,
-            content: ContentHash::of(&structure),
+            content: ContentHash::from_structure(&structure),
         },
         origin: assignment.origin,
         mixture_version: mixture.version(),
@@ -167,7 +167,7 @@ pub fn at(step: u64) -> Progress {
 
 pub fn report(assignment: &Assignment, outcome: Outcome, progress: Progress) -> Report {
     let checkpoint = format!("step {}", progress.step).into_bytes();
-    Report { walk: assignment.walk, turn: assignment.turn, outcome, checkpoint, progress }
+    Report { walk: assignment.walk, assignment: assignment.number, outcome, checkpoint, progress }
 }
 
 /// A report of a candidate at a step: the structure of that number with these features.
@@ -182,7 +182,7 @@ pub fn offer(
     report(assignment, Outcome::Candidate(block), at(step))
 }
 
-pub fn ended(assignment: &Assignment, step: u64, end: End) -> Report {
+pub fn ended(assignment: &Assignment, step: u64, end: WalkEnd) -> Report {
     report(assignment, Outcome::Ended(end), at(step))
 }
 

@@ -4,7 +4,7 @@
 use calm::Mixture;
 use serde::{Deserialize, Serialize};
 use wire::Origin;
-use wire::messages::{Assignment, End, Outcome, Progress, Report};
+use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 
 use super::{DIMENSION, SHORTEST, at, block, gamma_max, structure};
 
@@ -47,12 +47,12 @@ pub fn advance(
         .map_or_else(State::default, |bytes| serde_json::from_slice(bytes).unwrap());
     let mut steps = 0;
     let outcome = loop {
-        let Some(event) = script.get(state.events) else { break Outcome::Ended(End::Steps) };
-        if state.step >= assignment.until {
-            break Outcome::Turn;
+        let Some(event) = script.get(state.events) else { break Outcome::Ended(WalkEnd::Steps) };
+        if state.step >= assignment.last_step {
+            break Outcome::StepsDone;
         }
         if pause_after == Some(steps) {
-            break Outcome::Paused;
+            break Outcome::Interrupted;
         }
         steps += 1;
         state.step += 1;
@@ -62,7 +62,13 @@ pub fn advance(
         }
     };
     let checkpoint = serde_json::to_vec(&state).unwrap();
-    Report { walk: assignment.walk, turn: assignment.turn, outcome, checkpoint, progress: progress(&state) }
+    Report {
+        walk: assignment.walk,
+        assignment: assignment.number,
+        outcome,
+        checkpoint,
+        progress: progress(&state),
+    }
 }
 
 fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut State) -> Option<Outcome> {
@@ -71,7 +77,7 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
         let number = 2_000_000 + 1000 * u64::from(assignment.walk.0) + state.step;
         let frame =
             || block(assignment, mixture, &progress(state), structure(number, SHORTEST), [0.5; DIMENSION]);
-        return assignment.wanted.contains(&state.step).then(|| Outcome::Candidate(frame()));
+        return assignment.frame_steps.contains(&state.step).then(|| Outcome::Candidate(frame()));
     }
     match *event {
         Event::Nothing => None,
@@ -85,7 +91,7 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
             state.step = state.step.saturating_sub(2);
             None
         }
-        Event::BlowUp => Some(Outcome::Ended(End::BlewUp { reason: format!("at step {}", state.step) })),
+        Event::BlowUp => Some(Outcome::Ended(WalkEnd::BlewUp { reason: format!("at step {}", state.step) })),
     }
 }
 

@@ -118,7 +118,7 @@ pub async fn meeting(
             let Some(row) = page.last() else { break };
             last = Some(row.place);
             let met = page.iter().filter(|row| condition.is_met(&facts(row)));
-            meeting.extend(met.map(|row| ContentHash::of(&row.structure).0));
+            meeting.extend(met.map(|row| ContentHash::from_structure(&row.structure).0));
         }
     }
     let all: Vec<_> = all.into_iter().filter(|one| meeting.contains(&one.content.0)).collect();

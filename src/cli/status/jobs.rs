@@ -80,7 +80,7 @@ impl Jobs {
 
 /// Jobs that live, and of each kind the last that has ended if none does.
 async fn ask(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmError> {
-    let slurm = Slurm::with_patience(PATIENCE);
+    let slurm = Slurm::with_timeout(PATIENCE);
     let mut jobs = slurm.jobs(&job_names(location)).await?;
     let mut last: BTreeMap<Role, (bool, u64)> = BTreeMap::new();
     for job in &jobs {

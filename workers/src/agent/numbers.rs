@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use wire::WalkId;
 use wire::messages::{Assignment, Outcome, Progress};
-use wire::net::Told;
+use wire::net::SlotReport;
 
 use super::SILENT;
 
@@ -67,12 +67,12 @@ impl Numbers {
     pub(super) fn taken(&mut self, assignment: &Assignment, mixture_version: u64) {
         self.turns_taken += 1;
         self.mixture_version = self.mixture_version.max(Some(mixture_version));
-        let before = self.walks.get(&assignment.walk).filter(|stand| stand.turn + 1 == assignment.turn);
+        let before = self.walks.get(&assignment.walk).filter(|stand| stand.turn + 1 == assignment.number);
         let at = match (&assignment.checkpoint, before) {
             (None, _) => Some((0, 0)),
             (Some(_), before) => before.and_then(|stand| stand.at),
         };
-        self.walks.insert(assignment.walk, Stand { turn: assignment.turn, at });
+        self.walks.insert(assignment.walk, Stand { turn: assignment.number, at });
     }
 
     /// A walk stands there.
@@ -87,15 +87,15 @@ impl Numbers {
     }
 
     /// The orchestrator has taken this.
-    pub(super) fn told(&mut self, told: &Told) {
+    pub(super) fn told(&mut self, told: &SlotReport) {
         let turns = &mut self.turns;
         let number = match told {
-            Told::Nothing => return,
-            Told::Lost { .. } => &mut turns.lost,
-            Told::Report(report) => match report.outcome {
+            SlotReport::Empty => return,
+            SlotReport::Lost { .. } => &mut turns.lost,
+            SlotReport::Report(report) => match report.outcome {
                 Outcome::Candidate(_) => &mut turns.candidate,
-                Outcome::Turn => &mut turns.turn,
-                Outcome::Paused => &mut turns.paused,
+                Outcome::StepsDone => &mut turns.turn,
+                Outcome::Interrupted => &mut turns.paused,
                 Outcome::Ended(_) => &mut turns.ended,
             },
         };
@@ -106,7 +106,7 @@ impl Numbers {
 #[cfg(test)]
 mod tests {
     use atoms::{Cell, Structure};
-    use wire::messages::{End, Report};
+    use wire::messages::{Report, WalkEnd};
     use wire::{CampaignId, Origin};
 
     use super::*;
@@ -120,15 +120,15 @@ mod tests {
         Assignment {
             campaign: CampaignId([1; 16]),
             walk: WALK,
-            turn,
+            number: turn,
             origin: Origin::Biased,
             random_walk: WALK,
             seed_structure,
             checkpoint,
             verdict: None,
-            until: 100,
-            wanted: Vec::new(),
-            raised: 1.0,
+            last_step: 100,
+            frame_steps: Vec::new(),
+            threshold_factor: 1.0,
         }
     }
 
@@ -164,10 +164,16 @@ mod tests {
         let mut numbers = Numbers::default();
         let report = |outcome| {
             let checkpoint = Vec::new();
-            Told::Report(Report { walk: WALK, turn: 0, outcome, checkpoint, progress: at(0, 1) })
+            SlotReport::Report(Report { walk: WALK, assignment: 0, outcome, checkpoint, progress: at(0, 1) })
         };
-        let ended = || report(Outcome::Ended(End::Steps));
-        for told in [Told::Nothing, report(Outcome::Turn), ended(), ended(), Told::Lost { fault: true }] {
+        let ended = || report(Outcome::Ended(WalkEnd::Steps));
+        for told in [
+            SlotReport::Empty,
+            report(Outcome::StepsDone),
+            ended(),
+            ended(),
+            SlotReport::Lost { crashed: true },
+        ] {
             numbers.told(&told);
         }
         let expected = Turns { turn: 1, ended: 2, lost: 1, ..Turns::default() };

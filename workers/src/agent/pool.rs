@@ -5,16 +5,16 @@ use std::collections::{BTreeMap, VecDeque};
 use tokio::sync::oneshot;
 use wire::WalkId;
 use wire::messages::Report;
-use wire::net::{Slot, Told};
-use wire::transport::Work;
+use wire::net::{Slot, SlotReport};
+use wire::transport::WorkItem;
 
 /// The turns and walkers of a host. `S` is a slot: the place of a turn at the orchestrator.
 #[derive(Debug)]
 pub(super) struct Pool<S = Slot> {
     /// Turns that no walker has begun.
-    ready: VecDeque<(S, Work)>,
+    ready: VecDeque<(S, WorkItem)>,
     /// Walkers that wait for one, in the order in which they came.
-    waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
+    waiting: VecDeque<(u32, oneshot::Sender<Option<WorkItem>>)>,
     /// What each of the others works on.
     in_hand: BTreeMap<u32, (Option<S>, WalkId)>,
     /// Reports whose slots are gone.
@@ -33,14 +33,16 @@ impl<S> Default for Pool<S> {
 impl<S> Pool<S> {
     /// Begins with these slots, or goes on with them in place of others: what is to be told first. Turns that a walker has
     /// in hand keep a slot; those that nobody has begun are given up.
-    pub(super) fn begin(&mut self, slots: Vec<S>) -> Vec<(S, Told)> {
+    pub(super) fn begin(&mut self, slots: Vec<S>) -> Vec<(S, SlotReport)> {
         self.open = slots.len();
         self.ready.clear();
         let mut slots = slots.into_iter();
         for (slot, _) in self.in_hand.values_mut() {
             *slot = slots.next();
         }
-        slots.map(|slot| (slot, self.untold.pop_front().map_or(Told::Nothing, Told::Report))).collect()
+        slots
+            .map(|slot| (slot, self.untold.pop_front().map_or(SlotReport::Empty, SlotReport::Report)))
+            .collect()
     }
 
     /// A walker is free: what came of its turn is to be told, and it waits for another.
@@ -48,14 +50,14 @@ impl<S> Pool<S> {
         &mut self,
         walker: u32,
         report: Option<Report>,
-        reply: oneshot::Sender<Option<Work>>,
-    ) -> Option<(S, Told)> {
+        reply: oneshot::Sender<Option<WorkItem>>,
+    ) -> Option<(S, SlotReport)> {
         let slot = self.in_hand.remove(&walker).and_then(|(slot, _)| slot);
         self.waiting.push_back((walker, reply));
         self.deal();
         match (slot, report) {
-            (Some(slot), Some(report)) => Some((slot, Told::Report(report))),
-            (Some(slot), None) => Some((slot, Told::Lost { fault: false })),
+            (Some(slot), Some(report)) => Some((slot, SlotReport::Report(report))),
+            (Some(slot), None) => Some((slot, SlotReport::Lost { crashed: false })),
             (None, report) => {
                 self.untold.extend(report);
                 None
@@ -64,13 +66,13 @@ impl<S> Pool<S> {
     }
 
     /// A walker is no more: if it had a turn in hand, that is to be told.
-    pub(super) fn gone(&mut self, walker: u32, fault: bool) -> Option<(S, Told)> {
+    pub(super) fn gone(&mut self, walker: u32, crashed: bool) -> Option<(S, SlotReport)> {
         let (slot, _) = self.in_hand.remove(&walker)?;
-        Some((slot?, Told::Lost { fault }))
+        Some((slot?, SlotReport::Lost { crashed }))
     }
 
     /// A turn has come.
-    pub(super) fn turn(&mut self, slot: S, work: Work) {
+    pub(super) fn turn(&mut self, slot: S, work: WorkItem) {
         self.ready.push_back((slot, work));
         self.deal();
     }
@@ -81,8 +83,8 @@ impl<S> Pool<S> {
     }
 
     /// Keeps what could not be told.
-    pub(super) fn keep(&mut self, told: Told) {
-        if let Told::Report(report) = told {
+    pub(super) fn keep(&mut self, told: SlotReport) {
+        if let SlotReport::Report(report) = told {
             self.untold.push_back(report);
         }
     }

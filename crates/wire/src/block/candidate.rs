@@ -3,7 +3,7 @@
 use atoms::{Matrix3, Structure, Vec3};
 use zerocopy::IntoBytes;
 
-use super::layout::{Header, MAGIC, VERSION, flatten, length, seal};
+use super::layout::{Header, MAGIC, VERSION, flatten, length, write_checksum};
 use crate::ids::{CandidateId, ContentHash, Origin};
 
 /// What a walker knows of a structure when it offers it.
@@ -56,7 +56,11 @@ impl Candidate {
         let n = structure.len();
         assert!([structure.positions.len(), forces.len(), gamma.len(), gamma_nbr.len()] == [n; 4] && n > 0);
         assert_eq!(features.len() % n, 0, "features of every atom");
-        assert_eq!(self.id.content, ContentHash::of(structure), "the hash of this very structure");
+        assert_eq!(
+            self.id.content,
+            ContentHash::from_structure(structure),
+            "the hash of this very structure"
+        );
         assert_eq!(out.len(), self.encoded_len(), "room for the block");
         let header = self.header();
         let numbers: Vec<u64> = structure.species.iter().map(|s| u64::from(s.atomic_number())).collect();
@@ -75,7 +79,7 @@ impl Candidate {
             place.copy_from_slice(part);
             rest = behind;
         }
-        seal(out);
+        write_checksum(out);
     }
 
     fn header(&self) -> Header {

@@ -53,7 +53,7 @@ pub(super) fn length(atoms: u64, features: u64) -> u64 {
 }
 
 /// Writes the checksum of a block into its header.
-pub(super) fn seal(block: &mut [u8]) {
+pub(super) fn write_checksum(block: &mut [u8]) {
     let checksum = crc32fast::hash(&block[CHECKED_FROM..]);
     block[CHECKED_FROM - 4..CHECKED_FROM].copy_from_slice(&checksum.to_le_bytes());
 }

@@ -46,7 +46,7 @@ impl<'a> CandidateView<'a> {
         if view.header.periodic.iter().any(|p| *p > 1) || view.header.periodic[3] != 0 {
             return field("periodic", format!("{:?}", view.header.periodic));
         }
-        if ContentHash::of(&view.structure()) != view.id().content {
+        if ContentHash::from_structure(&view.structure()) != view.id().content {
             return field("content hash", view.id().content.to_string());
         }
         Ok(view)

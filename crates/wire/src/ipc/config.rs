@@ -16,8 +16,8 @@ use iceoryx2::prelude::{SemanticString, ServiceName, ipc_threadsafe};
 use iceoryx2::service::port_factory::request_response;
 
 use super::{IpcError, Sizes};
-use crate::exchange::message::Caller;
-use crate::place;
+use crate::protocol::message::SenderId;
+use crate::shm_dir;
 
 pub(super) type Service = ipc_threadsafe::Service;
 // Messages are words of 8 bytes: bytes aligned to 8 take eight times their number in iceoryx2's segments.
@@ -29,11 +29,11 @@ type Requests = request_response::PortFactory<Service, [u64], (), [u64], ()>;
 
 /// Candidates of one walker that are read where the walker wrote them. Beyond this number (a reproducible round of many
 /// walks) the server copies them, which frees the walker's memory.
-pub(super) const IN_PLACE: usize = 4;
+pub(super) const MAX_IN_PLACE: usize = 4;
 /// The same of all walkers, the dead ones among them, whose memory lasts as long as a candidate in it.
-pub(super) const IN_PLACE_IN_ALL: usize = 256;
+pub(super) const MAX_IN_PLACE_TOTAL: usize = 256;
 /// Requests of one walker that the server may hold: the above, an offer, questions, progress.
-const ACTIVE_REQUESTS: usize = IN_PLACE + 4;
+const ACTIVE_REQUESTS: usize = MAX_IN_PLACE + 4;
 /// Requests that a walker has memory for. More of them, or larger ones, make iceoryx2 add a segment.
 const REQUEST_BUFFERS: usize = ACTIVE_REQUESTS + 2;
 /// Channels that iceoryx2 has for the answers to one walker, each with a place for one. What nobody has read when its
@@ -57,9 +57,9 @@ pub fn space_needed(sizes: &Sizes) -> u64 {
 
 /// Whether a message is as large as was expected, or there is room for a larger one: without room, writing it would be
 /// the end of the process.
-pub(super) fn check_room(length: usize, message_bytes: usize) -> Result<(), IpcError> {
+pub(super) fn check_free_space(length: usize, message_bytes: usize) -> Result<(), IpcError> {
     if length > message_bytes {
-        let free = place::free_space().map_err(|e| IpcError::new("look for room", e))?;
+        let free = shm_dir::free_space().map_err(|e| IpcError::new("look for room", e))?;
         if free < 2 * length as u64 {
             let why =
                 format!("it has {length} bytes, more than expected, and /dev/shm has {free} bytes free");
@@ -74,7 +74,7 @@ fn answer_buffers(sizes: &Sizes) -> usize {
     ANSWER_BUFFERS * sizes.walkers as usize + 1
 }
 
-/// Words that a message of the expected length has at most.
+/// Payload that a message of the expected length has at most.
 fn words(message_bytes: usize) -> usize {
     (message_bytes + MESSAGE_MARGIN).div_ceil(8)
 }
@@ -101,7 +101,7 @@ pub(super) fn node(directory: &Path, prefix: &str) -> Result<Node<Service>, IpcE
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     let messages = &mut config.defaults.request_response;
-    messages.server_expired_connection_buffer = IN_PLACE_IN_ALL;
+    messages.server_expired_connection_buffer = MAX_IN_PLACE_TOTAL;
     messages.client_expired_connection_buffer = 4;
     NodeBuilder::new()
         .config(&config)
@@ -120,7 +120,7 @@ pub(super) fn create_requests(
     sizes: &Sizes,
     session: u64,
 ) -> Result<Requests, IpcError> {
-    node.service_builder(&name(&requests_of(session))?)
+    node.service_builder(&name(&requests_name(session))?)
         .request_response::<[u64], [u64]>()
         .enable_safe_overflow_for_requests(false)
         .enable_safe_overflow_for_responses(false)
@@ -138,7 +138,7 @@ pub(super) fn create_requests(
 }
 
 pub(super) fn open_requests(node: &Node<Service>, session: u64) -> Result<Requests, IpcError> {
-    node.service_builder(&name(&requests_of(session))?).request_response::<[u64], [u64]>().open().map_err(
+    node.service_builder(&name(&requests_name(session))?).request_response::<[u64], [u64]>().open().map_err(
         |e| IpcError::new("find the orchestrator: it has ended, or this walker is of another run", e),
     )
 }
@@ -170,33 +170,40 @@ pub(super) fn client_port(requests: &Requests, message_bytes: usize) -> Result<C
 }
 
 /// What wakes the server; the server creates it.
-pub(super) fn create_server_bell(
+pub(super) fn create_server_wakeup(
     node: &Node<Service>,
     sizes: &Sizes,
     session: u64,
 ) -> Result<Listener<Service>, IpcError> {
-    create_bell(node, &server_bell_of(session), processes(sizes))
+    create_wakeup(node, &server_wakeup_name(session), processes(sizes))
 }
 
-pub(super) fn server_bell(node: &Node<Service>, session: u64) -> Result<Notifier<Service>, IpcError> {
-    open_bell(node, &server_bell_of(session))
+pub(super) fn open_server_wakeup(node: &Node<Service>, session: u64) -> Result<Notifier<Service>, IpcError> {
+    open_wakeup(node, &server_wakeup_name(session))
 }
 
 /// What wakes a walker. Each process creates its own, so that one which dies while it does harms nobody else.
-pub(super) fn create_walker_bell(
+pub(super) fn create_walker_wakeup(
     node: &Node<Service>,
-    caller: Caller,
+    sender: SenderId,
 ) -> Result<Listener<Service>, IpcError> {
-    create_bell(node, &walker_bell_of(caller), 4)
+    create_wakeup(node, &walker_wakeup_name(sender), 4)
 }
 
-pub(super) fn walker_bell(node: &Node<Service>, caller: Caller) -> Result<Notifier<Service>, IpcError> {
-    open_bell(node, &walker_bell_of(caller))
+pub(super) fn open_walker_wakeup(
+    node: &Node<Service>,
+    sender: SenderId,
+) -> Result<Notifier<Service>, IpcError> {
+    open_wakeup(node, &walker_wakeup_name(sender))
 }
 
-fn create_bell(node: &Node<Service>, bell: &str, processes: usize) -> Result<Listener<Service>, IpcError> {
+fn create_wakeup(
+    node: &Node<Service>,
+    wakeup: &str,
+    processes: usize,
+) -> Result<Listener<Service>, IpcError> {
     let events = node
-        .service_builder(&name(bell)?)
+        .service_builder(&name(wakeup)?)
         .event()
         .max_listeners(1)
         .max_notifiers(processes)
@@ -211,21 +218,21 @@ fn create_bell(node: &Node<Service>, bell: &str, processes: usize) -> Result<Lis
     events.listener_builder().create().map_err(|e| IpcError::new("listen to events", e))
 }
 
-fn open_bell(node: &Node<Service>, bell: &str) -> Result<Notifier<Service>, IpcError> {
-    let events = node.service_builder(&name(bell)?).event().open();
+fn open_wakeup(node: &Node<Service>, wakeup: &str) -> Result<Notifier<Service>, IpcError> {
+    let events = node.service_builder(&name(wakeup)?).event().open();
     let events = events.map_err(|e| IpcError::new("open the events", e))?;
     events.notifier_builder().create().map_err(|e| IpcError::new("open the events", e))
 }
 
-fn requests_of(session: u64) -> String {
+fn requests_name(session: u64) -> String {
     format!("{session:016x}/requests")
 }
 
-fn server_bell_of(session: u64) -> String {
+fn server_wakeup_name(session: u64) -> String {
     format!("{session:016x}/server")
 }
 
-fn walker_bell_of(Caller { session, walker, incarnation }: Caller) -> String {
+fn walker_wakeup_name(SenderId { session, walker, incarnation }: SenderId) -> String {
     format!("{session:016x}/walker/{walker}/{incarnation}")
 }
 

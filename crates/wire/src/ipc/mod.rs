@@ -2,9 +2,9 @@
 //! walkers with an [`IpcWalker`] each, messages in memory that both map.
 //!
 //! - **One write.** A walker encodes its candidate into the memory in which the selector and the store read it. Nothing
-//!   is copied, unless the server holds more of one walker's candidates than [`config::IN_PLACE`].
+//!   is copied, unless the server holds more of one walker's candidates than [`config::MAX_IN_PLACE`].
 //! - **Delivery is acknowledged.** The answer to a report is sent after its commit; a walker keeps what is unanswered,
-//!   asks, and offers it again if it was lost (see [`crate::exchange`]). Offered twice it is decided once.
+//!   asks, and offers it again if it was lost (see [`crate::protocol`]). Offered twice it is decided once.
 //! - **No polling.** Each end sleeps until the other rings. A walker that waits wakes every two seconds to ask, which is
 //!   its sign of life and finds what was lost.
 //! - **Nobody waits for the dead.** A full buffer drops a message and says so; no call blocks on another process.
@@ -12,12 +12,12 @@
 //!   incarnation. Sockets and segments are the user's alone. A process of the same user that writes into mapped memory
 //!   by force can do harm, as it could with a debugger: this is no border between a user's own processes.
 
+mod borrowed_request;
 mod config;
-mod desk;
-mod echo;
-mod lent;
-mod lines;
+mod connections;
+mod reencode;
 mod server;
+mod session;
 mod walker;
 
 use std::fmt;
@@ -25,14 +25,14 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::exchange::message::Caller;
 use crate::mixture::SharedMixtureError;
+use crate::protocol::message::SenderId;
 
 pub use config::space_needed;
+pub use connections::Traffic;
 #[doc(hidden)]
-pub use echo::echo;
-pub use lines::Traffic;
-pub use server::{Handle, Server};
+pub use reencode::reencode;
+pub use server::{Server, ServerHandle};
 pub use walker::IpcWalker;
 
 /// How much is expected.
@@ -48,18 +48,19 @@ pub struct Sizes {
 /// All that a walker needs to connect.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Door {
+pub struct ConnectInfo {
     directory: PathBuf,
     prefix: String,
     mixture: PathBuf,
     message_bytes: usize,
-    caller: Caller,
+    #[serde(rename = "caller")]
+    sender: SenderId,
 }
 
-impl Door {
+impl ConnectInfo {
     /// The number of the walker that it is for.
     pub fn walker(&self) -> u32 {
-        self.caller.walker
+        self.sender.walker
     }
 }
 
@@ -79,13 +80,13 @@ pub enum IpcError {
     Mixture(#[from] SharedMixtureError),
     /// The orchestrator does not answer.
     #[error("the orchestrator has not answered for {seconds} s")]
-    Silence {
+    Timeout {
         /// How long.
         seconds: u64,
     },
     /// What this walker sends is dropped again and again.
     #[error("the orchestrator refused a report {times} times: this is a defect of calmwalk")]
-    Refused {
+    Rejected {
         /// How often.
         times: u32,
     },

@@ -103,7 +103,7 @@ pub enum SharedMixtureError {
     #[error(
         "reader {reader} is open already, by process {process}; if that process is dead it must be released first"
     )]
-    Taken {
+    SlotTaken {
         /// The reader.
         reader: u32,
         /// Process id of the one that has the slot.
@@ -113,7 +113,7 @@ pub enum SharedMixtureError {
     #[error(
         "version {version} of the mixture is not in shared memory (the newest is {newest}); ask for another turn"
     )]
-    Gone {
+    VersionNotFound {
         /// The version.
         version: u64,
         /// The newest.

@@ -7,7 +7,7 @@ use std::path::Path;
 use calm::Mixture;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
-use super::blocks::SPARE;
+use super::allocator::SPARE;
 use super::error::SharedMixtureError;
 
 const MAGIC: [u8; 8] = *b"CALMMIXT";
@@ -16,7 +16,7 @@ const FORMAT: u32 = 1;
 /// Sections and blocks start at multiples of this, so that memory is reserved and given back by whole pages.
 const PAGE: u64 = 4096;
 /// Words of different readers are on lines of their own, so that they do not slow each other.
-pub(super) const LINE: u64 = 64;
+pub(super) const CACHE_LINE: u64 = 64;
 /// Versions alive at once: one a walker is the rule, and this for those who look on.
 const SPARE_ROWS: u32 = 64;
 
@@ -72,7 +72,7 @@ pub(super) struct Layout {
     pub readers: u32,
     /// Rows for versions.
     pub rows: u32,
-    /// Blocks in an extent.
+    /// BlockAllocator in an extent.
     pub extent_blocks: u32,
     /// The words that processes speak by.
     pub control_at: u64,
@@ -99,7 +99,7 @@ pub(super) struct Layout {
 impl Layout {
     /// The layout for mixtures with the shape of `mixture`. An extent has room for two of each component, and at least for
     /// one of each and the spare ones, which are reserved at the start.
-    pub fn of(mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
+    pub fn for_mixture(mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
         let (elements, dimension) = (mixture.element_count(), mixture.dimension());
         let components = |element| mixture.components(element).unwrap_or_default().len().try_into().ok();
         let layout = || {
@@ -120,11 +120,11 @@ impl Layout {
             return None;
         }
         let control_at = up(HEADER as u64 + 4 * shape.len() as u64, PAGE)?;
-        let versions_at = LINE * (1 + u64::from(readers));
-        let rows_at = up(versions_at + 8 * u64::from(rows), LINE)?;
-        let row_bytes = up(4 * u64::from(components), LINE)?;
+        let versions_at = CACHE_LINE * (1 + u64::from(readers));
+        let rows_at = up(versions_at + 8 * u64::from(rows), CACHE_LINE)?;
+        let row_bytes = up(4 * u64::from(components), CACHE_LINE)?;
         let control_bytes = up(row_bytes.checked_mul(rows.into())?.checked_add(rows_at)?, PAGE)?;
-        let reader_holds_bytes = up(4 * u64::from(extent_blocks), LINE)?;
+        let reader_holds_bytes = up(4 * u64::from(extent_blocks), CACHE_LINE)?;
         let holds_bytes = up(reader_holds_bytes.checked_mul(readers.into())?.max(1), PAGE)?;
         let numbers = u64::from(dimension) * (u64::from(dimension) + 1);
         let block_bytes = up(numbers.checked_mul(8)?.checked_add(BLOCK_HEADER)?, PAGE)?;
@@ -205,7 +205,7 @@ impl Layout {
     }
 
     /// Element and number among its components, of every component in the order of a row.
-    pub fn places(&self) -> impl Iterator<Item = (u32, u32)> {
+    pub fn component_keys(&self) -> impl Iterator<Item = (u32, u32)> {
         (0..).zip(&self.shape).flat_map(|(element, &count)| (0..count).map(move |slot| (element, slot)))
     }
 

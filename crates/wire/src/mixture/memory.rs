@@ -8,9 +8,9 @@ use memmap2::{MmapOptions, MmapRaw};
 
 /// Bytes of a file that other processes may see and write at the same time.
 #[derive(Debug)]
-pub(super) struct Map(MmapRaw);
+pub(super) struct Mapping(MmapRaw);
 
-impl Map {
+impl Mapping {
     /// Maps `length` bytes from `offset` on, to be read and written.
     ///
     /// # Errors
@@ -19,13 +19,13 @@ impl Map {
         options(file, offset, length)?.map_raw(file).map(Self)
     }
 
-    /// As [`Map::shared`], but a write through it would end the process. Atomic words of it may only be loaded relaxed.
+    /// As [`Mapping::shared`], but a write through it would end the process. Atomic words of it may only be loaded relaxed.
     pub fn read_only(file: &File, offset: u64, length: u64) -> io::Result<Self> {
         options(file, offset, length)?.map_raw_read_only(file).map(Self)
     }
 
     /// The word at `offset`, which must lie within the map at a multiple of 8.
-    pub fn word(&self, offset: u64) -> &AtomicU64 {
+    pub fn word64(&self, offset: u64) -> &AtomicU64 {
         let place = self.place(offset, 8, 8);
         // SAFETY: `place` is within the mapping, which lives as long as `self`, and aligned; every process accesses
         // these words by atomic operations only.
@@ -33,7 +33,7 @@ impl Map {
     }
 
     /// The half word at `offset`, which must lie within the map at a multiple of 4.
-    pub fn half_word(&self, offset: u64) -> &AtomicU32 {
+    pub fn word32(&self, offset: u64) -> &AtomicU32 {
         let place = self.place(offset, 4, 4);
         // SAFETY: as for `word`.
         unsafe { AtomicU32::from_ptr(place.cast()) }

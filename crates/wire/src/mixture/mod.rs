@@ -22,15 +22,15 @@
 //! Memory is reserved before it is written: a full file system is an error, not a signal. The trust is that of the
 //! user: whoever may write the file may spoil it. A damaged file gives errors and never an access beyond its end.
 
-mod blocks;
-mod control;
+mod allocator;
+#[allow(unsafe_code)]
+mod block_reader;
 mod error;
+mod index;
 mod layout;
 #[allow(unsafe_code)]
-mod lender;
-#[allow(unsafe_code)]
 mod memory;
-mod protocol;
+mod pinning;
 mod reader;
 mod writer;
 

@@ -8,18 +8,18 @@ use std::sync::atomic::Ordering;
 
 use calm::{ChangedComponent, Component, Mixture};
 
-use super::control::Control;
+use super::block_reader::{BlockReader, Slot};
 use super::error::SharedMixtureError;
+use super::index::MixtureIndex;
 use super::layout::Layout;
-use super::lender::{Lender, Slot};
-use super::protocol::{NONE, Pinned, Word};
+use super::pinning::{NONE, Pinned, Word};
 
 /// The shared mixture as one reader sees it.
 ///
 /// The reader itself keeps the version it pinned last, so that the next one needs only what changed.
 #[derive(Debug)]
 pub struct MixtureReader {
-    lender: Lender,
+    block_reader: BlockReader,
     current: Option<Current>,
 }
 
@@ -49,19 +49,19 @@ impl MixtureReader {
         if reader >= layout.readers {
             return Err(SharedMixtureError::NoSlot { reader, readers: layout.readers });
         }
-        let control = Control::map(&file, &layout).map_err(|source| failed("map", source))?;
-        let (own, owner) = (std::process::id().into(), control.owner(reader));
+        let index = MixtureIndex::map(&file, &layout).map_err(|source| failed("map", source))?;
+        let (own, owner) = (std::process::id().into(), index.owner(reader));
         if let Err(process) = owner.compare_exchange(0, own, Ordering::AcqRel, Ordering::Acquire) {
-            return Err(SharedMixtureError::Taken { reader, process });
+            return Err(SharedMixtureError::SlotTaken { reader, process });
         }
-        let slot = Arc::new(Slot { control, reader });
-        let lender = Lender { path: path.into(), file, layout, slot, extents: Vec::new() };
-        Ok(Self { lender, current: None })
+        let slot = Arc::new(Slot { index, reader });
+        let block_reader = BlockReader { path: path.into(), file, layout, slot, extents: Vec::new() };
+        Ok(Self { block_reader, current: None })
     }
 
     /// The highest version published.
     pub fn newest(&self) -> u64 {
-        self.lender.slot.control.newest().look()
+        self.block_reader.slot.index.newest().load_acquire()
     }
 
     /// A version, evaluated in place. It stays as it is while anybody has it or a component of it.
@@ -74,17 +74,19 @@ impl MixtureReader {
         {
             return Ok(Arc::clone(&current.mixture));
         }
-        let slot = Arc::clone(&self.lender.slot);
-        let gone = || SharedMixtureError::Gone { version, newest: slot.control.newest().look() };
-        let row = (0..self.lender.layout.rows).find(|&row| slot.control.version(row).look() == version);
+        let slot = Arc::clone(&self.block_reader.slot);
+        let gone =
+            || SharedMixtureError::VersionNotFound { version, newest: slot.index.newest().load_acquire() };
+        let row =
+            (0..self.block_reader.layout.rows).find(|&row| slot.index.version(row).load_acquire() == version);
         // A row without a version is not a version.
         let row = row.filter(|_| version != NONE).ok_or_else(gone)?;
-        let pin = slot.control.pin(slot.reader);
-        let _pinned = Pinned::new(pin, slot.control.version(row), version).ok_or_else(gone)?;
-        let row: Vec<u32> = slot.control.row(row).map(|block| block.load(Ordering::Relaxed)).collect();
+        let pin = slot.index.pin(slot.reader);
+        let _pinned = Pinned::new(pin, slot.index.version(row), version).ok_or_else(gone)?;
+        let row: Vec<u32> = slot.index.row(row).map(|block| block.load(Ordering::Relaxed)).collect();
         let mixture = match &self.current {
-            Some(current) => following(&mut self.lender, current, &row)?.at_version(version),
-            None => Mixture::new(version, elements(&mut self.lender, &row)?)?,
+            Some(current) => following(&mut self.block_reader, current, &row)?.at_version(version),
+            None => Mixture::new(version, elements(&mut self.block_reader, &row)?)?,
         };
         let mixture = Arc::new(mixture);
         self.current = Some(Current { mixture: Arc::clone(&mixture), row });
@@ -93,12 +95,15 @@ impl MixtureReader {
 }
 
 /// All components of a pinned row.
-fn elements(lender: &mut Lender, row: &[u32]) -> Result<Vec<Vec<Arc<Component>>>, SharedMixtureError> {
+fn elements(
+    block_reader: &mut BlockReader,
+    row: &[u32],
+) -> Result<Vec<Vec<Arc<Component>>>, SharedMixtureError> {
     let mut blocks = row.iter();
-    let shape = lender.layout.shape.clone();
+    let shape = block_reader.layout.shape.clone();
     let elements = (0..).zip(shape).map(|(element, count)| {
         let components = (0..count).zip(blocks.by_ref());
-        components.map(|(slot, &block)| lender.lend((element, slot), block)).collect()
+        components.map(|(slot, &block)| block_reader.component((element, slot), block)).collect()
     });
     elements.collect()
 }
@@ -106,12 +111,16 @@ fn elements(lender: &mut Lender, row: &[u32]) -> Result<Vec<Vec<Arc<Component>>>
 /// The current mixture with the components that have other blocks in a pinned row.
 ///
 /// A block that the current version holds cannot have been used anew, so the same number is the same component.
-fn following(lender: &mut Lender, current: &Current, row: &[u32]) -> Result<Mixture, SharedMixtureError> {
-    let blocks = row.iter().zip(&current.row).zip(lender.layout.places());
+fn following(
+    block_reader: &mut BlockReader,
+    current: &Current,
+    row: &[u32],
+) -> Result<Mixture, SharedMixtureError> {
+    let blocks = row.iter().zip(&current.row).zip(block_reader.layout.component_keys());
     let other = blocks.filter(|((new, old), _)| new != old).map(|((&block, _), place)| (place, block));
     let other: Vec<_> = other.collect();
     let changed = other.into_iter().map(|((element, slot), block)| {
-        let component = lender.lend((element, slot), block)?;
+        let component = block_reader.component((element, slot), block)?;
         Ok(ChangedComponent { element: element as usize, slot: slot as usize, component })
     });
     let changed = changed.collect::<Result<Vec<_>, SharedMixtureError>>()?;

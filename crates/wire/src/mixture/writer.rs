@@ -9,28 +9,28 @@ use std::{fmt, io};
 
 use calm::Mixture;
 
-use super::blocks::{Blocks, SPARE};
-use super::control::Control;
+use super::allocator::{BlockAllocator, SPARE};
 use super::error::SharedMixtureError;
+use super::index::MixtureIndex;
 use super::layout::Layout;
-use super::protocol::{NONE, Word, take_away};
+use super::pinning::{NONE, Word, retire_version};
 
 /// The mixture in shared memory, to be published to. There must be one for a file.
 ///
 /// Dropping it leaves the file, which readers may still have open: whoever owns the place removes it.
 pub struct SharedMixture {
     layout: Layout,
-    control: Control,
-    blocks: Blocks,
+    index: MixtureIndex,
+    blocks: BlockAllocator,
     /// What stands in each row.
-    living: Vec<Option<Living>>,
+    living: Vec<Option<LiveVersion>>,
     /// The newest version and its blocks, in the order of a row: what others are compared with.
     latest: Option<(Mixture, Vec<u32>)>,
 }
 
 /// A version that readers can pin.
 #[derive(Debug)]
-struct Living {
+struct LiveVersion {
     version: u64,
     /// Block of each component.
     blocks: Vec<u32>,
@@ -53,7 +53,7 @@ impl SharedMixture {
     /// # Errors
     /// The size overflows.
     pub fn space_needed(mixture: &Mixture, readers: u32) -> Result<u64, SharedMixtureError> {
-        Layout::of(mixture, readers).map(|layout| reserved(&layout))
+        Layout::for_mixture(mixture, readers).map(|layout| reserved(&layout))
     }
 
     /// Makes the file, for the user alone (mode 0600), with `mixture` as its newest version and slots for `readers`
@@ -62,7 +62,7 @@ impl SharedMixture {
     /// # Errors
     /// Too little shared memory, sizes that overflow, a path that cannot be written.
     pub fn create(path: &Path, mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
-        let layout = Layout::of(mixture, readers)?;
+        let layout = Layout::for_mixture(mixture, readers)?;
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         match fs::remove_file(path) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => {
@@ -83,16 +83,16 @@ impl SharedMixture {
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         let copy = file.try_clone().map_err(|source| failed("open", source))?;
         file.set_len(reserved(&layout)).map_err(|source| failed("grow", source))?;
-        let mut blocks = Blocks::new(layout.clone(), copy, path.into());
+        let mut blocks = BlockAllocator::new(layout.clone(), copy, path.into());
         blocks.reserve(0, reserved(&layout))?;
         blocks.grow(initial_blocks(&layout))?;
-        let control = Control::map(file, &layout).map_err(|source| failed("map", source))?;
-        control.clear();
+        let index = MixtureIndex::map(file, &layout).map_err(|source| failed("map", source))?;
+        index.clear();
         let mut living = Vec::new();
         living.resize_with(layout.rows as usize, || None);
-        let mut shared = Self { layout, control, blocks, living, latest: None };
+        let mut shared = Self { layout, index, blocks, living, latest: None };
         let blocks = shared.write(mixture)?;
-        shared.enter(0, mixture, blocks, Vec::new());
+        shared.publish_row(0, mixture, blocks, Vec::new());
         shared.layout.write(file).map_err(|source| failed("write the header", source))?;
         Ok(shared)
     }
@@ -121,7 +121,7 @@ impl SharedMixture {
         let living = self.living.len();
         let row = row.ok_or(SharedMixtureError::TooManyVersions { version, living })?;
         let blocks = self.write(mixture)?;
-        self.enter(row, mixture, blocks, vec![Arc::downgrade(mixture)]);
+        self.publish_row(row, mixture, blocks, vec![Arc::downgrade(mixture)]);
         Ok(())
     }
 
@@ -129,9 +129,9 @@ impl SharedMixture {
     /// any more: what it reads from then on may change under its eyes.
     pub fn release(&mut self, reader: u32) {
         if reader < self.layout.readers {
-            self.control.pin(reader).put(NONE);
+            self.index.pin(reader).store_release(NONE);
             self.blocks.release(reader);
-            self.control.owner(reader).store(0, Ordering::Release);
+            self.index.owner(reader).store(0, Ordering::Release);
         }
     }
 
@@ -139,13 +139,13 @@ impl SharedMixture {
     fn write(&mut self, mixture: &Mixture) -> Result<Vec<u32>, SharedMixtureError> {
         let (mut row, mut written) = (Vec::with_capacity(self.layout.components as usize), Vec::new());
         let mut latest = self.latest.iter().flat_map(|(latest, blocks)| latest.iter().zip(blocks));
-        for (place, (.., component)) in self.layout.places().zip(mixture.iter()) {
+        for (place, (.., component)) in self.layout.component_keys().zip(mixture.iter()) {
             let block = match latest.next() {
                 Some(((.., same), &block)) if Arc::ptr_eq(same, component) => block,
                 _ => match self.blocks.write(place, mixture.version(), component) {
                     Ok(block) => *written.push_mut(block),
                     Err(error) => {
-                        self.blocks.give_back(written.into_iter());
+                        self.blocks.discard(written.into_iter());
                         return Err(error);
                     }
                 },
@@ -156,19 +156,19 @@ impl SharedMixture {
     }
 
     /// Lets readers see a version, of which the blocks are written, in a free row.
-    fn enter(&mut self, row: usize, mixture: &Mixture, blocks: Vec<u32>, owners: Vec<Weak<Mixture>>) {
+    fn publish_row(&mut self, row: usize, mixture: &Mixture, blocks: Vec<u32>, owners: Vec<Weak<Mixture>>) {
         let version = mixture.version();
-        self.blocks.refer(&blocks);
-        for (word, &block) in self.control.row(row as u32).zip(&blocks) {
+        self.blocks.incref(&blocks);
+        for (word, &block) in self.index.row(row as u32).zip(&blocks) {
             word.store(block, Ordering::Relaxed);
         }
-        self.control.version(row as u32).put(version);
+        self.index.version(row as u32).store_release(version);
         if self.latest.is_none() || version > self.newest() {
-            self.control.newest().put(version);
+            self.index.newest().store_release(version);
             self.latest = Some((mixture.clone(), blocks.clone()));
         }
         if let Some(place) = self.living.get_mut(row) {
-            *place = Some(Living { version, blocks, owners });
+            *place = Some(LiveVersion { version, blocks, owners });
         }
     }
 
@@ -176,25 +176,25 @@ impl SharedMixture {
     fn retire(&mut self) {
         let newest = self.newest();
         for (row, place) in self.living.iter_mut().enumerate() {
-            let unowned = |known: &Living| known.owners.iter().all(|owner| owner.strong_count() == 0);
+            let unowned = |known: &LiveVersion| known.owners.iter().all(|owner| owner.strong_count() == 0);
             let old = place.take_if(|known| {
                 known.version != newest
                     && unowned(known)
-                    && take_away(self.control.version(row as u32), known.version, self.control.pins())
+                    && retire_version(self.index.version(row as u32), known.version, self.index.pins())
             });
             if let Some(old) = old {
-                self.blocks.let_go(&old.blocks);
+                self.blocks.decref(&old.blocks);
             }
         }
-        self.blocks.collect();
+        self.blocks.reclaim();
     }
 
     fn newest(&self) -> u64 {
-        self.control.newest().look()
+        self.index.newest().load_acquire()
     }
 }
 
-/// Blocks at the start: one for each component and a few to change. An extent has room for them.
+/// BlockAllocator at the start: one for each component and a few to change. An extent has room for them.
 fn initial_blocks(layout: &Layout) -> u32 {
     layout.components.saturating_add(SPARE)
 }

@@ -24,10 +24,10 @@ use x509_parser::prelude::FromDer;
 use x509_parser::time::ASN1Time;
 
 pub use self::error::{CertificateError, CertificateFault};
-use super::door::Side;
+use super::endpoint::Side;
 
 /// A certificate that expires sooner is worth a warning.
-const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
+const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 24 * 3600);
 
 /// Certificates, as PEM files: both sides show one, and each trusts those that the authority has signed.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -61,7 +61,7 @@ pub(super) struct Credentials {
 
 impl Tls {
     /// `authority.pem`, `certificate.pem` and `key.pem` of a directory.
-    pub fn in_directory(directory: &Path) -> Self {
+    pub fn from_directory(directory: &Path) -> Self {
         let [authority, certificate, key] =
             ["authority.pem", "certificate.pem", "key.pem"].map(|name| directory.join(name));
         Self { authority, certificate, key }
@@ -94,7 +94,7 @@ impl Tls {
             for certificate in &certificates {
                 let parsed = parse(path, certificate)?;
                 warnings.extend(
-                    in_force(&parsed, now)
+                    check_validity(&parsed, now)
                         .map_err(|fault| fault.at(path))?
                         .map(|warning| format!("{} {warning}", path.display())),
                 );
@@ -105,7 +105,7 @@ impl Tls {
             .first()
             .ok_or_else(|| CertificateFault::Empty("certificate").at(&self.certificate))?;
         let names = names(&parse(&self.certificate, own)?);
-        self.is_accepted(&credentials, side, &names, now)?;
+        self.check_accepted(&credentials, side, &names, now)?;
         Ok(CheckedTls { names, warnings })
     }
 
@@ -131,7 +131,7 @@ impl Tls {
     }
 
     /// Asks what the other side will ask of the own certificate.
-    fn is_accepted(
+    fn check_accepted(
         &self,
         credentials: &Credentials,
         side: Side,
@@ -228,7 +228,10 @@ fn parse<'a>(
 }
 
 /// What to say of a certificate that expires soon.
-fn in_force(certificate: &X509Certificate<'_>, now: SystemTime) -> Result<Option<String>, CertificateFault> {
+fn check_validity(
+    certificate: &X509Certificate<'_>,
+    now: SystemTime,
+) -> Result<Option<String>, CertificateFault> {
     let since = now.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let now = i64::try_from(since.as_secs()).unwrap_or(i64::MAX);
     let date = |time: ASN1Time| time.to_datetime().date().to_string();
@@ -238,7 +241,7 @@ fn in_force(certificate: &X509Certificate<'_>, now: SystemTime) -> Result<Option
         Err(CertificateFault::NotYet { from: date(validity.not_before) })
     } else if left < 0 {
         Err(CertificateFault::Expired { on: date(validity.not_after) })
-    } else if left < SOON.as_secs().cast_signed() {
+    } else if left < EXPIRY_WARNING.as_secs().cast_signed() {
         let days = left / (24 * 3600);
         Ok(Some(format!("expires on {}, in {days} days: make another in time", date(validity.not_after))))
     } else {

@@ -7,7 +7,7 @@ use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
 
 /// Bytes that travel in one message.
-const PART: u64 = 4 << 20;
+const MAX_PART_BYTES: u64 = 4 << 20;
 
 pub(super) struct Files(BTreeMap<String, PathBuf>);
 
@@ -21,7 +21,7 @@ impl Files {
         let Some(path) = self.0.get(hash) else { return Ok(None) };
         let file = File::open(path)?;
         let length = file.metadata()?.len();
-        let mut part = vec![0; length.saturating_sub(offset).min(PART) as usize];
+        let mut part = vec![0; length.saturating_sub(offset).min(MAX_PART_BYTES) as usize];
         file.read_exact_at(&mut part, offset)?;
         Ok(Some((length, part)))
     }

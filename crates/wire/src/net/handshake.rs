@@ -10,12 +10,12 @@ use rustls::version::TLS13;
 use rustls::{AlertDescription, CertificateError as Refusal, ClientConfig, ClientConnection};
 
 use super::certificates::{Tls, provider};
-use super::door::Endpoint;
+use super::endpoint::Endpoint;
 
 /// The other side takes so long for a step at most, or is not there.
-const STEP: Duration = Duration::from_secs(5);
+const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 /// Within so long the other side says that it does not accept our certificate.
-const VERDICT: Duration = Duration::from_secs(2);
+const REJECTION_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Why two hosts will not speak to each other before one of them has another certificate.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -25,7 +25,7 @@ pub enum HandshakeError {
         "the certificate that the orchestrator shows at {endpoint} cannot be accepted: {why}; give the orchestrator one \
          for the name by which agents connect, of the authority in {authority} (docs/hosts.md, \"Certificates\")"
     )]
-    Theirs {
+    ServerCertificate {
         /// Where it listens.
         endpoint: Endpoint,
         /// What is wrong with it.
@@ -38,7 +38,7 @@ pub enum HandshakeError {
         "the orchestrator at {endpoint} refuses the certificate in {certificate}: {why}; give this host one that the \
          orchestrator's authority has signed (docs/hosts.md, \"Certificates\")"
     )]
-    Ours {
+    ClientCertificate {
         /// Where it listens.
         endpoint: Endpoint,
         /// Its reason.
@@ -53,16 +53,16 @@ pub(super) fn probe(endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError
     let Some((mut connection, mut stream)) = connect(endpoint, tls) else { return Ok(()) };
     while connection.is_handshaking() {
         if let Err(error) = connection.complete_io(&mut stream) {
-            return verdict(&error, endpoint, tls);
+            return classify(&error, endpoint, tls);
         }
     }
     // The orchestrator looks at our certificate only now, and waits for the first word if it likes it.
-    let said = stream.set_read_timeout(Some(VERDICT)).and_then(|()| {
-        let mut line = rustls::Stream::new(&mut connection, &mut stream);
-        line.flush()?;
-        line.read(&mut [0])
+    let said = stream.set_read_timeout(Some(REJECTION_TIMEOUT)).and_then(|()| {
+        let mut tls_stream = rustls::Stream::new(&mut connection, &mut stream);
+        tls_stream.flush()?;
+        tls_stream.read(&mut [0])
     });
-    said.map_or_else(|error| verdict(&error, endpoint, tls), |_| Ok(()))
+    said.map_or_else(|error| classify(&error, endpoint, tls), |_| Ok(()))
 }
 
 /// A connection that has not said anything yet; `None` if nobody is there.
@@ -77,23 +77,24 @@ fn connect(endpoint: &Endpoint, tls: &Tls) -> Option<(ClientConnection, TcpStrea
     let name = ServerName::try_from(endpoint.plain_host().to_owned()).ok()?;
     let connection = ClientConnection::new(Arc::new(config), name).ok()?;
     let addresses = (endpoint.plain_host(), endpoint.port()).to_socket_addrs().ok()?;
-    let stream = addresses.into_iter().find_map(|address| TcpStream::connect_timeout(&address, STEP).ok())?;
-    stream.set_read_timeout(Some(STEP)).ok()?;
-    stream.set_write_timeout(Some(STEP)).ok()?;
+    let stream =
+        addresses.into_iter().find_map(|address| TcpStream::connect_timeout(&address, STEP_TIMEOUT).ok())?;
+    stream.set_read_timeout(Some(STEP_TIMEOUT)).ok()?;
+    stream.set_write_timeout(Some(STEP_TIMEOUT)).ok()?;
     Some((connection, stream))
 }
 
 /// What an error means: nothing where the line broke, or whoever listens speaks no TLS.
-fn verdict(error: &io::Error, endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError> {
+fn classify(error: &io::Error, endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError> {
     let endpoint = endpoint.clone();
     match error.get_ref().and_then(|source| source.downcast_ref::<rustls::Error>()) {
         Some(rustls::Error::InvalidCertificate(why)) => {
             let authority = tls.authority.display().to_string();
-            Err(HandshakeError::Theirs { endpoint, why: in_words(why), authority })
+            Err(HandshakeError::ServerCertificate { endpoint, why: describe(why), authority })
         }
         Some(rustls::Error::AlertReceived(alert)) => {
             let certificate = tls.certificate.display().to_string();
-            let refused = refusal(*alert).map(|why| HandshakeError::Ours {
+            let refused = alert_reason(*alert).map(|why| HandshakeError::ClientCertificate {
                 endpoint,
                 why: why.to_owned(),
                 certificate,
@@ -104,7 +105,7 @@ fn verdict(error: &io::Error, endpoint: &Endpoint, tls: &Tls) -> Result<(), Hand
     }
 }
 
-fn in_words(why: &Refusal) -> String {
+fn describe(why: &Refusal) -> String {
     match why {
         Refusal::UnknownIssuer | Refusal::BadSignature => "another authority has signed it".to_owned(),
         Refusal::NotValidForNameContext { expected, presented } => {
@@ -128,7 +129,7 @@ fn bare(name: &str) -> &str {
 }
 
 /// What an alert says of our certificate, if it speaks of that.
-fn refusal(alert: AlertDescription) -> Option<&'static str> {
+fn alert_reason(alert: AlertDescription) -> Option<&'static str> {
     match alert {
         AlertDescription::UnknownCA | AlertDescription::DecryptError => {
             Some("another authority has signed it")

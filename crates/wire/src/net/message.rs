@@ -3,8 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::changes::Changes;
-use crate::exchange::message::{Answer, Caller, Letter};
+use super::delta::MixtureDelta;
+use crate::protocol::message::{Answer, Envelope, SenderId};
 
 /// The orchestrator answers under this key.
 pub(super) const ORCHESTRATOR: &str = "calmwalk/orchestrator";
@@ -28,13 +28,13 @@ pub struct Agent {
     /// Turns that it works on at the same time.
     pub walkers: u32,
     /// Turns that it takes beyond those.
-    pub ahead: u32,
+    pub prefetch: u32,
 }
 
 impl Agent {
     /// Turns that it may have in hand.
     pub fn slots(&self) -> u32 {
-        self.walkers.saturating_add(self.ahead)
+        self.walkers.saturating_add(self.prefetch)
     }
 }
 
@@ -44,15 +44,15 @@ pub(super) enum Request<'a> {
     Join(Agent),
     /// About a slot: what a walker says.
     #[serde(borrow)]
-    Letter(Letter<'a>),
+    Envelope(Envelope<'a>),
     /// About a slot, in place of an offer: the walker that worked on its turn is no more.
-    Lost { caller: Caller, sequence: u64, fault: bool },
+    Lost { sender: SenderId, sequence: u64, crashed: bool },
     /// The mixture of this version: what differs from the one that is there already, but for the first so many components.
     Mixture { session: u64, have: Option<u64>, wanted: u64, skip: u32 },
     /// A part of a file that walkers need.
     File { session: u64, hash: String, offset: u64 },
     /// Are you there, and am I to go on?
-    Here { session: u64 },
+    Ping { session: u64 },
     /// I leave; turns in my hands are free.
     Leave { session: u64, id: AgentId },
 }
@@ -60,29 +60,29 @@ pub(super) enum Request<'a> {
 #[derive(Serialize, Deserialize)]
 pub(super) enum Reply<'a> {
     #[serde(borrow)]
-    Joined(Place<'a>),
-    /// To a letter or a loss.
+    Joined(JoinReply<'a>),
+    /// To a envelope or a loss.
     Answer(Answer<'a>),
     #[serde(borrow)]
-    Mixture(Changes<'a>),
+    Mixture(MixtureDelta<'a>),
     File {
         length: u64,
         #[serde(serialize_with = "crate::bytes::serialize")]
         part: &'a [u8],
     },
-    Here {
+    Pong {
         stopping: bool,
     },
     Left,
     /// Not from you: you have been taken for dead, or this is another run of the orchestrator. Join anew.
-    Stranger(String),
+    RejoinRequired(String),
     /// This cannot be answered.
-    Refused(String),
+    Rejected(String),
 }
 
 /// A place among the walkers.
 #[derive(Serialize, Deserialize)]
-pub(super) struct Place<'a> {
+pub(super) struct JoinReply<'a> {
     pub session: u64,
     /// Number of the first slot; the others follow.
     pub first_slot: u32,

@@ -1,9 +1,9 @@
-//! The transport between hosts, on [zenoh](https://zenoh.io): an orchestrator with a [`Hub`], on every other host an
-//! agent with an [`Uplink`].
+//! The transport between hosts, on [zenoh](https://zenoh.io): an orchestrator with a [`AgentServer`], on every other host an
+//! agent with an [`AgentClient`].
 //!
 //! An agent takes part with a number of *slots*: to the reactor each is a walker like those of its own host. What an
 //! agent and the orchestrator say to each other about a slot is what a walker says over shared memory
-//! (`crate::exchange`): offers that are counted and idempotent, answers that come after the commit.
+//! (`crate::protocol`): offers that are counted and idempotent, answers that come after the commit.
 //!
 //! - **zenoh promises nothing across a break**, so everything is a question with an answer, asked again until there is
 //!   one. Nothing is published that somebody needs.
@@ -14,35 +14,35 @@
 //! - **Explicit endpoints, no scouting.** Off loopback nothing listens or connects without TLS with certificates on both sides.
 
 mod address;
+mod agent_client;
+mod agent_server;
 mod certificates;
-mod changes;
-mod desk;
-mod door;
+mod delta;
+mod endpoint;
 mod files;
 mod handshake;
-mod hub;
 mod message;
-mod roster;
+mod registry;
+mod session;
 mod slot;
-mod uplink;
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
 pub use address::{Address, Announcement};
+pub use agent_client::{AgentClient, LinkError, Membership};
+pub use agent_server::{AgentEvent, AgentServer, AgentServerHandle};
 pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
-pub use changes::ChangesError;
-pub use door::{Endpoint, EndpointError};
+pub use delta::DeltaError;
+pub use endpoint::{Endpoint, EndpointError};
 pub use handshake::HandshakeError;
-pub use hub::{AgentEvent, Handle, Hub};
 pub use message::{Agent, AgentId};
-pub use slot::{Slot, Told};
-pub use uplink::{Joined, Parted, Uplink};
+pub use slot::{Slot, SlotReport};
 
 /// What agents need to know of a campaign.
 #[derive(Clone, Debug, Default)]
-pub struct Welcome {
+pub struct AgentBootstrap {
     /// What walkers are started with.
     pub setup: Vec<u8>,
     /// Files that they read, by the BLAKE3 hash of their content (64 hexadecimal digits).
@@ -70,7 +70,7 @@ pub enum NetError {
     Handshake(#[from] HandshakeError),
     /// The file that says where the orchestrator is.
     #[error("cannot read {}: {source}", path.display())]
-    File {
+    EndpointFile {
         /// The file.
         path: PathBuf,
         /// Why not.
@@ -78,20 +78,20 @@ pub enum NetError {
     },
     /// No orchestrator has said where it is.
     #[error("no orchestrator has written yet where it is: there is no file {}", path.display())]
-    Nobody {
+    EndpointFileMissing {
         /// The file.
         path: PathBuf,
     },
     /// The orchestrator has written that there is no more work.
     #[error("the campaign is over")]
-    Over,
+    CampaignOver,
     /// A file that does not say where the orchestrator is.
     #[error(
         "{} does not say where the orchestrator is: expected tcp/HOST:PORT, found {found:?}; \
          calmwalk run --announce writes such a file",
         path.display()
     )]
-    Announcement {
+    InvalidAnnouncement {
         /// The file.
         path: PathBuf,
         /// How it begins.
@@ -107,7 +107,7 @@ pub enum NetError {
     },
     /// zenoh has ended.
     #[error("the line between hosts has ended: {why}")]
-    Ended {
+    SessionClosed {
         /// What zenoh says.
         why: String,
     },

@@ -66,7 +66,7 @@ pub fn candidate() -> impl Strategy<Value = Candidate> {
             |(place, numbers, structure, forces, (gamma, gamma_nbr, features))| {
                 let (campaign, walk, segment, step, origin, mixture_version) = place;
                 let (temperature, relative_volume, energy, virial) = numbers;
-                let content = ContentHash::of(&structure);
+                let content = ContentHash::from_structure(&structure);
                 let (campaign, walk) = (CampaignId(campaign), WalkId(walk));
                 Candidate {
                     id: CandidateId { campaign, walk, segment, step, content },

@@ -10,12 +10,12 @@ use std::time::Duration;
 use atoms::{Cell, Species, Structure};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
-use wire::ipc::{Door, IpcWalker};
+use wire::ipc::{ConnectInfo, IpcWalker};
 use wire::messages::{Assignment, Outcome, Report};
 use wire::transport::Transport;
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
-use super::desk::Desk;
+use super::test_server::TestServer;
 
 const ROLE: &str = "CALMWALK_TEST_ROLE";
 /// What [`Role::Orchestrator`] makes in its directory when a turn is done.
@@ -25,9 +25,9 @@ pub const AT_WORK: &str = "at-work";
 #[derive(Serialize, Deserialize)]
 pub enum Role {
     /// Ends each turn with [`candidate`] until it is sent home.
-    Walker(Door),
+    Walker(ConnectInfo),
     /// Takes a turn and never ends it.
-    Stuck(Door),
+    Stuck(ConnectInfo),
     /// An orchestrator of the campaign in that directory with a walker at work.
     Orchestrator(String),
 }
@@ -55,11 +55,11 @@ fn child() {
     }
 }
 
-fn walk(door: &Door, stuck: bool) {
+fn walk(door: &ConnectInfo, stuck: bool) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).unwrap();
     let mut report = None;
     while let Some(work) = walker.exchange(report.take()) {
-        let Assignment { walk, turn, .. } = work.assignment;
+        let Assignment { walk, number: turn, .. } = work.assignment;
         let candidate = candidate(&work.assignment);
         let (checkpoint, progress) = (turn.to_le_bytes().to_vec(), progress(turn));
         walker.progress(walk, progress.clone());
@@ -68,7 +68,7 @@ fn walk(door: &Door, stuck: bool) {
             sleep(Duration::MAX);
         }
         let outcome = Outcome::Candidate(candidate);
-        report = Some(Report { walk, turn, outcome, checkpoint, progress });
+        report = Some(Report { walk, assignment: turn, outcome, checkpoint, progress });
     }
     assert!(walker.failure().is_none(), "{:?}", walker.failure());
 }
@@ -76,11 +76,11 @@ fn walk(door: &Door, stuck: bool) {
 #[expect(clippy::zombie_processes, reason = "killed, and its walker with it")]
 fn orchestrate(directory: &str) {
     tokio::runtime::Runtime::new().unwrap().block_on(async {
-        let mut desk = Desk::open(Path::new(directory), 2, 1 << 16);
-        let _walker = desk.start(0, 1, Role::Walker);
-        let mut last = desk.offer().await;
+        let mut server = TestServer::open(Path::new(directory), 2, 1 << 16);
+        let _walker = server.start(0, 1, Role::Walker);
+        let mut last = server.offer().await;
         for turn in 1.. {
-            last = desk.go_on(last, turn, (2, 3)).await;
+            last = server.go_on(last, turn, (2, 3)).await;
             if turn == 1 {
                 std::fs::write(Path::new(directory).join(AT_WORK), "").unwrap();
             }
@@ -98,15 +98,15 @@ pub fn assignment(walk: u32, turn: u64, (atoms, features): (usize, usize)) -> As
     Assignment {
         campaign: CampaignId([7; 16]),
         walk,
-        turn,
+        number: turn,
         origin: Origin::Biased,
         random_walk: walk,
         seed_structure: structure(atoms),
         checkpoint: Some(vec![turn as u8; 100]),
         verdict: None,
-        until: features as u64,
-        wanted: Vec::new(),
-        raised: 1.0,
+        last_step: features as u64,
+        frame_steps: Vec::new(),
+        threshold_factor: 1.0,
     }
 }
 
@@ -119,10 +119,11 @@ fn structure(atoms: usize) -> Structure {
 
 /// The candidate with which a walker of these tests ends this turn.
 pub fn candidate(assignment: &Assignment) -> Candidate {
-    let Assignment { campaign, walk, turn, ref seed_structure, until: features, .. } = *assignment;
+    let Assignment { campaign, walk, number: turn, ref seed_structure, last_step: features, .. } =
+        *assignment;
     let n = seed_structure.len();
     let numbers = |count: usize, shift: f64| (0..count).map(|k| k as f64 + shift + turn as f64).collect();
-    let content = ContentHash::of(seed_structure);
+    let content = ContentHash::from_structure(seed_structure);
     Candidate {
         id: CandidateId { campaign, walk, segment: 0, step: turn, content },
         origin: Origin::Biased,

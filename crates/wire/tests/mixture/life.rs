@@ -73,9 +73,9 @@ fn a_version_lives_while_its_arc_does() {
     drop(promised);
     shared.publish(&next(&newest)).unwrap();
     let gone = reader.pin(0);
-    assert!(matches!(gone, Err(SharedMixtureError::Gone { version: 0, newest: 21 })), "{gone:?}");
-    assert!(matches!(reader.pin(7), Err(SharedMixtureError::Gone { version: 7, .. })));
-    assert!(matches!(reader.pin(u64::MAX), Err(SharedMixtureError::Gone { .. })));
+    assert!(matches!(gone, Err(SharedMixtureError::VersionNotFound { version: 0, newest: 21 })), "{gone:?}");
+    assert!(matches!(reader.pin(7), Err(SharedMixtureError::VersionNotFound { version: 7, .. })));
+    assert!(matches!(reader.pin(u64::MAX), Err(SharedMixtureError::VersionNotFound { .. })));
 }
 
 #[test]
@@ -129,7 +129,7 @@ fn a_component_outlives_its_mixture_its_reader_and_the_writer() {
     }
     assert_eq!(component, stamped(0));
     let taken = MixtureReader::open(&path, 0);
-    assert!(matches!(taken, Err(SharedMixtureError::Taken { reader: 0, .. })), "{taken:?}");
+    assert!(matches!(taken, Err(SharedMixtureError::SlotTaken { reader: 0, .. })), "{taken:?}");
     drop((shared, folder));
     assert_eq!(component, stamped(0));
 }

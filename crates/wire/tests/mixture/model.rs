@@ -137,7 +137,7 @@ impl Model {
                 reader.current = Some(version);
                 reader.held.push(mixture);
             }
-            Err(SharedMixtureError::Gone { newest, .. }) => {
+            Err(SharedMixtureError::VersionNotFound { newest, .. }) => {
                 assert!(!there, "version {version} should be there");
                 assert_eq!(newest, self.newest.version());
             }

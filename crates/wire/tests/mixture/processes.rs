@@ -130,7 +130,7 @@ fn reader_process() {
             match reader.pin(newest) {
                 Ok(mixture) => held.push(mixture),
                 // It was the newest a moment ago and promised to nobody.
-                Err(SharedMixtureError::Gone { .. }) => {}
+                Err(SharedMixtureError::VersionNotFound { .. }) => {}
                 Err(error) => panic!("{error}"),
             }
             while held.len() > 4 {

@@ -4,25 +4,25 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::{sleep, timeout};
-use wire::net::{AgentEvent, Parted, Told};
+use wire::net::{AgentEvent, LinkError, SlotReport};
 use wire::transport::Incoming;
 
-use super::head::{Head, LIMIT, Wanted, agent, join, mixture, next_version, report, work};
 use super::link::{Link, State};
+use super::test_server::{LIMIT, TestServer, Wanted, agent, join, mixture, next_version, report, work};
 
 /// The link is cut, or dead without a word, before the offer, while it is being decided, and at the answer.
 #[tokio::test(flavor = "multi_thread")]
 async fn what_is_told_over_a_breaking_link_comes_once() {
-    let mut head = Head::open(Wanted::default()).await;
+    let mut head = TestServer::open(Wanted::default()).await;
     let link = Link::to(head.port).await;
     let (_uplink, joined) = join(link.port, agent("a", 1)).await;
     let mut slot = joined.slots().remove(0);
     let line = Arc::clone(&joined);
     let working = tokio::spawn(async move {
-        let mut told = Told::Nothing;
+        let mut told = SlotReport::Empty;
         while let Some(work) = slot.exchange(&line, &told).await.unwrap() {
             sleep(Duration::from_millis(300)).await;
-            told = Told::Report(report(&work.assignment));
+            told = SlotReport::Report(report(&work.assignment));
         }
     });
     let mut mixture = Arc::new(mixture());
@@ -62,14 +62,14 @@ async fn what_is_told_over_a_breaking_link_comes_once() {
 #[tokio::test(flavor = "multi_thread")]
 async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
     let patience = Duration::from_millis(700);
-    let mut head = Head::open(Wanted { patience, ..Wanted::default() }).await;
+    let mut head = TestServer::open(Wanted { patience, ..Wanted::default() }).await;
     let link = Link::to(head.port).await;
     let (uplink, joined) = join(link.port, agent("a", 2)).await;
     let mut slots = joined.slots();
     let mixture = Arc::new(mixture());
     let line = Arc::clone(&joined);
     let mut slot = slots.remove(0);
-    let turn = tokio::spawn(async move { (slot.exchange(&line, &Told::Nothing).await, slot) });
+    let turn = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
     let first = head.offer().await;
     first.reply.send(Some(work(2, 1, &mixture))).unwrap();
     let (given, mut slot) = turn.await.unwrap();
@@ -77,23 +77,23 @@ async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
     // The other slot waits for its turn.
     let line = Arc::clone(&joined);
     let mut other = slots.remove(0);
-    let waiting = tokio::spawn(async move { other.exchange(&line, &Told::Nothing).await.map(drop) });
+    let waiting = tokio::spawn(async move { other.exchange(&line, &SlotReport::Empty).await.map(drop) });
     let second = head.offer().await;
 
     link.set(State::Cut);
-    head.event(|event| matches!(event, AgentEvent::Silent(_))).await;
+    head.event(|event| matches!(event, AgentEvent::Unresponsive(_))).await;
     for walker in [first.walker, second.walker] {
         let gone = head.next().await;
-        assert!(matches!(gone, Incoming::Gone { walker: found, .. } if found == walker), "{gone:?}");
+        assert!(matches!(gone, Incoming::Lost { walker: found, .. } if found == walker), "{gone:?}");
     }
     assert!(second.reply.send(Some(work(3, 1, &mixture))).is_err(), "nobody would get this turn");
     head.event(|event| matches!(event, AgentEvent::Lost(_))).await;
 
     link.set(State::Whole);
-    let told = Told::Report(report(&assignment));
+    let told = SlotReport::Report(report(&assignment));
     let refused = timeout(LIMIT, slot.exchange(&joined, &told)).await.expect("in time");
-    assert!(matches!(refused, Err(Parted::Stranger(_))), "{refused:?}");
-    assert!(matches!(waiting.await.unwrap(), Err(Parted::Stranger(_))));
+    assert!(matches!(refused, Err(LinkError::RejoinRequired(_))), "{refused:?}");
+    assert!(matches!(waiting.await.unwrap(), Err(LinkError::RejoinRequired(_))));
     let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());
     let mut slot = joined.slots().remove(0);
     let line = Arc::clone(&joined);
@@ -110,27 +110,27 @@ async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
 /// An orchestrator dies and another takes its place at the same endpoint.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_finds_the_next_run_of_its_orchestrator() {
-    let mut head = Head::open(Wanted::default()).await;
+    let mut head = TestServer::open(Wanted::default()).await;
     let (uplink, joined) = join(head.port, agent("a", 1)).await;
     let mut slot = joined.slots().remove(0);
     let mixture = next_version(&mixture(), 1, 1);
     let line = Arc::clone(&joined);
-    let turn = tokio::spawn(async move { (slot.exchange(&line, &Told::Nothing).await, slot) });
+    let turn = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
     head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
     let (given, mut slot) = turn.await.unwrap();
     let assignment = given.unwrap().unwrap().assignment;
     let port = head.kill().await;
-    let told = Told::Report(report(&assignment));
+    let told = SlotReport::Report(report(&assignment));
     let line = Arc::clone(&joined);
     let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.map(drop) });
     sleep(Duration::from_millis(500)).await;
-    let mut head = Head::open(Wanted { port, session: 2, mixture, ..Wanted::default() }).await;
+    let mut head = TestServer::open(Wanted { port, session: 2, mixture, ..Wanted::default() }).await;
     let refused = timeout(LIMIT, telling).await.expect("in time").unwrap();
-    assert!(matches!(refused, Err(Parted::Stranger(_))), "{refused:?}");
+    assert!(matches!(refused, Err(LinkError::RejoinRequired(_))), "{refused:?}");
     let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
     assert_eq!(joined.newest().await.version(), 1);
     let mut slot = joined.slots().remove(0);
-    let told = Told::Report(report(&assignment));
+    let told = SlotReport::Report(report(&assignment));
     let telling = async { slot.exchange(&joined, &told).await.unwrap().is_none() };
     let (home, found) = tokio::join!(telling, async {
         let offer = head.offer().await;

@@ -6,27 +6,27 @@ use std::sync::atomic::Ordering;
 
 use wire::WalkId;
 use wire::messages::Progress;
-use wire::net::{AgentEvent, Parted, Told};
+use wire::net::{AgentEvent, LinkError, SlotReport};
 use wire::transport::Incoming;
 
-use super::head::{Head, Wanted, agent, join, mixture, next_version, report, work};
+use super::test_server::{TestServer, Wanted, agent, join, mixture, next_version, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn turns_and_reports_come_as_they_were() {
-    let mut head = Head::open(Wanted::default()).await;
+    let mut head = TestServer::open(Wanted::default()).await;
     let (_uplink, joined) = join(head.port, agent("a", 1)).await;
     assert_eq!(joined.setup, b"the setup");
     let mut slot = joined.slots().remove(0);
     let line = Arc::clone(&joined);
     let working = tokio::spawn(async move {
-        let mut told = Told::Nothing;
+        let mut told = SlotReport::Empty;
         let mut turns = 0;
         while let Some(work) = slot.exchange(&line, &told).await.unwrap() {
             turns += 1;
-            assert_eq!(work.assignment.turn, turns);
+            assert_eq!(work.assignment.number, turns);
             assert_eq!(work.mixture.version(), turns, "the version of the turn");
             slot.progress(Arc::clone(&line), work.assignment.walk, Progress::default()).await;
-            told = Told::Report(report(&work.assignment));
+            told = SlotReport::Report(report(&work.assignment));
         }
         turns
     });
@@ -38,7 +38,7 @@ async fn turns_and_reports_come_as_they_were() {
             assert_eq!(walk, WalkId(5));
             offer = head.next().await;
         }
-        let Incoming::Free { report: found, reply, .. } = offer else { panic!("{offer:?}") };
+        let Incoming::Idle { report: found, reply, .. } = offer else { panic!("{offer:?}") };
         assert_eq!(found, expected);
         mixture = next_version(&mixture, turn % 2, turn % 2);
         let work = work(5, turn as u64, &mixture);
@@ -46,7 +46,7 @@ async fn turns_and_reports_come_as_they_were() {
         reply.send(Some(work)).unwrap();
     }
     let last = loop {
-        if let Incoming::Free { report, reply, .. } = head.next().await {
+        if let Incoming::Idle { report, reply, .. } = head.next().await {
             reply.send(None).unwrap();
             break report;
         }
@@ -66,20 +66,20 @@ async fn turns_and_reports_come_as_they_were() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_walker_that_dies_is_told_of_and_its_slot_goes_on() {
-    let mut head = Head::open(Wanted::default()).await;
+    let mut head = TestServer::open(Wanted::default()).await;
     let (_uplink, joined) = join(head.port, agent("a", 2)).await;
     let mut slot = joined.slots().remove(1);
     let mixture = Arc::new(mixture());
     for fault in [true, false] {
         let line = Arc::clone(&joined);
-        let told = if fault { Told::Nothing } else { Told::Lost { fault: true } };
+        let told = if fault { SlotReport::Empty } else { SlotReport::Lost { crashed: true } };
         let turn = tokio::spawn(async move {
             let work = slot.exchange(&line, &told).await.unwrap();
             (slot, work)
         });
         if !fault {
             let gone = head.next().await;
-            assert!(matches!(&gone, Incoming::Gone { fault, .. } if *fault), "{gone:?}");
+            assert!(matches!(&gone, Incoming::Lost { crashed, .. } if *crashed), "{gone:?}");
         }
         let offer = head.offer().await;
         assert_eq!(offer.report, None);
@@ -90,10 +90,10 @@ async fn a_walker_that_dies_is_told_of_and_its_slot_goes_on() {
     }
     joined.leave().await;
     for _ in 0..2 {
-        assert!(matches!(head.next().await, Incoming::Gone { fault: false, .. }));
+        assert!(matches!(head.next().await, Incoming::Lost { crashed: false, .. }));
     }
-    let told = Told::Nothing;
-    assert!(matches!(slot.exchange(&joined, &told).await, Err(Parted::Stranger(_))), "it has left");
+    let told = SlotReport::Empty;
+    assert!(matches!(slot.exchange(&joined, &told).await, Err(LinkError::RejoinRequired(_))), "it has left");
     head.close().await;
 }
 
@@ -104,11 +104,14 @@ async fn files_come_by_their_hash_and_agents_are_told_to_stop() {
     let content: Vec<u8> = (0..9_500_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
     std::fs::write(&path, &content).unwrap();
     let files = BTreeMap::from([("0123".to_owned(), path)]);
-    let head = Head::open(Wanted { files, ..Wanted::default() }).await;
+    let head = TestServer::open(Wanted { files, ..Wanted::default() }).await;
     let (_uplink, joined) = join(head.port, agent("a", 1)).await;
-    assert!(joined.file("0123").await.unwrap() == content);
-    let refused = joined.file("../../etc/passwd").await.unwrap_err();
-    assert!(matches!(&refused, Parted::Refused(why) if why.contains("no file with the hash")), "{refused}");
+    assert!(joined.fetch_file("0123").await.unwrap() == content);
+    let refused = joined.fetch_file("../../etc/passwd").await.unwrap_err();
+    assert!(
+        matches!(&refused, LinkError::Rejected(why) if why.contains("no file with the hash")),
+        "{refused}"
+    );
     assert_eq!(joined.is_stopping().await.unwrap(), Some(false));
     head.stopping.store(true, Ordering::Relaxed);
     assert_eq!(joined.is_stopping().await.unwrap(), Some(true));

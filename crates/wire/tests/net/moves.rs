@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::timeout;
-use wire::net::{Address, Announcement, NetError, Parted, Told, Uplink};
+use wire::net::{Address, AgentClient, Announcement, LinkError, NetError, SlotReport};
 
-use super::head::{Head, LIMIT, Wanted, agent, endpoint, report, work};
+use super::test_server::{LIMIT, TestServer, Wanted, agent, endpoint, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
@@ -18,41 +18,41 @@ async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
         fs::write(path.with_extension("new"), announcement.to_string()).unwrap();
         fs::rename(path.with_extension("new"), &path).unwrap();
     };
-    let address = Address::In(path.clone());
+    let address = Address::File(path.clone());
     // Before it has been anywhere the agent waits.
     let (why, whys) = std::sync::mpsc::channel();
     let opening = {
         let address = address.clone();
         let waiting = move |error: &NetError| why.send(error.to_string()).unwrap();
-        tokio::spawn(async move { Uplink::open(&address, None, agent("a", 1), waiting).await.unwrap() })
+        tokio::spawn(async move { AgentClient::open(&address, None, agent("a", 1), waiting).await.unwrap() })
     };
-    let mut head = Head::open(Wanted::default()).await;
+    let mut head = TestServer::open(Wanted::default()).await;
     let told = tokio::task::spawn_blocking(move || whys.recv_timeout(LIMIT).unwrap()).await.unwrap();
     assert!(told.contains("has written yet where it is"), "{told}");
-    write(Announcement::At(endpoint(head.port)));
+    write(Announcement::Endpoint(endpoint(head.port)));
     let uplink = Arc::new(timeout(LIMIT, opening).await.expect("in time").unwrap());
     let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());
 
     let mut slot = joined.slots().remove(0);
     let mixture = Wanted::default().mixture;
     let line = Arc::clone(&joined);
-    let turn = tokio::spawn(async move { (slot.exchange(&line, &Told::Nothing).await, slot) });
+    let turn = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
     head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
     let (given, mut slot) = turn.await.unwrap();
-    let told = Told::Report(report(&given.unwrap().unwrap().assignment));
+    let told = SlotReport::Report(report(&given.unwrap().unwrap().assignment));
     let before = head.kill().await;
     let line = Arc::clone(&joined);
     let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.map(drop) });
     tokio::time::sleep(Duration::from_millis(300)).await;
-    let head = Head::open(Wanted { session: 2, ..Wanted::default() }).await;
+    let head = TestServer::open(Wanted { session: 2, ..Wanted::default() }).await;
     assert_ne!(head.port, before);
-    write(Announcement::At(endpoint(head.port)));
+    write(Announcement::Endpoint(endpoint(head.port)));
     let refused = timeout(LIMIT, telling).await.expect("in time").unwrap();
-    assert!(matches!(refused, Err(Parted::Stranger(_))), "{refused:?}");
+    assert!(matches!(refused, Err(LinkError::RejoinRequired(_))), "{refused:?}");
     let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
-    assert!(timeout(Duration::from_millis(300), address.over()).await.is_err());
+    assert!(timeout(Duration::from_millis(300), address.wait_until_over()).await.is_err());
     write(Announcement::Over);
-    timeout(LIMIT, address.over()).await.expect("in time");
+    timeout(LIMIT, address.wait_until_over()).await.expect("in time");
     joined.leave().await;
     head.close().await;
 }

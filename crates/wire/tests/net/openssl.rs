@@ -1,15 +1,15 @@
 //! The script that makes certificates, which needs openssl: `cargo test -p wire --test openssl`.
 
 #[allow(dead_code, reason = "this target uses a part")]
-mod head;
+mod test_server;
 
 use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
 
-use head::{Head, LIMIT, Wanted, agent};
+use test_server::{LIMIT, TestServer, Wanted, agent};
 use tokio::time::timeout;
-use wire::net::{Tls, Uplink};
+use wire::net::{AgentClient, Tls};
 
 fn make(directory: &Path, names: &[&str]) {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/certificates.sh");
@@ -23,11 +23,11 @@ async fn hosts_with_certificates_of_the_script_speak_to_each_other() {
     make(directory.path(), &["head=node.example,localhost,10.0.0.8"]);
     // Another host later.
     make(directory.path(), &["10.0.0.7"]);
-    let tls = |name: &str| Tls::in_directory(&directory.path().join(name));
-    let head = Head::open(Wanted { tls: Some(tls("head")), ..Wanted::default() }).await;
+    let tls = |name: &str| Tls::from_directory(&directory.path().join(name));
+    let head = TestServer::open(Wanted { tls: Some(tls("head")), ..Wanted::default() }).await;
     let endpoint = format!("tcp/localhost:{}", head.port).parse().unwrap();
     let other = tls("10.0.0.7");
-    let uplink = Uplink::open(&endpoint, Some(&other), agent("a", 1), |_| {});
+    let uplink = AgentClient::open(&endpoint, Some(&other), agent("a", 1), |_| {});
     let uplink = Arc::new(timeout(LIMIT, uplink).await.expect("in time").unwrap());
     let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
     joined.leave().await;

@@ -6,27 +6,27 @@ use std::time::Duration;
 
 use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair};
 use tokio::time::timeout;
-use wire::net::{AgentEvent, Hub, NetError, Tls, Uplink, Welcome};
+use wire::net::{AgentBootstrap, AgentClient, AgentEvent, AgentServer, NetError, Tls};
 
-use super::head::{Head, LIMIT, PATIENCE, Wanted, agent, endpoint, join};
+use super::test_server::{LIMIT, PATIENCE, TestServer, Wanted, agent, endpoint, join};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn nothing_listens_or_connects_off_loopback_without_certificates() {
     let endpoint = "tcp/0.0.0.0:7447".parse().unwrap();
-    let refused = Hub::open(&endpoint, None, 1, PATIENCE, Welcome::default()).await.err();
+    let refused = AgentServer::open(&endpoint, None, 1, PATIENCE, AgentBootstrap::default()).await.err();
     assert!(matches!(refused, Some(NetError::Unprotected { .. })), "{refused:?}");
     let endpoint = "tcp/head:7447".parse().unwrap();
-    let refused = Uplink::open(&endpoint, None, agent("a", 1), |_| {}).await.err();
+    let refused = AgentClient::open(&endpoint, None, agent("a", 1), |_| {}).await.err();
     assert!(matches!(refused, Some(NetError::Unprotected { .. })), "{refused:?}");
-    let tls = Tls::in_directory(Path::new("/nowhere"));
-    let refused = Uplink::open(&endpoint, Some(&tls), agent("a", 1), |_| {}).await.err();
+    let tls = Tls::from_directory(Path::new("/nowhere"));
+    let refused = AgentClient::open(&endpoint, Some(&tls), agent("a", 1), |_| {}).await.err();
     assert!(refused.unwrap().to_string().contains("/nowhere/authority.pem"));
 }
 
 /// Whatever else comes under the orchestrator's key is dropped and answered with the reason.
 #[tokio::test(flavor = "multi_thread")]
 async fn foreign_messages_are_dropped_and_spoken_of() {
-    let head = Head::open(Wanted::default()).await;
+    let head = TestServer::open(Wanted::default()).await;
     let (_uplink, joined) = join(head.port, agent("a", 1)).await;
     let mut config = zenoh::Config::default();
     for (key, value) in [
@@ -54,7 +54,8 @@ async fn foreign_messages_are_dropped_and_spoken_of() {
     for (payload, expected) in cases {
         let said = ask(payload).await;
         assert!(said.contains(expected), "{said:?}: {expected}");
-        let spoken = |event: &AgentEvent| matches!(event, AgentEvent::Dropped(why) if why.contains(expected));
+        let spoken =
+            |event: &AgentEvent| matches!(event, AgentEvent::MessageRejected(why) if why.contains(expected));
         head.event(spoken).await;
     }
     joined.leave().await;
@@ -91,11 +92,11 @@ async fn only_who_has_a_certificate_of_the_campaign_takes_part() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
     certificates(folders[0].path(), &["localhost", "node1"]);
     certificates(folders[1].path(), &["localhost"]);
-    let tls = |folder: usize, name: &str| Tls::in_directory(&folders[folder].path().join(name));
-    let head = Head::open(Wanted { tls: Some(tls(0, "localhost")), ..Wanted::default() }).await;
+    let tls = |folder: usize, name: &str| Tls::from_directory(&folders[folder].path().join(name));
+    let head = TestServer::open(Wanted { tls: Some(tls(0, "localhost")), ..Wanted::default() }).await;
     let endpoint = format!("tcp/localhost:{}", head.port).parse().unwrap();
     let join = async |tls: Option<Tls>, patience: Duration| {
-        let opening = Uplink::open(&endpoint, tls.as_ref(), agent("a", 1), |_| {});
+        let opening = AgentClient::open(&endpoint, tls.as_ref(), agent("a", 1), |_| {});
         let uplink = timeout(patience, opening).await.ok()?;
         let uplink = Arc::new(uplink.ok()?);
         let joined = timeout(patience, uplink.join()).await.ok()?;

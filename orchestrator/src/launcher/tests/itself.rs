@@ -19,7 +19,7 @@ async fn the_program_starts_itself() {
     });
     let events = rest(&mut children).await;
     assert_eq!(lines(&events), ["read: the setup"]);
-    assert_eq!(ends(&events)[0].1.then, Standing::GoneHome);
+    assert_eq!(ends(&events)[0].1.then, ChildState::Exited);
 }
 
 #[test]
@@ -48,15 +48,17 @@ async fn lacks_descriptors() {
     // No file that is opened from now on gets a number.
     setrlimit(Resource::Nofile, limit(Some(3))).unwrap();
     for _ in 0..10 {
-        let Event::Ended { ended, .. } = next(&mut children).await else { panic!("it cannot be started") };
-        assert!(matches!(ended.ending, Ending::NotStarted { is_shortage: true, .. }), "{ended:?}");
-        assert!(matches!(ended.then, Standing::Pausing { .. }), "{ended:?}");
+        let ChildEvent::Ended { ended, .. } = next(&mut children).await else {
+            panic!("it cannot be started")
+        };
+        assert!(matches!(ended.reason, ExitReason::StartFailed { is_shortage: true, .. }), "{ended:?}");
+        assert!(matches!(ended.then, ChildState::BackingOff { .. }), "{ended:?}");
     }
     setrlimit(Resource::Nofile, limit(before)).unwrap();
     let events = rest(&mut children).await;
     // One more start may have failed before the limit was raised.
     let (_, last) = *ends(&events).last().unwrap();
-    assert_eq!((&last.ending, last.then), (&exit(0, None), Standing::GoneHome));
+    assert_eq!((&last.reason, last.then), (&exit(0, None), ChildState::Exited));
     writeln!(std::io::stderr(), "started in the end").unwrap();
 }
 
@@ -76,8 +78,8 @@ async fn groups_and_sessions_are_as_asked_for() {
     let (mut pids, mut ready) = ([None; 2], 0);
     while ready < 2 {
         match next(&mut children).await {
-            Event::Started { number, pid, .. } => pids[number as usize] = Pid::from_raw(pid as i32),
-            Event::Said { .. } => ready += 1,
+            ChildEvent::Started { number, pid, .. } => pids[number as usize] = Pid::from_raw(pid as i32),
+            ChildEvent::Stderr { .. } => ready += 1,
             event => panic!("{event:?}"),
         }
     }
@@ -94,7 +96,7 @@ fn waits() {
     let mut setup = String::new();
     std::io::stdin().read_to_string(&mut setup).unwrap();
     if setup == "in its own" {
-        own_session().unwrap();
+        start_own_session().unwrap();
     }
     writeln!(std::io::stderr(), "ready").unwrap();
     std::thread::sleep(if setup.is_empty() { Duration::ZERO } else { LONG });
@@ -139,13 +141,13 @@ fn tied() {
             write!(std::io::stderr(), "tied").unwrap();
             std::thread::sleep(LONG);
         }
-        Err(ParentGone::Other { .. }) => write!(std::io::stderr(), "gone").unwrap(),
+        Err(ParentExited::Other { .. }) => write!(std::io::stderr(), "gone").unwrap(),
         Err(error) => panic!("{error}"),
     }
 }
 
 #[test]
 fn a_name_is_what_lists_of_processes_show() {
-    be_called(c"calm-walker").unwrap();
+    set_process_name(c"calm-walker").unwrap();
     assert_eq!(std::fs::read_to_string("/proc/thread-self/comm").unwrap(), "calm-walker\n");
 }

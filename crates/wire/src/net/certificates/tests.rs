@@ -41,7 +41,7 @@ impl Authority {
         fs::write(directory.join("authority.pem"), &self.pem).unwrap();
         fs::write(directory.join("certificate.pem"), certificate.pem()).unwrap();
         fs::write(directory.join("key.pem"), key.serialize_pem()).unwrap();
-        Tls::in_directory(directory)
+        Tls::from_directory(directory)
     }
 }
 

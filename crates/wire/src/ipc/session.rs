@@ -1,0 +1,174 @@
+//! The server's work between two waits: what is said to whom.
+
+use std::borrow::Cow;
+use std::collections::VecDeque;
+use std::sync::{Arc, Weak};
+use std::task::{Context, Poll};
+use std::time::Instant;
+
+use super::IpcError;
+use super::borrowed_request::BorrowedRequest;
+use super::config::{MAX_IN_PLACE, MAX_IN_PLACE_TOTAL, Request};
+use super::connections::Connections;
+use crate::block::{BlockError, CandidateBlock};
+use crate::control::{EncodedReport, decode, encode};
+use crate::ids::WalkId;
+use crate::messages::Progress;
+use crate::mixture::SharedMixture;
+use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId, attach_candidate};
+use crate::protocol::rejected::RejectedMessage;
+use crate::protocol::sequence::{OfferStatus, SequenceTracker};
+use crate::transport::{Incoming, WorkItem};
+
+/// More progress than this is not kept for a busy reactor.
+const MAX_QUEUED_PROGRESS: usize = 64;
+
+pub(super) struct ServerSession {
+    /// What the reactor has not taken yet: at most an offer of each walker, its end, and some progress.
+    pub(super) outbox: VecDeque<Incoming>,
+    sequences: SequenceTracker,
+    connections: Connections,
+    /// Candidates that may still be read in place.
+    in_place: Vec<(SenderId, Weak<BorrowedRequest>)>,
+    mixtures: SharedMixture,
+}
+
+impl ServerSession {
+    pub(super) fn new(session: u64, mixtures: SharedMixture, connections: Connections) -> Self {
+        let sequences = SequenceTracker::new(session);
+        Self { outbox: VecDeque::new(), sequences, connections, in_place: Vec::new(), mixtures }
+    }
+
+    pub(super) fn expect(&mut self, walker: u32, incarnation: u32) {
+        if let Some(previous) = self.sequences.incarnation(walker) {
+            self.walker_lost(walker, previous, false);
+        }
+        self.sequences.expect(walker, incarnation);
+        self.connections.open(walker);
+    }
+
+    /// The walker's process is dead. Its decision is dropped before the reactor hears of it, so that a turn which is
+    /// given to it meanwhile is known to be lost one way or the other. News of a process that has a successor is no news: what the
+    /// successor holds must not be freed.
+    pub(super) fn walker_lost(&mut self, walker: u32, incarnation: u32, crashed: bool) {
+        if self.sequences.incarnation(walker) != Some(incarnation) {
+            return;
+        }
+        self.sequences.remove(walker);
+        self.connections.close(walker);
+        self.connections.clean();
+        self.mixtures.release(walker);
+        self.outbox.push_back(Incoming::Lost { walker, crashed });
+    }
+
+    /// Takes in a message; the walker that it is of and whether it brings a report, unless it is dropped.
+    pub(super) fn receive(&mut self, request: Request) -> Option<(u32, bool)> {
+        let (begin, bytes) = (Instant::now(), size_of_val(request.payload()) as u64);
+        let heard = self.listen(request);
+        self.connections.count(bytes, begin.elapsed(), heard.as_ref().err());
+        heard.ok()
+    }
+
+    fn listen(&mut self, request: Request) -> Result<(u32, bool), RejectedMessage> {
+        let request = Arc::new(BorrowedRequest::new(request)?);
+        let Envelope { sender, payload } = decode(request.control())?;
+        self.sequences.check_sender(sender)?;
+        let reports = matches!(payload, Payload::Offer { report: Some(_), .. });
+        match payload {
+            Payload::Offer { sequence, report } => self.offer(sender, sequence, report, &request)?,
+            Payload::Poll { sequence } => self.ask(sender, sequence, &request)?,
+            Payload::Progress(walk, progress) => self.progress(walk, progress.into_owned()),
+        }
+        Ok((sender.walker, reports))
+    }
+
+    fn offer(
+        &mut self,
+        sender: SenderId,
+        sequence: u64,
+        report: Option<EncodedReport<'_>>,
+        request: &Arc<BorrowedRequest>,
+    ) -> Result<(), RejectedMessage> {
+        match self.sequences.offer(sender, sequence)? {
+            OfferStatus::Answered(answer) => self.connections.send(sender, request, answer),
+            // The walker listens where it spoke last.
+            OfferStatus::Pending => self.connections.route(sender, request),
+            OfferStatus::New | OfferStatus::Unknown => {
+                let report = attach_candidate(report, self.candidate(sender, request)?)?;
+                self.sequences.begin(sender.walker);
+                self.connections.route(sender, request);
+                let reply = self.connections.decide(sender);
+                self.outbox.push_back(Incoming::Idle { walker: sender.walker, report, reply });
+            }
+        }
+        Ok(())
+    }
+
+    fn ask(
+        &mut self,
+        sender: SenderId,
+        sequence: u64,
+        request: &BorrowedRequest,
+    ) -> Result<(), RejectedMessage> {
+        let body = match self.sequences.poll(sender, sequence)? {
+            OfferStatus::Answered(answer) => {
+                self.connections.send(sender, request, answer);
+                return Ok(());
+            }
+            OfferStatus::Pending => AnswerBody::Pending,
+            OfferStatus::New | OfferStatus::Unknown => AnswerBody::Unknown,
+        };
+        self.connections.send(sender, request, &encode(&Answer { sequence, body }));
+        Ok(())
+    }
+
+    /// May be lost: whoever watches can do without.
+    fn progress(&mut self, walk: WalkId, progress: Progress) {
+        if self.outbox.len() < MAX_QUEUED_PROGRESS {
+            self.outbox.push_back(Incoming::Progress(walk, progress));
+        }
+    }
+
+    /// The candidate beside a message, where it stands if not too many stand already.
+    fn candidate(
+        &mut self,
+        sender: SenderId,
+        request: &Arc<BorrowedRequest>,
+    ) -> Result<Option<CandidateBlock>, BlockError> {
+        if request.block().is_empty() {
+            return Ok(None);
+        }
+        self.in_place.retain(|(_, request)| request.strong_count() > 0);
+        let of_sender = self.in_place.iter().filter(|(of, _)| *of == sender).count();
+        if of_sender >= MAX_IN_PLACE || self.in_place.len() >= MAX_IN_PLACE_TOTAL {
+            return CandidateBlock::from_bytes(request.block()).map(Some);
+        }
+        let block = CandidateBlock::in_place(Arc::clone(request) as _)?;
+        self.in_place.push((sender, Arc::downgrade(request)));
+        Ok(Some(block))
+    }
+
+    /// The next walker whose offer has been decided, and the decision: a turn, or home.
+    pub(super) fn poll_decision(&mut self, context: &mut Context<'_>) -> Poll<(u32, Option<WorkItem>)> {
+        self.connections.poll_decision(context)
+    }
+
+    /// Answers the offer of a walker.
+    pub(super) fn decided(&mut self, walker: u32, work: Option<WorkItem>) -> Result<(), IpcError> {
+        let Some((sender, sequence)) = self.sequences.pending(walker) else { return Ok(()) };
+        let body = match &work {
+            Some(WorkItem { assignment, mixture }) => {
+                self.mixtures.publish(mixture)?;
+                AnswerBody::Assignment {
+                    mixture_version: mixture.version(),
+                    assignment: Cow::Borrowed(assignment),
+                }
+            }
+            None => AnswerBody::Shutdown,
+        };
+        let answer = encode(&Answer { sequence, body });
+        self.connections.answer(sender, &answer, work.map(|work| work.mixture));
+        self.sequences.set_answer(walker, answer);
+        Ok(())
+    }
+}

@@ -1,0 +1,59 @@
+//! The words by which the processes speak to each other.
+
+use std::fs::File;
+use std::io;
+use std::sync::atomic::{AtomicU32, AtomicU64};
+
+use super::layout::{CACHE_LINE, Layout};
+use super::memory::Mapping;
+use super::pinning::{NONE, Word};
+
+/// Newest version, slots of the readers, version words and rows.
+#[derive(Debug)]
+pub(super) struct MixtureIndex {
+    map: Mapping,
+    layout: Layout,
+}
+
+impl MixtureIndex {
+    pub fn map(file: &File, layout: &Layout) -> io::Result<Self> {
+        let map = Mapping::shared(file, layout.control_at, layout.control_bytes)?;
+        Ok(Self { map, layout: layout.clone() })
+    }
+
+    /// The highest version published.
+    pub fn newest(&self) -> &AtomicU64 {
+        self.map.word64(0)
+    }
+
+    /// Process id of who has the slot, 0 for nobody.
+    pub fn owner(&self, reader: u32) -> &AtomicU64 {
+        self.map.word64(CACHE_LINE * (1 + u64::from(reader)))
+    }
+
+    /// The version that a reader looks at just now.
+    pub fn pin(&self, reader: u32) -> &AtomicU64 {
+        self.map.word64(CACHE_LINE * (1 + u64::from(reader)) + 8)
+    }
+
+    pub fn pins(&self) -> impl Iterator<Item = &AtomicU64> {
+        (0..self.layout.readers).map(|reader| self.pin(reader))
+    }
+
+    /// The version whose blocks stand in a row.
+    pub fn version(&self, row: u32) -> &AtomicU64 {
+        self.map.word64(self.layout.versions_at + 8 * u64::from(row))
+    }
+
+    /// Block number of each component. A row is written before its version word and read under a pin.
+    pub fn row(&self, row: u32) -> impl Iterator<Item = &AtomicU32> {
+        let start = self.layout.rows_at + self.layout.row_bytes * u64::from(row);
+        (0..self.layout.components).map(move |place| self.map.word32(start + 4 * u64::from(place)))
+    }
+
+    /// No version anywhere, no pins.
+    pub fn clear(&self) {
+        self.pins().for_each(|pin| pin.store_release(NONE));
+        (0..self.layout.rows).for_each(|row| self.version(row).store_release(NONE));
+    }
+}

@@ -1,0 +1,364 @@
+//! An agent's end: one session with the orchestrator, in which everything is asked until it is answered.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex as Lock, PoisonError};
+use std::time::Duration;
+
+use calm::Mixture;
+use tokio::sync::Mutex;
+use tokio::time::{Instant, sleep};
+use zenoh::Session;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::query::ConsolidationMode;
+use zerocopy::IntoBytes;
+
+use super::NetError;
+use super::address::{Address, Announcement};
+use super::certificates::Tls;
+use super::delta::{DeltaError, DeltaReceiver};
+use super::endpoint::{self, Endpoint, Side};
+use super::handshake;
+use super::message::{AGENTS, Agent, ORCHESTRATOR, Reply, Request};
+use super::slot::Slot;
+use crate::control::{ControlError, decode, encode};
+use crate::protocol::frame;
+
+/// A question without an answer is asked again after this.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(5);
+/// Between two tries while there is no line.
+const RETRY_DELAY: Duration = Duration::from_millis(300);
+/// Between two tries to connect for the first time.
+const CONNECT_RETRY_INTERVAL: Duration = Duration::from_secs(1);
+/// Between two looks whether the orchestrator is somewhere else.
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
+/// Versions of the mixture that are kept.
+const MAX_VERSIONS: usize = 4;
+
+/// An agent's line to the orchestrator.
+pub struct AgentClient {
+    address: Address,
+    tls: Option<Tls>,
+    agent: Agent,
+    connection: Lock<Arc<Connection>>,
+    /// Held by who looks for the orchestrator, with the moment of the last look.
+    last_poll: Mutex<Option<Instant>>,
+}
+
+/// A connection to the orchestrator in one place.
+struct Connection {
+    endpoint: Endpoint,
+    session: Session,
+    /// The sign of life.
+    _token: LivelinessToken,
+}
+
+/// A place among the walkers of a campaign.
+pub struct Membership {
+    client: Arc<AgentClient>,
+    /// Of this run of the orchestrator.
+    pub(super) session: u64,
+    first_slot: u32,
+    /// The newest version last; taken in by one slot at a time.
+    mixtures: Mutex<VecDeque<Arc<Mixture>>>,
+    /// What walkers are to be started with.
+    pub setup: Vec<u8>,
+}
+
+/// Why an agent has no place any more, or gets none.
+#[derive(Debug, thiserror::Error)]
+pub enum LinkError {
+    /// It was taken for dead, or the orchestrator was started again: it may join anew, with what it has to tell.
+    #[error("{0}")]
+    RejoinRequired(String),
+    /// The orchestrator does not understand what this program says.
+    #[error("the orchestrator refuses a message: {0}")]
+    Rejected(String),
+    /// Nothing has been heard of it.
+    #[error("the orchestrator has not answered for {minutes:.1} min")]
+    Timeout {
+        /// How long.
+        minutes: f64,
+    },
+    /// This program does not understand what the orchestrator says: another version of it, in the first place.
+    #[error("an answer of the orchestrator cannot be read: {0}")]
+    InvalidReply(String),
+}
+
+impl From<ControlError> for LinkError {
+    fn from(why: ControlError) -> Self {
+        Self::InvalidReply(why.to_string())
+    }
+}
+
+impl From<DeltaError> for LinkError {
+    fn from(why: DeltaError) -> Self {
+        Self::InvalidReply(why.to_string())
+    }
+}
+
+impl Connection {
+    /// Connects to where the orchestrator is said to be.
+    async fn find(address: &Address, tls: Option<&Tls>, agent: &Agent) -> Result<Self, NetError> {
+        match address.resolve()? {
+            Announcement::Endpoint(endpoint) => Self::open(endpoint, tls, agent).await,
+            Announcement::Over => Err(NetError::CampaignOver),
+        }
+    }
+
+    async fn open(endpoint: Endpoint, tls: Option<&Tls>, agent: &Agent) -> Result<Self, NetError> {
+        let session = endpoint::open(Side::Agent, &endpoint, tls).await?;
+        let token = session.liveliness().declare_token(format!("{AGENTS}/{}", agent.id));
+        let _token = token.await.map_err(|why| NetError::open(&endpoint, why))?;
+        Ok(Self { endpoint, session, _token })
+    }
+
+    /// Asks once; `None` if there was no answer in time, or no line.
+    async fn send_once(&self, payload: Vec<u8>) -> Option<Vec<u8>> {
+        let query = self.session.get(ORCHESTRATOR).payload(payload).timeout(REQUEST_TIMEOUT);
+        let replies = query.consolidation(ConsolidationMode::None).await.ok()?;
+        let reply = replies.recv_async().await.ok()?;
+        Some(reply.result().ok()?.payload().to_bytes().into_owned())
+    }
+}
+
+impl AgentClient {
+    /// Waits until an orchestrator listens at the address, and makes itself known there.
+    ///
+    /// `waiting` is told why the first try did not succeed.
+    ///
+    /// # Errors
+    /// An endpoint off loopback without certificates, files that cannot be read or that say something else, certificates
+    /// that one of the two sides does not accept.
+    pub async fn open(
+        address: &Address,
+        tls: Option<&Tls>,
+        agent: Agent,
+        waiting: impl FnOnce(&NetError),
+    ) -> Result<Self, NetError> {
+        let mut waiting = Some(waiting);
+        let connection = loop {
+            match Connection::find(address, tls, &agent).await {
+                Err(
+                    error @ (NetError::Open { .. }
+                    | NetError::EndpointFileMissing { .. }
+                    | NetError::CampaignOver),
+                ) => {
+                    if let (NetError::Open { endpoint, .. }, Some(tls)) = (&error, tls) {
+                        check_handshake(endpoint, tls).await?;
+                    }
+                    waiting.take().into_iter().for_each(|waiting| waiting(&error));
+                    sleep(CONNECT_RETRY_INTERVAL).await;
+                }
+                found => break found?,
+            }
+        };
+        let (address, tls) = (address.clone(), tls.cloned());
+        Ok(Self {
+            address,
+            tls,
+            agent,
+            connection: Lock::new(Arc::new(connection)),
+            last_poll: Mutex::default(),
+        })
+    }
+
+    /// Where it looks for the orchestrator.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    fn connection(&self) -> Arc<Connection> {
+        Arc::clone(&self.connection.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Goes to where the orchestrator is said to be, if that is not where the line leads.
+    async fn reconnect_if_moved(&self, connection: &Arc<Connection>) {
+        // One of many who have no answer looks for all of them.
+        let Ok(mut last_poll) = self.last_poll.try_lock() else { return };
+        if last_poll.is_some_and(|last_poll| last_poll.elapsed() < POLL_INTERVAL)
+            || !Arc::ptr_eq(connection, &self.connection())
+        {
+            return;
+        }
+        if let Ok(Announcement::Endpoint(endpoint)) = self.address.resolve()
+            && endpoint != connection.endpoint
+            && let Ok(found) = Connection::open(endpoint, self.tls.as_ref(), &self.agent).await
+        {
+            *self.connection.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(found);
+        }
+        *last_poll = Some(Instant::now());
+    }
+
+    /// Asks for a place until it is given one.
+    ///
+    /// # Errors
+    /// A place is refused.
+    pub async fn join(self: &Arc<Self>) -> Result<Membership, LinkError> {
+        loop {
+            match self.try_join().await {
+                // Another orchestrator has taken its place in the meantime.
+                Err(LinkError::RejoinRequired(_)) => {}
+                membership => return membership,
+            }
+        }
+    }
+
+    async fn try_join(self: &Arc<Self>) -> Result<Membership, LinkError> {
+        let answer = self.request(&Request::Join(self.agent.clone())).await?;
+        let Reply::Joined(place) = read(&answer)? else { return Err(unexpected("join")) };
+        let membership = Membership {
+            client: Arc::clone(self),
+            session: place.session,
+            first_slot: place.first_slot,
+            mixtures: Mutex::default(),
+            setup: place.setup.to_vec(),
+        };
+        membership.mixture(place.mixture_version).await?;
+        Ok(membership)
+    }
+
+    /// Asks once; `None` if there was no answer in time, or no line.
+    pub(super) async fn send_once(&self, control: &[u8], candidate: Option<&[u8]>) -> Option<Vec<u8>> {
+        let connection = self.connection();
+        let answer = connection.send_once(frame::with_block(control, candidate).as_bytes().to_vec()).await;
+        if answer.is_none() {
+            self.reconnect_if_moved(&connection).await;
+        }
+        answer
+    }
+
+    /// Asks until there is an answer.
+    async fn request(&self, request: &Request<'_>) -> Result<Vec<u8>, LinkError> {
+        let request = encode(request);
+        loop {
+            let asked = Instant::now();
+            match self.send_once(&request, None).await {
+                Some(answer) => return Ok(answer),
+                None => delay_retry(asked).await,
+            }
+        }
+    }
+}
+
+/// Checks that no certificate stands between the two sides: zenoh does not tell that from an orchestrator that is not there yet.
+async fn check_handshake(endpoint: &Endpoint, tls: &Tls) -> Result<(), NetError> {
+    let (endpoint, tls) = (endpoint.clone(), tls.clone());
+    let probed = tokio::task::spawn_blocking(move || handshake::probe(&endpoint, &tls)).await;
+    // A probe that crashed has found out nothing.
+    Ok(probed.unwrap_or(Ok(()))?)
+}
+
+/// Waits a little after a question that was not even asked.
+pub(super) async fn delay_retry(asked: Instant) {
+    if asked.elapsed() < RETRY_DELAY {
+        sleep(RETRY_DELAY).await;
+    }
+}
+
+/// An answer that is not a refusal.
+pub(super) fn read(answer: &[u8]) -> Result<Reply<'_>, LinkError> {
+    match decode(answer)? {
+        Reply::RejoinRequired(why) => Err(LinkError::RejoinRequired(why)),
+        Reply::Rejected(why) => Err(LinkError::Rejected(why)),
+        reply => Ok(reply),
+    }
+}
+
+fn unexpected(to: &str) -> LinkError {
+    LinkError::InvalidReply(format!("it does not answer the question ({to})"))
+}
+
+impl Membership {
+    /// A entry for each turn that this agent may have in hand.
+    pub fn slots(&self) -> Vec<Slot> {
+        let numbers = self.first_slot..self.first_slot + self.client.agent.slots();
+        numbers.map(|number| Slot::new(self.session, number)).collect()
+    }
+
+    pub(super) fn client(&self) -> &AgentClient {
+        &self.client
+    }
+
+    /// The newest mixture that is here.
+    pub async fn newest(&self) -> Arc<Mixture> {
+        let mixtures = self.mixtures.lock().await;
+        Arc::clone(mixtures.back().expect("joining has brought one"))
+    }
+
+    /// A version of the mixture; what is not here of it is asked for.
+    pub(super) async fn mixture(&self, version: u64) -> Result<Arc<Mixture>, LinkError> {
+        let mut mixtures = self.mixtures.lock().await;
+        if let Some(mixture) = mixtures.iter().find(|mixture| mixture.version() == version) {
+            return Ok(Arc::clone(mixture));
+        }
+        let mixture = Arc::new(self.fetch(mixtures.back(), version).await?);
+        mixtures.push_back(Arc::clone(&mixture));
+        let older = mixtures.len().saturating_sub(MAX_VERSIONS);
+        mixtures.drain(..older);
+        Ok(mixture)
+    }
+
+    async fn fetch(&self, base: Option<&Arc<Mixture>>, wanted: u64) -> Result<Mixture, LinkError> {
+        let have = base.map(|base| base.version());
+        let mut receiver: Option<DeltaReceiver> = None;
+        loop {
+            let skip = receiver.as_ref().map_or(0, DeltaReceiver::received);
+            let request = Request::Mixture { session: self.session, have, wanted, skip };
+            let answer = self.client.request(&request).await?;
+            let Reply::Mixture(part) = read(&answer)? else { return Err(unexpected("mixture")) };
+            let received = match &mut receiver {
+                Some(received) if received.is_next(&part) => received,
+                // The version to start from has been given up meanwhile: from the beginning, without it.
+                Some(_) => {
+                    receiver = None;
+                    continue;
+                }
+                None => receiver.insert(DeltaReceiver::new(
+                    &part,
+                    base.filter(|_| part.from.is_some()).map(|base| &**base),
+                )?),
+            };
+            if received.add_part(&part)? {
+                break;
+            }
+        }
+        Ok(receiver.expect("the loop ends with one").finish()?)
+    }
+
+    /// A file that walkers need, by the hash of its content.
+    ///
+    /// # Errors
+    /// The campaign has no such file.
+    pub async fn fetch_file(&self, hash: &str) -> Result<Vec<u8>, LinkError> {
+        let mut bytes = Vec::new();
+        loop {
+            let offset = bytes.len() as u64;
+            let request = Request::File { session: self.session, hash: hash.to_owned(), offset };
+            let answer = self.client.request(&request).await?;
+            let Reply::File { length, part } = read(&answer)? else { return Err(unexpected("file")) };
+            bytes.extend_from_slice(part);
+            if bytes.len() as u64 >= length || part.is_empty() {
+                return Ok(bytes);
+            }
+        }
+    }
+
+    /// Whether this agent is to stop; `None` if there is no answer.
+    ///
+    /// # Errors
+    /// It has no place any more.
+    pub async fn is_stopping(&self) -> Result<Option<bool>, LinkError> {
+        let question = encode(&Request::Ping { session: self.session });
+        let Some(answer) = self.client.send_once(&question, None).await else { return Ok(None) };
+        match read(&answer)? {
+            Reply::Pong { stopping } => Ok(Some(stopping)),
+            _ => Err(unexpected("here")),
+        }
+    }
+
+    /// Leaves: turns that are still in hand are free. One try, since those who are taken for dead have left as well.
+    pub async fn leave(&self) {
+        let request = Request::Leave { session: self.session, id: self.client.agent.id.clone() };
+        self.client.send_once(&encode(&request), None).await;
+    }
+}

@@ -1,0 +1,50 @@
+//! What lies in a place: listed, and removed.
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use super::error::{ShmDirError, io_error};
+
+/// What was removed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Removed {
+    /// Files, directories not counted.
+    pub files: usize,
+    /// Bytes of memory that they held.
+    pub bytes: u64,
+}
+
+/// What is in a directory; nothing if there is no such directory.
+pub(super) fn entries(directory: &Path) -> Result<Vec<PathBuf>, ShmDirError> {
+    let listed = match fs::read_dir(directory) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        listed => listed.map_err(io_error("list", directory))?,
+    };
+    listed.map(|entry| entry.map(|entry| entry.path()).map_err(io_error("list", directory))).collect()
+}
+
+pub(super) fn remove_tree(path: &Path, removed: &mut Removed) -> Result<(), ShmDirError> {
+    match path.symlink_metadata() {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(io_error("look at", path)(error)),
+        Ok(found) if found.is_dir() => {
+            entries(path)?.iter().try_for_each(|entry| remove_tree(entry, removed))?;
+            missing_is_fine(fs::remove_dir(path)).map_err(io_error("remove", path))
+        }
+        Ok(_) => remove_file(path, removed),
+    }
+}
+
+pub(super) fn remove_file(path: &Path, removed: &mut Removed) -> Result<(), ShmDirError> {
+    let blocks = path.symlink_metadata().map_or(0, |file| file.blocks());
+    missing_is_fine(fs::remove_file(path)).map_err(io_error("remove", path))?;
+    removed.files += 1;
+    removed.bytes += 512 * blocks;
+    Ok(())
+}
+
+fn missing_is_fine(result: io::Result<()>) -> io::Result<()> {
+    if result.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::NotFound) { Ok(()) } else { result }
+}

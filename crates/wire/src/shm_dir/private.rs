@@ -1,0 +1,63 @@
+//! Directories of this user alone.
+
+use std::fs::{DirBuilder, Metadata};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::Path;
+
+use super::error::{ShmDirError, io_error};
+
+pub(super) fn user() -> u32 {
+    rustix::process::geteuid().as_raw()
+}
+
+/// Makes a directory for this user alone, or checks that the one that is there is such a directory.
+pub(super) fn make_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
+    match DirBuilder::new().mode(0o700).create(path) {
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+        made => made.map_err(io_error("make", path))?,
+    }
+    check_private(path, uid)
+}
+
+/// Everybody may write to `/dev/shm`: what has the right name may be a trap.
+pub(super) fn check_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
+    let found = path.symlink_metadata().map_err(io_error("look at", path))?;
+    if found.is_dir() && found.uid() == uid && found.mode() & 0o777 == 0o700 {
+        return Ok(());
+    }
+    Err(ShmDirError::NotPrivate { path: path.to_owned(), found: describe(&found), uid })
+}
+
+fn describe(found: &Metadata) -> String {
+    let kind = if found.is_dir() { "a directory" } else { "no directory" };
+    format!("is {kind} of user {} with mode {:04o}", found.uid(), found.mode() & 0o7777)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{self, Permissions};
+    use std::os::unix::fs::{PermissionsExt, symlink};
+
+    use super::*;
+
+    #[test]
+    fn a_directory_that_others_made_or_may_write_to_is_refused() {
+        let here = tempfile::tempdir().unwrap();
+        let path = here.path().join("home");
+        make_private(&path, user()).unwrap();
+        make_private(&path, user()).unwrap();
+
+        let message = check_private(&path, user() + 1).unwrap_err().to_string();
+        assert!(message.contains(&format!("a directory of user {} with mode 0700", user())), "{message}");
+        fs::set_permissions(&path, Permissions::from_mode(0o770)).unwrap();
+        let message = make_private(&path, user()).unwrap_err().to_string();
+        assert!(message.contains("with mode 0770"), "{message}");
+
+        let link = here.path().join("link");
+        fs::set_permissions(&path, Permissions::from_mode(0o700)).unwrap();
+        symlink(&path, &link).unwrap();
+        let message = make_private(&link, user()).unwrap_err().to_string();
+        assert!(message.contains("no directory"), "{message}");
+    }
+}

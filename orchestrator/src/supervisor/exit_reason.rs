@@ -1,0 +1,173 @@
+//! How a process ended, in words.
+
+use std::fmt;
+use std::time::Duration;
+
+/// Exit code of a program that panicked.
+const PANIC: i32 = 101;
+
+/// How a process ended. Its text is what `status` shows.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ExitReason {
+    /// It left with an exit code.
+    Exit {
+        /// 0 if it went home; 130 or 143 if it was interrupted and left in order.
+        code: i32,
+        /// The last line that it wrote to its standard error.
+        last_line: Option<String>,
+    },
+    /// A signal ended it.
+    Signal {
+        /// Number of the signal.
+        signal: i32,
+        /// The last line that it wrote to its standard error.
+        last_line: Option<String>,
+    },
+    /// It gave no sign of life for so long, and was killed.
+    Unresponsive(Duration),
+    /// It was still there so long after it was told to end, and was killed.
+    StopTimeout(Duration),
+    /// It could not be started.
+    StartFailed {
+        /// What the system said.
+        reason: String,
+        /// Whether the host lacked descriptors, processes or memory: the start says nothing about the child, and a later
+        /// one may succeed.
+        is_shortage: bool,
+    },
+    /// It ended, and how is not for us to know: an adopted process is not our child.
+    Unknown,
+}
+
+impl ExitReason {
+    /// Whether it went home.
+    pub fn is_success(&self) -> bool {
+        matches!(self, Self::Exit { code: 0, .. })
+    }
+
+    /// Whether it was not started because the host lacked something.
+    pub(super) fn is_shortage(&self) -> bool {
+        matches!(self, Self::StartFailed { is_shortage: true, .. })
+    }
+
+    /// Whether the process crashed, so that the next one with the same work may well go the same way. Otherwise the end
+    /// came from outside (a SIGKILL of the kernel that was out of memory, a user's SIGTERM, a host that is too busy to
+    /// give signs of life), or the process itself said why it left.
+    pub fn is_crash(&self) -> bool {
+        match self {
+            Self::Exit { code, .. } => *code == PANIC,
+            Self::Signal { signal, .. } => {
+                matches!(signal_name(*signal), "SIGSEGV" | "SIGABRT" | "SIGBUS" | "SIGILL" | "SIGFPE")
+            }
+            Self::Unresponsive(_) | Self::StopTimeout(_) | Self::StartFailed { .. } | Self::Unknown => false,
+        }
+    }
+
+    /// Whether a process that was told to end by SIGTERM has done as it was told.
+    pub(super) fn is_expected_after_stop(&self) -> bool {
+        match self {
+            Self::Exit { code, .. } => is_interrupted(*code),
+            Self::Signal { signal, .. } => signal_name(*signal) == "SIGTERM",
+            // Of a process that is not our child nothing more can be known.
+            other => matches!(other, Self::Unknown),
+        }
+    }
+}
+
+impl fmt::Display for ExitReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Exit { code, last_line: Some(line) } => write!(f, "exit code {code}: {line}"),
+            Self::Exit { code, last_line: None } => write!(f, "exit code {code}"),
+            Self::Signal { signal, last_line } => {
+                write!(f, "killed by signal {signal}")?;
+                match signal_name(*signal) {
+                    "" => {}
+                    name => write!(f, " ({name})")?,
+                }
+                match last_line {
+                    // The last words before a death from outside have nothing to do with it.
+                    Some(line) if self.is_crash() => write!(f, ": {line}"),
+                    _ => Ok(()),
+                }
+            }
+            Self::Unresponsive(silence) => write!(f, "silent for {} s, killed", silence.as_secs_f64()),
+            Self::StopTimeout(grace) => {
+                write!(f, "still there {} s after it was told to end, killed", grace.as_secs_f64())
+            }
+            Self::StartFailed { reason, .. } => write!(f, "could not be started: {reason}"),
+            Self::Unknown => f.write_str("ended, it is not known how"),
+        }
+    }
+}
+
+/// Whether a process that caught SIGINT or SIGTERM says so by its exit code: 128 and the signal, as shells have it.
+fn is_interrupted(code: i32) -> bool {
+    matches!(code, 130 | 143)
+}
+
+/// Name of a signal, empty if it has none here.
+fn signal_name(signal: i32) -> &'static str {
+    match signal {
+        1 => "SIGHUP",
+        2 => "SIGINT",
+        3 => "SIGQUIT",
+        4 => "SIGILL",
+        5 => "SIGTRAP",
+        6 => "SIGABRT",
+        7 => "SIGBUS",
+        8 => "SIGFPE",
+        9 => "SIGKILL",
+        11 => "SIGSEGV",
+        13 => "SIGPIPE",
+        14 => "SIGALRM",
+        15 => "SIGTERM",
+        24 => "SIGXCPU",
+        25 => "SIGXFSZ",
+        31 => "SIGSYS",
+        _ => "",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn signal(signal: i32) -> ExitReason {
+        ExitReason::Signal { signal, last_line: Some("last words".to_owned()) }
+    }
+
+    #[test]
+    fn own_faults_and_deaths_from_outside_are_told_apart() {
+        use rustix::process::Signal;
+        for own in [Signal::SEGV, Signal::ABORT, Signal::BUS, Signal::ILL, Signal::FPE] {
+            assert!(signal(own.as_raw()).is_crash(), "{own:?}");
+        }
+        for outside in [Signal::KILL, Signal::TERM, Signal::INT, Signal::HUP, Signal::XCPU] {
+            assert!(!signal(outside.as_raw()).is_crash(), "{outside:?}");
+        }
+        assert!(ExitReason::Exit { code: PANIC, last_line: None }.is_crash());
+        for not_own in [0, 1, 2, 130, 143] {
+            assert!(!ExitReason::Exit { code: not_own, last_line: None }.is_crash(), "{not_own}");
+        }
+        assert!(!ExitReason::Unresponsive(Duration::from_secs(1)).is_crash());
+        let not_started = ExitReason::StartFailed { reason: "no memory".to_owned(), is_shortage: true };
+        assert!(!not_started.is_crash() && !ExitReason::Unknown.is_crash());
+    }
+
+    #[test]
+    fn an_end_is_told_in_words() {
+        let exit = |last_line: Option<&str>| {
+            ExitReason::Exit { code: 2, last_line: last_line.map(str::to_owned) }.to_string()
+        };
+        assert_eq!(exit(Some("no model")), "exit code 2: no model");
+        assert_eq!(exit(None), "exit code 2");
+        assert_eq!(signal(9).to_string(), "killed by signal 9 (SIGKILL)");
+        assert_eq!(signal(11).to_string(), "killed by signal 11 (SIGSEGV): last words");
+        assert_eq!(signal(35).to_string(), "killed by signal 35");
+        assert_eq!(
+            ExitReason::Unresponsive(Duration::from_secs(120)).to_string(),
+            "silent for 120 s, killed"
+        );
+    }
+}
