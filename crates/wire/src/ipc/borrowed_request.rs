@@ -1,4 +1,4 @@
-//! A request that the server keeps: the route of its answer, and the owner of the candidate in it.
+//! A request that the server keeps, to answer it and to read its candidate in place.
 
 use std::ptr::NonNull;
 use std::sync::{Mutex, PoisonError};
@@ -9,27 +9,27 @@ use super::IpcError;
 use super::config::Request;
 use crate::protocol::frame::{self, FrameError};
 
-/// A request with the places of its parts. The memory under them stays mapped as long as the request is kept, also when
-/// the walker that wrote it is dead and cleaned away.
+/// A request and the slices of its parts. The memory stays mapped as long as this value lives, even if the walker that
+/// wrote it is dead and cleaned up.
 pub(super) struct BorrowedRequest {
-    /// Behind a lock, because iceoryx2 lets a request be sent to another thread but not be shared.
+    /// Behind a lock because the request type of iceoryx2 is `Send` but not `Sync`.
     request: Mutex<Request>,
     control: NonNull<[u8]>,
     block: NonNull<[u8]>,
 }
 
-// SAFETY: the pointers lead into memory that `request` keeps mapped, that nobody moves, and that no thread of this
-// process writes to; whoever has a `&BorrowedRequest` can only read through them. The walker could still write to it: it is a
-// program of the same user that is trusted not to, as with a debugger (see `super`). What it sent is checked once, with
-// the lengths that are kept from then on, so that no later write leads out of the request.
+// SAFETY: the pointers refer to memory that `request` keeps mapped, that does not move, and that no thread of this
+// process writes; a `&BorrowedRequest` only reads through them. The walker could still write to it: it is a program of
+// the same user and trusted not to (see `super`). The content is validated once, with the lengths kept from then on, so
+// that no later write can lead to an access outside the request.
 #[allow(unsafe_code)]
 unsafe impl Send for BorrowedRequest {}
-// SAFETY: as above; the request itself is behind a lock.
+// SAFETY: see above; the request itself is behind a lock.
 #[allow(unsafe_code)]
 unsafe impl Sync for BorrowedRequest {}
 
 impl BorrowedRequest {
-    /// Finds the parts of a request. The length is read once, here, and not trusted to stay what it is.
+    /// Locates the parts of a request. The length is read only here, since the walker could change it later.
     pub(super) fn new(request: Request) -> Result<Self, FrameError> {
         let (control, block) = frame::split(request.payload().as_bytes())?;
         let (control, block) = (NonNull::from(control), NonNull::from(block));
@@ -39,23 +39,23 @@ impl BorrowedRequest {
     /// The control message.
     #[allow(unsafe_code)]
     pub(super) fn control(&self) -> &[u8] {
-        // SAFETY: made from a reference into the request's memory, which is mapped as long as `self.request` lives.
+        // SAFETY: created from a reference into the request's memory, which is mapped as long as `self.request` lives.
         unsafe { self.control.as_ref() }
     }
 
-    /// The candidate block; empty if there is none.
+    /// The candidate block, or empty.
     #[allow(unsafe_code)]
     pub(super) fn block(&self) -> &[u8] {
-        // SAFETY: as in `control`.
+        // SAFETY: see `control`.
         unsafe { self.block.as_ref() }
     }
 
-    /// Answers the request. An answer may be lost without an error; the walker asks for it then.
+    /// Answers the request. The answer may be lost without an error; the walker then polls.
     pub(super) fn answer(&self, control: &[u8]) -> Result<(), IpcError> {
         let words = frame::to_words(control, None);
         let request = self.request.lock().unwrap_or_else(PoisonError::into_inner);
         let memory = request.loan_slice_uninit(words.len());
-        let memory = memory.map_err(|e| IpcError::new("find memory for an answer", e))?;
+        let memory = memory.map_err(|e| IpcError::new("allocate an answer", e))?;
         memory.write_from_slice(&words).send().map_err(|e| IpcError::new("send an answer", e))
     }
 }

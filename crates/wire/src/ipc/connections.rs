@@ -1,4 +1,4 @@
-//! The server's connections to its walkers: where answers go, what wakes whom, and a count of what came.
+//! The server's connections to walkers: routes of answers, wakeup events, and traffic statistics.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -19,22 +19,22 @@ use crate::protocol::frame;
 use crate::protocol::message::SenderId;
 use crate::transport::WorkItem;
 
-/// What came to the server.
+/// Statistics of received messages.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Traffic {
-    /// Messages.
+    /// Number of messages.
     pub received: u64,
-    /// Their bytes.
+    /// Their total size, bytes.
     pub bytes: u64,
-    /// Time spent on checking and decoding them.
+    /// Time spent validating and decoding them.
     pub checking: Duration,
-    /// Messages that were not listened to.
+    /// Number of rejected messages.
     pub rejected: u64,
-    /// Why the last of them was not.
+    /// Reason of the last rejection.
     pub last_rejected: Option<String>,
-    /// Answers that could not be sent; walkers ask for them again.
+    /// Number of answers that could not be sent; walkers poll for them.
     pub unsent: u64,
-    /// Why the last of them could not.
+    /// Reason of the last failure.
     pub last_unsent: Option<String>,
 }
 
@@ -47,13 +47,13 @@ pub(super) struct Connections {
 
 #[derive(Default)]
 struct Connection {
-    /// Wakes the walker; made when it first speaks.
+    /// Wakes the walker; opened at its first message.
     wakeup: Option<Notifier<Service>>,
-    /// Where the answer to its offer goes.
+    /// The request whose response channel takes the answer.
     route: Option<Arc<BorrowedRequest>>,
-    /// Where the reactor's decision comes from.
+    /// Receives the reactor's decision.
     decision: Option<oneshot::Receiver<Option<WorkItem>>>,
-    /// The mixture of its turn, kept until it reports.
+    /// The mixture of the walker's assignment, kept until its report.
     mixture: Option<Arc<Mixture>>,
 }
 
@@ -70,19 +70,20 @@ impl Connections {
         self.walkers.remove(&walker);
     }
 
-    /// Removes what dead processes left behind in iceoryx2's tables.
+    /// Removes resources of dead processes from iceoryx2's tables.
     pub(super) fn clean(&self) {
         self.node.try_cleanup_dead_nodes();
     }
 
-    /// The answer to the walker's offer goes here.
+    /// Sets the request that takes the answer to the walker's offer.
     pub(super) fn route(&mut self, sender: SenderId, request: &Arc<BorrowedRequest>) {
         if let Some(connection) = self.walkers.get_mut(&sender.walker) {
             connection.route = Some(Arc::clone(request));
         }
     }
 
-    /// A way for the reactor's decision. The walker has reported: the mixture of its turn may go.
+    /// Creates the channel for the reactor's decision. The walker has reported, so the mixture of its assignment is
+    /// released.
     pub(super) fn decide(&mut self, sender: SenderId) -> oneshot::Sender<Option<WorkItem>> {
         let (reply, decision) = oneshot::channel();
         if let Some(connection) = self.walkers.get_mut(&sender.walker) {
@@ -103,7 +104,7 @@ impl Connections {
         Poll::Pending
     }
 
-    /// Answers the walker's offer and keeps the mixture of its turn.
+    /// Answers the walker's offer and keeps the mixture of its new assignment.
     pub(super) fn answer(&mut self, sender: SenderId, answer: &[u8], mixture: Option<Arc<Mixture>>) {
         let Some(connection) = self.walkers.get_mut(&sender.walker) else { return };
         connection.mixture = mixture;
@@ -112,7 +113,7 @@ impl Connections {
         }
     }
 
-    /// Sends an answer and wakes the walker. If it is lost the walker asks again.
+    /// Sends an answer and wakes the walker. If the answer is lost, the walker polls again.
     pub(super) fn send(&mut self, sender: SenderId, route: &BorrowedRequest, answer: &[u8]) {
         let Some(connection) = self.walkers.get_mut(&sender.walker) else { return };
         let sent = config::check_free_space(frame::length(answer.len(), None), self.message_bytes)
@@ -125,7 +126,7 @@ impl Connections {
         }
     }
 
-    /// Counts a message, how long it took, and, if it was dropped, why.
+    /// Counts a message, the time spent on it, and the reason if it was rejected.
     pub(super) fn count(&self, bytes: u64, took: Duration, rejected: Option<&impl fmt::Display>) {
         let mut traffic = self.traffic.lock().unwrap_or_else(PoisonError::into_inner);
         traffic.received += 1;

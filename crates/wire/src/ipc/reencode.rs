@@ -1,5 +1,5 @@
-//! What is understood of bytes, written as its sender would write it. Tests and the fuzz target look through this at all that
-//! is done to a message before it is believed.
+//! Decodes a message and encodes it again, for tests and the fuzz target: this covers all validation of received
+//! messages.
 
 use serde::Serialize;
 use zerocopy::IntoBytes;
@@ -13,7 +13,8 @@ use crate::protocol::rejected::RejectedMessage;
 #[cfg(test)]
 mod tests;
 
-/// The bytes read as the server reads a request, and as a walker reads an answer; none where they are refused.
+/// Decodes the bytes as a request to the server and as an answer to a walker, and encodes each again; `None` where the
+/// bytes are rejected.
 pub fn reencode(bytes: &[u8]) -> [Option<Vec<u8>>; 2] {
     [request(bytes).ok(), answer(bytes).ok()]
 }

@@ -1,4 +1,4 @@
-//! The orchestrator's end: one task that listens, answers, and hands on to the reactor.
+//! The orchestrator's end: a task that receives messages, answers them, and forwards them to the reactor.
 
 use std::future::poll_fn;
 use std::io;
@@ -20,10 +20,11 @@ use crate::protocol::message::SenderId;
 use crate::shm_dir::{self, ShmDir};
 use crate::transport::Incoming;
 
-/// Messages that are taken in before the server looks at anything else.
+/// Maximum number of messages handled before other events.
 const BATCH: usize = 64;
 
-/// The orchestrator's end of the transport. Walkers can connect as soon as it is open and are heard when it runs.
+/// The orchestrator's end of the transport. Walkers can connect as soon as it is open; [`Server::run`] handles their
+/// messages.
 pub struct Server {
     port: ServerPort,
     wakeup: Listener<Service>,
@@ -32,7 +33,7 @@ pub struct Server {
     handle: ServerHandle,
 }
 
-/// Speaks to the server's task.
+/// Controls the server's task.
 #[derive(Clone, Debug)]
 pub struct ServerHandle {
     connect_info: ConnectInfo,
@@ -54,45 +55,47 @@ impl ServerHandle {
         ConnectInfo { sender, ..self.connect_info.clone() }
     }
 
-    /// From now on this incarnation of the walker is heard and no other. To be called before its process is started and
-    /// after another, if there was one, has ended: if [`ServerHandle::lost`] has not said so, this does.
+    /// Accepts messages only of this incarnation of the walker from now on. Call it before the process is started and
+    /// after the previous process has exited; it implies [`ServerHandle::lost`] for the previous one.
     pub fn expect(&self, walker: u32, incarnation: u32) {
         self.command(Command::Expect { walker, incarnation });
     }
 
-    /// The walker's process is dead and has been waited for: what it held is freed, and the reactor hears of it, and
-    /// whether that was its own crashed. Nothing happens if this incarnation is not the expected one any more: what it
-    /// held has been freed, and what is held now belongs to its successor.
+    /// Reports that the walker's process has exited and was waited for, and whether it crashed. Frees its resources and
+    /// informs the reactor. Does nothing if another incarnation is expected, since the resources then belong to the
+    /// successor.
     pub fn lost(&self, walker: u32, incarnation: u32, crashed: bool) {
         self.command(Command::Lost { walker, incarnation, crashed });
     }
 
-    /// No walker will come any more, and none is alive: [`Server::run`] ends.
+    /// Makes [`Server::run`] return. Call it when no walker is alive and none will be started.
     pub fn close(&self) {
         self.command(Command::Close);
     }
 
-    /// What came so far.
+    /// Statistics of received messages.
     pub fn traffic(&self) -> Traffic {
         self.traffic.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     fn command(&self, command: Command) {
-        // After the server's end there is nothing to be done about it.
+        // Fails only if the server has already ended.
         let _ = self.commands.send(command);
     }
 }
 
 impl Server {
-    /// Opens the transport in a place that has been prepared. `session` tells this run of the orchestrator from others.
+    /// Opens the transport in a prepared directory. `session` distinguishes this run of the orchestrator from others.
     ///
     /// # Errors
-    /// Whatever iceoryx2 says.
+    /// Errors of iceoryx2 and of the operating system.
     pub fn open(shm_dir: &ShmDir, sizes: Sizes, session: u64) -> Result<Self, IpcError> {
         let node = config::node(shm_dir.directory(), shm_dir.prefix())?;
         let wakeup = config::create_server_wakeup(&node, &sizes, session)?;
         let port = config::server_port(&config::create_requests(&node, &sizes, session)?, &sizes)?;
-        shm_dir.restrict_permissions().map_err(|e| IpcError::new("close its files to other users", e))?;
+        shm_dir
+            .restrict_permissions()
+            .map_err(|e| IpcError::new("restrict the permissions of its files", e))?;
         shm_dir::reserve(shm_dir.prefix(), None).map_err(|e| IpcError::new("reserve its memory", e))?;
         let (sender, commands) = mpsc::unbounded_channel();
         let traffic = Arc::default();
@@ -113,16 +116,16 @@ impl Server {
         })
     }
 
-    /// For whoever starts and ends walkers.
+    /// Handle for the code that starts and stops walkers.
     pub fn handle(&self) -> ServerHandle {
         self.handle.clone()
     }
 
-    /// Listens to walkers and hands on to the reactor until [`ServerHandle::close`]. `heard` is told of each walker's messages, and
-    /// whether they brought a report.
+    /// Handles messages of walkers and forwards them to the reactor until [`ServerHandle::close`]. Calls `heard` for
+    /// each message with the walker's number and whether it contains a report.
     ///
     /// # Errors
-    /// Shared memory or sockets that fail, a mixture that cannot be shared.
+    /// Errors of shared memory or sockets, or a mixture that cannot be shared.
     pub async fn run(
         mut self,
         mixtures: SharedMixture,
@@ -140,11 +143,11 @@ impl Server {
                     Some(Command::Expect { walker, incarnation }) => session.expect(walker, incarnation),
                     Some(Command::Lost { walker, incarnation, crashed }) => {
                         session.walker_lost(walker, incarnation, crashed);
-                        // Lets go of the connection as well.
+                        // This also drops the connection.
                         more = receive_batch(&self.port, &mut session, &mut heard)?;
                     }
                     Some(Command::Close) | None => {
-                        // The reactor waits for the walkers that are gone, also when others keep its channel open.
+                        // The reactor waits for the exits, even if other senders keep its channel open.
                         for incoming in session.outbox.drain(..) {
                             if to_reactor.send(incoming).await.is_err() {
                                 break;
@@ -156,7 +159,7 @@ impl Server {
                 (walker, work) = poll_fn(|context| session.poll_decision(context)) => session.decided(walker, work)?,
                 permit = to_reactor.reserve(), if !session.outbox.is_empty() => match permit {
                     Ok(permit) => if let Some(incoming) = session.outbox.pop_front() { permit.send(incoming) },
-                    // The reactor has ended: whoever waits is sent home.
+                    // The reactor has ended: all waiting walkers shut down.
                     Err(_) => session.outbox.clear(),
                 },
                 () = tokio::task::yield_now(), if more => more = receive_batch(&self.port, &mut session, &mut heard)?,
@@ -171,7 +174,7 @@ impl Server {
     }
 }
 
-/// Takes in what has come; whether there may be more.
+/// Handles received messages. Returns whether there may be more.
 fn receive_batch(
     port: &ServerPort,
     session: &mut ServerSession,
@@ -184,7 +187,7 @@ fn receive_batch(
                     heard(walker, reports);
                 }
             }
-            // Of a walker that sends without end, or that died while it connected: the others ring again.
+            // The walker sends without pause, or died while connecting. Other walkers will wake the server again.
             Ok(None) | Err(ReceiveError::ExceedsMaxBorrows | ReceiveError::ConnectionFailure(_)) => {
                 return Ok(false);
             }
@@ -193,12 +196,12 @@ fn receive_batch(
     Ok(true)
 }
 
-/// The listener's descriptor, to be waited for by tokio.
+/// The listener's file descriptor, for tokio.
 #[allow(unsafe_code)]
 fn descriptor(wakeup: &Listener<Service>) -> io::Result<AsyncFd<OwnedFd>> {
-    // SAFETY: the listener, which owns the descriptor, outlives this function; what is kept is a duplicate.
+    // SAFETY: the listener owns the descriptor and outlives this function; only a duplicate is kept.
     let duplicate =
         unsafe { BorrowedFd::borrow_raw(wakeup.file_descriptor().native_handle()) }.try_clone_to_owned()?;
-    // SAFETY: the duplicate is owned by what is returned, which never gives it away, and is closed with it.
+    // SAFETY: the returned value owns the duplicate, never gives it away, and closes it.
     Ok(unsafe { AsyncFd::register(duplicate) }?)
 }

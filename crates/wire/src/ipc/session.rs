@@ -1,4 +1,4 @@
-//! The server's work between two waits: what is said to whom.
+//! State of the server: handles messages and decisions.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -20,11 +20,11 @@ use crate::protocol::rejected::RejectedMessage;
 use crate::protocol::sequence::{OfferStatus, SequenceTracker};
 use crate::transport::{Incoming, WorkItem};
 
-/// More progress than this is not kept for a busy reactor.
+/// Maximum number of progress messages queued for the reactor.
 const MAX_QUEUED_PROGRESS: usize = 64;
 
 pub(super) struct ServerSession {
-    /// What the reactor has not taken yet: at most an offer of each walker, its end, and some progress.
+    /// Messages for the reactor: at most one offer and one exit of each walker, and some progress.
     pub(super) outbox: VecDeque<Incoming>,
     sequences: SequenceTracker,
     connections: Connections,
@@ -47,9 +47,9 @@ impl ServerSession {
         self.connections.open(walker);
     }
 
-    /// The walker's process is dead. Its decision is dropped before the reactor hears of it, so that a turn which is
-    /// given to it meanwhile is known to be lost one way or the other. News of a process that has a successor is no news: what the
-    /// successor holds must not be freed.
+    /// Handles the exit of a walker's process. Drops the pending decision before the reactor learns of the exit, so
+    /// that an assignment sent in the meantime is recognized as lost either way. Does nothing if the process already
+    /// has a successor, whose resources must not be freed.
     pub(super) fn walker_lost(&mut self, walker: u32, incarnation: u32, crashed: bool) {
         if self.sequences.incarnation(walker) != Some(incarnation) {
             return;
@@ -61,7 +61,7 @@ impl ServerSession {
         self.outbox.push_back(Incoming::Lost { walker, crashed });
     }
 
-    /// Takes in a message; the walker that it is of and whether it brings a report, unless it is dropped.
+    /// Handles a message. Returns its walker and whether it contains a report, unless the message is rejected.
     pub(super) fn receive(&mut self, request: Request) -> Option<(u32, bool)> {
         let (begin, bytes) = (Instant::now(), size_of_val(request.payload()) as u64);
         let heard = self.listen(request);
@@ -91,7 +91,7 @@ impl ServerSession {
     ) -> Result<(), RejectedMessage> {
         match self.sequences.offer(sender, sequence)? {
             OfferStatus::Answered(answer) => self.connections.send(sender, request, answer),
-            // The walker listens where it spoke last.
+            // The walker waits for the answer to its latest request.
             OfferStatus::Pending => self.connections.route(sender, request),
             OfferStatus::New | OfferStatus::Unknown => {
                 let report = attach_candidate(report, self.candidate(sender, request)?)?;
@@ -122,14 +122,14 @@ impl ServerSession {
         Ok(())
     }
 
-    /// May be lost: whoever watches can do without.
+    /// May drop the message.
     fn progress(&mut self, walk: WalkId, progress: Progress) {
         if self.outbox.len() < MAX_QUEUED_PROGRESS {
             self.outbox.push_back(Incoming::Progress(walk, progress));
         }
     }
 
-    /// The candidate beside a message, where it stands if not too many stand already.
+    /// The candidate of a message; read in place unless too many are already.
     fn candidate(
         &mut self,
         sender: SenderId,
@@ -148,12 +148,12 @@ impl ServerSession {
         Ok(Some(block))
     }
 
-    /// The next walker whose offer has been decided, and the decision: a turn, or home.
+    /// The next decision of the reactor and its walker: an assignment, or `None` for shutdown.
     pub(super) fn poll_decision(&mut self, context: &mut Context<'_>) -> Poll<(u32, Option<WorkItem>)> {
         self.connections.poll_decision(context)
     }
 
-    /// Answers the offer of a walker.
+    /// Answers the pending offer of a walker.
     pub(super) fn decided(&mut self, walker: u32, work: Option<WorkItem>) -> Result<(), IpcError> {
         let Some((sender, sequence)) = self.sequences.pending(walker) else { return Ok(()) };
         let body = match &work {

@@ -1,4 +1,4 @@
-//! A walker's end.
+//! The walker's end.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -26,18 +26,18 @@ use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
 use crate::shm_dir;
 use crate::transport::{Transport, WorkItem};
 
-/// A walker that waits for an answer asks this often.
+/// Interval between polls while waiting for an answer.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// It gives up when the orchestrator has been silent for this long: it is stopped or hangs …
+/// Timeout for the orchestrator, which may be stopped or hang.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(600);
-/// … and earlier when the walker was asked to stop.
+/// The timeout after the walker was asked to stop.
 const STOPPING_TIMEOUT: Duration = Duration::from_secs(20);
-/// What a predecessor held is free after so long at the latest.
+/// Timeout for the server to free the slot of the previous process.
 const SLOT_TIMEOUT: Duration = Duration::from_secs(10);
-/// An offer that the orchestrator says it never had is made this often.
+/// Maximum number of times to send the same offer.
 const MAX_OFFERS: u32 = 5;
 
-/// A walker's end of the transport.
+/// The walker's end of the transport.
 pub struct IpcWalker {
     sender: SenderId,
     port: ClientPort,
@@ -52,12 +52,12 @@ pub struct IpcWalker {
     _node: Node<Service>,
 }
 
-/// A message that may be answered.
+/// A request that may be answered.
 struct PendingAnswer(Pending);
 
 impl Drop for PendingAnswer {
     fn drop(&mut self) {
-        // What nobody reads would keep its place, which a later answer needs (see `config::ANSWER_BUFFERS`).
+        // Unread answers would occupy slots that later answers need (see `config::ANSWER_BUFFERS`).
         while let Ok(Some(_)) = self.0.receive() {}
     }
 }
@@ -66,7 +66,7 @@ impl IpcWalker {
     /// Connects to the orchestrator. Setting `stopping` asks the walker to stop.
     ///
     /// # Errors
-    /// An orchestrator that is not there, or whatever iceoryx2 says.
+    /// The orchestrator is not running, or an error of iceoryx2.
     pub fn connect(connect_info: &ConnectInfo, stopping: Arc<AtomicBool>) -> Result<Self, IpcError> {
         let ConnectInfo { sender, .. } = *connect_info;
         let node = config::node(&connect_info.directory, &connect_info.prefix)?;
@@ -92,17 +92,17 @@ impl IpcWalker {
         })
     }
 
-    /// Why the last exchange ended without a turn; none if the walker was sent home.
+    /// Why the last exchange returned no assignment; `None` if the walker was shut down.
     pub fn failure(&self) -> Option<&IpcError> {
         self.failure.as_ref()
     }
 
-    /// Time spent so far on encoding messages.
+    /// Total time spent encoding messages.
     pub fn encoding(&self) -> Duration {
         self.encoding.get()
     }
 
-    /// Offers the report until there is an answer.
+    /// Sends the report until it is answered.
     fn converse(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<WorkItem>, IpcError> {
         self.sequence += 1;
         let (mut offer, mut question) = (self.offer(report)?, None);
@@ -135,7 +135,7 @@ impl IpcWalker {
         }
     }
 
-    /// Sleeps until the server rings or it is time to ask again. A signal may end it earlier.
+    /// Sleeps until the server wakes this walker or the next poll is due. A signal may end the sleep early.
     fn wait_for(&self, asked: Instant, heard: Instant) -> Result<(), IpcError> {
         let timeout = if self.stopping() { STOPPING_TIMEOUT } else { ANSWER_TIMEOUT };
         if heard.elapsed() > timeout {
@@ -161,12 +161,10 @@ impl IpcWalker {
         let control = encode(&Envelope { sender: self.sender, payload });
         let length = frame::length(control.len(), candidate);
         config::check_free_space(length, self.message_bytes)?;
-        let mut memory = self
-            .port
-            .loan_slice_uninit(length / 8)
-            .map_err(|e| IpcError::new("find memory for a message", e))?;
+        let mut memory =
+            self.port.loan_slice_uninit(length / 8).map_err(|e| IpcError::new("allocate a message", e))?;
         frame::write(initialised(memory.payload_mut()).as_mut_bytes(), &control, candidate);
-        // SAFETY: every word of shared memory has a value.
+        // SAFETY: every word of shared memory is initialized.
         #[allow(unsafe_code)]
         let memory = unsafe { memory.assume_init() };
         self.encoding.set(self.encoding.get() + begin.elapsed());
@@ -174,12 +172,12 @@ impl IpcWalker {
         if pending.number_of_server_connections() == 0 {
             return Ok(None);
         }
-        // A wakeup that cannot be wakeup because its buffer is full rings already.
+        // If notifying fails because the buffer is full, the server is already about to wake.
         let _ = self.server_wakeup.notify();
         Ok(Some(PendingAnswer(pending)))
     }
 
-    /// What has been answered to the present offer.
+    /// The answer to the current offer, if it has arrived.
     fn answer(&self, asked: Option<&PendingAnswer>) -> Result<Option<AnswerBody<'static>>, IpcError> {
         let Some(PendingAnswer(pending)) = asked else { return Ok(None) };
         let received = pending.receive().map_err(|e| IpcError::new("receive an answer", e))?;
@@ -191,8 +189,8 @@ impl IpcWalker {
     }
 }
 
-/// Opens the mixture. What a predecessor held, the server frees when it hears of its end, which may be a moment later
-/// than the start of this process.
+/// Opens the shared mixture. The server frees the slot of the previous process when it learns of its exit, which may be
+/// shortly after this process starts.
 fn reader(connect_info: &ConnectInfo) -> Result<MixtureReader, SharedMixtureError> {
     let begun = Instant::now();
     loop {
@@ -215,7 +213,7 @@ impl Transport for IpcWalker {
     }
 
     fn progress(&self, walk: WalkId, progress: Progress) {
-        // May be lost: whoever watches can do without this one.
+        // May be lost.
         let _ = self.send(Payload::Progress(walk, Cow::Owned(progress)), None);
     }
 
@@ -224,10 +222,10 @@ impl Transport for IpcWalker {
     }
 }
 
-/// BorrowedRequest memory, to be written to.
+/// The same memory as initialized words.
 #[allow(unsafe_code)]
 fn initialised(memory: &mut [MaybeUninit<u64>]) -> &mut [u64] {
-    // SAFETY: the memory is a file that is mapped: the kernel gave each byte its first value, a zero or what was
-    // written there before.
+    // SAFETY: the memory is a mapped file, so the kernel has initialized every byte, with zero or with what was written
+    // there before.
     unsafe { &mut *(std::ptr::from_mut(memory) as *mut [u64]) }
 }

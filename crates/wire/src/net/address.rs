@@ -1,4 +1,4 @@
-//! Where agents look for the orchestrator: always in one place, or wherever a file says that it is now.
+//! How agents find the orchestrator: at a fixed endpoint, or by an endpoint file.
 
 use std::fmt;
 use std::fs;
@@ -12,31 +12,31 @@ use tokio::time::sleep;
 use super::NetError;
 use super::endpoint::{Endpoint, EndpointError};
 
-/// Between two looks whether the campaign is over.
+/// Interval between checks whether the campaign is over.
 const POLL_INTERVAL: Duration = Duration::from_secs(5);
-/// What stands in the file of a campaign that is over.
+/// Content of the endpoint file of a campaign that is over.
 const OVER: &str = "over";
 
-/// Where agents look for the orchestrator.
+/// How agents find the orchestrator.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Address {
-    /// It is always here.
+    /// At this endpoint.
     Endpoint(Endpoint),
-    /// It writes into this file where it is, each time that it is started: `@FILE`.
+    /// At the endpoint in this file, which the orchestrator writes at every start: `@FILE`.
     File(PathBuf),
 }
 
-/// What the orchestrator writes into its file: a line of text.
+/// Content of the endpoint file: one line of text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Announcement {
-    /// It is here.
+    /// The orchestrator listens here.
     Endpoint(Endpoint),
     /// There is no more work.
     Over,
 }
 
 impl Address {
-    /// Where the orchestrator is now, as far as is known.
+    /// The current endpoint of the orchestrator.
     pub(super) fn resolve(&self) -> Result<Announcement, NetError> {
         let path = match self {
             Self::Endpoint(endpoint) => return Ok(Announcement::Endpoint(endpoint.clone())),
@@ -51,7 +51,7 @@ impl Address {
         text.parse().map_err(found)
     }
 
-    /// Waits until the file says that the campaign is over.
+    /// Waits until the endpoint file says that the campaign is over. Never returns for a fixed endpoint.
     pub async fn wait_until_over(&self) {
         if let Self::Endpoint(_) = self {
             std::future::pending().await

@@ -1,4 +1,4 @@
-//! An agent's end: one session with the orchestrator, in which everything is asked until it is answered.
+//! The agent's end: a session with the orchestrator. Requests are repeated until they are answered.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex as Lock, PoisonError};
@@ -23,64 +23,65 @@ use super::slot::Slot;
 use crate::control::{ControlError, decode, encode};
 use crate::protocol::frame;
 
-/// A question without an answer is asked again after this.
+/// Timeout of a request, after which it is repeated.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(5);
-/// Between two tries while there is no line.
+/// Delay between attempts while the link is down.
 const RETRY_DELAY: Duration = Duration::from_millis(300);
-/// Between two tries to connect for the first time.
+/// Interval between attempts to connect for the first time.
 const CONNECT_RETRY_INTERVAL: Duration = Duration::from_secs(1);
-/// Between two looks whether the orchestrator is somewhere else.
+/// Interval between checks whether the orchestrator has moved.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
-/// Versions of the mixture that are kept.
+/// Number of mixture versions to keep.
 const MAX_VERSIONS: usize = 4;
 
-/// An agent's line to the orchestrator.
+/// An agent's client of the orchestrator.
 pub struct AgentClient {
     address: Address,
     tls: Option<Tls>,
     agent: Agent,
     connection: Lock<Arc<Connection>>,
-    /// Held by who looks for the orchestrator, with the moment of the last look.
+    /// Time of the last check whether the orchestrator has moved; locked during the check.
     last_poll: Mutex<Option<Instant>>,
 }
 
-/// A connection to the orchestrator in one place.
+/// A connection to one endpoint.
 struct Connection {
     endpoint: Endpoint,
     session: Session,
-    /// The sign of life.
+    /// The heartbeat.
     _token: LivelinessToken,
 }
 
-/// A place among the walkers of a campaign.
+/// Membership of an agent in a run of the orchestrator.
 pub struct Membership {
     client: Arc<AgentClient>,
-    /// Of this run of the orchestrator.
+    /// Session of the orchestrator.
     pub(super) session: u64,
     first_slot: u32,
-    /// The newest version last; taken in by one slot at a time.
+    /// The newest version last; locked while a version is fetched.
     mixtures: Mutex<VecDeque<Arc<Mixture>>>,
-    /// What walkers are to be started with.
+    /// Configuration for starting walkers.
     pub setup: Vec<u8>,
 }
 
-/// Why an agent has no place any more, or gets none.
+/// Why an agent cannot work with the orchestrator.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// It was taken for dead, or the orchestrator was started again: it may join anew, with what it has to tell.
+    /// The agent was considered lost, or the orchestrator was restarted. The agent can join again and deliver its
+    /// reports.
     #[error("{0}")]
     RejoinRequired(String),
-    /// The orchestrator does not understand what this program says.
-    #[error("the orchestrator refuses a message: {0}")]
+    /// The orchestrator rejected a message.
+    #[error("the orchestrator rejected a message: {0}")]
     Rejected(String),
-    /// Nothing has been heard of it.
-    #[error("the orchestrator has not answered for {minutes:.1} min")]
+    /// The orchestrator does not answer.
+    #[error("no answer from the orchestrator for {minutes:.1} min")]
     Timeout {
-        /// How long.
+        /// Time since the last answer, min.
         minutes: f64,
     },
-    /// This program does not understand what the orchestrator says: another version of it, in the first place.
-    #[error("an answer of the orchestrator cannot be read: {0}")]
+    /// An answer cannot be decoded, most likely because the versions of calmwalk differ.
+    #[error("invalid answer of the orchestrator: {0}")]
     InvalidReply(String),
 }
 
@@ -97,7 +98,7 @@ impl From<DeltaError> for LinkError {
 }
 
 impl Connection {
-    /// Connects to where the orchestrator is said to be.
+    /// Connects to the current endpoint of the orchestrator.
     async fn find(address: &Address, tls: Option<&Tls>, agent: &Agent) -> Result<Self, NetError> {
         match address.resolve()? {
             Announcement::Endpoint(endpoint) => Self::open(endpoint, tls, agent).await,
@@ -112,7 +113,7 @@ impl Connection {
         Ok(Self { endpoint, session, _token })
     }
 
-    /// Asks once; `None` if there was no answer in time, or no line.
+    /// Sends a request once; `None` if there is no answer in time, or no link.
     async fn send_once(&self, payload: Vec<u8>) -> Option<Vec<u8>> {
         let query = self.session.get(ORCHESTRATOR).payload(payload).timeout(REQUEST_TIMEOUT);
         let replies = query.consolidation(ConsolidationMode::None).await.ok()?;
@@ -122,13 +123,13 @@ impl Connection {
 }
 
 impl AgentClient {
-    /// Waits until an orchestrator listens at the address, and makes itself known there.
+    /// Waits until an orchestrator listens at the address, and connects to it.
     ///
-    /// `waiting` is told why the first try did not succeed.
+    /// Calls `waiting` with the reason if the first attempt fails.
     ///
     /// # Errors
-    /// An endpoint off loopback without certificates, files that cannot be read or that say something else, certificates
-    /// that one of the two sides does not accept.
+    /// An endpoint off loopback without certificates, an endpoint file that cannot be read or is invalid, or a
+    /// certificate that one side rejects.
     pub async fn open(
         address: &Address,
         tls: Option<&Tls>,
@@ -162,7 +163,7 @@ impl AgentClient {
         })
     }
 
-    /// Where it looks for the orchestrator.
+    /// Address of the orchestrator.
     pub fn address(&self) -> &Address {
         &self.address
     }
@@ -171,9 +172,9 @@ impl AgentClient {
         Arc::clone(&self.connection.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Goes to where the orchestrator is said to be, if that is not where the line leads.
+    /// Connects to the current endpoint of the orchestrator if it has changed.
     async fn reconnect_if_moved(&self, connection: &Arc<Connection>) {
-        // One of many who have no answer looks for all of them.
+        // One of many concurrent requests without answer checks for all of them.
         let Ok(mut last_poll) = self.last_poll.try_lock() else { return };
         if last_poll.is_some_and(|last_poll| last_poll.elapsed() < POLL_INTERVAL)
             || !Arc::ptr_eq(connection, &self.connection())
@@ -189,14 +190,14 @@ impl AgentClient {
         *last_poll = Some(Instant::now());
     }
 
-    /// Asks for a place until it is given one.
+    /// Joins the campaign; repeats the request until it is answered.
     ///
     /// # Errors
-    /// A place is refused.
+    /// The orchestrator rejects the agent.
     pub async fn join(self: &Arc<Self>) -> Result<Membership, LinkError> {
         loop {
             match self.try_join().await {
-                // Another orchestrator has taken its place in the meantime.
+                // Another orchestrator has taken over in the meantime.
                 Err(LinkError::RejoinRequired(_)) => {}
                 membership => return membership,
             }
@@ -217,7 +218,7 @@ impl AgentClient {
         Ok(membership)
     }
 
-    /// Asks once; `None` if there was no answer in time, or no line.
+    /// Sends a request once; `None` if there is no answer in time, or no link.
     pub(super) async fn send_once(&self, control: &[u8], candidate: Option<&[u8]>) -> Option<Vec<u8>> {
         let connection = self.connection();
         let answer = connection.send_once(frame::with_block(control, candidate).as_bytes().to_vec()).await;
@@ -227,7 +228,7 @@ impl AgentClient {
         answer
     }
 
-    /// Asks until there is an answer.
+    /// Sends a request until it is answered.
     async fn request(&self, request: &Request<'_>) -> Result<Vec<u8>, LinkError> {
         let request = encode(request);
         loop {
@@ -240,22 +241,23 @@ impl AgentClient {
     }
 }
 
-/// Checks that no certificate stands between the two sides: zenoh does not tell that from an orchestrator that is not there yet.
+/// Checks whether a certificate prevents the connection. zenoh reports the same error if the orchestrator is not
+/// running.
 async fn check_handshake(endpoint: &Endpoint, tls: &Tls) -> Result<(), NetError> {
     let (endpoint, tls) = (endpoint.clone(), tls.clone());
     let probed = tokio::task::spawn_blocking(move || handshake::probe(&endpoint, &tls)).await;
-    // A probe that crashed has found out nothing.
+    // A probe that panicked has no result.
     Ok(probed.unwrap_or(Ok(()))?)
 }
 
-/// Waits a little after a question that was not even asked.
+/// Waits briefly if a request failed immediately.
 pub(super) async fn delay_retry(asked: Instant) {
     if asked.elapsed() < RETRY_DELAY {
         sleep(RETRY_DELAY).await;
     }
 }
 
-/// An answer that is not a refusal.
+/// Decodes an answer; rejections are errors.
 pub(super) fn read(answer: &[u8]) -> Result<Reply<'_>, LinkError> {
     match decode(answer)? {
         Reply::RejoinRequired(why) => Err(LinkError::RejoinRequired(why)),
@@ -265,11 +267,11 @@ pub(super) fn read(answer: &[u8]) -> Result<Reply<'_>, LinkError> {
 }
 
 fn unexpected(to: &str) -> LinkError {
-    LinkError::InvalidReply(format!("it does not answer the question ({to})"))
+    LinkError::InvalidReply(format!("it does not match the request ({to})"))
 }
 
 impl Membership {
-    /// A entry for each turn that this agent may have in hand.
+    /// The slots of this agent.
     pub fn slots(&self) -> Vec<Slot> {
         let numbers = self.first_slot..self.first_slot + self.client.agent.slots();
         numbers.map(|number| Slot::new(self.session, number)).collect()
@@ -279,13 +281,13 @@ impl Membership {
         &self.client
     }
 
-    /// The newest mixture that is here.
+    /// The newest mixture that has been received.
     pub async fn newest(&self) -> Arc<Mixture> {
         let mixtures = self.mixtures.lock().await;
         Arc::clone(mixtures.back().expect("joining has brought one"))
     }
 
-    /// A version of the mixture; what is not here of it is asked for.
+    /// A version of the mixture; fetches what is missing.
     pub(super) async fn mixture(&self, version: u64) -> Result<Arc<Mixture>, LinkError> {
         let mut mixtures = self.mixtures.lock().await;
         if let Some(mixture) = mixtures.iter().find(|mixture| mixture.version() == version) {
@@ -308,7 +310,7 @@ impl Membership {
             let Reply::Mixture(part) = read(&answer)? else { return Err(unexpected("mixture")) };
             let received = match &mut receiver {
                 Some(received) if received.is_next(&part) => received,
-                // The version to start from has been given up meanwhile: from the beginning, without it.
+                // The orchestrator has discarded the base version in the meantime: start over without it.
                 Some(_) => {
                     receiver = None;
                     continue;
@@ -325,7 +327,7 @@ impl Membership {
         Ok(receiver.expect("the loop ends with one").finish()?)
     }
 
-    /// A file that walkers need, by the hash of its content.
+    /// Fetches a file for walkers by the hash of its content.
     ///
     /// # Errors
     /// The campaign has no such file.
@@ -343,10 +345,10 @@ impl Membership {
         }
     }
 
-    /// Whether this agent is to stop; `None` if there is no answer.
+    /// Whether this agent should stop; `None` if there is no answer.
     ///
     /// # Errors
-    /// It has no place any more.
+    /// The agent must join again.
     pub async fn is_stopping(&self) -> Result<Option<bool>, LinkError> {
         let question = encode(&Request::Ping { session: self.session });
         let Some(answer) = self.client.send_once(&question, None).await else { return Ok(None) };
@@ -356,7 +358,7 @@ impl Membership {
         }
     }
 
-    /// Leaves: turns that are still in hand are free. One try, since those who are taken for dead have left as well.
+    /// Leaves and returns all assignments. Tries once only, since a lost agent loses its assignments as well.
     pub async fn leave(&self) {
         let request = Request::Leave { session: self.session, id: self.client.agent.id.clone() };
         self.client.send_once(&encode(&request), None).await;

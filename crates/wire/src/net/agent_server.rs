@@ -1,4 +1,4 @@
-//! The orchestrator's end: one task that listens to agents, answers, and hands on to the reactor.
+//! The orchestrator's end: a task that receives requests of agents, answers them, and forwards reports to the reactor.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -23,29 +23,30 @@ use super::session::ServerSession;
 use super::{AgentBootstrap, NetError};
 use crate::transport::Incoming;
 
-/// Questions that wait in line before zenoh holds agents up.
+/// Number of queued requests before zenoh applies backpressure.
 const QUEUE_LENGTH: usize = 1024;
-/// Between two looks for agents that have been silent for too long.
+/// Interval between checks for unresponsive agents.
 const EXPIRY_INTERVAL: Duration = Duration::from_millis(500);
 
-/// What happened to an agent.
+/// An event of an agent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum AgentEvent {
-    /// It takes part now.
+    /// It has joined.
     Joined(Agent),
-    /// It gives no sign of life: its link is down, or it is dead.
+    /// Its heartbeat is missing: the link is down, or the agent is dead.
     Unresponsive(Agent),
-    /// It was silent and is back.
+    /// Its heartbeat is back.
     Recovered(Agent),
-    /// It was silent for too long: others get its turns.
+    /// Its heartbeat was missing for too long: others get its assignments.
     Lost(Agent),
-    /// It has left in order.
+    /// It has left.
     Left(Agent),
-    /// A message was dropped; why.
+    /// A message was rejected, with the reason.
     MessageRejected(String),
 }
 
-/// The orchestrator's end of the transport. Agents can connect as soon as it is open and are heard when it runs.
+/// The orchestrator's end of the transport. Agents can connect as soon as it is open; [`AgentServer::run`] handles
+/// their requests.
 pub struct AgentServer {
     endpoint: Endpoint,
     session: Session,
@@ -58,7 +59,7 @@ pub struct AgentServer {
     bootstrap: AgentBootstrap,
 }
 
-/// Speaks to the hub's task.
+/// Controls the server's task.
 #[derive(Clone, Debug)]
 pub struct AgentServerHandle(mpsc::UnboundedSender<Close>);
 
@@ -66,19 +67,19 @@ pub struct AgentServerHandle(mpsc::UnboundedSender<Close>);
 struct Close;
 
 impl AgentServerHandle {
-    /// There is no more work: [`AgentServer::run`] ends when the last agent has left.
+    /// There is no more work: [`AgentServer::run`] returns when the last agent has left.
     pub fn close(&self) {
-        // After the hub's end there is nothing to be done about it.
+        // Fails only if the server has already ended.
         let _ = self.0.send(Close);
     }
 }
 
 impl AgentServer {
-    /// Listens on an endpoint. `session` tells this run of the orchestrator from others; an agent without a sign of life
-    /// for `agent_timeout` is taken for dead.
+    /// Listens on an endpoint. `session` distinguishes this run of the orchestrator from others. Agents without
+    /// heartbeat for `agent_timeout` are considered lost.
     ///
     /// # Errors
-    /// An endpoint off loopback without certificates, certificates that cannot be used, whatever zenoh says.
+    /// An endpoint off loopback without certificates, unusable certificates, or an error of zenoh.
     pub async fn open(
         endpoint: &Endpoint,
         tls: Option<&Tls>,
@@ -110,22 +111,22 @@ impl AgentServer {
         })
     }
 
-    /// Where it listens.
+    /// The endpoint it listens on.
     pub fn endpoint(&self) -> &Endpoint {
         &self.endpoint
     }
 
-    /// For whoever ends it.
+    /// Handle for stopping the server.
     pub fn handle(&self) -> AgentServerHandle {
         self.handle.clone()
     }
 
-    /// Listens to agents and hands on to the reactor until [`AgentServerHandle::close`], and then until every agent has left or been
-    /// taken for dead. `mixture` is the one in force; setting `stopping` asks agents to stop; `on_event` is told what happens
-    /// to them.
+    /// Handles requests of agents and forwards reports to the reactor until [`AgentServerHandle::close`], and then
+    /// until every agent has left or is lost. `mixture` is the current mixture. Setting `stopping` asks agents to stop.
+    /// `on_event` is called for every event of an agent.
     ///
     /// # Errors
-    /// zenoh has ended.
+    /// The zenoh session was closed.
     pub async fn run(
         mut self,
         mixture: Arc<Mixture>,
@@ -142,13 +143,13 @@ impl AgentServer {
         expiry.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
-                // Decisions that nobody waits for any more end before the reactor hears why.
+                // Complete aborted decisions before the reactor learns of the reason.
                 biased;
                 _ = self.commands.recv(), if !closing => closing = true,
                 Some((slot, work)) = decisions.next() => state.decided(slot, work),
                 permit = to_reactor.reserve(), if !state.outbox.is_empty() => match permit {
                     Ok(permit) => if let Some(incoming) = state.outbox.pop_front() { permit.send(incoming) },
-                    // The reactor has ended: whoever waits is sent home.
+                    // The reactor has ended: all waiting walkers shut down.
                     Err(_) => state.outbox.clear(),
                 },
                 change = self.liveliness.recv_async() => {

@@ -1,56 +1,56 @@
-//! The difference between two versions of the mixture, as components in the order of elements and keys.
+//! Deltas between versions of the mixture: lists of components, ordered by element and slot.
 
 use std::sync::Arc;
 
 use calm::{Component, ComponentBytesError, Mixture, MixtureError};
 use serde::{Deserialize, Serialize};
 
-/// Bytes of components that travel in one message, about.
+/// Approximate maximum size of the components in one message, bytes.
 const MAX_PART_BYTES: usize = 8 << 20;
 
-/// A part of the difference from one version to another, or of a whole mixture.
+/// A part of a delta between two versions, or of a complete mixture.
 #[derive(Serialize, Deserialize)]
 pub(super) struct MixtureDelta<'a> {
-    /// What it leads to.
+    /// Resulting version.
     pub version: u64,
-    /// What it starts from; a whole mixture otherwise.
+    /// Base version; `None` for a complete mixture.
     pub from: Option<u64>,
     /// Number of components of each element.
     pub shape: Vec<u32>,
-    /// Components in which they differ, in all.
+    /// Total number of changed components.
     pub total: u32,
-    /// Those before this one are in other parts.
+    /// Number of components in earlier parts.
     pub skip: u32,
-    /// Element and place of those in this part.
+    /// Element and slot of each component in this part.
     pub keys: Vec<(u32, u32)>,
-    /// Those components one after the other, all of the same length, without their statistics.
+    /// The encoded components, all of the same length, without their statistics.
     #[serde(serialize_with = "crate::bytes::serialize")]
     pub bytes: &'a [u8],
 }
 
-/// Why what was sent is no mixture.
+/// Why a received delta is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum DeltaError {
-    /// Not a component.
+    /// An invalid component.
     #[error(transparent)]
     Component(#[from] ComponentBytesError),
-    /// Components that do not fit together.
+    /// Components that do not form a mixture.
     #[error(transparent)]
     Mixture(#[from] MixtureError),
-    /// Parts that do not fit together.
-    #[error("a difference to version {version} of the mixture that does not fit: {what}")]
+    /// Parts that do not match.
+    #[error("invalid delta to version {version} of the mixture: {what}")]
     Parts {
-        /// Where it should lead to.
+        /// Resulting version.
         version: u64,
         /// What is wrong.
         what: String,
     },
 }
 
-/// Component and place.
+/// Element and slot of a component, and the component.
 type IndexedComponent<'a> = ((u32, u32), &'a Arc<Component>);
 
-/// Components of `to` that are not those of `from`.
+/// Components of `to` that differ from `from`.
 fn changed_components<'a>(
     from: Option<&'a Mixture>,
     to: &'a Mixture,
@@ -62,7 +62,7 @@ fn changed_components<'a>(
     })
 }
 
-/// The keys and bytes of the part of the difference that begins after `skip` components, and how many there are in all.
+/// The part of the delta after `skip` components: total number of components, their keys, and their bytes.
 pub(super) fn part(from: Option<&Mixture>, to: &Mixture, skip: u32) -> (u32, Vec<(u32, u32)>, Vec<u8>) {
     let (mut total, mut keys, mut bytes) = (0, Vec::new(), Vec::new());
     for (key, component) in changed_components(from, to) {
@@ -80,7 +80,7 @@ pub(super) fn shape(mixture: &Mixture) -> Vec<u32> {
     (0..mixture.element_count()).map(|k| mixture.components(k).map_or(0, <[_]>::len) as u32).collect()
 }
 
-/// A mixture on its way, part by part.
+/// Assembles a mixture from parts.
 pub(super) struct DeltaReceiver {
     version: u64,
     from: Option<u64>,
@@ -90,11 +90,11 @@ pub(super) struct DeltaReceiver {
 }
 
 impl DeltaReceiver {
-    /// Begins with the first part. `base` is the version that it starts from, if it starts from one.
+    /// Starts with the first part. `base` is the base version, if there is one.
     pub(super) fn new(first: &MixtureDelta<'_>, base: Option<&Mixture>) -> Result<Self, DeltaError> {
         let wrong = |what: &str| DeltaError::Parts { version: first.version, what: what.to_owned() };
         if first.from != base.map(Mixture::version) {
-            return Err(wrong("it starts from another version"));
+            return Err(wrong("it has another base version"));
         }
         let elements = match base {
             Some(base) if shape(base) != first.shape => return Err(wrong("it has another shape")),
@@ -110,18 +110,18 @@ impl DeltaReceiver {
         Ok(Self { version, from, elements, received: 0, total })
     }
 
-    /// Whether this is the part that comes next.
+    /// Whether this is the expected next part.
     pub(super) fn is_next(&self, part: &MixtureDelta<'_>) -> bool {
         (part.version, part.from, part.total, part.skip)
             == (self.version, self.from, self.total, self.received)
     }
 
-    /// Components received so far.
+    /// Number of components received.
     pub(super) fn received(&self) -> u32 {
         self.received
     }
 
-    /// Takes a part in; whether all are there.
+    /// Adds a part. Returns whether it was the last.
     pub(super) fn add_part(&mut self, part: &MixtureDelta<'_>) -> Result<bool, DeltaError> {
         let wrong = |what: String| DeltaError::Parts { version: self.version, what };
         let length = part.bytes.len().checked_div(part.keys.len()).unwrap_or(0);
@@ -132,14 +132,14 @@ impl DeltaReceiver {
         for (&(element, slot), bytes) in part.keys.iter().zip(part.bytes.chunks_exact(length.max(1))) {
             let component = Component::from_bytes(bytes)?;
             let place = self.elements.get_mut(element as usize).and_then(|of| of.get_mut(slot as usize));
-            let place = place.ok_or_else(|| wrong(format!("no place {slot} of element {element}")))?;
+            let place = place.ok_or_else(|| wrong(format!("no slot {slot} of element {element}")))?;
             *place = Some(Arc::new(component));
         }
         self.received += part.keys.len() as u32;
         Ok(self.received >= self.total)
     }
 
-    /// The mixture, once all parts are there.
+    /// The mixture, after the last part.
     pub(super) fn finish(self) -> Result<Mixture, DeltaError> {
         let version = self.version;
         let elements: Option<_> = self.elements.into_iter().map(|of| of.into_iter().collect()).collect();

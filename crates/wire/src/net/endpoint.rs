@@ -1,4 +1,4 @@
-//! Endpoints, and the zenoh sessions that listen on them or connect to them.
+//! Endpoints and their zenoh sessions.
 
 use std::fmt;
 use std::io;
@@ -12,23 +12,23 @@ use zenoh::{Config, Session, Wait};
 use super::NetError;
 use super::certificates::Tls;
 
-/// Where an orchestrator listens, or an agent connects to: `tcp/HOST:PORT`. Listening at port 0 takes one that is free.
+/// Where the orchestrator listens and agents connect: `tcp/HOST:PORT`. Listening on port 0 chooses a free port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoint {
     host: String,
     port: u16,
 }
 
-/// Text that is not an endpoint.
+/// Text that is not a valid endpoint.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{found:?} is not an endpoint: expected tcp/HOST:PORT, as tcp/head:7447 or tcp/[::1]:7447")]
+#[error("{found:?} is not an endpoint: expected tcp/HOST:PORT, for example tcp/head:7447 or tcp/[::1]:7447")]
 pub struct EndpointError {
     /// The text.
     pub found: String,
 }
 
 impl Endpoint {
-    /// Whether nobody on another host can reach it.
+    /// Whether the endpoint can be reached only from this host.
     pub fn is_loopback(&self) -> bool {
         match self.plain_host().parse::<IpAddr>() {
             Ok(address) => address.is_loopback(),
@@ -36,10 +36,10 @@ impl Endpoint {
         }
     }
 
-    /// This endpoint, with a port that is free now in the place of port 0.
+    /// Replaces port 0 by a currently free port.
     ///
     /// # Errors
-    /// The host is none of this machine's.
+    /// The host is not an address of this machine.
     pub(super) fn with_free_port(&self) -> io::Result<Self> {
         let port = match self.port {
             0 => TcpListener::bind((self.plain_host(), 0))?.local_addr()?.port(),
@@ -48,13 +48,13 @@ impl Endpoint {
         Ok(Self { host: self.host.clone(), port })
     }
 
-    /// As others reach it: where it is every address of this host, that is by the host's name.
+    /// The endpoint for other hosts: replaces the unspecified address by this host's name.
     pub fn with_host_name(&self, name: &str) -> Result<Self, EndpointError> {
         let everywhere = self.plain_host().parse::<IpAddr>().is_ok_and(|address| address.is_unspecified());
         if everywhere { format!("tcp/{name}:{}", self.port).parse() } else { Ok(self.clone()) }
     }
 
-    /// Name or address, without the brackets of IPv6.
+    /// Host name or address, without the brackets of IPv6.
     pub fn plain_host(&self) -> &str {
         self.host.trim_start_matches('[').trim_end_matches(']')
     }
@@ -63,7 +63,7 @@ impl Endpoint {
         self.port
     }
 
-    /// As zenoh spells it.
+    /// The locator in zenoh's format.
     fn locator(&self, tls: bool) -> String {
         format!("{}/{}:{}", if tls { "tls" } else { "tcp" }, self.host, self.port)
     }
@@ -94,20 +94,20 @@ impl fmt::Display for Endpoint {
     }
 }
 
-/// Which side of the line.
+/// Side of a connection.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Side {
     Orchestrator,
     Agent,
 }
 
-/// Opens a session on an endpoint; that of an agent is connected.
+/// Opens a session on an endpoint; an agent's session connects.
 pub(super) async fn open(side: Side, endpoint: &Endpoint, tls: Option<&Tls>) -> Result<Session, NetError> {
     if tls.is_none() && !endpoint.is_loopback() {
         return Err(NetError::Unprotected { endpoint: endpoint.clone() });
     }
     let config = config(side, endpoint, tls)?;
-    // It waits on the thread that polls it.
+    // This call blocks its thread.
     let opened = tokio::task::spawn_blocking(move || zenoh::open(config).wait()).await;
     opened.map_err(|why| NetError::open(endpoint, why))?.map_err(|why| NetError::open(endpoint, why))
 }
@@ -123,7 +123,7 @@ fn config(side: Side, endpoint: &Endpoint, tls: Option<&Tls>) -> Result<Config, 
         ("mode", json!(mode)),
         ("listen/endpoints", listen),
         ("connect/endpoints", connect),
-        // One try to begin with; a session that had a link is tried again for ever.
+        // A single attempt at first; zenoh reconnects an established session indefinitely.
         ("connect/timeout_ms", json!(0)),
         ("connect/exit_on_failure", json!(true)),
         (

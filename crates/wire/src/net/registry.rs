@@ -1,4 +1,4 @@
-//! Which agents take part, and which of them are taken for dead. No port, no clock.
+//! The agents of a run, and which of them are lost. Uses no ports and no clock.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -6,29 +6,29 @@ use std::time::{Duration, Instant};
 
 use super::message::{Agent, AgentId};
 
-/// Slots are numbered from here on: those below are walkers of the orchestrator's own host.
+/// Number of the first slot; smaller numbers are walkers of the orchestrator's host.
 const FIRST_SLOT: u32 = 1 << 16;
 
 /// The agents of a run.
 #[derive(Debug)]
 pub(super) struct AgentRegistry {
-    /// How long an agent may be without a sign of life.
+    /// Maximum time without heartbeat.
     timeout: Duration,
     next_slot: u32,
     agents: BTreeMap<AgentId, RegisteredAgent>,
 }
 
-/// An agent that takes part.
+/// An agent that has joined.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct RegisteredAgent {
     pub agent: Agent,
     pub first_slot: u32,
-    /// Since when it has given no sign of life.
+    /// Time at which its heartbeat disappeared.
     silent_since: Option<Instant>,
 }
 
 impl RegisteredAgent {
-    /// Numbers of its slots. No other agent of this run ever has or had one of them.
+    /// Numbers of its slots. They are unique within a run and never reused.
     pub(super) fn slots(&self) -> Range<u32> {
         self.first_slot..self.first_slot + self.agent.slots()
     }
@@ -39,8 +39,8 @@ impl AgentRegistry {
         Self { timeout, next_slot: FIRST_SLOT, agents: BTreeMap::new() }
     }
 
-    /// Takes an agent in, with slots of its own; `None` if there are no numbers left for so many. An agent that is in
-    /// already has to be taken out before.
+    /// Registers an agent with new slots; `None` if there are not enough numbers left. An agent that is already
+    /// registered must be removed first.
     pub(super) fn join(&mut self, agent: Agent) -> Option<&RegisteredAgent> {
         let first_slot = self.next_slot;
         self.next_slot = first_slot.checked_add(agent.slots())?;
@@ -49,12 +49,12 @@ impl AgentRegistry {
         Some(self.agents.entry(id).insert_entry(registered).into_mut())
     }
 
-    /// Takes an agent out.
+    /// Removes an agent.
     pub(super) fn leave(&mut self, id: &str) -> Option<RegisteredAgent> {
         self.agents.remove(id)
     }
 
-    /// Its sign of life has come or gone. Returns the agent if that is news.
+    /// Updates whether the agent's heartbeat is present. Returns the agent if this changed.
     pub(super) fn set_alive(&mut self, id: &str, alive: bool, now: Instant) -> Option<&Agent> {
         let registered = self.agents.get_mut(id)?;
         if alive == registered.silent_since.is_none() {
@@ -68,7 +68,7 @@ impl AgentRegistry {
         self.agents.is_empty()
     }
 
-    /// Takes out those whose sign of life has been missing for too long.
+    /// Removes the agents whose heartbeat has been missing for too long.
     pub(super) fn expire(&mut self, now: Instant) -> Vec<RegisteredAgent> {
         let timeout = self.timeout;
         let dead = |registered: &RegisteredAgent| {

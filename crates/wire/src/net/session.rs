@@ -1,4 +1,4 @@
-//! The hub's work between two waits: what is said to whom.
+//! State of the server: handles requests and decisions.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
@@ -30,32 +30,32 @@ use crate::protocol::rejected::RejectedMessage;
 use crate::protocol::sequence::{OfferStatus, SenderMismatch, SequenceTracker};
 use crate::transport::{Incoming, WorkItem};
 
-/// Slots have one incarnation each.
+/// Each slot has one incarnation.
 const INCARNATION: u32 = 1;
-/// More progress than this is not kept for a busy reactor.
+/// Maximum number of progress messages queued for the reactor.
 const MAX_QUEUED_PROGRESS: usize = 64;
-/// Versions of the mixture that an agent may be behind without being sent the whole.
+/// Number of recent mixture versions to keep as bases of deltas.
 const MAX_VERSIONS: usize = 64;
 
-/// The reactor's decision about a slot, when there is one.
+/// Resolves to the reactor's decision about a slot.
 pub(super) type PendingDecision = Pin<Box<dyn Future<Output = (u32, Option<WorkItem>)> + Send>>;
 
 pub(super) struct ServerSession {
-    /// What the reactor has not taken yet.
+    /// Messages for the reactor.
     pub outbox: VecDeque<Incoming>,
-    /// What nobody has been told yet.
+    /// Events to be reported.
     pub events: Vec<AgentEvent>,
     session: u64,
     setup: Vec<u8>,
-    /// Whether agents are to stop.
+    /// Whether agents should stop.
     stopping: Arc<AtomicBool>,
     registry: AgentRegistry,
     sequences: SequenceTracker,
-    /// Where answers go, and the mixture of each turn, kept until it is reported.
+    /// Routes of answers, and the mixture of each assignment, kept until its report.
     slots: BTreeMap<u32, SlotConnection>,
     /// The newest version last.
     versions: VecDeque<Arc<Mixture>>,
-    /// Answers on their way: a link that is down holds up none but its own.
+    /// Answers being sent. A broken link delays only its own.
     sending: JoinSet<()>,
 }
 
@@ -63,7 +63,7 @@ pub(super) struct ServerSession {
 struct SlotConnection {
     route: Option<Query>,
     mixture: Option<Arc<Mixture>>,
-    /// Gives up waiting for the reactor.
+    /// Aborts waiting for the reactor's decision.
     abort_decision: Option<AbortHandle>,
 }
 
@@ -89,7 +89,7 @@ impl ServerSession {
         }
     }
 
-    /// Takes in a question. If it brings an offer, the reactor's decision about it is to be waited for.
+    /// Handles a request. If it is an offer, returns the reactor's pending decision.
     pub(super) fn receive(&mut self, query: Query, files: &Files) -> Option<PendingDecision> {
         while self.sending.try_join_next().is_some() {}
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
@@ -97,7 +97,7 @@ impl ServerSession {
         result.unwrap_or_else(|why| {
             let said = why.to_string();
             if let RejectedMessage::SenderMismatch(_) = why {
-                // Of an agent that will join anew.
+                // The agent will join again.
                 self.send(query, &Reply::RejoinRequired(said));
             } else {
                 self.send(query, &Reply::Rejected(said.clone()));
@@ -160,7 +160,7 @@ impl ServerSession {
         if found == expected { Ok(()) } else { Err(SenderMismatch::Session { found, expected }) }
     }
 
-    /// An agent that asks again, because the answer was lost, gets new slots.
+    /// An agent that repeats its request because the answer was lost gets new slots.
     fn join(&mut self, query: &Query, agent: Agent) -> Result<(), RejectedMessage> {
         if let Some(member) = self.registry.leave(&agent.id) {
             self.agent_lost(&member);
@@ -180,7 +180,7 @@ impl ServerSession {
     }
 
     fn newest(&self) -> &Arc<Mixture> {
-        self.versions.back().expect("the first version is never removed before there is another")
+        self.versions.back().expect("the first version is not removed before another is added")
     }
 
     fn offer(
@@ -199,7 +199,7 @@ impl ServerSession {
         Ok(Some(self.take(sender.walker, report)))
     }
 
-    /// As an offer of nothing, by a walker that has no part in what became of the one before it.
+    /// Handled like an empty offer, after the loss of the walker is forwarded.
     fn lost(
         &mut self,
         query: &Query,
@@ -214,7 +214,7 @@ impl ServerSession {
         Ok(Some(self.take(sender.walker, None)))
     }
 
-    /// Whether an offer is to be decided; if it has been, the answer is sent again. The answer goes to whoever asked last.
+    /// Whether an offer is new. If it has been answered, sends the answer again. The latest request takes the answer.
     fn is_new(&mut self, query: &Query, sender: SenderId, sequence: u64) -> Result<bool, RejectedMessage> {
         let (new, again) = match self.sequences.offer(sender, sequence)? {
             OfferStatus::Answered(answer) => (false, Some(answer.to_vec())),
@@ -261,7 +261,7 @@ impl ServerSession {
         Ok(())
     }
 
-    /// May be lost: whoever watches can do without.
+    /// May drop the message.
     fn progress(&mut self, walk: WalkId, progress: Progress) {
         if self.outbox.len() < MAX_QUEUED_PROGRESS {
             self.outbox.push_back(Incoming::Progress(walk, progress));
@@ -285,13 +285,13 @@ impl ServerSession {
         Ok(())
     }
 
-    /// A version that agents may need: one of the newest, or that of a turn in somebody's hands.
+    /// A version that agents may need: a recent one, or one of a current assignment.
     fn version(&self, version: u64) -> Option<&Arc<Mixture>> {
         let promised = self.slots.values().filter_map(|slot_connection| slot_connection.mixture.as_ref());
         self.versions.iter().rev().chain(promised).find(|mixture| mixture.version() == version)
     }
 
-    /// Answers the offer of a slot.
+    /// Answers the pending offer of a slot.
     pub(super) fn decided(&mut self, slot: u32, work: Option<WorkItem>) {
         let Some((_, sequence)) = self.sequences.pending(slot) else { return };
         let body = match &work {
@@ -316,13 +316,13 @@ impl ServerSession {
         self.sequences.set_answer(slot, answer);
     }
 
-    /// An agent's sign of life has come or gone.
+    /// Handles the appearance or disappearance of an agent's heartbeat.
     pub(super) fn set_alive(&mut self, id: &str, alive: bool, now: Instant) {
         let event = if alive { AgentEvent::Recovered } else { AgentEvent::Unresponsive };
         self.events.extend(self.registry.set_alive(id, alive, now).cloned().map(event));
     }
 
-    /// Agents that have been silent for too long lose their turns.
+    /// Removes agents that were unresponsive for too long.
     pub(super) fn expire(&mut self, now: Instant) {
         for member in self.registry.expire(now) {
             self.agent_lost(&member);
@@ -330,8 +330,8 @@ impl ServerSession {
         }
     }
 
-    /// The slots of an agent are heard no more. Nobody waits for decisions about them before the reactor hears of it, so
-    /// that a turn which is given to one meanwhile is known to be lost one way or the other.
+    /// Rejects all further messages about the agent's slots. Aborts pending decisions before the reactor learns of the
+    /// loss, so that an assignment sent in the meantime is recognized as lost either way.
     fn agent_lost(&mut self, member: &RegisteredAgent) {
         for slot in member.slots() {
             self.sequences.remove(slot);
@@ -347,18 +347,18 @@ impl ServerSession {
         self.send_sealed(query, &encode(reply));
     }
 
-    /// If it is lost the agent asks again.
+    /// If the reply is lost, the agent repeats its request.
     fn send_sealed(&mut self, query: Query, reply: &[u8]) {
         let reply = reply.to_vec();
         self.sending.spawn(async move { drop(query.reply(ORCHESTRATOR, reply).await) });
     }
 
-    /// Whether no agent takes part.
+    /// Whether no agent is registered.
     pub(super) fn has_no_agents(&self) -> bool {
         self.registry.is_empty()
     }
 
-    /// Waits until what is on its way is gone.
+    /// Waits until all answers are sent.
     pub(super) async fn finish(mut self) {
         while self.sending.join_next().await.is_some() {}
     }

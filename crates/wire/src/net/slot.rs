@@ -1,4 +1,4 @@
-//! The entry about one turn that an agent has in hand.
+//! A slot of an agent: the exchange of reports and assignments for one walk at a time.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -14,23 +14,23 @@ use crate::messages::{Outcome, Progress, Report};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
 use crate::transport::WorkItem;
 
-/// A place for one turn at a time.
+/// A slot for one assignment at a time.
 #[derive(Debug)]
 pub struct Slot {
     sender: SenderId,
     sequence: u64,
 }
 
-/// What came of the last turn of a slot.
+/// Result of a slot's last assignment.
 #[derive(Clone, Debug)]
 pub enum SlotReport {
-    /// There was none.
+    /// There was no assignment.
     Empty,
-    /// This.
+    /// The walker's report.
     Report(Report),
-    /// The walker that worked on it is no more.
+    /// The walker has exited.
     Lost {
-        /// By its own crashed: the turn may do the same to the next one.
+        /// Whether it crashed: the assignment may crash the next walker as well.
         crashed: bool,
     },
 }
@@ -40,11 +40,11 @@ impl Slot {
         Self { sender: SenderId { session, walker: number, incarnation: 1 }, sequence: 0 }
     }
 
-    /// Delivers what came of the last turn and waits for the next, through every break of the line; `None` when there is no
-    /// more work. What was told is safe once this has returned.
+    /// Delivers the last report and waits for the next assignment, across broken links. Returns `None` when there is no
+    /// more work. The report is committed once this has returned `Ok`.
     ///
     /// # Errors
-    /// This agent has no place any more.
+    /// The agent must join again, or the orchestrator's answer is invalid.
     pub async fn exchange(
         &mut self,
         membership: &Membership,
@@ -61,14 +61,14 @@ impl Slot {
             } else {
                 membership.client().send_once(&offer, candidate).await
             };
-            // Whether it came or not is known by asking.
+            // Whether the offer arrived is found out by polling.
             offered = true;
             let Some(answer) = answer else {
                 delay_retry(asked).await;
                 continue;
             };
             let Reply::Answer(Answer { sequence, body }) = read(&answer)? else {
-                return Err(LinkError::InvalidReply("it does not answer an offer".to_owned()));
+                return Err(LinkError::InvalidReply("it is not an answer to an offer".to_owned()));
             };
             if sequence != self.sequence {
                 return Err(LinkError::InvalidReply(format!(
@@ -89,7 +89,7 @@ impl Slot {
         }
     }
 
-    /// Tells those who watch where a walk stands. May be lost.
+    /// Sends the current state of a walk, for display. May be lost.
     pub fn progress(
         &self,
         membership: Arc<Membership>,

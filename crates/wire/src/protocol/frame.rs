@@ -1,12 +1,12 @@
-//! A message as it travels: the control message and, behind it, the candidate.
+//! A message as it is sent: the control message, followed by the candidate.
 //!
 //! | bytes | content |
 //! | --- | --- |
 //! | 8 | length of the control message, little-endian |
-//! | that length, filled up with zeros to a multiple of 8 | the control message |
+//! | that length, padded with zeros to a multiple of 8 | the control message |
 //! | rest | the candidate block, or nothing |
 //!
-//! So the block is aligned to 8, and read where it stands. An answer is a control message without a block.
+//! The block is therefore aligned to 8 and can be read in place. Answers have no block.
 
 use zerocopy::IntoBytes;
 
@@ -14,23 +14,23 @@ use crate::block::Candidate;
 
 const PREFIX: usize = 8;
 
-/// Why bytes are not a request.
+/// Why bytes are not a valid request.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FrameError {
-    /// Fewer bytes than the length alone has.
-    #[error("a request of {0} bytes: its length alone has {PREFIX}")]
+    /// Shorter than the length field.
+    #[error("request too short: {0} bytes, the length field alone has {PREFIX}")]
     Short(usize),
-    /// A control message longer than the request.
-    #[error("a request of {found} bytes with a control message of {control}")]
+    /// The control message is longer than the request.
+    #[error("request of {found} bytes, but its control message should have {control}")]
     Length {
-        /// Bytes at hand.
+        /// Actual length, bytes.
         found: usize,
-        /// Bytes of the control message.
+        /// Length of the control message, bytes.
         control: u64,
     },
 }
 
-/// Bytes of a message, a multiple of 8.
+/// Length of a message in bytes, a multiple of 8.
 pub(crate) fn length(control: usize, candidate: Option<&Candidate>) -> usize {
     PREFIX + control.next_multiple_of(8) + candidate.map_or(0, Candidate::encoded_len)
 }
@@ -55,14 +55,14 @@ pub(crate) fn to_words(control: &[u8], candidate: Option<&Candidate>) -> Vec<u64
     words
 }
 
-/// The same with a candidate that is bytes already.
+/// A message with a candidate that is already encoded.
 pub(crate) fn with_block(control: &[u8], block: Option<&[u8]>) -> Vec<u8> {
     let mut bytes = to_words(control, None).as_bytes().to_vec();
     bytes.extend_from_slice(block.unwrap_or_default());
     bytes
 }
 
-/// The control message and the bytes behind it.
+/// Splits a request into control message and candidate block.
 pub(crate) fn split(request: &[u8]) -> Result<(&[u8], &[u8]), FrameError> {
     let Some((prefix, rest)) = request.split_first_chunk() else {
         return Err(FrameError::Short(request.len()));
@@ -100,7 +100,7 @@ mod tests {
             let bytes = control.to_le_bytes();
             assert_eq!(split(&bytes), Err(FrameError::Length { found: 8, control }));
         }
-        // The message would fit, what fills it up would not.
+        // The message would fit, its padding would not.
         let bytes = [&3_u64.to_le_bytes()[..], &[0; 3]].concat();
         assert_eq!(split(&bytes), Err(FrameError::Length { found: 11, control: 3 }));
     }

@@ -1,8 +1,9 @@
-//! What walkers and server say to each other, as control messages (see [`crate::control`]).
+//! Messages between walkers and server, encoded as control messages (see [`crate::control`]).
 //!
-//! A walker counts its offers: 1, 2, 3 … An offer is what came of a turn (nothing at first) and asks for the next. The
-//! answer is the acknowledgement: the report is committed. Until it comes the walker asks every so often, and learns
-//! that its offer waits for a decision, what the answer was, or that the offer never came and must be sent again.
+//! A walker numbers its offers 1, 2, 3, … An offer contains the report on the last assignment (none at first) and
+//! requests the next one. The answer acknowledges that the report is committed. Until it arrives, the walker polls
+//! periodically and learns that its offer is pending, what the answer was, or that the offer was lost and must be sent
+//! again.
 
 use std::borrow::Cow;
 
@@ -13,18 +14,18 @@ use crate::control::{ControlError, EncodedReport, checked_assignment, decode};
 use crate::ids::WalkId;
 use crate::messages::{Assignment, Outcome, Progress, Report};
 
-/// Who speaks: a process that is to be heard, and no other.
+/// Identifies the sender of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct SenderId {
-    /// Of this run of the orchestrator.
+    /// Session of the orchestrator: one per run.
     pub session: u64,
-    /// The walker's number.
+    /// Number of the walker.
     pub walker: u32,
-    /// Counts the processes that were this walker.
+    /// Start count of the walker's process.
     pub incarnation: u32,
 }
 
-/// From a walker.
+/// A message of a walker.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Envelope<'a> {
     pub sender: SenderId,
@@ -34,20 +35,20 @@ pub(crate) struct Envelope<'a> {
 
 #[derive(Serialize, Deserialize)]
 pub(crate) enum Payload<'a> {
-    /// What came of the last turn, and: what next?
+    /// Report on the last assignment, and request for the next.
     Offer {
         sequence: u64,
         #[serde(borrow)]
         report: Option<EncodedReport<'a>>,
     },
-    /// What became of that offer?
+    /// Asks for the state of an offer.
     Poll { sequence: u64 },
-    /// Where a walk stands.
+    /// Current state of a walk.
     Progress(WalkId, Cow<'a, Progress>),
 }
 
 impl<'a> Payload<'a> {
-    /// An offer of what came of a turn, and the candidate that travels beside it.
+    /// An offer with this report, and the candidate to send with it.
     pub(crate) fn offer(
         sequence: u64,
         report: Option<&'a Report<Candidate>>,
@@ -66,7 +67,7 @@ impl<'a> Payload<'a> {
     }
 }
 
-/// The report of an offer with the candidate that came beside it.
+/// The report of an offer with its candidate, which arrived separately.
 pub(crate) fn attach_candidate(
     report: Option<EncodedReport<'_>>,
     candidate: Option<CandidateBlock>,
@@ -78,7 +79,7 @@ pub(crate) fn attach_candidate(
     }
 }
 
-/// To a walker, about its offer `sequence`.
+/// Answer to offer `sequence` of a walker.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Answer<'a> {
     pub sequence: u64,
@@ -88,18 +89,18 @@ pub(crate) struct Answer<'a> {
 #[derive(Serialize, Deserialize)]
 #[expect(clippy::large_enum_variant, reason = "there is never more than one")]
 pub(crate) enum AnswerBody<'a> {
-    /// Committed; this is the next turn.
+    /// The report is committed; this is the next assignment.
     Assignment { mixture_version: u64, assignment: Cow<'a, Assignment> },
-    /// Committed if it could be; there is no more work.
+    /// There is no more work. The report is committed if that was possible.
     Shutdown,
-    /// Still being decided.
+    /// The decision is pending.
     Pending,
-    /// It never came: offer it again.
+    /// The offer was not received: send it again.
     Unknown,
 }
 
 impl Answer<'static> {
-    /// Decodes and checks an answer.
+    /// Decodes and validates an answer.
     pub(crate) fn decode(bytes: &[u8]) -> Result<Self, ControlError> {
         let Answer { sequence, body } = decode(bytes)?;
         let body = match body {

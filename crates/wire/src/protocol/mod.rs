@@ -1,5 +1,5 @@
-//! What walkers and whoever decides say to each other, whatever carries it: how bytes become messages, and how far a
-//! entry has come. No port, no clock.
+//! The protocol between walkers and server, independent of the transport: message encoding and sequence tracking. Uses
+//! no ports and no clock.
 
 pub(crate) mod frame;
 pub(crate) mod message;

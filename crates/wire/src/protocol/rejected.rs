@@ -1,11 +1,11 @@
-//! Why a message is not listened to.
+//! Why a message was rejected.
 
 use super::frame::FrameError;
 use super::sequence::SenderMismatch;
 use crate::block::BlockError;
 use crate::control::ControlError;
 
-/// Whoever sent it is told, where it can be; the last four are of questions that only agents ask.
+/// The server reports the reason to the sender where possible. The last four apply only to requests of agents.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum RejectedMessage {
     #[error(transparent)]
@@ -16,12 +16,12 @@ pub(crate) enum RejectedMessage {
     SenderMismatch(#[from] SenderMismatch),
     #[error(transparent)]
     Block(#[from] BlockError),
-    #[error("there is no version {0} of the mixture any more")]
+    #[error("version {0} of the mixture is no longer available")]
     Version(u64),
-    #[error("no file with the hash {0} belongs to this campaign")]
+    #[error("the campaign has no file with hash {0}")]
     File(String),
-    #[error("cannot read a file that walkers need: {0}")]
+    #[error("cannot read a file requested by an agent: {0}")]
     Read(#[from] std::io::Error),
-    #[error("no numbers are left for so many walkers")]
+    #[error("no slot numbers are left for this many walkers")]
     Numbers,
 }

@@ -1,10 +1,10 @@
-//! Who is to be heard, and how far the entry with each walker has come. No port, no clock.
+//! Tracks which processes may send messages, and the last offer of each walker. Uses no ports and no clock.
 
 use std::collections::BTreeMap;
 
 use super::message::SenderId;
 
-/// The sequences of a session.
+/// The last offer of each walker in a session.
 #[derive(Debug)]
 pub(crate) struct SequenceTracker {
     session: u64,
@@ -14,35 +14,35 @@ pub(crate) struct SequenceTracker {
 #[derive(Debug)]
 struct WalkerSequence {
     incarnation: u32,
-    /// The last offer that was taken; 0 before the first.
+    /// Number of the last accepted offer; 0 before the first.
     sequence: u64,
-    /// The answer to it, as it was sent; none while it is being decided.
+    /// The encoded answer to it; `None` while the decision is pending.
     answer: Option<Vec<u8>>,
 }
 
-/// What to do about an offer or a question.
+/// State of an offer.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum OfferStatus<'a> {
-    /// A new offer, to be decided.
+    /// A new offer.
     New,
-    /// It is being decided.
+    /// The decision is pending.
     Pending,
-    /// It has been answered: the same answer again.
+    /// Answered before; the same answer is sent again.
     Answered(&'a [u8]),
-    /// It never came.
+    /// Never received.
     Unknown,
 }
 
-/// Why a message is not listened to.
+/// Why a message does not come from an expected sender.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum SenderMismatch {
-    #[error("a message of session {found:016x}; this is session {expected:016x}")]
+    #[error("message of session {found:016x}, expected session {expected:016x}")]
     Session { found: u64, expected: u64 },
-    #[error("a message of walker {0}, which is not expected")]
+    #[error("message of unexpected walker {0}")]
     Walker(u32),
-    #[error("a message of incarnation {found} of walker {walker}; expected {expected}")]
+    #[error("message of incarnation {found} of walker {walker}, expected incarnation {expected}")]
     Incarnation { walker: u32, found: u32, expected: u32 },
-    #[error("offer {found} of walker {walker}, whose last was {last}")]
+    #[error("offer {found} of walker {walker} is out of order: the last was {last}")]
     Sequence { walker: u32, found: u64, last: u64 },
 }
 
@@ -51,28 +51,28 @@ impl SequenceTracker {
         Self { session, walkers: BTreeMap::new() }
     }
 
-    /// From now on this incarnation of the walker is heard and no other.
+    /// Accepts messages only of this incarnation of the walker from now on.
     pub(crate) fn expect(&mut self, walker: u32, incarnation: u32) {
         self.walkers.insert(walker, WalkerSequence { incarnation, sequence: 0, answer: None });
     }
 
-    /// The incarnation of the walker that is heard.
+    /// The incarnation of the walker whose messages are accepted.
     pub(crate) fn incarnation(&self, walker: u32) -> Option<u32> {
         self.walkers.get(&walker).map(|entry| entry.incarnation)
     }
 
-    /// The walker is heard no more.
+    /// Rejects all further messages of the walker.
     pub(crate) fn remove(&mut self, walker: u32) {
         self.walkers.remove(&walker);
     }
 
-    /// Whether a message comes from whom it should.
+    /// Checks that the sender is expected.
     pub(crate) fn check_sender(&self, sender: SenderId) -> Result<(), SenderMismatch> {
         self.find(sender).map(|_| ())
     }
 
-    /// What to do about an offer. It counts as taken after [`SequenceTracker::begin`] only, so that one whose content turns
-    /// out to be damaged changes nothing.
+    /// State of an offer that arrived. A new offer counts as received only after [`SequenceTracker::begin`], so an
+    /// offer with damaged content changes nothing.
     pub(crate) fn offer(&self, sender: SenderId, sequence: u64) -> Result<OfferStatus<'_>, SenderMismatch> {
         let entry = self.find(sender)?;
         match entry.status(sequence) {
@@ -82,13 +82,13 @@ impl SequenceTracker {
         }
     }
 
-    /// What to answer to a question.
+    /// State of an offer that a walker polls.
     pub(crate) fn poll(&self, sender: SenderId, sequence: u64) -> Result<OfferStatus<'_>, SenderMismatch> {
         let entry = self.find(sender)?;
         entry.status(sequence).ok_or_else(|| entry.out_of_order(sender, sequence))
     }
 
-    /// The walker's next offer is being decided.
+    /// Marks the walker's next offer as pending.
     pub(crate) fn begin(&mut self, walker: u32) {
         if let Some(entry) = self.walkers.get_mut(&walker) {
             entry.sequence += 1;
@@ -96,14 +96,14 @@ impl SequenceTracker {
         }
     }
 
-    /// Who waits under this number to have an offer answered, and which one.
+    /// Sender and number of the walker's pending offer.
     pub(crate) fn pending(&self, walker: u32) -> Option<(SenderId, u64)> {
         let WalkerSequence { incarnation, sequence, answer } = self.walkers.get(&walker)?;
         let sender = SenderId { session: self.session, walker, incarnation: *incarnation };
         (*sequence > 0 && answer.is_none()).then_some((sender, *sequence))
     }
 
-    /// The walker's offer has been decided, and this is the answer.
+    /// Stores the answer to the walker's pending offer.
     pub(crate) fn set_answer(&mut self, walker: u32, answer: Vec<u8>) {
         if let Some(entry) = self.walkers.get_mut(&walker) {
             entry.answer = Some(answer);
@@ -125,7 +125,7 @@ impl SequenceTracker {
 }
 
 impl WalkerSequence {
-    /// `None` if a walker that keeps to the rules does not say this.
+    /// `None` if no correct walker would send this number.
     fn status(&self, sequence: u64) -> Option<OfferStatus<'_>> {
         if sequence > 0 && sequence == self.sequence {
             return Some(self.answer.as_deref().map_or(OfferStatus::Pending, OfferStatus::Answered));
@@ -157,7 +157,7 @@ mod tests {
         assert_eq!(all.poll(SENDER, 1), Ok(OfferStatus::Unknown), "an offer that was lost");
         for sequence in 1..4 {
             assert_eq!(all.offer(SENDER, sequence), Ok(OfferStatus::New));
-            // Damaged content: nothing has changed.
+            // Damaged content changes nothing.
             assert_eq!(all.offer(SENDER, sequence), Ok(OfferStatus::New));
             all.begin(3);
             assert_eq!(all.offer(SENDER, sequence), Ok(OfferStatus::Pending));

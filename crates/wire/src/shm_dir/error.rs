@@ -1,48 +1,48 @@
-//! Why a place cannot be used.
+//! Errors of the shared memory directory.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Why a place cannot be used.
+/// Why the shared memory directory cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ShmDirError {
-    /// The operating system says no.
+    /// An error of the operating system.
     #[error("cannot {what} {}: {source}", path.display())]
     Io {
-        /// What was tried.
+        /// The operation.
         what: &'static str,
-        /// With which file.
+        /// The file.
         path: PathBuf,
-        /// What came of it.
+        /// The error.
         source: io::Error,
     },
-    /// Somebody else made it, or others may write to it.
+    /// Another user owns it, or others have write access.
     #[error(
-        "{} {found}, expected a directory of user {uid} with mode 0700: whoever made it must remove it, \
+        "{} {found}, expected a directory of user {uid} with mode 0700: its owner must remove it, \
          or use `--in-process`",
         path.display()
     )]
     NotPrivate {
         /// The directory.
         path: PathBuf,
-        /// What it is instead.
+        /// What was found instead.
         found: String,
         /// This user.
         uid: u32,
     },
-    /// A run that is alive.
+    /// A run is active.
     #[error(
-        "a process that runs the campaign{campaign} holds {}: wait for it or stop it first (it may be in a container \
+        "another process runs the campaign{campaign} and has locked {}: wait for it or stop it first (it may be in a container \
          that shares /dev/shm)",
         path.display()
     )]
     InUse {
-        /// The directory of the place.
+        /// The locked directory.
         path: PathBuf,
-        /// Where the campaign is, as far as that is known.
+        /// Location of the campaign, if known.
         campaign: String,
     },
-    /// Shared memory is too small. Going on would end with SIGBUS in the middle of a write.
+    /// Not enough shared memory. Continuing would end with SIGBUS during a write.
     #[error(
         "the campaign needs {} of shared memory and /dev/shm has {} free: enlarge /dev/shm (in a container \
          `--shm-size`), use fewer walkers, or use `--in-process`; `calmwalk clean` removes what dead campaigns left",
@@ -50,9 +50,9 @@ pub enum ShmDirError {
         megabytes(*free)
     )]
     Space {
-        /// Bytes.
+        /// Required, bytes.
         needed: u64,
-        /// Bytes.
+        /// Free, bytes.
         free: u64,
     },
 }

@@ -1,4 +1,4 @@
-//! What lies in a place: listed, and removed.
+//! Listing and removing files.
 
 use std::fs;
 use std::io;
@@ -10,13 +10,13 @@ use super::error::{ShmDirError, io_error};
 /// What was removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Removed {
-    /// Files, directories not counted.
+    /// Number of files, without directories.
     pub files: usize,
-    /// Bytes of memory that they held.
+    /// Memory they used, bytes.
     pub bytes: u64,
 }
 
-/// What is in a directory; nothing if there is no such directory.
+/// Entries of a directory; empty if it does not exist.
 pub(super) fn entries(directory: &Path) -> Result<Vec<PathBuf>, ShmDirError> {
     let listed = match fs::read_dir(directory) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),

@@ -1,7 +1,7 @@
-//! Who holds a place: a process that uses it has it locked until its end, however it ends.
+//! Locks on a campaign's directory: a process that uses it keeps it locked until it exits.
 //!
-//! The system's locks on the directories themselves are used, which need no file, also hold between containers that
-//! share `/dev/shm`, and come free when a process dies.
+//! Uses `flock` on the directories themselves. This needs no extra file, works between containers that share
+//! `/dev/shm`, and the kernel releases the lock when the process dies.
 
 use std::fs::{self, File, TryLockError};
 use std::os::unix::fs::MetadataExt;
@@ -11,12 +11,12 @@ use super::error::{ShmDirError, io_error};
 use super::private::{make_private, user};
 use super::user_root;
 
-/// The right to make and remove places of this user, for a moment. While somebody has it, no place comes, goes or
-/// changes its holder.
+/// A short-term lock on all directories of this user. While it is held, no directory is created, removed or locked by
+/// another process.
 pub(super) struct UserLock(File);
 
 impl UserLock {
-    /// Waits for it.
+    /// Waits for the lock.
     pub(super) fn wait() -> Result<Self, ShmDirError> {
         let root = user_root();
         loop {
@@ -26,7 +26,7 @@ impl UserLock {
                 file => file.map_err(io_error("open", &root))?,
             };
             file.lock().map_err(io_error("lock", &root))?;
-            // Whoever had it before may have removed the directory, and a new one has another lock.
+            // The previous holder may have removed the directory; a new one has another lock.
             if file.metadata().map_err(io_error("look at", &root))?.nlink() > 0 {
                 return Ok(Self(file));
             }
@@ -35,15 +35,15 @@ impl UserLock {
 }
 
 impl Drop for UserLock {
-    /// Leaves no empty directory behind.
+    /// Removes the directory if it is empty.
     fn drop(&mut self) {
-        // Fails where there are places.
+        // Fails if the directory is not empty.
         let _ = fs::remove_dir(user_root());
         unlock(&self.0);
     }
 }
 
-/// The directory of a place, locked.
+/// The lock on the directory of one campaign.
 #[derive(Debug)]
 pub(super) struct DirLock(File);
 
@@ -53,14 +53,14 @@ impl Drop for DirLock {
     }
 }
 
-/// Closing the file is not enough at once: a process that is just being started has it too, until its program begins.
+/// Closing the file would not release the lock immediately: a process that is being started shares it until `exec`.
 fn unlock(file: &File) {
-    // What cannot be unlocked comes free with the last who has the file.
+    // If this fails, the lock is released when the last process closes the file.
     let _ = file.unlock();
 }
 
 impl DirLock {
-    /// Takes it, unless somebody else has it. To be called by whoever has the [`UserLock`].
+    /// Takes the lock, or fails if another process has it. The caller must hold the [`UserLock`].
     pub(super) fn take(directory: &Path, campaign: Option<&Path>) -> Result<Self, ShmDirError> {
         let file = File::open(directory).map_err(io_error("open", directory))?;
         match file.try_lock() {

@@ -1,16 +1,16 @@
-//! What a campaign has in shared memory on this host, and how it is wiped.
+//! Shared memory of a campaign on this host, and its cleanup.
 //!
 //! | | |
 //! | --- | --- |
 //! | `/dev/shm/calmwalk-<uid>/` | this user's campaigns, mode 0700 |
-//! | `/dev/shm/calmwalk-<uid>/<name>/` | a campaign: sockets and tables of iceoryx2, the mixture, a file `campaign` that names its directory |
+//! | `/dev/shm/calmwalk-<uid>/<name>/` | a campaign: sockets and tables of iceoryx2, the mixture, a file `campaign` with the path of its directory |
 //! | `/dev/shm/cw-<name>-*` | its shared memory segments |
 //!
-//! `<name>` is a hash of user and campaign directory, so that campaigns do not see each other. All of it is in
-//! `/dev/shm` and nothing in `/tmp`, where cleaners remove old files under a campaign that lasts for weeks. It is short
-//! because the path of a socket has at most 107 bytes.
+//! `<name>` is a hash of user and campaign directory, which separates campaigns. It is short because the path of a
+//! socket has at most 107 bytes. Everything is in `/dev/shm` and nothing in `/tmp`, where cleaners would remove files
+//! of a campaign that lasts for weeks.
 //!
-//! A run holds its place (see [`lock`]), so that nobody else wipes it, whatever can be told of its campaign.
+//! A run locks its directory (see [`lock`]), so that no other process removes it.
 
 mod error;
 mod files;
@@ -35,13 +35,13 @@ use lock::{DirLock, UserLock};
 use private::{make_private, user};
 
 const SHARED_MEMORY: &str = "/dev/shm";
-/// The file that names the campaign's directory.
+/// The file with the path of the campaign's directory.
 const CAMPAIGN: &str = "campaign";
 const MIXTURE: &str = "mixture";
-/// Hexadecimal digits of a name.
+/// Length of a name, hexadecimal digits.
 const DIGITS: usize = 16;
 
-/// The place of one campaign.
+/// The shared memory directory of a campaign.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShmDir {
     directory: PathBuf,
@@ -49,19 +49,19 @@ pub struct ShmDir {
     campaign: Option<PathBuf>,
 }
 
-/// A place that is ready: this process's until this is dropped.
+/// A prepared directory, locked by this process until this value is dropped.
 #[derive(Debug)]
 pub struct PreparedDir {
-    /// What dead processes had left there.
+    /// What was removed of dead processes.
     pub removed: Removed,
     _lock: DirLock,
 }
 
 impl ShmDir {
-    /// The place of the campaign in `campaign_directory`, which must exist. Nothing is created.
+    /// The directory of the campaign in `campaign_directory`, which must exist. Creates nothing.
     ///
     /// # Errors
-    /// A directory that does not exist.
+    /// The directory does not exist.
     pub fn for_campaign(campaign_directory: &Path) -> Result<Self, ShmDirError> {
         let path = fs::canonicalize(campaign_directory).map_err(io_error("find", campaign_directory))?;
         let mut hasher = blake3::Hasher::new();
@@ -78,16 +78,16 @@ impl ShmDir {
         Self { directory, prefix: format!("cw-{name}-"), campaign }
     }
 
-    /// Every place of this user on this host, of live and dead campaigns.
+    /// All directories of this user on this host, of live and dead campaigns.
     ///
     /// # Errors
-    /// Directories that cannot be read.
+    /// A directory cannot be read.
     pub fn all() -> Result<Vec<Self>, ShmDirError> {
         let mut names = Vec::new();
         for entry in entries(&user_root())? {
             names.extend(entry.file_name().and_then(OsStr::to_str).map(str::to_owned));
         }
-        // Segments whose directory is gone.
+        // Segments without a directory.
         for path in segments("cw-")? {
             let name = path.file_name().and_then(OsStr::to_str).and_then(|name| name.strip_prefix("cw-"));
             names.extend(name.and_then(|name| name.split('-').next()).map(str::to_owned));
@@ -98,31 +98,31 @@ impl ShmDir {
         Ok(names.iter().map(|name| Self::named(name)).collect())
     }
 
-    /// The directory, for sockets, tables and the mixture.
+    /// The directory with sockets, tables and the mixture.
     pub fn directory(&self) -> &Path {
         &self.directory
     }
 
-    /// The file of the shared mixture.
+    /// Path of the shared mixture.
     pub fn mixture(&self) -> PathBuf {
         self.directory.join(MIXTURE)
     }
 
-    /// What the names of the campaign's segments in `/dev/shm` begin with.
+    /// Prefix of the names of the campaign's segments in `/dev/shm`.
     pub fn prefix(&self) -> &str {
         &self.prefix
     }
 
-    /// The campaign's directory; `None` of a place from [`ShmDir::all`] in which no file says so any more.
+    /// The campaign's directory; `None` for a directory from [`ShmDir::all`] without a `campaign` file.
     pub fn campaign_directory(&self) -> Option<&Path> {
         self.campaign.as_deref()
     }
 
-    /// Makes the place ready: removes what dead processes left, makes the directory, and checks that `needed` bytes are
-    /// free. Nobody else can prepare or remove it while what is returned lives.
+    /// Prepares the directory: removes what dead processes left, creates and locks the directory, and checks that
+    /// `needed` bytes are free. No other process can prepare or remove it while the returned value lives.
     ///
     /// # Errors
-    /// A run that is alive, files of somebody else, too little space.
+    /// A run is active, a file belongs to another user, or there is not enough space.
     pub fn prepare(&self, needed: u64) -> Result<PreparedDir, ShmDirError> {
         let _user_lock = UserLock::wait()?;
         let removed = self.wipe()?;
@@ -139,8 +139,8 @@ impl ShmDir {
         Ok(PreparedDir { removed, _lock: lock })
     }
 
-    /// Takes from others the right to read and write the campaign's segments, which iceoryx2 gives them for one of them
-    /// (a counter of processes).
+    /// Removes the permissions of other users on the campaign's segments. iceoryx2 grants them for one segment, a
+    /// counter of processes.
     pub(crate) fn restrict_permissions(&self) -> Result<(), ShmDirError> {
         for path in segments(&self.prefix)? {
             let mode = path.symlink_metadata().map_err(io_error("look at", &path))?.mode();
@@ -152,10 +152,10 @@ impl ShmDir {
         Ok(())
     }
 
-    /// Removes everything of this campaign, unless a run of it is alive.
+    /// Removes all shared memory of this campaign, unless a run is active.
     ///
     /// # Errors
-    /// A run that is alive ([`ShmDirError::InUse`]), files of somebody else.
+    /// A run is active ([`ShmDirError::InUse`]), or a file belongs to another user.
     pub fn remove(&self) -> Result<Removed, ShmDirError> {
         let _user_lock = UserLock::wait()?;
         self.wipe()
@@ -178,20 +178,20 @@ impl ShmDir {
     }
 }
 
-/// The directory of this user's places.
+/// The parent of all directories of this user.
 fn user_root() -> PathBuf {
     Path::new(SHARED_MEMORY).join(format!("calmwalk-{}", user()))
 }
 
-/// Bytes that may still be written to shared memory.
+/// Free shared memory, bytes.
 pub(crate) fn free_space() -> Result<u64, ShmDirError> {
     let statistics = rustix::fs::statvfs(SHARED_MEMORY)
-        .map_err(|source| io_error("ask for the free space of", Path::new(SHARED_MEMORY))(source.into()))?;
+        .map_err(|source| io_error("query the free space of", Path::new(SHARED_MEMORY))(source.into()))?;
     Ok(statistics.f_bavail.saturating_mul(statistics.f_frsize))
 }
 
-/// Reserves the memory of the campaign's segments, or of those of one port of iceoryx2 alone, whose names have its number
-/// in them. They are made sparse, and a write to what cannot be had any more would be the end of the process.
+/// Reserves the memory of the campaign's segments, or only of one iceoryx2 port, whose number is part of their names.
+/// Segments are created sparse; without reservation, a write could fail with SIGBUS.
 pub(crate) fn reserve(prefix: &str, port: Option<u128>) -> Result<(), ShmDirError> {
     let port = port.map_or_else(String::new, |port| format!("_{port}"));
     for path in segments(prefix)? {
@@ -212,7 +212,7 @@ fn reserve_file(path: &Path) -> Result<(), ShmDirError> {
     }
 }
 
-/// This user's files in `/dev/shm` whose names begin with `prefix`.
+/// This user's files in `/dev/shm` with this prefix.
 fn segments(prefix: &str) -> Result<Vec<PathBuf>, ShmDirError> {
     let mut paths = entries(Path::new(SHARED_MEMORY))?;
     paths.retain(|path| {
@@ -228,7 +228,7 @@ mod tests {
 
     use super::*;
 
-    /// `sockaddr_un` has room for 108 bytes with the zero at the end.
+    /// `sockaddr_un` has 108 bytes including the terminating zero.
     #[test]
     fn the_longest_path_of_a_socket_is_short_enough() {
         let home = format!("{SHARED_MEMORY}/calmwalk-{}", u32::MAX);

@@ -1,4 +1,4 @@
-//! Directories of this user alone.
+//! Directories that only this user can access.
 
 use std::fs::{DirBuilder, Metadata};
 use std::io;
@@ -11,7 +11,7 @@ pub(super) fn user() -> u32 {
     rustix::process::geteuid().as_raw()
 }
 
-/// Makes a directory for this user alone, or checks that the one that is there is such a directory.
+/// Creates a directory with mode 0700, or checks that the existing one has it.
 pub(super) fn make_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
@@ -20,7 +20,7 @@ pub(super) fn make_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
     check_private(path, uid)
 }
 
-/// Everybody may write to `/dev/shm`: what has the right name may be a trap.
+/// All users may write to `/dev/shm`, so an existing directory may belong to an attacker.
 pub(super) fn check_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
     let found = path.symlink_metadata().map_err(io_error("look at", path))?;
     if found.is_dir() && found.uid() == uid && found.mode() & 0o777 == 0o700 {
