@@ -1,4 +1,4 @@
-//! The writer's account of the blocks: which are free, which are in use and by whom.
+//! Allocation of blocks by the writer.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -14,55 +14,55 @@ use super::error::SharedMixtureError;
 use super::layout::{BlockHeader, Layout};
 use super::memory::Mapping;
 
-/// Free blocks beyond this give their memory back to the system.
+/// Number of free blocks that keep their memory.
 pub(super) const SPARE: u32 = 16;
 
-/// All blocks of the file.
+/// The blocks of the file.
 #[derive(Debug)]
 pub(super) struct BlockAllocator {
     layout: Layout,
     file: File,
     path: PathBuf,
-    /// The holds of each extent.
-    holds: Vec<Mapping>,
-    /// How many living versions refer to each block.
+    /// The reference counts of each extent.
+    refcounts: Vec<Mapping>,
+    /// Number of live versions that use each block.
     references: Vec<u32>,
-    /// Free, with memory reserved.
+    /// Free blocks with reserved memory.
     backed: Vec<u32>,
-    /// Free, without memory.
+    /// Free blocks without memory.
     unbacked: Vec<u32>,
-    /// No living version refers to them, but a reader may.
+    /// Blocks that no live version uses, but that a reader may still use.
     retired: Vec<u32>,
 }
 
 impl BlockAllocator {
-    /// The account of a file without extents.
+    /// An allocator for a file without extents.
     pub fn new(layout: Layout, file: File, path: PathBuf) -> Self {
-        let (holds, references) = (Vec::new(), Vec::new());
+        let (refcounts, references) = (Vec::new(), Vec::new());
         let (backed, unbacked, retired) = (Vec::new(), Vec::new(), Vec::new());
-        Self { layout, file, path, holds, references, backed, unbacked, retired }
+        Self { layout, file, path, refcounts, references, backed, unbacked, retired }
     }
 
-    /// Adds an extent, and reserves memory for its holds and its first `blocks` blocks.
+    /// Adds an extent, and reserves memory for its reference counts and its first `blocks` blocks.
     pub fn grow(&mut self, blocks: u32) -> Result<(), SharedMixtureError> {
-        let extent = self.holds.len() as u32;
+        let extent = self.refcounts.len() as u32;
         let (first, end) = (extent.checked_mul(self.layout.extent_blocks), self.layout.end(extent + 1));
         let (Some(first), Some(end), Some(start)) = (first, end, self.layout.extent_at(extent)) else {
             return Err(self.failed("grow", Errno::FBIG.into()));
         };
         self.file.set_len(end).map_err(|source| self.failed("grow", source))?;
-        self.reserve(start, self.layout.holds_bytes + self.layout.block_at(blocks))?;
-        let holds = Mapping::shared(&self.file, start, self.layout.holds_bytes);
-        self.holds.push(holds.map_err(|source| self.failed("map", source))?);
+        self.reserve(start, self.layout.refcount_bytes + self.layout.block_at(blocks))?;
+        let refcounts = Mapping::shared(&self.file, start, self.layout.refcount_bytes);
+        self.refcounts.push(refcounts.map_err(|source| self.failed("map", source))?);
         self.references.resize(self.references.len() + self.layout.extent_blocks as usize, 0);
         self.backed.extend((first..first + blocks).rev());
         self.unbacked.extend((first + blocks..first + self.layout.extent_blocks).rev());
         Ok(())
     }
 
-    /// Writes a component into a free block.
+    /// Writes a component to a free block.
     ///
-    /// The bytes go through the file and not through a map: where no memory is left this gives an error and not a signal.
+    /// Uses file I/O instead of the mapping: a lack of memory is then an error and not a signal.
     pub fn write(
         &mut self,
         (element, slot): (u32, u32),
@@ -92,7 +92,7 @@ impl BlockAllocator {
         Ok(block)
     }
 
-    /// One more living version refers to these blocks.
+    /// Counts a live version that uses these blocks.
     pub fn incref(&mut self, blocks: &[u32]) {
         for &block in blocks {
             if let Some(count) = self.references.get_mut(block as usize) {
@@ -101,7 +101,7 @@ impl BlockAllocator {
         }
     }
 
-    /// A version that refers to these blocks is no more.
+    /// Counts the end of a version that used these blocks.
     pub fn decref(&mut self, blocks: &[u32]) {
         for &block in blocks {
             if let Some(count) = self.references.get_mut(block as usize) {
@@ -113,13 +113,13 @@ impl BlockAllocator {
         }
     }
 
-    /// BlockAllocator that were written but that no version came to refer to.
+    /// Frees blocks that were written but never used by a version.
     pub fn discard(&mut self, blocks: impl Iterator<Item = u32>) {
         self.retired.extend(blocks);
         self.reclaim();
     }
 
-    /// Frees what nobody refers to and no reader holds.
+    /// Frees retired blocks that no reader uses.
     pub fn reclaim(&mut self) {
         let retired = std::mem::take(&mut self.retired);
         let (held, free): (Vec<u32>, Vec<u32>) = retired.into_iter().partition(|&block| self.is_held(block));
@@ -130,24 +130,25 @@ impl BlockAllocator {
         }
     }
 
-    /// A reader's process is dead: so are its holds.
+    /// Clears the reference counts of a reader whose process is dead.
     pub fn release(&self, reader: u32) {
-        for holds in &self.holds {
+        for refcounts in &self.refcounts {
             for index in 0..self.layout.extent_blocks {
-                holds.word32(self.layout.hold_at(reader, index)).store(0, Ordering::Release);
+                refcounts.word32(self.layout.refcount_at(reader, index)).store(0, Ordering::Release);
             }
         }
     }
 
     fn is_held(&self, block: u32) -> bool {
         let (extent, index) = self.layout.extent_of(block);
-        self.holds.get(extent as usize).is_some_and(|holds| {
-            let count = |reader| holds.word32(self.layout.hold_at(reader, index)).load(Ordering::Acquire);
+        self.refcounts.get(extent as usize).is_some_and(|refcounts| {
+            let count =
+                |reader| refcounts.word32(self.layout.refcount_at(reader, index)).load(Ordering::Acquire);
             (0..self.layout.readers).any(|reader| count(reader) > 0)
         })
     }
 
-    /// A free block with memory.
+    /// Takes a free block with memory.
     fn allocate(&mut self) -> Result<u32, SharedMixtureError> {
         if let Some(block) = self.backed.pop() {
             return Ok(block);
@@ -161,14 +162,14 @@ impl BlockAllocator {
         Ok(block)
     }
 
-    /// Place of a block in the file.
+    /// Offset of a block in the file.
     fn place(&self, block: u32) -> u64 {
         let (extent, index) = self.layout.extent_of(block);
-        let extent = self.layout.extent_at(extent).expect("checked when the extent was made");
-        extent + self.layout.holds_bytes + self.layout.block_at(index)
+        let extent = self.layout.extent_at(extent).expect("checked when the extent was added");
+        extent + self.layout.refcount_bytes + self.layout.block_at(index)
     }
 
-    /// Reserves memory for a part of the file: all of it or nothing.
+    /// Reserves memory for a part of the file, completely or not at all.
     pub fn reserve(&self, start: u64, length: u64) -> Result<(), SharedMixtureError> {
         match retry_on_intr(|| fallocate(&self.file, FallocateFlags::empty(), start, length)) {
             Ok(()) => Ok(()),
@@ -177,7 +178,7 @@ impl BlockAllocator {
         }
     }
 
-    /// Gives the memory of a block back; false if the system will not have it.
+    /// Releases the memory of a block; `false` if the system refuses.
     fn punch(&self, block: u32) -> bool {
         let flags = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
         retry_on_intr(|| fallocate(&self.file, flags, self.place(block), self.layout.block_bytes)).is_ok()

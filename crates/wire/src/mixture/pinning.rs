@@ -1,27 +1,28 @@
-//! How a reader and the writer agree on a row without a lock.
+//! Lock-free synchronization of readers and the writer on a row.
 //!
-//! Each row has a *version word*, each reader a *pin*; [`NONE`] in either means nothing. The reader stores its pin and then
-//! looks whether the row still has the version. The writer takes the version word away and then looks at all pins.
-//! Both put a sequentially consistent fence between the two steps, and of two such fences one comes first:
+//! Each row has a *version word*, each reader a *pin*; [`NONE`] in either means empty. The reader stores its pin and
+//! then checks that the row still has the version. The writer clears the version word and then checks all pins. Both
+//! execute a sequentially consistent fence between the two steps, and one of two such fences comes first:
 //!
-//! * the reader's first: the writer, looking after its own fence, sees the pin (or what the reader stored later) and
-//!   leaves row and blocks as they are;
-//! * the writer's first: the reader, looking after its own fence, sees the version word gone and reads nothing.
+//! * The reader's fence is first: the writer sees the pin (or what the reader stored later) when it checks after its
+//!   own fence, and leaves row and blocks unchanged.
+//! * The writer's fence is first: the reader sees that the version word is cleared when it checks after its own fence,
+//!   and reads nothing.
 //!
-//! If the writer sees what the reader stored *later*, then the pin was set and cleared again in between. Clearing is a release
-//! and the writer's look an acquire, so it also sees the holds that the reader raised while it had the pin. A block is
-//! used anew only when no living version refers to it, which makes new holds impossible, and all holds are zero;
-//! lowering a hold is a release, the writer's look at it an acquire, so the reader's last look at the block comes
-//! before it is overwritten.
+//! If the writer sees what the reader stored *later*, the pin was set and cleared again in between. Clearing is a
+//! release and the writer's check an acquire, so the writer also sees the reference counts that the reader incremented
+//! under the pin. A block is reused only if no live version uses it, which rules out new references, and all its
+//! reference counts are zero. A decrement is a release and the writer's check of the count an acquire, so the reader's
+//! last access to the block happens before the block is overwritten.
 //!
-//! A reader that reads the version word sees all that was written before it was stored: row and blocks (release, acquire).
+//! A reader that reads the version word sees everything written before it: row and blocks (release, acquire).
 
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
-/// No version. Versions are counted from 0, so none gets here.
+/// No version. Versions are counted from 0 and never reach this value.
 pub(super) const NONE: u64 = u64::MAX;
 
-/// A word of memory shared between the parties; a model checker has its own.
+/// A shared word of memory; the model checker has its own implementation.
 pub(super) trait Word {
     /// Loads with acquire.
     fn load_acquire(&self) -> u64;
@@ -45,14 +46,14 @@ impl Word for AtomicU64 {
     }
 }
 
-/// A version while its row is read.
+/// Keeps a version pinned while its row is read.
 pub(super) struct Pinned<'a, W: Word> {
     pin: &'a W,
 }
 
 impl<'a, W: Word> Pinned<'a, W> {
-    /// Pins `version`, of which `word` is the version word; `None` when it is gone. A pin serves one reader, one version at
-    /// a time.
+    /// Pins `version`, whose version word is `word`; `None` if the version was removed. A pin belongs to one reader and
+    /// holds one version at a time.
     pub fn new(pin: &'a W, word: &W, version: u64) -> Option<Self> {
         pin.store_release(version);
         W::fence();
@@ -67,7 +68,7 @@ impl<W: Word> Drop for Pinned<'_, W> {
     }
 }
 
-/// Takes `version` away from its row; false, and all is as before, when a reader has it pinned.
+/// Removes `version` from its row. Returns `false` and changes nothing if a reader has pinned it.
 pub(super) fn retire_version<'a, W: Word + 'a>(
     word: &W,
     version: u64,
@@ -84,8 +85,8 @@ pub(super) fn retire_version<'a, W: Word + 'a>(
 
 #[cfg(test)]
 mod tests {
-    //! Every order in which the steps of a reader and the writer can happen, and every value that the memory model lets
-    //! them see.
+    //! Explores every interleaving of the steps of a reader and the writer, and every value that the memory model
+    //! allows.
     #![allow(unsafe_code)]
 
     use loom::cell::UnsafeCell;
@@ -109,37 +110,37 @@ mod tests {
         }
     }
 
-    /// One row, one reader, one block. The checker ends the test when the block is read and written at once.
+    /// One row, one reader, one block. The checker fails the test on concurrent access to the block.
     struct Memory {
         version: AtomicU64,
         pin: AtomicU64,
-        hold: AtomicU64,
+        refcount: AtomicU64,
         block: UnsafeCell<u64>,
     }
 
     impl Memory {
         fn with_version(version: u64) -> Arc<Self> {
-            let [hold, pin, word] = [0, NONE, version].map(AtomicU64::new);
-            Arc::new(Self { version: word, pin, hold, block: UnsafeCell::new(version) })
+            let [refcount, pin, word] = [0, NONE, version].map(AtomicU64::new);
+            Arc::new(Self { version: word, pin, refcount, block: UnsafeCell::new(version) })
         }
 
-        /// Pins, holds, unpins, reads the block, lets go; whether the version was there.
+        /// Pins, increments, unpins, reads the block, decrements. Returns whether the version existed.
         fn read(&self, version: u64) -> bool {
             let Some(pinned) = Pinned::new(&self.pin, &self.version, version) else { return false };
-            self.hold.fetch_add(1, Ordering::Relaxed);
+            self.refcount.fetch_add(1, Ordering::Relaxed);
             drop(pinned);
-            // SAFETY: this is what is checked.
+            // SAFETY: this is what the test checks.
             self.block.with(|block| assert_eq!(unsafe { *block }, version));
-            self.hold.fetch_sub(1, Ordering::Release);
+            self.refcount.fetch_sub(1, Ordering::Release);
             true
         }
 
-        /// Uses the block anew if it is free; whether it was.
+        /// Reuses the block if it is free. Returns whether it was.
         fn replace(&self, old: u64, new: u64) -> bool {
             let free = retire_version(&self.version, old, std::iter::once(&self.pin))
-                && self.hold.load(Ordering::Acquire) == 0;
+                && self.refcount.load(Ordering::Acquire) == 0;
             if free {
-                // SAFETY: this is what is checked.
+                // SAFETY: this is what the test checks.
                 self.block.with_mut(|block| unsafe { *block = new });
                 self.version.store_release(new);
             }

@@ -1,4 +1,4 @@
-//! A reader: a walker's process.
+//! The reader, used by walkers.
 
 use std::fmt;
 use std::fs::OpenOptions;
@@ -14,22 +14,22 @@ use super::index::MixtureIndex;
 use super::layout::Layout;
 use super::pinning::{NONE, Pinned, Word};
 
-/// The shared mixture as one reader sees it.
+/// The shared mixture as seen by one reader.
 ///
-/// The reader itself keeps the version it pinned last, so that the next one needs only what changed.
+/// Keeps the last pinned version, so that pinning the next one reads only the changed components.
 #[derive(Debug)]
 pub struct MixtureReader {
     block_reader: BlockReader,
     current: Option<Current>,
 }
 
-/// A version as it was made from its row.
+/// A version and its row.
 struct Current {
     mixture: Arc<Mixture>,
     row: Vec<u32>,
 }
 
-/// Without its numbers.
+/// Omits the numbers.
 impl fmt::Debug for Current {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Current").field("version", &self.mixture.version()).finish_non_exhaustive()
@@ -37,10 +37,10 @@ impl fmt::Debug for Current {
 }
 
 impl MixtureReader {
-    /// Opens the shared mixture as reader number `reader`, counted from 0. Each number is for one reader at a time.
+    /// Opens the shared mixture as reader number `reader`, counted from 0. Only one reader can use a number at a time.
     ///
     /// # Errors
-    /// No such file, another kind of file, a damaged one, a number without a slot or in use.
+    /// The file does not exist, is damaged or another kind of file; or the number has no slot or is in use.
     pub fn open(path: &Path, reader: u32) -> Result<Self, SharedMixtureError> {
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         let file = OpenOptions::new().read(true).write(true).open(path);
@@ -59,15 +59,15 @@ impl MixtureReader {
         Ok(Self { block_reader, current: None })
     }
 
-    /// The highest version published.
+    /// The newest version.
     pub fn newest(&self) -> u64 {
         self.block_reader.slot.index.newest().load_acquire()
     }
 
-    /// A version, evaluated in place. It stays as it is while anybody has it or a component of it.
+    /// A version, evaluated in place. It remains unchanged while the mixture or one of its components is in use.
     ///
     /// # Errors
-    /// The version is not there (any more), or the file is damaged.
+    /// The version does not exist (any more), or the file is damaged.
     pub fn pin(&mut self, version: u64) -> Result<Arc<Mixture>, SharedMixtureError> {
         if let Some(current) = &self.current
             && current.mixture.version() == version
@@ -79,7 +79,7 @@ impl MixtureReader {
             || SharedMixtureError::VersionNotFound { version, newest: slot.index.newest().load_acquire() };
         let row =
             (0..self.block_reader.layout.rows).find(|&row| slot.index.version(row).load_acquire() == version);
-        // A row without a version is not a version.
+        // An empty row has no version.
         let row = row.filter(|_| version != NONE).ok_or_else(gone)?;
         let pin = slot.index.pin(slot.reader);
         let _pinned = Pinned::new(pin, slot.index.version(row), version).ok_or_else(gone)?;
@@ -108,9 +108,9 @@ fn elements(
     elements.collect()
 }
 
-/// The current mixture with the components that have other blocks in a pinned row.
+/// The current mixture with the components whose blocks differ in a pinned row.
 ///
-/// A block that the current version holds cannot have been used anew, so the same number is the same component.
+/// A block in use by the current version cannot have been reused, so an equal number means the same component.
 fn following(
     block_reader: &mut BlockReader,
     current: &Current,
