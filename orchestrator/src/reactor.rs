@@ -1,8 +1,8 @@
-//! The shell round the selector: takes reports from the channel, has every commit written, then answers.
+//! Drives the selector: receives reports, writes every commit to the store, and then answers.
 //!
-//! To have a transaction on the disk takes longer than most decisions. So what arrives during a commit is decided
-//! meanwhile, one after the other, and committed as one group when that commit is done. Everybody is answered when
-//! what was decided about them, and all before it, is on the disk.
+//! Writing a transaction to disk takes longer than most decisions. Reports that arrive during a commit are therefore
+//! decided one after the other in the meantime, and committed together afterwards. A walker is answered when the
+//! decision about its report, and all earlier decisions, are on disk.
 
 pub mod commit_batch;
 mod events;
@@ -27,81 +27,81 @@ use wire::transport::{Incoming, WorkItem};
 use self::events::{EventStream, ReactorEvent};
 use crate::selector::{Scheduling, Selector, SelectorError};
 
-/// How often a full label queue and paused walks are looked at again, and for how long what was found is good.
+/// Interval between checks of a full label queue and of paused walks, and validity of the result.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
-/// A turn may crashes so many walkers, which crashed with it in hand; then its walk is over.
+/// A walk ends after its assignment has crashed this many walkers.
 const MAX_CRASHES: u32 = 3;
 
-/// Why a campaign cannot go on.
+/// Why the reactor failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReactorError {
-    /// The selector gave up.
+    /// An error of the selector.
     #[error(transparent)]
     Selector(#[from] SelectorError),
-    /// The store gave up.
+    /// An error of the store.
     #[error(transparent)]
     Store(#[from] StoreError),
 }
 
-/// What those who watch are told.
+/// A notification for display.
 #[derive(Debug)]
 pub enum Notice<'a> {
-    /// Where a walk stands.
+    /// Current state of a walk.
     Progress(WalkId, Progress),
-    /// What was just committed.
+    /// A commit that has been written.
     Committed(&'a Commit),
-    /// Walkers wait because this many label jobs wait.
+    /// Walkers wait because this many label jobs are unfinished.
     QueueFull(u64),
 }
 
-/// How the reactor's work ended.
+/// How the reactor ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunOutcome {
-    /// Every walk is over.
+    /// Every walk has ended.
     Finished,
-    /// Walks are left, but it was asked to stop, or every walker is gone; the campaign can go on later.
+    /// Walks are left, but a stop was requested or all walkers have exited. The campaign can be continued.
     Stopped,
 }
 
-/// What the reactor works with.
+/// Configuration of the reactor.
 pub struct Reactor {
-    /// The core.
+    /// The selector.
     pub selector: Selector,
     /// The campaign's database.
     pub store: Store,
-    /// Reports of walkers.
+    /// Messages of walkers.
     pub incoming: mpsc::Receiver<Incoming>,
-    /// Set from outside, by Ctrl-C say: walkers are sent home with their walks where they stand.
+    /// Set to stop, for example by Ctrl-C: walkers are shut down and their walks can be continued later.
     pub stopping: Arc<AtomicBool>,
     /// Walkers wait while more label jobs than this are unfinished, unless the selector raises its threshold first.
     pub queue_limit: u64,
 }
 
-/// The reactor at work: what it works with, and the walkers as far as it must know of them.
+/// State of the running reactor.
 struct ReactorState {
     selector: Selector,
     store: Store,
     stopping: Arc<AtomicBool>,
     queue_limit: u64,
-    /// What is decided and not yet on its way to the disk.
+    /// Decisions that are not being written yet.
     decided: Option<Commit>,
-    /// Walkers that wait for a turn, in the order in which they came.
+    /// Idle walkers, in order of arrival.
     waiting: VecDeque<(u32, Reply)>,
-    /// Those whose answer is known and waits for the commit before it.
+    /// Replies that wait for the commit before them.
     pending_replies: Vec<PendingReply>,
-    /// The walk that each of the others has in hand.
+    /// The walk assigned to each busy walker.
     at_work: HashMap<u32, WalkId>,
-    /// Walkers that crashed with the present turn of a walk.
+    /// Number of walkers that crashed with the current assignment of a walk.
     crash_counts: HashMap<WalkId, u32>,
-    /// Label jobs that are unfinished at most, and when they were counted.
+    /// Upper bound of the number of unfinished label jobs, and when it was determined.
     unfinished: Option<(u64, Instant)>,
-    /// When it was last looked which walks people have paused.
+    /// When the list of paused walks was last read.
     paused_polled_at: Option<Instant>,
 }
 
 type Reply = oneshot::Sender<Option<WorkItem>>;
 
-/// The answer to a walker.
+/// A reply to a walker.
 struct PendingReply {
     walker: u32,
     reply: Reply,
@@ -109,13 +109,13 @@ struct PendingReply {
 }
 
 impl Reactor {
-    /// Runs until no walker has a turn in hand and there is none to be given out, because all walks are over or because
-    /// it is stopped; or until no walker can come any more.
+    /// Runs until no walker is busy and there is nothing to assign, because all walks have ended or a stop was
+    /// requested; or until no walker can connect any more.
     pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<RunOutcome, ReactorError> {
         let mut events =
             EventStream::new(self.incoming, self.selector.regrader().clone(), self.selector.mixture());
         let mut state = ReactorState::new(self.selector, self.store, self.stopping, self.queue_limit);
-        // An interval, not a time since the last message: walkers at work may report progress without a pause.
+        // An interval, not a timeout since the last message: busy walkers may report progress continuously.
         let mut poll = tokio::time::interval(POLL_INTERVAL);
         poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
         // One commit at a time.
@@ -140,7 +140,8 @@ impl Reactor {
                     events.set_mixture(state.selector.mixture());
                 }
                 _ = poll.tick(), if !state.waiting.is_empty() || state.at_work.is_empty() => {
-                    // A stop before the first walker asks is followed by no message: agents wait for the end of the reactor.
+                    // A stop before the first walker is idle is not followed by any message, but agents wait for the
+                    // reactor to end.
                     if state.waiting.is_empty() && !state.stopping.load(Ordering::Relaxed) {
                         continue;
                     }
@@ -155,7 +156,7 @@ impl Reactor {
             } else {
                 state.send_replies();
                 if !open || state.is_over() {
-                    // Whoever asks from now on has to be sent home by those who carry messages.
+                    // From now on the transports shut down walkers that ask for work.
                     return Ok(if state.selector.is_done() {
                         RunOutcome::Finished
                     } else {
@@ -174,7 +175,7 @@ async fn write(store: Store, commit: Commit) -> Result<Commit, StoreError> {
     Ok(commit)
 }
 
-/// Structures that a commit accepts: as many jobs, at most, come to the queue.
+/// Number of structures that a commit accepts: an upper bound of the jobs it adds to the queue.
 fn accepted(commit: &Commit) -> u64 {
     commit.candidates.iter().filter(|candidate| candidate.fate == Fate::Accepted).count() as u64
 }
@@ -196,7 +197,7 @@ impl ReactorState {
         }
     }
 
-    /// Takes a group in, in the order in which it arrived.
+    /// Handles a batch of events in order of arrival.
     fn decide(
         &mut self,
         batch: Vec<ReactorEvent>,
@@ -232,8 +233,7 @@ impl ReactorState {
         Ok(())
     }
 
-    /// Whether a walker has a turn of the walk in hand, or is about to be given it. One that was taken for dead and comes
-    /// back with a report cannot speak for a walk that was handed on.
+    /// Whether the walk is assigned, or about to be. If so, a report of a walker that was considered lost is ignored.
     fn is_in_hand(&self, walk: WalkId) -> bool {
         let pending_replies = self.pending_replies.iter().filter_map(|pending| pending.work.as_ref());
         let mut in_hand =
@@ -241,13 +241,13 @@ impl ReactorState {
         in_hand.any(|other| other == walk)
     }
 
-    /// Whether nobody works, waits, or will be given a turn.
+    /// Whether no walker is busy, waiting, or will get an assignment.
     fn is_over(&self) -> bool {
         let no_more = self.selector.is_done() || self.stopping.load(Ordering::Relaxed);
         no_more && self.waiting.is_empty() && self.at_work.is_empty()
     }
 
-    /// A walker was lost. If it had a turn in hand, another gets it, unless it is the turn that kills them.
+    /// Handles the loss of a walker. Its assignment goes to another walker, unless it has crashed too many.
     fn walker_lost(&mut self, walker: u32, crashed: bool) -> Result<Option<Commit>, ReactorError> {
         if let Some(index) = self.pending_replies.iter().position(|pending| pending.walker == walker) {
             if let Some(work) = self.pending_replies.remove(index).work {
@@ -261,7 +261,7 @@ impl ReactorState {
             let crashes = self.crash_counts.entry(walk).or_default();
             *crashes += 1;
             if *crashes == MAX_CRASHES {
-                // Not how: the last words of a process are not the same twice.
+                // Without the details: the last output of a process is not reproducible.
                 let reason = format!("{MAX_CRASHES} walkers crashed in this turn");
                 return Ok(self.selector.abandon_walk(walk, reason)?);
             }
@@ -270,7 +270,7 @@ impl ReactorState {
         Ok(None)
     }
 
-    /// Chooses turns for waiting walkers as far as there are any, or that they go home.
+    /// Assigns work to idle walkers as far as possible, or shuts them down.
     async fn schedule(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<(), ReactorError> {
         if self.waiting.is_empty() {
             return Ok(());
@@ -303,8 +303,8 @@ impl ReactorState {
         Ok(())
     }
 
-    /// Whether the label queue is full, or may be when what is decided has come to it: then it is looked at again after
-    /// the commit. It is not counted each time, since for a while it grows by what is decided here and nothing else.
+    /// Whether the label queue is full, or may be after the pending commit; it is then checked again after that commit.
+    /// It is not counted every time, because in the short term only the decisions made here add to it.
     async fn is_queue_full(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<bool, ReactorError> {
         let limit = self.selector.max_unfinished_jobs(self.queue_limit);
         if self
@@ -323,7 +323,7 @@ impl ReactorState {
         Ok(upper_bound > limit)
     }
 
-    /// Finds out which walks are to get no turn.
+    /// Reads which walks are paused.
     async fn refresh_paused(&mut self) -> Result<(), StoreError> {
         if self.paused_polled_at.is_none_or(|at| at.elapsed() >= POLL_INTERVAL) {
             self.selector.set_paused(self.store.paused_walks().await?);
@@ -337,7 +337,7 @@ impl ReactorState {
         self.pending_replies.extend(self.waiting.drain(..).map(home));
     }
 
-    /// Sends the answers: all that they rest on is on the disk.
+    /// Sends the pending replies, after everything they depend on is on disk.
     fn send_replies(&mut self) {
         for PendingReply { walker, reply, work } in self.pending_replies.drain(..) {
             let walk = work.as_ref().map(|work| work.assignment.walk);
@@ -346,7 +346,7 @@ impl ReactorState {
                     debug!(walker, walk = walk.0, "gave a turn");
                     self.at_work.insert(walker, walk);
                 }
-                // A walker that is gone needs no answer, and another gets its turn.
+                // The walker has exited; another walker gets its assignment.
                 (Err(_), Some(walk)) => self.selector.assignment_lost(walk),
                 (_, None) => {}
             }

@@ -1,5 +1,5 @@
-//! What arrives for the reactor. Candidates are examined on other threads while the reactor has others committed;
-//! everything comes to it in the order in which it arrived.
+//! The events of the reactor. Candidates are regraded on other threads while the reactor waits for commits; events
+//! arrive in the order of their messages.
 
 use std::panic::resume_unwind;
 use std::pin::Pin;
@@ -16,20 +16,20 @@ use wire::transport::{Incoming, WorkItem};
 
 use crate::selector::{RegradedReport, Regrader};
 
-/// Messages on their way, at most.
+/// Maximum number of messages being processed.
 const MAX_IN_FLIGHT: usize = 64;
-/// Messages that are taken together, at most.
+/// Maximum number of events in a batch.
 const MAX_BATCH: usize = 64;
 
-/// The reactor's end of the line.
+/// The reactor's end of the stream of events.
 pub(super) struct EventStream {
     batches: Pin<Box<dyn Stream<Item = Vec<ReactorEvent>> + Send>>,
     newest: watch::Sender<Arc<Mixture>>,
-    /// Whoever drops the events ends the task that brings them.
+    /// Dropping the stream ends the task that feeds it.
     _task: JoinSet<()>,
 }
 
-/// As [`Incoming`], its report examined, or about to be.
+/// Like [`Incoming`], with a report that is regraded, or being regraded.
 pub(super) enum ReactorEvent<R = RegradedReport> {
     Idle { walker: u32, report: Option<R>, reply: oneshot::Sender<Option<WorkItem>> },
     Progress(WalkId, Progress),
@@ -37,7 +37,7 @@ pub(super) enum ReactorEvent<R = RegradedReport> {
 }
 
 impl EventStream {
-    /// Begins to take what comes in. `mixture` is the one in force.
+    /// Starts receiving messages. `mixture` is the current mixture.
     pub fn new(incoming: mpsc::Receiver<Incoming>, regrader: Regrader, mixture: &Arc<Mixture>) -> Self {
         let (to_reactor, mut messages) = mpsc::channel(MAX_IN_FLIGHT);
         let (newest, mixture) = watch::channel(Arc::clone(mixture));
@@ -48,13 +48,13 @@ impl EventStream {
         Self { batches: Box::pin(batches), newest, _task: task }
     }
 
-    /// Waits until what came first has been examined, and takes all that is ready behind it; nothing when nothing will
-    /// come any more. May be given up while it waits: nothing is lost by that.
+    /// Waits until the first event is ready, and returns it with all ready events that follow; `None` at the end of the
+    /// stream. Cancel safe.
     pub async fn take(&mut self) -> Option<Vec<ReactorEvent>> {
         self.batches.next().await
     }
 
-    /// Says which mixture is in force, for those that are examined from now on.
+    /// Sets the current mixture, which is used for all later messages.
     pub fn set_mixture(&self, mixture: &Arc<Mixture>) {
         self.newest.send_if_modified(|newest| {
             let moved = !Arc::ptr_eq(newest, mixture);
@@ -84,7 +84,7 @@ impl ReactorEvent<JoinHandle<RegradedReport>> {
     }
 }
 
-/// Begins an examination for every report, as many side by side as there are cores.
+/// Starts regrading every report, on as many threads as there are cores.
 async fn forward(
     mut incoming: mpsc::Receiver<Incoming>,
     regrader: Regrader,

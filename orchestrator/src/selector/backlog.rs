@@ -1,32 +1,32 @@
-//! What a long label queue does to the threshold above which structures are collected.
+//! Raises the threshold of the collection rule while the label queue is long.
 
-/// Above so many times the limit the threshold rises no more, and walkers wait.
+/// Above this multiple of the limit, the threshold is no longer raised, and walkers wait.
 const MAX_FACTOR: u64 = 2;
 
-/// The threshold while structures wait for labels: as configured up to `limit` unfinished jobs, above it times
+/// The threshold while structures wait for labels: as configured up to `limit` unfinished jobs, above it multiplied by
 ///
 /// ```text
 /// 1 + ((unfinished - limit) / limit)²,     2 at most, at twice the limit
 /// ```
 ///
-/// so that it leaves the configured one without a step, and the most of what is new is collected first.
+/// so that it is continuous at the limit, and the structures with the highest grades are collected first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Backlog {
     limit: u64,
 }
 
 impl Backlog {
-    /// One that begins above `limit` unfinished jobs; a limit of 0 counts as 1.
+    /// Raises the threshold above `limit` unfinished jobs; a limit of 0 counts as 1.
     pub fn above(limit: u64) -> Self {
         Self { limit: limit.max(1) }
     }
 
-    /// Walkers wait while more jobs than this are unfinished, so the queue cannot grow much beyond it.
+    /// Number of unfinished jobs above which walkers wait, which bounds the length of the queue.
     pub fn bound(self) -> u64 {
         self.limit.saturating_mul(MAX_FACTOR)
     }
 
-    /// The factor on the threshold while so many jobs are unfinished.
+    /// Factor on the threshold for this number of unfinished jobs.
     pub fn factor(self, unfinished: u64) -> f64 {
         let above = unfinished.min(self.bound()).saturating_sub(self.limit);
         1.0 + (above as f64 / self.limit as f64).powi(2)

@@ -1,4 +1,4 @@
-//! What becomes of the reports of a round, one after the other in walk order.
+//! Decisions on the reports of a round, in the order of walks.
 
 use std::collections::BTreeSet;
 use std::panic::resume_unwind;
@@ -16,12 +16,12 @@ use wire::{CandidateBlock, ContentHash, WalkId};
 use super::decision_state::DecisionState;
 use super::{RegradedCandidate, RegradedReport, SelectorError, UpdateProtocol};
 
-/// Priority of the label jobs of biased candidates; control frames come after them.
+/// Priority of label jobs of biased candidates; control frames come after them.
 const BIASED_PRIORITY: i32 = 10;
 const CONTROL_PRIORITY: i32 = 0;
 
-/// Features of the original training frames, whose γ under the live mixture is watched: a mixture that moves must
-/// not forget what the potential was trained on.
+/// Features of the original training frames. Their γ under the live mixture is monitored: the mixture must not forget
+/// what the potential was trained on.
 #[derive(Clone, Debug)]
 pub struct TrainingFrames {
     /// Element index of each atom.
@@ -33,13 +33,13 @@ pub struct TrainingFrames {
 }
 
 impl TrainingFrames {
-    /// Training frames with these features, graded under the original mixture.
+    /// Training frames with these features; grades them under the original mixture.
     pub fn new(elements: Vec<usize>, features: Vec<f64>, original: &Mixture) -> Result<Self, GradeError> {
         let original = grade_distribution(original, &elements, &features)?;
         Ok(Self { elements, features, original })
     }
 
-    /// Their grades under another mixture, on every core: no atom's grade depends on the others.
+    /// Their grades under another mixture, computed on all cores, since atoms are independent.
     fn grades(&self, mixture: &Mixture) -> Result<GradeDistribution, SelectorError> {
         let cores = available_parallelism().map_or(1, |cores| cores.get());
         let atoms = self.elements.len().div_ceil(cores).max(1);
@@ -78,7 +78,7 @@ impl DecisionState {
                 }
                 Outcome::Candidate(regraded) => self.keep_control_frame(id, regraded?, &mut commit)?,
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
-                // A control walk whose frames did not come will not give them in another turn either.
+                // A control walk that missed its last frame will not provide it in a later assignment.
                 Outcome::StepsDone if self.walks[&id].missed_its_frames() => {
                     self.end_walk(id, &WalkEnd::Steps, &mut commit);
                 }
@@ -92,7 +92,7 @@ impl DecisionState {
         Ok(commit)
     }
 
-    /// Moves the walk to where its turn ended, and logs returns to a checkpoint.
+    /// Updates the walk from the report, and logs rollbacks.
     fn apply_report(&mut self, report: &RegradedReport, commit: &mut Commit) {
         let steps_per_assignment = self.settings.steps_per_assignment;
         let walk = self.walk_mut(report.walk);
@@ -115,7 +115,7 @@ impl DecisionState {
         }
     }
 
-    /// Decides on a candidate of a biased walk, and ends the walk if that was its last.
+    /// Decides on a candidate of a biased walk, and ends the walk if it has reached its limit.
     pub fn decide_candidate(
         &mut self,
         id: WalkId,
@@ -156,7 +156,7 @@ impl DecisionState {
         Ok(())
     }
 
-    /// A wanted frame of a control walk: labelled like a candidate, but no mixture learns from it.
+    /// Records a requested frame of a control walk: it is labelled like a candidate, but does not update the mixture.
     pub fn keep_control_frame(
         &mut self,
         id: WalkId,
@@ -176,7 +176,7 @@ impl DecisionState {
         Ok(())
     }
 
-    /// Puts a decision and the candidate that it is about into the commit.
+    /// Adds a decision with its candidate to the commit.
     fn record_decision(
         &self,
         id: WalkId,
@@ -206,7 +206,7 @@ impl DecisionState {
         });
     }
 
-    /// The first reason, if any, in the order: guard, duplicate, budget, covered, backlog.
+    /// The first applicable reason to decline, in the order guard, duplicate, budget, covered, backlog.
     fn reason_to_decline(
         &self,
         id: WalkId,
@@ -229,7 +229,7 @@ impl DecisionState {
         }
     }
 
-    /// Makes the mixture cover the candidate: the next version, in the commit.
+    /// Updates the mixture to cover the candidate, and adds the new version to the commit.
     fn update(
         &mut self,
         graded: &RegradedCandidate,
@@ -267,7 +267,7 @@ impl DecisionState {
         walk.state.accepted_steps.push(step);
     }
 
-    /// Feature vectors of accepted candidates are always kept, those of declined ones within a byte budget.
+    /// Features of accepted candidates are always stored, those of declined candidates within a limit.
     fn should_keep_features(&mut self, fate: Fate, block: &CandidateBlock) -> bool {
         if fate == Fate::Accepted {
             return true;
@@ -284,7 +284,7 @@ impl DecisionState {
         self.end_walk_as(id, end.name(), describe_end(end), commit);
     }
 
-    /// Ends a walk, which has that state from now on, for a reason in words.
+    /// Ends a walk with this final state, and the reason as text.
     pub fn end_walk_as(&mut self, id: WalkId, end: &str, reason: String, commit: &mut Commit) {
         let walk = self.walk_mut(id);
         (walk.record.state, walk.record.reason) = (end.to_owned(), reason);
@@ -305,7 +305,7 @@ impl DecisionState {
         commit.decisions.push(self.decision("ended", id, detail));
     }
 
-    /// Ends the biased walks that nobody has in hand once the campaign has as many structures as it may have.
+    /// Ends the unassigned biased walks once the campaign has its maximum number of structures.
     fn end_by_budget(&mut self, commit: &mut Commit) -> Vec<WalkId> {
         if !self.is_budget_exhausted() {
             return Vec::new();
@@ -317,7 +317,7 @@ impl DecisionState {
         idle
     }
 
-    /// The controls of biased walks that have ended; touches both.
+    /// Creates the control walks of biased walks that have ended. Returns all changed walks.
     fn start_controls(&mut self, commit: &mut Commit) -> Vec<WalkId> {
         let mut touched = Vec::new();
         if !self.settings.control {
@@ -333,7 +333,7 @@ impl DecisionState {
         touched
     }
 
-    /// Begins the control of the biased walk `of`, which must be there.
+    /// Creates the control walk of the biased walk `of`, which must exist.
     pub fn start_control(&mut self, id: WalkId, of: WalkId) -> Decision {
         let steps_per_assignment = self.settings.steps_per_assignment;
         let control = self.walk_mut(of).control(id, steps_per_assignment);
@@ -343,7 +343,7 @@ impl DecisionState {
     }
 }
 
-/// Why a walk ended, in words, where its name does not say it all.
+/// Why a walk ended, as text, if the name of the end is not sufficient.
 fn describe_end(end: &WalkEnd) -> String {
     match end {
         WalkEnd::Steps | WalkEnd::Collected | WalkEnd::Budget => String::new(),
@@ -352,7 +352,7 @@ fn describe_end(end: &WalkEnd) -> String {
     }
 }
 
-/// The value by which those who watch see what the mixture still knows.
+/// The value that shows how well the mixture still covers the training frames.
 fn training_frames(grades: &GradeDistribution, alarm: bool) -> (String, String) {
     let mut value = json!(grades);
     value["alarm"] = json!(alarm);

@@ -1,4 +1,4 @@
-//! What decisions depend on, and how it comes back from the store.
+//! The state that decisions depend on, and its restoration from the store.
 
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
@@ -17,24 +17,24 @@ use super::{
 };
 use crate::grader::Grader;
 
-/// Decides what becomes of candidates and walks.
+/// Decides on candidates and walks.
 pub(super) struct DecisionState {
     pub settings: Settings,
-    /// Shortest distance of each seed structure that a candidate must keep, Å.
+    /// Minimum distance in candidates of each seed structure, Å.
     pub min_distances: Vec<f64>,
     pub regrader: Regrader,
     pub mixture: Arc<Mixture>,
     pub training: Option<TrainingFrames>,
     pub walks: BTreeMap<WalkId, Walk>,
     pub known: HashSet<ContentHash>,
-    /// Rounds begun; always 0 in live mode.
+    /// Number of started rounds; always 0 in live mode.
     pub round: u64,
     pub accepted: u32,
     pub declined_feature_bytes: u64,
     pub staleness: Staleness,
-    /// Imported structures among the known ones: now, and when the log last spoke of them.
+    /// Number of imported structures: now, and when the log last recorded it.
     pub imported: (u64, u64),
-    /// The changeable rules, when the log last spoke of them.
+    /// The changeable rules when the log last recorded them.
     pub rules: Option<ChangeableRules>,
     pub backlog: Option<Backlog>,
     /// Factor on the threshold of the collection rule.
@@ -42,7 +42,7 @@ pub(super) struct DecisionState {
 }
 
 impl DecisionState {
-    /// One that goes on from what a store holds.
+    /// Restores the state from a store.
     pub fn restore(
         settings: Settings,
         seeds: &[SeedStructure],
@@ -82,12 +82,12 @@ impl DecisionState {
         })
     }
 
-    /// A walk that is known to be there: none is ever taken out of the table.
+    /// A walk that exists: walks are never removed from the table.
     pub fn walk_mut(&mut self, id: WalkId) -> &mut Walk {
         self.walks.get_mut(&id).expect("walks stay in the table")
     }
 
-    /// Seals a commit: what holds after it.
+    /// Adds the current values to a commit.
     pub fn add_values(&self, commit: &mut Commit) {
         let values = [
             ("round", self.round),
@@ -107,7 +107,7 @@ impl DecisionState {
     }
 }
 
-/// max(least, fraction × shortest distance) of each seed structure, Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
+/// max(minimum distance, fraction × shortest distance) for each seed structure, Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
 fn min_distances(
     settings: &Settings,
     seeds: &[SeedStructure],
@@ -122,15 +122,15 @@ fn min_distances(
     seeds.iter().map(of).collect()
 }
 
-/// The stored walks, which are numbered from 0 and start from known seed structures.
+/// The stored walks, which must be numbered from 0 and start from existing seed structures.
 fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<BTreeMap<WalkId, Walk>, SelectorError> {
     let restored = records.into_iter().enumerate().map(|(number, record)| {
         let (id, seed) = (record.walk, record.seed_structure);
         if id.0 as usize != number {
-            return Err(SelectorError::Snapshot(format!("walk {id} stands where walk {number} should")));
+            return Err(SelectorError::Snapshot(format!("found walk {id} in place of walk {number}")));
         }
         if seed as usize >= seeds {
-            let problem = format!("walk {id} starts from seed structure {seed}, but there are {seeds}");
+            let problem = format!("walk {id} starts from seed structure {seed}, but there are only {seeds}");
             return Err(SelectorError::Snapshot(problem));
         }
         Ok((id, Walk::restore(record)?))
@@ -138,7 +138,7 @@ fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<BTreeMap<Wal
     restored.collect()
 }
 
-/// A value that earlier versions did not keep.
+/// A value that databases of earlier versions do not have.
 fn restored<T: DeserializeOwned>(
     name: &str,
     values: &[(String, String)],
@@ -148,10 +148,10 @@ fn restored<T: DeserializeOwned>(
     read.map(Some).map_err(|error| SelectorError::Snapshot(format!("{name} is damaged: {error}")))
 }
 
-/// The mixture of this version: the original one with the components that the store has, which are all that ever changed.
+/// The mixture of a version: the original mixture with the stored components, which are all that ever changed.
 ///
 /// # Errors
-/// Components that are damaged, or are none of this mixture's.
+/// Components that are damaged or do not match the original mixture.
 pub fn restored_mixture(
     original: &Mixture,
     version: u64,

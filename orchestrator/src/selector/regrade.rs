@@ -1,4 +1,4 @@
-//! What can be found out about a candidate before its turn to be decided comes: on any thread, in any order.
+//! Grading of candidates by the selector. It can run before the decision, on any thread and in any order.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use wire::messages::Report;
 use super::SelectorError;
 use crate::grader::{Bonds, Grader};
 
-/// Grades candidates ahead of the decisions about them. Clones share what they need.
+/// Grades candidates ahead of the decisions about them. Cheap to clone.
 #[derive(Clone)]
 pub struct Regrader {
     pub(super) grader: Arc<Grader>,
@@ -21,24 +21,24 @@ pub struct Regrader {
 pub struct RegradedCandidate {
     pub(super) block: CandidateBlock,
     pub(super) bonds: Bonds,
-    /// Under the original mixture.
+    /// Grades under the original mixture.
     pub(super) original: AtomGrades,
-    /// The mixture of the grades below.
+    /// The mixture of the selector's grades.
     pub(super) mixture: Arc<Mixture>,
     pub(super) selector: AtomGrades,
 }
 
-/// A report with its candidate regraded, or why it cannot be: an error if it comes to a decision about it.
+/// A report with a regraded candidate, or the error, which is returned only if the candidate comes to a decision.
 pub type RegradedReport = Report<Result<RegradedCandidate, SelectorError>>;
 
 impl Regrader {
-    /// Examines the candidate of a report, if it has one. `mixture` is the one that is likely to be in force when it is
-    /// decided; under any other it will be graded again.
+    /// Grades the candidate of a report, if it has one. `mixture` should be the mixture at the time of the decision;
+    /// under another one, the candidate is graded again.
     pub fn regrade(&self, report: Report, mixture: &Arc<Mixture>) -> RegradedReport {
         report.map_candidate(|block| self.regrade_block(block, mixture))
     }
 
-    /// The same of a candidate alone.
+    /// Grades a candidate without a report.
     pub fn regrade_block(
         &self,
         block: CandidateBlock,
@@ -58,7 +58,7 @@ impl Regrader {
 }
 
 impl RegradedCandidate {
-    /// The same under the mixture in force.
+    /// The candidate with grades under the current mixture.
     pub(super) fn with_mixture(mut self, mixture: &Arc<Mixture>) -> Result<Self, SelectorError> {
         if !Arc::ptr_eq(mixture, &self.mixture) {
             let view = self.block.view();

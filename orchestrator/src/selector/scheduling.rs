@@ -1,4 +1,4 @@
-//! Which walk goes next.
+//! Choice of the next walk.
 
 use wire::WalkId;
 use wire::messages::Assignment;
@@ -6,19 +6,19 @@ use wire::messages::Assignment;
 use super::walk::Walk;
 use super::{Mode, Selector};
 
-/// What a free walker is to do.
+/// What an idle walker does next.
 #[derive(Debug)]
 pub enum Scheduling {
-    /// This turn, under the mixture of [`Selector::mixture`].
+    /// Works on this assignment, with the mixture of [`Selector::mixture`].
     Assign(Box<Assignment>),
-    /// Nothing now: turns are out whose reports decide what comes next, or walks are paused.
+    /// Waits: reports that determine the next assignment are outstanding, or walks are paused.
     Wait,
-    /// Nothing any more.
+    /// Exits: there is no more work.
     Done,
 }
 
 impl Selector {
-    /// The next turn for a free walker.
+    /// The next assignment for an idle walker.
     pub fn next_assignment(&mut self) -> Scheduling {
         if self.decisions.settings.mode == Mode::Reproducible && self.in_round.is_empty() {
             self.start_round();
@@ -36,19 +36,19 @@ impl Selector {
         if self.is_done() { Scheduling::Done } else { Scheduling::Wait }
     }
 
-    /// Whether every walk is over.
+    /// Whether every walk has ended.
     pub fn is_done(&self) -> bool {
         self.decisions.walks.values().all(Walk::has_ended)
     }
 
-    /// A walker was lost with its turn: the turn is given out again.
+    /// Returns the assignment of a lost walker; it is assigned again.
     pub fn assignment_lost(&mut self, id: WalkId) {
         if let Some(walk) = self.decisions.walks.get_mut(&id) {
             walk.is_assigned = false;
         }
     }
 
-    /// A round takes the first unfinished biased walks, and as many control walks beside them.
+    /// Starts a round with the first unfinished biased walks and as many control walks.
     fn start_round(&mut self) {
         for biased in [true, false] {
             let unfinished =
@@ -63,7 +63,7 @@ impl Selector {
     }
 
     fn assign(&mut self, id: WalkId) -> Assignment {
-        let walk = self.decisions.walks.get_mut(&id).expect("the caller took the id from the table");
+        let walk = self.decisions.walks.get_mut(&id).expect("the id comes from this table");
         walk.is_assigned = true;
         walk.record.state = "running".to_owned();
         Assignment {

@@ -1,4 +1,4 @@
-//! What is said once at the start of each run: what has changed since the last, and which walks there are.
+//! What the selector records at the start of each run: changes since the last run, and new walks.
 
 use serde_json::json;
 use store::records::{Commit, Decision};
@@ -14,7 +14,7 @@ impl DecisionState {
     pub fn start_walks(&mut self, seeds: &[SeedStructure]) -> Commit {
         let mut commit = Commit::default();
         if self.imported.0 != self.imported.1 {
-            // From here on candidates can be duplicates of them.
+            // From here on, candidates can be duplicates of them.
             commit
                 .decisions
                 .push(self.campaign_decision("imported", json!({ "structures": self.imported.0 })));
@@ -32,7 +32,7 @@ impl DecisionState {
         commit
     }
 
-    /// Says by which rules it goes on, if the log does not know. A campaign begins by those of its configuration.
+    /// Records the rules if they differ from those in the log. A campaign starts with the rules of its configuration.
     fn log_rule_changes(&mut self, commit: &mut Commit) {
         let rules = self.settings.changeable_rules();
         if self.rules.as_ref() == Some(&rules) {
@@ -45,12 +45,12 @@ impl DecisionState {
         self.rules = Some(rules);
     }
 
-    /// A decision that is about no walk.
+    /// A decision about no particular walk.
     pub fn campaign_decision(&self, kind: &'static str, detail: serde_json::Value) -> Decision {
         Decision { walk: None, ..self.decision(kind, WalkId(0), detail) }
     }
 
-    /// Begins the biased walk of a seed structure, which has that name.
+    /// Creates the biased walk of the seed structure with this name.
     pub fn start_walk(&mut self, id: WalkId, seed: usize, name: &str) -> Decision {
         self.walks.insert(id, Walk::new(id, seed as u32, self.settings.steps_per_assignment));
         self.decision("begun", id, json!({ "seed_structure": name }))
@@ -64,7 +64,7 @@ impl DecisionState {
         }
     }
 
-    /// Whether a walk has ended by a budget only, which is not used up any more.
+    /// Whether a walk ended only because of a limit that is no longer reached.
     pub fn can_resume(&self, id: WalkId) -> bool {
         let walk = &self.walks[&id];
         !self.is_budget_exhausted()
@@ -72,13 +72,13 @@ impl DecisionState {
             && walk.record.accepted < self.settings.max_per_seed_structure
     }
 
-    /// Lets a walk go on that has ended.
+    /// Resumes a walk that has ended.
     pub fn resume(&mut self, id: WalkId) -> Decision {
         self.walk_mut(id).record.state = "waiting".to_owned();
         self.decision("resumed", id, json!({}))
     }
 
-    /// Whether the campaign has as many structures as it may have.
+    /// Whether the campaign has its maximum number of structures.
     pub fn is_budget_exhausted(&self) -> bool {
         self.settings.max_structures.is_some_and(|total| self.accepted >= total)
     }

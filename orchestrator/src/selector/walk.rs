@@ -1,4 +1,4 @@
-//! One walk as the selector sees it.
+//! A walk, as the selector sees it.
 
 use serde::{Deserialize, Serialize};
 use store::records::WalkRecord;
@@ -7,28 +7,28 @@ use wire::{Origin, WalkId};
 
 use super::SelectorError;
 
-/// A walk: what the store holds of it, and whether a walker has it in hand.
+/// A walk: its stored record, and whether it is assigned.
 pub(super) struct Walk {
     pub record: WalkRecord,
     pub state: SelectorState,
-    /// A walker works on its turn.
+    /// Whether a walker works on it.
     pub is_assigned: bool,
 }
 
-/// What the selector itself remembers of a walk from one turn to the next.
+/// State of a walk that the selector keeps between assignments.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct SelectorState {
-    /// The answer to the candidate that the last turn ended with.
+    /// The decision on the candidate that ended the last assignment.
     pub verdict: Option<Verdict>,
-    /// Segment of the last turn that ended; the walk may be further since, if it was interrupted.
+    /// Segment at the end of the last completed assignment. An interrupted walk may be in a later one.
     pub segment: u32,
-    /// Last step of the turn.
+    /// Last step of the next assignment.
     pub until: u64,
-    /// Control walk: steps whose frames are still wanted.
+    /// Control walk: steps of the remaining frames.
     pub wanted: Vec<u64>,
     /// Biased walk: steps at which structures were accepted.
     pub accepted_steps: Vec<u64>,
-    /// Of them, those whose control frames a control walk was begun for.
+    /// Number of accepted steps for which a control walk exists.
     pub controlled: usize,
 }
 
@@ -50,12 +50,12 @@ impl Walk {
         Self { record, state: SelectorState { until, ..SelectorState::default() }, is_assigned: false }
     }
 
-    /// Whether structures were accepted from it that no control walk was begun for.
+    /// Whether it has accepted structures without a control walk.
     pub fn needs_control(&self) -> bool {
         self.is_biased() && self.has_ended() && self.state.controlled < self.state.accepted_steps.len()
     }
 
-    /// The unbiased control of a biased walk: frames at the steps at which that one collected.
+    /// The unbiased control of a biased walk, with frames at the steps where the biased walk collected.
     pub fn control(&mut self, walk: WalkId, steps_per_assignment: u64) -> Self {
         let mut control = Self::new(walk, self.record.seed_structure, 0);
         control.record.origin = Origin::Control;
@@ -89,26 +89,27 @@ impl Walk {
         !matches!(self.record.state.as_str(), "waiting" | "running")
     }
 
-    /// The next turn ends after `steps_per_assignment` at the latest, that of a control walk at its last wanted frame.
+    /// Sets the last step of the next assignment: after `steps_per_assignment` steps, or at a control walk's last frame
+    /// if that is earlier.
     pub fn set_last_step(&mut self, steps_per_assignment: u64) {
         let until = self.record.progress.step + steps_per_assignment;
         self.state.until = self.state.wanted.last().map_or(until, |last| until.min(*last));
     }
 
-    /// Whether a control walk has passed its last wanted frame without giving it.
+    /// Whether a control walk is past its last frame without having provided it.
     pub fn missed_its_frames(&self) -> bool {
         self.state.wanted.last().is_some_and(|last| self.record.progress.step >= *last)
     }
 
-    /// Keeps where a turn was interrupted: the same turn goes on from there. A verdict that the turn began with is
-    /// in the checkpoint by now.
+    /// Records where an assignment was interrupted; it continues from there. The checkpoint already accounts for the
+    /// verdict with which it started.
     pub fn interrupt<C>(&mut self, report: Report<C>) {
         self.record.checkpoint = Some(report.checkpoint);
         self.record.progress = report.progress;
         self.state.verdict = None;
     }
 
-    /// Whether it ended for no other reason than a budget.
+    /// Whether it ended only because of a limit.
     pub fn ended_by_budget(&self) -> bool {
         self.is_biased()
             && [WalkEnd::Collected, WalkEnd::Budget].iter().any(|end| self.record.state == end.name())
