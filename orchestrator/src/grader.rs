@@ -89,7 +89,7 @@ impl Grader {
                     } else {
                         Pair::new(j, i, distance, cutoff(j, i))
                     };
-                    // A pair of an atom and its own image is its own kind of reverse, with the same weight.
+                    // The pairs of an atom with its own images are each other's reverse, with the same weight.
                     for (place, pair) in [(next[j] + images.len() - 1 - k, reverse), (next[i] + k, pair)] {
                         // Rounding can leave a bond without its reverse only if atoms are extremely far away.
                         if let Some(slot) = pairs.get_mut(place) {

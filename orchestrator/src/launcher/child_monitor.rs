@@ -1,4 +1,4 @@
-//! What a process says and how it ends, told as it happens.
+//! Monitoring of a process: its standard error and its exit.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -14,21 +14,21 @@ use tokio::sync::mpsc;
 use super::line_splitter::{LineSplitter, is_failure_reason};
 use crate::supervisor::ExitReason;
 
-/// How long the last words of a process are waited for when it has ended. They are in the pipe already; only what it
-/// started itself and left behind can keep the pipe open.
+/// Time to read the standard error of a process after its exit. Its output is already in the pipe; only processes that
+/// it left behind can keep the pipe open.
 pub(super) const STDERR_DRAIN_TIMEOUT: Duration = Duration::from_millis(100);
 
-/// No more than so many bytes are in a pipe, as Linux has it.
+/// Maximum capacity of a pipe on Linux.
 const MAX_PIPE_BYTES: usize = 1 << 20;
 
-/// What there is to tell of a process.
+/// News of a process.
 #[derive(Debug)]
 pub(super) enum ChildNews {
     Stderr(String),
     Ended(ExitReason),
 }
 
-/// Tells of one process, under its number.
+/// Reports news of one process, with its number.
 #[derive(Clone, Debug)]
 pub(super) struct ChildReporter {
     pub number: u32,
@@ -37,12 +37,12 @@ pub(super) struct ChildReporter {
 
 impl ChildReporter {
     async fn report(&self, news: ChildNews) {
-        // Nobody wants to know any more when the receiver is gone.
+        // If the receiver is dropped, nobody needs the news.
         let _ = self.news.send((self.number, news)).await;
     }
 }
 
-/// Gives a child what it is to read, tells what it says, waits for its end and reaps it.
+/// Writes the setup of a child process, reports its standard error, waits for its exit and reports that.
 pub(super) async fn monitor_child(mut child: Child, setup: Vec<u8>, reporter: ChildReporter) {
     if let Some(stdin) = child.stdin.take() {
         tokio::spawn(feed(stdin, setup));
@@ -61,15 +61,15 @@ pub(super) async fn monitor_child(mut child: Child, setup: Vec<u8>, reporter: Ch
     reporter.report(ChildNews::Ended(exit_reason(status, stderr.last))).await;
 }
 
-/// Waits for the end of a process that is not our child.
+/// Waits for the exit of a process that is not our child.
 pub(super) async fn monitor_adopted(end: AsyncFd<OwnedFd>, reporter: ChildReporter) {
-    // An error would be that this process's runtime shuts down.
+    // An error means that the runtime is shutting down.
     let _ = end.readable().await;
     reporter.report(ChildNews::Ended(ExitReason::Unknown)).await;
 }
 
 async fn feed(mut stdin: ChildStdin, setup: Vec<u8>) {
-    // A child that does not want to read will have its reason, and say it.
+    // A child that does not read its setup reports the reason itself.
     let _ = stdin.write_all(&setup).await;
 }
 
@@ -81,11 +81,11 @@ fn exit_reason(status: io::Result<ExitStatus>, last_line: Option<String>) -> Exi
     }
 }
 
-/// What a child writes to its standard error, line by line.
+/// Standard error of a child, line by line.
 struct StderrLines {
     stderr: Option<ChildStderr>,
     lines: LineSplitter,
-    /// The last line that may say why it ended.
+    /// The last line that may explain its exit.
     last: Option<String>,
 }
 
@@ -94,7 +94,7 @@ impl StderrLines {
         Self { stderr, lines: LineSplitter::default(), last: None }
     }
 
-    /// The next line; `None` when there will be no more. Dropped while it waits, it has lost nothing.
+    /// The next line; `None` at the end. Cancel safe.
     async fn next(&mut self) -> Option<String> {
         let line = loop {
             match self.lines.next_line() {
@@ -111,7 +111,8 @@ impl StderrLines {
         Some(line)
     }
 
-    /// Reads what is in the pipe when the process has ended, however slowly the lines are taken; nothing is read after it.
+    /// Reads the rest of the pipe after the process has exited, however slowly the lines are consumed; nothing is read
+    /// afterwards.
     async fn read_last(&mut self) {
         let all = async {
             let mut left = MAX_PIPE_BYTES;
@@ -121,7 +122,7 @@ impl StderrLines {
                 left = left.saturating_sub(length);
             }
         };
-        // Whatever came until the time is over counts.
+        // Keeps what was read before the timeout.
         let _ = tokio::time::timeout(STDERR_DRAIN_TIMEOUT, all).await;
         self.stderr = None;
     }
@@ -129,7 +130,7 @@ impl StderrLines {
     /// Reads some bytes; `None` at the end.
     async fn read(&mut self) -> Option<usize> {
         let mut bytes = [0; 4096];
-        // An error is an end, too.
+        // Handles an error as the end.
         let length = self.stderr.as_mut()?.read(&mut bytes).await.unwrap_or(0);
         if length == 0 {
             self.stderr = None;

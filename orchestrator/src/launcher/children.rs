@@ -1,4 +1,4 @@
-//! The shell round the supervisor: the processes of one kind, kept alive.
+//! Runs the processes of one kind for the supervisor.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -14,56 +14,56 @@ use super::heartbeats::Heartbeats;
 use super::process::{AdoptError, Process};
 use crate::supervisor::{Action, ChildExit, ChildStatus, ExitReason, Limits, Supervisor};
 
-/// LineSplitter and ends that wait to be told; who writes more waits.
+/// Maximum number of queued lines and exits; further writers wait.
 const MAX_QUEUED: usize = 64;
 
-/// What happened to the children.
+/// An event of the children.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ChildEvent {
     /// A process was started.
     Started {
-        /// Which child.
+        /// Number of the child.
         number: u32,
-        /// The how-manieth start of this child, from 1.
+        /// Start count of this child, from 1.
         incarnation: u32,
-        /// Process number.
+        /// Process id.
         pid: u32,
     },
-    /// A line that a process wrote to its standard error.
+    /// A process wrote a line to its standard error.
     Stderr {
-        /// Which child.
+        /// Number of the child.
         number: u32,
-        /// The line, without its end.
+        /// The line, without line ending.
         line: String,
     },
-    /// A process ended, or could not be started. It has been reaped.
+    /// A process exited and was waited for, or could not be started.
     Ended {
-        /// Which child.
+        /// Number of the child.
         number: u32,
-        /// How, and what becomes of the child.
+        /// The exit and the new state of the child.
         ended: ChildExit,
     },
-    /// No process is left and none will be started. Nothing comes after it.
+    /// No process is running and none will be started. The last event.
     AllExited,
 }
 
-/// Processes of one kind, numbered from 0, which are started, watched and started again as the
-/// [supervisor](crate::supervisor) actions.
+/// Processes of one kind, numbered from 0, which are started, monitored and restarted as the
+/// [supervisor](crate::supervisor) decides.
 pub struct Children {
     supervisor: Supervisor,
-    /// What to start for a number and incarnation.
+    /// How to start the process with this number and incarnation.
     launch: Box<dyn FnMut(u32, u32) -> Launch + Send>,
     processes: BTreeMap<u32, Process>,
     heartbeats: Heartbeats,
     reporter: mpsc::Sender<(u32, ChildNews)>,
     news: mpsc::Receiver<(u32, ChildNews)>,
-    /// What happened and was not told yet.
+    /// Events that were not returned yet.
     events: VecDeque<ChildEvent>,
     reported_all_exited: bool,
 }
 
 impl Children {
-    /// So many children; [`Self::next`] starts them, each as `launch` says for its number and incarnation.
+    /// This number of children. [`Self::next`] starts them; `launch` says how for each number and incarnation.
     pub fn new(
         children: u32,
         limits: Limits,
@@ -82,8 +82,8 @@ impl Children {
         }
     }
 
-    /// Takes the process `pid` that was born at `birth` ([`store::process_birth`]) for a child that was not started yet.
-    /// It need not be a child of this process; of its end no more can be known than that it came. To be called inside the
+    /// Adopts process `pid`, which started at `birth` ([`store::process_birth`]), as a child that was never started. It
+    /// need not be a child of this process, but then the reason of its exit remains unknown. Must be called in a tokio
     /// runtime.
     pub fn adopt(&mut self, number: u32, pid: u32, birth: &str) -> Result<(), AdoptError> {
         let process = Process::find(pid, birth)?;
@@ -96,34 +96,34 @@ impl Children {
         Ok(())
     }
 
-    /// Where signs of life go.
+    /// Where to send heartbeats.
     pub fn heartbeats(&self) -> Heartbeats {
         self.heartbeats.clone()
     }
 
-    /// Ends the whole set in order: SIGTERM now, SIGKILL when the time of grace is over.
+    /// Stops all processes: SIGTERM now, SIGKILL after the grace period.
     pub fn stop(&mut self) {
         self.collect_heartbeats();
         let actions = self.supervisor.stop(self.heartbeats.now());
         self.execute(actions);
     }
 
-    /// There is no more work: nobody is started any more.
+    /// There is no more work: starts no more processes.
     pub fn close(&mut self) {
         self.supervisor.close();
     }
 
-    /// Where the children stand.
+    /// Status of the children.
     pub fn status(&mut self) -> Vec<ChildStatus> {
         self.collect_heartbeats();
         self.supervisor.status(self.heartbeats.now()).collect()
     }
 
-    /// The next thing that happens, and everything that has to be done until then: nobody is started or killed while
-    /// this is not awaited. To be awaited on the main thread: see [`crate::launcher`]. Dropped while it waits, it has lost nothing.
+    /// Returns the next event and performs all actions until then: no process is started or killed unless this is
+    /// awaited. Await it on the main thread, see [`crate::launcher`]. Cancel safe.
     pub async fn next(&mut self) -> ChildEvent {
         loop {
-            // Whoever is told of an end has to know of it before the next start.
+            // The caller must learn of an exit before the next start.
             if let Some(event) = self.events.pop_front() {
                 return event;
             }
@@ -160,7 +160,7 @@ impl Children {
             ChildNews::Stderr(line) => self.events.push_back(ChildEvent::Stderr { number, line }),
             ChildNews::Ended(reason) => {
                 self.processes.remove(&number);
-                // What it did before it ended.
+                // Heartbeats from before the exit.
                 self.collect_heartbeats();
                 self.ended(number, reason);
             }
@@ -188,9 +188,9 @@ impl Children {
 
     fn start(&mut self, number: u32, incarnation: u32) -> io::Result<u32> {
         let (mut child, setup) = (self.launch)(number, incarnation).start()?;
-        let pid = child.id().ok_or_else(|| io::Error::other("it ended before it could be watched"))?;
+        let pid = child.id().ok_or_else(|| io::Error::other("it exited before it could be monitored"))?;
         let process = Process::of_child(pid).inspect_err(|_| {
-            // What cannot be signalled later must not live.
+            // A process that cannot be signalled later must not live.
             let _ = child.start_kill();
         })?;
         self.processes.insert(number, process);
@@ -201,7 +201,7 @@ impl Children {
     fn signal(&mut self, number: u32, signal: Signal) {
         let sent = self.processes.get(&number).map(|process| process.signal(signal));
         if let Some(Err(error)) = sent {
-            let line = format!("signal {} could not be sent to it: {error}", signal.as_raw());
+            let line = format!("cannot send signal {} to it: {error}", signal.as_raw());
             self.events.push_back(ChildEvent::Stderr { number, line });
         }
     }
@@ -217,7 +217,7 @@ impl fmt::Debug for Children {
     }
 }
 
-/// The end of a start that failed.
+/// The exit reason of a failed start.
 fn start_failure(error: &io::Error) -> ExitReason {
     let is_shortage = error.raw_os_error().is_some_and(|number| {
         [libc::EMFILE, libc::ENFILE, libc::EAGAIN, libc::ENOMEM, libc::ENOBUFS].contains(&number)
@@ -225,7 +225,7 @@ fn start_failure(error: &io::Error) -> ExitReason {
     ExitReason::StartFailed { reason: error.to_string(), is_shortage }
 }
 
-/// Sleeps until then, or for ever.
+/// Sleeps until this time, or forever.
 async fn sleep_until(due: Option<Instant>) {
     match due {
         Some(due) => tokio::time::sleep_until(due.into()).await,

@@ -1,11 +1,11 @@
-//! Heartbeats of life, given from any thread for the price of storing a number.
+//! Heartbeats: recorded by any thread at the cost of an atomic store.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// Where signs of life of the children are left; clones leave them at the same place. Nobody is woken by them: they are
-/// looked at before anything is decided.
+/// Records heartbeats of the children; clones share the records. Recording wakes no thread: the records are read before
+/// every decision of the supervisor.
 #[derive(Clone, Debug)]
 pub struct Heartbeats {
     begun: Instant,
@@ -14,7 +14,7 @@ pub struct Heartbeats {
 
 #[derive(Debug, Default)]
 struct Heartbeat {
-    /// When it was last heard, ns since the beginning and at least 1; 0 if not since the last look.
+    /// Time of the last heartbeat, ns since `begun` and at least 1; 0 if there was none since the last read.
     heard: AtomicU64,
     delivered: AtomicBool,
 }
@@ -24,7 +24,7 @@ impl Heartbeats {
         Self { begun: Instant::now(), children: (0..children).map(|_| Heartbeat::default()).collect() }
     }
 
-    /// The child is alive.
+    /// Records that the child is alive.
     pub fn heartbeat(&self, number: u32) {
         if let Some(sign) = self.sign(number) {
             let now = u64::try_from(self.now().as_nanos()).unwrap_or(u64::MAX);
@@ -32,7 +32,7 @@ impl Heartbeats {
         }
     }
 
-    /// The child is alive and has delivered something.
+    /// Records that the child is alive and has delivered something.
     pub fn delivered(&self, number: u32) {
         self.heartbeat(number);
         if let Some(sign) = self.sign(number) {
@@ -40,17 +40,17 @@ impl Heartbeats {
         }
     }
 
-    /// Time since the beginning.
+    /// Time since `begun`.
     pub(super) fn now(&self) -> Duration {
         self.begun.elapsed()
     }
 
-    /// The instant so long after the beginning, if there is one.
+    /// The instant at this time since `begun`, if it can be represented.
     pub(super) fn instant(&self, since_beginning: Duration) -> Option<Instant> {
         self.begun.checked_add(since_beginning)
     }
 
-    /// When each child was last heard since the last look, and whether it was delivered: number, time, delivered.
+    /// Heartbeats since the last call: number of the child, time, and whether it delivered something.
     pub(super) fn collect(&self) -> impl Iterator<Item = (u32, Duration, bool)> {
         (0..).zip(self.children.iter()).filter_map(|(number, sign)| {
             let delivered = sign.delivered.swap(false, Ordering::Relaxed);

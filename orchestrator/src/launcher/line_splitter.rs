@@ -1,13 +1,13 @@
-//! Bytes into lines.
+//! Splits a stream of bytes into lines.
 
-/// Longer lines are broken up: whoever writes without end of line must not fill the memory.
+/// Longer lines are split, so that output without line endings does not fill the memory.
 const MAX_LINE_BYTES: usize = 8192;
 
-/// Takes bytes as they come and gives the lines in them.
+/// Splits a stream of bytes into lines.
 #[derive(Debug, Default)]
 pub(super) struct LineSplitter {
     bytes: Vec<u8>,
-    /// So many of them have been given away.
+    /// Number of bytes already returned.
     given: usize,
 }
 
@@ -18,7 +18,7 @@ impl LineSplitter {
         self.bytes.extend_from_slice(bytes);
     }
 
-    /// The next whole line, without its end.
+    /// The next complete line, without line ending.
     pub fn next_line(&mut self) -> Option<String> {
         let left = &self.bytes[self.given..];
         let window = &left[..left.len().min(MAX_LINE_BYTES)];
@@ -31,7 +31,7 @@ impl LineSplitter {
         Some(text(&window[..length]))
     }
 
-    /// What is left at the end, without an end of line.
+    /// The rest at the end of the stream.
     pub fn rest(&mut self) -> Option<String> {
         let rest = std::mem::take(self);
         let rest = &rest.bytes[rest.given..];
@@ -43,7 +43,7 @@ fn text(line: &[u8]) -> String {
     String::from_utf8_lossy(line).trim_end().to_owned()
 }
 
-/// Whether a line may stand for why a process failed: what Rust writes after the reason of a panic does not.
+/// Whether a line may explain a failure. Rust's hint about backtraces after a panic does not.
 pub(super) fn is_failure_reason(line: &str) -> bool {
     !line.is_empty() && !line.starts_with("note: run with `RUST_BACKTRACE=")
 }

@@ -1,27 +1,27 @@
-//! One child: where it stands and what it waits for.
+//! State of one child process.
 
 use std::time::Duration;
 
 use super::{Action, ChildState, ChildStatus, ExitReason, Limits};
 
-/// Where a child stands, with the times that decide what comes next.
+/// State of a child, with the times that determine its next action.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum State {
-    /// No process; the next start is due then.
+    /// No process; start one at this time.
     Waiting { until: Duration },
-    /// A process that was last heard of then, if it ever was: else it was started then.
+    /// A process with its last heartbeat, or its start time if `yet` is false.
     Running { heard: Duration, yet: bool },
-    /// A process that was told to end.
+    /// The process was asked to exit.
     Stopping { since: Duration },
-    /// A process that was killed, and why.
+    /// The process was killed, with the reason.
     Killed { reason: KillReason },
-    /// No process: ended in order.
+    /// No process: it exited normally.
     Exited,
-    /// No process: failed too often.
+    /// No process: it failed too often.
     Failed,
 }
 
-/// What a process was killed for.
+/// Why a process was killed.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum KillReason {
     Unresponsive(Duration),
@@ -31,11 +31,12 @@ pub(super) enum KillReason {
 #[derive(Clone, Debug)]
 pub(super) struct Child {
     pub state: State,
-    /// Starts so far.
+    /// Number of starts.
     pub incarnation: u32,
-    /// Failures in a row, without anything useful in between.
+    /// Consecutive failures without a delivery.
     pub failures: u32,
-    /// Starts in a row that failed because the host lacked something. They do not count as failures of the child.
+    /// Consecutive starts that failed because of a shortage of resources on the host. They are not failures of the
+    /// child.
     shortages: u32,
     restarts: u32,
     last_failure: Option<ExitReason>,
@@ -49,16 +50,16 @@ impl Default for Child {
 }
 
 impl Child {
-    /// Whether it never had a process, and may have one.
+    /// Whether it never had a process and can still have one.
     pub fn is_fresh(&self) -> bool {
         self.incarnation == 0 && self.last_failure.is_none() && matches!(self.state, State::Waiting { .. })
     }
 
-    /// What its process ended of: of what it was killed for, if it was. `None` if it had no process.
+    /// Why its process exited; if it was killed, the reason for that. `None` if it had no process.
     pub fn exit_reason(&self, reason: ExitReason) -> Option<ExitReason> {
         match self.state {
             State::Running { .. } | State::Stopping { .. } => Some(reason),
-            // It may have ended by itself just before the signal.
+            // It may have exited by itself just before the signal.
             State::Killed { .. }
                 if !matches!(reason, ExitReason::Signal { signal: 9, .. } | ExitReason::Unknown) =>
             {
@@ -72,7 +73,7 @@ impl Child {
         }
     }
 
-    /// Decides what becomes of it without its process.
+    /// Determines the next state after its process has exited.
     pub fn exited(&mut self, reason: &ExitReason, limits: &Limits, stopping: bool, now: Duration) {
         let may_leave = stopping || !limits.detached;
         let failed = !(may_leave && reason.is_success() || stopping && reason.is_expected_after_stop());
@@ -92,7 +93,7 @@ impl Child {
         };
     }
 
-    /// What is due of it by now; it counts as done.
+    /// The action that is due, which then counts as done.
     pub fn due_action(&mut self, number: u32, limits: &Limits, now: Duration) -> Option<Action> {
         if self.next_deadline(limits).is_none_or(|due| due > now) {
             return None;
@@ -122,7 +123,7 @@ impl Child {
         Some(action)
     }
 
-    /// When something will be due of it.
+    /// Time of the next action.
     pub fn next_deadline(&self, limits: &Limits) -> Option<Duration> {
         match self.state {
             State::Waiting { until } => Some(until),
@@ -154,7 +155,7 @@ impl Child {
     }
 }
 
-/// The pause after so many failures in a row: it doubles from the first to the longest.
+/// Backoff after this number of consecutive failures; doubles up to the maximum.
 fn backoff(limits: &Limits, failures: u32) -> Duration {
     let doublings = 1u32.checked_shl(failures.saturating_sub(1)).unwrap_or(u32::MAX);
     limits.initial_backoff.saturating_mul(doublings).min(limits.max_backoff)

@@ -1,4 +1,4 @@
-//! How a process ended, in words.
+//! Why a process exited.
 
 use std::fmt;
 use std::time::Duration;
@@ -6,53 +6,53 @@ use std::time::Duration;
 /// Exit code of a program that panicked.
 const PANIC: i32 = 101;
 
-/// How a process ended. Its text is what `status` shows.
+/// Why a process exited. `status` shows it as text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ExitReason {
-    /// It left with an exit code.
+    /// It exited with a code.
     Exit {
-        /// 0 if it went home; 130 or 143 if it was interrupted and left in order.
+        /// 0 if it finished its work; 130 or 143 if it was interrupted and exited normally.
         code: i32,
-        /// The last line that it wrote to its standard error.
+        /// Last line of its standard error.
         last_line: Option<String>,
     },
-    /// A signal ended it.
+    /// It was killed by a signal.
     Signal {
         /// Number of the signal.
         signal: i32,
-        /// The last line that it wrote to its standard error.
+        /// Last line of its standard error.
         last_line: Option<String>,
     },
-    /// It gave no sign of life for so long, and was killed.
+    /// It sent no heartbeat for this time and was killed.
     Unresponsive(Duration),
-    /// It was still there so long after it was told to end, and was killed.
+    /// It did not exit within this time after it was asked to, and was killed.
     StopTimeout(Duration),
     /// It could not be started.
     StartFailed {
-        /// What the system said.
+        /// The error.
         reason: String,
-        /// Whether the host lacked descriptors, processes or memory: the start says nothing about the child, and a later
-        /// one may succeed.
+        /// Whether the host lacked file descriptors, processes or memory. The failure then says nothing about the
+        /// child, and a later start may succeed.
         is_shortage: bool,
     },
-    /// It ended, and how is not for us to know: an adopted process is not our child.
+    /// Unknown, because an adopted process is not a child of this process.
     Unknown,
 }
 
 impl ExitReason {
-    /// Whether it went home.
+    /// Whether it finished its work.
     pub fn is_success(&self) -> bool {
         matches!(self, Self::Exit { code: 0, .. })
     }
 
-    /// Whether it was not started because the host lacked something.
+    /// Whether it could not be started because of a shortage of resources on the host.
     pub(super) fn is_shortage(&self) -> bool {
         matches!(self, Self::StartFailed { is_shortage: true, .. })
     }
 
-    /// Whether the process crashed, so that the next one with the same work may well go the same way. Otherwise the end
-    /// came from outside (a SIGKILL of the kernel that was out of memory, a user's SIGTERM, a host that is too busy to
-    /// give signs of life), or the process itself said why it left.
+    /// Whether the process crashed, so that another process with the same work may crash as well. Otherwise the cause
+    /// was external (SIGKILL by the kernel when out of memory, SIGTERM by a user, a host too busy for heartbeats), or
+    /// the process itself reported why it exited.
     pub fn is_crash(&self) -> bool {
         match self {
             Self::Exit { code, .. } => *code == PANIC,
@@ -63,12 +63,12 @@ impl ExitReason {
         }
     }
 
-    /// Whether a process that was told to end by SIGTERM has done as it was told.
+    /// Whether this is the expected result of SIGTERM.
     pub(super) fn is_expected_after_stop(&self) -> bool {
         match self {
             Self::Exit { code, .. } => is_interrupted(*code),
             Self::Signal { signal, .. } => signal_name(*signal) == "SIGTERM",
-            // Of a process that is not our child nothing more can be known.
+            // Nothing else can be known about a process that is not our child.
             other => matches!(other, Self::Unknown),
         }
     }
@@ -86,7 +86,7 @@ impl fmt::Display for ExitReason {
                     name => write!(f, " ({name})")?,
                 }
                 match last_line {
-                    // The last words before a death from outside have nothing to do with it.
+                    // If the cause is external, the last line is unrelated.
                     Some(line) if self.is_crash() => write!(f, ": {line}"),
                     _ => Ok(()),
                 }
@@ -101,12 +101,12 @@ impl fmt::Display for ExitReason {
     }
 }
 
-/// Whether a process that caught SIGINT or SIGTERM says so by its exit code: 128 and the signal, as shells have it.
+/// Whether the exit code says that the process handled SIGINT or SIGTERM: 128 plus the signal number, as in shells.
 fn is_interrupted(code: i32) -> bool {
     matches!(code, 130 | 143)
 }
 
-/// Name of a signal, empty if it has none here.
+/// Name of a signal, or empty.
 fn signal_name(signal: i32) -> &'static str {
     match signal {
         1 => "SIGHUP",

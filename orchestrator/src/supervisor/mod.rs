@@ -1,14 +1,14 @@
-//! The supervisor: which of a numbered set of processes is to be started, told to end, or killed, and when.
+//! The supervisor: decides which of a numbered set of processes to start, stop or kill, and when.
 //!
-//! A pure, synchronous core: what happened to the processes goes in, orders come out. It reads no clock and knows
-//! no process; every time is one since a fixed instant of whoever asks, [`crate::launcher::Children`] say.
+//! A pure, synchronous core: events of the processes go in, actions come out. It reads no clock and handles no process;
+//! all times are relative to a fixed instant chosen by the caller, for example [`crate::launcher::Children`].
 //!
-//! A child that ended without having been sent home is started again after a pause, which doubles with each failure in a
-//! row. Being useful (a delivered report, a label) ends the row: a sign of life alone does not, or a child that dies
-//! of its first piece of work would be started for ever.
+//! A child that exits before its work is finished is restarted after a backoff, which doubles with each consecutive
+//! failure. A delivery (a report, a label) resets the count of failures. A heartbeat does not, or a child that crashes
+//! in its first piece of work would be restarted forever.
 //!
-//! A start that fails because the host lacks descriptors, processes or memory says nothing about the child: it is tried again,
-//! after pauses that double likewise, and never ends in giving up.
+//! If a start fails because the host lacks file descriptors, processes or memory, this says nothing about the child:
+//! the start is repeated with the same doubling backoff, without limit.
 
 mod child;
 mod exit_reason;
@@ -18,21 +18,21 @@ use std::time::Duration;
 use child::{Child, State};
 pub use exit_reason::ExitReason;
 
-/// How patient a supervisor is.
+/// Timeouts and limits of a supervisor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// A child that gave no sign of life for so long, from its start on, hangs and is killed.
+    /// A child without heartbeat for this time is considered hung and killed.
     pub heartbeat_timeout: Duration,
-    /// Pause before the start after a first failure; it doubles with each further one in a row.
+    /// Delay before the restart after the first failure; doubles with each consecutive failure.
     pub initial_backoff: Duration,
-    /// No pause is longer.
+    /// Maximum delay before a restart.
     pub max_backoff: Duration,
-    /// A child is started again so many times in a row without having been useful; the failure after that is its last.
+    /// Maximum number of consecutive restarts without a delivery; the child fails after that.
     pub max_restarts: u32,
-    /// What is left so long after it was told to end is killed; if it outlives its parent, it is left to itself.
+    /// Time between asking a process to exit and killing it. Detached processes are left running instead.
     pub grace_period: Duration,
-    /// The children work for the campaign, not for the parent: they may go on without it, and one that leaves while
-    /// there is work has failed, whatever its exit code.
+    /// Whether the children work for the campaign and not for the parent: they may continue without it, and exiting
+    /// while there is work is a failure, whatever the exit code.
     pub detached: bool,
 }
 
@@ -50,45 +50,45 @@ impl Default for Limits {
     }
 }
 
-/// What is to be done with a process.
+/// What to do with a process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
-    /// Start it. It counts as started from here on; if that fails, it has ended as [`ExitReason::StartFailed`].
+    /// Start it. It counts as started from now on; if the start fails, it has exited with [`ExitReason::StartFailed`].
     Start {
-        /// Which child.
+        /// Number of the child.
         number: u32,
-        /// The how-manieth start of this child, from 1: never the same twice.
+        /// Start count of this child, from 1.
         incarnation: u32,
     },
-    /// Ask it to end in order (SIGTERM).
+    /// Ask it to exit (SIGTERM).
     Terminate {
-        /// Which child.
+        /// Number of the child.
         number: u32,
     },
-    /// End it (SIGKILL).
+    /// Kill it (SIGKILL).
     Kill {
-        /// Which child.
+        /// Number of the child.
         number: u32,
     },
 }
 
-/// Where a child stands.
+/// State of a child.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChildState {
-    /// Started, and not heard of yet.
+    /// Started, without a heartbeat so far.
     Starting,
-    /// At work.
+    /// Running.
     Running,
-    /// To be started again in a while.
+    /// Waiting for a restart.
     BackingOff {
-        /// For so long yet.
+        /// Remaining time.
         left: Duration,
     },
-    /// Told to end, or killed, and not gone yet.
+    /// Asked to exit, or killed, and still running.
     Stopping,
-    /// Ended in order; it will not be started again.
+    /// Exited normally; it is not restarted.
     Exited,
-    /// Failed too often in a row; it will not be started again.
+    /// Failed too often; it is not restarted.
     Failed,
 }
 
@@ -105,33 +105,33 @@ impl std::fmt::Display for ChildState {
     }
 }
 
-/// What there is to say of a child.
+/// Status of a child.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChildStatus {
-    /// Which child.
+    /// Number of the child.
     pub number: u32,
-    /// Starts so far; 0 if the process was adopted and is still that one.
+    /// Start count; 0 for an adopted process.
     pub incarnation: u32,
-    /// Where it stands.
+    /// State.
     pub state: ChildState,
-    /// Starts that followed a failure.
+    /// Number of restarts after a failure.
     pub restarts: u32,
-    /// How it failed last, if it ever did.
+    /// The last failure.
     pub last_failure: Option<ExitReason>,
 }
 
-/// The end of a process, as the supervisor judges it.
+/// The exit of a process, as the supervisor interprets it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChildExit {
-    /// Which start it was; 0 for an adopted process.
+    /// Start count of the process; 0 for an adopted process.
     pub incarnation: u32,
-    /// How it ended: in place of the signal, why it was sent.
+    /// Why it exited; if it was killed, why.
     pub reason: ExitReason,
-    /// What becomes of the child: pausing, gone home or given up.
+    /// State of the child after the exit: backing off, exited or failed.
     pub then: ChildState,
 }
 
-/// Watches the children of one kind, numbered from 0.
+/// Supervises the children of one kind, numbered from 0.
 #[derive(Clone, Debug)]
 pub struct Supervisor {
     limits: Limits,
@@ -140,13 +140,13 @@ pub struct Supervisor {
 }
 
 impl Supervisor {
-    /// So many children, all of which are due to be started.
+    /// This number of children, all due to be started.
     pub fn new(children: u32, limits: Limits) -> Self {
         Self { limits, children: (0..children).map(|_| Child::default()).collect(), stopping: false }
     }
 
-    /// Takes a living process for a child that was not started yet. Refused (`false`) when there is no such child,
-    /// when it was started before, and after a stop.
+    /// Adopts a running process as a child that was never started. Returns `false` if there is no such child, if it was
+    /// started before, or after a stop.
     pub fn adopt(&mut self, number: u32, now: Duration) -> bool {
         match self.child(number) {
             Some(child) if child.is_fresh() => {
@@ -157,25 +157,26 @@ impl Supervisor {
         }
     }
 
-    /// A sign of life.
+    /// Records a heartbeat.
     pub fn heartbeat(&mut self, number: u32, now: Duration) {
-        // Signs of a process that is dead or being killed come late and mean nothing.
+        // Late heartbeats of a process that is dead or being killed mean nothing.
         if let Some(State::Running { heard, yet }) = self.child(number).map(|child| &mut child.state) {
             *heard = now.max(*heard);
             *yet = true;
         }
     }
 
-    /// The child delivered something: whatever failed before, its next failure is a first one.
+    /// Records a delivery, which resets the count of failures.
     pub fn delivered(&mut self, number: u32, now: Duration) {
         self.heartbeat(number, now);
-        // It may have died since: what it delivered counts all the same.
+        // The process may have died since; its delivery still counts.
         if let Some(child) = self.child(number) {
             child.failures = 0;
         }
     }
 
-    /// The process of a child is gone (and reaped, if it was a child). `None` if it had none.
+    /// Records that a child's process has exited (and was waited for, if it was a child process). `None` if it had
+    /// none.
     pub fn ended(&mut self, number: u32, reason: ExitReason, now: Duration) -> Option<ChildExit> {
         let (limits, stopping) = (self.limits, self.stopping);
         let child = self.child(number)?;
@@ -184,7 +185,7 @@ impl Supervisor {
         Some(ChildExit { incarnation: child.incarnation, reason, then: child.public_state(now) })
     }
 
-    /// There is no more work: nothing is started any more.
+    /// There is no more work: starts no more processes.
     pub fn close(&mut self) {
         self.stopping = true;
         for child in &mut self.children {
@@ -194,8 +195,8 @@ impl Supervisor {
         }
     }
 
-    /// The whole set is to end: nothing is started any more, what runs is told to end, and killed by [`Self::due_actions`]
-    /// when its time of grace is over.
+    /// Stops all children: starts no more processes and asks the running ones to exit. [`Self::due_actions`] kills them
+    /// after the grace period.
     pub fn stop(&mut self, now: Duration) -> Vec<Action> {
         self.close();
         let mut actions = Vec::new();
@@ -208,7 +209,7 @@ impl Supervisor {
         actions
     }
 
-    /// What is due by now. To be asked at [`Self::next_deadline`], and after anything else that happened.
+    /// The actions that are due. Call it at [`Self::next_deadline`], and after every other event.
     pub fn due_actions(&mut self, now: Duration) -> Vec<Action> {
         let limits = self.limits;
         if self.was_suspended(now) {
@@ -218,17 +219,17 @@ impl Supervisor {
         (0..).zip(&mut self.children).filter_map(due).collect()
     }
 
-    /// When something will be due if nothing happens until then.
+    /// Time of the next action if no event happens before.
     pub fn next_deadline(&self) -> Option<Duration> {
         self.children.iter().filter_map(|child| child.next_deadline(&self.limits)).min()
     }
 
-    /// Whether no process is left and none will be started.
+    /// Whether no process is running and none will be started.
     pub fn is_over(&self) -> bool {
         self.children.iter().all(|child| matches!(child.state, State::Exited | State::Failed))
     }
 
-    /// Where each of the children stands.
+    /// Status of all children.
     pub fn status(&self, now: Duration) -> impl Iterator<Item = ChildStatus> {
         (0..).zip(&self.children).map(move |(number, child)| child.status(number, now))
     }
@@ -237,8 +238,8 @@ impl Supervisor {
         self.children.get_mut(usize::try_from(number).ok()?)
     }
 
-    /// Whether whoever was to ask at [`Self::next_deadline`] was itself held up, by Ctrl-Z or a host that was suspended.
-    /// Nobody listened in that time, so that no silence is proved.
+    /// Whether the caller itself was suspended past [`Self::next_deadline`], by Ctrl-Z or because the host was
+    /// suspended. Heartbeats were not received in that time, so their absence proves nothing.
     fn was_suspended(&self, now: Duration) -> bool {
         self.next_deadline().is_some_and(|due| now.saturating_sub(due) > self.limits.heartbeat_timeout / 10)
     }
