@@ -306,8 +306,8 @@ fn a_database_that_does_not_fit_is_refused() {
         error.expect("refused").to_string()
     };
     assert!(try_restore(&settings(Mode::Live), 2, None, good.clone()).is_ok());
-    assert!(refused(1, &|_| ()).contains("walk 1 starts from seed structure 1, but there are 1"));
-    assert!(refused(2, &|s| drop(s.walks.remove(0))).contains("walk 1 stands where walk 0 should"));
+    assert!(refused(1, &|_| ()).contains("walk 1 starts from seed structure 1, but there are only 1"));
+    assert!(refused(2, &|s| drop(s.walks.remove(0))).contains("found walk 1 in place of walk 0"));
     assert!(refused(2, &|s| s.walks[1].selector_state.clear()).contains("state of walk 1 is damaged"));
     assert!(refused(2, &|s| s.values[0].1.push('x')).contains("not a number"));
     let component = |bytes| ComponentRecord { element: 0, slot: 9, bytes };
@@ -330,7 +330,7 @@ fn a_seed_structure_that_cannot_be_graded_is_named() {
         SelectorSnapshot::default(),
     );
     let message = found.err().expect("refused").to_string();
-    assert_eq!(message, "seed structure 'seed-0': atom 1 is Cu, which the model does not know");
+    assert_eq!(message, "seed structure 'seed-0': atom 1 is Cu, which the model does not support");
 }
 
 #[test]

@@ -183,7 +183,7 @@ fn bytes_that_are_not_aligned_are_refused_in_place_and_copied_well() {
 }
 
 #[test]
-#[should_panic = "the hash of this very structure"]
+#[should_panic = "the id contains the hash of the structure"]
 fn a_candidate_with_the_name_of_another_is_not_encoded() {
     let mut candidate = some_block().view().to_candidate();
     candidate.structure.positions[0][0] = 1.0;

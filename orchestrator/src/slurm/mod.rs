@@ -1,6 +1,6 @@
 //! The jobs of a campaign in the batch system Slurm.
 //!
-//! A campaign has one job for its orchestrator, one for each agent and one for each group of labellers. Each job has a
+//! A campaign has one job for its orchestrator, one for each agent and one for each labeller. Each job has a
 //! unique [name](JobNames) and depends on being the only job with that name (`singleton`): if two are submitted at the
 //! same time, one waits for the end of the other. Slurm itself thus ensures that there is at most one orchestrator, and
 //! no more agents than requested, however often jobs are launched.

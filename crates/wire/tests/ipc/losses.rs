@@ -24,7 +24,7 @@ async fn a_lost_offer_is_found_by_asking() {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
     let reason = server.handle.traffic().last_rejected.unwrap();
-    assert_eq!(reason, "a message of walker 0, which is not expected");
+    assert_eq!(reason, "message of unexpected walker 0");
     server.handle.expect(0, 1);
     let first = server.offer().await;
     let last = server.go_on(first, 1, (3, 4)).await;

@@ -104,15 +104,15 @@ async fn what_is_no_message_is_dropped_and_counted() {
     let mut last = server.offer().await;
     let stranger = Stranger::enter(&server);
 
-    stranger.refused(&server, &[], "a request of 0 bytes").await;
+    stranger.refused(&server, &[], "request too short: 0 bytes").await;
     stranger
         .refused(
             &server,
             &[0xff; 304],
-            "a request of 304 bytes with a control message of 18446744073709551615",
+            "request of 304 bytes, but its control message should have 18446744073709551615",
         )
         .await;
-    stranger.refused(&server, &framed(b"", b""), "a control message of 0 bytes").await;
+    stranger.refused(&server, &framed(b"", b""), "control message too short: 0 bytes").await;
     last = server.go_on(last, 1, (3, 4)).await;
 
     let good = sealed(&stranger.letter((7, 2), QUESTION));
@@ -122,22 +122,26 @@ async fn what_is_no_message_is_dropped_and_counted() {
         framed(&bytes, b"")
     };
     stranger.refused(&server, &changed(0, b'B'), "not a control message").await;
-    stranger.refused(&server, &changed(4, 1), "a control message of version 1").await;
-    stranger.refused(&server, &changed(12, 0x55), "a damaged control message").await;
+    stranger.refused(&server, &changed(4, 1), "control message of version 1,").await;
+    stranger.refused(&server, &changed(12, 0x55), "damaged control message").await;
     let trailing = sealed(&[stranger.letter((7, 2), QUESTION).as_slice(), &[0]].concat());
-    stranger.refused(&server, &framed(&trailing, b""), "1 bytes behind the end").await;
+    stranger.refused(&server, &framed(&trailing, b""), "1 extra bytes after the end").await;
     let unknown = sealed(&stranger.letter((7, 2), &[9]));
-    stranger.refused(&server, &framed(&unknown, b""), "cannot be decoded").await;
+    stranger.refused(&server, &framed(&unknown, b""), "cannot decode control message").await;
     last = server.go_on(last, 2, (3, 4)).await;
 
     let of = |caller, words: &[u8]| framed(&sealed(&stranger.letter(caller, words)), b"");
-    stranger.refused(&server, &of((7, 2), QUESTION), "a message of walker 7, which is not expected").await;
+    stranger.refused(&server, &of((7, 2), QUESTION), "message of unexpected walker 7").await;
     stranger
-        .refused(&server, &of((0, 2), NOTHING), "a message of incarnation 2 of walker 0; expected 1")
+        .refused(
+            &server,
+            &of((0, 2), NOTHING),
+            "message of incarnation 2 of walker 0, expected incarnation 1",
+        )
         .await;
     let other = Stranger { session: !stranger.session, ..Stranger::enter(&server) };
     let bytes = framed(&sealed(&other.letter((0, 1), QUESTION)), b"");
-    other.refused(&server, &bytes, "a message of session ffffffff").await;
+    other.refused(&server, &bytes, "message of session ffffffff").await;
     last = server.go_on(last, 3, (3, 4)).await;
 
     last.reply.send(None).unwrap();
@@ -165,19 +169,21 @@ async fn an_offer_whose_candidate_is_wrong_changes_nothing() {
         .refused(
             &server,
             &with(&offer(9, &candidate), block.as_bytes()),
-            "offer 9 of walker 7, whose last was 0",
+            "offer 9 of walker 7 is out of order: the last was 0",
         )
         .await;
-    stranger.refused(&server, &with(&one, b""), "the block beside it is none").await;
-    stranger.refused(&server, &with(&one, &block.as_bytes()[..104]), "a candidate block of 104 bytes").await;
+    stranger.refused(&server, &with(&one, b""), "the attached block is none").await;
+    stranger
+        .refused(&server, &with(&one, &block.as_bytes()[..104]), "candidate block too short: 104 bytes")
+        .await;
     let mut damaged = block.as_bytes().to_vec();
     *damaged.last_mut().unwrap() ^= 1;
-    stranger.refused(&server, &with(&one, &damaged), "a damaged candidate block").await;
+    stranger.refused(&server, &with(&one, &damaged), "damaged candidate block").await;
     let mut other = candidate.clone();
     other.id.step += 1;
     let other = CandidateBlock::encode(&other);
-    stranger.refused(&server, &with(&one, other.as_bytes()), "the block beside it is 07070707-3.0.2-").await;
-    let beside = "bytes of a candidate beside a message that names none";
+    stranger.refused(&server, &with(&one, other.as_bytes()), "the attached block is 07070707-3.0.2-").await;
+    let beside = "bytes: the message names none";
     stranger.refused(&server, &with(NOTHING, block.as_bytes()), beside).await;
     assert!(server.incoming.try_recv().is_err() && server.heard.lock().unwrap().is_empty());
 

@@ -109,7 +109,7 @@ async fn files_come_by_their_hash_and_agents_are_told_to_stop() {
     assert!(joined.fetch_file("0123").await.unwrap() == content);
     let refused = joined.fetch_file("../../etc/passwd").await.unwrap_err();
     assert!(
-        matches!(&refused, LinkError::Rejected(why) if why.contains("no file with the hash")),
+        matches!(&refused, LinkError::Rejected(why) if why.contains("has no file with hash")),
         "{refused}"
     );
     assert_eq!(joined.is_stopping().await.unwrap(), Some(false));

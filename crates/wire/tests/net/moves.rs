@@ -28,7 +28,7 @@ async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
     };
     let mut head = TestServer::open(Wanted::default()).await;
     let told = tokio::task::spawn_blocking(move || whys.recv_timeout(LIMIT).unwrap()).await.unwrap();
-    assert!(told.contains("has written yet where it is"), "{told}");
+    assert!(told.contains("endpoint file not found"), "{told}");
     write(Announcement::Endpoint(endpoint(head.port)));
     let uplink = Arc::new(timeout(LIMIT, opening).await.expect("in time").unwrap());
     let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());

@@ -45,10 +45,10 @@ async fn foreign_messages_are_dropped_and_spoken_of() {
     let other_version = [&9_u64.to_le_bytes()[..], b"CALM\x09\0\0\0\0\0\0\0\0\0\0\0"].concat();
     let damaged = [&9_u64.to_le_bytes()[..], b"CALM\x02\0\0\0\x01\0\0\0\0\0\0\0"].concat();
     let cases = [
-        (Vec::new(), "a request of 0 bytes"),
-        (vec![1, 2, 3], "its length alone has 8"),
-        (vec![0xff; 64], "with a control message of 18446744073709551615"),
-        (other_version, "a control message of version 9; this program reads version"),
+        (Vec::new(), "request too short: 0 bytes"),
+        (vec![1, 2, 3], "the length field alone has 8"),
+        (vec![0xff; 64], "but its control message should have 18446744073709551615"),
+        (other_version, "control message of version 9, expected version"),
         (damaged, "checksum"),
     ];
     for (payload, expected) in cases {

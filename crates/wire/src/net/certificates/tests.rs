@@ -90,7 +90,7 @@ fn what_is_wrong_with_a_file_is_said_with_its_name() {
         ("key.pem", Some(""), "found no private key"),
         ("key.pem", Some(&authority.pem), "found no private key"),
         ("key.pem", Some(encrypted), "encrypted"),
-        ("key.pem", Some(&other), "not that of"),
+        ("key.pem", Some(&other), "does not belong to"),
         ("authority.pem", Some(no_base64), "damaged"),
         ("certificate.pem", Some(no_base64), "damaged"),
         ("authority.pem", Some(no_certificate), "damaged"),
@@ -117,7 +117,7 @@ fn certificates_of_another_authority_or_for_something_else_are_refused() {
     fs::write(&tls.authority, Authority::new().pem).unwrap();
     for side in [Side::Orchestrator, Side::Agent] {
         let why = refused(&tls, side);
-        assert!(why.contains("certificate.pem: the certificate was not signed by"), "{why}");
+        assert!(why.contains("certificate.pem: the certificate is not signed by"), "{why}");
     }
     let tls = Authority::new().host(here, |certificate| {
         certificate.extended_key_usages = vec![Purpose::ClientAuth];
@@ -125,7 +125,7 @@ fn certificates_of_another_authority_or_for_something_else_are_refused() {
     assert!(refused(&tls, Side::Orchestrator).contains("serverAuth"));
     assert!(tls.check(Side::Agent, today()).is_ok());
     let tls = Authority::new().host(here, |certificate| certificate.subject_alt_names.clear());
-    assert!(refused(&tls, Side::Orchestrator).contains("names no host"));
+    assert!(refused(&tls, Side::Orchestrator).contains("has no host names"));
     assert!(tls.check(Side::Agent, today()).is_ok(), "nobody asks an agent for its name");
 }
 
@@ -149,5 +149,5 @@ fn a_certificate_is_refused_before_and_after_its_time_and_spoken_of_before_its_e
     assert!(why.contains("certificate.pem: the certificate expired on 2030-05-31"), "{why}");
     let early = authority.host(directory.path(), |_| {}).check(Side::Agent, today() - 200 * DAY);
     let why = early.unwrap_err().to_string();
-    assert!(why.contains("certificate.pem: the certificate is valid from 2030-01-01 on"), "{why}");
+    assert!(why.contains("certificate.pem: the certificate is valid only from 2030-01-01"), "{why}");
 }
