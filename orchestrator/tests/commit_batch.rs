@@ -1,4 +1,4 @@
-//! Reports that arrive together are decided one after the other, committed as one, and answered after that.
+//! Reports that arrive together are decided one after the other, committed together, and answered afterwards.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -26,10 +26,10 @@ fn live_settings() -> Settings {
     Settings { max_per_seed_structure: 100, ..settings(Mode::Live) }
 }
 
-/// What a walker may report of a turn.
+/// What a walker may report on an assignment.
 #[derive(Clone, Debug)]
 enum Event {
-    /// A structure of this number, its second atom so far along one direction.
+    /// A structure with this number, whose second atom is at this distance along one direction.
     Candidate(u64, usize, f64),
     Turn,
     Paused,
@@ -58,7 +58,7 @@ fn any_settings() -> impl Strategy<Value = Settings> {
     )
 }
 
-/// The report that this event makes of the next turn, if there is one.
+/// The report on the next assignment for this event, if there is an assignment.
 fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Report> {
     let Scheduling::Assign(assignment) = selector.next_assignment() else { return None };
     let progress = at(10 * (number as u64 + 1));
@@ -109,7 +109,7 @@ proptest! {
         prop_assert_eq!(in_groups, one_by_one);
     }
 
-    /// When a candidate was examined, and under which mixture, makes no difference.
+    /// The result does not depend on when a candidate is regraded, and under which mixture.
     #[test]
     fn candidates_may_be_examined_ahead(
         settings in any_settings(),
@@ -132,7 +132,7 @@ proptest! {
     }
 }
 
-/// A live campaign that has begun, with a connection of its own to the database.
+/// A live campaign with a separate connection to its database.
 struct Live {
     store: Store,
     selector: Selector,
@@ -140,7 +140,7 @@ struct Live {
     _directory: TempDir,
 }
 
-/// Walkers whose reports stand in the channel.
+/// Walkers whose reports are in the channel.
 struct Arrived {
     to_reactor: mpsc::Sender<Incoming>,
     incoming: mpsc::Receiver<Incoming>,
@@ -162,7 +162,7 @@ impl Live {
         sqlx::query(sql).execute(&mut self.connection).await.unwrap();
     }
 
-    /// What the walks report, each of something new to the mixture.
+    /// A report of each walk, with a structure that is new to the mixture.
     fn reports(&mut self) -> Vec<Report> {
         let turns: Vec<_> = (0..WALKS).map(|_| turn(&mut self.selector)).collect();
         let offer = |(k, assignment)| {
@@ -173,7 +173,7 @@ impl Live {
         turns.iter().enumerate().map(offer).collect()
     }
 
-    /// The walks of the stored candidates, in the order in which they were decided.
+    /// The walks of the stored candidates, in decision order.
     async fn stored(&self) -> Vec<usize> {
         let mut walks = Vec::new();
         for (_, id) in self.store.candidate_ids(0, 100).await.unwrap() {
@@ -239,7 +239,7 @@ async fn nobody_is_answered_before_the_group_is_committed() {
     assert_eq!(reactor.await.unwrap().unwrap(), RunOutcome::Stopped);
 }
 
-/// The last of the reports cannot be committed. Who came before it may have been in its group or not.
+/// The last report cannot be committed. Earlier ones may have been in the same batch or not.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_group_that_fails_leaves_nothing_behind_and_is_not_answered() {
     let mut live = Live::begin().await;
@@ -250,7 +250,7 @@ async fn a_group_that_fails_leaves_nothing_behind_and_is_not_answered() {
     let before = live.store.decision_log_text().await.unwrap();
     (0..WALKS as u32 - 1).for_each(|walk| live.selector.assignment_lost(wire::WalkId(walk)));
     let mut reports = live.reports();
-    // The very candidate that is stored already, in a later turn of its walk.
+    // The candidate that is already stored, in a later assignment of its walk.
     reports[2].outcome = Outcome::Candidate(block);
     let Arrived { to_reactor: _open, incoming, mut answers } = Arrived::new(reports);
     let selector = std::mem::replace(&mut live.selector, begin(&live_settings(), WALKS));

@@ -1,4 +1,4 @@
-//! What becomes of candidates: every reason to decline, updates of the mixture, budgets, and what is logged.
+//! Decisions on candidates: every reason to decline, mixture updates, limits, and the log.
 
 use std::sync::Arc;
 
@@ -15,14 +15,14 @@ use crate::common::{
 
 /// γ = 3 in the first component.
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];
-/// γ = 1 there.
+/// γ = 1 in the first component.
 const KNOWN: [f64; 3] = [0.0, 1.0, 0.0];
 
 fn live() -> Settings {
     settings(Mode::Live)
 }
 
-/// A walk's next candidate: the structure of that number with these features.
+/// A walk's next candidate: the structure with this number and these features.
 fn next_candidate(selector: &mut Selector, step: u64, number: u64, z: [f64; 3]) -> Commit {
     let assignment = turn(selector);
     let report = offer(selector, &assignment, step, structure(number, SHORTEST), z);
@@ -41,7 +41,7 @@ fn what_is_accepted_is_covered_from_then_on() {
     );
     assert_eq!((commit.decisions[0].mixture_version, value(&commit, "mixture_version")), (1, "1"));
     assert_eq!(commit.decisions[0].candidate, Some(candidate.block.view().id()));
-    // One component was touched by both atoms, the other by none.
+    // Both atoms belong to one component; the other is unchanged.
     assert_eq!(commit.components.iter().map(|c| (c.element, c.slot)).collect::<Vec<_>>(), [(0, 0)]);
     assert_eq!((commit.walks.len(), commit.walks[0].accepted, commit.walks[0].turn), (1, 1, 1));
     assert!(gamma_max(selector.mixture(), NEW) < 1.25);
@@ -56,12 +56,12 @@ fn what_is_accepted_is_covered_from_then_on() {
     assert_eq!((selector.mixture().version(), commit.components.len()), (1, 0));
 }
 
-/// Three grades are kept: the walker's, the selector's at the decision, that of the original mixture.
+/// Three grades are recorded: the walker's, the selector's at the decision, and that of the original mixture.
 #[test]
 fn each_candidate_has_three_grades() {
     let mut selector = begin(&live(), 2);
     let (first, second) = (turn(&mut selector), turn(&mut selector));
-    // Both walkers have the original mixture; the second candidate comes when the first has been learned.
+    // Both walkers have the original mixture; the second candidate arrives after the first has updated it.
     let reports = [
         offer(&selector, &first, 5, structure(1, SHORTEST), NEW),
         offer(&selector, &second, 5, structure(2, SHORTEST), [0.0, 0.0, 3.5]),
@@ -98,7 +98,7 @@ fn atoms_too_close_are_declined() {
     }
 }
 
-/// The guard's fixed distance holds where a fraction of the seed structure's own is less.
+/// The guard's absolute minimum distance applies if the fraction of the seed structure's distance is smaller.
 #[test]
 fn the_least_distance_is_the_larger_of_two() {
     let mut selector = begin(&Settings { min_distance: (2.5, 0.75), ..live() }, 1);
@@ -144,7 +144,7 @@ fn a_seed_structure_gives_only_so_many() {
     assert_eq!(turn(&mut selector).walk.0, 1);
 }
 
-/// The limit may be lowered while a walk is on its way.
+/// The limit may be lowered while a walk is running.
 #[test]
 fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
     let mut store = common::memory::MemoryStore::default();
@@ -172,7 +172,7 @@ fn a_campaign_collects_only_so_many() {
             kinds(&decided(&mut selector, report))
         })
         .collect();
-    // The last of them ends the walks that nobody has in hand, a walk in hand ends with its report.
+    // The last accept ends the unassigned walks; an assigned walk ends with its report.
     assert_eq!(kinds, ["accepted", "accepted", "ended", "ended", "declined budget", "ended"]);
     assert!(selector.is_done());
 }
@@ -209,11 +209,11 @@ fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
     keep(&commit);
     let walks = walks.values().cloned().collect();
     let stored = SelectorSnapshot { walks, values: begun.values, ..SelectorSnapshot::default() };
-    // With the same budget nothing goes on but the control walk.
+    // With the same limit only the control walk continues.
     let mut same = common::restore(&limited, 2, stored.clone());
     assert!(same.start_walks().decisions.is_empty());
     assert_eq!(turn(&mut same).walk, wire::WalkId(2));
-    // With a larger one both walks do, from where they stood, and only what is new gets another control.
+    // With a larger limit both walks continue from where they ended, and only new structures get another control walk.
     let mut larger = common::restore(&Settings { max_structures: Some(2), ..limited }, 2, stored);
     assert_eq!(kinds(&larger.start_walks()), ["configuration", "resumed", "resumed"]);
     let assignment = turn(&mut larger);
@@ -237,7 +237,7 @@ fn the_first_reason_is_given() {
     let [first, assignments @ ..] = [(); 4].map(|()| turn(&mut selector));
     let report = offer(&selector, &first, 1, structure(9, SHORTEST), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["accepted", "ended"]);
-    // Close and known; known and covered; covered and beyond the budget.
+    // Close and known; known and covered; covered and beyond the limit.
     let offers =
         [(structure(1, 1.0), KNOWN), (structure(2, SHORTEST), KNOWN), (structure(3, SHORTEST), KNOWN)];
     let reasons = assignments.iter().zip(offers).flat_map(|(assignment, (structure, z))| {
@@ -264,7 +264,7 @@ fn the_verdict_goes_with_the_next_turn() {
     decided(&mut selector, report);
     let assignment = turn(&mut selector);
     assert_eq!(assignment.verdict, Some(Verdict::Declined(DeclineReason::Covered)));
-    // Interrupted: the walk has taken the verdict in, and it is not given twice.
+    // Interrupted: the checkpoint already accounts for the verdict, which is not sent again.
     let paused = common::report(&assignment, wire::messages::Outcome::Interrupted, common::at(11));
     let commit = decided(&mut selector, paused);
     assert!(commit.decisions.is_empty() && commit.values.is_empty());
@@ -284,7 +284,7 @@ fn features_of_declined_candidates_have_a_budget() {
     let mut selector = common::restore(&limited, 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
     for (number, keep, bytes) in [(1, true, size), (2, true, 2 * size), (3, false, 2 * size)] {
-        // What is used up is known after a restart, too.
+        // The limit is still reached after a restart.
         selector = common::restore(&limited, 1, store.snapshot());
         let commit = next_candidate(&mut selector, number, number, KNOWN);
         assert_eq!(kinds(&commit), ["declined covered"]);
@@ -313,14 +313,14 @@ fn the_mixture_is_restarted_for_the_next_seed_structure() {
     selector.start_walks();
     let commit = end_first_walk_after_a_collection(&mut selector);
     assert!(commit.restart_mixture && commit.components.is_empty());
-    // The versions go on: no two mixtures share a number.
+    // Versions continue: no two mixtures share a number.
     assert_eq!((value(&commit, "mixture_version"), selector.mixture().version()), ("2", 2));
     assert_eq!(selector.mixture().at_version(0), *mixture());
     let watched: serde_json::Value = serde_json::from_str(value(&commit, "training_frames")).unwrap();
     assert!((watched["maximum"].as_f64().unwrap() - 0.9).abs() < 1e-5, "{watched}");
 }
 
-/// A candidate is accepted from the first walk, which then ends. Returns the last commit.
+/// Accepts a candidate of the first walk, which then ends. Returns the last commit.
 fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     let mut reports = Vec::new();
     while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment() {
@@ -345,7 +345,7 @@ fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
 
 #[test]
 fn forgetting_is_recorded_and_raises_an_alarm() {
-    // Training frames along one direction; the candidates teach another.
+    // Training frames along one direction; the candidates are along another.
     let features: Vec<f64> = (0..20).flat_map(|k| [0.0, 0.0, 0.045 * f64::from(k) + 0.09]).collect();
     let training = TrainingFrames::new(vec![0; 20], features, &mixture()).unwrap();
     let share = training.original.share_above_one;
@@ -371,7 +371,7 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
     assert!(!alarms[0] && alarms[7], "{alarms:?}");
 }
 
-/// What is new, but not so new as it has to be while many structures wait for labels, is told apart.
+/// Candidates that are new, but below the threshold raised by a long queue, have their own reason to decline.
 #[test]
 fn a_raised_threshold_declines_what_lies_below_it() {
     let mut selector = begin(&live(), 1);
@@ -388,7 +388,7 @@ fn a_raised_threshold_declines_what_lies_below_it() {
     assert_eq!((selector.max_unfinished_jobs(100), begin(&live(), 1).max_unfinished_jobs(100)), (200, 100));
 }
 
-/// The update's rule reaches the search, not only the collection's.
+/// The rule of updates is used in the search, not only the collection rule.
 #[test]
 fn the_update_target_is_the_one_of_the_settings() {
     let mut strict = live();

@@ -1,4 +1,4 @@
-//! The reactor with a real database and walkers on threads of their own: nothing is lost, and nothing hangs.
+//! The reactor with a real database and walkers on threads: nothing is lost, and nothing hangs.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::common::{CAMPAIGN, restore, seed, settings};
 
 const PROTOCOL: ContentHash = ContentHash([7; 32]);
 
-/// Walks of 60 steps, each with something new every 7 and a return to a checkpoint.
+/// Walks of 60 steps, each with a new structure every 7 steps and a rollback.
 fn scripts() -> Vec<Script> {
     let event = |walk: u64, step: u64| match step {
         31 => Event::Return,
@@ -38,7 +38,7 @@ async fn a_stop_before_anybody_asks_is_the_end() {
     let directory = tempfile::tempdir().unwrap();
     let store = open(directory.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
-    // Those who carry messages of other hosts hold the way to it until it has ended.
+    // Transports from other hosts keep the channel open until the reactor has ended.
     let (reactor, _to_reactor) = reactor(&store, &stopping).await;
     let running = tokio::spawn(reactor.run(|_| {}));
     tokio::time::sleep(Duration::from_millis(50)).await;
@@ -51,7 +51,7 @@ fn rounds() -> Settings {
     Settings { max_per_seed_structure: 9, control: true, ..settings(Mode::Reproducible) }
 }
 
-/// The campaign's database, made if there is none.
+/// Opens or creates the campaign's database.
 async fn open(directory: &Path) -> Store {
     if directory.join(store::DATABASE).exists() {
         return Store::open(directory).await.unwrap();
@@ -78,7 +78,7 @@ async fn open(directory: &Path) -> Store {
     store
 }
 
-/// A reactor that goes on with what the database holds, and the way to it.
+/// A reactor that continues from the database, and the channel to it.
 async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::Sender<Incoming>) {
     let snapshot = SelectorSnapshot {
         imported: 0,
@@ -97,7 +97,7 @@ async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::S
     (Reactor { selector, store, incoming, stopping, queue_limit }, to_reactor)
 }
 
-/// The turn as a scripted walker does it: interrupted after a few steps if it was asked to stop.
+/// Works on an assignment like a scripted walker: interrupted after a few steps if asked to stop.
 fn work_on(work: &WorkItem, transport: &InProcess) -> Report {
     let assignment = &work.assignment;
     let seed = (0..3).find(|number| seed(*number).structure == assignment.seed_structure).unwrap();
@@ -107,7 +107,7 @@ fn work_on(work: &WorkItem, transport: &InProcess) -> Report {
     report
 }
 
-/// Walkers on threads; dropping the sender afterwards is what ends the reactor.
+/// Walkers on threads; dropping the sender afterwards ends the reactor.
 fn start_walkers(
     number: u32,
     to_reactor: mpsc::Sender<Incoming>,
@@ -125,13 +125,13 @@ fn start_walkers(
     (0..number).map(start).collect()
 }
 
-/// How a reactor ends; its walkers are freed also if it hangs.
+/// How a reactor ends; its walkers are released even if it hangs.
 async fn end_of(reactor: Reactor, watch: impl FnMut(Notice<'_>)) -> RunOutcome {
     let ended = tokio::time::timeout(Duration::from_secs(120), reactor.run(watch)).await;
     ended.expect("the reactor hangs").unwrap()
 }
 
-/// Runs until it is over, or until `stop_after` commits.
+/// Runs until it ends, or until `stop_after` commits.
 async fn run(store: &Store, walkers: u32, stop_after: usize) -> RunOutcome {
     let stopping = Arc::new(AtomicBool::new(false));
     let (reactor, to_reactor) = reactor(store, &stopping).await;
@@ -148,7 +148,7 @@ async fn run(store: &Store, walkers: u32, stop_after: usize) -> RunOutcome {
     ended
 }
 
-/// All of a database that two runs of one campaign must share.
+/// Everything in a database that must be equal in two runs of a campaign.
 async fn content(store: &Store) -> (String, String) {
     let mut candidates = String::new();
     for (_, id) in store.candidate_ids(0, 1000).await.unwrap() {
@@ -212,7 +212,7 @@ async fn walkers_wait_while_the_label_queue_is_full() {
         if store.unfinished_jobs().await.unwrap() <= LIMIT {
             continue; // It was full before the jobs below were taken out.
         }
-        // While it is full, only the round in hand may still come in.
+        // While the queue is full, only the current round may still be committed.
         let before = commits.load(Ordering::Relaxed);
         tokio::time::sleep(Duration::from_millis(450)).await;
         assert!(commits.load(Ordering::Relaxed) <= before + 1);
@@ -226,7 +226,7 @@ async fn walkers_wait_while_the_label_queue_is_full() {
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
-/// With a raised threshold the queue may grow to twice the limit, and no further.
+/// With a raised threshold, the queue may grow to twice the limit, but no further.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long() {
     const LIMIT: u64 = 2;
@@ -242,7 +242,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
             full.send(unfinished).unwrap();
         }
     }));
-    // Walkers by hand: what each turn says of the threshold is seen.
+    // Simulated walkers record the threshold factor of each assignment.
     let raised = Arc::new(std::sync::Mutex::new(Vec::new()));
     let (seen, mut transport) = (Arc::clone(&raised), InProcess::new(0, to_reactor, Arc::clone(&stopping)));
     let walker = thread::spawn(move || {
@@ -274,7 +274,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
     assert!(!factors.is_empty() && factors.iter().all(|factor| (1.0..=2.0).contains(factor)), "{factors:?}");
 }
 
-/// A campaign whose only walker waits can be stopped, also while somebody reports progress without a pause.
+/// A campaign whose only walker waits can be stopped, even while progress is reported continuously.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
     let folder = tempfile::tempdir().unwrap();
@@ -299,7 +299,7 @@ async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
     talking.join().unwrap();
 }
 
-/// A walker that dies with a turn in hand leaves it to the others.
+/// The assignment of a lost walker goes to another one.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_turn_of_a_walker_that_dies_is_done_by_another() {
     let folder = tempfile::tempdir().unwrap();
@@ -327,8 +327,7 @@ async fn a_campaign_whose_walkers_are_all_gone_is_not_done() {
     assert_eq!(end_of(reactor, |_| ()).await, RunOutcome::Stopped);
 }
 
-/// Walkers that end with the first walk's first turn in hand: by their own fault again and again, or because others kill
-/// them.
+/// Walkers that exit during the first assignment of the first walk: by repeated crashes, or because they are killed.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_turn_that_kills_its_walkers_ends_its_walk() {
     for (fault, walkers) in [(true, 3), (false, 5)] {
@@ -354,7 +353,7 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
     }
 }
 
-/// A paused walk gets no turn, its round waits for it, and what is decided is the same as without a pause.
+/// A paused walk gets no assignment, its round waits for it, and the decisions are the same as without a pause.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_paused_walk_stands_still_and_changes_nothing() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());

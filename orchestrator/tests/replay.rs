@@ -1,4 +1,4 @@
-//! What a campaign decided is decided again from its log, exactly; and other rules decide otherwise.
+//! Replaying a campaign's log gives exactly the same decisions with the same rules, and different ones with others.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -14,7 +14,7 @@ use crate::common::eventful::{Campaign, acts, any_settings, scripts};
 use crate::common::scripted::Script;
 use crate::common::{SHORTEST, grader, kinds, mixture, positive, seed, structure};
 
-/// The decisions of a campaign as a store gives them back, each with its candidate.
+/// The decisions of a campaign as restored from a store, each with its candidate.
 fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a CandidateRecord>)> {
     let candidates = campaign.commits.iter().flat_map(|commit| &commit.candidates);
     let candidates: BTreeMap<_, _> = candidates.map(|c| (c.block.view().id().to_string(), c)).collect();
@@ -42,7 +42,7 @@ fn open(campaign: &Campaign<'_>, settings: &Settings, seeds: usize, set: &[&str]
     Replay::new(settings.clone(), set, seeds, grader(), mixture(), None, imported).unwrap()
 }
 
-/// What comes of each place of the log.
+/// Replays each decision of the log.
 fn follow(
     replay: &mut Replay,
     log: &[(LoggedDecision, Option<&CandidateRecord>)],
@@ -57,7 +57,7 @@ fn follow(
     log.iter().map(next).collect()
 }
 
-/// Replays a campaign by its own rules and checks that everything is as it was.
+/// Replays a campaign with its own rules and checks that all decisions are equal.
 fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
     let log = log(campaign);
     let mut replay = open(campaign, settings, seeds, &[]);
@@ -99,7 +99,7 @@ proptest! {
         check_exact(&campaign.finish(false), &settings, scripts.len());
     }
 
-    /// The rules are changed twice, and structures that walks will meet are imported.
+    /// The rules change twice, and structures that walks will meet are imported.
     #[test]
     fn also_where_rules_changed_and_structures_were_imported(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize,
@@ -122,7 +122,7 @@ proptest! {
         check_exact(&campaign.finish(false), &settings, scripts.len());
     }
 
-    /// Where nothing is learned, a threshold alone decides what is new among what was offered.
+    /// If the mixture is never updated, the threshold alone decides which of the offered structures are new.
     #[test]
     fn a_stricter_rule_accepts_what_lies_above_it(
         settings in any_settings(), scripts in scripts(), threshold in 1.5..9.0,
@@ -139,7 +139,8 @@ proptest! {
             let was_accepted = candidate.fate == Fate::Accepted;
             let now = now.unwrap().candidate.unwrap();
             prop_assert_eq!(&now.selector, &candidate.selector);
-            // What is not in the data set any more can be no duplicate: so some that were declined are taken now.
+            // A structure that is no longer in the data set cannot have duplicates, so some declined ones are now
+            // accepted.
             if was_accepted {
                 prop_assert_eq!(now.fate == Fate::Accepted, above);
             } else if now.fate == Fate::Accepted {
@@ -149,7 +150,7 @@ proptest! {
     }
 }
 
-/// The campaigns above are worth the name: rules change in the middle of them, and imports are met.
+/// The campaigns above cover what they should: rules change in the middle of them, and imports are met.
 #[test]
 fn the_campaigns_reach_what_they_are_for() {
     let mut runner = TestRunner::deterministic();

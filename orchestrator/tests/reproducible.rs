@@ -41,7 +41,7 @@ proptest! {
         prop_assert_eq!(crashing.content(), calm_run(&settings, &scripts).content());
     }
 
-    /// Live mode depends on the order of reports, but not on crashes when nothing is under way.
+    /// Live mode depends on the order of reports, but not on crashes while no walker is busy.
     #[test]
     fn a_live_campaign_survives_crashes(settings in any_settings(), scripts in scripts()) {
         let settings = Settings { mode: Mode::Live, ..settings };
@@ -49,7 +49,7 @@ proptest! {
         prop_assert_eq!(crashing.content(), calm_run(&settings, &scripts).content());
     }
 
-    /// What must hold of any campaign, however eventful.
+    /// Properties that hold for every campaign, whatever the events.
     #[test]
     fn budgets_versions_and_rounds_hold(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
@@ -82,7 +82,7 @@ proptest! {
     }
 }
 
-/// The campaigns above are worth the name: every kind of decision and every reason occurs in them.
+/// The campaigns above cover what they should: every kind of decision and every reason occurs.
 #[test]
 fn the_scripts_reach_every_kind_of_decision() {
     let mut runner = TestRunner::deterministic();

@@ -1,4 +1,4 @@
-//! What is submitted and cancelled: by hand, then whoever launches how often while jobs begin, end and come back.
+//! Submitted and cancelled jobs: explicit cases, then arbitrary launches while jobs start, end and are requeued.
 
 use orchestrator::slurm::{DesiredJobs, Job, JobNames, Phase, Plan, Role, Submission, plan};
 use proptest::prelude::*;
@@ -60,7 +60,7 @@ fn in_the_place_of_one_that_ends_another_waits_for_its_end() {
 fn what_is_not_asked_for_any_more_is_cancelled() {
     let jobs = [
         job(7, Role::Orchestrator, "PENDING"),
-        // Two were submitted at once: the first stays; of a third the one that runs.
+        // Two were submitted at once: the first stays; of a third role, the running one stays.
         job(8, Role::Orchestrator, "PENDING"),
         job(2, Role::Agent(0), "PENDING"),
         job(3, Role::Agent(0), "RUNNING"),
@@ -81,7 +81,7 @@ fn agents_with_another_number_of_walkers_are_replaced() {
         job(4, Role::Labeller(0), "RUNNING"),
     ];
     jobs[1].walkers = Some(8);
-    // A site that keeps no comments.
+    // A site that does not keep comments.
     jobs[2].walkers = None;
     let expected = Plan { cancel: vec![2], submit: vec![submission(Role::Agent(0), &[2])] };
     assert_eq!(plan(&WANTED, &jobs), expected);
@@ -95,7 +95,7 @@ fn names_of_jobs_are_what_the_plan_speaks_of() {
     }
 }
 
-/// A job in a batch system that knows `singleton` and `afterany`.
+/// A job in a batch system that supports `singleton` and `afterany`.
 #[derive(Clone, Debug)]
 struct Known {
     job: Job,
@@ -143,7 +143,7 @@ impl System {
             && known.after.iter().all(|id| self.phase(*id) == Phase::Over)
     }
 
-    /// What the system does by itself to the job at a place.
+    /// A state change of a job by the system itself.
     fn moves(&mut self, place: usize, choice: u8) {
         let Some(known) = self.jobs.get(place % self.jobs.len().max(1)) else { return };
         let begins = self.may_begin(known);
@@ -181,7 +181,7 @@ impl System {
     }
 }
 
-/// Somebody who launches: what is still to be done of a plan that was made some time ago.
+/// A launch in progress: the remaining actions of a plan made earlier.
 #[derive(Debug, Default)]
 struct Launcher {
     wanted: Option<DesiredJobs>,
@@ -226,7 +226,8 @@ proptest! {
             }
             system.check(&most);
         }
-        // Whatever there was, a launch that nobody disturbs leaves what it asks for, and another has nothing to do.
+        // From any state, a launch without concurrent changes leaves the desired jobs, and a second launch does
+        // nothing.
         let wanted = asked[0];
         for known in &mut system.jobs {
             if known.job.phase() == Phase::Completing {

@@ -1,4 +1,4 @@
-//! The supervisor: scenarios by hand, then whatever may happen in any order.
+//! The supervisor: explicit scenarios, then arbitrary events in any order.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -39,7 +39,7 @@ fn status(supervisor: &Supervisor, number: u32, now: Duration) -> ChildStatus {
     supervisor.status(now).nth(number as usize).unwrap()
 }
 
-/// A supervisor of so many children, all started at 0.
+/// A supervisor of this number of children, all started at time 0.
 fn started(children: u32) -> Supervisor {
     let mut supervisor = Supervisor::new(children, LIMITS);
     let actions: Vec<_> = (0..children).map(|number| start(number, 1)).collect();
@@ -59,7 +59,7 @@ fn who_outlives_its_parent_stays_while_there_is_work_and_is_not_killed() {
         supervisor.ended(0, ExitReason::Exit { code: 130, last_line: None }, s(11)).unwrap().then,
         ChildState::Exited
     );
-    // The other still has something in hand when its time of grace is over.
+    // The other child is still working when its grace period ends.
     assert_eq!((supervisor.due_actions(s(39)), supervisor.is_over()), (vec![], false));
     assert_eq!((supervisor.due_actions(s(40)), supervisor.is_over()), (vec![], true));
 }
@@ -90,7 +90,7 @@ fn pauses_double_up_to_the_longest_until_the_child_is_given_up() {
         assert_eq!(supervisor.next_deadline(), Some(now + s(pause)));
         now += s(pause);
         assert_eq!(supervisor.due_actions(now), [start(0, incarnation)]);
-        // A sign of life proves nothing: it comes from a child that is about to die, too.
+        // A heartbeat proves nothing: a child that is about to die also sends it.
         supervisor.heartbeat(0, now);
     }
     let last = supervisor.ended(0, signal(11), now);
@@ -98,7 +98,7 @@ fn pauses_double_up_to_the_longest_until_the_child_is_given_up() {
     let given_up = status(&supervisor, 0, now);
     assert_eq!((given_up.incarnation, given_up.restarts), (6, 5));
     assert_eq!(given_up.last_failure, Some(signal(11)));
-    // The others go on.
+    // The others continue.
     assert!(!supervisor.is_over());
     assert_eq!(status(&supervisor, 1, now).state, ChildState::Running);
     assert_eq!(supervisor.next_deadline(), Some(s(120)));
@@ -120,7 +120,7 @@ fn what_was_useful_begins_a_new_row_of_failures() {
         assert_eq!(supervisor.due_actions(now), [start(0, incarnation)]);
         supervisor.delivered(0, now);
     }
-    // What it delivered may be seen only after its end.
+    // A delivery may be noticed only after the exit.
     supervisor.ended(0, crash(), now);
     supervisor.delivered(0, now);
     supervisor.due_actions(now + s(1));
@@ -157,13 +157,13 @@ fn a_silent_child_is_killed_once_and_started_again() {
         assert_eq!(status(&supervisor, 0, heard).state, standing);
         assert_eq!(supervisor.next_deadline(), Some(heard + s(120)));
         if speaks {
-            // Signs may arrive in any order.
+            // Heartbeats may arrive in any order.
             supervisor.heartbeat(0, heard - s(10));
         }
         assert_eq!(supervisor.due_actions(heard + s(119)), []);
         assert_eq!(supervisor.due_actions(heard + s(120)), [Action::Kill { number: 0 }]);
         assert_eq!(status(&supervisor, 0, heard).state, ChildState::Stopping);
-        // It may take its time to die, and what it said before comes late.
+        // It may take time to die, and earlier heartbeats arrive late.
         supervisor.heartbeat(0, heard + s(121));
         assert_eq!(supervisor.due_actions(heard + s(500)), []);
         assert_eq!(supervisor.next_deadline(), None);
@@ -177,7 +177,7 @@ fn a_silent_child_is_killed_once_and_started_again() {
 fn silence_proves_nothing_if_nobody_listened() {
     let mut supervisor = started(1);
     supervisor.heartbeat(0, s(10));
-    // The orchestrator was held up from 20 s to 1,000 s.
+    // The orchestrator was suspended from 20 s to 1,000 s.
     assert_eq!(supervisor.due_actions(s(1000)), []);
     assert_eq!(supervisor.next_deadline(), Some(s(1120)));
     assert_eq!(supervisor.due_actions(s(1121)), [Action::Kill { number: 0 }], "a little late is no excuse");
@@ -242,7 +242,7 @@ fn a_start_that_the_host_has_no_room_for_is_tried_again_for_ever() {
         assert_eq!(supervisor.due_actions(now), [start(0, incarnation)]);
     }
     assert_eq!(status(&supervisor, 0, now).last_failure, Some(shortage()));
-    // Nothing of that counts against the child.
+    // None of this counts as a failure of the child.
     for pause in [1, 2, 4, 6, 6] {
         assert_eq!(
             supervisor.ended(0, crash(), now).unwrap().then,
@@ -325,7 +325,7 @@ fn happening() -> impl Strategy<Value = Happening> {
     ]
 }
 
-/// The processes as they really are, and what must hold of the orders about them.
+/// The actual processes, and the invariants of actions on them.
 #[derive(Default)]
 struct World {
     now: Duration,
@@ -368,7 +368,7 @@ impl World {
             Happening::Ended(number, reason) => {
                 let was_alive = self.alive.remove(&number).is_some();
                 if was_alive && matches!(reason, ExitReason::StartFailed { is_shortage: true, .. }) {
-                    // It may be started again any number of times.
+                    // It may be restarted any number of times.
                     let starts = self.unrewarded.entry(number).or_default();
                     *starts = starts.saturating_sub(1);
                 }
@@ -388,7 +388,7 @@ impl World {
         }
         let actions = supervisor.due_actions(self.now);
         self.obey(actions);
-        // Else whoever sleeps until then would not sleep.
+        // Otherwise sleeping until then would be a busy loop.
         assert!(supervisor.next_deadline().is_none_or(|next| next > self.now));
         assert!(!supervisor.is_over() || self.alive.is_empty());
     }
@@ -402,7 +402,7 @@ proptest! {
         for happening in happenings {
             world.happen(&mut supervisor, happening);
         }
-        // After a stop the time of grace is all that it takes to have everything dead or killed.
+        // After a stop, every process has exited or is killed at the end of the grace period.
         world.happen(&mut supervisor, Happening::Stop);
         world.happen(&mut supervisor, Happening::Pass(LIMITS.grace_period));
         assert!(world.alive.values().all(|killed| *killed));

@@ -1,4 +1,4 @@
-//! Walks in turns and rounds: beginning, waiting, control walks, returns, losses, ends.
+//! Walks in assignments and rounds: starts, waiting, control walks, rollbacks, losses, ends.
 
 use orchestrator::selector::{Mode, Scheduling, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use store::records::{ComponentRecord, Fate};
@@ -96,7 +96,7 @@ fn reports_that_nobody_asked_for_change_nothing() {
     unasked(&mut selector, report.clone());
     turn(&mut selector);
     unasked(&mut selector, report);
-    // Twice in one round.
+    // Reported twice in one round.
     let mut selector = begin(&settings(Mode::Reproducible), 2);
     let [first, second] =
         [(); 2].map(|()| turn(&mut selector)).map(|a| common::report(&a, Outcome::StepsDone, at(10)));
@@ -118,7 +118,7 @@ fn a_late_report_of_a_walker_that_was_taken_for_lost_counts_once() {
         assert!(selector.report(report.clone()).unwrap().is_none());
         assert_eq!(turn(&mut selector).number, assignment.number + 1);
         assert!(selector.report(report).unwrap().is_none());
-        // What comes after the end of a walk comes too late.
+        // Reports after the end of a walk are ignored.
         selector.assignment_lost(assignment.walk);
         let last = turn(&mut selector);
         decided(&mut selector, ended(&last, 30, WalkEnd::Steps));
@@ -165,7 +165,7 @@ fn a_return_to_a_checkpoint_is_logged_once() {
     assert_eq!(kinds(&commit), [""; 0]);
 }
 
-/// An interruption after the return does not take it out of the log.
+/// An interruption after a rollback does not remove the rollback from the log.
 #[test]
 fn a_return_before_an_interruption_is_logged_as_well() {
     let mut store = MemoryStore::default();
@@ -197,7 +197,7 @@ fn every_end_is_logged_with_its_reason() {
     for (assignment, (end, name, reason)) in assignments.iter().zip(ends) {
         let commit = decided(&mut selector, ended(assignment, 3, end));
         let detail = &commit.decisions[0].detail;
-        // A walk that could not be taken up again stays where it was.
+        // A walk that could not be resumed keeps its step.
         let step = if name == "bad_start" { 0 } else { 3 };
         assert_eq!(
             *detail,
@@ -208,7 +208,7 @@ fn every_end_is_logged_with_its_reason() {
     assert!(selector.is_done());
 }
 
-/// With control, collections at these steps, then the end of the biased walk.
+/// With control walks: collects at these steps, and then ends the biased walk.
 fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
     let controlled = Settings {
         control: true,
@@ -232,12 +232,12 @@ fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
 #[test]
 fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
     let mut store = MemoryStore::default();
-    // After a return to a checkpoint a step can come twice.
+    // After a rollback, a step can occur twice.
     let mut selector = with_control(&mut store, &[5, 12, 5]);
     let begun = store.decisions.last().unwrap();
     assert_eq!((begun.kind, begun.walk), ("begun", Some(WalkId(1))));
     assert_eq!(begun.detail, serde_json::json!({ "control_of": 0, "wanted": [5, 12] }));
-    // A turn is no longer than any other, and ends at the last wanted frame.
+    // Assignments are no longer than usual, and end at the last requested frame.
     for (step, wanted, until, kinds_then) in
         [(5, vec![5, 12], 10, vec!["control"]), (12, vec![12], 12, vec!["control", "ended"])]
     {
@@ -248,7 +248,7 @@ fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
         );
         assert_eq!((assignment.frame_steps.clone(), assignment.last_step), (wanted, until));
         assert_eq!(assignment.seed_structure, common::seed(0).structure);
-        // An unremarkable structure: a control frame is taken whatever its grade.
+        // An unremarkable structure: a control frame is recorded whatever its grade.
         let report = offer(&selector, &assignment, step, structure(100 + step, SHORTEST), [0.1; 3]);
         let commit = decided(&mut selector, report);
         assert_eq!(kinds(&commit), kinds_then);
@@ -289,7 +289,7 @@ fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
     assert_eq!(kinds(&commit), ["control", "ended", "accepted", "ended", "begun"]);
     assert_eq!(commit.decisions[1].mixture_version, 0);
     store.commit(&commit);
-    // The second of two: had the control frame counted, there would be no room left for it.
+    // The second of two: if the control frame counted, there would be no room left for it.
     let again = restore(&limited, 2, store.snapshot());
     assert_eq!(again.mixture(), selector.mixture());
 }

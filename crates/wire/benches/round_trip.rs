@@ -1,10 +1,11 @@
-//! Round trip walker → server → walker: a walker's process offers candidates, a task that decides nothing answers.
+//! Round trip walker → server → walker. A walker's process sends candidates, and a task answers immediately.
 //! `cargo bench -p wire --bench round_trip`
 //!
-//! `encode` is the walker's part: control message and candidate, written once. `check` is the server's: checksums,
-//! content hash, decoding. What remains of the whole is the transport: two wake-ups of sleeping processes, the answer,
-//! the end of the old report. The whole is what a walker waits. Beside it, a byte to `cat` and back through pipes: two
-//! bare wake-ups. All that with processors at work, as they are in a campaign, and with idle ones, which take longer to wake.
+//! `encode` is the walker's share: encoding control message and candidate. `check` is the server's share: checksums,
+//! content hash, decoding. The rest is the transport: two wakeups of sleeping processes, the answer, and releasing the
+//! old report. The total is the time a walker waits. For comparison, a byte is sent to `cat` and back through pipes:
+//! two wakeups without anything else. All is measured with busy processors, as in a campaign, and with idle ones, which
+//! take longer to wake.
 
 use std::io::{Read, Write};
 use std::process::{Child, Command, Stdio};
@@ -25,13 +26,13 @@ use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
 const DOOR: &str = "CALMWALK_BENCH_DOOR";
 const TRIPS: usize = 2_000;
-/// Not counted: memory that is touched for the first time.
+/// Number of round trips before the measurement, in which memory is first accessed.
 const WARM_UP: usize = 100;
 
-/// Atoms and features: 1 kB to 4 MB. The fourth is a candidate as the paper has them.
+/// Atoms and features: 1 kB to 4 MB. The fourth has the size of a candidate in the paper.
 const SIZES: [(usize, usize); 6] = [(8, 4), (32, 24), (108, 32), (108, 131), (500, 131), (1000, 515)];
 
-/// Bytes of a checkpoint of 108 atoms. It goes with each report and comes with each turn, whatever the candidate.
+/// Size of a checkpoint of 108 atoms, bytes. It is part of every report and assignment.
 const CHECKPOINT: usize = 20_000;
 
 fn main() {
@@ -49,7 +50,7 @@ fn main() {
     }
 }
 
-/// Processes that keep every processor awake and give way to all others.
+/// Low-priority processes that keep every processor busy.
 struct AtWork(Vec<Child>);
 
 impl AtWork {
@@ -71,7 +72,7 @@ impl Drop for AtWork {
     }
 }
 
-/// A byte to another process and back.
+/// Sends a byte to another process and back.
 fn bare_wake_ups() {
     let mut cat =
         Command::new("cat").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("cat is there");
@@ -88,7 +89,7 @@ fn bare_wake_ups() {
     println!("  bare wake-ups through pipes: {median:.1} µs ({worst:.1})");
 }
 
-/// The walker's process: all sizes one after the other.
+/// The walker's process: all sizes in sequence.
 fn walk(door: &ConnectInfo) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
     let mut checked = walker.exchange(None).expect("a turn").assignment.number;
@@ -104,7 +105,7 @@ fn walk(door: &ConnectInfo) {
             let (begin, encoding) = (Instant::now(), walker.encoding());
             let work = walker.exchange(Some(report)).expect("a turn");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);
-            // The server's clock comes with the turn.
+            // The server's time is encoded in the number of the assignment.
             let check = Duration::from_nanos(
                 work.assignment.number - std::mem::replace(&mut checked, work.assignment.number),
             );
@@ -177,7 +178,7 @@ fn structure(atoms: usize) -> Structure {
     Structure { species, positions, cell, periodic: [true; 3] }
 }
 
-/// The next turn.
+/// The next assignment.
 fn assignment(turn: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([7; 16]),

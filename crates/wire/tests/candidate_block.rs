@@ -1,4 +1,4 @@
-//! A block gives back every bit that went in, and refuses every byte that did not.
+//! A block preserves every bit, and rejects every damaged byte.
 
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -6,7 +6,7 @@ use wire::{BlockError, Candidate, CandidateBlock, CandidateView};
 
 use crate::common::{bits, candidate};
 
-/// Places in the header.
+/// Offsets in the header.
 const LENGTH: usize = 16;
 const ATOMS: usize = 24;
 const FEATURES: usize = 32;
@@ -26,7 +26,7 @@ fn assert_same_bits(a: &Candidate, b: &Candidate) {
     assert_eq!(bits(&a.features), bits(&b.features));
 }
 
-/// The bytes with another number at a place of the header and the checksum that then fits.
+/// The block with other numbers at these header offsets, and a valid checksum.
 fn with_number(block: &CandidateBlock, numbers: &[(usize, u64)]) -> Vec<u8> {
     let mut bytes = block.as_bytes().to_vec();
     for (place, number) in numbers {
@@ -80,7 +80,7 @@ proptest! {
         prop_assert!(CandidateView::new(&bytes).is_err());
     }
 
-    /// Counts are checked before anything is taken by them, also where the checksum fits.
+    /// Counts are validated before memory is accessed, even if the checksum is valid.
     #[test]
     fn absurd_counts_are_refused(
         candidate in candidate(), atoms in any::<u64>(), features in any::<u64>(), length in any::<u64>(),
@@ -190,7 +190,7 @@ fn a_candidate_with_the_name_of_another_is_not_encoded() {
     CandidateBlock::encode(&candidate);
 }
 
-/// Memory that somebody else owns.
+/// Memory with another owner.
 struct Lent(Vec<u64>, usize);
 
 impl AsRef<[u8]> for Lent {
@@ -219,7 +219,7 @@ fn a_block_in_place_is_checked_and_not_copied() {
     ));
 }
 
-/// Memory that is written to behind the back of whoever reads it.
+/// Memory that is modified while it is in use.
 struct Unsteady {
     now: std::sync::atomic::AtomicBool,
     checked: Vec<u64>,

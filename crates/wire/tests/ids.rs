@@ -22,7 +22,7 @@ proptest! {
         prop_assert_eq!(text.parse::<ContentHash>().is_ok(), is_hexadecimal && text.len() == 64);
     }
 
-    /// Any one number of a structure changes its hash; nothing else does.
+    /// Changing any number of a structure changes its hash; nothing else does.
     #[test]
     fn a_hash_tells_structures_apart(structure in usable_structure(), at in any::<prop::sample::Index>()) {
         let hash = ContentHash::from_structure(&structure);

@@ -17,15 +17,15 @@ use crate::recording::Model;
 use crate::simulated::Seen;
 use crate::{AGENTS, PERIODS, Plan, WALKERS, campaign, endpoint, now, period, quantile};
 
-/// Waits so long at most for agents to end.
+/// Timeout for agents to end.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What was committed.
+/// Log of commits.
 #[derive(Default)]
 struct Log {
-    /// Candidates, and those accepted, of each period.
+    /// Number of candidates, and of accepted ones, in each period.
     candidates: [(u64, u64); PERIODS],
-    /// Versions of the mixture, and when the commit was made that brought them, s.
+    /// Mixture versions, and the time of their commits, s.
     versions: Vec<(u64, f64)>,
 }
 
@@ -39,7 +39,7 @@ pub async fn lead(plan: Plan) {
     store.commit(&selector.start_walks()).await.unwrap();
     let hub = AgentServer::open(&endpoint(plan), None, 1, PATIENCE, AgentBootstrap::default()).await.unwrap();
     let (handle, stopping) = (hub.handle(), Arc::new(AtomicBool::new(false)));
-    // As in `calmwalk run`.
+    // The same capacity as in `calmwalk run`.
     let (to_reactor, incoming) = mpsc::channel(64);
     let hub =
         tokio::spawn(hub.run(Arc::clone(selector.mixture()), Arc::clone(&stopping), to_reactor, |_| {}));
@@ -123,7 +123,7 @@ fn report(log: &Log, mut seen: Seen, memory: &[f64; PERIODS], plan: Plan) {
     );
 }
 
-/// For each version that every agent came to, or to a later one: how long after its commit the last did, s.
+/// For each version that every agent received, or a later one: delay from its commit to the last agent, s.
 fn delays(log: &Log, seen: &Seen) -> Vec<f64> {
     let last = |(version, committed): &(u64, f64)| {
         let there = seen.versions.iter().map(|agent| {

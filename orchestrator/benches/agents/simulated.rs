@@ -16,23 +16,23 @@ use crate::random::Random;
 use crate::recording::{Model, progress};
 use crate::{AGENTS, PERIODS, Plan, WALKERS, campaign, endpoint, now, period};
 
-/// Recorded candidates.
+/// Number of recorded candidates.
 const RECORDED: usize = 16;
-/// One of so many candidates is new to the mixture …
+/// One of this number of candidates is new to the mixture …
 const NEW: u64 = 50;
 /// … with an atom of this grade.
 const GRADE: f64 = 2.0;
 
-/// What the agents have seen.
+/// Measurements of the agents.
 #[derive(Default, Deserialize, Serialize)]
 pub struct Seen {
-    /// How long walkers waited from an offer to the next turn, of each period, s.
+    /// Time from an offer to the next assignment in each period, s.
     pub waits: [Vec<f64>; PERIODS],
-    /// Of each agent the versions of the mixture, and when they were in its shared memory, s.
+    /// For each agent: mixture versions, and when they were in its shared memory, s.
     pub versions: Vec<Vec<(u64, f64)>>,
 }
 
-/// A host.
+/// A simulated host.
 struct Host {
     joined: Membership,
     shared: Mutex<(SharedMixture, Vec<(u64, f64)>)>,
@@ -87,7 +87,7 @@ impl Host {
         Self { joined, shared: Mutex::new((shared, Vec::new())) }
     }
 
-    /// What an agent does with the mixture of a turn before a walker gets it.
+    /// Publishes the mixture of an assignment before a walker gets it, as agents do.
     fn publish(&self, mixture: &Arc<Mixture>) {
         let (shared, versions) = &mut *self.shared.lock().unwrap();
         shared.publish(mixture).unwrap();
@@ -97,7 +97,7 @@ impl Host {
     }
 }
 
-/// A walker that does no dynamics.
+/// A walker without dynamics.
 struct Walker {
     recorded: Arc<Vec<Candidate>>,
     host: Arc<Host>,
@@ -106,7 +106,7 @@ struct Walker {
 }
 
 impl Walker {
-    /// Offers until it is sent home. When it offered, and how long it waited, s.
+    /// Sends offers until it is shut down. Returns the time of each offer, and how long the walker waited, s.
     async fn work(mut self, mut slot: Slot, plan: Plan) -> Vec<(f64, f64)> {
         let (mut told, mut waits) = (SlotReport::Empty, Vec::new());
         loop {
@@ -125,7 +125,7 @@ impl Walker {
         }
     }
 
-    /// One that was recorded, moved a little as a whole, so that it is no duplicate.
+    /// A recorded candidate with all atoms shifted slightly, so that it is no duplicate.
     fn candidate(&mut self, assignment: &Assignment, mixture: &Mixture) -> Candidate {
         let (walk, turn) = (u64::from(assignment.walk.0), assignment.number);
         let mut candidate = self.recorded[(walk + turn) as usize % RECORDED].clone();
@@ -141,7 +141,7 @@ impl Walker {
         candidate
     }
 
-    /// Moves the features of the first atom in a random direction until it has the grade of something new.
+    /// Moves the features of the first atom in a random direction until the candidate has the grade of a new structure.
     fn make_new(&mut self, candidate: &mut Candidate, mixture: &Mixture) {
         let dimension = mixture.dimension();
         let before = candidate.features[..dimension].to_vec();
@@ -151,7 +151,7 @@ impl Walker {
             self.grades.evaluate(mixture, &[0], &moved, None).unwrap();
             (moved, self.grades.gamma[0])
         };
-        // γ grows with the distance: double it until it is enough, then halve the interval.
+        // γ increases with the distance: double it until it is large enough, then bisect.
         let (mut low, mut high) = (0.0, 1e-6);
         while moved(high).1 < GRADE {
             (low, high) = (high, 2.0 * high);

@@ -1,4 +1,4 @@
-//! A campaign in live mode whose walkers offer what was recorded, as fast as it is taken.
+//! A campaign in live mode whose walkers offer recorded candidates as fast as possible.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -16,12 +16,12 @@ use wire::{CandidateBlock, ContentHash};
 
 use crate::recording::{CAMPAIGN, Model, crystal, progress};
 
-/// Bytes of a walk's checkpoint with 108 atoms: three states of positions, velocities, forces and energies.
+/// Size of a walk's checkpoint with 108 atoms, bytes: three states of positions, velocities, forces and energies.
 pub const CHECKPOINT: usize = 27_000;
-/// Reports under way between walkers and reactor, as in a campaign.
+/// Capacity of the channel from walkers to reactor, as in a campaign.
 const CHANNEL: usize = 64;
 
-/// The paper's rules for aluminium; structures are collected from `threshold` on (the paper: γ_max > 1.5).
+/// The paper's rules for aluminium; structures are collected above `threshold` (in the paper, γ_max > 1.5).
 pub fn settings(threshold: f64) -> Settings {
     let positive = |number: f64| Positive::try_from(number).unwrap();
     Settings {
@@ -44,7 +44,7 @@ pub fn settings(threshold: f64) -> Settings {
     }
 }
 
-/// A selector at the start of the campaign, one seed structure a walk.
+/// A selector at the start of the campaign, with one seed structure per walk.
 pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
     let seeds = seeds(walks);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
@@ -61,7 +61,7 @@ pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
     .unwrap()
 }
 
-/// Where walks start.
+/// The seed structures.
 pub fn seeds(walks: usize) -> Vec<SeedStructure> {
     (0..walks).map(|k| SeedStructure { name: format!("fcc-{k}"), structure: crystal() }).collect()
 }
@@ -90,7 +90,7 @@ pub async fn create_store(location: Location, walks: usize) -> Store {
     store
 }
 
-/// What a walk offers next, or its end.
+/// The next candidate of a walk, or its end.
 pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Report {
     let mut checkpoint = vec![0; CHECKPOINT];
     checkpoint[..8].copy_from_slice(&assignment.number.to_le_bytes());
@@ -103,7 +103,7 @@ pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Report 
     }
 }
 
-/// How the whole way through reactor, selector and database went.
+/// Measurements of the whole path through reactor, selector and database.
 #[derive(Default)]
 pub struct Run {
     pub wall: Duration,
@@ -115,7 +115,7 @@ pub struct Run {
     pub commits: usize,
 }
 
-/// Every recorded candidate from walkers side by side, through the reactor, into the database.
+/// Sends every recorded candidate from concurrent walkers through the reactor to the database.
 pub async fn run(
     model: &Model,
     settings: &Settings,
@@ -149,8 +149,8 @@ pub async fn run(
     run
 }
 
-/// A walker as the reactor sees it: whatever walk it is given, the next of what was recorded of it is offered. The
-/// bytes are checked where they stand, as those from another process are.
+/// A walker as the reactor sees it: it offers the next recorded candidate of any walk it is assigned. The block is
+/// validated in place, like one from another process.
 async fn walk(
     walker: u32,
     to_reactor: &mpsc::Sender<Incoming>,
@@ -166,7 +166,7 @@ async fn walk(
     }
 }
 
-/// The block once more, its bytes checked.
+/// The block after another validation.
 pub fn checked(block: CandidateBlock) -> CandidateBlock {
     CandidateBlock::in_place(Arc::new(Bytes(block))).unwrap()
 }
@@ -194,7 +194,7 @@ impl Run {
     }
 }
 
-/// Time that all threads of this process have spent on processors, in steps of 10 ms (Linux).
+/// Processor time of all threads of this process, in steps of 10 ms (Linux).
 fn processor_time() -> Duration {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();

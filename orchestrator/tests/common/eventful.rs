@@ -1,4 +1,4 @@
-//! Campaigns of scripted walks to which things happen.
+//! Campaigns of scripted walks with arbitrary events.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
 use super::{restore, settings};
 
-/// Label jobs above which a live campaign raises its threshold.
+/// Number of label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
 
 fn open(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
@@ -24,20 +24,20 @@ fn open(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Select
     selector
 }
 
-/// What happens next while a campaign runs.
+/// The next event of a campaign.
 #[derive(Clone, Copy, Debug)]
 pub enum Act {
-    /// A free walker asks for a turn.
+    /// An idle walker asks for an assignment.
     Ask,
-    /// One of the walkers at work (the index picks) delivers its report.
+    /// A busy walker (chosen by the index) delivers its report.
     Deliver(prop::sample::Index),
-    /// One of them is interrupted after so many steps.
+    /// A busy walker is interrupted after this number of steps.
     Interrupt(prop::sample::Index, u64),
-    /// One of them is lost.
+    /// A busy walker is lost.
     Lose(prop::sample::Index),
-    /// So many structures wait for labels.
+    /// This number of structures waits for labels.
     Queue(u64),
-    /// All processes die, and the campaign is started again.
+    /// All processes die, and the campaign is restarted.
     Crash,
 }
 
@@ -57,7 +57,7 @@ pub fn acts() -> impl Strategy<Value = Vec<Act>> {
 }
 
 fn event() -> impl Strategy<Value = Event> {
-    // Few numbers and directions, so that duplicates and structures that are covered meanwhile are common.
+    // Few numbers and directions, so that duplicates and covered structures are frequent.
     let structure = (0..12_u64, 0..3_usize, 1.0..9.0, prop::bool::weighted(0.1)).prop_map(
         |(number, direction, far, close)| {
             let mut z = [0.0; 3];
@@ -93,7 +93,7 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
     )
 }
 
-/// A campaign on its way: the selector, its store, and walkers with turns in hand.
+/// A running campaign: the selector, its store, and busy walkers.
 pub struct Campaign<'a> {
     settings: &'a Settings,
     scripts: &'a [Script],
@@ -101,7 +101,7 @@ pub struct Campaign<'a> {
     pub selector: Selector,
     pub store: MemoryStore,
     at_work: Vec<WorkItem>,
-    /// All commits but those that only keep where an interrupted walk stands.
+    /// All commits except those that only record interrupted walks.
     pub commits: Vec<Commit>,
 }
 
@@ -123,7 +123,7 @@ impl<'a> Campaign<'a> {
         }
     }
 
-    /// Gives a turn to a free walker, if there are both.
+    /// Gives an assignment to an idle walker, if there are both.
     fn ask(&mut self) -> bool {
         if self.at_work.len() == self.walkers {
             return false;
@@ -166,7 +166,7 @@ impl<'a> Campaign<'a> {
         assert!(self.selector.start_walks().walks.is_empty());
     }
 
-    /// Everybody dies, and the campaign goes on by other settings.
+    /// All processes die, and the campaign continues with other settings.
     pub fn go_on(&mut self, settings: &'a Settings) {
         self.at_work.clear();
         self.settings = settings;
@@ -193,7 +193,7 @@ impl<'a> Campaign<'a> {
         }
     }
 
-    /// Goes on without incidents until all walks are over; with `crash_often`, every commit is followed by a crash.
+    /// Continues without incidents until all walks have ended; with `crash_often`, with a crash after every commit.
     pub fn finish(mut self, crash_often: bool) -> Self {
         for _ in 0..10_000 {
             if self.selector.is_done() {
@@ -209,7 +209,7 @@ impl<'a> Campaign<'a> {
         panic!("the campaign does not end");
     }
 
-    /// Everything that must be the same, as text: numbers are written so that other bits are other text.
+    /// Everything that must be equal, as text. Different bits of a number give different text.
     pub fn content(&self) -> Vec<String> {
         let rest = format!("{:?} {:?} {:?}", self.store.walks, self.store.components, self.store.values);
         self.commits.iter().map(|commit| format!("{commit:?}")).chain([rest]).collect()

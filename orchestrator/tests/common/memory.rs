@@ -1,4 +1,4 @@
-//! The store as the selector sees it, in memory: what is committed, and what comes out of it again.
+//! The store as the selector sees it, in memory.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,7 +18,7 @@ pub struct MemoryStore {
 }
 
 impl MemoryStore {
-    /// Takes a commit as the database does, with what that refuses.
+    /// Applies a commit like the database, with the same checks.
     pub fn commit(&mut self, commit: &Commit) {
         let decided: Vec<_> = commit.decisions.iter().filter_map(|decision| decision.candidate).collect();
         let there: Vec<_> = commit.candidates.iter().map(|candidate| candidate.block.view().id()).collect();

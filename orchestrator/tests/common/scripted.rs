@@ -1,5 +1,5 @@
-//! A walk by script instead of dynamics. Like a real one it is a function of assignment and mixture: the same turn gives
-//! the same report, whoever works on it, however often, and with pauses in between or not.
+//! A scripted walk without dynamics. Like a real walk, it is a function of assignment and mixture: the same assignment
+//! gives the same report on any walker, any number of times, with or without interruptions.
 
 use calm::Mixture;
 use serde::{Deserialize, Serialize};
@@ -8,19 +8,19 @@ use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 
 use super::{DIMENSION, SHORTEST, at, block, gamma_max, structure};
 
-/// What a walk meets at each of its steps, in order.
+/// The events of a walk, one per step.
 pub type Script = Vec<Event>;
 
 #[derive(Clone, Debug)]
 pub enum Event {
     Nothing,
-    /// A structure of this number and features of its second atom; `close` if its atoms are too close.
+    /// A structure with this number and features of its second atom; if `close`, its atoms are too close.
     Structure {
         number: u64,
         z: [f64; DIMENSION],
         close: bool,
     },
-    /// A return to the checkpoint of two steps before.
+    /// A rollback to the checkpoint of two steps before.
     Return,
     BlowUp,
 }
@@ -28,13 +28,13 @@ pub enum Event {
 /// The checkpoint of a scripted walk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct State {
-    /// Events behind it.
+    /// Number of past events.
     events: usize,
     step: u64,
     segment: u32,
 }
 
-/// The turn, paused after so many steps if it lasts longer.
+/// Works on the assignment; interrupted after this number of steps if it takes longer.
 pub fn advance(
     script: &Script,
     assignment: &Assignment,
@@ -73,7 +73,7 @@ pub fn advance(
 
 fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut State) -> Option<Outcome> {
     if assignment.origin == Origin::Control {
-        // No bias, so it meets nothing of the script; frames are those of another walk.
+        // Without bias, a control walk meets no events of the script; its frames are those of another walk.
         let number = 2_000_000 + 1000 * u64::from(assignment.walk.0) + state.step;
         let frame =
             || block(assignment, mixture, &progress(state), structure(number, SHORTEST), [0.5; DIMENSION]);

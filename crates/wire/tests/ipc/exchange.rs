@@ -1,9 +1,9 @@
-//! Turns and reports come and go.
+//! Exchange of assignments and reports.
 
 use super::process::Role;
 use super::test_server::{TestServer, check, work};
 
-/// From 1 kB to 4 MB, in memory that was laid out for less.
+/// Messages of 1 kB to 4 MB, in memory reserved for smaller ones.
 #[tokio::test(flavor = "multi_thread")]
 async fn candidates_of_any_size_come_as_they_were() {
     let directory = tempfile::tempdir().unwrap();
@@ -28,7 +28,7 @@ async fn candidates_of_any_size_come_as_they_were() {
     server.close().await;
 }
 
-/// A round of many walks: the selector holds more candidates than the walker has memory for, also after its end.
+/// A round of many walks: the selector holds more candidates than the walker has memory for, even after its exit.
 #[tokio::test(flavor = "multi_thread")]
 async fn candidates_last_as_long_as_they_are_held() {
     let directory = tempfile::tempdir().unwrap();

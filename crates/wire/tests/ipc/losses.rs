@@ -1,4 +1,4 @@
-//! Messages that are lost and processes that die.
+//! Lost messages and dead processes.
 
 use std::process::Child;
 use std::time::Duration;
@@ -14,7 +14,7 @@ fn kill(child: &mut Child) {
     child.wait().unwrap();
 }
 
-/// The walker speaks before it is expected, and is not heard: as if its offer had been lost.
+/// The walker sends its offer before it is expected. The offer is rejected, as if it had been lost.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_lost_offer_is_found_by_asking() {
     let directory = tempfile::tempdir().unwrap();
@@ -33,14 +33,14 @@ async fn a_lost_offer_is_found_by_asking() {
     server.close().await;
 }
 
-/// A decision may take longer than a walker waits between two questions: it is the same offer all the while.
+/// A decision may take longer than the walker's poll interval; the offer remains the same.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_slow_decision_is_waited_for() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 1, 1 << 16);
     let mut walker = server.start(0, 1, Role::Walker);
     let first = server.offer().await;
-    // An offer and two questions: signs of life.
+    // An offer and two polls are heartbeats.
     while server.heard.lock().unwrap().len() < 3 {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
@@ -56,7 +56,7 @@ async fn a_killed_walker_is_replaced() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     for incarnation in 1..8 {
-        // Killed in the middle of a turn.
+        // Killed while working on an assignment.
         let mut stuck = server.start(0, incarnation, Role::Stuck);
         let offer = server.offer().await;
         assert_eq!((offer.walker, &offer.report), (0, &None));
@@ -66,7 +66,7 @@ async fn a_killed_walker_is_replaced() {
         server.handle.lost(0, incarnation, false);
         assert!(matches!(server.next().await, Incoming::Lost { walker: 0, crashed: false }));
 
-        // Killed while it waits for the answer to a candidate.
+        // Killed while waiting for the answer to a candidate.
         let mut waiting = server.start(1, incarnation, Role::Walker);
         let offer = server.offer().await;
         let mut offer = server.go_on(offer, 1, (3, 4)).await;
@@ -80,7 +80,7 @@ async fn a_killed_walker_is_replaced() {
     let offer = server.offer().await;
     let offer = server.go_on(offer, 1, (3, 4)).await;
     offer.reply.send(None).unwrap();
-    // Its candidate would keep the walker's memory.
+    // Its candidate would keep the walker's memory mapped.
     drop(offer.report);
     assert!(walker.wait().unwrap().success());
     server.handle.lost(0, 8, false);
@@ -89,7 +89,8 @@ async fn a_killed_walker_is_replaced() {
     server.close().await;
 }
 
-/// The reactor hears of the last walker's end also if the server is closed at once: others may keep its channel open.
+/// The reactor learns of the last walker's exit even if the server is closed immediately: others may keep its channel
+/// open.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_end_is_told_before_the_server_closes() {
     let directory = tempfile::tempdir().unwrap();
@@ -104,7 +105,7 @@ async fn an_end_is_told_before_the_server_closes() {
     server.close().await;
 }
 
-/// The successor of a dead walker is expected before somebody says that it is dead: nothing of the successor is freed.
+/// A successor is expected before the death of its predecessor is reported: the successor's resources are not freed.
 #[tokio::test(flavor = "multi_thread")]
 async fn late_news_of_a_death_does_no_harm_to_the_successor() {
     let directory = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! The transport between processes, with real ones.
+//! The transport between real processes.
 
 mod exchange;
 mod losses;

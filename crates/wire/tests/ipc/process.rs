@@ -1,4 +1,4 @@
-//! The other processes of these tests: this very binary, told by its environment what to be.
+//! Other processes of these tests: this test binary, with a role from its environment.
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -18,21 +18,21 @@ use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 use super::test_server::TestServer;
 
 const ROLE: &str = "CALMWALK_TEST_ROLE";
-/// What [`Role::Orchestrator`] makes in its directory when a turn is done.
+/// File that [`Role::Orchestrator`] creates in its directory when an assignment is done.
 pub const AT_WORK: &str = "at-work";
 
-/// What a process is to be.
+/// Role of a process.
 #[derive(Serialize, Deserialize)]
 pub enum Role {
-    /// Ends each turn with [`candidate`] until it is sent home.
+    /// Ends each assignment with [`candidate`] until it is shut down.
     Walker(ConnectInfo),
-    /// Takes a turn and never ends it.
+    /// Takes an assignment and hangs.
     Stuck(ConnectInfo),
-    /// An orchestrator of the campaign in that directory with a walker at work.
+    /// An orchestrator of the campaign in this directory, with a busy walker.
     Orchestrator(String),
 }
 
-/// Begins a process.
+/// Starts a process.
 pub fn start(role: &Role) -> Child {
     Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "ipc::process::child", "--ignored", "--nocapture"])
@@ -42,7 +42,7 @@ pub fn start(role: &Role) -> Child {
         .unwrap()
 }
 
-/// No test, but what [`start`] runs.
+/// Not a test: the entry point of processes started by [`start`].
 #[test]
 #[ignore = "run by the others"]
 fn child() {
@@ -92,7 +92,7 @@ pub fn progress(step: u64) -> wire::messages::Progress {
     wire::messages::Progress { step, ..Default::default() }
 }
 
-/// A turn at whose end a candidate of so many atoms with so many features is wanted.
+/// An assignment that ends with a candidate of this number of atoms and features.
 pub fn assignment(walk: u32, turn: u64, (atoms, features): (usize, usize)) -> Assignment {
     let walk = WalkId(walk);
     Assignment {
@@ -117,7 +117,7 @@ fn structure(atoms: usize) -> Structure {
     Structure { species, positions, cell, periodic: [true; 3] }
 }
 
-/// The candidate with which a walker of these tests ends this turn.
+/// The candidate that ends this assignment.
 pub fn candidate(assignment: &Assignment) -> Candidate {
     let Assignment { campaign, walk, number: turn, ref seed_structure, last_step: features, .. } =
         *assignment;

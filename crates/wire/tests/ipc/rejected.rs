@@ -1,4 +1,4 @@
-//! Messages that are none, and walkers that are not expected.
+//! Invalid messages and unexpected walkers are rejected.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ use super::test_server::TestServer;
 
 type Service = ipc_threadsafe::Service;
 
-/// Somebody who knows the way in and sends what it likes.
+/// A process that connects and sends arbitrary messages.
 struct Stranger {
     session: u64,
     port: Client<Service, [u64], (), [u64], ()>,
@@ -51,7 +51,7 @@ impl Stranger {
         assert_eq!(pending.number_of_server_connections(), 1);
     }
 
-    /// Sends something, and has it dropped for that reason.
+    /// Sends bytes and checks that they are rejected for this reason.
     async fn refused(&self, server: &TestServer, bytes: &[u8], reason: &str) {
         let before = server.handle.traffic().rejected;
         self.send(bytes);
@@ -62,14 +62,14 @@ impl Stranger {
         assert!(found.contains(reason), "found '{found}', expected '{reason}'");
     }
 
-    /// A letter as walkers write it.
+    /// An envelope as walkers encode it.
     fn letter(&self, (walker, incarnation): (u32, u32), words: &[u8]) -> Vec<u8> {
         let caller = postcard::to_stdvec(&(self.session, walker, incarnation)).unwrap();
         [caller.as_slice(), words].concat()
     }
 }
 
-/// Bytes as they are sent, filled up to whole words.
+/// The bytes padded to whole words, as they are sent.
 fn words(bytes: &[u8]) -> Vec<u64> {
     let word = |bytes: &[u8]| std::array::from_fn(|k| bytes.get(k).copied().unwrap_or(0));
     bytes.chunks(8).map(|bytes| u64::from_le_bytes(word(bytes))).collect()
@@ -80,13 +80,13 @@ fn sealed(content: &[u8]) -> Vec<u8> {
     [b"CALM\x02".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
 }
 
-/// A request with a control message and what is behind it.
+/// A request with a control message and the bytes after it.
 fn framed(control: &[u8], behind: &[u8]) -> Vec<u8> {
     let padding = control.len().next_multiple_of(8) - control.len();
     [&(control.len() as u64).to_le_bytes()[..], control, &[0; 8][..padding], behind].concat()
 }
 
-/// The words of an offer whose report names that candidate.
+/// The payload of an offer whose report names this candidate.
 fn offer(sequence: u8, candidate: &Candidate) -> Vec<u8> {
     let id = candidate.id;
     let report = (id.walk.0, 1_u64, 0_u8, id, &[1_u8, 2][..], wire::messages::Progress::default());
@@ -187,7 +187,7 @@ async fn an_offer_whose_candidate_is_wrong_changes_nothing() {
     stranger.refused(&server, &with(NOTHING, block.as_bytes()), beside).await;
     assert!(server.incoming.try_recv().is_err() && server.heard.lock().unwrap().is_empty());
 
-    // Mended, it is taken; again, it is not taken twice.
+    // The valid offer is accepted; repeated, it is not accepted again.
     for _ in 0..3 {
         stranger.send(&with(&one, block.as_bytes()));
     }
@@ -201,7 +201,7 @@ async fn an_offer_whose_candidate_is_wrong_changes_nothing() {
     server.close().await;
 }
 
-/// Rubbish without end does not keep the server from those who wait.
+/// A flood of garbage does not block the server for other walkers.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_flood_is_survived() {
     let directory = tempfile::tempdir().unwrap();
@@ -211,7 +211,7 @@ async fn a_flood_is_survived() {
     let flood = std::thread::spawn(move || {
         for k in 0..20_000_u32 {
             let words = vec![u64::from(k) << 32 | u64::from(k); k as usize % 60 + 1];
-            // Full buffers drop.
+            // Full buffers drop messages.
             let _ = stranger.port.loan_slice_uninit(words.len()).unwrap().write_from_slice(&words).send();
             let _ = stranger.bell.notify();
         }

@@ -1,4 +1,4 @@
-//! Campaigns beside each other, and what lies where.
+//! Concurrent campaigns, and the files of each.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -21,7 +21,7 @@ async fn two_campaigns_do_not_see_each_other() {
         first = here.go_on(first, turn, (3, 4)).await;
         second = there.go_on(second, turn + 100, (4, 3)).await;
     }
-    // The end of one, with all that it has, is nothing to the other.
+    // The end of one campaign does not affect the other.
     first.reply.send(None).unwrap();
     assert!(walkers[0].wait().unwrap().success());
     assert_eq!(here.handle.traffic().rejected, 0);
@@ -64,7 +64,7 @@ async fn everything_is_the_users_alone_and_in_the_campaigns_place() {
     assert!(!ShmDir::all().unwrap().contains(&place));
 }
 
-/// Sparse segments would end a process in the middle of a write.
+/// With sparse segments, a write could kill the process.
 #[tokio::test(flavor = "multi_thread")]
 async fn memory_is_reserved_and_no_more_than_was_asked_for() {
     let directory = tempfile::tempdir().unwrap();
@@ -120,7 +120,7 @@ fn a_place_is_wiped_before_it_is_used_and_after() {
     fs::write(&segment, [1; 5_000]).unwrap();
 
     let removed = place.prepare(0).unwrap().removed;
-    // With the file that names the campaign.
+    // Includes the file with the path of the campaign.
     assert_eq!((removed.files, removed.bytes), (3, 12_288 + 8_192 + 4_096));
     fs::write(&segment, b"again").unwrap();
     fs::remove_dir_all(place.directory()).unwrap();
@@ -133,7 +133,7 @@ fn a_place_is_wiped_before_it_is_used_and_after() {
     assert_eq!(place.remove().unwrap(), wire::shm_dir::Removed::default());
 }
 
-/// Also one whose campaign cannot be told: the file that names it is not yet written, or names what is not visible here.
+/// Even if its campaign is unknown: the `campaign` file is not yet written, or its path does not exist here.
 #[test]
 fn a_place_in_use_is_not_removed() {
     let directory = tempfile::tempdir().unwrap();
@@ -163,7 +163,7 @@ fn a_place_in_use_is_not_removed() {
     assert_eq!(files_of(&place), Vec::<String>::new());
 }
 
-/// Places that come and go at the same time do not disturb each other.
+/// Directories that are created and removed concurrently do not interfere.
 #[test]
 fn the_directory_of_all_places_may_come_and_go() {
     std::thread::scope(|scope| {

@@ -1,4 +1,4 @@
-//! What stands in for orchestrator, supervisor and reactor.
+//! A stand-in for orchestrator, supervisor and reactor.
 
 use std::path::Path;
 use std::process::Child;
@@ -19,10 +19,10 @@ use wire::{CandidateBlock, WalkId};
 
 use super::process::{Role, assignment, candidate, start};
 
-/// Nothing here takes nearly as long.
+/// Timeout, much longer than anything here takes.
 const LIMIT: Duration = Duration::from_secs(60);
 
-/// Sessions of these tests are told apart.
+/// Distinguishes the sessions of these tests.
 static SESSION: AtomicU64 = AtomicU64::new(1);
 
 /// An orchestrator in this process.
@@ -31,12 +31,12 @@ pub struct TestServer {
     prepared: PreparedDir,
     pub handle: ServerHandle,
     pub incoming: mpsc::Receiver<Incoming>,
-    /// The walkers that were heard, in order.
+    /// Walkers of the received messages, in order.
     pub heard: Arc<Mutex<Vec<u32>>>,
     pub task: JoinHandle<Result<(), IpcError>>,
 }
 
-/// A walker that waits for a turn.
+/// A walker that waits for an assignment.
 pub struct Offer {
     pub walker: u32,
     pub report: Option<Report>,
@@ -66,7 +66,7 @@ impl TestServer {
         start(&role(self.handle.connect_info(walker, incarnation)))
     }
 
-    /// The next message that is not about progress.
+    /// The next message other than progress.
     pub async fn next(&mut self) -> Incoming {
         loop {
             let incoming = timeout(LIMIT, self.incoming.recv()).await.expect("in time").expect("a message");
@@ -76,7 +76,7 @@ impl TestServer {
         }
     }
 
-    /// The next offer; nothing else may come before it.
+    /// The next message other than progress, which must be an offer.
     pub async fn offer(&mut self) -> Offer {
         match self.next().await {
             Incoming::Idle { walker, report, reply } => Offer { walker, report, reply },
@@ -84,7 +84,7 @@ impl TestServer {
         }
     }
 
-    /// Gives a turn, and takes the offer with which it ends after checking it.
+    /// Sends an assignment, and checks and returns the offer that answers it.
     pub async fn go_on(&mut self, offer: Offer, turn: u64, size: (usize, usize)) -> Offer {
         let walker = offer.walker;
         offer.reply.send(Some(work(walker, turn, size))).unwrap();
@@ -94,7 +94,7 @@ impl TestServer {
         next
     }
 
-    /// Ends, with all processes dead, and looks at what is left.
+    /// Closes the server after all processes have exited, and checks that no files remain.
     pub async fn close(self) {
         self.handle.close();
         timeout(LIMIT, self.task).await.expect("in time").unwrap().unwrap();
@@ -104,12 +104,12 @@ impl TestServer {
     }
 }
 
-/// A turn and its mixture, whose version is the number of the turn.
+/// An assignment with its mixture, whose version is the number of the assignment.
 pub fn work(walker: u32, turn: u64, size: (usize, usize)) -> WorkItem {
     WorkItem { assignment: assignment(walker, turn, size), mixture: Arc::new(mixture(turn)) }
 }
 
-/// Whether a report is what came of that turn.
+/// Checks that a report answers this assignment.
 pub fn check(report: &Report, walker: u32, turn: u64, size: (usize, usize)) {
     let Report { walk, assignment: found, ref checkpoint, ref outcome, .. } = *report;
     assert_eq!((walk, found, checkpoint.as_slice()), (WalkId(walker), turn, &turn.to_le_bytes()[..]));
@@ -117,7 +117,7 @@ pub fn check(report: &Report, walker: u32, turn: u64, size: (usize, usize)) {
     assert_eq!(*outcome, Outcome::Candidate(expected));
 }
 
-/// Everything of a place that is there.
+/// All files of a campaign.
 pub fn files_of(place: &ShmDir) -> Vec<String> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir("/dev/shm").unwrap() {

@@ -122,7 +122,7 @@ fn a_component_outlives_its_mixture_its_reader_and_the_writer() {
     let mut reader = MixtureReader::open(&path, 0).unwrap();
     let component = Arc::clone(reader.pin(0).unwrap().component(0, 0).unwrap());
     drop(reader);
-    // Enough versions to use every block several times.
+    // Enough versions to reuse every block several times.
     for _ in 0..200 {
         mixture = next(&mixture);
         shared.publish(&mixture).unwrap();
@@ -201,7 +201,7 @@ fn a_leak_of_versions_is_an_error_that_passes() {
         kept.push(mixture);
     };
     assert!(matches!(refused, SharedMixtureError::TooManyVersions { living: 68, .. }), "{refused}");
-    // All of them can still be read, and when one is dropped another fits.
+    // All of them can still be read, and dropping one makes room for another.
     let mut reader = MixtureReader::open(&path, 0).unwrap();
     kept.iter().skip(1).for_each(|mixture| check(&reader.pin(mixture.version()).unwrap()));
     let mixture = next(kept.last().unwrap());

@@ -1,4 +1,4 @@
-//! The link breaks, agents and orchestrators die: nothing is lost and nothing comes twice.
+//! Broken links, and dead agents and orchestrators: nothing is lost or delivered twice.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use wire::transport::Incoming;
 use super::link::{Link, State};
 use super::test_server::{LIMIT, TestServer, Wanted, agent, join, mixture, next_version, report, work};
 
-/// The link is cut, or dead without a word, before the offer, while it is being decided, and at the answer.
+/// The link is cut or silently dead before the offer, while it is pending, and during the answer.
 #[tokio::test(flavor = "multi_thread")]
 async fn what_is_told_over_a_breaking_link_comes_once() {
     let mut head = TestServer::open(Wanted::default()).await;
@@ -36,7 +36,7 @@ async fn what_is_told_over_a_breaking_link_comes_once() {
         expected = Some(report(&work.assignment));
         let state = breaks[turn as usize % breaks.len()];
         if turn % 2 == 0 {
-            // Cut while it is being decided.
+            // Cut while the offer is pending.
             link.set(state);
             sleep(Duration::from_millis(500)).await;
             offer.reply.send(Some(work)).unwrap();
@@ -58,7 +58,8 @@ async fn what_is_told_over_a_breaking_link_comes_once() {
     head.close().await;
 }
 
-/// Who was silent for too long has lost its slots before anybody hears of it, and is not heard when it comes back.
+/// An agent that was unresponsive for too long has lost its slots before this is reported, and is rejected when it
+/// comes back.
 #[tokio::test(flavor = "multi_thread")]
 async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
     let patience = Duration::from_millis(700);
@@ -74,7 +75,7 @@ async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
     first.reply.send(Some(work(2, 1, &mixture))).unwrap();
     let (given, mut slot) = turn.await.unwrap();
     let assignment = given.unwrap().unwrap().assignment;
-    // The other slot waits for its turn.
+    // The other slot waits for its assignment.
     let line = Arc::clone(&joined);
     let mut other = slots.remove(0);
     let waiting = tokio::spawn(async move { other.exchange(&line, &SlotReport::Empty).await.map(drop) });
@@ -107,7 +108,7 @@ async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
     head.close().await;
 }
 
-/// An orchestrator dies and another takes its place at the same endpoint.
+/// An orchestrator dies and another replaces it at the same endpoint.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_finds_the_next_run_of_its_orchestrator() {
     let mut head = TestServer::open(Wanted::default()).await;

@@ -1,4 +1,4 @@
-//! Turns, reports, mixtures and files come and go.
+//! Exchange of assignments, reports, mixtures and files.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -53,7 +53,7 @@ async fn turns_and_reports_come_as_they_were() {
     };
     assert_eq!(last, expected);
     assert_eq!(working.await.unwrap(), 20);
-    // What was received is what was sent, bit by bit, whatever the way from version to version.
+    // The received mixture is bitwise equal, whatever deltas led to it.
     let newest = joined.newest().await;
     assert_eq!(newest.version(), mixture.version());
     for ((_, _, sent), (_, _, received)) in mixture.iter().zip(newest.iter()) {

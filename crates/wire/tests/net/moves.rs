@@ -1,4 +1,4 @@
-//! The orchestrator comes back somewhere else.
+//! The orchestrator restarts at another endpoint.
 
 use std::fs;
 use std::sync::Arc;
@@ -13,13 +13,13 @@ use super::test_server::{LIMIT, TestServer, Wanted, agent, endpoint, report, wor
 async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("endpoint");
-    // At once, as a reader sees it.
+    // Written atomically, as seen by a reader.
     let write = |announcement: Announcement| {
         fs::write(path.with_extension("new"), announcement.to_string()).unwrap();
         fs::rename(path.with_extension("new"), &path).unwrap();
     };
     let address = Address::File(path.clone());
-    // Before it has been anywhere the agent waits.
+    // The agent waits until the orchestrator has started.
     let (why, whys) = std::sync::mpsc::channel();
     let opening = {
         let address = address.clone();

@@ -1,4 +1,4 @@
-//! The script that makes certificates, which needs openssl: `cargo test -p wire --test openssl`.
+//! The script that creates certificates, which requires openssl: `cargo test -p wire --test openssl`.
 
 #[allow(dead_code, reason = "this target uses a part")]
 mod test_server;

@@ -1,4 +1,4 @@
-//! Strangers are not heard.
+//! Unexpected senders are rejected.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ async fn nothing_listens_or_connects_off_loopback_without_certificates() {
     assert!(refused.unwrap().to_string().contains("/nowhere/authority.pem"));
 }
 
-/// Whatever else comes under the orchestrator's key is dropped and answered with the reason.
+/// Any other message with the orchestrator's key is rejected, and answered with the reason.
 #[tokio::test(flavor = "multi_thread")]
 async fn foreign_messages_are_dropped_and_spoken_of() {
     let head = TestServer::open(Wanted::default()).await;
@@ -62,7 +62,7 @@ async fn foreign_messages_are_dropped_and_spoken_of() {
     head.close().await;
 }
 
-/// An authority, and a directory with a certificate of it for every name.
+/// An authority, and a directory with a signed certificate for each name.
 fn certificates(directory: &Path, names: &[&str]) {
     let authority_key = KeyPair::generate().unwrap();
     let mut authority = CertificateParams::default();

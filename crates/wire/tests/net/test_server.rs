@@ -1,4 +1,4 @@
-//! What stands in for orchestrator and reactor, and for an agent.
+//! A stand-in for orchestrator and reactor, and for an agent.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -20,9 +20,9 @@ use wire::net::{
 use wire::transport::{Incoming, WorkItem};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
-/// Nothing here takes nearly as long.
+/// Timeout, much longer than anything here takes.
 pub const LIMIT: Duration = Duration::from_secs(60);
-/// An agent may be silent for longer than any break that it is to survive here.
+/// Timeout of agents, longer than any break that they must survive here.
 pub const PATIENCE: Duration = Duration::from_secs(40);
 
 /// An orchestrator in this process.
@@ -35,14 +35,14 @@ pub struct TestServer {
     pub task: JoinHandle<Result<(), NetError>>,
 }
 
-/// A slot that waits for a turn.
+/// A slot that waits for an assignment.
 pub struct Offer {
     pub walker: u32,
     pub report: Option<Report>,
     pub reply: oneshot::Sender<Option<WorkItem>>,
 }
 
-/// What is wanted of a head.
+/// Options of the server.
 pub struct Wanted {
     pub port: u16,
     pub session: u64,
@@ -77,7 +77,7 @@ impl TestServer {
         timeout(LIMIT, self.incoming.recv()).await.expect("in time").expect("a message")
     }
 
-    /// The next offer; nothing else may come before it.
+    /// The next message other than progress, which must be an offer.
     pub async fn offer(&mut self) -> Offer {
         match self.next().await {
             Incoming::Idle { walker, report, reply } => Offer { walker, report, reply },
@@ -85,7 +85,7 @@ impl TestServer {
         }
     }
 
-    /// Waits until something has happened to an agent.
+    /// Waits for an event of an agent.
     pub async fn event(&self, wanted: impl Fn(&AgentEvent) -> bool) {
         let seen = async {
             while !self.events.lock().unwrap().iter().any(&wanted) {
@@ -97,13 +97,13 @@ impl TestServer {
         }
     }
 
-    /// Ends when every agent has left.
+    /// Closes the server; returns when every agent has left.
     pub async fn close(self) {
         self.handle.close();
         timeout(LIMIT, self.task).await.expect("in time").unwrap().unwrap();
     }
 
-    /// Ends at once, as a process that is killed; another may listen in its place then.
+    /// Ends immediately, like a killed process. Another server can then listen on the port.
     pub async fn kill(self) -> u16 {
         self.task.abort();
         let _ = self.task.await;
@@ -136,7 +136,7 @@ pub fn agent(id: &str, walkers: u32) -> Agent {
     }
 }
 
-/// An agent that has been given a place.
+/// An agent that has joined.
 pub async fn join(port: u16, agent: Agent) -> (Arc<AgentClient>, Arc<Membership>) {
     let uplink = Arc::new(AgentClient::open(&endpoint(port).into(), None, agent, |_| {}).await.unwrap());
     let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
@@ -156,7 +156,7 @@ fn component(element: usize, slot: usize, scale: f64) -> Arc<Component> {
     Arc::new(Component::new(centroid, inverse, 1.5, None).unwrap())
 }
 
-/// The next version, in which one component differs.
+/// The next version, which differs in one component.
 pub fn next_version(mixture: &Mixture, element: usize, slot: usize) -> Arc<Mixture> {
     let component = component(element, slot, 2.0 + mixture.version() as f64);
     Arc::new(mixture.with_changes(&[ChangedComponent { element, slot, component }]).unwrap())
@@ -180,7 +180,7 @@ pub fn work(walk: u32, turn: u64, mixture: &Arc<Mixture>) -> WorkItem {
     WorkItem { assignment, mixture: Arc::clone(mixture) }
 }
 
-/// What comes of a turn.
+/// The report on an assignment.
 pub fn report(assignment: &Assignment) -> Report {
     let Assignment { campaign, walk, number: turn, .. } = *assignment;
     let structure = structure();

@@ -4,7 +4,7 @@ use std::process::Command;
 
 use super::*;
 
-/// A process that is nobody's child here.
+/// A process that is not a child of this process.
 fn adopted_process() -> (u32, String) {
     let script = "sleep 1000 <&- >&- 2>&- & echo $!";
     let output = Command::new("/bin/sh").args(["-c", script]).output().unwrap();
@@ -19,7 +19,7 @@ async fn an_adopted_process_is_watched_and_ended() {
     children.adopt(1, pid, &birth).unwrap();
     assert!(matches!(children.adopt(1, pid, &birth), Err(AdoptError::NotAdoptable { number: 1, .. })));
     assert!(matches!(children.adopt(2, pid, &birth), Err(AdoptError::NotAdoptable { number: 2, .. })));
-    // The other one comes and goes meanwhile.
+    // The other child starts and exits meanwhile.
     while !matches!(next(&mut children).await, ChildEvent::Ended { number: 0, .. }) {}
     assert_eq!(children.status()[1].incarnation, 0);
     children.stop();
@@ -61,7 +61,7 @@ async fn another_process_under_an_old_number_is_not_adopted() {
     for (pid, birth) in [(own, "another/1"), (own, ""), (0, ""), (u32::MAX, ""), (i32::MAX as u32, "")] {
         assert!(matches!(children.adopt(0, pid, birth), Err(AdoptError::Gone { .. })), "{pid}");
     }
-    // Nothing came of it: the child is started as if nothing had been.
+    // The failed adoption has no effect: the child is started normally.
     assert!(matches!(next(&mut children).await, ChildEvent::Started { incarnation: 1, .. }));
     rest(&mut children).await;
 }

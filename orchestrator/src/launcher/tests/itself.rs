@@ -7,7 +7,7 @@ use rustix::process::{Resource, Rlimit, getpgid, getpid, getrlimit, setrlimit};
 
 use super::*;
 
-/// The arguments with which this test program runs but one of its tests, one that is not run otherwise.
+/// Arguments that make this test program run only one of its ignored tests.
 fn only(test: &str) -> [String; 4] {
     [format!("launcher::tests::itself::{test}"), "--exact".into(), "--ignored".into(), "--nocapture".into()]
 }
@@ -38,14 +38,14 @@ async fn a_child_that_the_host_has_no_room_for_is_started_when_there_is() {
     assert_eq!(lines(&events), ["started in the end"], "{events:?}");
 }
 
-/// In a process of its own, since other tests need descriptors. Its child may not fail even once.
+/// In a process of its own, since other tests need file descriptors. Its child must not fail even once.
 #[tokio::test]
 #[ignore = "runs in a process that another test starts"]
 async fn lacks_descriptors() {
     let limit = |current| Rlimit { current, maximum: getrlimit(Resource::Nofile).maximum };
     let before = getrlimit(Resource::Nofile).current;
     let mut children = children(&["exit 0"], NO_RESTART);
-    // No file that is opened from now on gets a number.
+    // No more files can be opened from now on.
     setrlimit(Resource::Nofile, limit(Some(3))).unwrap();
     for _ in 0..10 {
         let ChildEvent::Ended { ended, .. } = next(&mut children).await else {
@@ -62,10 +62,11 @@ async fn lacks_descriptors() {
     writeln!(std::io::stderr(), "started in the end").unwrap();
 }
 
-/// 0 where the session's leader is in another process namespace, as in a container: `getsid` of rustix does not expect that.
+/// 0 if the session leader is in another process namespace, as in a container, which `getsid` of rustix does not
+/// expect.
 fn session_of(pid: Pid) -> i32 {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).unwrap();
-    // The name stands in brackets and may hold anything; state, parent, group and session follow.
+    // The name is in parentheses and may contain anything; state, parent, group and session follow.
     stat.rsplit(')').next().unwrap().split_whitespace().nth(3).unwrap().parse().unwrap()
 }
 
@@ -102,7 +103,7 @@ fn waits() {
     std::thread::sleep(if setup.is_empty() { Duration::ZERO } else { LONG });
 }
 
-/// Starts [`tied`] from a thread that ends when the process has tied itself, or has failed to.
+/// Starts [`tied`] from a thread that exits when the process has bound itself to its parent, or has failed to.
 fn tied_to(parent: u32) -> (std::process::ExitStatus, String) {
     let start = move || {
         let mut command = Command::new("/proc/self/exe");

@@ -1,4 +1,4 @@
-//! Real processes, small ones.
+//! Tests with real, small processes.
 
 mod adopted;
 mod itself;
@@ -12,7 +12,7 @@ use tokio::time::timeout;
 use super::*;
 use crate::supervisor::{ChildExit, ChildState, ExitReason, Limits};
 
-/// Long enough for anything here on a busy machine.
+/// Timeout for anything here on a busy machine.
 const LONG: Duration = Duration::from_secs(120);
 
 const LIMITS: Limits = Limits {
@@ -42,7 +42,7 @@ async fn next(children: &mut Children) -> ChildEvent {
     timeout(LONG, children.next()).await.expect("an event")
 }
 
-/// Everything that happens from here to the end; of each process nothing is left then.
+/// All events until the end, when no process must be left.
 async fn rest(children: &mut Children) -> Vec<ChildEvent> {
     let mut events = Vec::new();
     loop {
@@ -83,7 +83,7 @@ fn signal(pid: u32, signal: Signal) {
     kill_process(Pid::from_raw(pid as i32).unwrap(), signal).unwrap();
 }
 
-/// Stops a process, and waits until it stands still: a SIGTERM that it gets at the same time would come first.
+/// Stops a process and waits until it is stopped, since a concurrent SIGTERM would come first.
 async fn hold(pid: u32) {
     signal(pid, Signal::STOP);
     while !std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap().contains(") T ") {
@@ -112,7 +112,7 @@ async fn a_setup_larger_than_a_pipe_arrives_whole() {
     let mut children = Children::new(1, NO_RESTART, launch);
     let mut found = Vec::new();
     let ended = loop {
-        // Whoever waits may be called away at any time.
+        // Waiting can be cancelled at any time.
         match timeout(Duration::from_micros(200), children.next()).await {
             Ok(ChildEvent::Stderr { line, .. }) => found.push(line),
             Ok(ChildEvent::Ended { ended, .. }) => break ended,
@@ -183,12 +183,12 @@ async fn a_delivery_that_nobody_has_looked_at_yet_counts() {
     let script = format!("cd {}; until rm go; do sleep 0.01; done 2>&-; exit 1", directory.path().display());
     let launch = move |_, _| Launch::shell(&script);
     let mut children = Children::new(1, Limits { max_restarts: 1, ..LIMITS }, launch);
-    // After a first failure without one, only a delivery keeps the next from being the last.
+    // After a failure without a delivery, only a delivery prevents the next failure from being the last.
     for delivers in [false, true, true] {
         assert!(matches!(next(&mut children).await, ChildEvent::Started { .. }));
         let heartbeats = children.heartbeats();
         let deliver = async {
-            // The end is waited for by now.
+            // The monitor waits for the exit by now.
             tokio::time::sleep(Duration::from_millis(20)).await;
             if delivers {
                 heartbeats.delivered(0);
@@ -224,7 +224,7 @@ async fn a_stopped_process_is_killed_and_started_again() {
             ChildEvent::Stderr { .. } => {
                 beats += 1;
                 children.heartbeats().heartbeat(0);
-                // After more than the time of silence: it lives as long as it speaks.
+                // After more than the heartbeat timeout: it lives as long as it sends heartbeats.
                 if beats == BEATS {
                     signal(first, Signal::STOP);
                 }
@@ -282,7 +282,7 @@ async fn a_death_by_signal_is_told() {
 
 #[tokio::test]
 async fn what_a_process_leaves_behind_does_not_keep_it() {
-    // The one left behind holds the pipe of the standard error open.
+    // The orphaned process keeps the pipe of the standard error open.
     let mut children = children(&["echo here >&2; sleep 20 & printf last >&2; exit 4"], NO_RESTART);
     let begun = std::time::Instant::now();
     let events = rest(&mut children).await;
@@ -300,7 +300,7 @@ async fn last_words_wait_for_a_slow_listener() {
             ChildEvent::Ended { ended, .. } => break ended.reason,
             event => assert!(matches!(event, ChildEvent::Started { .. })),
         }
-        // It has ended long before everything is heard.
+        // It exits long before all lines are received.
         if found % 500 == 0 {
             tokio::time::sleep(child_monitor::STDERR_DRAIN_TIMEOUT).await;
         }

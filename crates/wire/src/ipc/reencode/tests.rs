@@ -1,4 +1,4 @@
-//! Messages between walker and orchestrator come back as they were, and nothing else is taken for one.
+//! Messages between walker and orchestrator survive a round trip, and invalid bytes are rejected.
 
 use atoms::Structure;
 use proptest::collection::vec;
@@ -19,29 +19,29 @@ mod any;
 #[allow(dead_code, reason = "the tests of the package use the rest")]
 mod common;
 
-/// The length of the control message, and its own fixed part.
+/// Offset of the content: the length field and the header of the control message.
 const CONTENT: usize = 8 + 9;
 
 type Reader = fn(&[u8]) -> Result<Vec<u8>, RejectedMessage>;
 
-/// A message, and who reads it.
+/// A message, and the function that reads it.
 fn message() -> impl Strategy<Value = (Vec<u8>, Reader)> {
     let request = request().prop_map(|bytes| (bytes, super::request as Reader));
     prop_oneof![request, answer().prop_map(|bytes| (bytes, super::answer as Reader))]
 }
 
-/// The content of a message, without what fills it up.
+/// The content of a message, without padding.
 fn content(message: &[u8]) -> &[u8] {
     &frame::split(message).unwrap().0[9..]
 }
 
-/// What a sender would send of any content, right or wrong.
+/// Arbitrary content as a control message.
 fn sealed(content: &[u8]) -> Vec<u8> {
     let control = [b"CALM\x02".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
     frame::to_words(&control, None).as_bytes().to_vec()
 }
 
-/// The message with other bytes beside it.
+/// The message with another block.
 fn with_block(message: &[u8], block: &[u8]) -> Vec<u8> {
     let (control, _) = frame::split(message).unwrap();
     [frame::to_words(control, None).as_bytes(), block].concat()
@@ -66,7 +66,7 @@ proptest! {
         let control = encode(&payload);
         let Payload::Offer { report: Some(found), .. } = decode(&control).unwrap() else { panic!("an offer") };
         let found = attach_candidate(Some(found), candidate.map(CandidateBlock::encode)).unwrap();
-        // Candidates hold numbers of any bits, NaN too: their blocks are compared.
+        // Candidates may contain NaN, so their blocks are compared.
         prop_assert_eq!(found, Some(report.map_candidate(|candidate| CandidateBlock::encode(&candidate))));
     }
 
@@ -83,7 +83,7 @@ proptest! {
         (mut bytes, read) in message(), at in any::<prop::sample::Index>(), change in 1..=255_u8,
     ) {
         let (control, block) = frame::split(&bytes).unwrap();
-        // What fills up to a multiple of 8 is not looked at.
+        // Padding to a multiple of 8 is ignored.
         let (end, filled) = (8 + control.len(), bytes.len() - block.len());
         let at = at.index(end + block.len());
         let at = if at < end { at } else { at - end + filled };
@@ -114,14 +114,14 @@ proptest! {
     fn random_bytes_do_no_harm(bytes in vec(any::<u8>(), 0..400), length in 0..400_u64) {
         prop_assert_eq!(reencode(&bytes), [None, None]);
         prop_assert_eq!(reencode(&[&length.to_le_bytes(), bytes.as_slice()].concat()), [None, None]);
-        // With the checksum that fits, what can be read comes back.
+        // With a valid checksum, whatever can be decoded survives a round trip.
         for (role, reencoded) in reencode(&sealed(&bytes)).into_iter().enumerate() {
             let Some(reencoded) = reencoded else { continue };
             prop_assert_eq!(&reencode(&reencoded)[role], &Some(reencoded));
         }
     }
 
-    /// Damage that the checksum does not see, as from a program with an error.
+    /// Damage that the checksum does not detect, for example by a bug in the sender.
     #[test]
     fn a_wrong_program_does_no_harm(
         (bytes, read) in message(), at in any::<prop::sample::Index>(), byte in any::<u8>(),
@@ -210,20 +210,22 @@ fn what_is_wrong_is_said() {
     assert!(matches!(super::answer(&bytes[..7]), Err(RejectedMessage::Frame(FrameError::Short(7)))));
 }
 
-/// A length before a text or a list is not trusted.
+/// The length of a text or list is not trusted.
 #[test]
 fn absurd_lengths_are_refused() {
     let absurd = [&[0xff; 9][..], &[1]].concat();
     let is_refused = |read: Reader, content: &[&[u8]]| {
         matches!(read(&sealed(&content.concat())), Err(RejectedMessage::Control(ControlError::Content(_))))
     };
-    // Session, walker, incarnation; offer 1 with a report: walk 0, turn 0, ended, blew up, and a reason of 2⁶³ bytes.
+    // Session, walker, incarnation; offer 1 with a report: walk 0, assignment 0, ended, blew up, and a reason of 2⁶³
+    // bytes.
     let envelope = [0, 0, 0, 0, 1, 1, 0, 0, 3, 4];
-    // No reason, no checkpoint, progress of nothing.
+    // No reason, no checkpoint, zero progress.
     let rest = [&[0, 0][..], &[0, 0], &[0; 32], &[0, 0, 0]].concat();
     assert!(super::request(&sealed(&[&envelope[..], &rest].concat())).is_ok());
     assert!(is_refused(super::request, &[&envelope, &absurd, &rest[1..]]));
-    // Offer 1 was decided: a turn, mixture 0, campaign, walk 0, turn 0, biased, random walk 0, and 2⁶³ species.
+    // Answer to offer 1: an assignment, mixture 0, campaign, walk 0, assignment 0, biased, random walk 0, and 2⁶³
+    // species.
     let turn = [&[1, 0, 0][..], &[0; 16], &[0; 4]].concat();
     assert!(is_refused(super::answer, &[&turn, &absurd, &[0; 100]]));
 }

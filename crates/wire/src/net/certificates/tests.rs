@@ -29,7 +29,7 @@ impl Authority {
         Self { pem, issuer: Issuer::new(parameters, key) }
     }
 
-    /// Writes the files of a host whose certificate is as `change` has it.
+    /// Writes the files of a host, with changes to its certificate.
     fn host(&self, directory: &Path, change: impl FnOnce(&mut CertificateParams)) -> Tls {
         let key = KeyPair::generate().unwrap();
         let mut parameters = CertificateParams::new(["head".to_owned(), "10.0.0.3".to_owned()]).unwrap();

@@ -1,4 +1,4 @@
-//! Messages of any content, written as their senders write them.
+//! Strategies for arbitrary messages, encoded as by their senders.
 
 use std::borrow::Cow;
 
@@ -127,7 +127,7 @@ pub fn request() -> impl Strategy<Value = Vec<u8>> {
     prop_oneof![4 => offer(), 1 => question, 1 => news]
 }
 
-/// A turn as the server gives it.
+/// An assignment as the server sends it.
 pub fn given(sequence: u64, mixture_version: u64, assignment: &Assignment) -> Vec<u8> {
     let assignment = Cow::Borrowed(assignment);
     written(&Answer { sequence, body: AnswerBody::Assignment { mixture_version, assignment } }, None)
