@@ -57,7 +57,7 @@ impl Grader {
         let mut list = NeighbourList::new(self.largest_cutoff, 0.0);
         list.update(structure)?;
         let mut bonds = Bonds { elements, pairs: Vec::new(), shortest: f64::INFINITY };
-        self.weigh(structure, &list, &mut bonds);
+        self.compute_pairs(structure, &list, &mut bonds);
         Ok(bonds)
     }
 
@@ -66,7 +66,7 @@ impl Grader {
     /// Visiting the atoms in order fills the pairs of each atom starting from its first neighbour. The images of a
     /// neighbour are in ascending order on both sides, so the first on one side is the reverse of the last on the
     /// other.
-    fn weigh(&self, structure: &Structure, list: &NeighbourList, bonds: &mut Bonds) {
+    fn compute_pairs(&self, structure: &Structure, list: &NeighbourList, bonds: &mut Bonds) {
         let Bonds { elements, pairs, shortest } = bonds;
         let cutoff = |i: usize, j: usize| self.pair_cutoffs[elements[i] * self.elements.len() + elements[j]];
         let mut next = Vec::with_capacity(list.len());

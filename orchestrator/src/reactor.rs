@@ -90,7 +90,7 @@ struct ReactorState {
     /// Replies that wait for the commit before them.
     pending_replies: Vec<PendingReply>,
     /// The walk assigned to each busy walker.
-    at_work: HashMap<u32, WalkId>,
+    assigned: HashMap<u32, WalkId>,
     /// Number of walkers that crashed with the current assignment of a walk.
     crash_counts: HashMap<WalkId, u32>,
     /// Upper bound of the number of unfinished label jobs, and when it was determined.
@@ -139,7 +139,7 @@ impl Reactor {
                     }
                     events.set_mixture(state.selector.mixture());
                 }
-                _ = poll.tick(), if !state.waiting.is_empty() || state.at_work.is_empty() => {
+                _ = poll.tick(), if !state.waiting.is_empty() || state.assigned.is_empty() => {
                     // A stop before the first walker is idle is not followed by any message, but agents wait for the
                     // reactor to end.
                     if state.waiting.is_empty() && !state.stopping.load(Ordering::Relaxed) {
@@ -169,9 +169,9 @@ impl Reactor {
 }
 
 async fn write(store: Store, commit: Commit) -> Result<Commit, StoreError> {
-    let begun = Instant::now();
+    let start = Instant::now();
     store.commit(&commit).await?;
-    log::committed(&commit, begun.elapsed());
+    log::committed(&commit, start.elapsed());
     Ok(commit)
 }
 
@@ -190,7 +190,7 @@ impl ReactorState {
             decided: None,
             waiting: VecDeque::new(),
             pending_replies: Vec::new(),
-            at_work: HashMap::new(),
+            assigned: HashMap::new(),
             crash_counts: HashMap::new(),
             unfinished: None,
             paused_polled_at: None,
@@ -210,9 +210,9 @@ impl ReactorState {
                     None
                 }
                 ReactorEvent::Idle { walker, report, reply } => {
-                    self.at_work.remove(&walker);
+                    self.assigned.remove(&walker);
                     self.waiting.push_back((walker, reply));
-                    match report.filter(|report| !self.is_in_hand(report.walk)) {
+                    match report.filter(|report| !self.is_assigned(report.walk)) {
                         Some(report) => {
                             self.crash_counts.remove(&report.walk);
                             self.selector.report_regraded(report)?
@@ -234,17 +234,17 @@ impl ReactorState {
     }
 
     /// Whether the walk is assigned, or about to be. If so, a report of a walker that was considered lost is ignored.
-    fn is_in_hand(&self, walk: WalkId) -> bool {
+    fn is_assigned(&self, walk: WalkId) -> bool {
         let pending_replies = self.pending_replies.iter().filter_map(|pending| pending.work.as_ref());
-        let mut in_hand =
-            self.at_work.values().copied().chain(pending_replies.map(|work| work.assignment.walk));
-        in_hand.any(|other| other == walk)
+        let mut assigned =
+            self.assigned.values().copied().chain(pending_replies.map(|work| work.assignment.walk));
+        assigned.any(|other| other == walk)
     }
 
     /// Whether no walker is busy, waiting, or will get an assignment.
     fn is_over(&self) -> bool {
         let no_more = self.selector.is_done() || self.stopping.load(Ordering::Relaxed);
-        no_more && self.waiting.is_empty() && self.at_work.is_empty()
+        no_more && self.waiting.is_empty() && self.assigned.is_empty()
     }
 
     /// Handles the loss of a walker. Its assignment goes to another walker, unless it has crashed too many.
@@ -255,8 +255,8 @@ impl ReactorState {
             }
             return Ok(None);
         }
-        let Some(walk) = self.at_work.remove(&walker) else { return Ok(None) };
-        warn!(walker, walk = walk.0, crashed, "a walker was lost with a turn in hand");
+        let Some(walk) = self.assigned.remove(&walker) else { return Ok(None) };
+        warn!(walker, walk = walk.0, crashed, "a walker was lost with an assignment");
         if crashed {
             let crashes = self.crash_counts.entry(walk).or_default();
             *crashes += 1;
@@ -343,8 +343,8 @@ impl ReactorState {
             let walk = work.as_ref().map(|work| work.assignment.walk);
             match (reply.send(work), walk) {
                 (Ok(()), Some(walk)) => {
-                    debug!(walker, walk = walk.0, "gave a turn");
-                    self.at_work.insert(walker, walk);
+                    debug!(walker, walk = walk.0, "sent an assignment");
+                    self.assigned.insert(walker, walk);
                 }
                 // The walker has exited; another walker gets its assignment.
                 (Err(_), Some(walk)) => self.selector.assignment_lost(walk),

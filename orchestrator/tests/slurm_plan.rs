@@ -60,7 +60,7 @@ fn in_the_place_of_one_that_ends_another_waits_for_its_end() {
 fn what_is_not_asked_for_any_more_is_cancelled() {
     let jobs = [
         job(7, Role::Orchestrator, "PENDING"),
-        // Two were submitted at once: the first stays; of a third role, the running one stays.
+        // Two orchestrators were submitted at once: the first stays. Of two jobs of agent 0, the running one stays.
         job(8, Role::Orchestrator, "PENDING"),
         job(2, Role::Agent(0), "PENDING"),
         job(3, Role::Agent(0), "RUNNING"),

@@ -35,7 +35,7 @@ impl Listen {
         checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
         let endpoint = self.endpoint.with_host_name(&self.host).map_err(Failure::input)?;
         let host = endpoint.plain_host();
-        if checked.is_for(host) {
+        if checked.is_valid_for(host) {
             return Ok(());
         }
         let names = checked.names.join(", ");

@@ -80,14 +80,14 @@ pub(crate) enum ControlError {
         found: f64,
     },
     /// The candidate is missing, or another one than the report names.
-    #[error("report of walk {walk} names candidate {}, but the attached block is {}", name(.named), name(.beside))]
+    #[error("report of walk {walk} names candidate {}, but the attached block is {}", name(.named), name(.attached))]
     Candidate {
         /// The walk.
         walk: WalkId,
         /// Named in the report.
         named: Option<Box<CandidateId>>,
         /// Id of the attached block.
-        beside: Option<Box<CandidateId>>,
+        attached: Option<Box<CandidateId>>,
     },
     /// A candidate without a report that names it.
     #[error("unexpected candidate of {0} bytes: the message names none")]
@@ -202,8 +202,8 @@ fn checked_outcome(
         }
         (outcome, block) => {
             let named = if let EncodedOutcome::Candidate(id) = outcome { Some(Box::new(id)) } else { None };
-            let beside = block.map(|block| Box::new(block.view().id()));
-            Err(ControlError::Candidate { walk, named, beside })
+            let attached = block.map(|block| Box::new(block.view().id()));
+            Err(ControlError::Candidate { walk, named, attached })
         }
     }
 }

@@ -45,7 +45,7 @@ impl ChildReporter {
 /// Writes the setup of a child process, reports its standard error, waits for its exit and reports that.
 pub(super) async fn monitor_child(mut child: Child, setup: Vec<u8>, reporter: ChildReporter) {
     if let Some(stdin) = child.stdin.take() {
-        tokio::spawn(feed(stdin, setup));
+        tokio::spawn(write_setup(stdin, setup));
     }
     let mut stderr = StderrLines::new(child.stderr.take());
     let status = loop {
@@ -68,7 +68,7 @@ pub(super) async fn monitor_adopted(end: AsyncFd<OwnedFd>, reporter: ChildReport
     reporter.report(ChildNews::Ended(ExitReason::Unknown)).await;
 }
 
-async fn feed(mut stdin: ChildStdin, setup: Vec<u8>) {
+async fn write_setup(mut stdin: ChildStdin, setup: Vec<u8>) {
     // A child that does not read its setup reports the reason itself.
     let _ = stdin.write_all(&setup).await;
 }

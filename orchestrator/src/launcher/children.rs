@@ -86,7 +86,7 @@ impl Children {
     /// need not be a child of this process, but then the reason of its exit remains unknown. Must be called in a tokio
     /// runtime.
     pub fn adopt(&mut self, number: u32, pid: u32, birth: &str) -> Result<(), AdoptError> {
-        let process = Process::find(pid, birth)?;
+        let process = Process::open_running(pid, birth)?;
         let end = process.end().map_err(|error| AdoptError::Refused { pid, error })?;
         if !self.supervisor.adopt(number, self.heartbeats.now()) {
             return Err(AdoptError::NotAdoptable { pid, number });
@@ -189,7 +189,7 @@ impl Children {
     fn start(&mut self, number: u32, incarnation: u32) -> io::Result<u32> {
         let (mut child, setup) = (self.launch)(number, incarnation).start()?;
         let pid = child.id().ok_or_else(|| io::Error::other("it exited before it could be monitored"))?;
-        let process = Process::of_child(pid).inspect_err(|_| {
+        let process = Process::from_child(pid).inspect_err(|_| {
             // A process that cannot be signalled later must not live.
             let _ = child.start_kill();
         })?;

@@ -45,12 +45,12 @@ pub(super) struct Process {
 
 impl Process {
     /// The handle of a child process that was not waited for.
-    pub fn of_child(pid: u32) -> io::Result<Self> {
+    pub fn from_child(pid: u32) -> io::Result<Self> {
         Ok(Self { handle: open(pid)? })
     }
 
     /// The handle of the process with this id and start time ([`store::process_birth`]).
-    pub fn find(pid: u32, birth: &str) -> Result<Self, AdoptError> {
+    pub fn open_running(pid: u32, birth: &str) -> Result<Self, AdoptError> {
         let handle = open(pid).map_err(|error| match error {
             Errno::SRCH | Errno::INVAL => AdoptError::Gone { pid },
             error => AdoptError::Refused { pid, error: error.into() },
@@ -83,7 +83,7 @@ impl Process {
 /// Asks the process `pid`, which started at `birth` ([`store::process_birth`]), to exit (SIGTERM), without waiting for
 /// it. Used for a labeller of an earlier run that cannot be adopted because it uses another label protocol.
 pub fn request_exit(pid: u32, birth: &str) -> Result<(), AdoptError> {
-    let sent = Process::find(pid, birth)?.signal(Signal::TERM);
+    let sent = Process::open_running(pid, birth)?.signal(Signal::TERM);
     sent.map_err(|error| AdoptError::Refused { pid, error })
 }
 

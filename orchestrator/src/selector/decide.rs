@@ -336,7 +336,7 @@ impl DecisionState {
     /// Creates the control walk of the biased walk `of`, which must exist.
     pub fn start_control(&mut self, id: WalkId, of: WalkId) -> Decision {
         let steps_per_assignment = self.settings.steps_per_assignment;
-        let control = self.walk_mut(of).control(id, steps_per_assignment);
+        let control = self.walk_mut(of).new_control(id, steps_per_assignment);
         let detail = json!({ "control_of": of, "wanted": control.state.wanted });
         self.walks.insert(id, control);
         self.decision("begun", id, detail)

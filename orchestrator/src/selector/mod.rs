@@ -231,7 +231,7 @@ impl Selector {
     /// Enables raising the threshold of the collection rule while more than `limit` label jobs are unfinished (see
     /// [`Self::set_unfinished_jobs`]). Live mode only, since the length of the queue depends on timing.
     pub fn raise_threshold_above(&mut self, limit: u64) {
-        self.decisions.backlog = Some(Backlog::above(limit));
+        self.decisions.backlog = Some(Backlog::new(limit));
     }
 
     /// Sets the number of unfinished label jobs, for all later decisions and assignments.
@@ -249,7 +249,7 @@ impl Selector {
     /// Number of unfinished label jobs above which walkers wait: `limit`, or a larger number if the threshold is raised
     /// first.
     pub fn max_unfinished_jobs(&self, limit: u64) -> u64 {
-        self.decisions.backlog.map_or(limit, Backlog::bound)
+        self.decisions.backlog.map_or(limit, Backlog::max_unfinished_jobs)
     }
 
     /// Takes the report on an assignment. The returned commit must be written before any later assignment is sent.

@@ -56,7 +56,7 @@ impl Walk {
     }
 
     /// The unbiased control of a biased walk, with frames at the steps where the biased walk collected.
-    pub fn control(&mut self, walk: WalkId, steps_per_assignment: u64) -> Self {
+    pub fn new_control(&mut self, walk: WalkId, steps_per_assignment: u64) -> Self {
         let mut control = Self::new(walk, self.record.seed_structure, 0);
         control.record.origin = Origin::Control;
         control.record.partner = Some(self.record.walk);

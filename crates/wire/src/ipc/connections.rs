@@ -76,7 +76,7 @@ impl Connections {
     }
 
     /// Sets the request that takes the answer to the walker's offer.
-    pub(super) fn route(&mut self, sender: SenderId, request: &Arc<BorrowedRequest>) {
+    pub(super) fn set_route(&mut self, sender: SenderId, request: &Arc<BorrowedRequest>) {
         if let Some(connection) = self.walkers.get_mut(&sender.walker) {
             connection.route = Some(Arc::clone(request));
         }
@@ -84,7 +84,7 @@ impl Connections {
 
     /// Creates the channel for the reactor's decision. The walker has reported, so the mixture of its assignment is
     /// released.
-    pub(super) fn decide(&mut self, sender: SenderId) -> oneshot::Sender<Option<WorkItem>> {
+    pub(super) fn decision_channel(&mut self, sender: SenderId) -> oneshot::Sender<Option<WorkItem>> {
         let (reply, decision) = oneshot::channel();
         if let Some(connection) = self.walkers.get_mut(&sender.walker) {
             connection.decision = Some(decision);
@@ -127,7 +127,7 @@ impl Connections {
     }
 
     /// Counts a message, the time spent on it, and the reason if it was rejected.
-    pub(super) fn count(&self, bytes: u64, took: Duration, rejected: Option<&impl fmt::Display>) {
+    pub(super) fn record_message(&self, bytes: u64, took: Duration, rejected: Option<&impl fmt::Display>) {
         let mut traffic = self.traffic.lock().unwrap_or_else(PoisonError::into_inner);
         traffic.received += 1;
         traffic.bytes += bytes;

@@ -23,20 +23,20 @@ fn request(bytes: &[u8]) -> Result<Vec<u8>, RejectedMessage> {
     let (control, block) = frame::split(bytes)?;
     let Envelope { sender, payload } = decode(control)?;
     let Payload::Offer { sequence, report } = payload else {
-        return Ok(written(&Envelope { sender, payload }, None));
+        return Ok(encode_message(&Envelope { sender, payload }, None));
     };
     let block = if block.is_empty() { None } else { Some(CandidateBlock::from_bytes(block)?) };
     let report = attach_candidate(report, block)?;
     let report = report.map(|report| report.map_candidate(|block| block.view().to_candidate()));
     let (payload, candidate) = Payload::offer(sequence, report.as_ref());
-    Ok(written(&Envelope { sender, payload }, candidate))
+    Ok(encode_message(&Envelope { sender, payload }, candidate))
 }
 
 fn answer(bytes: &[u8]) -> Result<Vec<u8>, RejectedMessage> {
     let (control, _) = frame::split(bytes)?;
-    Ok(written(&Answer::decode(control)?, None))
+    Ok(encode_message(&Answer::decode(control)?, None))
 }
 
-fn written(content: &impl Serialize, candidate: Option<&Candidate>) -> Vec<u8> {
+fn encode_message(content: &impl Serialize, candidate: Option<&Candidate>) -> Vec<u8> {
     frame::to_words(&encode(content), candidate).as_bytes().to_vec()
 }

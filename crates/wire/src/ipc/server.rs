@@ -156,7 +156,7 @@ impl Server {
                         return Ok(());
                     }
                 },
-                (walker, work) = poll_fn(|context| session.poll_decision(context)) => session.decided(walker, work)?,
+                (walker, work) = poll_fn(|context| session.poll_decision(context)) => session.handle_decision(walker, work)?,
                 permit = to_reactor.reserve(), if !session.outbox.is_empty() => match permit {
                     Ok(permit) => if let Some(incoming) = session.outbox.pop_front() { permit.send(incoming) },
                     // The reactor has ended: all waiting walkers shut down.

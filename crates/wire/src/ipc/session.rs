@@ -64,19 +64,19 @@ impl ServerSession {
     /// Handles a message. Returns its walker and whether it contains a report, unless the message is rejected.
     pub(super) fn receive(&mut self, request: Request) -> Option<(u32, bool)> {
         let (begin, bytes) = (Instant::now(), size_of_val(request.payload()) as u64);
-        let heard = self.listen(request);
-        self.connections.count(bytes, begin.elapsed(), heard.as_ref().err());
-        heard.ok()
+        let received = self.dispatch(request);
+        self.connections.record_message(bytes, begin.elapsed(), received.as_ref().err());
+        received.ok()
     }
 
-    fn listen(&mut self, request: Request) -> Result<(u32, bool), RejectedMessage> {
+    fn dispatch(&mut self, request: Request) -> Result<(u32, bool), RejectedMessage> {
         let request = Arc::new(BorrowedRequest::new(request)?);
         let Envelope { sender, payload } = decode(request.control())?;
         self.sequences.check_sender(sender)?;
         let reports = matches!(payload, Payload::Offer { report: Some(_), .. });
         match payload {
             Payload::Offer { sequence, report } => self.offer(sender, sequence, report, &request)?,
-            Payload::Poll { sequence } => self.ask(sender, sequence, &request)?,
+            Payload::Poll { sequence } => self.poll(sender, sequence, &request)?,
             Payload::Progress(walk, progress) => self.progress(walk, progress.into_owned()),
         }
         Ok((sender.walker, reports))
@@ -92,19 +92,19 @@ impl ServerSession {
         match self.sequences.offer(sender, sequence)? {
             OfferStatus::Answered(answer) => self.connections.send(sender, request, answer),
             // The walker waits for the answer to its latest request.
-            OfferStatus::Pending => self.connections.route(sender, request),
+            OfferStatus::Pending => self.connections.set_route(sender, request),
             OfferStatus::New | OfferStatus::Unknown => {
                 let report = attach_candidate(report, self.candidate(sender, request)?)?;
                 self.sequences.begin(sender.walker);
-                self.connections.route(sender, request);
-                let reply = self.connections.decide(sender);
+                self.connections.set_route(sender, request);
+                let reply = self.connections.decision_channel(sender);
                 self.outbox.push_back(Incoming::Idle { walker: sender.walker, report, reply });
             }
         }
         Ok(())
     }
 
-    fn ask(
+    fn poll(
         &mut self,
         sender: SenderId,
         sequence: u64,
@@ -154,7 +154,7 @@ impl ServerSession {
     }
 
     /// Answers the pending offer of a walker.
-    pub(super) fn decided(&mut self, walker: u32, work: Option<WorkItem>) -> Result<(), IpcError> {
+    pub(super) fn handle_decision(&mut self, walker: u32, work: Option<WorkItem>) -> Result<(), IpcError> {
         let Some((sender, sequence)) = self.sequences.pending(walker) else { return Ok(()) };
         let body = match &work {
             Some(WorkItem { assignment, mixture }) => {

@@ -76,7 +76,7 @@ impl IpcWalker {
             config::client_port(&config::open_requests(&node, sender.session)?, connect_info.message_bytes)?;
         shm_dir::reserve(&connect_info.prefix, Some(port.id().value()))
             .map_err(|e| IpcError::new("reserve its memory", e))?;
-        let mixtures = reader(connect_info)?;
+        let mixtures = open_mixture(connect_info)?;
         Ok(Self {
             sender,
             port,
@@ -103,7 +103,7 @@ impl IpcWalker {
     }
 
     /// Sends the report until it is answered.
-    fn converse(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<WorkItem>, IpcError> {
+    fn exchange_report(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<WorkItem>, IpcError> {
         self.sequence += 1;
         let (mut offer, mut question) = (self.offer(report)?, None);
         let (mut offers, mut asked, mut heard) = (1, Instant::now(), Instant::now());
@@ -113,7 +113,7 @@ impl IpcWalker {
                 decision => decision,
             };
             match decision {
-                None => self.wait_for(asked, heard)?,
+                None => self.wait(asked, heard)?,
                 Some(AnswerBody::Pending) => heard = Instant::now(),
                 Some(AnswerBody::Shutdown) => return Ok(None),
                 Some(AnswerBody::Assignment { mixture_version, assignment }) => {
@@ -136,7 +136,7 @@ impl IpcWalker {
     }
 
     /// Sleeps until the server wakes this walker or the next poll is due. A signal may end the sleep early.
-    fn wait_for(&self, asked: Instant, heard: Instant) -> Result<(), IpcError> {
+    fn wait(&self, asked: Instant, heard: Instant) -> Result<(), IpcError> {
         let timeout = if self.stopping() { STOPPING_TIMEOUT } else { ANSWER_TIMEOUT };
         if heard.elapsed() > timeout {
             return Err(IpcError::Timeout { seconds: timeout.as_secs() });
@@ -191,7 +191,7 @@ impl IpcWalker {
 
 /// Opens the shared mixture. The server frees the slot of the previous process when it learns of its exit, which may be
 /// shortly after this process starts.
-fn reader(connect_info: &ConnectInfo) -> Result<MixtureReader, SharedMixtureError> {
+fn open_mixture(connect_info: &ConnectInfo) -> Result<MixtureReader, SharedMixtureError> {
     let begun = Instant::now();
     loop {
         match MixtureReader::open(&connect_info.mixture, connect_info.sender.walker) {
@@ -205,7 +205,7 @@ fn reader(connect_info: &ConnectInfo) -> Result<MixtureReader, SharedMixtureErro
 
 impl Transport for IpcWalker {
     fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem> {
-        let answer = self.converse(report.as_ref());
+        let answer = self.exchange_report(report.as_ref());
         answer.unwrap_or_else(|failure| {
             self.failure = Some(failure);
             None

@@ -122,11 +122,12 @@ impl BlockAllocator {
     /// Frees retired blocks that no reader uses.
     pub fn reclaim(&mut self) {
         let retired = std::mem::take(&mut self.retired);
-        let (held, free): (Vec<u32>, Vec<u32>) = retired.into_iter().partition(|&block| self.is_held(block));
+        let (held, free): (Vec<u32>, Vec<u32>) =
+            retired.into_iter().partition(|&block| self.is_in_use(block));
         self.retired = held;
         for block in free {
             let spare = self.backed.len() >= SPARE as usize;
-            if spare && self.punch(block) { &mut self.unbacked } else { &mut self.backed }.push(block);
+            if spare && self.punch_hole(block) { &mut self.unbacked } else { &mut self.backed }.push(block);
         }
     }
 
@@ -139,7 +140,7 @@ impl BlockAllocator {
         }
     }
 
-    fn is_held(&self, block: u32) -> bool {
+    fn is_in_use(&self, block: u32) -> bool {
         let (extent, index) = self.layout.extent_of(block);
         self.refcounts.get(extent as usize).is_some_and(|refcounts| {
             let count =
@@ -179,7 +180,7 @@ impl BlockAllocator {
     }
 
     /// Releases the memory of a block; `false` if the system refuses.
-    fn punch(&self, block: u32) -> bool {
+    fn punch_hole(&self, block: u32) -> bool {
         let flags = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
         retry_on_intr(|| fallocate(&self.file, flags, self.place(block), self.layout.block_bytes)).is_ok()
     }

@@ -17,7 +17,7 @@ pub(super) struct MixtureIndex {
 
 impl MixtureIndex {
     pub fn map(file: &File, layout: &Layout) -> io::Result<Self> {
-        let map = Mapping::shared(file, layout.control_at, layout.control_bytes)?;
+        let map = Mapping::shared(file, layout.index_at, layout.index_bytes)?;
         Ok(Self { map, layout: layout.clone() })
     }
 

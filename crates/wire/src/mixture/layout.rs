@@ -75,9 +75,9 @@ pub(super) struct Layout {
     /// Blocks per extent.
     pub extent_blocks: u32,
     /// Start of the index.
-    pub control_at: u64,
+    pub index_at: u64,
     /// Length of the index.
-    pub control_bytes: u64,
+    pub index_bytes: u64,
     /// Version words, from the start of the index.
     pub versions_at: u64,
     /// Rows, from the start of the index.
@@ -119,17 +119,17 @@ impl Layout {
         if dimension == 0 || components == 0 || extent_blocks == 0 {
             return None;
         }
-        let control_at = up(HEADER as u64 + 4 * shape.len() as u64, PAGE)?;
+        let index_at = up(HEADER as u64 + 4 * shape.len() as u64, PAGE)?;
         let versions_at = CACHE_LINE * (1 + u64::from(readers));
         let rows_at = up(versions_at + 8 * u64::from(rows), CACHE_LINE)?;
         let row_bytes = up(4 * u64::from(components), CACHE_LINE)?;
-        let control_bytes = up(row_bytes.checked_mul(rows.into())?.checked_add(rows_at)?, PAGE)?;
+        let index_bytes = up(row_bytes.checked_mul(rows.into())?.checked_add(rows_at)?, PAGE)?;
         let reader_refcount_bytes = up(4 * u64::from(extent_blocks), CACHE_LINE)?;
         let refcount_bytes = up(reader_refcount_bytes.checked_mul(readers.into())?.max(1), PAGE)?;
         let numbers = u64::from(dimension) * (u64::from(dimension) + 1);
         let block_bytes = up(numbers.checked_mul(8)?.checked_add(BLOCK_HEADER)?, PAGE)?;
         let extent_bytes = block_bytes.checked_mul(extent_blocks.into())?.checked_add(refcount_bytes)?;
-        let extents_at = control_at.checked_add(control_bytes)?;
+        let extents_at = index_at.checked_add(index_bytes)?;
         Some(Self {
             dimension,
             shape,
@@ -137,8 +137,8 @@ impl Layout {
             readers,
             rows,
             extent_blocks,
-            control_at,
-            control_bytes,
+            index_at,
+            index_bytes,
             versions_at,
             rows_at,
             row_bytes,

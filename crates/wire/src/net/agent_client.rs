@@ -206,7 +206,7 @@ impl AgentClient {
 
     async fn try_join(self: &Arc<Self>) -> Result<Membership, LinkError> {
         let answer = self.request(&Request::Join(self.agent.clone())).await?;
-        let Reply::Joined(place) = read(&answer)? else { return Err(unexpected("join")) };
+        let Reply::Joined(place) = decode_reply(&answer)? else { return Err(unexpected("join")) };
         let membership = Membership {
             client: Arc::clone(self),
             session: place.session,
@@ -258,7 +258,7 @@ pub(super) async fn delay_retry(asked: Instant) {
 }
 
 /// Decodes an answer; rejections are errors.
-pub(super) fn read(answer: &[u8]) -> Result<Reply<'_>, LinkError> {
+pub(super) fn decode_reply(answer: &[u8]) -> Result<Reply<'_>, LinkError> {
     match decode(answer)? {
         Reply::RejoinRequired(why) => Err(LinkError::RejoinRequired(why)),
         Reply::Rejected(why) => Err(LinkError::Rejected(why)),
@@ -307,7 +307,7 @@ impl Membership {
             let skip = receiver.as_ref().map_or(0, DeltaReceiver::received);
             let request = Request::Mixture { session: self.session, have, wanted, skip };
             let answer = self.client.request(&request).await?;
-            let Reply::Mixture(part) = read(&answer)? else { return Err(unexpected("mixture")) };
+            let Reply::Mixture(part) = decode_reply(&answer)? else { return Err(unexpected("mixture")) };
             let received = match &mut receiver {
                 Some(received) if received.is_next(&part) => received,
                 // The orchestrator has discarded the base version in the meantime: start over without it.
@@ -337,7 +337,7 @@ impl Membership {
             let offset = bytes.len() as u64;
             let request = Request::File { session: self.session, hash: hash.to_owned(), offset };
             let answer = self.client.request(&request).await?;
-            let Reply::File { length, part } = read(&answer)? else { return Err(unexpected("file")) };
+            let Reply::File { length, part } = decode_reply(&answer)? else { return Err(unexpected("file")) };
             bytes.extend_from_slice(part);
             if bytes.len() as u64 >= length || part.is_empty() {
                 return Ok(bytes);
@@ -352,7 +352,7 @@ impl Membership {
     pub async fn is_stopping(&self) -> Result<Option<bool>, LinkError> {
         let question = encode(&Request::Ping { session: self.session });
         let Some(answer) = self.client.send_once(&question, None).await else { return Ok(None) };
-        match read(&answer)? {
+        match decode_reply(&answer)? {
             Reply::Pong { stopping } => Ok(Some(stopping)),
             _ => Err(unexpected("here")),
         }

@@ -146,7 +146,7 @@ impl AgentServer {
                 // Complete aborted decisions before the reactor learns of the reason.
                 biased;
                 _ = self.commands.recv(), if !closing => closing = true,
-                Some((slot, work)) = decisions.next() => state.decided(slot, work),
+                Some((slot, work)) = decisions.next() => state.handle_decision(slot, work),
                 permit = to_reactor.reserve(), if !state.outbox.is_empty() => match permit {
                     Ok(permit) => if let Some(incoming) = state.outbox.pop_front() { permit.send(incoming) },
                     // The reactor has ended: all waiting walkers shut down.

@@ -181,7 +181,7 @@ impl Tls {
 impl CheckedTls {
     /// Whether agents can use this name for the host: it is in the certificate, possibly with a wildcard for the first
     /// label.
-    pub fn is_for(&self, host: &str) -> bool {
+    pub fn is_valid_for(&self, host: &str) -> bool {
         let address = |text: &str| text.parse::<IpAddr>().ok();
         let host = host.trim_start_matches('[').trim_end_matches(']');
         self.names.iter().any(|name| match name.strip_prefix("*.") {

@@ -110,7 +110,7 @@ fn describe(why: &Refusal) -> String {
     match why {
         Refusal::UnknownIssuer | Refusal::BadSignature => "it is signed by another authority".to_owned(),
         Refusal::NotValidForNameContext { expected, presented } => {
-            let presented: Vec<_> = presented.iter().map(|name| bare(name)).collect();
+            let presented: Vec<_> = presented.iter().map(|name| bare_name(name)).collect();
             format!("it is for {}, not for {}", presented.join(", "), expected.to_str())
         }
         Refusal::Expired | Refusal::ExpiredContext { .. } => {
@@ -124,7 +124,7 @@ fn describe(why: &Refusal) -> String {
 }
 
 /// The name in `DnsName("head")`.
-fn bare(name: &str) -> &str {
+fn bare_name(name: &str) -> &str {
     let inside = name.split_once('(').and_then(|(_, rest)| rest.strip_suffix(')'));
     inside.unwrap_or(name).trim_matches('"')
 }

@@ -93,7 +93,7 @@ impl ServerSession {
     pub(super) fn receive(&mut self, query: Query, files: &Files) -> Option<PendingDecision> {
         while self.sending.try_join_next().is_some() {}
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
-        let result = self.listen(&query, &payload, files);
+        let result = self.dispatch(&query, &payload, files);
         result.unwrap_or_else(|why| {
             let said = why.to_string();
             if let RejectedMessage::SenderMismatch(_) = why {
@@ -107,7 +107,7 @@ impl ServerSession {
         })
     }
 
-    fn listen(
+    fn dispatch(
         &mut self,
         query: &Query,
         payload: &[u8],
@@ -120,7 +120,7 @@ impl ServerSession {
                 Payload::Offer { sequence, report } => {
                     return self.offer(query, sender, sequence, report, block);
                 }
-                Payload::Poll { sequence } => self.ask(query, sender, sequence)?,
+                Payload::Poll { sequence } => self.poll(query, sender, sequence)?,
                 Payload::Progress(walk, progress) => {
                     self.sequences.check_sender(sender)?;
                     self.progress(walk, progress.into_owned());
@@ -130,21 +130,21 @@ impl ServerSession {
                 return self.lost(query, sender, sequence, crashed);
             }
             Request::Mixture { session, have, wanted, skip } => {
-                self.check(session)?;
+                self.check_session(session)?;
                 self.mixture(query, have, wanted, skip)?;
             }
             Request::File { session, hash, offset } => {
-                self.check(session)?;
+                self.check_session(session)?;
                 let (length, part) = files.part(&hash, offset)?.ok_or(RejectedMessage::File(hash))?;
                 self.send(query.clone(), &Reply::File { length, part: &part });
             }
             Request::Ping { session } => {
-                self.check(session)?;
+                self.check_session(session)?;
                 let stopping = self.stopping.load(Ordering::Relaxed);
                 self.send(query.clone(), &Reply::Pong { stopping });
             }
             Request::Leave { session, id } => {
-                self.check(session)?;
+                self.check_session(session)?;
                 if let Some(member) = self.registry.leave(&id) {
                     self.agent_lost(&member);
                     self.events.push(AgentEvent::Left(member.agent));
@@ -155,7 +155,7 @@ impl ServerSession {
         Ok(None)
     }
 
-    fn check(&self, found: u64) -> Result<(), SenderMismatch> {
+    fn check_session(&self, found: u64) -> Result<(), SenderMismatch> {
         let expected = self.session;
         if found == expected { Ok(()) } else { Err(SenderMismatch::Session { found, expected }) }
     }
@@ -175,7 +175,7 @@ impl ServerSession {
         let mixture_version = self.newest().version();
         let place = JoinReply { session: self.session, first_slot, mixture_version, setup: &self.setup };
         let reply = encode(&Reply::Joined(place));
-        self.send_sealed(query.clone(), &reply);
+        self.send_encoded(query.clone(), &reply);
         Ok(())
     }
 
@@ -196,7 +196,7 @@ impl ServerSession {
         }
         let candidate = (!block.is_empty()).then(|| CandidateBlock::from_bytes(block)).transpose()?;
         let report = attach_candidate(report, candidate)?;
-        Ok(Some(self.take(sender.walker, report)))
+        Ok(Some(self.begin_offer(sender.walker, report)))
     }
 
     /// Handled like an empty offer, after the loss of the walker is forwarded.
@@ -211,7 +211,7 @@ impl ServerSession {
             return Ok(None);
         }
         self.outbox.push_back(Incoming::Lost { walker: sender.walker, crashed });
-        Ok(Some(self.take(sender.walker, None)))
+        Ok(Some(self.begin_offer(sender.walker, None)))
     }
 
     /// Whether an offer is new. If it has been answered, sends the answer again. The latest request takes the answer.
@@ -222,19 +222,19 @@ impl ServerSession {
             OfferStatus::New | OfferStatus::Unknown => (true, None),
         };
         match again {
-            Some(answer) => self.send_sealed(query.clone(), &answer),
-            None => self.route(sender.walker, query),
+            Some(answer) => self.send_encoded(query.clone(), &answer),
+            None => self.set_route(sender.walker, query),
         }
         Ok(new)
     }
 
-    fn route(&mut self, slot: u32, query: &Query) {
+    fn set_route(&mut self, slot: u32, query: &Query) {
         if let Some(slot_connection) = self.slots.get_mut(&slot) {
             slot_connection.route = Some(query.clone());
         }
     }
 
-    fn take(&mut self, slot: u32, report: Option<crate::messages::Report>) -> PendingDecision {
+    fn begin_offer(&mut self, slot: u32, report: Option<crate::messages::Report>) -> PendingDecision {
         self.sequences.begin(slot);
         let (reply, decision) = oneshot::channel();
         let (decision, give_up) = abortable(decision);
@@ -246,13 +246,13 @@ impl ServerSession {
         Box::pin(async move { (slot, decision.await.ok().and_then(Result::ok).flatten()) })
     }
 
-    fn ask(&mut self, query: &Query, sender: SenderId, sequence: u64) -> Result<(), RejectedMessage> {
+    fn poll(&mut self, query: &Query, sender: SenderId, sequence: u64) -> Result<(), RejectedMessage> {
         match self.sequences.poll(sender, sequence)? {
             OfferStatus::Answered(answer) => {
                 let answer = answer.to_vec();
-                self.send_sealed(query.clone(), &answer);
+                self.send_encoded(query.clone(), &answer);
             }
-            OfferStatus::Pending => self.route(sender.walker, query),
+            OfferStatus::Pending => self.set_route(sender.walker, query),
             OfferStatus::New | OfferStatus::Unknown => {
                 let answer = Answer { sequence, body: AnswerBody::Unknown };
                 self.send(query.clone(), &Reply::Answer(answer));
@@ -292,7 +292,7 @@ impl ServerSession {
     }
 
     /// Answers the pending offer of a slot.
-    pub(super) fn decided(&mut self, slot: u32, work: Option<WorkItem>) {
+    pub(super) fn handle_decision(&mut self, slot: u32, work: Option<WorkItem>) {
         let Some((_, sequence)) = self.sequences.pending(slot) else { return };
         let body = match &work {
             Some(WorkItem { assignment, mixture }) => AnswerBody::Assignment {
@@ -311,7 +311,7 @@ impl ServerSession {
         let Some(slot_connection) = self.slots.get_mut(&slot) else { return };
         slot_connection.mixture = work.map(|work| work.mixture);
         if let Some(route) = slot_connection.route.take() {
-            self.send_sealed(route, &answer);
+            self.send_encoded(route, &answer);
         }
         self.sequences.set_answer(slot, answer);
     }
@@ -344,11 +344,11 @@ impl ServerSession {
     }
 
     fn send(&mut self, query: Query, reply: &Reply<'_>) {
-        self.send_sealed(query, &encode(reply));
+        self.send_encoded(query, &encode(reply));
     }
 
     /// If the reply is lost, the agent repeats its request.
-    fn send_sealed(&mut self, query: Query, reply: &[u8]) {
+    fn send_encoded(&mut self, query: Query, reply: &[u8]) {
         let reply = reply.to_vec();
         self.sending.spawn(async move { drop(query.reply(ORCHESTRATOR, reply).await) });
     }

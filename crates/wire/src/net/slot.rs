@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use tokio::time::Instant;
 
-use super::agent_client::{LinkError, Membership, delay_retry, read};
+use super::agent_client::{LinkError, Membership, decode_reply, delay_retry};
 use super::message::{Reply, Request};
 use crate::block::CandidateBlock;
 use crate::control::{EncodedReport, checked_assignment, encode};
@@ -67,7 +67,7 @@ impl Slot {
                 delay_retry(asked).await;
                 continue;
             };
-            let Reply::Answer(Answer { sequence, body }) = read(&answer)? else {
+            let Reply::Answer(Answer { sequence, body }) = decode_reply(&answer)? else {
                 return Err(LinkError::InvalidReply("it is not an answer to an offer".to_owned()));
             };
             if sequence != self.sequence {

@@ -31,7 +31,7 @@ pub(super) fn remove_tree(path: &Path, removed: &mut Removed) -> Result<(), ShmD
         Err(error) => Err(io_error("look at", path)(error)),
         Ok(found) if found.is_dir() => {
             entries(path)?.iter().try_for_each(|entry| remove_tree(entry, removed))?;
-            missing_is_fine(fs::remove_dir(path)).map_err(io_error("remove", path))
+            ignore_not_found(fs::remove_dir(path)).map_err(io_error("remove", path))
         }
         Ok(_) => remove_file(path, removed),
     }
@@ -39,12 +39,12 @@ pub(super) fn remove_tree(path: &Path, removed: &mut Removed) -> Result<(), ShmD
 
 pub(super) fn remove_file(path: &Path, removed: &mut Removed) -> Result<(), ShmDirError> {
     let blocks = path.symlink_metadata().map_or(0, |file| file.blocks());
-    missing_is_fine(fs::remove_file(path)).map_err(io_error("remove", path))?;
+    ignore_not_found(fs::remove_file(path)).map_err(io_error("remove", path))?;
     removed.files += 1;
     removed.bytes += 512 * blocks;
     Ok(())
 }
 
-fn missing_is_fine(result: io::Result<()>) -> io::Result<()> {
+fn ignore_not_found(result: io::Result<()>) -> io::Result<()> {
     if result.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::NotFound) { Ok(()) } else { result }
 }

@@ -8,7 +8,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
 use super::error::{ShmDirError, io_error};
-use super::private::{make_private, user};
+use super::private::{create_private, user};
 use super::user_root;
 
 /// A short-term lock on all directories of this user. While it is held, no directory is created, removed or locked by
@@ -20,7 +20,7 @@ impl UserLock {
     pub(super) fn wait() -> Result<Self, ShmDirError> {
         let root = user_root();
         loop {
-            make_private(&root, user())?;
+            create_private(&root, user())?;
             let file = match File::open(&root) {
                 Err(error) if error.kind() == std::io::ErrorKind::NotFound => continue,
                 file => file.map_err(io_error("open", &root))?,

@@ -32,7 +32,7 @@ pub use files::Removed;
 use error::io_error;
 use files::{entries, remove_file, remove_tree};
 use lock::{DirLock, UserLock};
-use private::{make_private, user};
+use private::{create_private, user};
 
 const SHARED_MEMORY: &str = "/dev/shm";
 /// The file with the path of the campaign's directory.
@@ -68,10 +68,10 @@ impl ShmDir {
         hasher.update(&user().to_le_bytes());
         hasher.update(path.as_os_str().as_bytes());
         let hash = hasher.finalize().to_hex();
-        Ok(Self { campaign: Some(path), ..Self::named(&hash[..DIGITS]) })
+        Ok(Self { campaign: Some(path), ..Self::from_name(&hash[..DIGITS]) })
     }
 
-    fn named(name: &str) -> Self {
+    fn from_name(name: &str) -> Self {
         let directory = user_root().join(name);
         let campaign = fs::read(directory.join(CAMPAIGN)).ok();
         let campaign = campaign.map(|path| PathBuf::from(OsStr::from_bytes(&path)));
@@ -95,7 +95,7 @@ impl ShmDir {
         names.retain(|name| name.len() == DIGITS && name.bytes().all(|b| b.is_ascii_hexdigit()));
         names.sort_unstable();
         names.dedup();
-        Ok(names.iter().map(|name| Self::named(name)).collect())
+        Ok(names.iter().map(|name| Self::from_name(name)).collect())
     }
 
     /// The directory with sockets, tables and the mixture.
@@ -130,7 +130,7 @@ impl ShmDir {
         if free < needed {
             return Err(ShmDirError::Space { needed, free });
         }
-        make_private(&self.directory, user())?;
+        create_private(&self.directory, user())?;
         let lock = self.lock()?;
         if let Some(campaign) = &self.campaign {
             let file = self.directory.join(CAMPAIGN);
@@ -233,7 +233,7 @@ mod tests {
     fn the_longest_path_of_a_socket_is_short_enough() {
         let home = format!("{SHARED_MEMORY}/calmwalk-{}", u32::MAX);
         let name: String = repeat_n('f', DIGITS).collect();
-        let path = format!("{home}/{name}/{}{}.e", ShmDir::named(&name).prefix, u128::MAX);
+        let path = format!("{home}/{name}/{}{}.e", ShmDir::from_name(&name).prefix, u128::MAX);
         assert_eq!(path.len(), 107);
     }
 }

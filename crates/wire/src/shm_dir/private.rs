@@ -12,7 +12,7 @@ pub(super) fn user() -> u32 {
 }
 
 /// Creates a directory with mode 0700, or checks that the existing one has it.
-pub(super) fn make_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
+pub(super) fn create_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
         made => made.map_err(io_error("make", path))?,
@@ -45,19 +45,19 @@ mod tests {
     fn a_directory_that_others_made_or_may_write_to_is_refused() {
         let here = tempfile::tempdir().unwrap();
         let path = here.path().join("home");
-        make_private(&path, user()).unwrap();
-        make_private(&path, user()).unwrap();
+        create_private(&path, user()).unwrap();
+        create_private(&path, user()).unwrap();
 
         let message = check_private(&path, user() + 1).unwrap_err().to_string();
         assert!(message.contains(&format!("a directory of user {} with mode 0700", user())), "{message}");
         fs::set_permissions(&path, Permissions::from_mode(0o770)).unwrap();
-        let message = make_private(&path, user()).unwrap_err().to_string();
+        let message = create_private(&path, user()).unwrap_err().to_string();
         assert!(message.contains("with mode 0770"), "{message}");
 
         let link = here.path().join("link");
         fs::set_permissions(&path, Permissions::from_mode(0o700)).unwrap();
         symlink(&path, &link).unwrap();
-        let message = make_private(&link, user()).unwrap_err().to_string();
+        let message = create_private(&link, user()).unwrap_err().to_string();
         assert!(message.contains("no directory"), "{message}");
     }
 }

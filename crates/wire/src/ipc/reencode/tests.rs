@@ -36,7 +36,7 @@ fn content(message: &[u8]) -> &[u8] {
 }
 
 /// Arbitrary content as a control message.
-fn sealed(content: &[u8]) -> Vec<u8> {
+fn encoded(content: &[u8]) -> Vec<u8> {
     let control = [b"CALM\x02".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
     frame::to_words(&control, None).as_bytes().to_vec()
 }
@@ -97,10 +97,10 @@ proptest! {
     ) {
         prop_assert!(read(&bytes[..at.index(bytes.len())]).is_err());
         let content = content(&bytes);
-        let found = read(&sealed(&[content, &added].concat()));
+        let found = read(&encoded(&[content, &added].concat()));
         let trailing = |error: &RejectedMessage| matches!(error, RejectedMessage::Control(ControlError::Trailing(n)) if *n == added.len());
         prop_assert!(found.as_ref().is_err_and(trailing), "{found:?}");
-        let found = read(&sealed(&content[..content.len() - 1]));
+        let found = read(&encoded(&content[..content.len() - 1]));
         prop_assert!(matches!(found, Err(RejectedMessage::Control(ControlError::Content(_)))), "{found:?}");
     }
 
@@ -115,7 +115,7 @@ proptest! {
         prop_assert_eq!(reencode(&bytes), [None, None]);
         prop_assert_eq!(reencode(&[&length.to_le_bytes(), bytes.as_slice()].concat()), [None, None]);
         // With a valid checksum, whatever can be decoded survives a round trip.
-        for (role, reencoded) in reencode(&sealed(&bytes)).into_iter().enumerate() {
+        for (role, reencoded) in reencode(&encoded(&bytes)).into_iter().enumerate() {
             let Some(reencoded) = reencoded else { continue };
             prop_assert_eq!(&reencode(&reencoded)[role], &Some(reencoded));
         }
@@ -130,7 +130,7 @@ proptest! {
         let at = at.index(content.len());
         content[at] = byte;
         let (_, block) = frame::split(&bytes).unwrap();
-        let spoiled = with_block(&sealed(&content), block);
+        let spoiled = with_block(&encoded(&content), block);
         if let Ok(reencoded) = read(&spoiled) {
             prop_assert_eq!(read(&reencoded).map_err(|e| e.to_string()), Ok(reencoded));
         }
@@ -186,7 +186,7 @@ proptest! {
 
 #[test]
 fn what_is_wrong_is_said() {
-    let bytes = written(&Answer { sequence: 3, body: AnswerBody::Shutdown }, None);
+    let bytes = encode_message(&Answer { sequence: 3, body: AnswerBody::Shutdown }, None);
     let changed = |at: usize| {
         let mut bytes = bytes.clone();
         bytes[at] ^= 1;
@@ -215,14 +215,14 @@ fn what_is_wrong_is_said() {
 fn absurd_lengths_are_refused() {
     let absurd = [&[0xff; 9][..], &[1]].concat();
     let is_refused = |read: Reader, content: &[&[u8]]| {
-        matches!(read(&sealed(&content.concat())), Err(RejectedMessage::Control(ControlError::Content(_))))
+        matches!(read(&encoded(&content.concat())), Err(RejectedMessage::Control(ControlError::Content(_))))
     };
     // Session, walker, incarnation; offer 1 with a report: walk 0, assignment 0, ended, blew up, and a reason of 2⁶³
     // bytes.
     let envelope = [0, 0, 0, 0, 1, 1, 0, 0, 3, 4];
     // No reason, no checkpoint, zero progress.
     let rest = [&[0, 0][..], &[0, 0], &[0; 32], &[0, 0, 0]].concat();
-    assert!(super::request(&sealed(&[&envelope[..], &rest].concat())).is_ok());
+    assert!(super::request(&encoded(&[&envelope[..], &rest].concat())).is_ok());
     assert!(is_refused(super::request, &[&envelope, &absurd, &rest[1..]]));
     // Answer to offer 1: an assignment, mixture 0, campaign, walk 0, assignment 0, biased, random walk 0, and 2⁶³
     // species.

@@ -64,10 +64,10 @@ fn a_certificate_is_for_the_hosts_that_it_names() {
     let names = ["head", "*.cluster.example", "10.0.0.3", "::1"].map(str::to_owned).to_vec();
     let checked = CheckedTls { names, warnings: vec![] };
     for host in ["head", "HEAD", "node7.cluster.example", "10.0.0.3", "[::1]", "[0:0:0:0:0:0:0:1]"] {
-        assert!(checked.is_for(host), "{host}");
+        assert!(checked.is_valid_for(host), "{host}");
     }
     for host in ["node7", "cluster.example", "a.b.cluster.example", "10.0.0.4", "[::2]", ""] {
-        assert!(!checked.is_for(host), "{host}");
+        assert!(!checked.is_valid_for(host), "{host}");
     }
 }
 

@@ -7,7 +7,7 @@ use proptest::option;
 use proptest::prelude::*;
 
 use super::common::{candidate, origin, usable_structure};
-use super::written;
+use super::encode_message;
 use crate::block::Candidate;
 use crate::ids::{CampaignId, Origin, WalkId};
 use crate::messages::{Assignment, DeclineReason, Outcome, Progress, Report, Verdict, WalkEnd};
@@ -108,7 +108,7 @@ pub fn sender() -> impl Strategy<Value = SenderId> {
 /// An offer as a walker sends it.
 pub fn offered(sender: SenderId, sequence: u64, report: Option<&Report<Candidate>>) -> Vec<u8> {
     let (payload, candidate) = Payload::offer(sequence, report);
-    written(&Envelope { sender, payload }, candidate)
+    encode_message(&Envelope { sender, payload }, candidate)
 }
 
 pub fn offer() -> impl Strategy<Value = Vec<u8>> {
@@ -118,11 +118,11 @@ pub fn offer() -> impl Strategy<Value = Vec<u8>> {
 
 pub fn request() -> impl Strategy<Value = Vec<u8>> {
     let question = (sender(), any::<u64>()).prop_map(|(sender, sequence)| {
-        written(&Envelope { sender, payload: Payload::Poll { sequence } }, None)
+        encode_message(&Envelope { sender, payload: Payload::Poll { sequence } }, None)
     });
     let news = (sender(), any::<u32>(), progress()).prop_map(|(sender, walk, progress)| {
         let payload = Payload::Progress(WalkId(walk), Cow::Owned(progress));
-        written(&Envelope { sender, payload }, None)
+        encode_message(&Envelope { sender, payload }, None)
     });
     prop_oneof![4 => offer(), 1 => question, 1 => news]
 }
@@ -130,7 +130,7 @@ pub fn request() -> impl Strategy<Value = Vec<u8>> {
 /// An assignment as the server sends it.
 pub fn given(sequence: u64, mixture_version: u64, assignment: &Assignment) -> Vec<u8> {
     let assignment = Cow::Borrowed(assignment);
-    written(&Answer { sequence, body: AnswerBody::Assignment { mixture_version, assignment } }, None)
+    encode_message(&Answer { sequence, body: AnswerBody::Assignment { mixture_version, assignment } }, None)
 }
 
 pub fn answer() -> impl Strategy<Value = Vec<u8>> {
@@ -142,7 +142,7 @@ pub fn answer() -> impl Strategy<Value = Vec<u8>> {
             1 => AnswerBody::Pending,
             _ => AnswerBody::Unknown,
         };
-        written(&Answer { sequence, body }, None)
+        encode_message(&Answer { sequence, body }, None)
     });
     prop_oneof![3 => turn, 1 => other]
 }
