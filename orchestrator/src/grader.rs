@@ -133,7 +133,7 @@ mod tests {
 
     /// A skew cell much smaller than the cutoffs, two elements, cutoffs that differ with the direction of a bond.
     #[test]
-    fn pairs_are_those_of_each_bond_by_itself() {
+    fn pairs_equal_those_computed_separately() {
         let elements: Vec<Species> = vec!["Al".parse().unwrap(), "Si".parse().unwrap()];
         let cutoffs = [6.0, 5.0, 4.5, 5.5];
         for periodic in [[true; 3], [true, false, true], [false; 3]] {

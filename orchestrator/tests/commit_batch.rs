@@ -91,7 +91,7 @@ proptest! {
     #![proptest_config(ProptestConfig { rng_seed: RngSeed::Fixed(11), ..ProptestConfig::default() })]
 
     #[test]
-    fn a_group_leaves_behind_what_its_commits_do(
+    fn a_batch_has_the_same_result_as_its_commits(
         settings in any_settings(),
         events in prop::collection::vec(event(), 1..40),
         cuts in prop::collection::vec(1..9_usize, 40),
@@ -111,7 +111,7 @@ proptest! {
 
     /// The result does not depend on when a candidate is regraded, and under which mixture.
     #[test]
-    fn candidates_may_be_examined_ahead(
+    fn candidates_may_be_regraded_ahead(
         settings in any_settings(),
         events in prop::collection::vec(event(), 1..40),
         ahead in prop::collection::vec(0..4_usize, 40),
@@ -219,7 +219,7 @@ fn reactor(store: &Store, selector: Selector, incoming: mpsc::Receiver<Incoming>
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn nobody_is_answered_before_the_group_is_committed() {
+async fn answers_wait_for_the_commit_of_the_batch() {
     let mut live = Live::begin().await;
     let mut reports = live.reports();
     reports.swap(0, 2);
@@ -241,7 +241,7 @@ async fn nobody_is_answered_before_the_group_is_committed() {
 
 /// The last report cannot be committed. Earlier ones may have been in the same batch or not.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_group_that_fails_leaves_nothing_behind_and_is_not_answered() {
+async fn a_failed_batch_writes_nothing_and_is_not_answered() {
     let mut live = Live::begin().await;
     let first = live.reports().remove(2);
     let Outcome::Candidate(block) = first.outcome.clone() else { panic!("reports are of candidates") };

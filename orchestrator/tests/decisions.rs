@@ -30,7 +30,7 @@ fn next_candidate(selector: &mut Selector, step: u64, number: u64, z: [f64; 3]) 
 }
 
 #[test]
-fn what_is_accepted_is_covered_from_then_on() {
+fn accepted_structures_are_covered_afterwards() {
     let mut selector = begin(&live(), 1);
     let commit = next_candidate(&mut selector, 5, 1, NEW);
     assert_eq!(kinds(&commit), ["accepted"]);
@@ -100,7 +100,7 @@ fn atoms_too_close_are_declined() {
 
 /// The guard's absolute minimum distance applies if the fraction of the seed structure's distance is smaller.
 #[test]
-fn the_least_distance_is_the_larger_of_two() {
+fn the_minimum_distance_is_the_larger_of_two() {
     let mut selector = begin(&Settings { min_distance: (2.5, 0.75), ..live() }, 1);
     let assignment = turn(&mut selector);
     let report = offer(&selector, &assignment, 1, structure(1, 2.45), NEW);
@@ -123,7 +123,7 @@ fn a_known_structure_is_declined() {
 }
 
 #[test]
-fn without_updates_all_that_is_new_to_the_original_is_accepted() {
+fn without_updates_everything_new_to_the_original_mixture_is_accepted() {
     let mut selector = begin(&Settings { update: UpdateProtocol::Never, ..live() }, 1);
     for number in 1..=2 {
         let commit = next_candidate(&mut selector, number, number, NEW);
@@ -134,7 +134,7 @@ fn without_updates_all_that_is_new_to_the_original_is_accepted() {
 }
 
 #[test]
-fn a_seed_structure_gives_only_so_many() {
+fn the_limit_per_seed_structure_is_enforced() {
     let mut selector =
         begin(&Settings { update: UpdateProtocol::Never, max_per_seed_structure: 2, ..live() }, 2);
     assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
@@ -161,7 +161,7 @@ fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
 }
 
 #[test]
-fn a_campaign_collects_only_so_many() {
+fn the_campaign_limit_is_enforced() {
     let limited = Settings { update: UpdateProtocol::Never, max_structures: Some(2), ..live() };
     let mut selector = begin(&limited, 3);
     let assignments = [(); 3].map(|()| turn(&mut selector));
@@ -196,7 +196,7 @@ fn imports_are_logged_once_when_they_begin_to_count() {
 }
 
 #[test]
-fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
+fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
     let limited =
         Settings { update: UpdateProtocol::Never, max_structures: Some(1), control: true, ..live() };
     let mut selector = common::restore(&limited, 2, SelectorSnapshot::default());
@@ -225,7 +225,7 @@ fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
 }
 
 #[test]
-fn the_first_reason_is_given() {
+fn the_first_reason_applies() {
     let limited = Settings { max_per_seed_structure: 1, max_structures: Some(1), ..live() };
     let known = vec![
         wire::ContentHash::from_structure(&structure(1, 1.0)),
@@ -249,7 +249,7 @@ fn the_first_reason_is_given() {
 }
 
 #[test]
-fn the_verdict_goes_with_the_next_turn() {
+fn the_verdict_is_part_of_the_next_assignment() {
     let mut selector = begin(&live(), 1);
     assert_eq!(turn(&mut selector).verdict, None);
     selector.assignment_lost(wire::WalkId(0));
@@ -277,7 +277,7 @@ fn the_verdict_goes_with_the_next_turn() {
 }
 
 #[test]
-fn features_of_declined_candidates_have_a_budget() {
+fn features_of_declined_candidates_are_limited() {
     let size = size_of_val(features(NEW).as_slice()) as u64;
     let limited = Settings { declined_feature_bytes: 2 * size + 1, ..live() };
     let mut store = common::memory::MemoryStore::default();
@@ -297,7 +297,7 @@ fn features_of_declined_candidates_have_a_budget() {
 }
 
 #[test]
-fn the_mixture_is_carried_from_one_seed_structure_to_the_next() {
+fn updates_accumulate_over_seed_structures() {
     let mut selector = begin(&settings(Mode::Reproducible), 2);
     end_first_walk_after_a_collection(&mut selector);
     assert_eq!(selector.mixture().version(), 1);
@@ -305,7 +305,7 @@ fn the_mixture_is_carried_from_one_seed_structure_to_the_next() {
 }
 
 #[test]
-fn the_mixture_is_restarted_for_the_next_seed_structure() {
+fn each_seed_structure_starts_from_the_original_mixture() {
     let restarted =
         Settings { update: UpdateProtocol::Restarted, walks_per_round: 1, ..settings(Mode::Reproducible) };
     let training = TrainingFrames::new(vec![0], vec![0.0, 0.0, 0.9], &mixture()).unwrap();
@@ -373,7 +373,7 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
 
 /// Candidates that are new, but below the threshold raised by a long queue, have their own reason to decline.
 #[test]
-fn a_raised_threshold_declines_what_lies_below_it() {
+fn candidates_below_a_raised_threshold_are_declined() {
     let mut selector = begin(&live(), 1);
     selector.raise_threshold_above(100);
     selector.set_unfinished_jobs(150);
@@ -390,7 +390,7 @@ fn a_raised_threshold_declines_what_lies_below_it() {
 
 /// The rule of updates is used in the search, not only the collection rule.
 #[test]
-fn the_update_target_is_the_one_of_the_settings() {
+fn the_update_target_comes_from_the_settings() {
     let mut strict = live();
     strict.search.stop = calm::UpdateRule::MaximumGrade { target: positive(0.8) };
     let mut selector = begin(&strict, 1);

@@ -34,7 +34,7 @@ fn scripts() -> Vec<Script> {
 }
 
 #[tokio::test]
-async fn a_stop_before_anybody_asks_is_the_end() {
+async fn a_stop_before_the_first_message_ends_the_reactor() {
     let directory = tempfile::tempdir().unwrap();
     let store = open(directory.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
@@ -228,7 +228,7 @@ async fn walkers_wait_while_the_label_queue_is_full() {
 
 /// With a raised threshold, the queue may grow to twice the limit, but no further.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long() {
+async fn walkers_continue_with_a_raised_threshold_up_to_twice_the_limit() {
     const LIMIT: u64 = 2;
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
@@ -276,7 +276,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
 
 /// A campaign whose only walker waits can be stopped, even while progress is reported continuously.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
+async fn waiting_walkers_are_shut_down_when_the_campaign_stops() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
@@ -301,7 +301,7 @@ async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
 
 /// The assignment of a lost walker goes to another one.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_turn_of_a_walker_that_dies_is_done_by_another() {
+async fn assignments_of_dead_walkers_are_completed_by_others() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
@@ -319,7 +319,7 @@ async fn the_turn_of_a_walker_that_dies_is_done_by_another() {
 }
 
 #[tokio::test]
-async fn a_campaign_whose_walkers_are_all_gone_is_not_done() {
+async fn a_campaign_without_walkers_is_not_finished() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
     let (reactor, to_reactor) = reactor(&store, &Arc::default()).await;
@@ -329,7 +329,7 @@ async fn a_campaign_whose_walkers_are_all_gone_is_not_done() {
 
 /// Walkers that exit during the first assignment of the first walk: by repeated crashes, or because they are killed.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_turn_that_kills_its_walkers_ends_its_walk() {
+async fn assignments_that_crash_walkers_end_their_walk() {
     for (fault, walkers) in [(true, 3), (false, 5)] {
         let directory = tempfile::tempdir().unwrap();
         let store = open(directory.path()).await;
@@ -355,7 +355,7 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
 
 /// A paused walk gets no assignment, its round waits for it, and the decisions are the same as without a pause.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_paused_walk_stands_still_and_changes_nothing() {
+async fn pausing_a_walk_does_not_change_decisions() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
     let whole = open(folders[0].path()).await;
     assert_eq!(run(&whole, 2, usize::MAX).await, RunOutcome::Finished);

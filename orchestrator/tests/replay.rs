@@ -89,7 +89,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
     #[test]
-    fn every_decision_comes_out_as_it_was(
+    fn every_decision_is_reproduced(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
     ) {
         let mode = if live { Mode::Live } else { Mode::Reproducible };
@@ -101,7 +101,7 @@ proptest! {
 
     /// The rules change twice, and structures that walks will meet are imported.
     #[test]
-    fn also_where_rules_changed_and_structures_were_imported(
+    fn replays_include_changed_rules_and_imports(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize,
         parts in prop::array::uniform3(acts()), limits in prop::array::uniform2((1..6_u32, prop::option::of(1..12_u32))),
         imports in prop::collection::vec(0..12_u64, 0..6),
@@ -124,7 +124,7 @@ proptest! {
 
     /// If the mixture is never updated, the threshold alone decides which of the offered structures are new.
     #[test]
-    fn a_stricter_rule_accepts_what_lies_above_it(
+    fn a_stricter_rule_accepts_structures_above_its_threshold(
         settings in any_settings(), scripts in scripts(), threshold in 1.5..9.0,
     ) {
         let settings = Settings { update: UpdateProtocol::Never, max_per_seed_structure: 100, max_structures: None, ..settings };
@@ -152,7 +152,7 @@ proptest! {
 
 /// The campaigns above cover what they should: rules change in the middle of them, and imports are met.
 #[test]
-fn the_campaigns_reach_what_they_are_for() {
+fn the_campaigns_cover_the_intended_cases() {
     let mut runner = TestRunner::deterministic();
     let mut seen = HashSet::new();
     for _ in 0..60 {

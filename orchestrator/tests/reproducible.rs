@@ -22,7 +22,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
 
     #[test]
-    fn incidents_change_nothing(
+    fn incidents_do_not_change_results(
         settings in any_settings(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
     ) {
         let mut eventful = Campaign::begin(&settings, &scripts, walkers);

@@ -45,7 +45,7 @@ fn only_what_is_missing_is_submitted() {
 }
 
 #[test]
-fn in_the_place_of_one_that_ends_another_waits_for_its_end() {
+fn replacements_wait_for_completing_jobs() {
     let jobs = [
         job(1, Role::Orchestrator, "COMPLETING"),
         job(2, Role::Agent(0), "RUNNING"),
@@ -57,7 +57,7 @@ fn in_the_place_of_one_that_ends_another_waits_for_its_end() {
 }
 
 #[test]
-fn what_is_not_asked_for_any_more_is_cancelled() {
+fn undesired_jobs_are_cancelled() {
     let jobs = [
         job(7, Role::Orchestrator, "PENDING"),
         // Two orchestrators were submitted at once: the first stays. Of two jobs of agent 0, the running one stays.
@@ -88,7 +88,7 @@ fn agents_with_another_number_of_walkers_are_replaced() {
 }
 
 #[test]
-fn names_of_jobs_are_what_the_plan_speaks_of() {
+fn job_names_match_the_plan() {
     let names = JobNames::new("0123456789ab");
     for role in WANTED.roles() {
         assert_eq!(names.role(&names.job_name(role)), Some(role));
@@ -203,7 +203,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
 
     #[test]
-    fn never_two_orchestrators_nor_more_walkers_than_asked(
+    fn there_are_never_two_orchestrators_nor_too_many_agents(
         steps in proptest::collection::vec((0..8_u8, any::<u8>(), any::<u8>()), 0..200),
         asked in proptest::collection::vec((0..4_u32, 1..3_u32, 0..2_u32), 1..4),
     ) {

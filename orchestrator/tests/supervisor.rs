@@ -48,7 +48,7 @@ fn started(children: u32) -> Supervisor {
 }
 
 #[test]
-fn who_outlives_its_parent_stays_while_there_is_work_and_is_not_killed() {
+fn detached_children_are_not_killed() {
     let mut supervisor = Supervisor::new(2, Limits { detached: true, ..LIMITS });
     assert_eq!(supervisor.due_actions(s(0)), [start(0, 1), start(1, 1)]);
     let left = supervisor.ended(0, home(), s(5)).unwrap();
@@ -65,7 +65,7 @@ fn who_outlives_its_parent_stays_while_there_is_work_and_is_not_killed() {
 }
 
 #[test]
-fn nobody_is_started_when_there_is_no_more_work() {
+fn nothing_is_started_without_work() {
     let mut supervisor = started(2);
     supervisor.ended(0, crash(), s(1)).unwrap();
     supervisor.close();
@@ -79,7 +79,7 @@ fn nobody_is_started_when_there_is_no_more_work() {
 }
 
 #[test]
-fn pauses_double_up_to_the_longest_until_the_child_is_given_up() {
+fn backoff_doubles_up_to_the_maximum_until_the_child_fails() {
     let mut supervisor = started(2);
     supervisor.heartbeat(1, s(0));
     let mut now = s(0);
@@ -107,7 +107,7 @@ fn pauses_double_up_to_the_longest_until_the_child_is_given_up() {
 }
 
 #[test]
-fn what_was_useful_begins_a_new_row_of_failures() {
+fn deliveries_reset_failures() {
     let mut supervisor = started(1);
     let mut now = s(0);
     for incarnation in 2..30 {
@@ -135,7 +135,7 @@ fn without_restarts_the_first_failure_is_the_last() {
 }
 
 #[test]
-fn who_went_home_stays_there() {
+fn finished_children_are_not_restarted() {
     let mut supervisor = started(1);
     let ended = supervisor.ended(0, home(), s(5)).unwrap();
     assert_eq!(ended, ChildExit { incarnation: 1, reason: home(), then: ChildState::Exited });
@@ -146,7 +146,7 @@ fn who_went_home_stays_there() {
 }
 
 #[test]
-fn a_silent_child_is_killed_once_and_started_again() {
+fn unresponsive_children_are_killed_once_and_restarted() {
     for speaks in [false, true] {
         let mut supervisor = started(1);
         let heard = if speaks { s(50) } else { s(0) };
@@ -174,7 +174,7 @@ fn a_silent_child_is_killed_once_and_started_again() {
 }
 
 #[test]
-fn silence_proves_nothing_if_nobody_listened() {
+fn missed_heartbeats_during_a_suspension_do_not_count() {
     let mut supervisor = started(1);
     supervisor.heartbeat(0, s(10));
     // The orchestrator was suspended from 20 s to 1,000 s.
@@ -203,7 +203,7 @@ fn a_stop_terminates_and_then_kills() {
 }
 
 #[test]
-fn who_was_interrupted_by_others_is_started_again() {
+fn children_interrupted_from_outside_are_restarted() {
     let interrupted = ExitReason::Exit { code: 130, last_line: None };
     let mut supervisor = started(1);
     let ended = supervisor.ended(0, interrupted.clone(), s(0)).unwrap();
@@ -231,7 +231,7 @@ fn a_child_that_cannot_be_started_counts_as_failed() {
 }
 
 #[test]
-fn a_start_that_the_host_has_no_room_for_is_tried_again_for_ever() {
+fn starts_without_resources_are_retried_forever() {
     let mut supervisor = started(1);
     let shortage = || ExitReason::StartFailed { reason: "too many open files".to_owned(), is_shortage: true };
     let mut now = s(0);
@@ -255,7 +255,7 @@ fn a_start_that_the_host_has_no_room_for_is_tried_again_for_ever() {
 }
 
 #[test]
-fn a_living_process_is_taken_in_without_a_start() {
+fn running_processes_are_adopted() {
     let mut supervisor = Supervisor::new(2, LIMITS);
     assert!(supervisor.adopt(1, s(0)));
     assert!(!supervisor.adopt(1, s(0)), "it has one");
@@ -272,7 +272,7 @@ fn a_living_process_is_taken_in_without_a_start() {
 }
 
 #[test]
-fn enormous_limits_are_no_trouble() {
+fn very_large_limits_do_not_overflow() {
     let limits = Limits {
         heartbeat_timeout: Duration::MAX,
         max_backoff: Duration::MAX,
@@ -288,7 +288,7 @@ fn enormous_limits_are_no_trouble() {
 }
 
 #[test]
-fn nobody_is_soon_over() {
+fn a_campaign_without_walks_ends_immediately() {
     assert!(Supervisor::new(0, LIMITS).is_over());
 }
 
@@ -396,7 +396,7 @@ impl World {
 
 proptest! {
     #[test]
-    fn nothing_goes_wrong_in_any_order(happenings in prop::collection::vec(happening(), 0..200)) {
+    fn invariants_hold_for_any_order_of_events(happenings in prop::collection::vec(happening(), 0..200)) {
         let mut supervisor = Supervisor::new(CHILDREN, LIMITS);
         let mut world = World::default();
         for happening in happenings {
@@ -413,7 +413,7 @@ proptest! {
     }
 
     #[test]
-    fn children_that_always_fail_are_given_up_in_the_end(deaths in prop::collection::vec(0u64..200, 18)) {
+    fn children_that_always_fail_are_not_restarted_forever(deaths in prop::collection::vec(0u64..200, 18)) {
         let mut supervisor = Supervisor::new(CHILDREN, LIMITS);
         let mut deaths = deaths.into_iter();
         let mut starts = 0;

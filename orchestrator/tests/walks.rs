@@ -46,7 +46,7 @@ fn every_seed_structure_gets_one_walk() {
 }
 
 #[test]
-fn a_round_is_decided_when_all_its_reports_are_in_and_in_walk_order() {
+fn complete_rounds_are_decided_in_walk_order() {
     let mut selector = begin(&settings(Mode::Reproducible), 3);
     let (first, second) = (turn(&mut selector), turn(&mut selector));
     assert!(is_waiting(&mut selector), "the third walk is not in the round");
@@ -83,7 +83,7 @@ fn live_walks_do_not_wait_for_each_other() {
 }
 
 #[test]
-fn reports_that_nobody_asked_for_change_nothing() {
+fn unsolicited_reports_change_nothing() {
     let mut selector = begin(&settings(Mode::Live), 1);
     let assignment = turn(&mut selector);
     let unasked = |selector: &mut Selector, report| {
@@ -107,7 +107,7 @@ fn reports_that_nobody_asked_for_change_nothing() {
 }
 
 #[test]
-fn a_late_report_of_a_walker_that_was_taken_for_lost_counts_once() {
+fn late_reports_of_lost_walkers_count_once() {
     for mode in [Mode::Live, Mode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
         let assignment = turn(&mut selector);
@@ -127,7 +127,7 @@ fn a_late_report_of_a_walker_that_was_taken_for_lost_counts_once() {
 }
 
 #[test]
-fn the_turn_of_a_lost_walker_is_given_out_again() {
+fn assignments_of_lost_walkers_are_assigned_again() {
     for mode in [Mode::Live, Mode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
         let first = turn(&mut selector);
@@ -151,7 +151,7 @@ fn returned(segment: u32, step: u64) -> Progress {
 }
 
 #[test]
-fn a_return_to_a_checkpoint_is_logged_once() {
+fn rollbacks_are_logged_once() {
     let mut selector = begin(&settings(Mode::Live), 1);
     let assignment = turn(&mut selector);
     let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(2, 8)));
@@ -167,7 +167,7 @@ fn a_return_to_a_checkpoint_is_logged_once() {
 
 /// An interruption after a rollback does not remove the rollback from the log.
 #[test]
-fn a_return_before_an_interruption_is_logged_as_well() {
+fn rollbacks_before_an_interruption_are_logged() {
     let mut store = MemoryStore::default();
     let mut selector = restore(&settings(Mode::Live), 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
@@ -230,7 +230,7 @@ fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
 }
 
 #[test]
-fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
+fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
     let mut store = MemoryStore::default();
     // After a rollback, a step can occur twice.
     let mut selector = with_control(&mut store, &[5, 12, 5]);
@@ -295,7 +295,7 @@ fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
 }
 
 #[test]
-fn a_database_that_does_not_fit_is_refused() {
+fn a_mismatched_database_is_rejected() {
     let mut store = MemoryStore::default();
     store.commit(&restore(&settings(Mode::Live), 2, SelectorSnapshot::default()).start_walks());
     let good = store.snapshot();
@@ -334,7 +334,7 @@ fn a_seed_structure_that_cannot_be_graded_is_named() {
 }
 
 #[test]
-fn a_paused_walk_gets_no_turn_and_the_others_go_on_in_live_mode() {
+fn paused_walks_get_no_assignments_while_others_continue_in_live_mode() {
     let mut selector = restore(&settings(Mode::Live), 3, SelectorSnapshot::default());
     let _ = selector.start_walks();
     selector.set_paused([WalkId(0), WalkId(2)].into());

@@ -64,7 +64,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_are_found_wherever_the_bytes_are_cut() {
+    fn lines_do_not_depend_on_chunk_boundaries() {
         let text = "one\r\n\nthr\u{e9}e\nlast".as_bytes();
         for cut in 0..=text.len() {
             let (head, tail) = text.split_at(cut);
@@ -75,14 +75,14 @@ mod tests {
     }
 
     #[test]
-    fn a_line_without_end_is_broken_up() {
+    fn long_lines_are_split() {
         let long = vec![b'x'; 2 * MAX_LINE_BYTES + 1];
         let lengths: Vec<usize> = lines(&[&long, b"\n"]).iter().map(String::len).collect();
         assert_eq!(lengths, [MAX_LINE_BYTES, MAX_LINE_BYTES, 1]);
     }
 
     #[test]
-    fn the_reason_of_a_panic_is_not_the_hint_after_it() {
+    fn the_backtrace_hint_is_not_the_reason_of_a_panic() {
         assert!(is_failure_reason("no such atom") && !is_failure_reason(""));
         assert!(!is_failure_reason(
             "note: run with `RUST_BACKTRACE=1` environment variable to display a backtrace"

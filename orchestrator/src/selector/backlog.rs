@@ -48,7 +48,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_never_falls_while_the_queue_grows(limit in any::<u64>(), a in any::<u64>(), b in any::<u64>()) {
+        fn the_threshold_is_monotonic(limit in any::<u64>(), a in any::<u64>(), b in any::<u64>()) {
             let (backlog, (less, more)) = (Backlog::new(limit), (a.min(b), a.max(b)));
             let (low, high) = (backlog.factor(less), backlog.factor(more));
             prop_assert!((1.0..=2.0).contains(&low) && low <= high && high <= 2.0);

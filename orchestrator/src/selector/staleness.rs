@@ -76,7 +76,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn quantiles_are_those_of_the_ages_but_for_a_thirtieth(
+        fn quantiles_are_accurate_to_a_thirtieth(
             mut ages in prop::collection::vec(prop_oneof![0..200_u64, any::<u64>()], 1..200), share in 0.0..=1.0_f64,
         ) {
             let staleness = of(&ages);

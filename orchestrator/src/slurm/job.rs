@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn other_jobs_are_passed_over_and_half_lines_are_not() {
+    fn other_jobs_are_skipped_and_incomplete_lines_are_errors() {
         let names = JobNames::new("1a");
         for line in ["", "12|RUNNING|relax|node7|N/A|1:00|(null)|None", "12_[1-3]|PENDING|a|b"] {
             assert_eq!(Job::parse(line, &names), Ok(None), "{line}");

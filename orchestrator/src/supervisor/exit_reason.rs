@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn own_faults_and_deaths_from_outside_are_told_apart() {
+    fn crashes_and_external_causes_are_distinguished() {
         use rustix::process::Signal;
         for own in [Signal::SEGV, Signal::ABORT, Signal::BUS, Signal::ILL, Signal::FPE] {
             assert!(signal(own.as_raw()).is_crash(), "{own:?}");
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn an_end_is_told_in_words() {
+    fn exit_reasons_are_displayed() {
         let exit = |last_line: Option<&str>| {
             ExitReason::Exit { code: 2, last_line: last_line.map(str::to_owned) }.to_string()
         };

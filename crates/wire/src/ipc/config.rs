@@ -244,7 +244,7 @@ mod tests {
 
     /// A walker that received its answer by another request does not read the answers to its polls.
     #[test]
-    fn answers_that_nobody_reads_leave_room_for_others() {
+    fn unread_answers_leave_room_for_others() {
         let directory = tempfile::tempdir().unwrap();
         let sizes = Sizes { walkers: 1, message_bytes: 64 };
         let node = node(directory.path(), "unread").unwrap();

@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_in_use_is_left_alone() {
+    fn blocks_in_use_are_not_reused() {
         loom::model(|| {
             let memory = Memory::with_version(7);
             let reader = {

@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_says_where_the_orchestrator_is() {
+    fn endpoint_files_are_resolved() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("endpoint");
         let address: Address = format!("@{}", path.display()).parse().unwrap();

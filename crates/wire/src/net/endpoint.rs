@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn others_are_told_a_name_and_a_port() {
+    fn endpoints_for_other_hosts_have_name_and_port() {
         let endpoint = |text: &str| text.parse::<Endpoint>().unwrap();
         assert_eq!(endpoint("tcp/0.0.0.0:7").with_host_name("node7").unwrap(), endpoint("tcp/node7:7"));
         assert_eq!(endpoint("tcp/[::]:7").with_host_name("node7").unwrap(), endpoint("tcp/node7:7"));

@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_never_used_again() {
+    fn slot_numbers_are_never_reused() {
         let mut registry = AgentRegistry::new(Duration::from_secs(60));
         assert_eq!(registry.join(agent("a", 2)).unwrap().slots(), FIRST_SLOT..FIRST_SLOT + 3);
         assert_eq!(registry.join(agent("b", 1)).unwrap().slots(), FIRST_SLOT + 3..FIRST_SLOT + 5);
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_silent_for_too_long_is_taken_out_and_who_comes_back_in_time_stays() {
+    fn agents_without_heartbeat_expire_unless_they_recover_in_time() {
         let (mut registry, start) = (AgentRegistry::new(Duration::from_secs(60)), Instant::now());
         let at = |seconds| start + Duration::from_secs(seconds);
         registry.join(agent("a", 2));

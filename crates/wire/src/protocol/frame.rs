@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_control_message_comes_back_and_the_block_begins_at_a_multiple_of_8() {
+    fn control_messages_survive_a_round_trip_and_blocks_are_aligned() {
         for content in 0..20_u8 {
             let message: Vec<u8> = (0..content).collect();
             let mut bytes = vec![0xff; length(message.len(), None)];

@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn an_offer_is_taken_once_and_answered_as_often_as_it_is_made() {
+    fn repeated_offers_are_decided_once_and_answered_each_time() {
         let mut all = expecting();
         assert_eq!(all.poll(SENDER, 1), Ok(OfferStatus::Unknown), "an offer that was lost");
         for sequence in 1..4 {
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn offers_out_of_order_are_refused() {
+    fn offers_out_of_order_are_rejected() {
         let mut all = expecting();
         let refused = |all: &SequenceTracker, found, last| {
             let stranger = Err(SenderMismatch::Sequence { walker: 3, found, last });
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn only_who_is_expected_is_heard() {
+    fn only_expected_senders_are_accepted() {
         let mut all = expecting();
         assert_eq!(all.check_sender(SENDER), Ok(()));
         let of = |session, walker, incarnation| SenderId { session, walker, incarnation };

@@ -42,7 +42,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_directory_that_others_made_or_may_write_to_is_refused() {
+    fn directories_of_other_users_or_with_wrong_modes_are_rejected() {
         let here = tempfile::tempdir().unwrap();
         let path = here.path().join("home");
         create_private(&path, user()).unwrap();

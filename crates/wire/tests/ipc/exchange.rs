@@ -5,7 +5,7 @@ use super::test_server::{TestServer, check, work};
 
 /// Messages of 1 kB to 4 MB, in memory reserved for smaller ones.
 #[tokio::test(flavor = "multi_thread")]
-async fn candidates_of_any_size_come_as_they_were() {
+async fn candidates_of_any_size_survive_a_round_trip() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 1, 1 << 17);
     let mut walker = server.start(0, 1, Role::Walker);
@@ -30,7 +30,7 @@ async fn candidates_of_any_size_come_as_they_were() {
 
 /// A round of many walks: the selector holds more candidates than the walker has memory for, even after its exit.
 #[tokio::test(flavor = "multi_thread")]
-async fn candidates_last_as_long_as_they_are_held() {
+async fn candidates_live_as_long_as_they_are_used() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 1, 1 << 17);
     let mut walker = server.start(0, 1, Role::Walker);

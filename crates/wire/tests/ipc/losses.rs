@@ -16,7 +16,7 @@ fn kill(child: &mut Child) {
 
 /// The walker sends its offer before it is expected. The offer is rejected, as if it had been lost.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_lost_offer_is_found_by_asking() {
+async fn lost_offers_are_found_by_polling() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 1, 1 << 16);
     let mut walker = start(&Role::Walker(server.handle.connect_info(0, 1)));
@@ -35,7 +35,7 @@ async fn a_lost_offer_is_found_by_asking() {
 
 /// A decision may take longer than the walker's poll interval; the offer remains the same.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_slow_decision_is_waited_for() {
+async fn walkers_wait_for_slow_decisions() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 1, 1 << 16);
     let mut walker = server.start(0, 1, Role::Walker);
@@ -92,7 +92,7 @@ async fn a_killed_walker_is_replaced() {
 /// The reactor learns of the last walker's exit even if the server is closed immediately: others may keep its channel
 /// open.
 #[tokio::test(flavor = "multi_thread")]
-async fn an_end_is_told_before_the_server_closes() {
+async fn exits_are_forwarded_before_the_server_closes() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 1, 1 << 16);
     let mut stuck = server.start(0, 1, Role::Stuck);
@@ -107,7 +107,7 @@ async fn an_end_is_told_before_the_server_closes() {
 
 /// A successor is expected before the death of its predecessor is reported: the successor's resources are not freed.
 #[tokio::test(flavor = "multi_thread")]
-async fn late_news_of_a_death_does_no_harm_to_the_successor() {
+async fn late_reports_of_an_exit_do_not_affect_the_successor() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 1, 1 << 16);
     let mut first = server.start(0, 1, Role::Stuck);
@@ -135,7 +135,7 @@ async fn late_news_of_a_death_does_no_harm_to_the_successor() {
 const SERVER_FILES: usize = 7;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_orchestrator_leaves_nothing_that_matters() {
+async fn the_remains_of_a_killed_orchestrator_are_cleaned_up() {
     let directory = tempfile::tempdir().unwrap();
     let place = ShmDir::for_campaign(directory.path()).unwrap();
     for _ in 0..2 {

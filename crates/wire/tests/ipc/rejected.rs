@@ -97,7 +97,7 @@ const NOTHING: &[u8] = &[0, 1, 0];
 const QUESTION: &[u8] = &[1, 1];
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_no_message_is_dropped_and_counted() {
+async fn invalid_messages_are_rejected_and_counted() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     let mut walker = server.start(0, 1, Role::Walker);
@@ -155,7 +155,7 @@ async fn what_is_no_message_is_dropped_and_counted() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_offer_whose_candidate_is_wrong_changes_nothing() {
+async fn offers_with_invalid_candidates_change_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     server.handle.expect(7, 2);
@@ -203,7 +203,7 @@ async fn an_offer_whose_candidate_is_wrong_changes_nothing() {
 
 /// A flood of garbage does not block the server for other walkers.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_flood_is_survived() {
+async fn a_flood_of_messages_does_not_block_walkers() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     let mut walker = server.start(0, 1, Role::Walker);

@@ -34,7 +34,7 @@ async fn two_campaigns_do_not_see_each_other() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn everything_is_the_users_alone_and_in_the_campaigns_place() {
+async fn all_files_are_private_and_in_the_campaign_directory() {
     let directory = tempfile::tempdir().unwrap();
     let elsewhere = || ["/tmp/iceoryx2", "/dev/shm/iox2_"].map(|path| Path::new(path).exists());
     let before = elsewhere();
@@ -100,7 +100,7 @@ async fn memory_is_reserved_and_no_more_than_was_asked_for() {
 }
 
 #[test]
-fn too_little_space_is_said_before_anything_is_made() {
+fn lack_of_space_is_reported_before_anything_is_created() {
     let directory = tempfile::tempdir().unwrap();
     let place = ShmDir::for_campaign(directory.path()).unwrap();
     let error = place.prepare(u64::MAX).unwrap_err();
@@ -110,7 +110,7 @@ fn too_little_space_is_said_before_anything_is_made() {
 }
 
 #[test]
-fn a_place_is_wiped_before_it_is_used_and_after() {
+fn directories_are_cleaned_before_and_after_use() {
     let directory = tempfile::tempdir().unwrap();
     let place = ShmDir::for_campaign(directory.path()).unwrap();
     place.prepare(0).unwrap();
@@ -135,7 +135,7 @@ fn a_place_is_wiped_before_it_is_used_and_after() {
 
 /// Even if its campaign is unknown: the `campaign` file is not yet written, or its path does not exist here.
 #[test]
-fn a_place_in_use_is_not_removed() {
+fn directories_in_use_are_not_removed() {
     let directory = tempfile::tempdir().unwrap();
     let place = ShmDir::for_campaign(directory.path()).unwrap();
     let prepared = place.prepare(0).unwrap();
@@ -165,7 +165,7 @@ fn a_place_in_use_is_not_removed() {
 
 /// Directories that are created and removed concurrently do not interfere.
 #[test]
-fn the_directory_of_all_places_may_come_and_go() {
+fn the_parent_directory_may_be_created_and_removed_concurrently() {
     std::thread::scope(|scope| {
         for _ in 0..4 {
             scope.spawn(|| {

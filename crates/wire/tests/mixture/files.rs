@@ -11,7 +11,7 @@ use wire::{MixtureReader, SharedMixture, SharedMixtureError};
 use super::helpers::{check, first, next};
 
 #[test]
-fn the_file_is_the_users_alone_and_as_large_as_announced() {
+fn the_file_is_private_and_has_the_announced_size() {
     let folder = tempdir_in("/dev/shm").unwrap();
     let path = folder.path().join("mixture");
     let shared = SharedMixture::create(&path, &first(), 4).unwrap();
@@ -34,7 +34,7 @@ fn a_new_file_replaces_an_old_one_that_readers_keep() {
 }
 
 #[test]
-fn other_files_are_refused() {
+fn other_files_are_rejected() {
     let folder = tempdir_in("/dev/shm").unwrap();
     let path = folder.path().join("mixture");
     let refused = || MixtureReader::open(&path, 0).unwrap_err();
@@ -51,7 +51,7 @@ fn other_files_are_refused() {
 }
 
 #[test]
-fn no_damage_leads_beyond_the_file() {
+fn damage_never_leads_beyond_the_file() {
     let folder = tempdir_in("/dev/shm").unwrap();
     let path = folder.path().join("mixture");
     let _shared = SharedMixture::create(&path, &first(), 2).unwrap();

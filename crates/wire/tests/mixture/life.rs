@@ -16,7 +16,7 @@ fn place() -> (TempDir, PathBuf) {
 }
 
 #[test]
-fn what_is_published_is_read() {
+fn published_versions_can_be_read() {
     let (_folder, path) = place();
     let mut mixture = first();
     let mut shared = SharedMixture::create(&path, &mixture, 2).unwrap();
@@ -135,7 +135,7 @@ fn a_component_outlives_its_mixture_its_reader_and_the_writer() {
 }
 
 #[test]
-fn a_slot_is_free_again_when_all_is_dropped() {
+fn slots_are_freed_when_everything_is_dropped() {
     let (_folder, path) = place();
     let mixture = first();
     let mut shared = SharedMixture::create(&path, &mixture, 2).unwrap();
@@ -170,7 +170,7 @@ fn the_same_version_is_the_same_mixture_and_unchanged_components_are_shared() {
 }
 
 #[test]
-fn another_shape_is_refused() {
+fn other_shapes_are_rejected() {
     let (_folder, path) = place();
     let mut shared = SharedMixture::create(&path, &first(), 1).unwrap();
     let number = DIMENSION - 1;
@@ -188,7 +188,7 @@ fn another_shape_is_refused() {
 }
 
 #[test]
-fn a_leak_of_versions_is_an_error_that_passes() {
+fn leaking_versions_is_a_recoverable_error() {
     let (_folder, path) = place();
     let mixture = first();
     let mut shared = SharedMixture::create(&path, &mixture, 1).unwrap();

@@ -168,7 +168,7 @@ proptest! {
     })]
 
     #[test]
-    fn what_is_promised_is_there_and_what_is_held_never_changes(events in vec(event(), 1..120)) {
+    fn assigned_versions_exist_and_used_blocks_never_change(events in vec(event(), 1..120)) {
         let folder = tempfile::tempdir_in("/dev/shm").unwrap();
         let mut model = Model::new(folder.path().join("mixture"));
         events.into_iter().for_each(|event| model.happen(event));

@@ -69,7 +69,7 @@ impl Peer {
 }
 
 #[test]
-fn readers_in_other_processes_see_whole_versions_and_may_be_killed() {
+fn readers_in_other_processes_see_complete_versions_and_may_be_killed() {
     let folder = tempfile::tempdir_in("/dev/shm").unwrap();
     let path: PathBuf = folder.path().join("mixture");
     let mut mixture = first();
@@ -114,7 +114,7 @@ fn readers_in_other_processes_see_whole_versions_and_may_be_killed() {
 }
 
 #[test]
-#[ignore = "run by readers_in_other_processes_see_whole_versions_and_may_be_killed"]
+#[ignore = "run by readers_in_other_processes_see_complete_versions_and_may_be_killed"]
 fn reader_process() {
     let path = PathBuf::from(std::env::var_os("SHARED_MIXTURE").expect("set by the test that runs this one"));
     let number = std::env::var("READER").unwrap().parse().unwrap();

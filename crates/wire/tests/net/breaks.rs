@@ -12,7 +12,7 @@ use super::test_server::{LIMIT, TestServer, Wanted, agent, join, mixture, next_v
 
 /// The link is cut or silently dead before the offer, while it is pending, and during the answer.
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_told_over_a_breaking_link_comes_once() {
+async fn reports_over_a_breaking_link_arrive_once() {
     let mut head = TestServer::open(Wanted::default()).await;
     let link = Link::to(head.port).await;
     let (_uplink, joined) = join(link.port, agent("a", 1)).await;
@@ -61,7 +61,7 @@ async fn what_is_told_over_a_breaking_link_comes_once() {
 /// An agent that was unresponsive for too long has lost its slots before this is reported, and is rejected when it
 /// comes back.
 #[tokio::test(flavor = "multi_thread")]
-async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
+async fn lost_agents_stay_lost_and_may_join_again() {
     let patience = Duration::from_millis(700);
     let mut head = TestServer::open(Wanted { patience, ..Wanted::default() }).await;
     let link = Link::to(head.port).await;

@@ -12,7 +12,7 @@ use wire::transport::Incoming;
 use super::test_server::{TestServer, Wanted, agent, join, mixture, next_version, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn turns_and_reports_come_as_they_were() {
+async fn assignments_and_reports_survive_a_round_trip() {
     let mut head = TestServer::open(Wanted::default()).await;
     let (_uplink, joined) = join(head.port, agent("a", 1)).await;
     assert_eq!(joined.setup, b"the setup");
@@ -65,7 +65,7 @@ async fn turns_and_reports_come_as_they_were() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_walker_that_dies_is_told_of_and_its_slot_goes_on() {
+async fn lost_walkers_are_reported_and_their_slots_continue() {
     let mut head = TestServer::open(Wanted::default()).await;
     let (_uplink, joined) = join(head.port, agent("a", 2)).await;
     let mut slot = joined.slots().remove(1);
@@ -98,7 +98,7 @@ async fn a_walker_that_dies_is_told_of_and_its_slot_goes_on() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn files_come_by_their_hash_and_agents_are_told_to_stop() {
+async fn agents_fetch_files_by_hash_and_learn_of_a_stop() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model");
     let content: Vec<u8> = (0..9_500_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 13) as u8).collect();

@@ -18,7 +18,7 @@ fn make(directory: &Path, names: &[&str]) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn hosts_with_certificates_of_the_script_speak_to_each_other() {
+async fn hosts_with_certificates_of_the_script_can_connect() {
     let directory = tempfile::tempdir().unwrap();
     make(directory.path(), &["head=node.example,localhost,10.0.0.8"]);
     // Another host later.

@@ -25,7 +25,7 @@ async fn nothing_listens_or_connects_off_loopback_without_certificates() {
 
 /// Any other message with the orchestrator's key is rejected, and answered with the reason.
 #[tokio::test(flavor = "multi_thread")]
-async fn foreign_messages_are_dropped_and_spoken_of() {
+async fn unexpected_messages_are_rejected_and_reported() {
     let head = TestServer::open(Wanted::default()).await;
     let (_uplink, joined) = join(head.port, agent("a", 1)).await;
     let mut config = zenoh::Config::default();
@@ -88,7 +88,7 @@ fn certificates(directory: &Path, names: &[&str]) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_who_has_a_certificate_of_the_campaign_takes_part() {
+async fn only_agents_with_a_valid_certificate_can_join() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
     certificates(folders[0].path(), &["localhost", "node1"]);
     certificates(folders[1].path(), &["localhost"]);

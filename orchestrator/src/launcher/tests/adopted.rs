@@ -40,7 +40,7 @@ async fn an_adopted_process_that_dies_is_replaced() {
 }
 
 #[test]
-fn a_stranger_is_asked_to_end() {
+fn processes_of_earlier_runs_are_asked_to_exit() {
     let (pid, birth) = adopted_process();
     assert!(matches!(request_exit(pid, "another/1"), Err(AdoptError::Gone { .. })));
     assert!(store::process_birth(pid).is_some());
@@ -55,7 +55,7 @@ fn a_stranger_is_asked_to_end() {
 }
 
 #[tokio::test]
-async fn another_process_under_an_old_number_is_not_adopted() {
+async fn reused_process_ids_are_not_adopted() {
     let own = std::process::id();
     let mut children = children(&["exit 0"], LIMITS);
     for (pid, birth) in [(own, "another/1"), (own, ""), (0, ""), (u32::MAX, ""), (i32::MAX as u32, "")] {

@@ -31,7 +31,7 @@ fn reads_its_setup() {
 }
 
 #[tokio::test]
-async fn a_child_that_the_host_has_no_room_for_is_started_when_there_is() {
+async fn children_start_when_the_host_has_resources_again() {
     let mut children =
         Children::new(1, NO_RESTART, |_, _| Launch::this_program(only("lacks_descriptors"), Vec::new()));
     let events = rest(&mut children).await;
@@ -126,7 +126,7 @@ fn a_process_ends_with_the_thread_that_started_it() {
 }
 
 #[test]
-fn a_process_without_its_parent_does_not_go_on() {
+fn processes_do_not_continue_without_their_parent() {
     let (_, said) = tied_to(std::process::id() + 1);
     assert_eq!(said, "gone");
 }
@@ -148,7 +148,7 @@ fn tied() {
 }
 
 #[test]
-fn a_name_is_what_lists_of_processes_show() {
+fn process_lists_show_the_name() {
     set_process_name(c"calm-walker").unwrap();
     assert_eq!(std::fs::read_to_string("/proc/thread-self/comm").unwrap(), "calm-walker\n");
 }

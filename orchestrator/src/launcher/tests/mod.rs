@@ -92,7 +92,7 @@ async fn hold(pid: u32) {
 }
 
 #[tokio::test]
-async fn an_exit_code_comes_with_the_last_words() {
+async fn exit_codes_come_with_the_last_line() {
     let mut children = children(&["echo first >&2; printf 'last words' >&2; exit 3"], NO_RESTART);
     let events = rest(&mut children).await;
     assert!(matches!(events[0], ChildEvent::Started { number: 0, incarnation: 1, .. }), "{events:?}");
@@ -105,7 +105,7 @@ async fn an_exit_code_comes_with_the_last_words() {
 }
 
 #[tokio::test]
-async fn a_setup_larger_than_a_pipe_arrives_whole() {
+async fn setups_larger_than_a_pipe_arrive_completely() {
     let numbers: Vec<String> = (0..100_000).map(|number| number.to_string()).collect();
     let setup = numbers.join("\n").into_bytes();
     let launch = move |_, _| Launch { setup: setup.clone(), ..Launch::shell("cat >&2") };
@@ -125,14 +125,14 @@ async fn a_setup_larger_than_a_pipe_arrives_whole() {
 }
 
 #[tokio::test]
-async fn a_setup_that_nobody_reads_hinders_nobody() {
+async fn unread_setups_do_not_block() {
     let launch = |_, _| Launch { setup: vec![b'x'; 1 << 20], ..Launch::shell("exit 5") };
     let mut children = Children::new(1, NO_RESTART, launch);
     assert_eq!(ends(&rest(&mut children).await)[0].1.reason, exit(5, None));
 }
 
 #[tokio::test]
-async fn what_fails_again_and_again_is_given_up_and_the_others_go_on() {
+async fn repeated_failures_do_not_affect_other_children() {
     let mut children = children(&["echo no model >&2; exit 7", "exec sleep 1000"], LIMITS);
     let (mut incarnations, mut pauses) = (Vec::new(), Vec::new());
     loop {
@@ -161,7 +161,7 @@ async fn what_fails_again_and_again_is_given_up_and_the_others_go_on() {
 }
 
 #[tokio::test]
-async fn a_delivery_before_the_end_begins_a_new_row() {
+async fn a_delivery_before_the_exit_resets_failures() {
     let mut children = children(&["echo done >&2; exit 1"], Limits { max_restarts: 1, ..LIMITS });
     for _ in 0..5 {
         loop {
@@ -177,7 +177,7 @@ async fn a_delivery_before_the_end_begins_a_new_row() {
 }
 
 #[tokio::test]
-async fn a_delivery_that_nobody_has_looked_at_yet_counts() {
+async fn unread_deliveries_count() {
     let directory = tempfile::tempdir().unwrap();
     let go = directory.path().join("go");
     let script = format!("cd {}; until rm go; do sleep 0.01; done 2>&-; exit 1", directory.path().display());
@@ -202,7 +202,7 @@ async fn a_delivery_that_nobody_has_looked_at_yet_counts() {
 }
 
 #[tokio::test]
-async fn a_process_that_says_nothing_from_its_start_is_killed() {
+async fn processes_without_any_heartbeat_are_killed() {
     let silence = Duration::from_millis(200);
     let mut children = children(&["exec sleep 1000"], Limits { heartbeat_timeout: silence, ..NO_RESTART });
     let events = rest(&mut children).await;
@@ -210,7 +210,7 @@ async fn a_process_that_says_nothing_from_its_start_is_killed() {
 }
 
 #[tokio::test]
-async fn a_stopped_process_is_killed_and_started_again() {
+async fn stopped_processes_are_killed_and_restarted() {
     const BEATS: u32 = 75;
     let silence = Duration::from_secs(3);
     let beat = "while :; do echo alive >&2; sleep 0.05; done";
@@ -242,7 +242,7 @@ async fn a_stopped_process_is_killed_and_started_again() {
 }
 
 #[tokio::test]
-async fn a_stop_ends_those_that_obey_and_kills_those_that_do_not() {
+async fn stopping_kills_children_that_do_not_exit() {
     const SCRIPTS: [&str; 3] = [
         "trap 'exit 130' TERM; echo ready >&2; while :; do sleep 0.02; done",
         "trap '' TERM; echo ready >&2; while :; do sleep 0.02; done",
@@ -270,7 +270,7 @@ async fn a_stop_ends_those_that_obey_and_kills_those_that_do_not() {
 }
 
 #[tokio::test]
-async fn a_death_by_signal_is_told() {
+async fn exits_by_signal_are_reported() {
     let mut children = children(&["kill -9 $$", "kill -SEGV $$"], NO_RESTART);
     let events = rest(&mut children).await;
     let mut told: Vec<_> =
@@ -281,7 +281,7 @@ async fn a_death_by_signal_is_told() {
 }
 
 #[tokio::test]
-async fn what_a_process_leaves_behind_does_not_keep_it() {
+async fn orphaned_processes_do_not_delay_the_exit() {
     // The orphaned process keeps the pipe of the standard error open.
     let mut children = children(&["echo here >&2; sleep 20 & printf last >&2; exit 4"], NO_RESTART);
     let begun = std::time::Instant::now();
@@ -291,7 +291,7 @@ async fn what_a_process_leaves_behind_does_not_keep_it() {
 }
 
 #[tokio::test]
-async fn last_words_wait_for_a_slow_listener() {
+async fn the_last_lines_wait_for_a_slow_reader() {
     let mut children = children(&["seq 5000 >&2; echo the reason >&2; exit 4"], NO_RESTART);
     let mut found = 0;
     let reason = loop {
@@ -309,7 +309,7 @@ async fn last_words_wait_for_a_slow_listener() {
 }
 
 #[tokio::test]
-async fn what_cannot_be_started_is_told() {
+async fn failed_starts_are_reported() {
     let launch = |_, _| Launch { program: "/no/such/program".into(), ..Launch::shell("") };
     let mut children = Children::new(1, LIMITS, launch);
     let events = rest(&mut children).await;

@@ -56,12 +56,12 @@ fn is_about_the_candidate(found: &Result<Vec<u8>, RejectedMessage>) -> bool {
 
 proptest! {
     #[test]
-    fn messages_come_back((bytes, read) in message()) {
+    fn messages_survive_a_round_trip((bytes, read) in message()) {
         prop_assert_eq!(read(&bytes).map_err(|e| e.to_string()), Ok(bytes));
     }
 
     #[test]
-    fn a_report_arrives_with_its_candidate(report in report()) {
+    fn reports_arrive_with_their_candidates(report in report()) {
         let (payload, candidate) = Payload::offer(1, Some(&report));
         let control = encode(&payload);
         let Payload::Offer { report: Some(found), .. } = decode(&control).unwrap() else { panic!("an offer") };
@@ -71,7 +71,7 @@ proptest! {
     }
 
     #[test]
-    fn a_turn_arrives(assignment in assignment(), sequence in any::<u64>(), version in any::<u64>()) {
+    fn assignments_arrive(assignment in assignment(), sequence in any::<u64>(), version in any::<u64>()) {
         let bytes = given(sequence, version, &assignment);
         let answer = Answer::decode(frame::split(&bytes).unwrap().0).unwrap();
         let AnswerBody::Assignment { mixture_version, assignment: found } = answer.body else { panic!("a turn") };
@@ -79,7 +79,7 @@ proptest! {
     }
 
     #[test]
-    fn a_changed_byte_is_refused(
+    fn changed_bytes_are_rejected(
         (mut bytes, read) in message(), at in any::<prop::sample::Index>(), change in 1..=255_u8,
     ) {
         let (control, block) = frame::split(&bytes).unwrap();
@@ -92,7 +92,7 @@ proptest! {
     }
 
     #[test]
-    fn missing_and_added_bytes_are_refused(
+    fn missing_and_extra_bytes_are_rejected(
         (bytes, read) in message(), at in any::<prop::sample::Index>(), added in vec(any::<u8>(), 1..20),
     ) {
         prop_assert!(read(&bytes[..at.index(bytes.len())]).is_err());
@@ -105,7 +105,7 @@ proptest! {
     }
 
     #[test]
-    fn bytes_behind_an_offer_are_refused(bytes in offer(), added in vec(any::<u8>(), 1..20)) {
+    fn unexpected_bytes_after_an_offer_are_rejected(bytes in offer(), added in vec(any::<u8>(), 1..20)) {
         let found = super::request(&[bytes.as_slice(), &added].concat());
         prop_assert!(matches!(found, Err(RejectedMessage::Block(_))), "{found:?}");
     }
@@ -123,7 +123,7 @@ proptest! {
 
     /// Damage that the checksum does not detect, for example by a bug in the sender.
     #[test]
-    fn a_wrong_program_does_no_harm(
+    fn wrong_senders_do_no_harm(
         (bytes, read) in message(), at in any::<prop::sample::Index>(), byte in any::<u8>(),
     ) {
         let mut content = content(&bytes).to_vec();
@@ -153,7 +153,7 @@ proptest! {
     }
 
     #[test]
-    fn a_report_about_the_candidate_of_another_walk_is_refused(sender in sender(), candidate in candidate()) {
+    fn reports_with_candidates_of_other_walks_are_rejected(sender in sender(), candidate in candidate()) {
         let walk = WalkId(candidate.id.walk.0 ^ 1);
         let (outcome, checkpoint) = (Outcome::Candidate(candidate), Vec::new());
         let report = Report { walk, assignment: 0, outcome, checkpoint, progress: Progress::default() };
@@ -161,7 +161,7 @@ proptest! {
     }
 
     #[test]
-    fn assignments_that_cannot_be_worked_on_are_refused(assignment in assignment()) {
+    fn invalid_assignments_are_rejected(assignment in assignment()) {
         let refused = |assignment: &Assignment| super::answer(&given(1, 1, assignment)).unwrap_err().to_string();
         let with = |seed_structure| Assignment { seed_structure, ..assignment.clone() };
         let mut broken = assignment.seed_structure.clone();
@@ -185,7 +185,7 @@ proptest! {
 }
 
 #[test]
-fn what_is_wrong_is_said() {
+fn errors_are_specific() {
     let bytes = encode_message(&Answer { sequence: 3, body: AnswerBody::Shutdown }, None);
     let changed = |at: usize| {
         let mut bytes = bytes.clone();
@@ -212,7 +212,7 @@ fn what_is_wrong_is_said() {
 
 /// The length of a text or list is not trusted.
 #[test]
-fn absurd_lengths_are_refused() {
+fn excessive_lengths_are_rejected() {
     let absurd = [&[0xff; 9][..], &[1]].concat();
     let is_refused = |read: Reader, content: &[&[u8]]| {
         matches!(read(&encoded(&content.concat())), Err(RejectedMessage::Control(ControlError::Content(_))))

@@ -50,7 +50,7 @@ fn refused(tls: &Tls, side: Side) -> String {
 }
 
 #[test]
-fn good_certificates_serve_both_sides() {
+fn valid_certificates_work_on_both_sides() {
     let directory = tempfile::tempdir().unwrap();
     let tls = Authority::new().host(directory.path(), |_| {});
     for side in [Side::Orchestrator, Side::Agent] {
@@ -60,7 +60,7 @@ fn good_certificates_serve_both_sides() {
 }
 
 #[test]
-fn a_certificate_is_for_the_hosts_that_it_names() {
+fn certificates_match_their_host_names() {
     let names = ["head", "*.cluster.example", "10.0.0.3", "::1"].map(str::to_owned).to_vec();
     let checked = CheckedTls { names, warnings: vec![] };
     for host in ["head", "HEAD", "node7.cluster.example", "10.0.0.3", "[::1]", "[0:0:0:0:0:0:0:1]"] {
@@ -72,7 +72,7 @@ fn a_certificate_is_for_the_hosts_that_it_names() {
 }
 
 #[test]
-fn what_is_wrong_with_a_file_is_said_with_its_name() {
+fn errors_name_the_file() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let authority = Authority::new();
@@ -110,7 +110,7 @@ fn what_is_wrong_with_a_file_is_said_with_its_name() {
 }
 
 #[test]
-fn certificates_of_another_authority_or_for_something_else_are_refused() {
+fn certificates_of_other_authorities_or_purposes_are_rejected() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let tls = Authority::new().host(here, |_| {});
@@ -130,7 +130,7 @@ fn certificates_of_another_authority_or_for_something_else_are_refused() {
 }
 
 #[test]
-fn a_certificate_is_refused_before_and_after_its_time_and_spoken_of_before_its_end() {
+fn certificates_are_rejected_outside_their_validity_with_a_warning_before_expiry() {
     let directory = tempfile::tempdir().unwrap();
     let authority = Authority::new();
     let until = |year, month, day| {
