@@ -164,13 +164,13 @@ impl Live {
 
     /// A report of each walk, with a structure that is new to the mixture.
     fn reports(&mut self) -> Vec<Report> {
-        let turns: Vec<_> = (0..WALKS).map(|_| turn(&mut self.selector)).collect();
+        let assignments: Vec<_> = (0..WALKS).map(|_| next_assignment(&mut self.selector)).collect();
         let offer = |(k, assignment)| {
             let mut z = [0.0; DIMENSION];
             z[k] = 5.0;
             offer(&self.selector, assignment, 10, structure(k as u64, SHORTEST), z)
         };
-        turns.iter().enumerate().map(offer).collect()
+        assignments.iter().enumerate().map(offer).collect()
     }
 
     /// The walks of the stored candidates, in decision order.

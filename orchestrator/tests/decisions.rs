@@ -9,8 +9,8 @@ use wire::messages::{DeclineReason, Verdict, WalkEnd};
 
 use crate::common;
 use crate::common::{
-    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, offer, positive, settings,
-    structure, try_restore, turn, value,
+    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, next_assignment, offer, positive,
+    settings, structure, try_restore, value,
 };
 
 /// γ = 3 in the first component.
@@ -24,7 +24,7 @@ fn live() -> Settings {
 
 /// A walk's next candidate: the structure with this number and these features.
 fn next_candidate(selector: &mut Selector, step: u64, number: u64, z: [f64; 3]) -> Commit {
-    let assignment = turn(selector);
+    let assignment = next_assignment(selector);
     let report = offer(selector, &assignment, step, structure(number, SHORTEST), z);
     decided(selector, report)
 }
@@ -60,7 +60,7 @@ fn accepted_structures_are_covered_afterwards() {
 #[test]
 fn each_candidate_has_three_grades() {
     let mut selector = begin(&live(), 2);
-    let (first, second) = (turn(&mut selector), turn(&mut selector));
+    let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
     // Both walkers have the original mixture; the second candidate arrives after the first has updated it.
     let reports = [
         offer(&selector, &first, 5, structure(1, SHORTEST), NEW),
@@ -92,7 +92,7 @@ fn atoms_too_close_are_declined() {
     let mut selector = begin(&live(), 1);
     let least = 0.75 * SHORTEST;
     for (number, distance, kind) in [(1, least - 1e-6, "declined guard"), (2, least + 1e-6, "accepted")] {
-        let assignment = turn(&mut selector);
+        let assignment = next_assignment(&mut selector);
         let report = offer(&selector, &assignment, number, structure(number, distance), NEW);
         assert_eq!(kinds(&decided(&mut selector, report)), [kind]);
     }
@@ -102,7 +102,7 @@ fn atoms_too_close_are_declined() {
 #[test]
 fn the_minimum_distance_is_the_larger_of_two() {
     let mut selector = begin(&Settings { min_distance: (2.5, 0.75), ..live() }, 1);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     let report = offer(&selector, &assignment, 1, structure(1, 2.45), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["declined guard"]);
 }
@@ -141,7 +141,7 @@ fn the_limit_per_seed_structure_is_enforced() {
     let commit = next_candidate(&mut selector, 6, 2, NEW);
     assert_eq!(kinds(&commit), ["accepted", "ended"]);
     assert_eq!((commit.walks[0].state.as_str(), commit.walks[0].accepted), ("collected", 2));
-    assert_eq!(turn(&mut selector).walk.0, 1);
+    assert_eq!(next_assignment(&mut selector).walk.0, 1);
 }
 
 /// The limit may be lowered while a walk is running.
@@ -164,7 +164,7 @@ fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
 fn the_campaign_limit_is_enforced() {
     let limited = Settings { update: UpdateProtocol::Never, max_structures: Some(2), ..live() };
     let mut selector = begin(&limited, 3);
-    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     let kinds: Vec<_> = (1..)
         .zip(&assignments)
         .flat_map(|(number, assignment)| {
@@ -212,11 +212,11 @@ fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
     // With the same limit only the control walk continues.
     let mut same = common::restore(&limited, 2, stored.clone());
     assert!(same.start_walks().decisions.is_empty());
-    assert_eq!(turn(&mut same).walk, wire::WalkId(2));
+    assert_eq!(next_assignment(&mut same).walk, wire::WalkId(2));
     // With a larger limit both walks continue from where they ended, and only new structures get another control walk.
     let mut larger = common::restore(&Settings { max_structures: Some(2), ..limited }, 2, stored);
     assert_eq!(kinds(&larger.start_walks()), ["configuration", "resumed", "resumed"]);
-    let assignment = turn(&mut larger);
+    let assignment = next_assignment(&mut larger);
     assert_eq!((assignment.number, assignment.verdict.clone()), (1, Some(Verdict::Accepted)));
     let report = offer(&larger, &assignment, 9, structure(2, SHORTEST), NEW);
     let commit = decided(&mut larger, report);
@@ -234,7 +234,7 @@ fn the_first_reason_applies() {
     let mut selector =
         common::restore(&limited, 4, SelectorSnapshot { known, ..SelectorSnapshot::default() });
     selector.start_walks();
-    let [first, assignments @ ..] = [(); 4].map(|()| turn(&mut selector));
+    let [first, assignments @ ..] = [(); 4].map(|()| next_assignment(&mut selector));
     let report = offer(&selector, &first, 1, structure(9, SHORTEST), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["accepted", "ended"]);
     // Close and known; known and covered; covered and beyond the limit.
@@ -251,10 +251,10 @@ fn the_first_reason_applies() {
 #[test]
 fn the_verdict_is_part_of_the_next_assignment() {
     let mut selector = begin(&live(), 1);
-    assert_eq!(turn(&mut selector).verdict, None);
+    assert_eq!(next_assignment(&mut selector).verdict, None);
     selector.assignment_lost(wire::WalkId(0));
     next_candidate(&mut selector, 4, 1, NEW);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     assert_eq!(
         (assignment.verdict.clone(), assignment.number, assignment.last_step),
         (Some(Verdict::Accepted), 1, 14)
@@ -262,13 +262,13 @@ fn the_verdict_is_part_of_the_next_assignment() {
     assert_eq!(assignment.checkpoint.as_deref(), Some(b"step 4".as_slice()));
     let report = offer(&selector, &assignment, 9, structure(2, SHORTEST), NEW);
     decided(&mut selector, report);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     assert_eq!(assignment.verdict, Some(Verdict::Declined(DeclineReason::Covered)));
     // Interrupted: the checkpoint already accounts for the verdict, which is not sent again.
     let paused = common::report(&assignment, wire::messages::Outcome::Interrupted, common::at(11));
     let commit = decided(&mut selector, paused);
     assert!(commit.decisions.is_empty() && commit.values.is_empty());
-    let again = turn(&mut selector);
+    let again = next_assignment(&mut selector);
     assert_eq!(
         (again.verdict, again.number, again.last_step),
         (None, assignment.number, assignment.last_step)
@@ -332,10 +332,10 @@ fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     assert_eq!(kinds(&last)[0], "accepted");
     let mut reports = Vec::new();
     while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment() {
-        let turn = wire::messages::Outcome::StepsDone;
+        let done = wire::messages::Outcome::StepsDone;
         reports.push(match assignment.walk.0 {
             0 => ended(&assignment, 10, WalkEnd::Steps),
-            _ => common::report(&assignment, turn, common::at(10)),
+            _ => common::report(&assignment, done, common::at(10)),
         });
     }
     let last = reports.into_iter().filter_map(|report| selector.report(report).unwrap()).last().unwrap();
@@ -384,7 +384,7 @@ fn candidates_below_a_raised_threshold_are_declined() {
     assert_eq!(kinds(&next_candidate(&mut selector, 6, 2, KNOWN)), ["declined covered"]);
     assert_eq!(kinds(&next_candidate(&mut selector, 7, 3, NEW)), ["accepted"]);
     selector.set_unfinished_jobs(100);
-    assert_eq!(turn(&mut selector).threshold_factor, 1.0);
+    assert_eq!(next_assignment(&mut selector).threshold_factor, 1.0);
     assert_eq!((selector.max_unfinished_jobs(100), begin(&live(), 1).max_unfinished_jobs(100)), (200, 100));
 }
 

@@ -308,7 +308,7 @@ async fn assignments_of_dead_walkers_are_completed_by_others() {
     let (reactor, to_reactor) = reactor(&store, &stopping).await;
     let mut mortal = InProcess::new(9, to_reactor.clone(), Arc::clone(&stopping));
     let dying = thread::spawn(move || {
-        let work = mortal.exchange(None).expect("the first to ask gets a turn");
+        let work = mortal.exchange(None).expect("the first idle walker gets an assignment");
         drop(work);
     });
     let running = tokio::spawn(end_of(reactor, |_| ()));
@@ -339,7 +339,7 @@ async fn assignments_that_crash_walkers_end_their_walk() {
         for walker in 0..walkers {
             let (reply, answer) = tokio::sync::oneshot::channel();
             to_reactor.send(Incoming::Idle { walker, report: None, reply }).await.unwrap();
-            assert_eq!(answer.await.unwrap().expect("a turn").assignment.walk, WalkId(0));
+            assert_eq!(answer.await.unwrap().expect("an assignment").assignment.walk, WalkId(0));
             to_reactor.send(Incoming::Lost { walker, crashed: fault }).await.unwrap();
         }
         let threads = start_walkers(1, to_reactor, &stopping);

@@ -23,7 +23,7 @@ fn crash() -> ExitReason {
     ExitReason::Exit { code: 2, last_line: None }
 }
 
-fn home() -> ExitReason {
+fn finished() -> ExitReason {
     ExitReason::Exit { code: 0, last_line: None }
 }
 
@@ -51,7 +51,7 @@ fn started(children: u32) -> Supervisor {
 fn detached_children_are_not_killed() {
     let mut supervisor = Supervisor::new(2, Limits { detached: true, ..LIMITS });
     assert_eq!(supervisor.due_actions(s(0)), [start(0, 1), start(1, 1)]);
-    let left = supervisor.ended(0, home(), s(5)).unwrap();
+    let left = supervisor.ended(0, finished(), s(5)).unwrap();
     assert_eq!(left.then, ChildState::BackingOff { left: s(1) });
     assert_eq!(supervisor.due_actions(s(6)), [start(0, 2)]);
     assert_eq!(supervisor.stop(s(10)), [Action::Terminate { number: 0 }, Action::Terminate { number: 1 }]);
@@ -74,7 +74,7 @@ fn nothing_is_started_without_work() {
         (vec![], ChildState::Exited)
     );
     assert!(!supervisor.is_over());
-    supervisor.ended(1, home(), s(101)).unwrap();
+    supervisor.ended(1, finished(), s(101)).unwrap();
     assert!(supervisor.is_over());
 }
 
@@ -102,7 +102,7 @@ fn backoff_doubles_up_to_the_maximum_until_the_child_fails() {
     assert!(!supervisor.is_over());
     assert_eq!(status(&supervisor, 1, now).state, ChildState::Running);
     assert_eq!(supervisor.next_deadline(), Some(s(120)));
-    supervisor.ended(1, home(), now);
+    supervisor.ended(1, finished(), now);
     assert!(supervisor.is_over() && supervisor.next_deadline().is_none());
 }
 
@@ -137,12 +137,12 @@ fn without_restarts_the_first_failure_is_the_last() {
 #[test]
 fn finished_children_are_not_restarted() {
     let mut supervisor = started(1);
-    let ended = supervisor.ended(0, home(), s(5)).unwrap();
-    assert_eq!(ended, ChildExit { incarnation: 1, reason: home(), then: ChildState::Exited });
+    let ended = supervisor.ended(0, finished(), s(5)).unwrap();
+    assert_eq!(ended, ChildExit { incarnation: 1, reason: finished(), then: ChildState::Exited });
     assert_eq!(supervisor.due_actions(s(1000)), []);
     assert!(supervisor.is_over());
     assert_eq!(status(&supervisor, 0, s(5)).last_failure, None);
-    assert_eq!(supervisor.ended(0, home(), s(6)), None, "it had no process");
+    assert_eq!(supervisor.ended(0, finished(), s(6)), None, "it had no process");
 }
 
 #[test]
@@ -187,7 +187,7 @@ fn missed_heartbeats_during_a_suspension_do_not_count() {
 fn a_stop_terminates_and_then_kills() {
     let mut supervisor = started(5);
     supervisor.ended(1, crash(), s(1));
-    supervisor.ended(2, home(), s(1));
+    supervisor.ended(2, finished(), s(1));
     supervisor.due_actions(s(1));
     let terminate = [0, 3, 4].map(|number| Action::Terminate { number });
     assert_eq!(supervisor.stop(s(1)), terminate);
@@ -310,7 +310,7 @@ fn happening() -> impl Strategy<Value = Happening> {
     let reason = prop_oneof![
         4 => Just(crash()),
         2 => Just(signal(9)),
-        1 => Just(home()),
+        1 => Just(finished()),
         1 => Just(ExitReason::Unknown),
         1 => any::<bool>().prop_map(|is_shortage| ExitReason::StartFailed { reason: String::new(), is_shortage }),
     ];

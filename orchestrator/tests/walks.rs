@@ -8,7 +8,8 @@ use wire::{Origin, WalkId};
 use crate::common;
 use crate::common::memory::MemoryStore;
 use crate::common::{
-    SHORTEST, at, begin, decided, ended, kinds, offer, restore, settings, structure, try_restore, turn, value,
+    SHORTEST, at, begin, decided, ended, kinds, next_assignment, offer, restore, settings, structure,
+    try_restore, value,
 };
 
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];
@@ -34,7 +35,7 @@ fn every_seed_structure_gets_one_walk() {
         (kinds(&commit), commit.walks[0].walk, commit.walks[0].seed_structure),
         (vec!["begun".into()], WalkId(2), 2)
     );
-    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     for (seed, assignment) in assignments.iter().enumerate() {
         assert_eq!(assignment.seed_structure, common::seed(seed).structure);
         assert_eq!((assignment.campaign, assignment.random_walk), (common::CAMPAIGN, assignment.walk));
@@ -48,7 +49,7 @@ fn every_seed_structure_gets_one_walk() {
 #[test]
 fn complete_rounds_are_decided_in_walk_order() {
     let mut selector = begin(&settings(Mode::Reproducible), 3);
-    let (first, second) = (turn(&mut selector), turn(&mut selector));
+    let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
     assert!(is_waiting(&mut selector), "the third walk is not in the round");
     let reports = [
         offer(&selector, &second, 5, structure(2, SHORTEST), NEW),
@@ -63,29 +64,36 @@ fn complete_rounds_are_decided_in_walk_order() {
     assert_eq!(walks, [(Some(WalkId(0)), 1), (Some(WalkId(1)), 1)]);
     assert_eq!((value(&commit, "round"), selector.mixture().version()), ("1", 1));
     // A walk that ends makes room for the next.
-    let (first, second) = (turn(&mut selector), turn(&mut selector));
+    let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
     assert!(selector.report(ended(&first, 20, WalkEnd::Steps)).unwrap().is_none());
     decided(&mut selector, common::report(&second, Outcome::StepsDone, at(15)));
-    assert_eq!([turn(&mut selector).walk, turn(&mut selector).walk], [WalkId(1), WalkId(2)]);
+    assert_eq!(
+        [next_assignment(&mut selector).walk, next_assignment(&mut selector).walk],
+        [WalkId(1), WalkId(2)]
+    );
 }
 
 #[test]
 fn live_walks_do_not_wait_for_each_other() {
     let mut selector = begin(&settings(Mode::Live), 3);
-    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     for assignment in assignments.iter().rev() {
         let report = offer(&selector, assignment, 5, structure(assignment.walk.0.into(), SHORTEST), NEW);
         let commit = decided(&mut selector, report);
         assert_eq!(commit.decisions[0].walk, Some(assignment.walk));
         assert_eq!(commit.decisions[0].round, 0);
-        assert_eq!(turn(&mut selector).walk, assignment.walk, "its next turn is there at once");
+        assert_eq!(
+            next_assignment(&mut selector).walk,
+            assignment.walk,
+            "its next assignment is available at once"
+        );
     }
 }
 
 #[test]
 fn unsolicited_reports_change_nothing() {
     let mut selector = begin(&settings(Mode::Live), 1);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     let unasked = |selector: &mut Selector, report| {
         assert!(selector.report(report).unwrap().is_none());
     };
@@ -94,12 +102,13 @@ fn unsolicited_reports_change_nothing() {
     unasked(&mut selector, wire::messages::Report { assignment: 1, ..report.clone() });
     decided(&mut selector, report.clone());
     unasked(&mut selector, report.clone());
-    turn(&mut selector);
+    next_assignment(&mut selector);
     unasked(&mut selector, report);
     // Reported twice in one round.
     let mut selector = begin(&settings(Mode::Reproducible), 2);
-    let [first, second] =
-        [(); 2].map(|()| turn(&mut selector)).map(|a| common::report(&a, Outcome::StepsDone, at(10)));
+    let [first, second] = [(); 2]
+        .map(|()| next_assignment(&mut selector))
+        .map(|a| common::report(&a, Outcome::StepsDone, at(10)));
     assert!(selector.report(first.clone()).unwrap().is_none());
     unasked(&mut selector, first);
     decided(&mut selector, second.clone());
@@ -110,17 +119,17 @@ fn unsolicited_reports_change_nothing() {
 fn late_reports_of_lost_walkers_count_once() {
     for mode in [Mode::Live, Mode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
-        let assignment = turn(&mut selector);
+        let assignment = next_assignment(&mut selector);
         let report = common::report(&assignment, Outcome::StepsDone, at(10));
         selector.assignment_lost(assignment.walk);
         let commit = decided(&mut selector, report.clone());
         assert_eq!(commit.walks[0].turn, assignment.number + 1);
         assert!(selector.report(report.clone()).unwrap().is_none());
-        assert_eq!(turn(&mut selector).number, assignment.number + 1);
+        assert_eq!(next_assignment(&mut selector).number, assignment.number + 1);
         assert!(selector.report(report).unwrap().is_none());
         // Reports after the end of a walk are ignored.
         selector.assignment_lost(assignment.walk);
-        let last = turn(&mut selector);
+        let last = next_assignment(&mut selector);
         decided(&mut selector, ended(&last, 30, WalkEnd::Steps));
         assert!(selector.report(ended(&last, 30, WalkEnd::Steps)).unwrap().is_none());
     }
@@ -130,10 +139,10 @@ fn late_reports_of_lost_walkers_count_once() {
 fn assignments_of_lost_walkers_are_assigned_again() {
     for mode in [Mode::Live, Mode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
-        let first = turn(&mut selector);
+        let first = next_assignment(&mut selector);
         assert!(is_waiting(&mut selector));
         selector.assignment_lost(first.walk);
-        let second = turn(&mut selector);
+        let second = next_assignment(&mut selector);
         assert_eq!(first, second);
         selector.assignment_lost(WalkId(7));
         let commit = decided(&mut selector, ended(&second, 30, WalkEnd::Steps));
@@ -153,13 +162,13 @@ fn returned(segment: u32, step: u64) -> Progress {
 #[test]
 fn rollbacks_are_logged_once() {
     let mut selector = begin(&settings(Mode::Live), 1);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(2, 8)));
     assert_eq!(kinds(&commit), ["segment"]);
     let detail = &commit.decisions[0].detail;
     assert_eq!(*detail, serde_json::json!({ "segment": 2, "from": 7, "to": 3, "tau": 0.125, "returns": 2 }));
     assert_eq!(commit.walks[0].progress.segment, 2);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     assert_eq!(assignment.last_step, 18);
     let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(2, 18)));
     assert_eq!(kinds(&commit), [""; 0]);
@@ -171,10 +180,10 @@ fn rollbacks_before_an_interruption_are_logged() {
     let mut store = MemoryStore::default();
     let mut selector = restore(&settings(Mode::Live), 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     store.commit(&decided(&mut selector, common::report(&assignment, Outcome::Interrupted, returned(1, 4))));
     let mut selector = restore(&settings(Mode::Live), 1, store.snapshot());
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(1, 10)));
     assert_eq!(kinds(&commit), ["segment"]);
 }
@@ -193,7 +202,7 @@ fn every_end_is_logged_with_its_reason() {
         (WalkEnd::BadStart { reason: reason() }, "bad_start", "forces are not finite"),
     ];
     let mut selector = begin(&settings(Mode::Live), ends.len());
-    let assignments = [(); 4].map(|()| turn(&mut selector));
+    let assignments = [(); 4].map(|()| next_assignment(&mut selector));
     for (assignment, (end, name, reason)) in assignments.iter().zip(ends) {
         let commit = decided(&mut selector, ended(assignment, 3, end));
         let detail = &commit.decisions[0].detail;
@@ -219,11 +228,11 @@ fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
     let mut selector = restore(&controlled, 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
     for (number, step) in (1..).zip(steps) {
-        let assignment = turn(&mut selector);
+        let assignment = next_assignment(&mut selector);
         let report = offer(&selector, &assignment, *step, structure(number, SHORTEST), NEW);
         store.commit(&decided(&mut selector, report));
     }
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     let commit = decided(&mut selector, ended(&assignment, 30, WalkEnd::BlewUp { reason: "hot".into() }));
     store.commit(&commit);
     selector
@@ -241,7 +250,7 @@ fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
     for (step, wanted, until, kinds_then) in
         [(5, vec![5, 12], 10, vec!["control"]), (12, vec![12], 12, vec!["control", "ended"])]
     {
-        let assignment = turn(&mut selector);
+        let assignment = next_assignment(&mut selector);
         assert_eq!(
             (assignment.walk, assignment.origin, assignment.random_walk),
             (WalkId(1), Origin::Control, WalkId(0))
@@ -276,7 +285,7 @@ fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
     let limited = Settings { control: true, max_structures: Some(2), ..settings(Mode::Reproducible) };
     let mut selector = restore(&limited, 2, store.snapshot());
     store.commit(&selector.start_walks());
-    let (control, biased) = (turn(&mut selector), turn(&mut selector));
+    let (control, biased) = (next_assignment(&mut selector), next_assignment(&mut selector));
     assert_eq!(
         (control.origin, biased.origin),
         (Origin::Control, Origin::Biased),
@@ -338,10 +347,10 @@ fn paused_walks_get_no_assignments_while_others_continue_in_live_mode() {
     let mut selector = restore(&settings(Mode::Live), 3, SelectorSnapshot::default());
     let _ = selector.start_walks();
     selector.set_paused([WalkId(0), WalkId(2)].into());
-    assert_eq!(turn(&mut selector).walk, WalkId(1));
+    assert_eq!(next_assignment(&mut selector).walk, WalkId(1));
     assert!(matches!(selector.next_assignment(), Scheduling::Wait) && !selector.is_done());
     selector.set_paused([WalkId(0)].into());
-    assert_eq!(turn(&mut selector).walk, WalkId(2));
+    assert_eq!(next_assignment(&mut selector).walk, WalkId(2));
     selector.set_paused([].into());
-    assert_eq!(turn(&mut selector).walk, WalkId(0));
+    assert_eq!(next_assignment(&mut selector).walk, WalkId(0));
 }

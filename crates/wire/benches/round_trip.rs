@@ -92,7 +92,7 @@ fn bare_wake_ups() {
 /// The walker's process: all sizes in sequence.
 fn walk(door: &ConnectInfo) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
-    let mut checked = walker.exchange(None).expect("a turn").assignment.number;
+    let mut checked = walker.exchange(None).expect("an assignment").assignment.number;
     println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
     for (atoms, features) in SIZES {
         let candidate = candidate(atoms, features);
@@ -103,7 +103,7 @@ fn walk(door: &ConnectInfo) {
             let progress = Progress::default();
             let report = Report { walk: WalkId(0), assignment: trip as u64, outcome, checkpoint, progress };
             let (begin, encoding) = (Instant::now(), walker.encoding());
-            let work = walker.exchange(Some(report)).expect("a turn");
+            let work = walker.exchange(Some(report)).expect("an assignment");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);
             // The server's time is encoded in the number of the assignment.
             let check = Duration::from_nanos(
@@ -179,11 +179,11 @@ fn structure(atoms: usize) -> Structure {
 }
 
 /// The next assignment.
-fn assignment(turn: u64) -> Assignment {
+fn assignment(number: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([7; 16]),
         walk: WalkId(0),
-        number: turn,
+        number,
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure: structure(108),

@@ -181,8 +181,8 @@ fn visibility(path: &Path, size: Size, mut mixture: Arc<Mixture>) {
     let mut shared = SharedMixture::create(path, &mixture, READERS).expect("room in /dev/shm");
     let mut readers: Vec<Child> = (0..READERS).map(|number| start(path, number)).collect();
     let (mut random, mut seen) = (Random(3), [const { Vec::new() }; 4]);
-    for turn in 0..400 {
-        let place = turn * 7 % (size.elements * size.components);
+    for repetition in 0..400 {
+        let place = repetition * 7 % (size.elements * size.components);
         let (element, slot) = (place / size.components, place % size.components);
         let component = component(&mut random, size.dimension);
         let next = mixture.with_changes(&[ChangedComponent { element, slot, component }]);
@@ -198,7 +198,7 @@ fn visibility(path: &Path, size: Size, mut mixture: Arc<Mixture>) {
         }
         let answers: Vec<[u64; 3]> = readers.iter_mut().map(answer).collect();
         let last = |which: usize| answers.iter().map(|answer| answer[which]).max().unwrap_or(0);
-        if turn >= 20 {
+        if repetition >= 20 {
             let times = [published - start, last(1), last(2), last(0) - start];
             seen.iter_mut().zip(times).for_each(|(seen, time)| seen.push(time as f64 / 1e3));
         }

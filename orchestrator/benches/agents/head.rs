@@ -111,9 +111,9 @@ fn report(log: &Log, mut seen: Seen, memory: &[f64; PERIODS], plan: Plan) {
     row("candidates/s", log.candidates.map(|(all, _)| all as f64 / each), 0);
     row("accepts/s", log.candidates.map(|(_, accepted)| accepted as f64 / each), 1);
     let waits = seen.waits.each_mut();
-    row("offer to next turn, median (ms)", waits.map(|waits| 1e3 * quantile(waits, 0.5)), 1);
+    row("offer to next assignment, median (ms)", waits.map(|waits| 1e3 * quantile(waits, 0.5)), 1);
     let waits = seen.waits.each_mut();
-    row("offer to next turn, 99 % (ms)", waits.map(|waits| 1e3 * quantile(waits, 0.99)), 1);
+    row("offer to next assignment, 99 % (ms)", waits.map(|waits| 1e3 * quantile(waits, 0.99)), 1);
     row("memory of the orchestrator (MB)", *memory, 0);
     let mut delays = delays(log, &seen);
     let [median, most, worst] = [0.5, 0.99, 1.0].map(|share| 1e3 * quantile(&mut delays, share));

@@ -108,17 +108,17 @@ struct Walker {
 impl Walker {
     /// Sends offers until it is shut down. Returns the time of each offer, and how long the walker waited, s.
     async fn work(mut self, mut slot: Slot, plan: Plan) -> Vec<(f64, f64)> {
-        let (mut told, mut waits) = (SlotReport::Empty, Vec::new());
+        let (mut report, mut waits) = (SlotReport::Empty, Vec::new());
         loop {
             let (offered, begun) = (now(), Instant::now());
-            let work = slot.exchange(&self.host.joined, &told).await.unwrap();
+            let work = slot.exchange(&self.host.joined, &report).await.unwrap();
             waits.push((offered, begun.elapsed().as_secs_f64()));
             let Some(work) = work else { return waits };
             self.host.publish(&work.mixture);
             let walk = if plan.rate > 0.0 { WALKERS as f64 / plan.rate } else { 0.0 };
             sleep(Duration::from_secs_f64(walk * (0.5 + self.random.uniform()))).await;
             let candidate = self.candidate(&work.assignment, &work.mixture);
-            told = SlotReport::Report(campaign::report(
+            report = SlotReport::Report(campaign::report(
                 &work.assignment,
                 Some(CandidateBlock::encode(&candidate)),
             ));
@@ -127,15 +127,15 @@ impl Walker {
 
     /// A recorded candidate with all atoms shifted slightly, so that it is no duplicate.
     fn candidate(&mut self, assignment: &Assignment, mixture: &Mixture) -> Candidate {
-        let (walk, turn) = (u64::from(assignment.walk.0), assignment.number);
-        let mut candidate = self.recorded[(walk + turn) as usize % RECORDED].clone();
-        let shift = 1e-9 * (walk + WALKERS as u64 * turn) as f64;
+        let (walk, number) = (u64::from(assignment.walk.0), assignment.number);
+        let mut candidate = self.recorded[(walk + number) as usize % RECORDED].clone();
+        let shift = 1e-9 * (walk + WALKERS as u64 * number) as f64;
         candidate.structure.positions.iter_mut().for_each(|position| position[0] += shift);
-        let step = progress(turn).step;
+        let step = progress(number).step;
         let content = ContentHash::from_structure(&candidate.structure);
         candidate.id = CandidateId { walk: assignment.walk, step, content, ..candidate.id };
         candidate.mixture_version = mixture.version();
-        if (walk + turn).is_multiple_of(NEW) {
+        if (walk + number).is_multiple_of(NEW) {
             self.make_new(&mut candidate, mixture);
         }
         candidate

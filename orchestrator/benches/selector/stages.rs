@@ -60,15 +60,15 @@ impl Stages {
         let mut selector = selector(model, recording.len(), settings);
         let mut commits = vec![selector.start_walks()];
         let mut offers: Vec<_> = recording.iter().map(|blocks| blocks.iter()).collect();
-        let mut turns = Vec::new();
+        let mut assignments = Vec::new();
         loop {
             while let Scheduling::Assign(assignment) = selector.next_assignment() {
-                turns.push(assignment);
+                assignments.push(assignment);
             }
-            if turns.is_empty() {
+            if assignments.is_empty() {
                 return commits;
             }
-            for assignment in turns.drain(..) {
+            for assignment in assignments.drain(..) {
                 let block = offers[assignment.walk.0 as usize].next();
                 let before = Arc::clone(selector.mixture());
                 let report = report(&assignment, block.cloned());

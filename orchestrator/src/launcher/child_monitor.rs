@@ -37,7 +37,7 @@ pub(super) struct ChildReporter {
 
 impl ChildReporter {
     async fn report(&self, news: ChildNews) {
-        // If the receiver is dropped, nobody needs the news.
+        // If the receiver is dropped, the news is not needed.
         let _ = self.news.send((self.number, news)).await;
     }
 }

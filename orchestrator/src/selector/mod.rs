@@ -264,10 +264,10 @@ impl Selector {
     /// Ends a walk whose current assignment cannot be completed, as if it had been reported.
     pub fn abandon_walk(&mut self, id: WalkId, reason: String) -> Result<Option<Commit>, SelectorError> {
         let Some(walk) = self.decisions.walks.get(&id) else { return Ok(None) };
-        let WalkRecord { turn, checkpoint, progress, .. } = walk.record.clone();
+        let WalkRecord { turn: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::BlewUp { reason }));
-        self.report(Report { walk: id, assignment: turn, outcome, checkpoint, progress })
+        self.report(Report { walk: id, assignment: number, outcome, checkpoint, progress })
     }
 
     /// Regrades reports for [`Selector::report_regraded`], for example on other threads.

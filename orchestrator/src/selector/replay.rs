@@ -1,7 +1,7 @@
 //! Replays the decision log of a campaign, with the same rules or with others.
 //!
 //! The actions of walkers are taken from the log: which structures they offered and when, rollbacks, and ends of walks.
-//! The decisions are made anew. With the same rules, every decision must be the same.
+//! The decisions are made again. With the same rules, every decision must be the same.
 
 use std::collections::HashSet;
 use std::sync::Arc;

@@ -110,10 +110,10 @@ pub fn begin(settings: &Settings, seeds: usize) -> Selector {
 }
 
 /// The next assignment, which must exist.
-pub fn turn(selector: &mut Selector) -> Assignment {
+pub fn next_assignment(selector: &mut Selector) -> Assignment {
     match selector.next_assignment() {
         Scheduling::Assign(assignment) => *assignment,
-        other => panic!("expected a turn, found {other:?}"),
+        other => panic!("expected an assignment, found {other:?}"),
     }
 }
 

@@ -146,7 +146,7 @@ impl Connection {
             None => self.wakeup.insert(config::open_walker_wakeup(node, sender)?),
         };
         match wakeup.notify() {
-            Ok(0) => Err(IpcError::new("wake a walker", "nobody listens")),
+            Ok(0) => Err(IpcError::new("wake a walker", "it has no listener")),
             Ok(_) => Ok(()),
             Err(reason) => Err(IpcError::new("wake a walker", reason)),
         }

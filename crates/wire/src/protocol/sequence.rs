@@ -181,7 +181,7 @@ mod tests {
         refused(&all, 0, 0);
         refused(&all, 2, 0);
         all.begin(3);
-        // The first is not answered: nobody can know what comes after it.
+        // The first is not answered: the next offer is unknown.
         refused(&all, 2, 1);
         all.set_answer(3, Vec::new());
         all.begin(3);

@@ -12,8 +12,8 @@ async fn candidates_of_any_size_survive_a_round_trip() {
     let mut last = server.offer().await;
     assert_eq!((last.walker, &last.report), (0, &None));
     let sizes = [(1, 0), (4, 20), (108, 131), (108, 131), (1000, 500), (1, 1), (500, 1040), (108, 0)];
-    for (turn, size) in (1..).zip(sizes) {
-        last = server.go_on(last, turn, size).await;
+    for (number, size) in (1..).zip(sizes) {
+        last = server.go_on(last, number, size).await;
     }
     last.reply.send(None).unwrap();
     assert!(walker.wait().unwrap().success());
@@ -36,11 +36,11 @@ async fn candidates_live_as_long_as_they_are_used() {
     let mut walker = server.start(0, 1, Role::Walker);
     let mut held = Vec::new();
     let mut last = server.offer().await;
-    for turn in 1..30 {
-        last.reply.send(Some(work(0, turn, (20, 30)))).unwrap();
+    for number in 1..30 {
+        last.reply.send(Some(work(0, number, (20, 30)))).unwrap();
         last = server.offer().await;
         held.push(last.report.take().unwrap());
-        if turn == 20 {
+        if number == 20 {
             held.drain(3..10);
         }
     }
@@ -62,17 +62,17 @@ async fn many_walkers_are_answered_each_for_itself() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 6, 1 << 16);
     let mut walkers: Vec<_> = (0..6).map(|walker| server.start(walker, 3, Role::Walker)).collect();
-    let mut turns = [0; 6];
+    let mut assignments = [0; 6];
     let mut home = 0;
     while home < walkers.len() {
         let offer = server.offer().await;
-        let turn = &mut turns[offer.walker as usize];
-        if *turn > 0 {
-            check(&offer.report.unwrap(), offer.walker, *turn, (3, 4));
+        let number = &mut assignments[offer.walker as usize];
+        if *number > 0 {
+            check(&offer.report.unwrap(), offer.walker, *number, (3, 4));
         }
-        *turn += 1;
-        home += usize::from(*turn == 40);
-        offer.reply.send((*turn < 40).then(|| work(offer.walker, *turn, (3, 4)))).unwrap();
+        *number += 1;
+        home += usize::from(*number == 40);
+        offer.reply.send((*number < 40).then(|| work(offer.walker, *number, (3, 4)))).unwrap();
     }
     assert!(walkers.iter_mut().all(|walker| walker.wait().unwrap().success()));
     assert_eq!(server.handle.traffic().rejected, 0);

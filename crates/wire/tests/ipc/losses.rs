@@ -74,7 +74,7 @@ async fn a_killed_walker_is_replaced() {
         server.handle.lost(1, incarnation, true);
         assert!(matches!(server.next().await, Incoming::Lost { walker: 1, crashed: true }));
         check(&offer.report.take().unwrap(), 1, 1, (3, 4));
-        offer.reply.send(None).expect_err("nobody is there to be answered");
+        offer.reply.send(None).expect_err("the walker is dead");
     }
     let mut walker = server.start(0, 8, Role::Walker);
     let offer = server.offer().await;

@@ -59,16 +59,16 @@ fn walk(door: &ConnectInfo, stuck: bool) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).unwrap();
     let mut report = None;
     while let Some(work) = walker.exchange(report.take()) {
-        let Assignment { walk, number: turn, .. } = work.assignment;
+        let Assignment { walk, number, .. } = work.assignment;
         let candidate = candidate(&work.assignment);
-        let (checkpoint, progress) = (turn.to_le_bytes().to_vec(), progress(turn));
+        let (checkpoint, progress) = (number.to_le_bytes().to_vec(), progress(number));
         walker.progress(walk, progress.clone());
-        assert_eq!(work.mixture.version(), turn, "the version of the turn");
+        assert_eq!(work.mixture.version(), number, "the version of the assignment");
         if stuck {
             sleep(Duration::MAX);
         }
         let outcome = Outcome::Candidate(candidate);
-        report = Some(Report { walk, assignment: turn, outcome, checkpoint, progress });
+        report = Some(Report { walk, assignment: number, outcome, checkpoint, progress });
     }
     assert!(walker.failure().is_none(), "{:?}", walker.failure());
 }
@@ -79,9 +79,9 @@ fn orchestrate(directory: &str) {
         let mut server = TestServer::open(Path::new(directory), 2, 1 << 16);
         let _walker = server.start(0, 1, Role::Walker);
         let mut last = server.offer().await;
-        for turn in 1.. {
-            last = server.go_on(last, turn, (2, 3)).await;
-            if turn == 1 {
+        for number in 1.. {
+            last = server.go_on(last, number, (2, 3)).await;
+            if number == 1 {
                 std::fs::write(Path::new(directory).join(AT_WORK), "").unwrap();
             }
         }
@@ -93,16 +93,16 @@ pub fn progress(step: u64) -> wire::messages::Progress {
 }
 
 /// An assignment that ends with a candidate of this number of atoms and features.
-pub fn assignment(walk: u32, turn: u64, (atoms, features): (usize, usize)) -> Assignment {
+pub fn assignment(walk: u32, number: u64, (atoms, features): (usize, usize)) -> Assignment {
     let walk = WalkId(walk);
     Assignment {
         campaign: CampaignId([7; 16]),
         walk,
-        number: turn,
+        number,
         origin: Origin::Biased,
         random_walk: walk,
         seed_structure: structure(atoms),
-        checkpoint: Some(vec![turn as u8; 100]),
+        checkpoint: Some(vec![number as u8; 100]),
         verdict: None,
         last_step: features as u64,
         frame_steps: Vec::new(),
@@ -119,18 +119,17 @@ fn structure(atoms: usize) -> Structure {
 
 /// The candidate that ends this assignment.
 pub fn candidate(assignment: &Assignment) -> Candidate {
-    let Assignment { campaign, walk, number: turn, ref seed_structure, last_step: features, .. } =
-        *assignment;
+    let Assignment { campaign, walk, number, ref seed_structure, last_step: features, .. } = *assignment;
     let n = seed_structure.len();
-    let numbers = |count: usize, shift: f64| (0..count).map(|k| k as f64 + shift + turn as f64).collect();
+    let numbers = |count: usize, shift: f64| (0..count).map(|k| k as f64 + shift + number as f64).collect();
     let content = ContentHash::from_structure(seed_structure);
     Candidate {
-        id: CandidateId { campaign, walk, segment: 0, step: turn, content },
+        id: CandidateId { campaign, walk, segment: 0, step: number, content },
         origin: Origin::Biased,
-        mixture_version: turn,
+        mixture_version: number,
         temperature: 300.0,
         relative_volume: 1.0,
-        energy: turn as f64,
+        energy: number as f64,
         virial: [[1.0; 3]; 3],
         structure: seed_structure.clone(),
         forces: vec![[0.5; 3]; n],

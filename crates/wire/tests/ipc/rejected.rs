@@ -183,8 +183,8 @@ async fn offers_with_invalid_candidates_change_nothing() {
     other.id.step += 1;
     let other = CandidateBlock::encode(&other);
     stranger.refused(&server, &with(&one, other.as_bytes()), "the attached block is 07070707-3.0.2-").await;
-    let beside = "bytes: the message names none";
-    stranger.refused(&server, &with(NOTHING, block.as_bytes()), beside).await;
+    let unexpected = "bytes: the message names none";
+    stranger.refused(&server, &with(NOTHING, block.as_bytes()), unexpected).await;
     assert!(server.incoming.try_recv().is_err() && server.heard.lock().unwrap().is_empty());
 
     // The valid offer is accepted; repeated, it is not accepted again.
@@ -217,8 +217,8 @@ async fn a_flood_of_messages_does_not_block_walkers() {
         }
     });
     let mut last = server.offer().await;
-    for turn in 1..50 {
-        last = server.go_on(last, turn, (3, 4)).await;
+    for number in 1..50 {
+        last = server.go_on(last, number, (3, 4)).await;
     }
     last.reply.send(None).unwrap();
     assert!(walker.wait().unwrap().success());

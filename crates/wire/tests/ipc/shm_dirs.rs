@@ -17,9 +17,9 @@ async fn two_campaigns_do_not_see_each_other() {
         directories.each_ref().map(|directory| TestServer::open(directory.path(), 1, 1 << 16));
     let mut walkers = [&here, &there].map(|server| server.start(0, 1, Role::Walker));
     let (mut first, mut second) = (here.offer().await, there.offer().await);
-    for turn in 1..20 {
-        first = here.go_on(first, turn, (3, 4)).await;
-        second = there.go_on(second, turn + 100, (4, 3)).await;
+    for number in 1..20 {
+        first = here.go_on(first, number, (3, 4)).await;
+        second = there.go_on(second, number + 100, (4, 3)).await;
     }
     // The end of one campaign does not affect the other.
     first.reply.send(None).unwrap();

@@ -85,12 +85,12 @@ impl TestServer {
     }
 
     /// Sends an assignment, and checks and returns the offer that answers it.
-    pub async fn go_on(&mut self, offer: Offer, turn: u64, size: (usize, usize)) -> Offer {
+    pub async fn go_on(&mut self, offer: Offer, number: u64, size: (usize, usize)) -> Offer {
         let walker = offer.walker;
-        offer.reply.send(Some(work(walker, turn, size))).unwrap();
+        offer.reply.send(Some(work(walker, number, size))).unwrap();
         let next = self.offer().await;
         assert_eq!(next.walker, walker);
-        check(next.report.as_ref().unwrap(), walker, turn, size);
+        check(next.report.as_ref().unwrap(), walker, number, size);
         next
     }
 
@@ -105,15 +105,15 @@ impl TestServer {
 }
 
 /// An assignment with its mixture, whose version is the number of the assignment.
-pub fn work(walker: u32, turn: u64, size: (usize, usize)) -> WorkItem {
-    WorkItem { assignment: assignment(walker, turn, size), mixture: Arc::new(mixture(turn)) }
+pub fn work(walker: u32, number: u64, size: (usize, usize)) -> WorkItem {
+    WorkItem { assignment: assignment(walker, number, size), mixture: Arc::new(mixture(number)) }
 }
 
 /// Checks that a report answers this assignment.
-pub fn check(report: &Report, walker: u32, turn: u64, size: (usize, usize)) {
+pub fn check(report: &Report, walker: u32, number: u64, size: (usize, usize)) {
     let Report { walk, assignment: found, ref checkpoint, ref outcome, .. } = *report;
-    assert_eq!((walk, found, checkpoint.as_slice()), (WalkId(walker), turn, &turn.to_le_bytes()[..]));
-    let expected = CandidateBlock::encode(&candidate(&assignment(walker, turn, size)));
+    assert_eq!((walk, found, checkpoint.as_slice()), (WalkId(walker), number, &number.to_le_bytes()[..]));
+    let expected = CandidateBlock::encode(&candidate(&assignment(walker, number, size)));
     assert_eq!(*outcome, Outcome::Candidate(expected));
 }
 

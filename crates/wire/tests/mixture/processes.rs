@@ -129,7 +129,7 @@ fn reader_process() {
             let newest = reader.newest();
             match reader.pin(newest) {
                 Ok(mixture) => held.push(mixture),
-                // It was the newest version a moment ago, and was assigned to nobody.
+                // It was the newest version a moment ago, and was not assigned.
                 Err(SharedMixtureError::VersionNotFound { .. }) => {}
                 Err(error) => panic!("{error}"),
             }

@@ -19,23 +19,23 @@ async fn reports_over_a_breaking_link_arrive_once() {
     let mut slot = joined.slots().remove(0);
     let line = Arc::clone(&joined);
     let working = tokio::spawn(async move {
-        let mut told = SlotReport::Empty;
-        while let Some(work) = slot.exchange(&line, &told).await.unwrap() {
+        let mut last_report = SlotReport::Empty;
+        while let Some(work) = slot.exchange(&line, &last_report).await.unwrap() {
             sleep(Duration::from_millis(300)).await;
-            told = SlotReport::Report(report(&work.assignment));
+            last_report = SlotReport::Report(report(&work.assignment));
         }
     });
     let mut mixture = Arc::new(mixture());
     let mut expected = None;
     let breaks = [State::Cut, State::Dead, State::Cut];
-    for turn in 1..=6_u64 {
+    for number in 1..=6_u64 {
         let offer = head.offer().await;
-        assert_eq!(offer.report, expected, "turn {turn}: each report once, in order");
+        assert_eq!(offer.report, expected, "assignment {number}: each report once, in order");
         mixture = next_version(&mixture, 0, 0);
-        let work = work(2, turn, &mixture);
+        let work = work(2, number, &mixture);
         expected = Some(report(&work.assignment));
-        let state = breaks[turn as usize % breaks.len()];
-        if turn % 2 == 0 {
+        let state = breaks[number as usize % breaks.len()];
+        if number % 2 == 0 {
             // Cut while the offer is pending.
             link.set(state);
             sleep(Duration::from_millis(500)).await;
@@ -70,10 +70,10 @@ async fn lost_agents_stay_lost_and_may_join_again() {
     let mixture = Arc::new(mixture());
     let line = Arc::clone(&joined);
     let mut slot = slots.remove(0);
-    let turn = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
+    let exchange = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
     let first = head.offer().await;
     first.reply.send(Some(work(2, 1, &mixture))).unwrap();
-    let (given, mut slot) = turn.await.unwrap();
+    let (given, mut slot) = exchange.await.unwrap();
     let assignment = given.unwrap().unwrap().assignment;
     // The other slot waits for its assignment.
     let line = Arc::clone(&joined);
@@ -87,18 +87,18 @@ async fn lost_agents_stay_lost_and_may_join_again() {
         let gone = head.next().await;
         assert!(matches!(gone, Incoming::Lost { walker: found, .. } if found == walker), "{gone:?}");
     }
-    assert!(second.reply.send(Some(work(3, 1, &mixture))).is_err(), "nobody would get this turn");
+    assert!(second.reply.send(Some(work(3, 1, &mixture))).is_err(), "no walker would get this assignment");
     head.event(|event| matches!(event, AgentEvent::Lost(_))).await;
 
     link.set(State::Whole);
-    let told = SlotReport::Report(report(&assignment));
-    let refused = timeout(LIMIT, slot.exchange(&joined, &told)).await.expect("in time");
+    let last_report = SlotReport::Report(report(&assignment));
+    let refused = timeout(LIMIT, slot.exchange(&joined, &last_report)).await.expect("in time");
     assert!(matches!(refused, Err(LinkError::RejoinRequired(_))), "{refused:?}");
     assert!(matches!(waiting.await.unwrap(), Err(LinkError::RejoinRequired(_))));
     let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());
     let mut slot = joined.slots().remove(0);
     let line = Arc::clone(&joined);
-    let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.unwrap().is_none() });
+    let telling = tokio::spawn(async move { slot.exchange(&line, &last_report).await.unwrap().is_none() });
     let offer = head.offer().await;
     assert!(offer.walker > second.walker, "numbers are never used again");
     assert_eq!(offer.report, Some(report(&assignment)));
@@ -116,14 +116,14 @@ async fn an_agent_finds_the_next_run_of_its_orchestrator() {
     let mut slot = joined.slots().remove(0);
     let mixture = next_version(&mixture(), 1, 1);
     let line = Arc::clone(&joined);
-    let turn = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
+    let exchange = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
     head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
-    let (given, mut slot) = turn.await.unwrap();
+    let (given, mut slot) = exchange.await.unwrap();
     let assignment = given.unwrap().unwrap().assignment;
     let port = head.kill().await;
-    let told = SlotReport::Report(report(&assignment));
+    let last_report = SlotReport::Report(report(&assignment));
     let line = Arc::clone(&joined);
-    let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.map(drop) });
+    let telling = tokio::spawn(async move { slot.exchange(&line, &last_report).await.map(drop) });
     sleep(Duration::from_millis(500)).await;
     let mut head = TestServer::open(Wanted { port, session: 2, mixture, ..Wanted::default() }).await;
     let refused = timeout(LIMIT, telling).await.expect("in time").unwrap();
@@ -131,8 +131,8 @@ async fn an_agent_finds_the_next_run_of_its_orchestrator() {
     let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
     assert_eq!(joined.newest().await.version(), 1);
     let mut slot = joined.slots().remove(0);
-    let told = SlotReport::Report(report(&assignment));
-    let telling = async { slot.exchange(&joined, &told).await.unwrap().is_none() };
+    let last_report = SlotReport::Report(report(&assignment));
+    let telling = async { slot.exchange(&joined, &last_report).await.unwrap().is_none() };
     let (home, found) = tokio::join!(telling, async {
         let offer = head.offer().await;
         offer.reply.send(None).unwrap();

@@ -19,20 +19,20 @@ async fn assignments_and_reports_survive_a_round_trip() {
     let mut slot = joined.slots().remove(0);
     let line = Arc::clone(&joined);
     let working = tokio::spawn(async move {
-        let mut told = SlotReport::Empty;
-        let mut turns = 0;
-        while let Some(work) = slot.exchange(&line, &told).await.unwrap() {
-            turns += 1;
-            assert_eq!(work.assignment.number, turns);
-            assert_eq!(work.mixture.version(), turns, "the version of the turn");
+        let mut last_report = SlotReport::Empty;
+        let mut assignments = 0;
+        while let Some(work) = slot.exchange(&line, &last_report).await.unwrap() {
+            assignments += 1;
+            assert_eq!(work.assignment.number, assignments);
+            assert_eq!(work.mixture.version(), assignments, "the version of the assignment");
             slot.progress(Arc::clone(&line), work.assignment.walk, Progress::default()).await;
-            told = SlotReport::Report(report(&work.assignment));
+            last_report = SlotReport::Report(report(&work.assignment));
         }
-        turns
+        assignments
     });
     let mut mixture = Arc::new(mixture());
     let mut expected = None;
-    for turn in 1..=20 {
+    for number in 1..=20 {
         let mut offer = head.next().await;
         while let Incoming::Progress(walk, _) = offer {
             assert_eq!(walk, WalkId(5));
@@ -40,8 +40,8 @@ async fn assignments_and_reports_survive_a_round_trip() {
         }
         let Incoming::Idle { report: found, reply, .. } = offer else { panic!("{offer:?}") };
         assert_eq!(found, expected);
-        mixture = next_version(&mixture, turn % 2, turn % 2);
-        let work = work(5, turn as u64, &mixture);
+        mixture = next_version(&mixture, number % 2, number % 2);
+        let work = work(5, number as u64, &mixture);
         expected = Some(report(&work.assignment));
         reply.send(Some(work)).unwrap();
     }
@@ -72,9 +72,9 @@ async fn lost_walkers_are_reported_and_their_slots_continue() {
     let mixture = Arc::new(mixture());
     for fault in [true, false] {
         let line = Arc::clone(&joined);
-        let told = if fault { SlotReport::Empty } else { SlotReport::Lost { crashed: true } };
-        let turn = tokio::spawn(async move {
-            let work = slot.exchange(&line, &told).await.unwrap();
+        let last_report = if fault { SlotReport::Empty } else { SlotReport::Lost { crashed: true } };
+        let exchange = tokio::spawn(async move {
+            let work = slot.exchange(&line, &last_report).await.unwrap();
             (slot, work)
         });
         if !fault {
@@ -85,15 +85,18 @@ async fn lost_walkers_are_reported_and_their_slots_continue() {
         assert_eq!(offer.report, None);
         offer.reply.send(Some(work(1, 1, &mixture))).unwrap();
         let work;
-        (slot, work) = turn.await.unwrap();
+        (slot, work) = exchange.await.unwrap();
         assert!(work.is_some());
     }
     joined.leave().await;
     for _ in 0..2 {
         assert!(matches!(head.next().await, Incoming::Lost { crashed: false, .. }));
     }
-    let told = SlotReport::Empty;
-    assert!(matches!(slot.exchange(&joined, &told).await, Err(LinkError::RejoinRequired(_))), "it has left");
+    let last_report = SlotReport::Empty;
+    assert!(
+        matches!(slot.exchange(&joined, &last_report).await, Err(LinkError::RejoinRequired(_))),
+        "it has left"
+    );
     head.close().await;
 }
 

@@ -36,13 +36,13 @@ async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
     let mut slot = joined.slots().remove(0);
     let mixture = Wanted::default().mixture;
     let line = Arc::clone(&joined);
-    let turn = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
+    let exchange = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
     head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
-    let (given, mut slot) = turn.await.unwrap();
-    let told = SlotReport::Report(report(&given.unwrap().unwrap().assignment));
+    let (given, mut slot) = exchange.await.unwrap();
+    let last_report = SlotReport::Report(report(&given.unwrap().unwrap().assignment));
     let before = head.kill().await;
     let line = Arc::clone(&joined);
-    let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.map(drop) });
+    let telling = tokio::spawn(async move { slot.exchange(&line, &last_report).await.map(drop) });
     tokio::time::sleep(Duration::from_millis(300)).await;
     let head = TestServer::open(Wanted { session: 2, ..Wanted::default() }).await;
     assert_ne!(head.port, before);

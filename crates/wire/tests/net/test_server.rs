@@ -112,7 +112,7 @@ impl TestServer {
                 sleep(Duration::from_millis(10)).await;
             }
         };
-        timeout(LIMIT, free).await.expect("nobody listens any more");
+        timeout(LIMIT, free).await.expect("the port is free");
         self.port
     }
 }
@@ -162,18 +162,18 @@ pub fn next_version(mixture: &Mixture, element: usize, slot: usize) -> Arc<Mixtu
     Arc::new(mixture.with_changes(&[ChangedComponent { element, slot, component }]).unwrap())
 }
 
-pub fn work(walk: u32, turn: u64, mixture: &Arc<Mixture>) -> WorkItem {
+pub fn work(walk: u32, number: u64, mixture: &Arc<Mixture>) -> WorkItem {
     let walk = WalkId(walk);
     let assignment = Assignment {
         campaign: CampaignId([7; 16]),
         walk,
-        number: turn,
+        number,
         origin: Origin::Biased,
         random_walk: walk,
         seed_structure: structure(),
-        checkpoint: Some(vec![turn as u8; 100]),
+        checkpoint: Some(vec![number as u8; 100]),
         verdict: None,
-        last_step: turn * 1000,
+        last_step: number * 1000,
         frame_steps: Vec::new(),
         threshold_factor: 1.0,
     };
@@ -182,7 +182,7 @@ pub fn work(walk: u32, turn: u64, mixture: &Arc<Mixture>) -> WorkItem {
 
 /// The report on an assignment.
 pub fn report(assignment: &Assignment) -> Report {
-    let Assignment { campaign, walk, number: turn, .. } = *assignment;
+    let Assignment { campaign, walk, number, .. } = *assignment;
     let structure = structure();
     let n = structure.len();
     let candidate = Candidate {
@@ -190,27 +190,27 @@ pub fn report(assignment: &Assignment) -> Report {
             campaign,
             walk,
             segment: 0,
-            step: turn,
+            step: number,
             content: ContentHash::from_structure(&structure),
         },
         origin: Origin::Biased,
         mixture_version: 3,
         temperature: 300.0,
         relative_volume: 1.0,
-        energy: -(turn as f64),
+        energy: -(number as f64),
         virial: [[0.5; 3]; 3],
         structure,
         forces: vec![[0.25; 3]; n],
         gamma: vec![1.0; n],
         gamma_nbr: vec![2.0; n],
-        features: vec![turn as f64; n * 20],
+        features: vec![number as f64; n * 20],
     };
     let outcome = Outcome::Candidate(CandidateBlock::encode(&candidate));
     Report {
         walk,
-        assignment: turn,
+        assignment: number,
         outcome,
-        checkpoint: turn.to_le_bytes().to_vec(),
+        checkpoint: number.to_le_bytes().to_vec(),
         progress: Progress::default(),
     }
 }

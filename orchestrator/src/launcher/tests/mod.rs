@@ -273,11 +273,11 @@ async fn stopping_kills_children_that_do_not_exit() {
 async fn exits_by_signal_are_reported() {
     let mut children = children(&["kill -9 $$", "kill -SEGV $$"], NO_RESTART);
     let events = rest(&mut children).await;
-    let mut told: Vec<_> =
+    let mut reasons: Vec<_> =
         ends(&events).iter().map(|(number, ended)| (*number, ended.reason.to_string())).collect();
-    told.sort();
-    assert_eq!(told[0].1, "killed by signal 9 (SIGKILL)");
-    assert_eq!(told[1].1, "killed by signal 11 (SIGSEGV)");
+    reasons.sort();
+    assert_eq!(reasons[0].1, "killed by signal 9 (SIGKILL)");
+    assert_eq!(reasons[1].1, "killed by signal 11 (SIGSEGV)");
 }
 
 #[tokio::test]

@@ -74,7 +74,7 @@ proptest! {
     fn assignments_arrive(assignment in assignment(), sequence in any::<u64>(), version in any::<u64>()) {
         let bytes = given(sequence, version, &assignment);
         let answer = Answer::decode(frame::split(&bytes).unwrap().0).unwrap();
-        let AnswerBody::Assignment { mixture_version, assignment: found } = answer.body else { panic!("a turn") };
+        let AnswerBody::Assignment { mixture_version, assignment: found } = answer.body else { panic!("an assignment") };
         prop_assert_eq!((answer.sequence, mixture_version, found.as_ref()), (sequence, version, &assignment));
     }
 
@@ -226,6 +226,6 @@ fn excessive_lengths_are_rejected() {
     assert!(is_refused(super::request, &[&envelope, &absurd, &rest[1..]]));
     // Answer to offer 1: an assignment, mixture 0, campaign, walk 0, assignment 0, biased, random walk 0, and 2⁶³
     // species.
-    let turn = [&[1, 0, 0][..], &[0; 16], &[0; 4]].concat();
-    assert!(is_refused(super::answer, &[&turn, &absurd, &[0; 100]]));
+    let body = [&[1, 0, 0][..], &[0; 16], &[0; 4]].concat();
+    assert!(is_refused(super::answer, &[&body, &absurd, &[0; 100]]));
 }

@@ -134,7 +134,7 @@ pub fn given(sequence: u64, mixture_version: u64, assignment: &Assignment) -> Ve
 }
 
 pub fn answer() -> impl Strategy<Value = Vec<u8>> {
-    let turn = (any::<u64>(), any::<u64>(), assignment())
+    let assigned = (any::<u64>(), any::<u64>(), assignment())
         .prop_map(|(sequence, version, assignment)| given(sequence, version, &assignment));
     let other = (any::<u64>(), 0..3).prop_map(|(sequence, which)| {
         let body = match which {
@@ -144,5 +144,5 @@ pub fn answer() -> impl Strategy<Value = Vec<u8>> {
         };
         encode_message(&Answer { sequence, body }, None)
     });
-    prop_oneof![3 => turn, 1 => other]
+    prop_oneof![3 => assigned, 1 => other]
 }
