@@ -1,6 +1,6 @@
 //! The selector: owns the mixture, decides on every candidate, and assigns the walks to walkers.
 //!
-//! It has two parts. [`DecisionState`] decides on candidates and walks, one after the other, and knows nothing of
+//! It has two parts. `DecisionState` decides on candidates and walks, one after the other, and knows nothing of
 //! assignments. The other part hands out assignments and collects reports, in rounds if the campaign is reproducible. A
 //! replay uses the same `DecisionState`.
 //!

@@ -5,7 +5,7 @@
 //! same time, one waits for the end of the other. Slurm itself thus ensures that there is at most one orchestrator, and
 //! no more agents than requested, however often jobs are launched.
 //!
-//! A pure function, [`plan`], decides which jobs to submit and to cancel; [`Slurm`] calls Slurm's commands.
+//! A pure function, [`plan()`], decides which jobs to submit and to cancel; [`Slurm`] calls Slurm's commands.
 
 mod commands;
 mod job;
