@@ -132,9 +132,9 @@ impl Reactor {
                 batch = events.take(), if open => {
                     let batch = batch.unwrap_or_default();
                     open = !batch.is_empty();
-                    let told = batch.iter().all(|event| matches!(event, ReactorEvent::Progress(..)));
+                    let only_progress = batch.iter().all(|event| matches!(event, ReactorEvent::Progress(..)));
                     state.decide(batch, &mut watch)?;
-                    if open && told {
+                    if open && only_progress {
                         continue;
                     }
                     events.set_mixture(state.selector.mixture());
@@ -235,9 +235,8 @@ impl ReactorState {
 
     /// Whether the walk is assigned, or about to be. If so, a report of a walker that was considered lost is ignored.
     fn is_assigned(&self, walk: WalkId) -> bool {
-        let pending_replies = self.pending_replies.iter().filter_map(|pending| pending.work.as_ref());
-        let mut assigned =
-            self.assigned.values().copied().chain(pending_replies.map(|work| work.assignment.walk));
+        let pending = self.pending_replies.iter().filter_map(|pending| pending.work.as_ref());
+        let mut assigned = self.assigned.values().copied().chain(pending.map(|work| work.assignment.walk));
         assigned.any(|other| other == walk)
     }
 
@@ -333,8 +332,8 @@ impl ReactorState {
     }
 
     fn dismiss_waiting(&mut self) {
-        let home = |(walker, reply)| PendingReply { walker, reply, work: None };
-        self.pending_replies.extend(self.waiting.drain(..).map(home));
+        let dismissal = |(walker, reply)| PendingReply { walker, reply, work: None };
+        self.pending_replies.extend(self.waiting.drain(..).map(dismissal));
     }
 
     /// Sends the pending replies, after everything they depend on is on disk.

@@ -136,9 +136,9 @@ impl CandidateBlock {
         let mut words = vec![0_u64; length as usize / 8];
         let bytes = words.as_mut_bytes();
         // The features come last.
-        let (before, place) = bytes.split_at_mut(bytes.len() - size_of_val(features));
+        let (before, tail) = bytes.split_at_mut(bytes.len() - size_of_val(features));
         before.copy_from_slice(&self.as_bytes()[..before.len()]);
-        place.copy_from_slice(features.as_bytes());
+        tail.copy_from_slice(features.as_bytes());
         let header = Header { length, features: counts.features as u64, ..header.clone() };
         bytes[..HEADER].copy_from_slice(header.as_bytes());
         write_checksum(bytes);

@@ -75,9 +75,9 @@ impl Candidate {
         ];
         let mut rest = &mut *out;
         for part in parts {
-            let (place, behind) = rest.split_at_mut(part.len());
-            place.copy_from_slice(part);
-            rest = behind;
+            let (array, after) = rest.split_at_mut(part.len());
+            array.copy_from_slice(part);
+            rest = after;
         }
         write_checksum(out);
     }

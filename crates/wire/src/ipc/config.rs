@@ -59,7 +59,7 @@ pub fn space_needed(sizes: &Sizes) -> u64 {
 /// would kill the process with SIGBUS.
 pub(super) fn check_free_space(length: usize, message_bytes: usize) -> Result<(), IpcError> {
     if length > message_bytes {
-        let free = shm_dir::free_space().map_err(|e| IpcError::new("look for room", e))?;
+        let free = shm_dir::free_space().map_err(|e| IpcError::new("query the free space", e))?;
         if free < 2 * length as u64 {
             let why =
                 format!("its {length} bytes are more than expected, and /dev/shm has only {free} bytes free");
@@ -260,10 +260,10 @@ mod tests {
             drop(ask(number));
         }
         // Reading a channel frees it, so each channel loses at most one answer.
-        let heard = (0..2 * CHANNELS as u64).filter(|number| {
+        let received = (0..2 * CHANNELS as u64).filter(|number| {
             let pending = ask(*number);
             pending.receive().unwrap().is_some_and(|answer| answer.payload() == [*number])
         });
-        assert!(heard.count() >= CHANNELS);
+        assert!(received.count() >= CHANNELS);
     }
 }

@@ -127,11 +127,11 @@ impl Connections {
     }
 
     /// Counts a message, the time spent on it, and the reason if it was rejected.
-    pub(super) fn record_message(&self, bytes: u64, took: Duration, rejected: Option<&impl fmt::Display>) {
+    pub(super) fn record_message(&self, bytes: u64, time: Duration, rejected: Option<&impl fmt::Display>) {
         let mut traffic = self.traffic.lock().unwrap_or_else(PoisonError::into_inner);
         traffic.received += 1;
         traffic.bytes += bytes;
-        traffic.checking += took;
+        traffic.checking += time;
         if let Some(reason) = rejected {
             traffic.rejected += 1;
             traffic.last_rejected = Some(reason.to_string());

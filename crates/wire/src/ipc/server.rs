@@ -121,7 +121,7 @@ impl Server {
         self.handle.clone()
     }
 
-    /// Handles messages of walkers and forwards them to the reactor until [`ServerHandle::close`]. Calls `heard` for
+    /// Handles messages of walkers and forwards them to the reactor until [`ServerHandle::close`]. Calls `on_message` for
     /// each message with the walker's number and whether it contains a report.
     ///
     /// # Errors
@@ -130,7 +130,7 @@ impl Server {
         mut self,
         mixtures: SharedMixture,
         to_reactor: mpsc::Sender<Incoming>,
-        mut heard: impl FnMut(u32, bool) + Send + 'static,
+        mut on_message: impl FnMut(u32, bool) + Send + 'static,
     ) -> Result<(), IpcError> {
         let mut session =
             ServerSession::new(self.handle.connect_info.sender.session, mixtures, self.connections);
@@ -144,7 +144,7 @@ impl Server {
                     Some(Command::Lost { walker, incarnation, crashed }) => {
                         session.walker_lost(walker, incarnation, crashed);
                         // This also drops the connection.
-                        more = receive_batch(&self.port, &mut session, &mut heard)?;
+                        more = receive_batch(&self.port, &mut session, &mut on_message)?;
                     }
                     Some(Command::Close) | None => {
                         // The reactor waits for the exits, even if other senders keep its channel open.
@@ -162,12 +162,12 @@ impl Server {
                     // The reactor has ended: all waiting walkers shut down.
                     Err(_) => session.outbox.clear(),
                 },
-                () = tokio::task::yield_now(), if more => more = receive_batch(&self.port, &mut session, &mut heard)?,
+                () = tokio::task::yield_now(), if more => more = receive_batch(&self.port, &mut session, &mut on_message)?,
                 guard = wakeup.readable() => {
                     let mut guard = guard.map_err(|e| IpcError::new("wait for events", e))?;
                     self.wakeup.try_wait(|_| {}).map_err(|e| IpcError::new("take in events", e))?;
                     guard.clear_ready();
-                    more = receive_batch(&self.port, &mut session, &mut heard)?;
+                    more = receive_batch(&self.port, &mut session, &mut on_message)?;
                 }
             }
         }
@@ -178,13 +178,13 @@ impl Server {
 fn receive_batch(
     port: &ServerPort,
     session: &mut ServerSession,
-    heard: &mut impl FnMut(u32, bool),
+    on_message: &mut impl FnMut(u32, bool),
 ) -> Result<bool, IpcError> {
     for _ in 0..BATCH {
         match port.receive() {
             Ok(Some(request)) => {
                 if let Some((walker, reports)) = session.receive(request) {
-                    heard(walker, reports);
+                    on_message(walker, reports);
                 }
             }
             // The walker sends without pause, or died while connecting. Other walkers will wake the server again.

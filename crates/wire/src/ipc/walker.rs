@@ -105,43 +105,43 @@ impl IpcWalker {
     /// Sends the report until it is answered.
     fn exchange_report(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<WorkItem>, IpcError> {
         self.sequence += 1;
-        let (mut offer, mut question) = (self.offer(report)?, None);
-        let (mut offers, mut asked, mut heard) = (1, Instant::now(), Instant::now());
+        let (mut offer, mut poll) = (self.offer(report)?, None);
+        let (mut attempts, mut last_poll, mut last_answer) = (1, Instant::now(), Instant::now());
         loop {
             let decision = match self.answer(offer.as_ref())? {
-                None => self.answer(question.as_ref())?,
+                None => self.answer(poll.as_ref())?,
                 decision => decision,
             };
             match decision {
-                None => self.wait(asked, heard)?,
-                Some(AnswerBody::Pending) => heard = Instant::now(),
+                None => self.wait(last_poll, last_answer)?,
+                Some(AnswerBody::Pending) => last_answer = Instant::now(),
                 Some(AnswerBody::Shutdown) => return Ok(None),
                 Some(AnswerBody::Assignment { mixture_version, assignment }) => {
                     let mixture = self.mixtures.pin(mixture_version)?;
                     return Ok(Some(WorkItem { assignment: assignment.into_owned(), mixture }));
                 }
-                Some(AnswerBody::Unknown) if offers == MAX_OFFERS => {
+                Some(AnswerBody::Unknown) if attempts == MAX_OFFERS => {
                     return Err(IpcError::Rejected { times: MAX_OFFERS });
                 }
                 Some(AnswerBody::Unknown) => {
-                    (offer, question) = (self.offer(report)?, None);
-                    (offers, heard) = (offers + 1, Instant::now());
+                    (offer, poll) = (self.offer(report)?, None);
+                    (attempts, last_answer) = (attempts + 1, Instant::now());
                 }
             }
-            if asked.elapsed() >= POLL_INTERVAL {
-                asked = Instant::now();
-                question = self.send(Payload::Poll { sequence: self.sequence }, None)?;
+            if last_poll.elapsed() >= POLL_INTERVAL {
+                last_poll = Instant::now();
+                poll = self.send(Payload::Poll { sequence: self.sequence }, None)?;
             }
         }
     }
 
     /// Sleeps until the server wakes this walker or the next poll is due. A signal may end the sleep early.
-    fn wait(&self, asked: Instant, heard: Instant) -> Result<(), IpcError> {
+    fn wait(&self, last_poll: Instant, last_answer: Instant) -> Result<(), IpcError> {
         let timeout = if self.stopping() { STOPPING_TIMEOUT } else { ANSWER_TIMEOUT };
-        if heard.elapsed() > timeout {
+        if last_answer.elapsed() > timeout {
             return Err(IpcError::Timeout { seconds: timeout.as_secs() });
         }
-        let due = POLL_INTERVAL.saturating_sub(asked.elapsed());
+        let due = POLL_INTERVAL.saturating_sub(last_poll.elapsed());
         let _ = self.wakeup.timed_wait(|_| {}, due);
         Ok(())
     }
@@ -178,8 +178,8 @@ impl IpcWalker {
     }
 
     /// The answer to the current offer, if it has arrived.
-    fn answer(&self, asked: Option<&PendingAnswer>) -> Result<Option<AnswerBody<'static>>, IpcError> {
-        let Some(PendingAnswer(pending)) = asked else { return Ok(None) };
+    fn answer(&self, request: Option<&PendingAnswer>) -> Result<Option<AnswerBody<'static>>, IpcError> {
+        let Some(PendingAnswer(pending)) = request else { return Ok(None) };
         let received = pending.receive().map_err(|e| IpcError::new("receive an answer", e))?;
         let Some(received) = received else { return Ok(None) };
         let unreadable = |why: &dyn Display| IpcError::new("read an answer", why);
@@ -192,10 +192,10 @@ impl IpcWalker {
 /// Opens the shared mixture. The server frees the slot of the previous process when it learns of its exit, which may be
 /// shortly after this process starts.
 fn open_mixture(connect_info: &ConnectInfo) -> Result<MixtureReader, SharedMixtureError> {
-    let begun = Instant::now();
+    let start = Instant::now();
     loop {
         match MixtureReader::open(&connect_info.mixture, connect_info.sender.walker) {
-            Err(SharedMixtureError::SlotTaken { .. }) if begun.elapsed() < SLOT_TIMEOUT => {
+            Err(SharedMixtureError::SlotTaken { .. }) if start.elapsed() < SLOT_TIMEOUT => {
                 sleep(Duration::from_millis(20));
             }
             opened => return opened,

@@ -81,13 +81,13 @@ impl BlockAllocator {
             effective_count,
             reserved: [0; 2],
         };
-        let mut place = self.place(block);
+        let mut offset = self.offset_of(block);
         for part in [header.as_bytes(), component.inverse().as_bytes(), component.centroid().as_bytes()] {
-            if let Err(source) = self.file.write_all_at(part, place) {
+            if let Err(source) = self.file.write_all_at(part, offset) {
                 self.backed.push(block);
                 return Err(self.failed("write a component", source));
             }
-            place += part.len() as u64;
+            offset += part.len() as u64;
         }
         Ok(block)
     }
@@ -158,13 +158,13 @@ impl BlockAllocator {
             self.grow(0)?;
         }
         let Some(&block) = self.unbacked.last() else { return Err(self.failed("grow", Errno::FBIG.into())) };
-        self.reserve(self.place(block), self.layout.block_bytes)?;
+        self.reserve(self.offset_of(block), self.layout.block_bytes)?;
         self.unbacked.pop();
         Ok(block)
     }
 
     /// Offset of a block in the file.
-    fn place(&self, block: u32) -> u64 {
+    fn offset_of(&self, block: u32) -> u64 {
         let (extent, index) = self.layout.extent_of(block);
         let extent = self.layout.extent_at(extent).expect("checked when the extent was added");
         extent + self.layout.refcount_bytes + self.layout.block_at(index)
@@ -182,7 +182,7 @@ impl BlockAllocator {
     /// Releases the memory of a block; `false` if the system refuses.
     fn punch_hole(&self, block: u32) -> bool {
         let flags = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
-        retry_on_intr(|| fallocate(&self.file, flags, self.place(block), self.layout.block_bytes)).is_ok()
+        retry_on_intr(|| fallocate(&self.file, flags, self.offset_of(block), self.layout.block_bytes)).is_ok()
     }
 
     fn full(&self, needed: u64) -> SharedMixtureError {

@@ -51,14 +51,14 @@ struct BlockGuard {
 
 impl BlockReader {
     /// The component in a block of a pinned row.
-    pub fn component(&mut self, place: (u32, u32), block: u32) -> Result<Arc<Component>, SharedMixtureError> {
+    pub fn component(&mut self, key: (u32, u32), block: u32) -> Result<Arc<Component>, SharedMixtureError> {
         let (extent, index) = self.layout.extent_of(block);
         let extent = self.extent(extent)?;
         let at = self.layout.block_at(index);
         let word = |field: usize| extent.blocks.word64(at + field as u64).load(Ordering::Relaxed);
         let found = (word(offset_of!(BlockHeader, element)), word(offset_of!(BlockHeader, slot)));
-        if found != (place.0.into(), place.1.into()) {
-            let what = format!("block {block} contains component {found:?}, expected {place:?}");
+        if found != (key.0.into(), key.1.into()) {
+            let what = format!("block {block} contains component {found:?}, expected {key:?}");
             return Err(SharedMixtureError::Damaged { path: self.path.clone(), what });
         }
         let threshold = f64::from_bits(word(offset_of!(BlockHeader, threshold)));
@@ -85,8 +85,8 @@ impl BlockReader {
             .map_err(|error| damaged(format!("cannot map extent {number}: {error}")))?;
         let extent = Arc::new(extent);
         self.extents.resize(self.extents.len().max(number as usize + 1), None);
-        if let Some(place) = self.extents.get_mut(number as usize) {
-            *place = Some(Arc::clone(&extent));
+        if let Some(entry) = self.extents.get_mut(number as usize) {
+            *entry = Some(Arc::clone(&extent));
         }
         Ok(extent)
     }

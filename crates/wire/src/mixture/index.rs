@@ -48,7 +48,7 @@ impl MixtureIndex {
     /// Block number of each component. A row is written before its version word, and read under a pin.
     pub fn row(&self, row: u32) -> impl Iterator<Item = &AtomicU32> {
         let start = self.layout.rows_at + self.layout.row_bytes * u64::from(row);
-        (0..self.layout.components).map(move |place| self.map.word32(start + 4 * u64::from(place)))
+        (0..self.layout.components).map(move |component| self.map.word32(start + 4 * u64::from(component)))
     }
 
     /// Removes all versions and pins.

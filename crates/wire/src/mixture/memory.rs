@@ -27,17 +27,17 @@ impl Mapping {
 
     /// The 64-bit word at `offset`, which must lie within the mapping and be a multiple of 8.
     pub fn word64(&self, offset: u64) -> &AtomicU64 {
-        let place = self.place(offset, 8, 8);
-        // SAFETY: `place` is within the mapping, which lives as long as `self`, and aligned; all processes access these
+        let pointer = self.pointer(offset, 8, 8);
+        // SAFETY: `pointer` is within the mapping, which lives as long as `self`, and aligned; all processes access these
         // words only atomically.
-        unsafe { AtomicU64::from_ptr(place.cast()) }
+        unsafe { AtomicU64::from_ptr(pointer.cast()) }
     }
 
     /// The 32-bit word at `offset`, which must lie within the mapping and be a multiple of 4.
     pub fn word32(&self, offset: u64) -> &AtomicU32 {
-        let place = self.place(offset, 4, 4);
+        let pointer = self.pointer(offset, 4, 4);
         // SAFETY: as for `word64`.
-        unsafe { AtomicU32::from_ptr(place.cast()) }
+        unsafe { AtomicU32::from_ptr(pointer.cast()) }
     }
 
     /// `count` numbers at `offset`, which must lie within the mapping and be a multiple of 8.
@@ -45,20 +45,20 @@ impl Mapping {
     /// # Safety
     /// No process may write them while the slice lives.
     pub unsafe fn numbers(&self, offset: u64, count: usize) -> &[f64] {
-        let place = self.place(offset, 8 * count, 8);
-        // SAFETY: `place` is the start of `count` aligned numbers within the mapping, which lives as long as `self`;
+        let pointer = self.pointer(offset, 8 * count, 8);
+        // SAFETY: `pointer` is the start of `count` aligned numbers within the mapping, which lives as long as `self`;
         // any bits are a valid number; the caller guarantees that no process writes them.
-        unsafe { std::slice::from_raw_parts(place.cast(), count) }
+        unsafe { std::slice::from_raw_parts(pointer.cast(), count) }
     }
 
     /// Panics outside the mapping: offsets come from the layout, which was checked against the file.
-    fn place(&self, offset: u64, length: usize, alignment: usize) -> *mut u8 {
+    fn pointer(&self, offset: u64, length: usize, alignment: usize) -> *mut u8 {
         let start = usize::try_from(offset).ok();
         let end = start.and_then(|start| start.checked_add(length));
         assert!(end.is_some_and(|end| end <= self.0.len()), "{length} bytes at {offset} are beyond the map");
-        let place = self.0.as_mut_ptr().wrapping_add(offset as usize);
-        assert!(place.addr().is_multiple_of(alignment), "{offset} is not a multiple of {alignment}");
-        place
+        let pointer = self.0.as_mut_ptr().wrapping_add(offset as usize);
+        assert!(pointer.addr().is_multiple_of(alignment), "{offset} is not a multiple of {alignment}");
+        pointer
     }
 }
 

@@ -75,14 +75,14 @@ impl MixtureReader {
             return Ok(Arc::clone(&current.mixture));
         }
         let slot = Arc::clone(&self.block_reader.slot);
-        let gone =
+        let not_found =
             || SharedMixtureError::VersionNotFound { version, newest: slot.index.newest().load_acquire() };
         let row =
             (0..self.block_reader.layout.rows).find(|&row| slot.index.version(row).load_acquire() == version);
         // An empty row has no version.
-        let row = row.filter(|_| version != NONE).ok_or_else(gone)?;
+        let row = row.filter(|_| version != NONE).ok_or_else(not_found)?;
         let pin = slot.index.pin(slot.reader);
-        let _pinned = Pinned::new(pin, slot.index.version(row), version).ok_or_else(gone)?;
+        let _pinned = Pinned::new(pin, slot.index.version(row), version).ok_or_else(not_found)?;
         let row: Vec<u32> = slot.index.row(row).map(|block| block.load(Ordering::Relaxed)).collect();
         let mixture = match &self.current {
             Some(current) => following(&mut self.block_reader, current, &row)?.at_version(version),
@@ -117,7 +117,7 @@ fn following(
     row: &[u32],
 ) -> Result<Mixture, SharedMixtureError> {
     let blocks = row.iter().zip(&current.row).zip(block_reader.layout.component_keys());
-    let other = blocks.filter(|((new, old), _)| new != old).map(|((&block, _), place)| (place, block));
+    let other = blocks.filter(|((new, old), _)| new != old).map(|((&block, _), key)| (key, block));
     let other: Vec<_> = other.collect();
     let changed = other.into_iter().map(|((element, slot), block)| {
         let component = block_reader.component((element, slot), block)?;

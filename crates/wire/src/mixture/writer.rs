@@ -72,11 +72,11 @@ impl SharedMixture {
         }
         let file = OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(path);
         let file = file.map_err(|source| failed("create", source))?;
-        let made = Self::fill(&file, path, layout, mixture);
-        if made.is_err() {
+        let created = Self::fill(&file, path, layout, mixture);
+        if created.is_err() {
             let _ = fs::remove_file(path);
         }
-        made
+        created
     }
 
     fn fill(file: &File, path: &Path, layout: Layout, mixture: &Mixture) -> Result<Self, SharedMixtureError> {
@@ -139,10 +139,10 @@ impl SharedMixture {
     fn write(&mut self, mixture: &Mixture) -> Result<Vec<u32>, SharedMixtureError> {
         let (mut row, mut written) = (Vec::with_capacity(self.layout.components as usize), Vec::new());
         let mut latest = self.latest.iter().flat_map(|(latest, blocks)| latest.iter().zip(blocks));
-        for (place, (.., component)) in self.layout.component_keys().zip(mixture.iter()) {
+        for (key, (.., component)) in self.layout.component_keys().zip(mixture.iter()) {
             let block = match latest.next() {
                 Some(((.., same), &block)) if Arc::ptr_eq(same, component) => block,
-                _ => match self.blocks.write(place, mixture.version(), component) {
+                _ => match self.blocks.write(key, mixture.version(), component) {
                     Ok(block) => *written.push_mut(block),
                     Err(error) => {
                         self.blocks.discard(written.into_iter());
@@ -167,17 +167,17 @@ impl SharedMixture {
             self.index.newest().store_release(version);
             self.latest = Some((mixture.clone(), blocks.clone()));
         }
-        if let Some(place) = self.living.get_mut(row) {
-            *place = Some(LiveVersion { version, blocks, owners });
+        if let Some(entry) = self.living.get_mut(row) {
+            *entry = Some(LiveVersion { version, blocks, owners });
         }
     }
 
     /// Removes the versions that are no longer in use in this process, and frees blocks.
     fn retire(&mut self) {
         let newest = self.newest();
-        for (row, place) in self.living.iter_mut().enumerate() {
+        for (row, entry) in self.living.iter_mut().enumerate() {
             let unowned = |known: &LiveVersion| known.owners.iter().all(|owner| owner.strong_count() == 0);
-            let old = place.take_if(|known| {
+            let old = entry.take_if(|known| {
                 known.version != newest
                     && unowned(known)
                     && retire_version(self.index.version(row as u32), known.version, self.index.pins())

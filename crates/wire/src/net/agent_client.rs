@@ -206,15 +206,15 @@ impl AgentClient {
 
     async fn try_join(self: &Arc<Self>) -> Result<Membership, LinkError> {
         let answer = self.request(&Request::Join(self.agent.clone())).await?;
-        let Reply::Joined(place) = decode_reply(&answer)? else { return Err(unexpected("join")) };
+        let Reply::Joined(reply) = decode_reply(&answer)? else { return Err(unexpected("join")) };
         let membership = Membership {
             client: Arc::clone(self),
-            session: place.session,
-            first_slot: place.first_slot,
+            session: reply.session,
+            first_slot: reply.first_slot,
             mixtures: Mutex::default(),
-            setup: place.setup.to_vec(),
+            setup: reply.setup.to_vec(),
         };
-        membership.mixture(place.mixture_version).await?;
+        membership.mixture(reply.mixture_version).await?;
         Ok(membership)
     }
 
@@ -232,10 +232,10 @@ impl AgentClient {
     async fn request(&self, request: &Request<'_>) -> Result<Vec<u8>, LinkError> {
         let request = encode(request);
         loop {
-            let asked = Instant::now();
+            let sent_at = Instant::now();
             match self.send_once(&request, None).await {
                 Some(answer) => return Ok(answer),
-                None => delay_retry(asked).await,
+                None => delay_retry(sent_at).await,
             }
         }
     }
@@ -251,8 +251,8 @@ async fn check_handshake(endpoint: &Endpoint, tls: &Tls) -> Result<(), NetError>
 }
 
 /// Waits briefly if a request failed immediately.
-pub(super) async fn delay_retry(asked: Instant) {
-    if asked.elapsed() < RETRY_DELAY {
+pub(super) async fn delay_retry(sent_at: Instant) {
+    if sent_at.elapsed() < RETRY_DELAY {
         sleep(RETRY_DELAY).await;
     }
 }
@@ -350,11 +350,11 @@ impl Membership {
     /// # Errors
     /// The agent must join again.
     pub async fn is_stopping(&self) -> Result<Option<bool>, LinkError> {
-        let question = encode(&Request::Ping { session: self.session });
-        let Some(answer) = self.client.send_once(&question, None).await else { return Ok(None) };
+        let ping = encode(&Request::Ping { session: self.session });
+        let Some(answer) = self.client.send_once(&ping, None).await else { return Ok(None) };
         match decode_reply(&answer)? {
             Reply::Pong { stopping } => Ok(Some(stopping)),
-            _ => Err(unexpected("here")),
+            _ => Err(unexpected("ping")),
         }
     }
 

@@ -58,12 +58,12 @@ pub(super) fn probe(endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError
         }
     }
     // The orchestrator validates our certificate only now; if it accepts it, it waits for data.
-    let said = stream.set_read_timeout(Some(REJECTION_TIMEOUT)).and_then(|()| {
+    let result = stream.set_read_timeout(Some(REJECTION_TIMEOUT)).and_then(|()| {
         let mut tls_stream = rustls::Stream::new(&mut connection, &mut stream);
         tls_stream.flush()?;
         tls_stream.read(&mut [0])
     });
-    said.map_or_else(|error| classify(&error, endpoint, tls), |_| Ok(()))
+    result.map_or_else(|error| classify(&error, endpoint, tls), |_| Ok(()))
 }
 
 /// A connection before the handshake; `None` if nobody listens.

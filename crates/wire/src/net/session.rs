@@ -95,13 +95,13 @@ impl ServerSession {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
         let result = self.dispatch(&query, &payload, files);
         result.unwrap_or_else(|why| {
-            let said = why.to_string();
+            let reason = why.to_string();
             if let RejectedMessage::SenderMismatch(_) = why {
                 // The agent will join again.
-                self.send(query, &Reply::RejoinRequired(said));
+                self.send(query, &Reply::RejoinRequired(reason));
             } else {
-                self.send(query, &Reply::Rejected(said.clone()));
-                self.events.push(AgentEvent::MessageRejected(said));
+                self.send(query, &Reply::Rejected(reason.clone()));
+                self.events.push(AgentEvent::MessageRejected(reason));
             }
             None
         })
@@ -173,8 +173,8 @@ impl ServerSession {
             self.slots.insert(slot, SlotConnection::default());
         }
         let mixture_version = self.newest().version();
-        let place = JoinReply { session: self.session, first_slot, mixture_version, setup: &self.setup };
-        let reply = encode(&Reply::Joined(place));
+        let joined = JoinReply { session: self.session, first_slot, mixture_version, setup: &self.setup };
+        let reply = encode(&Reply::Joined(joined));
         self.send_encoded(query.clone(), &reply);
         Ok(())
     }

@@ -52,19 +52,19 @@ impl Slot {
     ) -> Result<Option<WorkItem>, LinkError> {
         self.sequence += 1;
         let (offer, candidate) = self.offer(report);
-        let question = encode(&Request::Envelope(self.envelope(Payload::Poll { sequence: self.sequence })));
+        let poll = encode(&Request::Envelope(self.envelope(Payload::Poll { sequence: self.sequence })));
         let mut offered = false;
         loop {
-            let asked = Instant::now();
+            let sent_at = Instant::now();
             let answer = if offered {
-                membership.client().send_once(&question, None).await
+                membership.client().send_once(&poll, None).await
             } else {
                 membership.client().send_once(&offer, candidate).await
             };
             // Whether the offer arrived is found out by polling.
             offered = true;
             let Some(answer) = answer else {
-                delay_retry(asked).await;
+                delay_retry(sent_at).await;
                 continue;
             };
             let Reply::Answer(Answer { sequence, body }) = decode_reply(&answer)? else {
@@ -83,7 +83,7 @@ impl Slot {
                     return Ok(Some(WorkItem { assignment, mixture }));
                 }
                 AnswerBody::Shutdown => return Ok(None),
-                AnswerBody::Pending => delay_retry(asked).await,
+                AnswerBody::Pending => delay_retry(sent_at).await,
                 AnswerBody::Unknown => offered = false,
             }
         }

@@ -28,7 +28,7 @@ pub(super) fn entries(directory: &Path) -> Result<Vec<PathBuf>, ShmDirError> {
 pub(super) fn remove_tree(path: &Path, removed: &mut Removed) -> Result<(), ShmDirError> {
     match path.symlink_metadata() {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        Err(error) => Err(io_error("look at", path)(error)),
+        Err(error) => Err(io_error("inspect", path)(error)),
         Ok(found) if found.is_dir() => {
             entries(path)?.iter().try_for_each(|entry| remove_tree(entry, removed))?;
             ignore_not_found(fs::remove_dir(path)).map_err(io_error("remove", path))

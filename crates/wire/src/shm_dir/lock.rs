@@ -27,7 +27,7 @@ impl UserLock {
             };
             file.lock().map_err(io_error("lock", &root))?;
             // The previous holder may have removed the directory; a new one has another lock.
-            if file.metadata().map_err(io_error("look at", &root))?.nlink() > 0 {
+            if file.metadata().map_err(io_error("inspect", &root))?.nlink() > 0 {
                 return Ok(Self(file));
             }
         }

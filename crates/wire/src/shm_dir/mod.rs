@@ -143,7 +143,7 @@ impl ShmDir {
     /// counter of processes.
     pub(crate) fn restrict_permissions(&self) -> Result<(), ShmDirError> {
         for path in segments(&self.prefix)? {
-            let mode = path.symlink_metadata().map_err(io_error("look at", &path))?.mode();
+            let mode = path.symlink_metadata().map_err(io_error("inspect", &path))?.mode();
             if mode & 0o077 != 0 {
                 let private = Permissions::from_mode(mode & 0o700);
                 fs::set_permissions(&path, private).map_err(io_error("change the mode of", &path))?;
@@ -204,7 +204,7 @@ pub(crate) fn reserve(prefix: &str, port: Option<u128>) -> Result<(), ShmDirErro
 
 fn reserve_file(path: &Path) -> Result<(), ShmDirError> {
     let file = OpenOptions::new().write(true).open(path).map_err(io_error("open", path))?;
-    let needed = file.metadata().map_err(io_error("look at", path))?.len();
+    let needed = file.metadata().map_err(io_error("inspect", path))?.len();
     match retry_on_intr(|| fallocate(&file, FallocateFlags::empty(), 0, needed)) {
         Ok(()) => Ok(()),
         Err(Errno::NOSPC) => Err(ShmDirError::Space { needed, free: free_space()? }),

@@ -15,14 +15,14 @@ pub(super) fn user() -> u32 {
 pub(super) fn create_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-        made => made.map_err(io_error("make", path))?,
+        created => created.map_err(io_error("create", path))?,
     }
     check_private(path, uid)
 }
 
 /// All users may write to `/dev/shm`, so an existing directory may belong to an attacker.
 pub(super) fn check_private(path: &Path, uid: u32) -> Result<(), ShmDirError> {
-    let found = path.symlink_metadata().map_err(io_error("look at", path))?;
+    let found = path.symlink_metadata().map_err(io_error("inspect", path))?;
     if found.is_dir() && found.uid() == uid && found.mode() & 0o777 == 0o700 {
         return Ok(());
     }

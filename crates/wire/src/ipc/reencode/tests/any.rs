@@ -117,14 +117,14 @@ pub fn offer() -> impl Strategy<Value = Vec<u8>> {
 }
 
 pub fn request() -> impl Strategy<Value = Vec<u8>> {
-    let question = (sender(), any::<u64>()).prop_map(|(sender, sequence)| {
+    let poll = (sender(), any::<u64>()).prop_map(|(sender, sequence)| {
         encode_message(&Envelope { sender, payload: Payload::Poll { sequence } }, None)
     });
     let news = (sender(), any::<u32>(), progress()).prop_map(|(sender, walk, progress)| {
         let payload = Payload::Progress(WalkId(walk), Cow::Owned(progress));
         encode_message(&Envelope { sender, payload }, None)
     });
-    prop_oneof![4 => offer(), 1 => question, 1 => news]
+    prop_oneof![4 => offer(), 1 => poll, 1 => news]
 }
 
 /// An assignment as the server sends it.
