@@ -11,7 +11,7 @@
 mod campaign;
 #[path = "../selector/database.rs"]
 mod database;
-mod head;
+mod orchestrator;
 #[path = "../selector/random.rs"]
 mod random;
 #[path = "../selector/recording.rs"]
@@ -50,7 +50,12 @@ fn main() {
         Some(&[port, begun]) => {
             runtime.block_on(simulated::agents(Plan { port: port as u16, rate, duration, begun }))
         }
-        _ => runtime.block_on(head::lead(Plan { port: free_port(), rate, duration, begun: now() + START })),
+        _ => runtime.block_on(orchestrator::lead(Plan {
+            port: free_port(),
+            rate,
+            duration,
+            begun: now() + START,
+        })),
     }
 }
 

@@ -140,7 +140,7 @@ pub async fn run(
         .collect();
     drop(to_reactor);
     let mut run = Run::default();
-    reactor.run(|notice| run.take_in(&notice)).await.unwrap();
+    reactor.run(|notice| run.record(&notice)).await.unwrap();
     (run.wall, run.processor) = (begun.elapsed(), processor_time() - used);
     for walker in walkers {
         walker.await.unwrap();
@@ -180,7 +180,7 @@ impl AsRef<[u8]> for Bytes {
 }
 
 impl Run {
-    fn take_in(&mut self, notice: &Notice<'_>) {
+    fn record(&mut self, notice: &Notice<'_>) {
         let Notice::Committed(commit) = notice else { return };
         self.commits += 1;
         for candidate in &commit.candidates {

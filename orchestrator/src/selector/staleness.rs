@@ -34,7 +34,7 @@ impl Staleness {
         self.counts.get(&0).copied().unwrap_or(0) as f64 / self.decisions() as f64
     }
 
-    /// Quantile of the ages; 0 without any.
+    /// The smallest age that is at least as large as this fraction of all ages; 0 without any.
     pub fn quantile(&self, share: f64) -> u64 {
         let rank = share * self.decisions() as f64;
         let mut below = 0;

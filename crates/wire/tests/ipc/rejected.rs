@@ -148,7 +148,7 @@ async fn invalid_messages_are_rejected_and_counted() {
     assert!(walker.wait().unwrap().success());
     assert!(
         server.heard.lock().unwrap().iter().all(|walker| *walker == 0),
-        "strangers give no signs of life"
+        "unexpected senders give no heartbeats"
     );
     drop((stranger, other));
     server.close().await;

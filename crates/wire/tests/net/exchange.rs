@@ -9,15 +9,15 @@ use wire::messages::Progress;
 use wire::net::{AgentEvent, LinkError, SlotReport};
 use wire::transport::Incoming;
 
-use super::test_server::{TestServer, Wanted, agent, join, mixture, next_version, report, work};
+use super::test_server::{ServerOptions, TestServer, agent, join, mixture, next_version, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn assignments_and_reports_survive_a_round_trip() {
-    let mut head = TestServer::open(Wanted::default()).await;
-    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
-    assert_eq!(joined.setup, b"the setup");
-    let mut slot = joined.slots().remove(0);
-    let line = Arc::clone(&joined);
+    let mut server = TestServer::open(ServerOptions::default()).await;
+    let (_client, membership) = join(server.port, agent("a", 1)).await;
+    assert_eq!(membership.setup, b"the setup");
+    let mut slot = membership.slots().remove(0);
+    let line = Arc::clone(&membership);
     let working = tokio::spawn(async move {
         let mut last_report = SlotReport::Empty;
         let mut assignments = 0;
@@ -33,10 +33,10 @@ async fn assignments_and_reports_survive_a_round_trip() {
     let mut mixture = Arc::new(mixture());
     let mut expected = None;
     for number in 1..=20 {
-        let mut offer = head.next().await;
+        let mut offer = server.next().await;
         while let Incoming::Progress(walk, _) = offer {
             assert_eq!(walk, WalkId(5));
-            offer = head.next().await;
+            offer = server.next().await;
         }
         let Incoming::Idle { report: found, reply, .. } = offer else { panic!("{offer:?}") };
         assert_eq!(found, expected);
@@ -46,7 +46,7 @@ async fn assignments_and_reports_survive_a_round_trip() {
         reply.send(Some(work)).unwrap();
     }
     let last = loop {
-        if let Incoming::Idle { report, reply, .. } = head.next().await {
+        if let Incoming::Idle { report, reply, .. } = server.next().await {
             reply.send(None).unwrap();
             break report;
         }
@@ -54,50 +54,50 @@ async fn assignments_and_reports_survive_a_round_trip() {
     assert_eq!(last, expected);
     assert_eq!(working.await.unwrap(), 20);
     // The received mixture is bitwise equal, whatever deltas led to it.
-    let newest = joined.newest().await;
+    let newest = membership.newest().await;
     assert_eq!(newest.version(), mixture.version());
     for ((_, _, sent), (_, _, received)) in mixture.iter().zip(newest.iter()) {
         assert_eq!(sent.to_bytes(), received.to_bytes());
     }
-    joined.leave().await;
-    head.event(|event| matches!(event, AgentEvent::Left(_))).await;
-    head.close().await;
+    membership.leave().await;
+    server.event(|event| matches!(event, AgentEvent::Left(_))).await;
+    server.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn lost_walkers_are_reported_and_their_slots_continue() {
-    let mut head = TestServer::open(Wanted::default()).await;
-    let (_uplink, joined) = join(head.port, agent("a", 2)).await;
-    let mut slot = joined.slots().remove(1);
+    let mut server = TestServer::open(ServerOptions::default()).await;
+    let (_client, membership) = join(server.port, agent("a", 2)).await;
+    let mut slot = membership.slots().remove(1);
     let mixture = Arc::new(mixture());
     for fault in [true, false] {
-        let line = Arc::clone(&joined);
+        let line = Arc::clone(&membership);
         let last_report = if fault { SlotReport::Empty } else { SlotReport::Lost { crashed: true } };
         let exchange = tokio::spawn(async move {
             let work = slot.exchange(&line, &last_report).await.unwrap();
             (slot, work)
         });
         if !fault {
-            let gone = head.next().await;
+            let gone = server.next().await;
             assert!(matches!(&gone, Incoming::Lost { crashed, .. } if *crashed), "{gone:?}");
         }
-        let offer = head.offer().await;
+        let offer = server.offer().await;
         assert_eq!(offer.report, None);
         offer.reply.send(Some(work(1, 1, &mixture))).unwrap();
         let work;
         (slot, work) = exchange.await.unwrap();
         assert!(work.is_some());
     }
-    joined.leave().await;
+    membership.leave().await;
     for _ in 0..2 {
-        assert!(matches!(head.next().await, Incoming::Lost { crashed: false, .. }));
+        assert!(matches!(server.next().await, Incoming::Lost { crashed: false, .. }));
     }
     let last_report = SlotReport::Empty;
     assert!(
-        matches!(slot.exchange(&joined, &last_report).await, Err(LinkError::RejoinRequired(_))),
+        matches!(slot.exchange(&membership, &last_report).await, Err(LinkError::RejoinRequired(_))),
         "it has left"
     );
-    head.close().await;
+    server.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -107,17 +107,17 @@ async fn agents_fetch_files_by_hash_and_learn_of_a_stop() {
     let content: Vec<u8> = (0..9_500_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
     std::fs::write(&path, &content).unwrap();
     let files = BTreeMap::from([("0123".to_owned(), path)]);
-    let head = TestServer::open(Wanted { files, ..Wanted::default() }).await;
-    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
-    assert!(joined.fetch_file("0123").await.unwrap() == content);
-    let refused = joined.fetch_file("../../etc/passwd").await.unwrap_err();
+    let server = TestServer::open(ServerOptions { files, ..ServerOptions::default() }).await;
+    let (_client, membership) = join(server.port, agent("a", 1)).await;
+    assert!(membership.fetch_file("0123").await.unwrap() == content);
+    let refused = membership.fetch_file("../../etc/passwd").await.unwrap_err();
     assert!(
         matches!(&refused, LinkError::Rejected(why) if why.contains("has no file with hash")),
         "{refused}"
     );
-    assert_eq!(joined.is_stopping().await.unwrap(), Some(false));
-    head.stopping.store(true, Ordering::Relaxed);
-    assert_eq!(joined.is_stopping().await.unwrap(), Some(true));
-    joined.leave().await;
-    head.close().await;
+    assert_eq!(membership.is_stopping().await.unwrap(), Some(false));
+    server.stopping.store(true, Ordering::Relaxed);
+    assert_eq!(membership.is_stopping().await.unwrap(), Some(true));
+    membership.leave().await;
+    server.close().await;
 }

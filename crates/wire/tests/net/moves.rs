@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::time::timeout;
 use wire::net::{Address, AgentClient, Announcement, LinkError, NetError, SlotReport};
 
-use super::test_server::{LIMIT, TestServer, Wanted, agent, endpoint, report, work};
+use super::test_server::{LIMIT, ServerOptions, TestServer, agent, endpoint, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
@@ -26,33 +26,33 @@ async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
         let waiting = move |error: &NetError| why.send(error.to_string()).unwrap();
         tokio::spawn(async move { AgentClient::open(&address, None, agent("a", 1), waiting).await.unwrap() })
     };
-    let mut head = TestServer::open(Wanted::default()).await;
+    let mut server = TestServer::open(ServerOptions::default()).await;
     let told = tokio::task::spawn_blocking(move || whys.recv_timeout(LIMIT).unwrap()).await.unwrap();
     assert!(told.contains("endpoint file not found"), "{told}");
-    write(Announcement::Endpoint(endpoint(head.port)));
-    let uplink = Arc::new(timeout(LIMIT, opening).await.expect("in time").unwrap());
-    let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());
+    write(Announcement::Endpoint(endpoint(server.port)));
+    let client = Arc::new(timeout(LIMIT, opening).await.expect("in time").unwrap());
+    let membership = Arc::new(timeout(LIMIT, client.join()).await.expect("in time").unwrap());
 
-    let mut slot = joined.slots().remove(0);
-    let mixture = Wanted::default().mixture;
-    let line = Arc::clone(&joined);
+    let mut slot = membership.slots().remove(0);
+    let mixture = ServerOptions::default().mixture;
+    let line = Arc::clone(&membership);
     let exchange = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
-    head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
+    server.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
     let (given, mut slot) = exchange.await.unwrap();
     let last_report = SlotReport::Report(report(&given.unwrap().unwrap().assignment));
-    let before = head.kill().await;
-    let line = Arc::clone(&joined);
+    let before = server.kill().await;
+    let line = Arc::clone(&membership);
     let telling = tokio::spawn(async move { slot.exchange(&line, &last_report).await.map(drop) });
     tokio::time::sleep(Duration::from_millis(300)).await;
-    let head = TestServer::open(Wanted { session: 2, ..Wanted::default() }).await;
-    assert_ne!(head.port, before);
-    write(Announcement::Endpoint(endpoint(head.port)));
+    let server = TestServer::open(ServerOptions { session: 2, ..ServerOptions::default() }).await;
+    assert_ne!(server.port, before);
+    write(Announcement::Endpoint(endpoint(server.port)));
     let refused = timeout(LIMIT, telling).await.expect("in time").unwrap();
     assert!(matches!(refused, Err(LinkError::RejoinRequired(_))), "{refused:?}");
-    let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
+    let membership = timeout(LIMIT, client.join()).await.expect("in time").unwrap();
     assert!(timeout(Duration::from_millis(300), address.wait_until_over()).await.is_err());
     write(Announcement::Over);
     timeout(LIMIT, address.wait_until_over()).await.expect("in time");
-    joined.leave().await;
-    head.close().await;
+    membership.leave().await;
+    server.close().await;
 }

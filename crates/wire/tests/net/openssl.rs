@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
 
-use test_server::{LIMIT, TestServer, Wanted, agent};
+use test_server::{LIMIT, ServerOptions, TestServer, agent};
 use tokio::time::timeout;
 use wire::net::{AgentClient, Tls};
 
@@ -24,12 +24,12 @@ async fn hosts_with_certificates_of_the_script_can_connect() {
     // Another host later.
     make(directory.path(), &["10.0.0.7"]);
     let tls = |name: &str| Tls::from_directory(&directory.path().join(name));
-    let head = TestServer::open(Wanted { tls: Some(tls("head")), ..Wanted::default() }).await;
-    let endpoint = format!("tcp/localhost:{}", head.port).parse().unwrap();
+    let server = TestServer::open(ServerOptions { tls: Some(tls("head")), ..ServerOptions::default() }).await;
+    let endpoint = format!("tcp/localhost:{}", server.port).parse().unwrap();
     let other = tls("10.0.0.7");
-    let uplink = AgentClient::open(&endpoint, Some(&other), agent("a", 1), |_| {});
-    let uplink = Arc::new(timeout(LIMIT, uplink).await.expect("in time").unwrap());
-    let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
-    joined.leave().await;
-    head.close().await;
+    let client = AgentClient::open(&endpoint, Some(&other), agent("a", 1), |_| {});
+    let client = Arc::new(timeout(LIMIT, client).await.expect("in time").unwrap());
+    let membership = timeout(LIMIT, client.join()).await.expect("in time").unwrap();
+    membership.leave().await;
+    server.close().await;
 }

@@ -8,12 +8,12 @@ use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, 
 use tokio::time::timeout;
 use wire::net::{AgentBootstrap, AgentClient, AgentEvent, AgentServer, NetError, Tls};
 
-use super::test_server::{LIMIT, PATIENCE, TestServer, Wanted, agent, endpoint, join};
+use super::test_server::{AGENT_TIMEOUT, LIMIT, ServerOptions, TestServer, agent, endpoint, join};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn nothing_listens_or_connects_off_loopback_without_certificates() {
     let endpoint = "tcp/0.0.0.0:7447".parse().unwrap();
-    let refused = AgentServer::open(&endpoint, None, 1, PATIENCE, AgentBootstrap::default()).await.err();
+    let refused = AgentServer::open(&endpoint, None, 1, AGENT_TIMEOUT, AgentBootstrap::default()).await.err();
     assert!(matches!(refused, Some(NetError::Unprotected { .. })), "{refused:?}");
     let endpoint = "tcp/head:7447".parse().unwrap();
     let refused = AgentClient::open(&endpoint, None, agent("a", 1), |_| {}).await.err();
@@ -26,12 +26,12 @@ async fn nothing_listens_or_connects_off_loopback_without_certificates() {
 /// Any other message with the orchestrator's key is rejected, and answered with the reason.
 #[tokio::test(flavor = "multi_thread")]
 async fn unexpected_messages_are_rejected_and_reported() {
-    let head = TestServer::open(Wanted::default()).await;
-    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
+    let server = TestServer::open(ServerOptions::default()).await;
+    let (_client, membership) = join(server.port, agent("a", 1)).await;
     let mut config = zenoh::Config::default();
     for (key, value) in [
         ("mode", "\"client\"".to_owned()),
-        ("connect/endpoints", format!("[\"{}\"]", endpoint(head.port))),
+        ("connect/endpoints", format!("[\"{}\"]", endpoint(server.port))),
         ("scouting/multicast/enabled", "false".to_owned()),
     ] {
         config.insert_json5(key, &value).unwrap();
@@ -56,10 +56,10 @@ async fn unexpected_messages_are_rejected_and_reported() {
         assert!(said.contains(expected), "{said:?}: {expected}");
         let spoken =
             |event: &AgentEvent| matches!(event, AgentEvent::MessageRejected(why) if why.contains(expected));
-        head.event(spoken).await;
+        server.event(spoken).await;
     }
-    joined.leave().await;
-    head.close().await;
+    membership.leave().await;
+    server.close().await;
 }
 
 /// An authority, and a directory with a signed certificate for each name.
@@ -93,19 +93,20 @@ async fn only_agents_with_a_valid_certificate_can_join() {
     certificates(folders[0].path(), &["localhost", "node1"]);
     certificates(folders[1].path(), &["localhost"]);
     let tls = |folder: usize, name: &str| Tls::from_directory(&folders[folder].path().join(name));
-    let head = TestServer::open(Wanted { tls: Some(tls(0, "localhost")), ..Wanted::default() }).await;
-    let endpoint = format!("tcp/localhost:{}", head.port).parse().unwrap();
-    let join = async |tls: Option<Tls>, patience: Duration| {
+    let server =
+        TestServer::open(ServerOptions { tls: Some(tls(0, "localhost")), ..ServerOptions::default() }).await;
+    let endpoint = format!("tcp/localhost:{}", server.port).parse().unwrap();
+    let join = async |tls: Option<Tls>, agent_timeout: Duration| {
         let opening = AgentClient::open(&endpoint, tls.as_ref(), agent("a", 1), |_| {});
-        let uplink = timeout(patience, opening).await.ok()?;
-        let uplink = Arc::new(uplink.ok()?);
-        let joined = timeout(patience, uplink.join()).await.ok()?;
-        Some((uplink, joined.unwrap()))
+        let client = timeout(agent_timeout, opening).await.ok()?;
+        let client = Arc::new(client.ok()?);
+        let membership = timeout(agent_timeout, client.join()).await.ok()?;
+        Some((client, membership.unwrap()))
     };
     let a_while = Duration::from_secs(4);
     assert!(join(None, a_while).await.is_none(), "no certificate");
     assert!(join(Some(tls(1, "localhost")), a_while).await.is_none(), "one of another authority");
-    let (_uplink, joined) = join(Some(tls(0, "node1")), LIMIT).await.expect("one of this authority");
-    joined.leave().await;
-    head.close().await;
+    let (_client, membership) = join(Some(tls(0, "node1")), LIMIT).await.expect("one of this authority");
+    membership.leave().await;
+    server.close().await;
 }

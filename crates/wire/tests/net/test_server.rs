@@ -23,7 +23,7 @@ use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Orig
 /// Timeout, much longer than anything here takes.
 pub const LIMIT: Duration = Duration::from_secs(60);
 /// Timeout of agents, longer than any break that they must survive here.
-pub const PATIENCE: Duration = Duration::from_secs(40);
+pub const AGENT_TIMEOUT: Duration = Duration::from_secs(40);
 
 /// An orchestrator in this process.
 pub struct TestServer {
@@ -43,27 +43,28 @@ pub struct Offer {
 }
 
 /// Options of the server.
-pub struct Wanted {
+pub struct ServerOptions {
     pub port: u16,
     pub session: u64,
-    pub patience: Duration,
+    pub agent_timeout: Duration,
     pub mixture: Arc<Mixture>,
     pub files: BTreeMap<String, PathBuf>,
     pub tls: Option<Tls>,
 }
 
-impl Default for Wanted {
+impl Default for ServerOptions {
     fn default() -> Self {
         let (port, mixture) = (free_port(), Arc::new(mixture()));
-        Self { port, session: 1, patience: PATIENCE, mixture, files: BTreeMap::new(), tls: None }
+        Self { port, session: 1, agent_timeout: AGENT_TIMEOUT, mixture, files: BTreeMap::new(), tls: None }
     }
 }
 
 impl TestServer {
-    pub async fn open(wanted: Wanted) -> Self {
-        let Wanted { port, session, patience, mixture, files, tls } = wanted;
+    pub async fn open(wanted: ServerOptions) -> Self {
+        let ServerOptions { port, session, agent_timeout, mixture, files, tls } = wanted;
         let welcome = AgentBootstrap { setup: b"the setup".to_vec(), files };
-        let hub = AgentServer::open(&endpoint(port), tls.as_ref(), session, patience, welcome).await.unwrap();
+        let hub =
+            AgentServer::open(&endpoint(port), tls.as_ref(), session, agent_timeout, welcome).await.unwrap();
         let (handle, stopping) = (hub.handle(), Arc::new(AtomicBool::new(false)));
         let (to_reactor, incoming) = mpsc::channel(4);
         let events = Arc::new(Mutex::new(Vec::new()));
@@ -136,11 +137,11 @@ pub fn agent(id: &str, walkers: u32) -> Agent {
     }
 }
 
-/// An agent that has joined.
+/// An agent that has membership.
 pub async fn join(port: u16, agent: Agent) -> (Arc<AgentClient>, Arc<Membership>) {
-    let uplink = Arc::new(AgentClient::open(&endpoint(port).into(), None, agent, |_| {}).await.unwrap());
-    let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
-    (uplink, Arc::new(joined))
+    let client = Arc::new(AgentClient::open(&endpoint(port).into(), None, agent, |_| {}).await.unwrap());
+    let membership = timeout(LIMIT, client.join()).await.expect("in time").unwrap();
+    (client, Arc::new(membership))
 }
 
 /// Two elements with 3 and 2 components of 20 features.

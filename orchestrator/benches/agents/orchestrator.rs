@@ -18,7 +18,7 @@ use crate::simulated::Seen;
 use crate::{AGENTS, PERIODS, Plan, WALKERS, campaign, endpoint, now, period, quantile};
 
 /// Timeout for agents to end.
-const PATIENCE: Duration = Duration::from_secs(60);
+const AGENT_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Log of commits.
 #[derive(Default)]
@@ -37,12 +37,13 @@ pub async fn lead(plan: Plan) {
     let mut selector = campaign::selector(&model, WALKERS, &settings);
     let store = campaign::create_store(room.location, WALKERS).await;
     store.commit(&selector.start_walks()).await.unwrap();
-    let hub = AgentServer::open(&endpoint(plan), None, 1, PATIENCE, AgentBootstrap::default()).await.unwrap();
-    let (handle, stopping) = (hub.handle(), Arc::new(AtomicBool::new(false)));
+    let server =
+        AgentServer::open(&endpoint(plan), None, 1, AGENT_TIMEOUT, AgentBootstrap::default()).await.unwrap();
+    let (handle, stopping) = (server.handle(), Arc::new(AtomicBool::new(false)));
     // The same capacity as in `calmwalk run`.
     let (to_reactor, incoming) = mpsc::channel(64);
-    let hub =
-        tokio::spawn(hub.run(Arc::clone(selector.mixture()), Arc::clone(&stopping), to_reactor, |_| {}));
+    let server =
+        tokio::spawn(server.run(Arc::clone(selector.mixture()), Arc::clone(&stopping), to_reactor, |_| {}));
     let program = std::env::current_exe().unwrap();
     let arguments = [plan.rate, plan.duration.as_secs_f64(), f64::from(plan.port), plan.begun];
     let arguments = arguments.map(|number| number.to_string());
@@ -57,9 +58,9 @@ pub async fn lead(plan: Plan) {
     });
     let reactor = Reactor { selector, store: store.clone(), incoming, stopping, queue_limit: u64::MAX };
     let writing = Arc::clone(&log);
-    reactor.run(move |notice| writing.lock().unwrap().take_in(&notice, plan)).await.unwrap();
+    reactor.run(move |notice| writing.lock().unwrap().record(&notice, plan)).await.unwrap();
     handle.close();
-    hub.await.unwrap().unwrap();
+    server.await.unwrap().unwrap();
     let agents = agents.wait_with_output().unwrap();
     assert!(agents.status.success());
     let seen: Seen = serde_json::from_slice(&agents.stdout).unwrap();
@@ -70,7 +71,7 @@ pub async fn lead(plan: Plan) {
 }
 
 impl Log {
-    fn take_in(&mut self, notice: &Notice<'_>, plan: Plan) {
+    fn record(&mut self, notice: &Notice<'_>, plan: Plan) {
         let Notice::Committed(commit) = notice else { return };
         if let Some(period) = period(now(), plan) {
             let accepted = commit.candidates.iter().filter(|candidate| candidate.fate == Fate::Accepted);
