@@ -15,7 +15,9 @@ use std::time::Duration;
 use calm::forgetting::ForgettingAlarm;
 use calm::{Artifact, UpdateSettings};
 use orchestrator::grader::Grader;
-use orchestrator::selector::{Mode, Next, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
+use orchestrator::selector::{
+    Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+};
 use potentials::grace::{GraceModel, Threads};
 use rustix::time::{ClockId, clock_gettime};
 use wire::messages::{Outcome, Report};
@@ -59,11 +61,11 @@ impl Campaign {
             settings: Arc::new(walk_settings()),
         };
         let mut selector = selector(mode, assignment_steps, &model);
-        selector.begin_walks();
+        selector.start_walks();
         let (mut campaign, mut turns, mut begun) = (Self::default(), BinaryHeap::new(), 0);
         loop {
             // There are as many walkers as walks, so every assignment starts at once.
-            while let Next::Turn(assignment) = selector.next_turn() {
+            while let Scheduling::Assign(assignment) = selector.next_assignment() {
                 let used = processor_time();
                 let report = advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {});
                 let taken = processor_time() - used;
@@ -102,7 +104,7 @@ fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
     let settings = Settings {
         mode,
         walks_per_round: seeds().len(),
-        turn_steps: assignment_steps,
+        steps_per_assignment: assignment_steps,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
             combination: calm::CovarianceUpdateKind::Convex,
@@ -111,17 +113,17 @@ fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
         },
         forgetting_alarm: ForgettingAlarm::default(),
         collection: toml::from_str(rule).unwrap(),
-        per_seed: u32::MAX,
-        total: None,
+        max_per_seed_structure: u32::MAX,
+        max_structures: None,
         control: false,
-        least_distance: (1.2, 0.75),
+        min_distance: (1.2, 0.75),
         declined_feature_bytes: 0,
     };
     let n = model.elements().len();
     let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
     let grader = Grader::new(model.elements().to_vec(), cutoffs);
     let original = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
-    let (campaign, snapshot) = (CampaignId([1; 16]), Snapshot::default());
+    let (campaign, snapshot) = (CampaignId([1; 16]), SelectorSnapshot::default());
     Selector::restore(settings, campaign, seeds(), grader, original, None, snapshot).unwrap()
 }
 

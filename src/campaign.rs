@@ -179,7 +179,7 @@ impl Campaign {
             value["instructions"] = json!(instructions());
         }
         let seed = |named: &SourcedStructure| {
-            format!("{} {}", named.seed.name, ContentHash::of(&named.seed.structure))
+            format!("{} {}", named.seed.name, ContentHash::from_structure(&named.seed.structure))
         };
         value["seeds"] = self.seed_structures.iter().map(seed).collect();
         value
@@ -193,7 +193,7 @@ impl Campaign {
         hasher.update(fixed.to_string().as_bytes());
         for named in &self.seed_structures {
             hasher.update(named.seed.name.as_bytes());
-            hasher.update(&ContentHash::of(&named.seed.structure).0);
+            hasher.update(&ContentHash::from_structure(&named.seed.structure).0);
         }
         let mut id = [0; 16];
         id.copy_from_slice(&hasher.finalize().as_bytes()[..16]);
@@ -291,15 +291,15 @@ pub fn selector_settings(config: &Config) -> selector::Settings {
     selector::Settings {
         mode: campaign.mode,
         walks_per_round: run.walks_per_round.get(),
-        turn_steps: run.turn_steps.get(),
+        steps_per_assignment: run.turn_steps.get(),
         update: calm.update,
         search: config.update_settings(),
         forgetting_alarm: ForgettingAlarm { share_above_one: calm.forgetting_alarm },
         collection: collect.when,
-        per_seed: collect.per_seed.get(),
-        total: config.most_structures(),
+        max_per_seed_structure: collect.per_seed.get(),
+        max_structures: config.most_structures(),
         control: campaign.control,
-        least_distance: (guard.least_distance.get(), guard.least_distance_fraction.get()),
+        min_distance: (guard.least_distance.get(), guard.least_distance_fraction.get()),
         declined_feature_bytes: collect.declined_features_mb * 1_000_000,
     }
 }

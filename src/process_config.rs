@@ -10,7 +10,7 @@ use potentials::grace::{GraceModel, Precision, RadialPath};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
-use wire::ipc::Door;
+use wire::ipc::ConnectInfo;
 use workers::labeller::{ExecutionSettings, LabelBounds, Method};
 use workers::settings::WalkSettings;
 
@@ -26,7 +26,7 @@ pub struct WalkerConfig {
     /// Parent process. The walker ends with it.
     pub parent: u32,
     /// How to connect to the orchestrator.
-    pub door: Door,
+    pub door: ConnectInfo,
     /// The exported model.
     pub model: PathBuf,
     /// BLAKE3 hash of that file.

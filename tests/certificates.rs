@@ -82,8 +82,8 @@ fn files_that_are_wrong_end_a_run_and_an_agent_at_once() {
     for (directory, file, expected) in [
         (&expired, "certificate.pem", "expired on"),
         (&missing, "key.pem", "cannot be read"),
-        (&other, "key.pem", "not that of"),
-        (&foreign, "certificate.pem", "was not signed by"),
+        (&other, "key.pem", "does not belong to"),
+        (&foreign, "certificate.pem", "is not signed by"),
     ] {
         let [tls] = tls(directory).try_into().unwrap();
         let file = directory.join(file).display().to_string();
@@ -131,7 +131,7 @@ fn an_agent_that_cannot_accept_the_orchestrators_certificate_ends_and_says_why()
     let other_authority = Authority::new().host(here.join("other_authority"), "localhost", 300);
     for (orchestrator, expected) in [
         (other_name, "it is for head.example, not for localhost"),
-        (other_authority, "another authority has signed it"),
+        (other_authority, "it is signed by another authority"),
     ] {
         let mut hosts = hosts(&orchestrator, &agent);
         let log = hosts.home.path().join("log");
@@ -164,7 +164,7 @@ fn an_agent_whose_certificate_the_orchestrator_refuses_ends_and_says_why() {
     let mut waiting = hosts.agent(0);
     assert_eq!(waiting.0.wait().unwrap().code(), Some(2), "{}", hosts.said(0));
     let said = hosts.said(0);
-    assert!(said.contains("refuses the certificate") && said.contains("another authority"), "{said}");
+    assert!(said.contains("rejects the certificate") && said.contains("another authority"), "{said}");
     signal(run.0.id(), "TERM");
     assert_eq!(run.0.wait().unwrap().code(), Some(130), "{}", hosts.orchestrator_stderr());
     hosts.assert_cleaned_up();

@@ -43,10 +43,10 @@ fn a_log_has_what_all_processes_of_a_campaign_do() {
     assert!(labels.iter().all(|event| event["process"].as_str().unwrap().starts_with("labeller ")));
     assert_eq!(said(&log, "leased").len(), labels.len());
 
-    let turns = said(&log, "made a turn");
-    let by: BTreeSet<_> = turns.iter().map(|event| event["process"].as_str().unwrap()).collect();
+    let assignments = said(&log, "finished an assignment");
+    let by: BTreeSet<_> = assignments.iter().map(|event| event["process"].as_str().unwrap()).collect();
     assert!(!by.is_empty() && by.iter().all(|name| ["walker 0", "walker 1"].contains(name)), "{by:?}");
-    assert!(turns.iter().all(|event| event["fields"]["seconds"].as_f64().unwrap() > 0.0));
+    assert!(assignments.iter().all(|event| event["fields"]["seconds"].as_f64().unwrap() > 0.0));
     assert!(!said(&log, "committed").is_empty());
     let operations = said(&log, "operation");
     let kinds: Vec<_> = operations.iter().map(|event| event["fields"]["kind"].as_str().unwrap()).collect();

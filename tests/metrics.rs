@@ -129,12 +129,14 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
         metrics.get(name).and_then(|(_, samples)| samples.get(labels).copied())
     };
     assert_eq!(value("calmwalk_agent_link_up", ""), Some(0.0));
-    assert_eq!(value("calmwalk_agent_turns_taken_total", ""), Some(0.0));
+    assert_eq!(value("calmwalk_agent_assignments_received_total", ""), Some(0.0));
     assert_eq!(value("calmwalk_agent_link_silence_seconds", ""), None, "nobody was ever heard");
 
     let mut orchestrator = hosts.start_orchestrator();
     let is_above = |name: &str, labels: &str| value(name, labels) > Some(0.0);
-    wait_until("it delivers candidates", || is_above("calmwalk_agent_turns_total", "outcome=\"candidate\""));
+    wait_until("it delivers candidates", || {
+        is_above("calmwalk_agent_assignments_total", "outcome=\"candidate\"")
+    });
     wait_until("a question was answered", || is_above("calmwalk_agent_link_round_trip_seconds", ""));
     wait_until("the mixture has moved", || is_above("calmwalk_agent_mixture_version", ""));
     wait_until("its walker is seen", || value("calmwalk_agent_walkers", "state=\"running\"") == Some(1.0));
@@ -143,8 +145,8 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     are_documented(&metrics);
     assert_eq!(number("calmwalk_agent_link_up"), 1.0);
     assert_eq!(number("calmwalk_agent_places_total"), 1.0);
-    let came: f64 = metrics["calmwalk_agent_turns_total"].1.values().sum();
-    let taken = number("calmwalk_agent_turns_taken_total");
+    let came: f64 = metrics["calmwalk_agent_assignments_total"].1.values().sum();
+    let taken = number("calmwalk_agent_assignments_received_total");
     assert!(
         came > 0.0 && came <= taken && taken <= came + 1.0,
         "one walker has one turn in hand: {metrics:?}"

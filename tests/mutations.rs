@@ -145,7 +145,7 @@ fn candidates() {
             walk: wire::WalkId(3),
             segment: 0,
             step: 5,
-            content: ContentHash::of(&structure),
+            content: ContentHash::from_structure(&structure),
         },
         origin: wire::Origin::Biased,
         mixture_version: 3,

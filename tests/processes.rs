@@ -293,7 +293,7 @@ fn clean_removes_what_killed_processes_left_and_nothing_else() {
     processes_in(here).iter().for_each(|process| signal(process.pid, "KILL"));
     running.0.wait().unwrap();
     wait_until("every process is gone", || processes_in(here).is_empty());
-    let place = wire::place::Place::of(here).unwrap();
+    let place = wire::shm_dir::ShmDir::for_campaign(here).unwrap();
     assert!(place.directory().exists());
     let said = succeed(here, ["clean", "."]);
     assert!(said.contains("files from shared memory") && !said.contains(" 0 files"), "{said}");
@@ -345,7 +345,7 @@ fn shared_memory_is_the_users_alone() {
     let mut running = start(here);
     wait_for_work(here);
     let held = pause_walkers(here, 2);
-    let place = wire::place::Place::of(here).unwrap();
+    let shm_dir = wire::shm_dir::ShmDir::for_campaign(here).unwrap();
     assert_eq!(fs::metadata(place.directory()).unwrap().mode() & 0o777, 0o700);
     let mut segments = 0;
     for file in fs::read_dir("/dev/shm").unwrap().flatten() {

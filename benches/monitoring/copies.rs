@@ -141,7 +141,7 @@ async fn copy(connection: &mut SqliteConnection, one: ExportRow, candidates: u64
         let count = PLAIN | grades.clone().count() as u64;
         let grades = grades.zip(&mut numbers).flat_map(|(grade, u)| (2.0 * u * grade).to_le_bytes());
         let grades: Vec<u8> = count.to_le_bytes().into_iter().chain(grades).collect();
-        let content = ContentHash::of(&structure);
+        let content = ContentHash::from_structure(&structure);
         let walk = WalkId(u32::try_from(i % WALKS).expect("a walk"));
         let id = CandidateId { walk, segment: 0, step: i, content, ..view.id() };
         let candidate = Candidate { id, structure: structure.clone(), ..view.to_candidate() };

@@ -60,5 +60,5 @@ fn content_hash(bytes: &[u8], atoms: usize) -> [u8; 32] {
         cell: atoms::Cell(std::array::from_fn(|k| vector(144 + 24 * k))),
         periodic: std::array::from_fn(|k| bytes[116 + k] == 1),
     };
-    wire::ContentHash::of(&structure).0
+    wire::ContentHash::from_structure(&structure).0
 }

@@ -1,9 +1,9 @@
-//! Any bytes parse as a message between walker and orchestrator or are rejected, and a message re-encodes to
+//! Arbitrary bytes parse as a message between walker and orchestrator or are rejected, and a message re-encodes to
 //! the same bytes.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use wire::ipc::echo;
+use wire::ipc::reencode;
 
 fuzz_target!(|bytes: &[u8]| {
     read(bytes);
@@ -11,14 +11,14 @@ fuzz_target!(|bytes: &[u8]| {
 });
 
 fn read(bytes: &[u8]) {
-    for (role, echoed) in echo(bytes).into_iter().enumerate() {
-        let Some(echoed) = echoed else { continue };
+    for (role, reencoded) in reencode(bytes).into_iter().enumerate() {
+        let Some(reencoded) = reencoded else { continue };
         // NaN is not equal to itself, so compare the encoded messages.
-        assert_eq!(echo(&echoed)[role].as_ref(), Some(&echoed));
+        assert_eq!(reencode(&reencoded)[role].as_ref(), Some(&reencoded));
     }
 }
 
-/// Prepends a valid header, so that the fuzzer reaches the code behind the checksum.
+/// Prepends a valid header, so that the fuzzer reaches the code after the checksum.
 fn framed(bytes: &[u8]) -> Vec<u8> {
     let control = [b"CALM\x02".as_slice(), &crc32fast::hash(bytes).to_le_bytes(), bytes].concat();
     let mut framed = [(control.len() as u64).to_le_bytes().as_slice(), &control].concat();

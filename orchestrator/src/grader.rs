@@ -1,11 +1,11 @@
-//! Grades of a structure whose features are known: γ from the mixture, γ_nbr from the structure.
+//! Grades of a structure with known features: γ from the mixture, γ_nbr from the structure.
 
 use atoms::{NeighbourList, Species, Structure, StructureError, cell};
 use calm::neighbourhood::{Pair, PairError, neighbourhood_average};
 use calm::{GradeError, Grades, Mixture};
 use store::records::AtomGrades;
 
-/// What of a model the grades need: its elements, in index order, and its pair cutoffs.
+/// The parts of a model that grading needs: its elements, in index order, and its pair cutoffs.
 #[derive(Clone, Debug)]
 pub struct Grader {
     elements: Vec<Species>,
@@ -16,21 +16,21 @@ pub struct Grader {
 /// Why a structure cannot be graded.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum GraderError {
-    /// An element that the model does not know.
-    #[error("atom {atom} is {species}, which the model does not know")]
+    /// An element that the model does not support.
+    #[error("atom {atom} is {species}, which the model does not support")]
     Species {
         /// Index of the atom.
         atom: usize,
         /// Its element.
         species: Species,
     },
-    /// A structure that is none.
+    /// An invalid structure.
     #[error(transparent)]
     Structure(#[from] StructureError),
-    /// Features that do not fit the mixture.
+    /// Features that do not match the mixture.
     #[error(transparent)]
     Grade(#[from] GradeError),
-    /// Pairs that do not fit the features.
+    /// Pairs that do not match the features.
     #[error(transparent)]
     Pair(#[from] PairError),
 }
@@ -57,15 +57,16 @@ impl Grader {
         let mut list = NeighbourList::new(self.largest_cutoff, 0.0);
         list.update(structure)?;
         let mut bonds = Bonds { elements, pairs: Vec::new(), shortest: f64::INFINITY };
-        self.weigh(structure, &list, &mut bonds);
+        self.compute_pairs(structure, &list, &mut bonds);
         Ok(bonds)
     }
 
-    /// The pairs in the order of the list, each bond and its reverse weighed at once.
+    /// Computes the weights of all pairs, in the order of the list, each bond together with its reverse.
     ///
-    /// Going through the atoms in order fills the pairs of each from its first neighbour on. The images of a neighbour
-    /// stand in ascending order on both sides, so the first of one side is the reverse of the last of the other.
-    fn weigh(&self, structure: &Structure, list: &NeighbourList, bonds: &mut Bonds) {
+    /// Visiting the atoms in order fills the pairs of each atom starting from its first neighbour. The images of a
+    /// neighbour are in ascending order on both sides, so the first on one side is the reverse of the last on the
+    /// other.
+    fn compute_pairs(&self, structure: &Structure, list: &NeighbourList, bonds: &mut Bonds) {
         let Bonds { elements, pairs, shortest } = bonds;
         let cutoff = |i: usize, j: usize| self.pair_cutoffs[elements[i] * self.elements.len() + elements[j]];
         let mut next = Vec::with_capacity(list.len());
@@ -88,9 +89,9 @@ impl Grader {
                     } else {
                         Pair::new(j, i, distance, cutoff(j, i))
                     };
-                    // An atom and its own image are each other's reverse, with the same weight.
+                    // The pairs of an atom with its own images are each other's reverse, with the same weight.
                     for (place, pair) in [(next[j] + images.len() - 1 - k, reverse), (next[i] + k, pair)] {
-                        // Rounding could leave a bond without its reverse only where atoms are absurdly far away.
+                        // Rounding can leave a bond without its reverse only if atoms are extremely far away.
                         if let Some(slot) = pairs.get_mut(place) {
                             *slot = pair;
                         }
@@ -105,19 +106,19 @@ impl Grader {
     }
 }
 
-/// What the grades of one structure need of it, whatever the mixture.
+/// The data of a structure that grading needs, independent of the mixture.
 #[derive(Clone, Debug)]
 pub struct Bonds {
     /// Element index of each atom.
     pub elements: Vec<usize>,
-    /// Directed pairs within the largest cutoff, weighted: 0 beyond their own.
+    /// Directed pairs within the largest cutoff, with weights; the weight is 0 beyond the cutoff of the pair.
     pub pairs: Vec<Pair>,
     /// Shortest distance, Å; infinite without neighbours.
     pub shortest: f64,
 }
 
 impl Bonds {
-    /// γ and γ_nbr under `mixture` of atoms with these features ([n × D]).
+    /// γ and γ_nbr under `mixture`, for atoms with these features ([n × D]).
     pub fn grade(&self, mixture: &Mixture, features: &[f64]) -> Result<AtomGrades, GraderError> {
         let mut grades = Grades::default();
         grades.evaluate(mixture, &self.elements, features, None)?;
@@ -132,7 +133,7 @@ mod tests {
 
     /// A skew cell much smaller than the cutoffs, two elements, cutoffs that differ with the direction of a bond.
     #[test]
-    fn pairs_are_those_of_each_bond_by_itself() {
+    fn pairs_equal_those_computed_separately() {
         let elements: Vec<Species> = vec!["Al".parse().unwrap(), "Si".parse().unwrap()];
         let cutoffs = [6.0, 5.0, 4.5, 5.5];
         for periodic in [[true; 3], [true, false, true], [false; 3]] {

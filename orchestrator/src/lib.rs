@@ -1,11 +1,11 @@
-//! The selector, which decides, and the reactor, which feeds it.
+//! The orchestrator of a campaign.
 //!
-//! The [`selector`] is a pure, synchronous core: reports in, commits out, no clock, no socket, no randomness.
-//! The [`reactor`] is the thin shell round it: it takes reports from a channel, has each commit written to the
-//! store, and only then answers.
+//! The [`selector`] is a pure, synchronous core that decides: reports in, commits out, without clock, socket or
+//! randomness. The [`reactor`] drives it: it receives reports from a channel, writes each commit to the store, and only
+//! then answers.
 //!
-//! The processes of a campaign are kept alive in the same way: the [`supervisor`] decides, the [`launcher`] starts and
-//! watches. Where a batch system starts processes, [`slurm`] tells it which.
+//! Process supervision has the same structure: the [`supervisor`] decides, the [`launcher`] starts and monitors
+//! processes. If a batch system starts the processes, [`slurm`] decides which jobs to submit.
 
 pub mod grader;
 pub mod launcher;

@@ -1,11 +1,11 @@
-//! The shell round the selector: takes reports from the channel, has every commit written, then answers.
+//! Drives the selector: receives reports, writes every commit to the store, and then answers.
 //!
-//! To have a transaction on the disk takes longer than most decisions. So what arrives during a commit is decided
-//! meanwhile, one after the other, and committed as one group when that commit is done. Everybody is answered when
-//! what was decided about them, and all before it, is on the disk.
+//! Writing a transaction to disk takes longer than most decisions. Reports that arrive during a commit are therefore
+//! decided one after the other in the meantime, and committed together afterwards. A walker is answered when the
+//! decision about its report, and all earlier decisions, are on disk.
 
-mod arrivals;
-pub mod group;
+pub mod commit_batch;
+mod events;
 mod log;
 
 use std::collections::{HashMap, VecDeque};
@@ -22,102 +22,102 @@ use tokio::time::MissedTickBehavior;
 use tracing::{debug, warn};
 use wire::WalkId;
 use wire::messages::Progress;
-use wire::transport::{Incoming, Work};
+use wire::transport::{Incoming, WorkItem};
 
-use self::arrivals::{Arrival, Arrivals};
-use crate::selector::{Next, Selector, SelectorError};
+use self::events::{EventStream, ReactorEvent};
+use crate::selector::{Scheduling, Selector, SelectorError};
 
-/// How often a full label queue and paused walks are looked at again, and for how long what was found is good.
-const LOOK: Duration = Duration::from_millis(200);
-/// A turn may cost so many walkers, which crashed with it in hand; then its walk is over.
-const MOST_WALKERS: u32 = 3;
+/// Interval between checks of a full label queue and of paused walks, and validity of the result.
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
+/// A walk ends after its assignment has crashed this many walkers.
+const MAX_CRASHES: u32 = 3;
 
-/// Why a campaign cannot go on.
+/// Why the reactor failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReactorError {
-    /// The selector gave up.
+    /// An error of the selector.
     #[error(transparent)]
     Selector(#[from] SelectorError),
-    /// The store gave up.
+    /// An error of the store.
     #[error(transparent)]
     Store(#[from] StoreError),
 }
 
-/// What those who watch are told.
+/// A notification for display.
 #[derive(Debug)]
 pub enum Notice<'a> {
-    /// Where a walk stands.
+    /// Current state of a walk.
     Progress(WalkId, Progress),
-    /// What was just committed.
+    /// A commit that has been written.
     Committed(&'a Commit),
-    /// Walkers wait because this many label jobs wait.
+    /// Walkers wait because this many label jobs are unfinished.
     QueueFull(u64),
 }
 
-/// How the reactor's work ended.
+/// How the reactor ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ended {
-    /// Every walk is over.
-    Done,
-    /// Walks are left, but it was asked to stop, or every walker is gone; the campaign can go on later.
+pub enum RunOutcome {
+    /// Every walk has ended.
+    Finished,
+    /// Walks are left, but a stop was requested or all walkers have exited. The campaign can be continued.
     Stopped,
 }
 
-/// What the reactor works with.
+/// Configuration of the reactor.
 pub struct Reactor {
-    /// The core.
+    /// The selector.
     pub selector: Selector,
     /// The campaign's database.
     pub store: Store,
-    /// Reports of walkers.
+    /// Messages of walkers.
     pub incoming: mpsc::Receiver<Incoming>,
-    /// Set from outside, by Ctrl-C say: walkers are sent home with their walks where they stand.
+    /// Set to stop, for example by Ctrl-C: walkers are shut down and their walks can be continued later.
     pub stopping: Arc<AtomicBool>,
     /// Walkers wait while more label jobs than this are unfinished, unless the selector raises its threshold first.
     pub queue_limit: u64,
 }
 
-/// The reactor at work: what it works with, and the walkers as far as it must know of them.
-struct Shell {
+/// State of the running reactor.
+struct ReactorState {
     selector: Selector,
     store: Store,
     stopping: Arc<AtomicBool>,
     queue_limit: u64,
-    /// What is decided and not yet on its way to the disk.
+    /// Decisions that are not being written yet.
     decided: Option<Commit>,
-    /// Walkers that wait for a turn, in the order in which they came.
+    /// Idle walkers, in order of arrival.
     waiting: VecDeque<(u32, Reply)>,
-    /// Those whose answer is known and waits for the commit before it.
-    promised: Vec<Promise>,
-    /// The walk that each of the others has in hand.
-    at_work: HashMap<u32, WalkId>,
-    /// Walkers that crashed with the present turn of a walk.
-    costs: HashMap<WalkId, u32>,
-    /// Label jobs that are unfinished at most, and when they were counted.
+    /// Replies that wait for the commit before them.
+    pending_replies: Vec<PendingReply>,
+    /// The walk assigned to each busy walker.
+    assigned: HashMap<u32, WalkId>,
+    /// Number of walkers that crashed with the current assignment of a walk.
+    crash_counts: HashMap<WalkId, u32>,
+    /// Upper bound of the number of unfinished label jobs, and when it was determined.
     unfinished: Option<(u64, Instant)>,
-    /// When it was last looked which walks people have paused.
-    paused_at: Option<Instant>,
+    /// When the list of paused walks was last read.
+    paused_polled_at: Option<Instant>,
 }
 
-type Reply = oneshot::Sender<Option<Work>>;
+type Reply = oneshot::Sender<Option<WorkItem>>;
 
-/// The answer to a walker.
-struct Promise {
+/// A reply to a walker.
+struct PendingReply {
     walker: u32,
     reply: Reply,
-    work: Option<Work>,
+    work: Option<WorkItem>,
 }
 
 impl Reactor {
-    /// Runs until no walker has a turn in hand and there is none to be given out, because all walks are over or because
-    /// it is stopped; or until no walker can come any more.
-    pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<Ended, ReactorError> {
-        let mut arrivals =
-            Arrivals::new(self.incoming, self.selector.examiner().clone(), self.selector.mixture());
-        let mut shell = Shell::new(self.selector, self.store, self.stopping, self.queue_limit);
-        // An interval, not a time since the last message: walkers at work may report progress without a pause.
-        let mut look = tokio::time::interval(LOOK);
-        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    /// Runs until no walker is busy and there is nothing to assign, because all walks have ended or a stop was
+    /// requested; or until no walker can connect any more.
+    pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<RunOutcome, ReactorError> {
+        let mut events =
+            EventStream::new(self.incoming, self.selector.regrader().clone(), self.selector.mixture());
+        let mut state = ReactorState::new(self.selector, self.store, self.stopping, self.queue_limit);
+        // An interval, not a timeout since the last message: busy walkers may report progress continuously.
+        let mut poll = tokio::time::interval(POLL_INTERVAL);
+        poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
         // One commit at a time.
         let mut writing = JoinSet::new();
         let mut open = true;
@@ -127,21 +127,22 @@ impl Reactor {
                     let written: Result<Commit, StoreError> =
                         written.unwrap_or_else(|error| resume_unwind(error.into_panic()));
                     watch(Notice::Committed(&written?));
-                    shell.keep_promises();
+                    state.send_replies();
                 }
-                group = arrivals.take(), if open => {
-                    let group = group.unwrap_or_default();
-                    open = !group.is_empty();
-                    let told = group.iter().all(|arrival| matches!(arrival, Arrival::Progress(..)));
-                    shell.decide(group, &mut watch)?;
-                    if open && told {
+                batch = events.take(), if open => {
+                    let batch = batch.unwrap_or_default();
+                    open = !batch.is_empty();
+                    let only_progress = batch.iter().all(|event| matches!(event, ReactorEvent::Progress(..)));
+                    state.decide(batch, &mut watch)?;
+                    if open && only_progress {
                         continue;
                     }
-                    arrivals.in_force(shell.selector.mixture());
+                    events.set_mixture(state.selector.mixture());
                 }
-                _ = look.tick(), if !shell.waiting.is_empty() || shell.at_work.is_empty() => {
-                    // A stop before the first walker asks is followed by no message: agents wait for the end of the reactor.
-                    if shell.waiting.is_empty() && !shell.stopping.load(Ordering::Relaxed) {
+                _ = poll.tick(), if !state.waiting.is_empty() || state.assigned.is_empty() => {
+                    // A stop before the first walker is idle is not followed by any message, but agents wait for the
+                    // reactor to end.
+                    if state.waiting.is_empty() && !state.stopping.load(Ordering::Relaxed) {
                         continue;
                     }
                 }
@@ -149,14 +150,18 @@ impl Reactor {
             if !writing.is_empty() {
                 continue;
             }
-            shell.promise(&mut watch).await?;
-            if let Some(commit) = shell.decided.take() {
-                writing.spawn(write(shell.store.clone(), commit));
+            state.schedule(&mut watch).await?;
+            if let Some(commit) = state.decided.take() {
+                writing.spawn(write(state.store.clone(), commit));
             } else {
-                shell.keep_promises();
-                if !open || shell.is_over() {
-                    // Whoever asks from now on has to be sent home by those who carry messages.
-                    return Ok(if shell.selector.is_done() { Ended::Done } else { Ended::Stopped });
+                state.send_replies();
+                if !open || state.is_over() {
+                    // From now on the transports shut down walkers that ask for work.
+                    return Ok(if state.selector.is_done() {
+                        RunOutcome::Finished
+                    } else {
+                        RunOutcome::Stopped
+                    });
                 }
             }
         }
@@ -164,18 +169,18 @@ impl Reactor {
 }
 
 async fn write(store: Store, commit: Commit) -> Result<Commit, StoreError> {
-    let begun = Instant::now();
+    let start = Instant::now();
     store.commit(&commit).await?;
-    log::committed(&commit, begun.elapsed());
+    log::committed(&commit, start.elapsed());
     Ok(commit)
 }
 
-/// Structures that a commit accepts: as many jobs, at most, come to the queue.
+/// Number of structures that a commit accepts: an upper bound of the jobs it adds to the queue.
 fn accepted(commit: &Commit) -> u64 {
     commit.candidates.iter().filter(|candidate| candidate.fate == Fate::Accepted).count() as u64
 }
 
-impl Shell {
+impl ReactorState {
     fn new(selector: Selector, store: Store, stopping: Arc<AtomicBool>, queue_limit: u64) -> Self {
         Self {
             selector,
@@ -184,162 +189,164 @@ impl Shell {
             queue_limit,
             decided: None,
             waiting: VecDeque::new(),
-            promised: Vec::new(),
-            at_work: HashMap::new(),
-            costs: HashMap::new(),
+            pending_replies: Vec::new(),
+            assigned: HashMap::new(),
+            crash_counts: HashMap::new(),
             unfinished: None,
-            paused_at: None,
+            paused_polled_at: None,
         }
     }
 
-    /// Takes a group in, in the order in which it arrived.
+    /// Handles a batch of events in order of arrival.
     fn decide(
         &mut self,
-        group: Vec<Arrival>,
+        batch: Vec<ReactorEvent>,
         watch: &mut impl FnMut(Notice<'_>),
     ) -> Result<(), ReactorError> {
-        for arrival in group {
-            let commit = match arrival {
-                Arrival::Progress(walk, progress) => {
+        for event in batch {
+            let commit = match event {
+                ReactorEvent::Progress(walk, progress) => {
                     watch(Notice::Progress(walk, progress));
                     None
                 }
-                Arrival::Free { walker, report, reply } => {
-                    self.at_work.remove(&walker);
+                ReactorEvent::Idle { walker, report, reply } => {
+                    self.assigned.remove(&walker);
                     self.waiting.push_back((walker, reply));
-                    match report.filter(|report| !self.is_in_hand(report.walk)) {
+                    match report.filter(|report| !self.is_assigned(report.walk)) {
                         Some(report) => {
-                            self.costs.remove(&report.walk);
-                            self.selector.examined(report)?
+                            self.crash_counts.remove(&report.walk);
+                            self.selector.report_regraded(report)?
                         }
                         None => None,
                     }
                 }
-                Arrival::Gone { walker, fault } => self.gone(walker, fault)?,
+                ReactorEvent::Lost { walker, crashed } => self.walker_lost(walker, crashed)?,
             };
             if let Some(commit) = commit {
-                if let Some((most, _)) = &mut self.unfinished {
-                    *most += accepted(&commit);
-                    self.selector.set_unfinished_jobs(*most);
+                if let Some((upper_bound, _)) = &mut self.unfinished {
+                    *upper_bound += accepted(&commit);
+                    self.selector.set_unfinished_jobs(*upper_bound);
                 }
-                group::append(self.decided.get_or_insert_default(), commit);
+                commit_batch::append(self.decided.get_or_insert_default(), commit);
             }
         }
         Ok(())
     }
 
-    /// Whether a walker has a turn of the walk in hand, or is about to be given it. One that was taken for dead and comes
-    /// back with a report cannot speak for a walk that was handed on.
-    fn is_in_hand(&self, walk: WalkId) -> bool {
-        let promised = self.promised.iter().filter_map(|promise| promise.work.as_ref());
-        let mut in_hand = self.at_work.values().copied().chain(promised.map(|work| work.assignment.walk));
-        in_hand.any(|other| other == walk)
+    /// Whether the walk is assigned, or about to be. If so, a report of a walker that was considered lost is ignored.
+    fn is_assigned(&self, walk: WalkId) -> bool {
+        let pending = self.pending_replies.iter().filter_map(|pending| pending.work.as_ref());
+        let mut assigned = self.assigned.values().copied().chain(pending.map(|work| work.assignment.walk));
+        assigned.any(|other| other == walk)
     }
 
-    /// Whether nobody works, waits, or will be given a turn.
+    /// Whether no walker is busy, waiting, or will get an assignment.
     fn is_over(&self) -> bool {
         let no_more = self.selector.is_done() || self.stopping.load(Ordering::Relaxed);
-        no_more && self.waiting.is_empty() && self.at_work.is_empty()
+        no_more && self.waiting.is_empty() && self.assigned.is_empty()
     }
 
-    /// A walker was lost. If it had a turn in hand, another gets it, unless it is the turn that kills them.
-    fn gone(&mut self, walker: u32, fault: bool) -> Result<Option<Commit>, ReactorError> {
-        if let Some(index) = self.promised.iter().position(|promise| promise.walker == walker) {
-            if let Some(work) = self.promised.remove(index).work {
-                self.selector.lost(work.assignment.walk);
+    /// Handles the loss of a walker. Its assignment goes to another walker, unless it has crashed too many.
+    fn walker_lost(&mut self, walker: u32, crashed: bool) -> Result<Option<Commit>, ReactorError> {
+        if let Some(index) = self.pending_replies.iter().position(|pending| pending.walker == walker) {
+            if let Some(work) = self.pending_replies.remove(index).work {
+                self.selector.assignment_lost(work.assignment.walk);
             }
             return Ok(None);
         }
-        let Some(walk) = self.at_work.remove(&walker) else { return Ok(None) };
-        warn!(walker, walk = walk.0, fault, "a walker was lost with a turn in hand");
-        if fault {
-            let cost = self.costs.entry(walk).or_default();
-            *cost += 1;
-            if *cost == MOST_WALKERS {
-                // Not how: the last words of a process are not the same twice.
-                let reason = format!("{MOST_WALKERS} walkers crashed in this turn");
-                return Ok(self.selector.give_up(walk, reason)?);
+        let Some(walk) = self.assigned.remove(&walker) else { return Ok(None) };
+        warn!(walker, walk = walk.0, crashed, "a walker was lost with an assignment");
+        if crashed {
+            let crashes = self.crash_counts.entry(walk).or_default();
+            *crashes += 1;
+            if *crashes == MAX_CRASHES {
+                // Without the details: the last output of a process is not reproducible.
+                let reason = format!("{MAX_CRASHES} walkers crashed in this turn");
+                return Ok(self.selector.abandon_walk(walk, reason)?);
             }
         }
-        self.selector.lost(walk);
+        self.selector.assignment_lost(walk);
         Ok(None)
     }
 
-    /// Chooses turns for waiting walkers as far as there are any, or that they go home.
-    async fn promise(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<(), ReactorError> {
+    /// Assigns work to idle walkers as far as possible, or shuts them down.
+    async fn schedule(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<(), ReactorError> {
         if self.waiting.is_empty() {
             return Ok(());
         }
         if self.stopping.load(Ordering::Relaxed) {
-            self.send_home();
+            self.dismiss_waiting();
             return Ok(());
         }
         if self.is_queue_full(watch).await? {
             return Ok(());
         }
-        self.look_for_pauses().await?;
+        self.refresh_paused().await?;
         while let Some((walker, reply)) = self.waiting.pop_front() {
-            match self.selector.next_turn() {
-                Next::Turn(assignment) => {
+            match self.selector.next_assignment() {
+                Scheduling::Assign(assignment) => {
                     let mixture = Arc::clone(self.selector.mixture());
-                    let work = Some(Work { assignment: *assignment, mixture });
-                    self.promised.push(Promise { walker, reply, work });
+                    let work = Some(WorkItem { assignment: *assignment, mixture });
+                    self.pending_replies.push(PendingReply { walker, reply, work });
                 }
-                Next::Wait => {
+                Scheduling::Wait => {
                     self.waiting.push_front((walker, reply));
                     return Ok(());
                 }
-                Next::Done => {
+                Scheduling::Done => {
                     self.waiting.push_front((walker, reply));
-                    self.send_home();
+                    self.dismiss_waiting();
                 }
             }
         }
         Ok(())
     }
 
-    /// Whether the label queue is full, or may be when what is decided has come to it: then it is looked at again after
-    /// the commit. It is not counted each time, since for a while it grows by what is decided here and nothing else.
+    /// Whether the label queue is full, or may be after the pending commit; it is then checked again after that commit.
+    /// It is not counted every time, because in the short term only the decisions made here add to it.
     async fn is_queue_full(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<bool, ReactorError> {
-        let limit = self.selector.most_unfinished(self.queue_limit);
-        if self.unfinished.is_some_and(|(most, at)| most <= limit && at.elapsed() < LOOK) {
+        let limit = self.selector.max_unfinished_jobs(self.queue_limit);
+        if self
+            .unfinished
+            .is_some_and(|(upper_bound, at)| upper_bound <= limit && at.elapsed() < POLL_INTERVAL)
+        {
             return Ok(false);
         }
         let unfinished = self.store.unfinished_jobs().await?;
         if unfinished > limit {
             watch(Notice::QueueFull(unfinished));
         }
-        let most = unfinished + self.decided.as_ref().map_or(0, accepted);
-        self.unfinished = Some((most, Instant::now()));
-        self.selector.set_unfinished_jobs(most);
-        Ok(most > limit)
+        let upper_bound = unfinished + self.decided.as_ref().map_or(0, accepted);
+        self.unfinished = Some((upper_bound, Instant::now()));
+        self.selector.set_unfinished_jobs(upper_bound);
+        Ok(upper_bound > limit)
     }
 
-    /// Finds out which walks are to get no turn.
-    async fn look_for_pauses(&mut self) -> Result<(), StoreError> {
-        if self.paused_at.is_none_or(|at| at.elapsed() >= LOOK) {
+    /// Reads which walks are paused.
+    async fn refresh_paused(&mut self) -> Result<(), StoreError> {
+        if self.paused_polled_at.is_none_or(|at| at.elapsed() >= POLL_INTERVAL) {
             self.selector.set_paused(self.store.paused_walks().await?);
-            self.paused_at = Some(Instant::now());
+            self.paused_polled_at = Some(Instant::now());
         }
         Ok(())
     }
 
-    fn send_home(&mut self) {
-        let home = |(walker, reply)| Promise { walker, reply, work: None };
-        self.promised.extend(self.waiting.drain(..).map(home));
+    fn dismiss_waiting(&mut self) {
+        let dismissal = |(walker, reply)| PendingReply { walker, reply, work: None };
+        self.pending_replies.extend(self.waiting.drain(..).map(dismissal));
     }
 
-    /// Sends the answers: all that they rest on is on the disk.
-    fn keep_promises(&mut self) {
-        for Promise { walker, reply, work } in self.promised.drain(..) {
+    /// Sends the pending replies, after everything they depend on is on disk.
+    fn send_replies(&mut self) {
+        for PendingReply { walker, reply, work } in self.pending_replies.drain(..) {
             let walk = work.as_ref().map(|work| work.assignment.walk);
             match (reply.send(work), walk) {
                 (Ok(()), Some(walk)) => {
-                    debug!(walker, walk = walk.0, "gave a turn");
-                    self.at_work.insert(walker, walk);
+                    debug!(walker, walk = walk.0, "sent an assignment");
+                    self.assigned.insert(walker, walk);
                 }
-                // A walker that is gone needs no answer, and another gets its turn.
-                (Err(_), Some(walk)) => self.selector.lost(walk),
+                // The walker has exited; another walker gets its assignment.
+                (Err(_), Some(walk)) => self.selector.assignment_lost(walk),
                 (_, None) => {}
             }
         }

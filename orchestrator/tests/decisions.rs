@@ -1,36 +1,36 @@
-//! What becomes of candidates: every reason to decline, updates of the mixture, budgets, and what is logged.
+//! Decisions on candidates: every reason to decline, mixture updates, limits, and the log.
 
 use std::sync::Arc;
 
 use calm::grade::maximum;
-use orchestrator::selector::{Mode, Selector, Settings, Snapshot, TrainingFrames, UpdateProtocol};
+use orchestrator::selector::{Mode, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol};
 use store::records::{Commit, Fate};
-use wire::messages::{Decline, End, Verdict};
+use wire::messages::{DeclineReason, Verdict, WalkEnd};
 
 use crate::common;
 use crate::common::{
-    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, offer, positive, settings,
-    structure, try_restore, turn, value,
+    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, next_assignment, offer, positive,
+    settings, structure, try_restore, value,
 };
 
 /// γ = 3 in the first component.
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];
-/// γ = 1 there.
+/// γ = 1 in the first component.
 const KNOWN: [f64; 3] = [0.0, 1.0, 0.0];
 
 fn live() -> Settings {
     settings(Mode::Live)
 }
 
-/// A walk's next candidate: the structure of that number with these features.
+/// A walk's next candidate: the structure with this number and these features.
 fn next_candidate(selector: &mut Selector, step: u64, number: u64, z: [f64; 3]) -> Commit {
-    let assignment = turn(selector);
+    let assignment = next_assignment(selector);
     let report = offer(selector, &assignment, step, structure(number, SHORTEST), z);
     decided(selector, report)
 }
 
 #[test]
-fn what_is_accepted_is_covered_from_then_on() {
+fn accepted_structures_are_covered_afterwards() {
     let mut selector = begin(&live(), 1);
     let commit = next_candidate(&mut selector, 5, 1, NEW);
     assert_eq!(kinds(&commit), ["accepted"]);
@@ -41,7 +41,7 @@ fn what_is_accepted_is_covered_from_then_on() {
     );
     assert_eq!((commit.decisions[0].mixture_version, value(&commit, "mixture_version")), (1, "1"));
     assert_eq!(commit.decisions[0].candidate, Some(candidate.block.view().id()));
-    // One component was touched by both atoms, the other by none.
+    // Both atoms belong to one component; the other is unchanged.
     assert_eq!(commit.components.iter().map(|c| (c.element, c.slot)).collect::<Vec<_>>(), [(0, 0)]);
     assert_eq!((commit.walks.len(), commit.walks[0].accepted, commit.walks[0].turn), (1, 1, 1));
     assert!(gamma_max(selector.mixture(), NEW) < 1.25);
@@ -52,16 +52,16 @@ fn what_is_accepted_is_covered_from_then_on() {
 
     let commit = next_candidate(&mut selector, 6, 2, NEW);
     assert_eq!(kinds(&commit), ["declined covered"]);
-    assert_eq!(commit.candidates[0].fate, Fate::Declined(Decline::Covered));
+    assert_eq!(commit.candidates[0].fate, Fate::Declined(DeclineReason::Covered));
     assert_eq!((selector.mixture().version(), commit.components.len()), (1, 0));
 }
 
-/// Three grades are kept: the walker's, the selector's at the decision, that of the original mixture.
+/// Three grades are recorded: the walker's, the selector's at the decision, and that of the original mixture.
 #[test]
 fn each_candidate_has_three_grades() {
     let mut selector = begin(&live(), 2);
-    let (first, second) = (turn(&mut selector), turn(&mut selector));
-    // Both walkers have the original mixture; the second candidate comes when the first has been learned.
+    let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
+    // Both walkers have the original mixture; the second candidate arrives after the first has updated it.
     let reports = [
         offer(&selector, &first, 5, structure(1, SHORTEST), NEW),
         offer(&selector, &second, 5, structure(2, SHORTEST), [0.0, 0.0, 3.5]),
@@ -92,17 +92,17 @@ fn atoms_too_close_are_declined() {
     let mut selector = begin(&live(), 1);
     let least = 0.75 * SHORTEST;
     for (number, distance, kind) in [(1, least - 1e-6, "declined guard"), (2, least + 1e-6, "accepted")] {
-        let assignment = turn(&mut selector);
+        let assignment = next_assignment(&mut selector);
         let report = offer(&selector, &assignment, number, structure(number, distance), NEW);
         assert_eq!(kinds(&decided(&mut selector, report)), [kind]);
     }
 }
 
-/// The guard's fixed distance holds where a fraction of the seed structure's own is less.
+/// The guard's absolute minimum distance applies if the fraction of the seed structure's distance is smaller.
 #[test]
-fn the_least_distance_is_the_larger_of_two() {
-    let mut selector = begin(&Settings { least_distance: (2.5, 0.75), ..live() }, 1);
-    let assignment = turn(&mut selector);
+fn the_minimum_distance_is_the_larger_of_two() {
+    let mut selector = begin(&Settings { min_distance: (2.5, 0.75), ..live() }, 1);
+    let assignment = next_assignment(&mut selector);
     let report = offer(&selector, &assignment, 1, structure(1, 2.45), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["declined guard"]);
 }
@@ -116,14 +116,14 @@ fn a_known_structure_is_declined() {
     assert_eq!(kinds(&commit), ["declined duplicate"]);
     assert_eq!(value(&commit, "mixture_version"), "0");
     // Imported structures are known from the start.
-    let known = vec![wire::ContentHash::of(&structure(7, SHORTEST))];
-    let mut selector = common::restore(&never, 1, Snapshot { known, ..Snapshot::default() });
-    selector.begin_walks();
+    let known = vec![wire::ContentHash::from_structure(&structure(7, SHORTEST))];
+    let mut selector = common::restore(&never, 1, SelectorSnapshot { known, ..SelectorSnapshot::default() });
+    selector.start_walks();
     assert_eq!(kinds(&next_candidate(&mut selector, 5, 7, NEW)), ["declined duplicate"]);
 }
 
 #[test]
-fn without_updates_all_that_is_new_to_the_original_is_accepted() {
+fn without_updates_everything_new_to_the_original_mixture_is_accepted() {
     let mut selector = begin(&Settings { update: UpdateProtocol::Never, ..live() }, 1);
     for number in 1..=2 {
         let commit = next_candidate(&mut selector, number, number, NEW);
@@ -134,36 +134,37 @@ fn without_updates_all_that_is_new_to_the_original_is_accepted() {
 }
 
 #[test]
-fn a_seed_structure_gives_only_so_many() {
-    let mut selector = begin(&Settings { update: UpdateProtocol::Never, per_seed: 2, ..live() }, 2);
+fn the_limit_per_seed_structure_is_enforced() {
+    let mut selector =
+        begin(&Settings { update: UpdateProtocol::Never, max_per_seed_structure: 2, ..live() }, 2);
     assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
     let commit = next_candidate(&mut selector, 6, 2, NEW);
     assert_eq!(kinds(&commit), ["accepted", "ended"]);
     assert_eq!((commit.walks[0].state.as_str(), commit.walks[0].accepted), ("collected", 2));
-    assert_eq!(turn(&mut selector).walk.0, 1);
+    assert_eq!(next_assignment(&mut selector).walk.0, 1);
 }
 
-/// The limit may be lowered while a walk is on its way.
+/// The limit may be lowered while a walk is running.
 #[test]
 fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
     let mut store = common::memory::MemoryStore::default();
-    let more = Settings { update: UpdateProtocol::Never, per_seed: 3, ..live() };
-    let mut selector = common::restore(&more, 1, Snapshot::default());
-    store.commit(&selector.begin_walks());
+    let more = Settings { update: UpdateProtocol::Never, max_per_seed_structure: 3, ..live() };
+    let mut selector = common::restore(&more, 1, SelectorSnapshot::default());
+    store.commit(&selector.start_walks());
     for number in 1..=2 {
         store.commit(&next_candidate(&mut selector, number, number, NEW));
     }
-    let mut selector = common::restore(&Settings { per_seed: 2, ..more }, 1, store.snapshot());
+    let mut selector = common::restore(&Settings { max_per_seed_structure: 2, ..more }, 1, store.snapshot());
     let commit = next_candidate(&mut selector, 3, 3, NEW);
     assert_eq!(kinds(&commit), ["declined budget", "ended"]);
     assert!(selector.is_done());
 }
 
 #[test]
-fn a_campaign_collects_only_so_many() {
-    let limited = Settings { update: UpdateProtocol::Never, total: Some(2), ..live() };
+fn the_campaign_limit_is_enforced() {
+    let limited = Settings { update: UpdateProtocol::Never, max_structures: Some(2), ..live() };
     let mut selector = begin(&limited, 3);
-    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     let kinds: Vec<_> = (1..)
         .zip(&assignments)
         .flat_map(|(number, assignment)| {
@@ -171,48 +172,52 @@ fn a_campaign_collects_only_so_many() {
             kinds(&decided(&mut selector, report))
         })
         .collect();
-    // The last of them ends the walks that nobody has in hand, a walk in hand ends with its report.
+    // The last accept ends the unassigned walks; an assigned walk ends with its report.
     assert_eq!(kinds, ["accepted", "accepted", "ended", "ended", "declined budget", "ended"]);
     assert!(selector.is_done());
 }
 
 #[test]
 fn imports_are_logged_once_when_they_begin_to_count() {
-    let snapshot = |values| Snapshot { imported: 3, values, ..Snapshot::default() };
+    let snapshot = |values| SelectorSnapshot { imported: 3, values, ..SelectorSnapshot::default() };
     let mut selector = common::restore(&live(), 1, snapshot(Vec::new()));
-    let commit = selector.begin_walks();
+    let commit = selector.start_walks();
     assert_eq!(kinds(&commit), ["imported", "begun"]);
     assert_eq!(
         (commit.decisions[0].walk, &commit.decisions[0].detail["structures"]),
         (None, &serde_json::json!(3))
     );
-    let mut again =
-        common::restore(&live(), 1, Snapshot { walks: commit.walks.clone(), ..snapshot(commit.values) });
-    assert!(again.begin_walks().decisions.is_empty());
+    let mut again = common::restore(
+        &live(),
+        1,
+        SelectorSnapshot { walks: commit.walks.clone(), ..snapshot(commit.values) },
+    );
+    assert!(again.start_walks().decisions.is_empty());
 }
 
 #[test]
-fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
-    let limited = Settings { update: UpdateProtocol::Never, total: Some(1), control: true, ..live() };
-    let mut selector = common::restore(&limited, 2, Snapshot::default());
+fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
+    let limited =
+        Settings { update: UpdateProtocol::Never, max_structures: Some(1), control: true, ..live() };
+    let mut selector = common::restore(&limited, 2, SelectorSnapshot::default());
     let mut walks = std::collections::BTreeMap::new();
     let mut keep = |commit: &Commit| walks.extend(commit.walks.iter().map(|walk| (walk.walk, walk.clone())));
-    let begun = selector.begin_walks();
+    let begun = selector.start_walks();
     keep(&begun);
     let commit = next_candidate(&mut selector, 5, 1, NEW);
     assert_eq!(kinds(&commit), ["accepted", "ended", "ended", "begun"]);
     keep(&commit);
     let walks = walks.values().cloned().collect();
-    let stored = Snapshot { walks, values: begun.values, ..Snapshot::default() };
-    // With the same budget nothing goes on but the control walk.
+    let stored = SelectorSnapshot { walks, values: begun.values, ..SelectorSnapshot::default() };
+    // With the same limit only the control walk continues.
     let mut same = common::restore(&limited, 2, stored.clone());
-    assert!(same.begin_walks().decisions.is_empty());
-    assert_eq!(turn(&mut same).walk, wire::WalkId(2));
-    // With a larger one both walks do, from where they stood, and only what is new gets another control.
-    let mut larger = common::restore(&Settings { total: Some(2), ..limited }, 2, stored);
-    assert_eq!(kinds(&larger.begin_walks()), ["configuration", "resumed", "resumed"]);
-    let assignment = turn(&mut larger);
-    assert_eq!((assignment.turn, assignment.verdict.clone()), (1, Some(Verdict::Accepted)));
+    assert!(same.start_walks().decisions.is_empty());
+    assert_eq!(next_assignment(&mut same).walk, wire::WalkId(2));
+    // With a larger limit both walks continue from where they ended, and only new structures get another control walk.
+    let mut larger = common::restore(&Settings { max_structures: Some(2), ..limited }, 2, stored);
+    assert_eq!(kinds(&larger.start_walks()), ["configuration", "resumed", "resumed"]);
+    let assignment = next_assignment(&mut larger);
+    assert_eq!((assignment.number, assignment.verdict.clone()), (1, Some(Verdict::Accepted)));
     let report = offer(&larger, &assignment, 9, structure(2, SHORTEST), NEW);
     let commit = decided(&mut larger, report);
     assert_eq!(kinds(&commit), ["accepted", "ended", "ended", "begun"]);
@@ -220,16 +225,19 @@ fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
 }
 
 #[test]
-fn the_first_reason_is_given() {
-    let limited = Settings { per_seed: 1, total: Some(1), ..live() };
-    let known =
-        vec![wire::ContentHash::of(&structure(1, 1.0)), wire::ContentHash::of(&structure(2, SHORTEST))];
-    let mut selector = common::restore(&limited, 4, Snapshot { known, ..Snapshot::default() });
-    selector.begin_walks();
-    let [first, assignments @ ..] = [(); 4].map(|()| turn(&mut selector));
+fn the_first_reason_applies() {
+    let limited = Settings { max_per_seed_structure: 1, max_structures: Some(1), ..live() };
+    let known = vec![
+        wire::ContentHash::from_structure(&structure(1, 1.0)),
+        wire::ContentHash::from_structure(&structure(2, SHORTEST)),
+    ];
+    let mut selector =
+        common::restore(&limited, 4, SelectorSnapshot { known, ..SelectorSnapshot::default() });
+    selector.start_walks();
+    let [first, assignments @ ..] = [(); 4].map(|()| next_assignment(&mut selector));
     let report = offer(&selector, &first, 1, structure(9, SHORTEST), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["accepted", "ended"]);
-    // Close and known; known and covered; covered and beyond the budget.
+    // Close and known; known and covered; covered and beyond the limit.
     let offers =
         [(structure(1, 1.0), KNOWN), (structure(2, SHORTEST), KNOWN), (structure(3, SHORTEST), KNOWN)];
     let reasons = assignments.iter().zip(offers).flat_map(|(assignment, (structure, z))| {
@@ -241,39 +249,42 @@ fn the_first_reason_is_given() {
 }
 
 #[test]
-fn the_verdict_goes_with_the_next_turn() {
+fn the_verdict_is_part_of_the_next_assignment() {
     let mut selector = begin(&live(), 1);
-    assert_eq!(turn(&mut selector).verdict, None);
-    selector.lost(wire::WalkId(0));
+    assert_eq!(next_assignment(&mut selector).verdict, None);
+    selector.assignment_lost(wire::WalkId(0));
     next_candidate(&mut selector, 4, 1, NEW);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     assert_eq!(
-        (assignment.verdict.clone(), assignment.turn, assignment.until),
+        (assignment.verdict.clone(), assignment.number, assignment.last_step),
         (Some(Verdict::Accepted), 1, 14)
     );
     assert_eq!(assignment.checkpoint.as_deref(), Some(b"step 4".as_slice()));
     let report = offer(&selector, &assignment, 9, structure(2, SHORTEST), NEW);
     decided(&mut selector, report);
-    let assignment = turn(&mut selector);
-    assert_eq!(assignment.verdict, Some(Verdict::Declined(Decline::Covered)));
-    // Interrupted: the walk has taken the verdict in, and it is not given twice.
-    let paused = common::report(&assignment, wire::messages::Outcome::Paused, common::at(11));
+    let assignment = next_assignment(&mut selector);
+    assert_eq!(assignment.verdict, Some(Verdict::Declined(DeclineReason::Covered)));
+    // Interrupted: the checkpoint already accounts for the verdict, which is not sent again.
+    let paused = common::report(&assignment, wire::messages::Outcome::Interrupted, common::at(11));
     let commit = decided(&mut selector, paused);
     assert!(commit.decisions.is_empty() && commit.values.is_empty());
-    let again = turn(&mut selector);
-    assert_eq!((again.verdict, again.turn, again.until), (None, assignment.turn, assignment.until));
+    let again = next_assignment(&mut selector);
+    assert_eq!(
+        (again.verdict, again.number, again.last_step),
+        (None, assignment.number, assignment.last_step)
+    );
     assert_eq!(again.checkpoint.as_deref(), Some(b"step 11".as_slice()));
 }
 
 #[test]
-fn features_of_declined_candidates_have_a_budget() {
+fn features_of_declined_candidates_are_limited() {
     let size = size_of_val(features(NEW).as_slice()) as u64;
     let limited = Settings { declined_feature_bytes: 2 * size + 1, ..live() };
     let mut store = common::memory::MemoryStore::default();
-    let mut selector = common::restore(&limited, 1, Snapshot::default());
-    store.commit(&selector.begin_walks());
+    let mut selector = common::restore(&limited, 1, SelectorSnapshot::default());
+    store.commit(&selector.start_walks());
     for (number, keep, bytes) in [(1, true, size), (2, true, 2 * size), (3, false, 2 * size)] {
-        // What is used up is known after a restart, too.
+        // The limit is still reached after a restart.
         selector = common::restore(&limited, 1, store.snapshot());
         let commit = next_candidate(&mut selector, number, number, KNOWN);
         assert_eq!(kinds(&commit), ["declined covered"]);
@@ -286,7 +297,7 @@ fn features_of_declined_candidates_have_a_budget() {
 }
 
 #[test]
-fn the_mixture_is_carried_from_one_seed_structure_to_the_next() {
+fn updates_accumulate_over_seed_structures() {
     let mut selector = begin(&settings(Mode::Reproducible), 2);
     end_first_walk_after_a_collection(&mut selector);
     assert_eq!(selector.mixture().version(), 1);
@@ -294,25 +305,25 @@ fn the_mixture_is_carried_from_one_seed_structure_to_the_next() {
 }
 
 #[test]
-fn the_mixture_is_restarted_for_the_next_seed_structure() {
+fn each_seed_structure_starts_from_the_original_mixture() {
     let restarted =
         Settings { update: UpdateProtocol::Restarted, walks_per_round: 1, ..settings(Mode::Reproducible) };
     let training = TrainingFrames::new(vec![0], vec![0.0, 0.0, 0.9], &mixture()).unwrap();
-    let mut selector = try_restore(&restarted, 2, Some(training), Snapshot::default()).unwrap();
-    selector.begin_walks();
+    let mut selector = try_restore(&restarted, 2, Some(training), SelectorSnapshot::default()).unwrap();
+    selector.start_walks();
     let commit = end_first_walk_after_a_collection(&mut selector);
     assert!(commit.restart_mixture && commit.components.is_empty());
-    // The versions go on: no two mixtures share a number.
+    // Versions continue: no two mixtures share a number.
     assert_eq!((value(&commit, "mixture_version"), selector.mixture().version()), ("2", 2));
     assert_eq!(selector.mixture().at_version(0), *mixture());
     let watched: serde_json::Value = serde_json::from_str(value(&commit, "training_frames")).unwrap();
     assert!((watched["maximum"].as_f64().unwrap() - 0.9).abs() < 1e-5, "{watched}");
 }
 
-/// A candidate is accepted from the first walk, which then ends. Returns the last commit.
+/// Accepts a candidate of the first walk, which then ends. Returns the last commit.
 fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     let mut reports = Vec::new();
-    while let orchestrator::selector::Next::Turn(assignment) = selector.next_turn() {
+    while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment() {
         let number = u64::from(assignment.walk.0);
         let z = if number == 0 { NEW } else { KNOWN };
         reports.push(offer(selector, &assignment, 5, structure(number, SHORTEST), z));
@@ -320,11 +331,11 @@ fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     let last = reports.into_iter().filter_map(|report| selector.report(report).unwrap()).last().unwrap();
     assert_eq!(kinds(&last)[0], "accepted");
     let mut reports = Vec::new();
-    while let orchestrator::selector::Next::Turn(assignment) = selector.next_turn() {
-        let turn = wire::messages::Outcome::Turn;
+    while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment() {
+        let done = wire::messages::Outcome::StepsDone;
         reports.push(match assignment.walk.0 {
-            0 => ended(&assignment, 10, End::Steps),
-            _ => common::report(&assignment, turn, common::at(10)),
+            0 => ended(&assignment, 10, WalkEnd::Steps),
+            _ => common::report(&assignment, done, common::at(10)),
         });
     }
     let last = reports.into_iter().filter_map(|report| selector.report(report).unwrap()).last().unwrap();
@@ -334,15 +345,15 @@ fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
 
 #[test]
 fn forgetting_is_recorded_and_raises_an_alarm() {
-    // Training frames along one direction; the candidates teach another.
+    // Training frames along one direction; the candidates are along another.
     let features: Vec<f64> = (0..20).flat_map(|k| [0.0, 0.0, 0.045 * f64::from(k) + 0.09]).collect();
     let training = TrainingFrames::new(vec![0; 20], features, &mixture()).unwrap();
     let share = training.original.share_above_one;
     assert_eq!(share, 0.0);
-    let mut patient = Settings { per_seed: 50, ..live() };
+    let mut patient = Settings { max_per_seed_structure: 50, ..live() };
     patient.search.stop = calm::UpdateRule::MaximumGrade { target: positive(2.9) };
-    let mut selector = try_restore(&patient, 1, Some(training), Snapshot::default()).unwrap();
-    selector.begin_walks();
+    let mut selector = try_restore(&patient, 1, Some(training), SelectorSnapshot::default()).unwrap();
+    selector.start_walks();
     let mut alarms = Vec::new();
     for number in 1..=8 {
         let z = [0.0, 1.5 * 2_f64.powi(number as i32), 0.0];
@@ -360,11 +371,11 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
     assert!(!alarms[0] && alarms[7], "{alarms:?}");
 }
 
-/// What is new, but not so new as it has to be while many structures wait for labels, is told apart.
+/// Candidates that are new, but below the threshold raised by a long queue, have their own reason to decline.
 #[test]
-fn a_raised_threshold_declines_what_lies_below_it() {
+fn candidates_below_a_raised_threshold_are_declined() {
     let mut selector = begin(&live(), 1);
-    selector.raise_above(100);
+    selector.raise_threshold_above(100);
     selector.set_unfinished_jobs(150);
     let commit = next_candidate(&mut selector, 5, 1, [0.0, 1.8, 0.0]);
     assert_eq!(kinds(&commit), ["declined backlog"]);
@@ -373,13 +384,13 @@ fn a_raised_threshold_declines_what_lies_below_it() {
     assert_eq!(kinds(&next_candidate(&mut selector, 6, 2, KNOWN)), ["declined covered"]);
     assert_eq!(kinds(&next_candidate(&mut selector, 7, 3, NEW)), ["accepted"]);
     selector.set_unfinished_jobs(100);
-    assert_eq!(turn(&mut selector).raised, 1.0);
-    assert_eq!((selector.most_unfinished(100), begin(&live(), 1).most_unfinished(100)), (200, 100));
+    assert_eq!(next_assignment(&mut selector).threshold_factor, 1.0);
+    assert_eq!((selector.max_unfinished_jobs(100), begin(&live(), 1).max_unfinished_jobs(100)), (200, 100));
 }
 
-/// The update's rule reaches the search, not only the collection's.
+/// The rule of updates is used in the search, not only the collection rule.
 #[test]
-fn the_update_target_is_the_one_of_the_settings() {
+fn the_update_target_comes_from_the_settings() {
     let mut strict = live();
     strict.search.stop = calm::UpdateRule::MaximumGrade { target: positive(0.8) };
     let mut selector = begin(&strict, 1);

@@ -2,8 +2,8 @@
 
 mod common;
 
+mod commit_batch;
 mod decisions;
-mod group;
 mod reactor;
 mod replay;
 mod reproducible;

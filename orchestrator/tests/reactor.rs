@@ -1,4 +1,4 @@
-//! The reactor with a real database and walkers on threads of their own: nothing is lost, and nothing hangs.
+//! The reactor with a real database and walkers on threads: nothing is lost, and nothing hangs.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -6,12 +6,12 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use orchestrator::reactor::{Ended, Notice, Reactor};
-use orchestrator::selector::{Mode, Settings, Snapshot};
+use orchestrator::reactor::{Notice, Reactor, RunOutcome};
+use orchestrator::selector::{Mode, SelectorSnapshot, Settings};
 use store::{Campaign, JobState, Protocol, SeedStructure, Store};
 use tokio::sync::mpsc;
 use wire::messages::{Progress, Report};
-use wire::transport::{InProcess, Incoming, Transport, Work};
+use wire::transport::{InProcess, Incoming, Transport, WorkItem};
 use wire::{ContentHash, WalkId};
 
 use crate::common::scripted::{Event, Script, advance};
@@ -19,7 +19,7 @@ use crate::common::{CAMPAIGN, restore, seed, settings};
 
 const PROTOCOL: ContentHash = ContentHash([7; 32]);
 
-/// Walks of 60 steps, each with something new every 7 and a return to a checkpoint.
+/// Walks of 60 steps, each with a new structure every 7 steps and a rollback.
 fn scripts() -> Vec<Script> {
     let event = |walk: u64, step: u64| match step {
         31 => Event::Return,
@@ -34,24 +34,24 @@ fn scripts() -> Vec<Script> {
 }
 
 #[tokio::test]
-async fn a_stop_before_anybody_asks_is_the_end() {
+async fn a_stop_before_the_first_message_ends_the_reactor() {
     let directory = tempfile::tempdir().unwrap();
     let store = open(directory.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
-    // Those who carry messages of other hosts hold the way to it until it has ended.
+    // Transports from other hosts keep the channel open until the reactor has ended.
     let (reactor, _to_reactor) = reactor(&store, &stopping).await;
     let running = tokio::spawn(reactor.run(|_| {}));
     tokio::time::sleep(Duration::from_millis(50)).await;
     stopping.store(true, Ordering::Relaxed);
     let ended = tokio::time::timeout(Duration::from_secs(60), running).await.expect("it ends");
-    assert_eq!(ended.unwrap().unwrap(), Ended::Stopped);
+    assert_eq!(ended.unwrap().unwrap(), RunOutcome::Stopped);
 }
 
 fn rounds() -> Settings {
-    Settings { per_seed: 9, control: true, ..settings(Mode::Reproducible) }
+    Settings { max_per_seed_structure: 9, control: true, ..settings(Mode::Reproducible) }
 }
 
-/// The campaign's database, made if there is none.
+/// Opens or creates the campaign's database.
 async fn open(directory: &Path) -> Store {
     if directory.join(store::DATABASE).exists() {
         return Store::open(directory).await.unwrap();
@@ -78,9 +78,9 @@ async fn open(directory: &Path) -> Store {
     store
 }
 
-/// A reactor that goes on with what the database holds, and the way to it.
+/// A reactor that continues from the database, and the channel to it.
 async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::Sender<Incoming>) {
-    let snapshot = Snapshot {
+    let snapshot = SelectorSnapshot {
         imported: 0,
         walks: store.load_walks().await.unwrap(),
         components: store.load_components().await.unwrap(),
@@ -88,7 +88,7 @@ async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::S
         values: store.values().await.unwrap(),
     };
     let mut selector = restore(&rounds(), 3, snapshot);
-    let begun = selector.begin_walks();
+    let begun = selector.start_walks();
     if !begun.walks.is_empty() {
         store.commit(&begun).await.unwrap();
     }
@@ -97,8 +97,8 @@ async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::S
     (Reactor { selector, store, incoming, stopping, queue_limit }, to_reactor)
 }
 
-/// The turn as a scripted walker does it: interrupted after a few steps if it was asked to stop.
-fn work_on(work: &Work, transport: &InProcess) -> Report {
+/// Works on an assignment like a scripted walker: interrupted after a few steps if asked to stop.
+fn work_on(work: &WorkItem, transport: &InProcess) -> Report {
     let assignment = &work.assignment;
     let seed = (0..3).find(|number| seed(*number).structure == assignment.seed_structure).unwrap();
     let pause = transport.stopping().then_some(2);
@@ -107,7 +107,7 @@ fn work_on(work: &Work, transport: &InProcess) -> Report {
     report
 }
 
-/// Walkers on threads; dropping the sender afterwards is what ends the reactor.
+/// Walkers on threads; dropping the sender afterwards ends the reactor.
 fn start_walkers(
     number: u32,
     to_reactor: mpsc::Sender<Incoming>,
@@ -125,14 +125,14 @@ fn start_walkers(
     (0..number).map(start).collect()
 }
 
-/// How a reactor ends; its walkers are freed also if it hangs.
-async fn end_of(reactor: Reactor, watch: impl FnMut(Notice<'_>)) -> Ended {
+/// How a reactor ends; its walkers are released even if it hangs.
+async fn end_of(reactor: Reactor, watch: impl FnMut(Notice<'_>)) -> RunOutcome {
     let ended = tokio::time::timeout(Duration::from_secs(120), reactor.run(watch)).await;
     ended.expect("the reactor hangs").unwrap()
 }
 
-/// Runs until it is over, or until `stop_after` commits.
-async fn run(store: &Store, walkers: u32, stop_after: usize) -> Ended {
+/// Runs until it ends, or until `stop_after` commits.
+async fn run(store: &Store, walkers: u32, stop_after: usize) -> RunOutcome {
     let stopping = Arc::new(AtomicBool::new(false));
     let (reactor, to_reactor) = reactor(store, &stopping).await;
     let threads = start_walkers(walkers, to_reactor, &stopping);
@@ -148,7 +148,7 @@ async fn run(store: &Store, walkers: u32, stop_after: usize) -> Ended {
     ended
 }
 
-/// All of a database that two runs of one campaign must share.
+/// Everything in a database that must be equal in two runs of a campaign.
 async fn content(store: &Store) -> (String, String) {
     let mut candidates = String::new();
     for (_, id) in store.candidate_ids(0, 1000).await.unwrap() {
@@ -166,7 +166,7 @@ async fn content(store: &Store) -> (String, String) {
 async fn nothing_is_lost_when_a_campaign_is_stopped_again_and_again() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
     let whole = open(folders[0].path()).await;
-    assert_eq!(run(&whole, 1, usize::MAX).await, Ended::Done);
+    assert_eq!(run(&whole, 1, usize::MAX).await, RunOutcome::Finished);
     let (log, rest) = content(&whole).await;
     let log_has = |kind: &str| log.contains(kind);
     assert!(["accepted", "declined", "control", "segment", "ended"].into_iter().all(log_has), "{log}");
@@ -174,7 +174,7 @@ async fn nothing_is_lost_when_a_campaign_is_stopped_again_and_again() {
     let mut times = 0;
     let stopped = loop {
         let store = open(folders[1].path()).await;
-        if run(&store, 3, 1 + times % 3).await == Ended::Done {
+        if run(&store, 3, 1 + times % 3).await == RunOutcome::Finished {
             break store;
         }
         store.close().await;
@@ -185,7 +185,7 @@ async fn nothing_is_lost_when_a_campaign_is_stopped_again_and_again() {
     let (log_of_stopped, rest_of_stopped) = content(&stopped).await;
     assert_eq!(log_of_stopped, log);
     assert_eq!(rest_of_stopped, rest);
-    assert_eq!(run(&stopped, 2, usize::MAX).await, Ended::Done, "a campaign that is over stays so");
+    assert_eq!(run(&stopped, 2, usize::MAX).await, RunOutcome::Finished, "a campaign that is over stays so");
     assert_eq!(content(&stopped).await.0, log);
 }
 
@@ -212,7 +212,7 @@ async fn walkers_wait_while_the_label_queue_is_full() {
         if store.unfinished_jobs().await.unwrap() <= LIMIT {
             continue; // It was full before the jobs below were taken out.
         }
-        // While it is full, only the round in hand may still come in.
+        // While the queue is full, only the current round may still be committed.
         let before = commits.load(Ordering::Relaxed);
         tokio::time::sleep(Duration::from_millis(450)).await;
         assert!(commits.load(Ordering::Relaxed) <= before + 1);
@@ -222,19 +222,19 @@ async fn walkers_wait_while_the_label_queue_is_full() {
         times += 1;
     }
     assert!(times > 2);
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
-/// With a raised threshold the queue may grow to twice the limit, and no further.
+/// With a raised threshold, the queue may grow to twice the limit, but no further.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long() {
+async fn walkers_continue_with_a_raised_threshold_up_to_twice_the_limit() {
     const LIMIT: u64 = 2;
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
     let (mut reactor, to_reactor) = reactor(&store, &stopping).await;
-    reactor.selector.raise_above(LIMIT);
+    reactor.selector.raise_threshold_above(LIMIT);
     let reactor = Reactor { queue_limit: LIMIT, ..reactor };
     let (full, mut seen_full) = mpsc::unbounded_channel();
     let running = tokio::spawn(end_of(reactor, move |notice| {
@@ -242,13 +242,13 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
             full.send(unfinished).unwrap();
         }
     }));
-    // Walkers by hand: what each turn says of the threshold is seen.
+    // Simulated walkers record the threshold factor of each assignment.
     let raised = Arc::new(std::sync::Mutex::new(Vec::new()));
     let (seen, mut transport) = (Arc::clone(&raised), InProcess::new(0, to_reactor, Arc::clone(&stopping)));
     let walker = thread::spawn(move || {
         let mut report = None;
         while let Some(work) = transport.exchange(report.take()) {
-            seen.lock().unwrap().push(work.assignment.raised);
+            seen.lock().unwrap().push(work.assignment.threshold_factor);
             report = Some(work_on(&work, &transport).map_candidate(|block| block.view().to_candidate()));
         }
     });
@@ -260,7 +260,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
         }
         times += 1;
     }
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     walker.join().unwrap();
     let raised = raised.lock().unwrap().clone();
     assert!(times > 0 && raised.contains(&1.0), "{raised:?}");
@@ -274,9 +274,9 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
     assert!(!factors.is_empty() && factors.iter().all(|factor| (1.0..=2.0).contains(factor)), "{factors:?}");
 }
 
-/// A campaign whose only walker waits can be stopped, also while somebody reports progress without a pause.
+/// A campaign whose only walker waits can be stopped, even while progress is reported continuously.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
+async fn waiting_walkers_are_shut_down_when_the_campaign_stops() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
@@ -295,42 +295,41 @@ async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
             stopping.store(true, Ordering::Relaxed);
         }
     };
-    assert_eq!(end_of(reactor, watch).await, Ended::Stopped);
+    assert_eq!(end_of(reactor, watch).await, RunOutcome::Stopped);
     talking.join().unwrap();
 }
 
-/// A walker that dies with a turn in hand leaves it to the others.
+/// The assignment of a lost walker goes to another one.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_turn_of_a_walker_that_dies_is_done_by_another() {
+async fn assignments_of_dead_walkers_are_completed_by_others() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
     let (reactor, to_reactor) = reactor(&store, &stopping).await;
     let mut mortal = InProcess::new(9, to_reactor.clone(), Arc::clone(&stopping));
     let dying = thread::spawn(move || {
-        let work = mortal.exchange(None).expect("the first to ask gets a turn");
+        let work = mortal.exchange(None).expect("the first idle walker gets an assignment");
         drop(work);
     });
     let running = tokio::spawn(end_of(reactor, |_| ()));
     tokio::task::spawn_blocking(|| dying.join().unwrap()).await.unwrap();
     let threads = start_walkers(2, to_reactor, &stopping);
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
 #[tokio::test]
-async fn a_campaign_whose_walkers_are_all_gone_is_not_done() {
+async fn a_campaign_without_walkers_is_not_finished() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
     let (reactor, to_reactor) = reactor(&store, &Arc::default()).await;
     drop(to_reactor);
-    assert_eq!(end_of(reactor, |_| ()).await, Ended::Stopped);
+    assert_eq!(end_of(reactor, |_| ()).await, RunOutcome::Stopped);
 }
 
-/// Walkers that end with the first walk's first turn in hand: by their own fault again and again, or because others kill
-/// them.
+/// Walkers that exit during the first assignment of the first walk: by repeated crashes, or because they are killed.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_turn_that_kills_its_walkers_ends_its_walk() {
+async fn assignments_that_crash_walkers_end_their_walk() {
     for (fault, walkers) in [(true, 3), (false, 5)] {
         let directory = tempfile::tempdir().unwrap();
         let store = open(directory.path()).await;
@@ -339,12 +338,12 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
         let running = tokio::spawn(end_of(reactor, |_| {}));
         for walker in 0..walkers {
             let (reply, answer) = tokio::sync::oneshot::channel();
-            to_reactor.send(Incoming::Free { walker, report: None, reply }).await.unwrap();
-            assert_eq!(answer.await.unwrap().expect("a turn").assignment.walk, WalkId(0));
-            to_reactor.send(Incoming::Gone { walker, fault }).await.unwrap();
+            to_reactor.send(Incoming::Idle { walker, report: None, reply }).await.unwrap();
+            assert_eq!(answer.await.unwrap().expect("an assignment").assignment.walk, WalkId(0));
+            to_reactor.send(Incoming::Lost { walker, crashed: fault }).await.unwrap();
         }
         let threads = start_walkers(1, to_reactor, &stopping);
-        assert_eq!(running.await.unwrap(), Ended::Done);
+        assert_eq!(running.await.unwrap(), RunOutcome::Finished);
         threads.into_iter().for_each(|thread| thread.join().unwrap());
         let walk = store.load_walks().await.unwrap().remove(0);
         let expected = "3 walkers crashed in this turn";
@@ -354,12 +353,12 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
     }
 }
 
-/// A paused walk gets no turn, its round waits for it, and what is decided is the same as without a pause.
+/// A paused walk gets no assignment, its round waits for it, and the decisions are the same as without a pause.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_paused_walk_stands_still_and_changes_nothing() {
+async fn pausing_a_walk_does_not_change_decisions() {
     let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
     let whole = open(folders[0].path()).await;
-    assert_eq!(run(&whole, 2, usize::MAX).await, Ended::Done);
+    assert_eq!(run(&whole, 2, usize::MAX).await, RunOutcome::Finished);
 
     let store = open(folders[1].path()).await;
     let stopping = Arc::new(AtomicBool::new(false));
@@ -374,7 +373,7 @@ async fn a_paused_walk_stands_still_and_changes_nothing() {
     tokio::time::sleep(Duration::from_millis(700)).await;
     assert_eq!((turns().await, running.is_finished()), (vec![0; 3], false), "the first round waits");
     store.pause_walks(&[WalkId(1)], false, 0).await.unwrap();
-    assert_eq!(running.await.unwrap(), Ended::Done);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     threads.into_iter().for_each(|thread| thread.join().unwrap());
     assert_eq!(content(&store).await, content(&whole).await);
 }

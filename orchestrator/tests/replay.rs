@@ -1,9 +1,9 @@
-//! What a campaign decided is decided again from its log, exactly; and other rules decide otherwise.
+//! Replaying a campaign's log gives exactly the same decisions with the same rules, and different ones with others.
 
 use std::collections::{BTreeMap, HashSet};
 
 use calm::CollectionRule;
-use orchestrator::selector::{Mode, Replay, Replayed, Settings, UpdateProtocol};
+use orchestrator::selector::{Mode, Replay, ReplayedDecision, Settings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
@@ -14,7 +14,7 @@ use crate::common::eventful::{Campaign, acts, any_settings, scripts};
 use crate::common::scripted::Script;
 use crate::common::{SHORTEST, grader, kinds, mixture, positive, seed, structure};
 
-/// The decisions of a campaign as a store gives them back, each with its candidate.
+/// The decisions of a campaign as restored from a store, each with its candidate.
 fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a CandidateRecord>)> {
     let candidates = campaign.commits.iter().flat_map(|commit| &commit.candidates);
     let candidates: BTreeMap<_, _> = candidates.map(|c| (c.block.view().id().to_string(), c)).collect();
@@ -42,26 +42,29 @@ fn open(campaign: &Campaign<'_>, settings: &Settings, seeds: usize, set: &[&str]
     Replay::new(settings.clone(), set, seeds, grader(), mixture(), None, imported).unwrap()
 }
 
-/// What comes of each place of the log.
-fn follow(replay: &mut Replay, log: &[(LoggedDecision, Option<&CandidateRecord>)]) -> Vec<Option<Replayed>> {
+/// Replays each decision of the log.
+fn follow(
+    replay: &mut Replay,
+    log: &[(LoggedDecision, Option<&CandidateRecord>)],
+) -> Vec<Option<ReplayedDecision>> {
     let next = |(decision, candidate): &(LoggedDecision, Option<&CandidateRecord>)| {
         let examine = |record: &&CandidateRecord| {
-            replay.examiner().examine_block(record.block.clone(), replay.mixture()).unwrap()
+            replay.regrader().regrade_block(record.block.clone(), replay.mixture()).unwrap()
         };
         let examined = candidate.as_ref().map(examine);
-        replay.follow(decision, examined).unwrap()
+        replay.apply(decision, examined).unwrap()
     };
     log.iter().map(next).collect()
 }
 
-/// Replays a campaign by its own rules and checks that everything is as it was.
+/// Replays a campaign with its own rules and checks that all decisions are equal.
 fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
     let log = log(campaign);
     let mut replay = open(campaign, settings, seeds, &[]);
     let replayed = follow(&mut replay, &log);
     for ((recorded, candidate), now) in log.iter().zip(replayed) {
         let now = now.unwrap_or_else(|| panic!("nothing comes of {recorded:?}"));
-        let Replayed { decision, candidate: graded } = now;
+        let ReplayedDecision { decision, candidate: graded } = now;
         let found =
             (decision.kind, decision.walk.map(|walk| walk.0), decision.mixture_version, decision.round);
         assert_eq!(found, (recorded.kind.as_str(), recorded.walk, recorded.mixture_version, recorded.round));
@@ -76,7 +79,7 @@ fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
         .collect();
     let version = campaign.selector.mixture().version();
     assert_eq!(
-        (replay.mixture().version(), replay.other_component(version, &components).unwrap()),
+        (replay.mixture().version(), replay.first_different_component(version, &components).unwrap()),
         (version, None)
     );
     assert_eq!(replay.cut_short(), 0);
@@ -86,7 +89,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
     #[test]
-    fn every_decision_comes_out_as_it_was(
+    fn every_decision_is_reproduced(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
     ) {
         let mode = if live { Mode::Live } else { Mode::Reproducible };
@@ -96,9 +99,9 @@ proptest! {
         check_exact(&campaign.finish(false), &settings, scripts.len());
     }
 
-    /// The rules are changed twice, and structures that walks will meet are imported.
+    /// The rules change twice, and structures that walks will meet are imported.
     #[test]
-    fn also_where_rules_changed_and_structures_were_imported(
+    fn replays_include_changed_rules_and_imports(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize,
         parts in prop::array::uniform3(acts()), limits in prop::array::uniform2((1..6_u32, prop::option::of(1..12_u32))),
         imports in prop::collection::vec(0..12_u64, 0..6),
@@ -106,11 +109,11 @@ proptest! {
         let mode = if live { Mode::Live } else { Mode::Reproducible };
         let settings = Settings { mode, ..settings };
         let [second, third] =
-            limits.map(|(per_seed, total)| Settings { per_seed, total, ..settings.clone() });
+            limits.map(|(max_per_seed_structure, total)| Settings { max_per_seed_structure, max_structures: total, ..settings.clone() });
         let [first, middle, last] = parts;
         let mut campaign = Campaign::begin(&settings, &scripts, walkers);
         first.into_iter().for_each(|act| campaign.act(act));
-        let hash = |number| ContentHash::of(&structure(number, SHORTEST));
+        let hash = |number| ContentHash::from_structure(&structure(number, SHORTEST));
         campaign.store.imported = imports.into_iter().map(hash).collect();
         campaign.go_on(&second);
         middle.into_iter().for_each(|act| campaign.act(act));
@@ -119,12 +122,12 @@ proptest! {
         check_exact(&campaign.finish(false), &settings, scripts.len());
     }
 
-    /// Where nothing is learned, a threshold alone decides what is new among what was offered.
+    /// If the mixture is never updated, the threshold alone decides which of the offered structures are new.
     #[test]
-    fn a_stricter_rule_accepts_what_lies_above_it(
+    fn a_stricter_rule_accepts_structures_above_its_threshold(
         settings in any_settings(), scripts in scripts(), threshold in 1.5..9.0,
     ) {
-        let settings = Settings { update: UpdateProtocol::Never, per_seed: 100, total: None, ..settings };
+        let settings = Settings { update: UpdateProtocol::Never, max_per_seed_structure: 100, max_structures: None, ..settings };
         let campaign = Campaign::begin(&settings, &scripts, 1).finish(false);
         let log = log(&campaign);
         let collection = CollectionRule::MaximumGrade { threshold: positive(threshold) };
@@ -136,7 +139,8 @@ proptest! {
             let was_accepted = candidate.fate == Fate::Accepted;
             let now = now.unwrap().candidate.unwrap();
             prop_assert_eq!(&now.selector, &candidate.selector);
-            // What is not in the data set any more can be no duplicate: so some that were declined are taken now.
+            // A structure that is no longer in the data set cannot have duplicates, so some declined ones are now
+            // accepted.
             if was_accepted {
                 prop_assert_eq!(now.fate == Fate::Accepted, above);
             } else if now.fate == Fate::Accepted {
@@ -146,22 +150,27 @@ proptest! {
     }
 }
 
-/// The campaigns above are worth the name: rules change in the middle of them, and imports are met.
+/// The campaigns above cover what they should: rules change in the middle of them, and imports are met.
 #[test]
-fn the_campaigns_reach_what_they_are_for() {
+fn the_campaigns_cover_the_intended_cases() {
     let mut runner = TestRunner::deterministic();
     let mut seen = HashSet::new();
     for _ in 0..60 {
         let settings = any_settings().new_tree(&mut runner).unwrap().current();
         let settings = Settings { mode: Mode::Live, update: UpdateProtocol::Carried, ..settings };
         let scripts: Vec<Script> = scripts().new_tree(&mut runner).unwrap().current();
-        let more = Settings { per_seed: settings.per_seed + 3, total: None, ..settings.clone() };
+        let more = Settings {
+            max_per_seed_structure: settings.max_per_seed_structure + 3,
+            max_structures: None,
+            ..settings.clone()
+        };
         let mut campaign = Campaign::begin(&settings, &scripts, 2);
         for act in acts().new_tree(&mut runner).unwrap().current() {
             campaign.act(act);
         }
         let mut campaign = campaign.finish(false);
-        campaign.store.imported = (0..12).map(|n| ContentHash::of(&structure(n, SHORTEST))).collect();
+        campaign.store.imported =
+            (0..12).map(|n| ContentHash::from_structure(&structure(n, SHORTEST))).collect();
         campaign.go_on(&more);
         let campaign = campaign.finish(false);
         check_exact(&campaign, &settings, scripts.len());

@@ -22,7 +22,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
 
     #[test]
-    fn incidents_change_nothing(
+    fn incidents_do_not_change_results(
         settings in any_settings(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
     ) {
         let mut eventful = Campaign::begin(&settings, &scripts, walkers);
@@ -41,7 +41,7 @@ proptest! {
         prop_assert_eq!(crashing.content(), calm_run(&settings, &scripts).content());
     }
 
-    /// Live mode depends on the order of reports, but not on crashes when nothing is under way.
+    /// Live mode depends on the order of reports, but not on crashes while no walker is busy.
     #[test]
     fn a_live_campaign_survives_crashes(settings in any_settings(), scripts in scripts()) {
         let settings = Settings { mode: Mode::Live, ..settings };
@@ -49,7 +49,7 @@ proptest! {
         prop_assert_eq!(crashing.content(), calm_run(&settings, &scripts).content());
     }
 
-    /// What must hold of any campaign, however eventful.
+    /// Properties that hold for every campaign, whatever the events.
     #[test]
     fn budgets_versions_and_rounds_hold(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
@@ -65,10 +65,10 @@ proptest! {
         let biased = campaign.store.walks.values().filter(|walk| walk.origin == Origin::Biased);
         let accepted: Vec<u32> = biased.map(|walk| walk.accepted).collect();
         prop_assert_eq!(accepted.len(), scripts.len());
-        prop_assert!(accepted.iter().all(|accepted| *accepted <= settings.per_seed));
+        prop_assert!(accepted.iter().all(|accepted| *accepted <= settings.max_per_seed_structure));
         prop_assert_eq!(accepted.iter().sum::<u32>() as usize, count("accepted"));
         prop_assert_eq!(campaign.store.known.len(), count("accepted"));
-        prop_assert!(settings.total.is_none_or(|total| count("accepted") <= total as usize));
+        prop_assert!(settings.max_structures.is_none_or(|total| count("accepted") <= total as usize));
         prop_assert_eq!(campaign.store.walks.len(), count("begun"));
         prop_assert_eq!(campaign.store.walks.len(), count("ended"));
         let versions = campaign.store.decisions.iter().map(|decision| (decision.round, decision.mixture_version));
@@ -82,7 +82,7 @@ proptest! {
     }
 }
 
-/// The campaigns above are worth the name: every kind of decision and every reason occurs in them.
+/// The campaigns above cover what they should: every kind of decision and every reason occurs.
 #[test]
 fn the_scripts_reach_every_kind_of_decision() {
     let mut runner = TestRunner::deterministic();

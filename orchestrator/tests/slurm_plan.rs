@@ -1,9 +1,9 @@
-//! What is submitted and cancelled: by hand, then whoever launches how often while jobs begin, end and come back.
+//! Submitted and cancelled jobs: explicit cases, then arbitrary launches while jobs start, end and are requeued.
 
-use orchestrator::slurm::{Job, JobNames, JobPhase, Plan, Role, Submission, Wanted, plan};
+use orchestrator::slurm::{DesiredJobs, Job, JobNames, JobPhase, Plan, Role, Submission, plan};
 use proptest::prelude::*;
 
-const WANTED: Wanted = Wanted { agents: 2, walkers: 4, labellers: 1 };
+const WANTED: DesiredJobs = DesiredJobs { agents: 2, walkers: 4, labellers: 1 };
 
 fn job(id: u64, role: Role, state: &str) -> Job {
     let walkers = matches!(role, Role::Agent(_)).then_some(WANTED.walkers);
@@ -45,7 +45,7 @@ fn only_what_is_missing_is_submitted() {
 }
 
 #[test]
-fn in_the_place_of_one_that_ends_another_waits_for_its_end() {
+fn replacements_wait_for_completing_jobs() {
     let jobs = [
         job(1, Role::Orchestrator, "COMPLETING"),
         job(2, Role::Agent(0), "RUNNING"),
@@ -57,10 +57,10 @@ fn in_the_place_of_one_that_ends_another_waits_for_its_end() {
 }
 
 #[test]
-fn what_is_not_asked_for_any_more_is_cancelled() {
+fn undesired_jobs_are_cancelled() {
     let jobs = [
         job(7, Role::Orchestrator, "PENDING"),
-        // Two were submitted at once: the first stays; of a third the one that runs.
+        // Two orchestrators were submitted at once: the first stays. Of two jobs of agent 0, the running one stays.
         job(8, Role::Orchestrator, "PENDING"),
         job(2, Role::Agent(0), "PENDING"),
         job(3, Role::Agent(0), "RUNNING"),
@@ -81,21 +81,21 @@ fn agents_with_another_number_of_walkers_are_replaced() {
         job(4, Role::Labeller(0), "RUNNING"),
     ];
     jobs[1].walkers = Some(8);
-    // A site that keeps no comments.
+    // A site that does not keep comments.
     jobs[2].walkers = None;
     let expected = Plan { cancel: vec![2], submit: vec![submission(Role::Agent(0), &[2])] };
     assert_eq!(plan(&WANTED, &jobs), expected);
 }
 
 #[test]
-fn names_of_jobs_are_what_the_plan_speaks_of() {
+fn job_names_match_the_plan() {
     let names = JobNames::new("0123456789ab");
     for role in WANTED.roles() {
-        assert_eq!(names.role(&names.of(role)), Some(role));
+        assert_eq!(names.role(&names.job_name(role)), Some(role));
     }
 }
 
-/// A job in a batch system that knows `singleton` and `afterany`.
+/// A job in a batch system that supports `singleton` and `afterany`.
 #[derive(Clone, Debug)]
 struct Known {
     job: Job,
@@ -110,7 +110,7 @@ struct System {
 }
 
 impl System {
-    fn submit(&mut self, wanted: &Wanted, submission: Submission) {
+    fn submit(&mut self, wanted: &DesiredJobs, submission: Submission) {
         self.last += 1;
         let mut job = job(self.last, submission.role, "PENDING");
         job.walkers = job.walkers.map(|_| wanted.walkers);
@@ -143,7 +143,7 @@ impl System {
             && known.after.iter().all(|id| self.phase(*id) == JobPhase::Over)
     }
 
-    /// What the system does by itself to the job at a place.
+    /// A state change of a job by the system itself.
     fn moves(&mut self, place: usize, choice: u8) {
         let Some(known) = self.jobs.get(place % self.jobs.len().max(1)) else { return };
         let begins = self.may_begin(known);
@@ -164,7 +164,7 @@ impl System {
         self.jobs.iter().map(|known| known.job.clone()).collect()
     }
 
-    fn check(&self, most: &Wanted) {
+    fn check(&self, most: &DesiredJobs) {
         let running = |role: Role| {
             let running = self.jobs.iter().filter(move |known| known.job.phase() == JobPhase::Running);
             running.filter(move |known| known.job.role == role).count()
@@ -181,10 +181,10 @@ impl System {
     }
 }
 
-/// Somebody who launches: what is still to be done of a plan that was made some time ago.
+/// A launch in progress: the remaining actions of a plan made earlier.
 #[derive(Debug, Default)]
 struct Launcher {
-    wanted: Option<Wanted>,
+    wanted: Option<DesiredJobs>,
     plan: Plan,
 }
 
@@ -203,15 +203,15 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
 
     #[test]
-    fn never_two_orchestrators_nor_more_walkers_than_asked(
+    fn there_are_never_two_orchestrators_nor_too_many_agents(
         steps in proptest::collection::vec((0..8_u8, any::<u8>(), any::<u8>()), 0..200),
         asked in proptest::collection::vec((0..4_u32, 1..3_u32, 0..2_u32), 1..4),
     ) {
         let asked: Vec<_> = asked.into_iter()
-            .map(|(agents, walkers, labellers)| Wanted { agents, walkers, labellers })
+            .map(|(agents, walkers, labellers)| DesiredJobs { agents, walkers, labellers })
             .collect();
-        let most = |of: fn(&Wanted) -> u32| asked.iter().map(of).max().unwrap_or(0);
-        let most = Wanted { agents: most(|w| w.agents), walkers: most(|w| w.walkers), labellers: 0 };
+        let most = |of: fn(&DesiredJobs) -> u32| asked.iter().map(of).max().unwrap_or(0);
+        let most = DesiredJobs { agents: most(|w| w.agents), walkers: most(|w| w.walkers), labellers: 0 };
         let mut system = System::default();
         let mut launchers: [Launcher; 3] = Default::default();
         for (kind, which, choice) in steps {
@@ -226,7 +226,8 @@ proptest! {
             }
             system.check(&most);
         }
-        // Whatever there was, a launch that nobody disturbs leaves what it asks for, and another has nothing to do.
+        // From any state, a launch without concurrent changes leaves the desired jobs, and a second launch does
+        // nothing.
         let wanted = asked[0];
         for known in &mut system.jobs {
             if known.job.phase() == JobPhase::Completing {

@@ -1,216 +1,216 @@
-//! The supervisor: scenarios by hand, then whatever may happen in any order.
+//! The supervisor: explicit scenarios, then arbitrary events in any order.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use orchestrator::supervisor::{ChildStatus, Ended, Ending, Limits, Order, Standing, Supervisor};
+use orchestrator::supervisor::{Action, ChildExit, ChildState, ChildStatus, ExitReason, Limits, Supervisor};
 use proptest::prelude::*;
 
 const LIMITS: Limits = Limits {
-    silence: Duration::from_secs(120),
-    first_pause: Duration::from_secs(1),
-    longest_pause: Duration::from_secs(6),
-    restarts: 5,
-    grace: Duration::from_secs(30),
-    outlives: false,
+    heartbeat_timeout: Duration::from_secs(120),
+    initial_backoff: Duration::from_secs(1),
+    max_backoff: Duration::from_secs(6),
+    max_restarts: 5,
+    grace_period: Duration::from_secs(30),
+    detached: false,
 };
 
 fn s(seconds: u64) -> Duration {
     Duration::from_secs(seconds)
 }
 
-fn crash() -> Ending {
-    Ending::Exit { code: 2, words: None }
+fn crash() -> ExitReason {
+    ExitReason::Exit { code: 2, last_line: None }
 }
 
-fn home() -> Ending {
-    Ending::Exit { code: 0, words: None }
+fn finished() -> ExitReason {
+    ExitReason::Exit { code: 0, last_line: None }
 }
 
-fn signal(signal: i32) -> Ending {
-    Ending::Signal { signal, words: None }
+fn signal(signal: i32) -> ExitReason {
+    ExitReason::Signal { signal, last_line: None }
 }
 
-fn start(number: u32, incarnation: u32) -> Order {
-    Order::Start { number, incarnation }
+fn start(number: u32, incarnation: u32) -> Action {
+    Action::Start { number, incarnation }
 }
 
 fn status(supervisor: &Supervisor, number: u32, now: Duration) -> ChildStatus {
     supervisor.status(now).nth(number as usize).unwrap()
 }
 
-/// A supervisor of so many children, all started at 0.
+/// A supervisor of this number of children, all started at time 0.
 fn started(children: u32) -> Supervisor {
     let mut supervisor = Supervisor::new(children, LIMITS);
-    let orders: Vec<_> = (0..children).map(|number| start(number, 1)).collect();
-    assert_eq!(supervisor.due(s(0)), orders);
+    let actions: Vec<_> = (0..children).map(|number| start(number, 1)).collect();
+    assert_eq!(supervisor.due_actions(s(0)), actions);
     supervisor
 }
 
 #[test]
-fn who_outlives_its_parent_stays_while_there_is_work_and_is_not_killed() {
-    let mut supervisor = Supervisor::new(2, Limits { outlives: true, ..LIMITS });
-    assert_eq!(supervisor.due(s(0)), [start(0, 1), start(1, 1)]);
-    let left = supervisor.ended(0, home(), s(5)).unwrap();
-    assert_eq!(left.then, Standing::Pausing { left: s(1) });
-    assert_eq!(supervisor.due(s(6)), [start(0, 2)]);
-    assert_eq!(supervisor.stop(s(10)), [Order::Terminate { number: 0 }, Order::Terminate { number: 1 }]);
+fn detached_children_are_not_killed() {
+    let mut supervisor = Supervisor::new(2, Limits { detached: true, ..LIMITS });
+    assert_eq!(supervisor.due_actions(s(0)), [start(0, 1), start(1, 1)]);
+    let left = supervisor.ended(0, finished(), s(5)).unwrap();
+    assert_eq!(left.then, ChildState::BackingOff { left: s(1) });
+    assert_eq!(supervisor.due_actions(s(6)), [start(0, 2)]);
+    assert_eq!(supervisor.stop(s(10)), [Action::Terminate { number: 0 }, Action::Terminate { number: 1 }]);
     assert_eq!(
-        supervisor.ended(0, Ending::Exit { code: 130, words: None }, s(11)).unwrap().then,
-        Standing::GoneHome
+        supervisor.ended(0, ExitReason::Exit { code: 130, last_line: None }, s(11)).unwrap().then,
+        ChildState::Exited
     );
-    // The other still has something in hand when its time of grace is over.
-    assert_eq!((supervisor.due(s(39)), supervisor.is_over()), (vec![], false));
-    assert_eq!((supervisor.due(s(40)), supervisor.is_over()), (vec![], true));
+    // The other child is still working when its grace period ends.
+    assert_eq!((supervisor.due_actions(s(39)), supervisor.is_over()), (vec![], false));
+    assert_eq!((supervisor.due_actions(s(40)), supervisor.is_over()), (vec![], true));
 }
 
 #[test]
-fn nobody_is_started_when_there_is_no_more_work() {
+fn nothing_is_started_without_work() {
     let mut supervisor = started(2);
     supervisor.ended(0, crash(), s(1)).unwrap();
     supervisor.close();
     assert_eq!(
-        (supervisor.due(s(100)), status(&supervisor, 0, s(100)).standing),
-        (vec![], Standing::GoneHome)
+        (supervisor.due_actions(s(100)), status(&supervisor, 0, s(100)).state),
+        (vec![], ChildState::Exited)
     );
     assert!(!supervisor.is_over());
-    supervisor.ended(1, home(), s(101)).unwrap();
+    supervisor.ended(1, finished(), s(101)).unwrap();
     assert!(supervisor.is_over());
 }
 
 #[test]
-fn pauses_double_up_to_the_longest_until_the_child_is_given_up() {
+fn backoff_doubles_up_to_the_maximum_until_the_child_fails() {
     let mut supervisor = started(2);
-    supervisor.heard(1, s(0));
+    supervisor.heartbeat(1, s(0));
     let mut now = s(0);
     for (incarnation, pause) in (2..).zip([1, 2, 4, 6, 6]) {
         let ended = supervisor.ended(0, crash(), now).unwrap();
-        assert_eq!(ended.then, Standing::Pausing { left: s(pause) });
-        assert_eq!(supervisor.due(now + s(pause) - Duration::from_nanos(1)), []);
-        assert_eq!(supervisor.next(), Some(now + s(pause)));
+        assert_eq!(ended.then, ChildState::BackingOff { left: s(pause) });
+        assert_eq!(supervisor.due_actions(now + s(pause) - Duration::from_nanos(1)), []);
+        assert_eq!(supervisor.next_deadline(), Some(now + s(pause)));
         now += s(pause);
-        assert_eq!(supervisor.due(now), [start(0, incarnation)]);
-        // A sign of life proves nothing: it comes from a child that is about to die, too.
-        supervisor.heard(0, now);
+        assert_eq!(supervisor.due_actions(now), [start(0, incarnation)]);
+        // A heartbeat proves nothing: a child that is about to die also sends it.
+        supervisor.heartbeat(0, now);
     }
     let last = supervisor.ended(0, signal(11), now);
-    assert_eq!(last, Some(Ended { incarnation: 6, ending: signal(11), then: Standing::GivenUp }));
+    assert_eq!(last, Some(ChildExit { incarnation: 6, reason: signal(11), then: ChildState::Failed }));
     let given_up = status(&supervisor, 0, now);
     assert_eq!((given_up.incarnation, given_up.restarts), (6, 5));
     assert_eq!(given_up.last_failure, Some(signal(11)));
-    // The others go on.
+    // The others continue.
     assert!(!supervisor.is_over());
-    assert_eq!(status(&supervisor, 1, now).standing, Standing::Running);
-    assert_eq!(supervisor.next(), Some(s(120)));
-    supervisor.ended(1, home(), now);
-    assert!(supervisor.is_over() && supervisor.next().is_none());
+    assert_eq!(status(&supervisor, 1, now).state, ChildState::Running);
+    assert_eq!(supervisor.next_deadline(), Some(s(120)));
+    supervisor.ended(1, finished(), now);
+    assert!(supervisor.is_over() && supervisor.next_deadline().is_none());
 }
 
 #[test]
-fn what_was_useful_begins_a_new_row_of_failures() {
+fn deliveries_reset_failures() {
     let mut supervisor = started(1);
     let mut now = s(0);
     for incarnation in 2..30 {
         assert_eq!(
             supervisor.ended(0, crash(), now).unwrap().then,
-            Standing::Pausing { left: s(1) },
+            ChildState::BackingOff { left: s(1) },
             "{incarnation}"
         );
         now += s(1);
-        assert_eq!(supervisor.due(now), [start(0, incarnation)]);
-        supervisor.useful(0, now);
+        assert_eq!(supervisor.due_actions(now), [start(0, incarnation)]);
+        supervisor.delivered(0, now);
     }
-    // What it delivered may be seen only after its end.
+    // A delivery may be noticed only after the exit.
     supervisor.ended(0, crash(), now);
-    supervisor.useful(0, now);
-    supervisor.due(now + s(1));
-    assert_eq!(supervisor.ended(0, crash(), now).unwrap().then, Standing::Pausing { left: s(1) });
+    supervisor.delivered(0, now);
+    supervisor.due_actions(now + s(1));
+    assert_eq!(supervisor.ended(0, crash(), now).unwrap().then, ChildState::BackingOff { left: s(1) });
 }
 
 #[test]
 fn without_restarts_the_first_failure_is_the_last() {
-    let mut supervisor = Supervisor::new(1, Limits { restarts: 0, ..LIMITS });
-    supervisor.due(s(0));
-    assert_eq!(supervisor.ended(0, crash(), s(0)).unwrap().then, Standing::GivenUp);
+    let mut supervisor = Supervisor::new(1, Limits { max_restarts: 0, ..LIMITS });
+    supervisor.due_actions(s(0));
+    assert_eq!(supervisor.ended(0, crash(), s(0)).unwrap().then, ChildState::Failed);
 }
 
 #[test]
-fn who_went_home_stays_there() {
+fn finished_children_are_not_restarted() {
     let mut supervisor = started(1);
-    let ended = supervisor.ended(0, home(), s(5)).unwrap();
-    assert_eq!(ended, Ended { incarnation: 1, ending: home(), then: Standing::GoneHome });
-    assert_eq!(supervisor.due(s(1000)), []);
+    let ended = supervisor.ended(0, finished(), s(5)).unwrap();
+    assert_eq!(ended, ChildExit { incarnation: 1, reason: finished(), then: ChildState::Exited });
+    assert_eq!(supervisor.due_actions(s(1000)), []);
     assert!(supervisor.is_over());
     assert_eq!(status(&supervisor, 0, s(5)).last_failure, None);
-    assert_eq!(supervisor.ended(0, home(), s(6)), None, "it had no process");
+    assert_eq!(supervisor.ended(0, finished(), s(6)), None, "it had no process");
 }
 
 #[test]
-fn a_silent_child_is_killed_once_and_started_again() {
+fn unresponsive_children_are_killed_once_and_restarted() {
     for speaks in [false, true] {
         let mut supervisor = started(1);
         let heard = if speaks { s(50) } else { s(0) };
         if speaks {
-            supervisor.heard(0, heard);
+            supervisor.heartbeat(0, heard);
         }
-        let standing = if speaks { Standing::Running } else { Standing::Starting };
-        assert_eq!(status(&supervisor, 0, heard).standing, standing);
-        assert_eq!(supervisor.next(), Some(heard + s(120)));
+        let standing = if speaks { ChildState::Running } else { ChildState::Starting };
+        assert_eq!(status(&supervisor, 0, heard).state, standing);
+        assert_eq!(supervisor.next_deadline(), Some(heard + s(120)));
         if speaks {
-            // Signs may arrive in any order.
-            supervisor.heard(0, heard - s(10));
+            // Heartbeats may arrive in any order.
+            supervisor.heartbeat(0, heard - s(10));
         }
-        assert_eq!(supervisor.due(heard + s(119)), []);
-        assert_eq!(supervisor.due(heard + s(120)), [Order::Kill { number: 0 }]);
-        assert_eq!(status(&supervisor, 0, heard).standing, Standing::Ending);
-        // It may take its time to die, and what it said before comes late.
-        supervisor.heard(0, heard + s(121));
-        assert_eq!(supervisor.due(heard + s(500)), []);
-        assert_eq!(supervisor.next(), None);
+        assert_eq!(supervisor.due_actions(heard + s(119)), []);
+        assert_eq!(supervisor.due_actions(heard + s(120)), [Action::Kill { number: 0 }]);
+        assert_eq!(status(&supervisor, 0, heard).state, ChildState::Stopping);
+        // It may take time to die, and earlier heartbeats arrive late.
+        supervisor.heartbeat(0, heard + s(121));
+        assert_eq!(supervisor.due_actions(heard + s(500)), []);
+        assert_eq!(supervisor.next_deadline(), None);
         let ended = supervisor.ended(0, signal(9), heard + s(500)).unwrap();
-        assert_eq!(ended.ending, Ending::Silent(s(120)));
-        assert_eq!(ended.then, Standing::Pausing { left: s(1) });
+        assert_eq!(ended.reason, ExitReason::Unresponsive(s(120)));
+        assert_eq!(ended.then, ChildState::BackingOff { left: s(1) });
     }
 }
 
 #[test]
-fn silence_proves_nothing_if_nobody_listened() {
+fn missed_heartbeats_during_a_suspension_do_not_count() {
     let mut supervisor = started(1);
-    supervisor.heard(0, s(10));
-    // The orchestrator was held up from 20 s to 1,000 s.
-    assert_eq!(supervisor.due(s(1000)), []);
-    assert_eq!(supervisor.next(), Some(s(1120)));
-    assert_eq!(supervisor.due(s(1121)), [Order::Kill { number: 0 }], "a little late is no excuse");
+    supervisor.heartbeat(0, s(10));
+    // The orchestrator was suspended from 20 s to 1,000 s.
+    assert_eq!(supervisor.due_actions(s(1000)), []);
+    assert_eq!(supervisor.next_deadline(), Some(s(1120)));
+    assert_eq!(supervisor.due_actions(s(1121)), [Action::Kill { number: 0 }], "a little late is no excuse");
 }
 
 #[test]
 fn a_stop_terminates_and_then_kills() {
     let mut supervisor = started(5);
     supervisor.ended(1, crash(), s(1));
-    supervisor.ended(2, home(), s(1));
-    supervisor.due(s(1));
-    let terminate = [0, 3, 4].map(|number| Order::Terminate { number });
+    supervisor.ended(2, finished(), s(1));
+    supervisor.due_actions(s(1));
+    let terminate = [0, 3, 4].map(|number| Action::Terminate { number });
     assert_eq!(supervisor.stop(s(1)), terminate);
-    assert_eq!(status(&supervisor, 1, s(1)).standing, Standing::GoneHome, "it is not started again");
-    assert_eq!(supervisor.ended(0, signal(15), s(2)).unwrap().then, Standing::GoneHome);
+    assert_eq!(status(&supervisor, 1, s(1)).state, ChildState::Exited, "it is not started again");
+    assert_eq!(supervisor.ended(0, signal(15), s(2)).unwrap().then, ChildState::Exited);
     assert_eq!(status(&supervisor, 0, s(2)).last_failure, None, "as it was told");
-    assert_eq!(supervisor.ended(3, signal(11), s(2)).unwrap().then, Standing::GoneHome);
+    assert_eq!(supervisor.ended(3, signal(11), s(2)).unwrap().then, ChildState::Exited);
     assert_eq!(status(&supervisor, 3, s(2)).last_failure, Some(signal(11)));
-    assert_eq!(supervisor.next(), Some(s(31)));
-    assert_eq!(supervisor.due(s(31)), [Order::Kill { number: 4 }]);
-    assert_eq!(supervisor.ended(4, signal(9), s(31)).unwrap().ending, Ending::Lingering(s(30)));
+    assert_eq!(supervisor.next_deadline(), Some(s(31)));
+    assert_eq!(supervisor.due_actions(s(31)), [Action::Kill { number: 4 }]);
+    assert_eq!(supervisor.ended(4, signal(9), s(31)).unwrap().reason, ExitReason::StopTimeout(s(30)));
     assert!(supervisor.is_over());
 }
 
 #[test]
-fn who_was_interrupted_by_others_is_started_again() {
-    let interrupted = Ending::Exit { code: 130, words: None };
+fn children_interrupted_from_outside_are_restarted() {
+    let interrupted = ExitReason::Exit { code: 130, last_line: None };
     let mut supervisor = started(1);
     let ended = supervisor.ended(0, interrupted.clone(), s(0)).unwrap();
-    assert_eq!(ended.then, Standing::Pausing { left: s(1) });
-    supervisor.due(s(1));
+    assert_eq!(ended.then, ChildState::BackingOff { left: s(1) });
+    supervisor.due_actions(s(1));
     supervisor.stop(s(1));
-    assert_eq!(supervisor.ended(0, crash(), s(1)).unwrap().then, Standing::GoneHome);
+    assert_eq!(supervisor.ended(0, crash(), s(1)).unwrap().then, ChildState::Exited);
     assert_eq!(status(&supervisor, 0, s(1)).last_failure, Some(crash()));
     let mut supervisor = started(1);
     supervisor.stop(s(1));
@@ -221,64 +221,74 @@ fn who_was_interrupted_by_others_is_started_again() {
 #[test]
 fn a_child_that_cannot_be_started_counts_as_failed() {
     let mut supervisor = started(1);
-    let reason = Ending::NotStarted { reason: "no such program".to_owned(), is_shortage: false };
+    let reason = ExitReason::StartFailed { reason: "no such program".to_owned(), is_shortage: false };
     let ended = supervisor.ended(0, reason.clone(), s(0)).unwrap();
-    assert_eq!(ended, Ended { incarnation: 1, ending: reason, then: Standing::Pausing { left: s(1) } });
-    assert_eq!(supervisor.due(s(1)), [start(0, 2)]);
+    assert_eq!(
+        ended,
+        ChildExit { incarnation: 1, reason: reason, then: ChildState::BackingOff { left: s(1) } }
+    );
+    assert_eq!(supervisor.due_actions(s(1)), [start(0, 2)]);
 }
 
 #[test]
-fn a_start_that_the_host_has_no_room_for_is_tried_again_for_ever() {
+fn starts_without_resources_are_retried_forever() {
     let mut supervisor = started(1);
-    let shortage = || Ending::NotStarted { reason: "too many open files".to_owned(), is_shortage: true };
+    let shortage = || ExitReason::StartFailed { reason: "too many open files".to_owned(), is_shortage: true };
     let mut now = s(0);
     for (incarnation, pause) in (2..).zip([1, 2, 4].into_iter().chain([6; 100])) {
         let ended = supervisor.ended(0, shortage(), now).unwrap();
-        assert_eq!(ended.then, Standing::Pausing { left: s(pause) }, "{incarnation}");
+        assert_eq!(ended.then, ChildState::BackingOff { left: s(pause) }, "{incarnation}");
         now += s(pause);
-        assert_eq!(supervisor.due(now), [start(0, incarnation)]);
+        assert_eq!(supervisor.due_actions(now), [start(0, incarnation)]);
     }
     assert_eq!(status(&supervisor, 0, now).last_failure, Some(shortage()));
-    // Nothing of that counts against the child.
+    // None of this counts as a failure of the child.
     for pause in [1, 2, 4, 6, 6] {
-        assert_eq!(supervisor.ended(0, crash(), now).unwrap().then, Standing::Pausing { left: s(pause) });
+        assert_eq!(
+            supervisor.ended(0, crash(), now).unwrap().then,
+            ChildState::BackingOff { left: s(pause) }
+        );
         now += s(pause);
-        supervisor.due(now);
+        supervisor.due_actions(now);
     }
-    assert_eq!(supervisor.ended(0, crash(), now).unwrap().then, Standing::GivenUp);
+    assert_eq!(supervisor.ended(0, crash(), now).unwrap().then, ChildState::Failed);
 }
 
 #[test]
-fn a_living_process_is_taken_in_without_a_start() {
+fn running_processes_are_adopted() {
     let mut supervisor = Supervisor::new(2, LIMITS);
     assert!(supervisor.adopt(1, s(0)));
     assert!(!supervisor.adopt(1, s(0)), "it has one");
     assert!(!supervisor.adopt(2, s(0)), "no such child");
-    assert_eq!(supervisor.due(s(0)), [start(0, 1)]);
+    assert_eq!(supervisor.due_actions(s(0)), [start(0, 1)]);
     assert!(!supervisor.adopt(0, s(0)), "it was started");
-    supervisor.heard(0, s(100));
-    assert_eq!(supervisor.due(s(120)), [Order::Kill { number: 1 }], "it must speak like any other");
-    let ended = supervisor.ended(1, Ending::Unseen, s(120)).unwrap();
-    assert_eq!((ended.incarnation, ended.ending), (0, Ending::Silent(s(120))));
+    supervisor.heartbeat(0, s(100));
+    assert_eq!(supervisor.due_actions(s(120)), [Action::Kill { number: 1 }], "it must speak like any other");
+    let ended = supervisor.ended(1, ExitReason::Unknown, s(120)).unwrap();
+    assert_eq!((ended.incarnation, ended.reason), (0, ExitReason::Unresponsive(s(120))));
     assert!(!supervisor.adopt(1, s(120)), "its next process is one of ours");
-    assert_eq!(supervisor.due(s(121)), [start(1, 1)]);
+    assert_eq!(supervisor.due_actions(s(121)), [start(1, 1)]);
     assert_eq!(status(&supervisor, 1, s(121)).restarts, 1);
 }
 
 #[test]
-fn enormous_limits_are_no_trouble() {
-    let limits =
-        Limits { silence: Duration::MAX, longest_pause: Duration::MAX, restarts: u32::MAX, ..LIMITS };
+fn very_large_limits_do_not_overflow() {
+    let limits = Limits {
+        heartbeat_timeout: Duration::MAX,
+        max_backoff: Duration::MAX,
+        max_restarts: u32::MAX,
+        ..LIMITS
+    };
     let mut supervisor = Supervisor::new(1, limits);
     for _ in 0..100 {
-        supervisor.due(supervisor.next().unwrap());
+        supervisor.due_actions(supervisor.next_deadline().unwrap());
         supervisor.ended(0, crash(), s(1)).unwrap();
     }
     assert_eq!(status(&supervisor, 0, s(0)).restarts, 99);
 }
 
 #[test]
-fn nobody_is_soon_over() {
+fn a_campaign_without_walks_ends_immediately() {
     assert!(Supervisor::new(0, LIMITS).is_over());
 }
 
@@ -289,7 +299,7 @@ enum Happening {
     Pass(Duration),
     Heard(u32),
     Useful(u32),
-    Ended(u32, Ending),
+    Ended(u32, ExitReason),
     Adopted(u32),
     Stop,
 }
@@ -297,25 +307,25 @@ enum Happening {
 fn happening() -> impl Strategy<Value = Happening> {
     // One number more than there are children.
     let number = 0..=CHILDREN;
-    let ending = prop_oneof![
+    let reason = prop_oneof![
         4 => Just(crash()),
         2 => Just(signal(9)),
-        1 => Just(home()),
-        1 => Just(Ending::Unseen),
-        1 => any::<bool>().prop_map(|is_shortage| Ending::NotStarted { reason: String::new(), is_shortage }),
+        1 => Just(finished()),
+        1 => Just(ExitReason::Unknown),
+        1 => any::<bool>().prop_map(|is_shortage| ExitReason::StartFailed { reason: String::new(), is_shortage }),
     ];
     prop_oneof![
         8 => (0u64..20_000).prop_map(|ms| Happening::Pass(Duration::from_millis(ms))),
         1 => (0u64..200).prop_map(|s| Happening::Pass(Duration::from_secs(s))),
         4 => number.clone().prop_map(Happening::Heard),
         1 => number.clone().prop_map(Happening::Useful),
-        8 => (number.clone(), ending).prop_map(|(number, ending)| Happening::Ended(number, ending)),
+        8 => (number.clone(), reason).prop_map(|(number, reason)| Happening::Ended(number, reason)),
         1 => number.prop_map(Happening::Adopted),
         1 => Just(Happening::Stop),
     ]
 }
 
-/// The processes as they really are, and what must hold of the orders about them.
+/// The actual processes, and the invariants of actions on them.
 #[derive(Default)]
 struct World {
     now: Duration,
@@ -326,10 +336,10 @@ struct World {
 }
 
 impl World {
-    fn obey(&mut self, orders: Vec<Order>) {
-        for order in orders {
-            match order {
-                Order::Start { number, incarnation } => {
+    fn obey(&mut self, actions: Vec<Action>) {
+        for action in actions {
+            match action {
+                Action::Start { number, incarnation } => {
                     assert!(!self.stopped, "a start after the stop");
                     assert!(number < CHILDREN);
                     assert_eq!(self.alive.insert(number, false), None, "two processes of number {number}");
@@ -337,10 +347,10 @@ impl World {
                     assert_eq!(incarnation, before + 1);
                     let starts = self.unrewarded.entry(number).or_default();
                     *starts += 1;
-                    assert!(*starts <= LIMITS.restarts + 1, "started too often");
+                    assert!(*starts <= LIMITS.max_restarts + 1, "started too often");
                 }
-                Order::Terminate { number } => assert_eq!(self.alive.get(&number), Some(&false)),
-                Order::Kill { number } => {
+                Action::Terminate { number } => assert_eq!(self.alive.get(&number), Some(&false)),
+                Action::Kill { number } => {
                     assert_eq!(self.alive.insert(number, true), Some(false), "one kill for one process");
                 }
             }
@@ -350,19 +360,19 @@ impl World {
     fn happen(&mut self, supervisor: &mut Supervisor, happening: Happening) {
         match happening {
             Happening::Pass(time) => self.now += time,
-            Happening::Heard(number) => supervisor.heard(number, self.now),
+            Happening::Heard(number) => supervisor.heartbeat(number, self.now),
             Happening::Useful(number) => {
-                supervisor.useful(number, self.now);
+                supervisor.delivered(number, self.now);
                 self.unrewarded.insert(number, 0);
             }
-            Happening::Ended(number, ending) => {
+            Happening::Ended(number, reason) => {
                 let was_alive = self.alive.remove(&number).is_some();
-                if was_alive && matches!(ending, Ending::NotStarted { is_shortage: true, .. }) {
-                    // It may be started again any number of times.
+                if was_alive && matches!(reason, ExitReason::StartFailed { is_shortage: true, .. }) {
+                    // It may be restarted any number of times.
                     let starts = self.unrewarded.entry(number).or_default();
                     *starts = starts.saturating_sub(1);
                 }
-                assert_eq!(supervisor.ended(number, ending, self.now).is_some(), was_alive);
+                assert_eq!(supervisor.ended(number, reason, self.now).is_some(), was_alive);
             }
             Happening::Adopted(number) => {
                 if supervisor.adopt(number, self.now) {
@@ -372,45 +382,45 @@ impl World {
             }
             Happening::Stop => {
                 self.stopped = true;
-                let orders = supervisor.stop(self.now);
-                self.obey(orders);
+                let actions = supervisor.stop(self.now);
+                self.obey(actions);
             }
         }
-        let orders = supervisor.due(self.now);
-        self.obey(orders);
-        // Else whoever sleeps until then would not sleep.
-        assert!(supervisor.next().is_none_or(|next| next > self.now));
+        let actions = supervisor.due_actions(self.now);
+        self.obey(actions);
+        // Otherwise sleeping until then would be a busy loop.
+        assert!(supervisor.next_deadline().is_none_or(|next| next > self.now));
         assert!(!supervisor.is_over() || self.alive.is_empty());
     }
 }
 
 proptest! {
     #[test]
-    fn nothing_goes_wrong_in_any_order(happenings in prop::collection::vec(happening(), 0..200)) {
+    fn invariants_hold_for_any_order_of_events(happenings in prop::collection::vec(happening(), 0..200)) {
         let mut supervisor = Supervisor::new(CHILDREN, LIMITS);
         let mut world = World::default();
         for happening in happenings {
             world.happen(&mut supervisor, happening);
         }
-        // After a stop the time of grace is all that it takes to have everything dead or killed.
+        // After a stop, every process has exited or is killed at the end of the grace period.
         world.happen(&mut supervisor, Happening::Stop);
-        world.happen(&mut supervisor, Happening::Pass(LIMITS.grace));
+        world.happen(&mut supervisor, Happening::Pass(LIMITS.grace_period));
         assert!(world.alive.values().all(|killed| *killed));
         for number in 0..CHILDREN {
             world.happen(&mut supervisor, Happening::Ended(number, signal(9)));
         }
-        assert!(supervisor.is_over() && supervisor.next().is_none());
+        assert!(supervisor.is_over() && supervisor.next_deadline().is_none());
     }
 
     #[test]
-    fn children_that_always_fail_are_given_up_in_the_end(deaths in prop::collection::vec(0u64..200, 18)) {
+    fn children_that_always_fail_are_not_restarted_forever(deaths in prop::collection::vec(0u64..200, 18)) {
         let mut supervisor = Supervisor::new(CHILDREN, LIMITS);
         let mut deaths = deaths.into_iter();
         let mut starts = 0;
-        while let Some(now) = supervisor.next() {
-            for order in supervisor.due(now) {
-                match order {
-                    Order::Start { number, .. } => {
+        while let Some(now) = supervisor.next_deadline() {
+            for action in supervisor.due_actions(now) {
+                match action {
+                    Action::Start { number, .. } => {
                         starts += 1;
                         let death = now + Duration::from_millis(deaths.next().unwrap());
                         supervisor.ended(number, crash(), death).unwrap();
@@ -420,7 +430,7 @@ proptest! {
             }
         }
         assert!(supervisor.is_over());
-        assert_eq!(starts, CHILDREN * (LIMITS.restarts + 1));
-        assert!(supervisor.status(s(0)).all(|child| child.standing == Standing::GivenUp));
+        assert_eq!(starts, CHILDREN * (LIMITS.max_restarts + 1));
+        assert!(supervisor.status(s(0)).all(|child| child.state == ChildState::Failed));
     }
 }

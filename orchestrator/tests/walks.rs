@@ -1,54 +1,55 @@
-//! Walks in turns and rounds: beginning, waiting, control walks, returns, losses, ends.
+//! Walks in assignments and rounds: starts, waiting, control walks, rollbacks, losses, ends.
 
-use orchestrator::selector::{Mode, Next, Selector, Settings, Snapshot, UpdateProtocol};
+use orchestrator::selector::{Mode, Scheduling, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use store::records::{ComponentRecord, Fate};
-use wire::messages::{End, Outcome, Progress};
+use wire::messages::{Outcome, Progress, WalkEnd};
 use wire::{Origin, WalkId};
 
 use crate::common;
 use crate::common::memory::MemoryStore;
 use crate::common::{
-    SHORTEST, at, begin, decided, ended, kinds, offer, restore, settings, structure, try_restore, turn, value,
+    SHORTEST, at, begin, decided, ended, kinds, next_assignment, offer, restore, settings, structure,
+    try_restore, value,
 };
 
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];
 
 fn is_waiting(selector: &mut Selector) -> bool {
-    matches!(selector.next_turn(), Next::Wait)
+    matches!(selector.next_assignment(), Scheduling::Wait)
 }
 
 #[test]
 fn every_seed_structure_gets_one_walk() {
     let mut store = MemoryStore::default();
-    let mut selector = restore(&settings(Mode::Live), 2, Snapshot::default());
+    let mut selector = restore(&settings(Mode::Live), 2, SelectorSnapshot::default());
     assert!(selector.is_done(), "no walks yet");
-    let commit = selector.begin_walks();
+    let commit = selector.start_walks();
     assert_eq!(kinds(&commit), ["begun", "begun"]);
     assert_eq!(commit.decisions[1].detail["seed_structure"], "seed-1");
     store.commit(&commit);
-    assert!(selector.begin_walks().walks.is_empty());
+    assert!(selector.start_walks().walks.is_empty());
     // Another seed structure is added to the campaign.
     let mut selector = restore(&settings(Mode::Live), 3, store.snapshot());
-    let commit = selector.begin_walks();
+    let commit = selector.start_walks();
     assert_eq!(
         (kinds(&commit), commit.walks[0].walk, commit.walks[0].seed_structure),
         (vec!["begun".into()], WalkId(2), 2)
     );
-    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     for (seed, assignment) in assignments.iter().enumerate() {
         assert_eq!(assignment.seed_structure, common::seed(seed).structure);
         assert_eq!((assignment.campaign, assignment.random_walk), (common::CAMPAIGN, assignment.walk));
-        assert_eq!((assignment.turn, assignment.until, assignment.checkpoint.is_none()), (0, 10, true));
+        assert_eq!((assignment.number, assignment.last_step, assignment.checkpoint.is_none()), (0, 10, true));
     }
     assert!(is_waiting(&mut selector));
-    let names: Vec<_> = selector.standing(100).into_iter().map(|(_, name, step)| (name, step)).collect();
+    let names: Vec<_> = selector.walk_progress(100).into_iter().map(|(_, name, step)| (name, step)).collect();
     assert_eq!(names, [("seed-0".into(), 0), ("seed-1".into(), 0), ("seed-2".into(), 0)]);
 }
 
 #[test]
-fn a_round_is_decided_when_all_its_reports_are_in_and_in_walk_order() {
+fn complete_rounds_are_decided_in_walk_order() {
     let mut selector = begin(&settings(Mode::Reproducible), 3);
-    let (first, second) = (turn(&mut selector), turn(&mut selector));
+    let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
     assert!(is_waiting(&mut selector), "the third walk is not in the round");
     let reports = [
         offer(&selector, &second, 5, structure(2, SHORTEST), NEW),
@@ -63,43 +64,51 @@ fn a_round_is_decided_when_all_its_reports_are_in_and_in_walk_order() {
     assert_eq!(walks, [(Some(WalkId(0)), 1), (Some(WalkId(1)), 1)]);
     assert_eq!((value(&commit, "round"), selector.mixture().version()), ("1", 1));
     // A walk that ends makes room for the next.
-    let (first, second) = (turn(&mut selector), turn(&mut selector));
-    assert!(selector.report(ended(&first, 20, End::Steps)).unwrap().is_none());
-    decided(&mut selector, common::report(&second, Outcome::Turn, at(15)));
-    assert_eq!([turn(&mut selector).walk, turn(&mut selector).walk], [WalkId(1), WalkId(2)]);
+    let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
+    assert!(selector.report(ended(&first, 20, WalkEnd::Steps)).unwrap().is_none());
+    decided(&mut selector, common::report(&second, Outcome::StepsDone, at(15)));
+    assert_eq!(
+        [next_assignment(&mut selector).walk, next_assignment(&mut selector).walk],
+        [WalkId(1), WalkId(2)]
+    );
 }
 
 #[test]
 fn live_walks_do_not_wait_for_each_other() {
     let mut selector = begin(&settings(Mode::Live), 3);
-    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     for assignment in assignments.iter().rev() {
         let report = offer(&selector, assignment, 5, structure(assignment.walk.0.into(), SHORTEST), NEW);
         let commit = decided(&mut selector, report);
         assert_eq!(commit.decisions[0].walk, Some(assignment.walk));
         assert_eq!(commit.decisions[0].round, 0);
-        assert_eq!(turn(&mut selector).walk, assignment.walk, "its next turn is there at once");
+        assert_eq!(
+            next_assignment(&mut selector).walk,
+            assignment.walk,
+            "its next assignment is available at once"
+        );
     }
 }
 
 #[test]
-fn reports_that_nobody_asked_for_change_nothing() {
+fn unsolicited_reports_change_nothing() {
     let mut selector = begin(&settings(Mode::Live), 1);
-    let assignment = turn(&mut selector);
+    let assignment = next_assignment(&mut selector);
     let unasked = |selector: &mut Selector, report| {
         assert!(selector.report(report).unwrap().is_none());
     };
-    let report = common::report(&assignment, Outcome::Turn, at(10));
+    let report = common::report(&assignment, Outcome::StepsDone, at(10));
     unasked(&mut selector, wire::messages::Report { walk: WalkId(1), ..report.clone() });
-    unasked(&mut selector, wire::messages::Report { turn: 1, ..report.clone() });
+    unasked(&mut selector, wire::messages::Report { assignment: 1, ..report.clone() });
     decided(&mut selector, report.clone());
     unasked(&mut selector, report.clone());
-    turn(&mut selector);
+    next_assignment(&mut selector);
     unasked(&mut selector, report);
-    // Twice in one round.
+    // Reported twice in one round.
     let mut selector = begin(&settings(Mode::Reproducible), 2);
-    let [first, second] =
-        [(); 2].map(|()| turn(&mut selector)).map(|a| common::report(&a, Outcome::Turn, at(10)));
+    let [first, second] = [(); 2]
+        .map(|()| next_assignment(&mut selector))
+        .map(|a| common::report(&a, Outcome::StepsDone, at(10)));
     assert!(selector.report(first.clone()).unwrap().is_none());
     unasked(&mut selector, first);
     decided(&mut selector, second.clone());
@@ -107,39 +116,42 @@ fn reports_that_nobody_asked_for_change_nothing() {
 }
 
 #[test]
-fn a_late_report_of_a_walker_that_was_taken_for_lost_counts_once() {
+fn late_reports_of_lost_walkers_count_once() {
     for mode in [Mode::Live, Mode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
-        let assignment = turn(&mut selector);
-        let report = common::report(&assignment, Outcome::Turn, at(10));
-        selector.lost(assignment.walk);
+        let assignment = next_assignment(&mut selector);
+        let report = common::report(&assignment, Outcome::StepsDone, at(10));
+        selector.assignment_lost(assignment.walk);
         let commit = decided(&mut selector, report.clone());
-        assert_eq!(commit.walks[0].turn, assignment.turn + 1);
+        assert_eq!(commit.walks[0].turn, assignment.number + 1);
         assert!(selector.report(report.clone()).unwrap().is_none());
-        assert_eq!(turn(&mut selector).turn, assignment.turn + 1);
+        assert_eq!(next_assignment(&mut selector).number, assignment.number + 1);
         assert!(selector.report(report).unwrap().is_none());
-        // What comes after the end of a walk comes too late.
-        selector.lost(assignment.walk);
-        let last = turn(&mut selector);
-        decided(&mut selector, ended(&last, 30, End::Steps));
-        assert!(selector.report(ended(&last, 30, End::Steps)).unwrap().is_none());
+        // Reports after the end of a walk are ignored.
+        selector.assignment_lost(assignment.walk);
+        let last = next_assignment(&mut selector);
+        decided(&mut selector, ended(&last, 30, WalkEnd::Steps));
+        assert!(selector.report(ended(&last, 30, WalkEnd::Steps)).unwrap().is_none());
     }
 }
 
 #[test]
-fn the_turn_of_a_lost_walker_is_given_out_again() {
+fn assignments_of_lost_walkers_are_assigned_again() {
     for mode in [Mode::Live, Mode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
-        let first = turn(&mut selector);
+        let first = next_assignment(&mut selector);
         assert!(is_waiting(&mut selector));
-        selector.lost(first.walk);
-        let second = turn(&mut selector);
+        selector.assignment_lost(first.walk);
+        let second = next_assignment(&mut selector);
         assert_eq!(first, second);
-        selector.lost(WalkId(7));
-        let commit = decided(&mut selector, ended(&second, 30, End::Steps));
+        selector.assignment_lost(WalkId(7));
+        let commit = decided(&mut selector, ended(&second, 30, WalkEnd::Steps));
         assert_eq!(kinds(&commit), ["ended"]);
-        selector.lost(second.walk);
-        assert!(matches!(selector.next_turn(), Next::Done), "what has ended is not given out again");
+        selector.assignment_lost(second.walk);
+        assert!(
+            matches!(selector.next_assignment(), Scheduling::Done),
+            "what has ended is not given out again"
+        );
     }
 }
 
@@ -148,31 +160,31 @@ fn returned(segment: u32, step: u64) -> Progress {
 }
 
 #[test]
-fn a_return_to_a_checkpoint_is_logged_once() {
+fn rollbacks_are_logged_once() {
     let mut selector = begin(&settings(Mode::Live), 1);
-    let assignment = turn(&mut selector);
-    let commit = decided(&mut selector, common::report(&assignment, Outcome::Turn, returned(2, 8)));
+    let assignment = next_assignment(&mut selector);
+    let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(2, 8)));
     assert_eq!(kinds(&commit), ["segment"]);
     let detail = &commit.decisions[0].detail;
     assert_eq!(*detail, serde_json::json!({ "segment": 2, "from": 7, "to": 3, "tau": 0.125, "returns": 2 }));
     assert_eq!(commit.walks[0].progress.segment, 2);
-    let assignment = turn(&mut selector);
-    assert_eq!(assignment.until, 18);
-    let commit = decided(&mut selector, common::report(&assignment, Outcome::Turn, returned(2, 18)));
+    let assignment = next_assignment(&mut selector);
+    assert_eq!(assignment.last_step, 18);
+    let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(2, 18)));
     assert_eq!(kinds(&commit), [""; 0]);
 }
 
-/// An interruption after the return does not take it out of the log.
+/// An interruption after a rollback does not remove the rollback from the log.
 #[test]
-fn a_return_before_an_interruption_is_logged_as_well() {
+fn rollbacks_before_an_interruption_are_logged() {
     let mut store = MemoryStore::default();
-    let mut selector = restore(&settings(Mode::Live), 1, Snapshot::default());
-    store.commit(&selector.begin_walks());
-    let assignment = turn(&mut selector);
-    store.commit(&decided(&mut selector, common::report(&assignment, Outcome::Paused, returned(1, 4))));
+    let mut selector = restore(&settings(Mode::Live), 1, SelectorSnapshot::default());
+    store.commit(&selector.start_walks());
+    let assignment = next_assignment(&mut selector);
+    store.commit(&decided(&mut selector, common::report(&assignment, Outcome::Interrupted, returned(1, 4))));
     let mut selector = restore(&settings(Mode::Live), 1, store.snapshot());
-    let assignment = turn(&mut selector);
-    let commit = decided(&mut selector, common::report(&assignment, Outcome::Turn, returned(1, 10)));
+    let assignment = next_assignment(&mut selector);
+    let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(1, 10)));
     assert_eq!(kinds(&commit), ["segment"]);
 }
 
@@ -180,21 +192,21 @@ fn a_return_before_an_interruption_is_logged_as_well() {
 fn every_end_is_logged_with_its_reason() {
     let reason = || "forces are not finite".to_owned();
     let ends = [
-        (End::Steps, "steps", ""),
+        (WalkEnd::Steps, "steps", ""),
         (
-            End::Trapped { guard: "shortest-bond".into() },
+            WalkEnd::Trapped { guard: "shortest-bond".into() },
             "trapped",
             "refused by the shortest-bond guard again and again",
         ),
-        (End::BlewUp { reason: reason() }, "blew_up", "forces are not finite"),
-        (End::BadStart { reason: reason() }, "bad_start", "forces are not finite"),
+        (WalkEnd::BlewUp { reason: reason() }, "blew_up", "forces are not finite"),
+        (WalkEnd::BadStart { reason: reason() }, "bad_start", "forces are not finite"),
     ];
     let mut selector = begin(&settings(Mode::Live), ends.len());
-    let assignments = [(); 4].map(|()| turn(&mut selector));
+    let assignments = [(); 4].map(|()| next_assignment(&mut selector));
     for (assignment, (end, name, reason)) in assignments.iter().zip(ends) {
         let commit = decided(&mut selector, ended(assignment, 3, end));
         let detail = &commit.decisions[0].detail;
-        // A walk that could not be taken up again stays where it was.
+        // A walk that could not be resumed keeps its step.
         let step = if name == "bad_start" { 0 } else { 3 };
         assert_eq!(
             *detail,
@@ -205,47 +217,47 @@ fn every_end_is_logged_with_its_reason() {
     assert!(selector.is_done());
 }
 
-/// With control, collections at these steps, then the end of the biased walk.
+/// With control walks: collects at these steps, and then ends the biased walk.
 fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
     let controlled = Settings {
         control: true,
-        per_seed: 9,
+        max_per_seed_structure: 9,
         update: UpdateProtocol::Never,
         ..settings(Mode::Reproducible)
     };
-    let mut selector = restore(&controlled, 1, Snapshot::default());
-    store.commit(&selector.begin_walks());
+    let mut selector = restore(&controlled, 1, SelectorSnapshot::default());
+    store.commit(&selector.start_walks());
     for (number, step) in (1..).zip(steps) {
-        let assignment = turn(&mut selector);
+        let assignment = next_assignment(&mut selector);
         let report = offer(&selector, &assignment, *step, structure(number, SHORTEST), NEW);
         store.commit(&decided(&mut selector, report));
     }
-    let assignment = turn(&mut selector);
-    let commit = decided(&mut selector, ended(&assignment, 30, End::BlewUp { reason: "hot".into() }));
+    let assignment = next_assignment(&mut selector);
+    let commit = decided(&mut selector, ended(&assignment, 30, WalkEnd::BlewUp { reason: "hot".into() }));
     store.commit(&commit);
     selector
 }
 
 #[test]
-fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
+fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
     let mut store = MemoryStore::default();
-    // After a return to a checkpoint a step can come twice.
+    // After a rollback, a step can occur twice.
     let mut selector = with_control(&mut store, &[5, 12, 5]);
     let begun = store.decisions.last().unwrap();
     assert_eq!((begun.kind, begun.walk), ("begun", Some(WalkId(1))));
     assert_eq!(begun.detail, serde_json::json!({ "control_of": 0, "wanted": [5, 12] }));
-    // A turn is no longer than any other, and ends at the last wanted frame.
+    // Assignments are no longer than usual, and end at the last requested frame.
     for (step, wanted, until, kinds_then) in
         [(5, vec![5, 12], 10, vec!["control"]), (12, vec![12], 12, vec!["control", "ended"])]
     {
-        let assignment = turn(&mut selector);
+        let assignment = next_assignment(&mut selector);
         assert_eq!(
             (assignment.walk, assignment.origin, assignment.random_walk),
             (WalkId(1), Origin::Control, WalkId(0))
         );
-        assert_eq!((assignment.wanted.clone(), assignment.until), (wanted, until));
+        assert_eq!((assignment.frame_steps.clone(), assignment.last_step), (wanted, until));
         assert_eq!(assignment.seed_structure, common::seed(0).structure);
-        // An unremarkable structure: a control frame is taken whatever its grade.
+        // An unremarkable structure: a control frame is recorded whatever its grade.
         let report = offer(&selector, &assignment, step, structure(100 + step, SHORTEST), [0.1; 3]);
         let commit = decided(&mut selector, report);
         assert_eq!(kinds(&commit), kinds_then);
@@ -255,7 +267,7 @@ fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
         assert!(candidate.selector.gamma.len() == 2 && candidate.original.gamma.len() == 2);
         store.commit(&commit);
     }
-    assert!(matches!(selector.next_turn(), Next::Done), "a control has no control");
+    assert!(matches!(selector.next_assignment(), Scheduling::Done), "a control has no control");
     assert_eq!(store.walks[&WalkId(1)].state, "collected");
     assert_eq!(store.known.len(), 3, "control frames are not what later candidates are compared with");
 }
@@ -263,17 +275,17 @@ fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
 #[test]
 fn a_walk_that_collected_nothing_has_no_control() {
     let mut selector = with_control(&mut MemoryStore::default(), &[]);
-    assert!(matches!(selector.next_turn(), Next::Done));
+    assert!(matches!(selector.next_assignment(), Scheduling::Done));
 }
 
 #[test]
 fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
     let mut store = MemoryStore::default();
     drop(with_control(&mut store, &[5]));
-    let limited = Settings { control: true, total: Some(2), ..settings(Mode::Reproducible) };
+    let limited = Settings { control: true, max_structures: Some(2), ..settings(Mode::Reproducible) };
     let mut selector = restore(&limited, 2, store.snapshot());
-    store.commit(&selector.begin_walks());
-    let (control, biased) = (turn(&mut selector), turn(&mut selector));
+    store.commit(&selector.start_walks());
+    let (control, biased) = (next_assignment(&mut selector), next_assignment(&mut selector));
     assert_eq!(
         (control.origin, biased.origin),
         (Origin::Control, Origin::Biased),
@@ -286,25 +298,25 @@ fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
     assert_eq!(kinds(&commit), ["control", "ended", "accepted", "ended", "begun"]);
     assert_eq!(commit.decisions[1].mixture_version, 0);
     store.commit(&commit);
-    // The second of two: had the control frame counted, there would be no room left for it.
+    // The second of two: if the control frame counted, there would be no room left for it.
     let again = restore(&limited, 2, store.snapshot());
     assert_eq!(again.mixture(), selector.mixture());
 }
 
 #[test]
-fn a_database_that_does_not_fit_is_refused() {
+fn a_mismatched_database_is_rejected() {
     let mut store = MemoryStore::default();
-    store.commit(&restore(&settings(Mode::Live), 2, Snapshot::default()).begin_walks());
+    store.commit(&restore(&settings(Mode::Live), 2, SelectorSnapshot::default()).start_walks());
     let good = store.snapshot();
-    let refused = |seeds: usize, change: &dyn Fn(&mut Snapshot)| {
+    let refused = |seeds: usize, change: &dyn Fn(&mut SelectorSnapshot)| {
         let mut snapshot = good.clone();
         change(&mut snapshot);
         let error = try_restore(&settings(Mode::Live), seeds, None, snapshot).err();
         error.expect("refused").to_string()
     };
     assert!(try_restore(&settings(Mode::Live), 2, None, good.clone()).is_ok());
-    assert!(refused(1, &|_| ()).contains("walk 1 starts from seed structure 1, but there are 1"));
-    assert!(refused(2, &|s| drop(s.walks.remove(0))).contains("walk 1 stands where walk 0 should"));
+    assert!(refused(1, &|_| ()).contains("walk 1 starts from seed structure 1, but there are only 1"));
+    assert!(refused(2, &|s| drop(s.walks.remove(0))).contains("found walk 1 in place of walk 0"));
     assert!(refused(2, &|s| s.walks[1].selector_state.clear()).contains("state of walk 1 is damaged"));
     assert!(refused(2, &|s| s.values[0].1.push('x')).contains("not a number"));
     let component = |bytes| ComponentRecord { element: 0, slot: 9, bytes };
@@ -324,21 +336,21 @@ fn a_seed_structure_that_cannot_be_graded_is_named() {
         common::grader(),
         common::mixture(),
         None,
-        Snapshot::default(),
+        SelectorSnapshot::default(),
     );
     let message = found.err().expect("refused").to_string();
-    assert_eq!(message, "seed structure 'seed-0': atom 1 is Cu, which the model does not know");
+    assert_eq!(message, "seed structure 'seed-0': atom 1 is Cu, which the model does not support");
 }
 
 #[test]
-fn a_paused_walk_gets_no_turn_and_the_others_go_on_in_live_mode() {
-    let mut selector = restore(&settings(Mode::Live), 3, Snapshot::default());
-    let _ = selector.begin_walks();
+fn paused_walks_get_no_assignments_while_others_continue_in_live_mode() {
+    let mut selector = restore(&settings(Mode::Live), 3, SelectorSnapshot::default());
+    let _ = selector.start_walks();
     selector.set_paused([WalkId(0), WalkId(2)].into());
-    assert_eq!(turn(&mut selector).walk, WalkId(1));
-    assert!(matches!(selector.next_turn(), Next::Wait) && !selector.is_done());
+    assert_eq!(next_assignment(&mut selector).walk, WalkId(1));
+    assert!(matches!(selector.next_assignment(), Scheduling::Wait) && !selector.is_done());
     selector.set_paused([WalkId(0)].into());
-    assert_eq!(turn(&mut selector).walk, WalkId(2));
+    assert_eq!(next_assignment(&mut selector).walk, WalkId(2));
     selector.set_paused([].into());
-    assert_eq!(turn(&mut selector).walk, WalkId(0));
+    assert_eq!(next_assignment(&mut selector).walk, WalkId(0));
 }

@@ -101,7 +101,7 @@ impl Loader<'_> {
         let mut warnings = Vec::new();
         for named in seeds {
             let SourcedStructure { seed: SeedStructure { name, structure }, source } = named;
-            if let Some(other) = first.insert(ContentHash::of(&rounded(structure)), named) {
+            if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
                 let message = format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",
                     other.seed.name, other.source

@@ -54,7 +54,7 @@ impl Agent {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         self.log.init("agent")?;
         let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));
-        let tls = self.tls.as_deref().map(Tls::in_directory);
+        let tls = self.tls.as_deref().map(Tls::from_directory);
         if let Some(tls) = &tls {
             let checked = tls.check_for_agent().map_err(Failure::input)?;
             checked.warnings.iter().for_each(|warning| log_and_warn(format_args!("WARNING: {warning}")));
@@ -77,7 +77,7 @@ impl Agent {
             pid: process.pid,
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
             walkers,
-            ahead: self.prefetch,
+            prefetch: self.prefetch,
         };
         let watched = AgentState::default();
         block_on(async {

@@ -13,7 +13,7 @@ pub struct CalculationRunner {}
 
 impl CalculationRunner {
     pub fn run(self) -> Result<ExitStatus, Failure> {
-        launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
+        launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
         run_calculation().map_err(Failure::failed)?;
         Ok(ExitStatus::Done)
     }

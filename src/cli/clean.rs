@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use store::CampaignLock;
-use wire::place::{Place, PlaceError, Removed};
+use wire::shm_dir::{Removed, ShmDir, ShmDirError};
 
 use super::{ExitStatus, Failure};
 use crate::output::{count, print};
@@ -22,7 +22,7 @@ pub struct Clean {
 impl Clean {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.directories.is_empty() {
-            for shared in Place::all().map_err(Failure::failed)? {
+            for shared in ShmDir::all().map_err(Failure::failed)? {
                 let campaign = shared.campaign_directory();
                 match clean(&shared, campaign) {
                     Ok(removed) => report(campaign.unwrap_or(shared.directory()), removed)?,
@@ -32,7 +32,7 @@ impl Clean {
             }
         }
         for directory in &self.directories {
-            let shared = Place::of(directory).map_err(Failure::input)?;
+            let shared = ShmDir::for_campaign(directory).map_err(Failure::input)?;
             report(directory, clean(&shared, Some(directory))?)?;
         }
         Ok(ExitStatus::Done)
@@ -40,13 +40,13 @@ impl Clean {
 }
 
 /// Removes the shared-memory files of a campaign, under the lock that keeps it from starting meanwhile.
-fn clean(shared: &Place, campaign: Option<&Path>) -> Result<Removed, Failure> {
+fn clean(shared: &ShmDir, campaign: Option<&Path>) -> Result<Removed, Failure> {
     // A campaign whose directory was deleted cannot start.
     let campaign = campaign.filter(|directory| directory.is_dir());
     let _lock = campaign.map(|directory| CampaignLock::acquire(directory, "calmwalk clean")).transpose()?;
     shared.remove().map_err(|error| match error {
         // In use although the directory is not locked: it may be invisible here, or renamed.
-        PlaceError::InUse { .. } => Failure::input(error),
+        ShmDirError::InUse { .. } => Failure::input(error),
         error => Failure::failed(error),
     })
 }

@@ -23,12 +23,12 @@ pub struct Labeller {}
 
 impl Labeller {
     pub fn run(self) -> Result<ExitStatus, Failure> {
-        launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
+        launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
         let setup: LabellerConfig = process_config::from_stdin()?;
         log::init(setup.log.clone(), "labeller", setup.number)?;
         match &setup.slot {
             Some(slot) => launcher::end_with_parent(slot.parent).map_err(Failure::failed)?,
-            None => launcher::own_session().map_err(Failure::failed)?,
+            None => launcher::start_own_session().map_err(Failure::failed)?,
         }
         let method = setup.method.load(&setup.protocol)?;
         let closing = Arc::new(Shutdown::default());

@@ -8,7 +8,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use orchestrator::slurm::{JobNames, JobPhase, Plan, Slurm, SlurmError, Wanted, plan};
+use orchestrator::slurm::{DesiredJobs, JobNames, JobPhase, Plan, Slurm, SlurmError, plan};
 use store::Location;
 
 use self::job_specs::JobSpecs;
@@ -106,7 +106,7 @@ impl Launch {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let System::Slurm = self.on;
         let directory = self.directory()?;
-        let slurm = Slurm::with_patience(COMMAND_TIMEOUT);
+        let slurm = Slurm::with_timeout(COMMAND_TIMEOUT);
         if self.stop {
             let config = Config::load(&self.config)?.config;
             let names = job_names(&config.location(&directory)?);
@@ -141,7 +141,7 @@ impl Launch {
         })
     }
 
-    fn wanted(&self, location: &Location) -> Wanted {
+    fn wanted(&self, location: &Location) -> DesiredJobs {
         let mut labellers = self.labellers;
         if let Location::Directory(_) = location
             && labellers > 0
@@ -152,7 +152,7 @@ impl Launch {
             );
             labellers = 0;
         }
-        Wanted { agents: self.agents.unwrap_or(0), walkers: self.walkers, labellers }
+        DesiredJobs { agents: self.agents.unwrap_or(0), walkers: self.walkers, labellers }
     }
 
     async fn launch(
@@ -160,7 +160,7 @@ impl Launch {
         slurm: &Slurm,
         names: &JobNames,
         specs: &JobSpecs,
-        wanted: Wanted,
+        wanted: DesiredJobs,
     ) -> Result<(), Failure> {
         let jobs = |error: SlurmError| match self.dry_run && error.is_missing() {
             true => Ok(Vec::new()),

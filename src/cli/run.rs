@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
-use orchestrator::selector::{Selector, Snapshot};
+use orchestrator::selector::{Selector, SelectorSnapshot};
 use serde_json::json;
 use store::{
     DATABASE, Location, ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds,
@@ -89,7 +89,7 @@ impl Run {
         create_directory(&directory)?;
         let listen = self.listen.map(|endpoint| runtime::Listen {
             endpoint,
-            tls: self.tls.as_deref().map(Tls::in_directory),
+            tls: self.tls.as_deref().map(Tls::from_directory),
             announce: self.announce,
             host: self.host.unwrap_or_else(store::this_host),
         });
@@ -180,7 +180,7 @@ async fn run(
     let work = async {
         if used_up.is_some() {
             // The budget allows no further work.
-            return Ok(reactor::Ended::Stopped);
+            return Ok(reactor::RunOutcome::Stopped);
         }
         if in_process {
             single_process::run(run, selector).await
@@ -323,19 +323,23 @@ async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
 }
 
 /// Releases what this process holds, and removes its registration.
-async fn unregister(store: &Store, process: &ProcessRecord, ended: reactor::Ended) -> Result<(), StoreError> {
+async fn unregister(
+    store: &Store,
+    process: &ProcessRecord,
+    ended: reactor::RunOutcome,
+) -> Result<(), StoreError> {
     let now = unix_milliseconds();
     store.release_all(&process.id, now).await?;
     store.remove_process(&process.id).await?;
     let how = match ended {
-        reactor::Ended::Done => "done",
-        reactor::Ended::Stopped => "stopped",
+        reactor::RunOutcome::Finished => "done",
+        reactor::RunOutcome::Stopped => "stopped",
     };
     store.log_operation(now, "ended", &json!({ "process": process.id, "how": how })).await
 }
 
 async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, Failure> {
-    let snapshot = Snapshot {
+    let snapshot = SelectorSnapshot {
         walks: store.load_walks().await?,
         components: store.load_components().await?,
         known: store.known_hashes().await?,
@@ -352,7 +356,7 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
         snapshot,
     )
     .map_err(Failure::failed)?;
-    let started = selector.begin_walks();
+    let started = selector.start_walks();
     if !started.decisions.is_empty() {
         store.commit(&started).await?;
     }

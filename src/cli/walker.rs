@@ -22,7 +22,7 @@ impl Walker {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let setup: WalkerConfig = process_config::from_stdin()?;
         log::init(setup.log.clone(), "walker", Some(setup.door.walker()))?;
-        launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
+        launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
         launcher::end_with_parent(setup.parent).map_err(Failure::failed)?;
         let stopping = signals::stop_flag()?;
         let threads = Threads::new(setup.threads).map_err(Failure::failed)?;

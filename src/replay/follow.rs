@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::thread;
 
 use calm::Mixture;
-use orchestrator::selector::{Examined, Examiner, Replay, SelectorError};
+use orchestrator::selector::{RegradedCandidate, Regrader, Replay, SelectorError};
 use store::{Store, StoredCandidate};
 
 use super::failure;
@@ -38,7 +38,7 @@ pub async fn follow(
         }
         for recorded in &page {
             let candidate = match recorded.candidate {
-                Some(_) if replay.comes_to(recorded).map_err(failure)? => {
+                Some(_) if replay.is_reached(recorded).map_err(failure)? => {
                     Some(prefetch.take(store, replay, recorded.sequence).await?)
                 }
                 _ => None,
@@ -49,7 +49,7 @@ pub async fn follow(
             }
             let (stored, examined) = candidate.map(|ready| (ready.stored, ready.examined)).unzip();
             let examined = examined.flatten().transpose().map_err(Failure::failed)?;
-            let now = replay.follow(recorded, examined).map_err(failure)?;
+            let now = replay.apply(recorded, examined).map_err(failure)?;
             report.add(LogEntry { decision: recorded, candidate: stored.as_ref() }, now, replay.is_exact());
             bar.set(recorded.sequence.unsigned_abs(), String::new);
             if report.difference.is_some() {
@@ -69,7 +69,7 @@ fn damaged(decision: i64, problem: &str) -> Failure {
 /// A stored candidate without its arrays, and graded unless its features were not kept.
 struct PrefetchedCandidate {
     stored: StoredCandidate,
-    examined: Option<Result<Examined, SelectorError>>,
+    examined: Option<Result<RegradedCandidate, SelectorError>>,
 }
 
 /// Candidates after a position in the log.
@@ -95,7 +95,7 @@ impl Prefetch {
         if self.ready.is_empty() {
             let cores = cores();
             let stored = store.candidates(decision - 1, self.control, CANDIDATES_PER_CORE * cores).await?;
-            self.ready = examine(stored, replay.examiner(), replay.mixture(), cores as usize)?.into();
+            self.ready = examine(stored, replay.regrader(), replay.mixture(), cores as usize)?.into();
         }
         let ready = self.ready.pop_front().filter(|ready| ready.stored.decision == decision);
         ready.ok_or_else(|| damaged(decision, "its candidate is missing"))
@@ -105,7 +105,7 @@ impl Prefetch {
 /// Grades candidates on every core.
 fn examine(
     stored: Vec<StoredCandidate>,
-    examiner: &Examiner,
+    examiner: &Regrader,
     mixture: &Arc<Mixture>,
     cores: usize,
 ) -> Result<Vec<PrefetchedCandidate>, Failure> {
@@ -129,7 +129,7 @@ fn examine(
 
 fn examine_one(
     mut stored: StoredCandidate,
-    examiner: &Examiner,
+    examiner: &Regrader,
     mixture: &Arc<Mixture>,
 ) -> Result<PrefetchedCandidate, Failure> {
     let Some(features) = stored.features.take() else {
@@ -139,5 +139,5 @@ fn examine_one(
         .block
         .with_features(&features)
         .map_err(|error| damaged(stored.decision, &error.to_string()))?;
-    Ok(PrefetchedCandidate { examined: Some(examiner.examine_block(block, mixture)), stored })
+    Ok(PrefetchedCandidate { examined: Some(examiner.regrade_block(block, mixture)), stored })
 }

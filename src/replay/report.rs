@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use orchestrator::selector::{Replay, ReplayError, Replayed};
+use orchestrator::selector::{Replay, ReplayError, ReplayedDecision};
 use serde::Serialize;
 use serde_json::{Value, json};
 use store::{AtomGrades, LoggedDecision, NewestMixture, StoredCandidate};
@@ -134,7 +134,7 @@ impl Report {
     }
 
     /// Adds an entry of the log and its outcome in the replay.
-    pub fn add(&mut self, recorded: LogEntry<'_>, now: Option<Replayed>, exact: bool) {
+    pub fn add(&mut self, recorded: LogEntry<'_>, now: Option<ReplayedDecision>, exact: bool) {
         let decision = recorded.decision;
         self.replayed = decision.sequence;
         self.before.mixture_version = decision.mixture_version;
@@ -185,7 +185,7 @@ impl Report {
         if !replay.is_exact() || self.stopped.is_some() || self.difference.is_some() {
             return Ok(());
         }
-        let other = replay.other_component(end.version, &end.components)?;
+        let other = replay.first_different_component(end.version, &end.components)?;
         self.same_mixture = Some(other.is_none());
         self.difference = other.map(|(element, slot)| Difference {
             decision: end.decision,
@@ -219,7 +219,7 @@ fn step(decision: &LoggedDecision) -> u64 {
 }
 
 /// The first difference between a decision and its record.
-fn difference(recorded: &LogEntry<'_>, now: Option<&Replayed>) -> Option<Difference> {
+fn difference(recorded: &LogEntry<'_>, now: Option<&ReplayedDecision>) -> Option<Difference> {
     let before = recorded.decision;
     let as_json = |kind: &str, walk: Option<u32>, candidate: Option<String>, version: u64, detail: &Value| {
         json!({
@@ -228,7 +228,7 @@ fn difference(recorded: &LogEntry<'_>, now: Option<&Replayed>) -> Option<Differe
     };
     let LoggedDecision { kind, walk, candidate, mixture_version, detail, .. } = before;
     let old = as_json(kind, *walk, candidate.clone(), *mixture_version, detail);
-    let new = now.map_or(Value::Null, |Replayed { decision: now, .. }| {
+    let new = now.map_or(Value::Null, |ReplayedDecision { decision: now, .. }| {
         let (walk, candidate) = (now.walk.map(|walk| walk.0), now.candidate.map(|id| id.to_string()));
         as_json(now.kind, walk, candidate, now.mixture_version, &now.detail)
     });

@@ -5,7 +5,7 @@ use serde_json::json;
 use store::{
     AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Protocol, SeedStructure, Store,
 };
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 use super::*;
@@ -42,7 +42,7 @@ async fn offer(store: &Store, step: u64, origin: Origin, fate: Fate, keep_featur
     // The structure of a control walk differs slightly from that of its biased walk.
     let shift = if origin == Origin::Control { 0.001 } else { 0.0 };
     let structure = structure(2.5 + 0.01 * step as f64 + shift);
-    let content = ContentHash::of(&structure);
+    let content = ContentHash::from_structure(&structure);
     // The grades increase from atom to atom.
     let grades: Vec<_> = (0..ATOMS).map(|k| 0.2 * (k + 1) as f64).collect();
     let walk = WalkId(u32::from(origin == Origin::Control));
@@ -156,7 +156,7 @@ async fn what_is_missing_is_said() {
     for step in 0..30 {
         offer(&store, step, Origin::Biased, Fate::Accepted, false).await;
     }
-    offer(&store, 99, Origin::Biased, Fate::Declined(Decline::Covered), false).await;
+    offer(&store, 99, Origin::Biased, Fate::Declined(DeclineReason::Covered), false).await;
     let files = build(&store).await.unwrap();
     let page = words(file(&files, PAGE));
     for expected in ["no force error is known", "The store has no features", "n = 31", "240 atoms"] {
@@ -175,7 +175,7 @@ async fn figures_have_the_numbers_of_the_store() {
     for step in 0..40 {
         offer(&store, step, Origin::Biased, Fate::Accepted, true).await;
         offer(&store, step, Origin::Control, Fate::Accepted, true).await;
-        offer(&store, 1000 + step, Origin::Biased, Fate::Declined(Decline::Duplicate), true).await;
+        offer(&store, 1000 + step, Origin::Biased, Fate::Declined(DeclineReason::Duplicate), true).await;
     }
     label_all(&store).await;
     let files = build(&store).await.unwrap();

@@ -8,14 +8,14 @@ use std::time::Duration;
 
 use calm::Mixture;
 use orchestrator::launcher::{self, Children, Launch};
-use orchestrator::supervisor::{Limits, Standing};
+use orchestrator::supervisor::{ChildState, Limits};
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
-use wire::net::{self, Address, Joined, NetError, Parted, Tls, Uplink};
-use wire::place::Place;
+use wire::net::{self, Address, AgentClient, LinkError, Membership, NetError, Tls};
+use wire::shm_dir::ShmDir;
 use wire::transport::Incoming;
 use workers::agent::{self, Agent, AgentEvent};
 
@@ -47,8 +47,8 @@ pub async fn run(
     let (uplink, joined, setup) = tokio::select! {
         joined = join(address, tls, agent, directory) => joined?,
         () = stop.notified() => return Ok(ExitStatus::Interrupted),
-        () = address.over() => {
-            log_and_print("the campaign is over");
+        () = address.wait_until_over() => {
+            log_and_print("the campaign is wait_until_over");
             return Ok(ExitStatus::Done);
         }
         () = tokio::time::sleep(patience) => {
@@ -61,7 +61,7 @@ pub async fn run(
         count(walkers, "walker"),
         joined.newest().await.version()
     ));
-    let place = Place::of(directory).map_err(Failure::failed)?;
+    let place = ShmDir::for_campaign(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
     let (flag, wake) = (Arc::clone(&stopping), Arc::clone(&stop));
     let numbers = Arc::clone(&state.numbers);
@@ -90,9 +90,9 @@ async fn join(
     tls: Option<&Tls>,
     agent: net::Agent,
     directory: &Path,
-) -> Result<(Arc<Uplink>, Joined, AgentConfig), Failure> {
+) -> Result<(Arc<AgentClient>, Membership, AgentConfig), Failure> {
     let waiting = |why: &NetError| log_and_warn(format_args!("waiting for the orchestrator: {why}"));
-    let uplink = Uplink::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
+    let uplink = AgentClient::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
     let uplink = Arc::new(uplink);
     loop {
         let joined = uplink.join().await.map_err(Failure::failed)?;
@@ -110,15 +110,19 @@ async fn join(
 
 /// Path of the model: the orchestrator's file if this host can read it, otherwise a downloaded copy. `None` if this
 /// agent lost its membership before the download finished.
-async fn model(joined: &Joined, setup: &AgentConfig, directory: &Path) -> Result<Option<PathBuf>, Failure> {
+async fn model(
+    joined: &Membership,
+    setup: &AgentConfig,
+    directory: &Path,
+) -> Result<Option<PathBuf>, Failure> {
     let hash = &setup.model_hash;
     if process_config::verify_hash(&setup.model, hash).is_ok() {
         return Ok(Some(setup.model.clone()));
     }
     log_and_print("the orchestrator's model file is not on this host: downloading the model …");
     let path = directory.join("kokkos.npz");
-    let bytes = match joined.file(hash).await {
-        Err(Parted::Stranger(_)) => return Ok(None),
+    let bytes = match joined.fetch_file(hash).await {
+        Err(LinkError::RejoinRequired(_)) => return Ok(None),
         bytes => bytes.map_err(Failure::failed)?,
     };
     fs::write(&path, bytes)
@@ -131,17 +135,17 @@ async fn model(joined: &Joined, setup: &AgentConfig, directory: &Path) -> Result
 struct AgentHost {
     walkers: Children,
     state: AgentState,
-    line: ipc::Handle,
+    line: ipc::ServerHandle,
     dispatching: DispatchTask,
     serving: JoinHandle<Result<(), IpcError>>,
     /// How the last walker failed, if all have failed for good.
     given_up: Option<String>,
 }
 
-type DispatchTask = JoinHandle<Result<agent::AgentExit, Parted>>;
+type DispatchTask = JoinHandle<Result<agent::AgentExit, LinkError>>;
 
 async fn run_in(
-    place: &Place,
+    place: &ShmDir,
     setup: &AgentConfig,
     (walkers, threads): (u32, usize),
     mixture: &Mixture,
@@ -157,14 +161,14 @@ async fn run_in(
     let server = Server::open(place, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
     let line = server.handle();
     let limits = Limits {
-        silence: Duration::from_secs_f64(setup.silence_limit),
-        restarts: setup.restarts,
+        heartbeat_timeout: Duration::from_secs_f64(setup.silence_limit),
+        max_restarts: setup.restarts,
         ..Limits::default()
     };
     let walkers = Children::new(walkers, limits, launch(setup, threads, line.clone()));
     let (to_agent, incoming) = mpsc::channel(CHANNEL);
-    let signs = walkers.signs();
-    let heard = move |walker, useful| if useful { signs.useful(walker) } else { signs.heard(walker) };
+    let signs = walkers.heartbeats();
+    let heard = move |walker, useful| if useful { signs.delivered(walker) } else { signs.heartbeat(walker) };
     let serving = tokio::spawn(server.run(shared, to_agent, heard));
     let dispatching = dispatch(incoming);
     AgentHost { walkers, state: state.clone(), line, dispatching, serving, given_up: None }
@@ -176,14 +180,14 @@ async fn run_in(
 fn launch(
     setup: &AgentConfig,
     threads: usize,
-    line: ipc::Handle,
+    line: ipc::ServerHandle,
 ) -> impl FnMut(u32, u32) -> Launch + Send + 'static {
     let (setup, parent) = (setup.clone(), std::process::id());
     move |number, incarnation| {
         line.expect(number, incarnation);
         let setup = WalkerConfig {
             parent,
-            door: line.door(number, incarnation),
+            door: line.connect_info(number, incarnation),
             model: setup.model.clone(),
             model_hash: setup.model_hash.clone(),
             precision: setup.precision,
@@ -230,19 +234,21 @@ impl AgentHost {
     }
 
     /// Handles an event of a walker process. Returns whether all walkers have ended.
-    fn handle(&mut self, event: launcher::Event) -> bool {
+    fn handle(&mut self, event: launcher::ChildEvent) -> bool {
         match event {
-            launcher::Event::Started { .. } => {}
-            launcher::Event::Said { number, line } => log_and_print(format_args!("walker {number}: {line}")),
-            launcher::Event::Ended { number, ended } => {
-                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
-                if ended.then == Standing::GoneHome {
+            launcher::ChildEvent::Started { .. } => {}
+            launcher::ChildEvent::Stderr { number, line } => {
+                log_and_print(format_args!("walker {number}: {line}"))
+            }
+            launcher::ChildEvent::Ended { number, ended } => {
+                self.line.lost(number, ended.incarnation, ended.reason.is_crash());
+                if ended.then == ChildState::Exited {
                     self.walkers.close();
                 } else {
-                    log_and_warn(format_args!("walker {number}: {}; {}", ended.ending, ended.then));
+                    log_and_warn(format_args!("walker {number}: {}; {}", ended.reason, ended.then));
                 }
             }
-            launcher::Event::AllGone => {
+            launcher::ChildEvent::AllExited => {
                 self.line.close();
                 self.given_up = all_failed_message(&mut self.walkers);
                 return true;

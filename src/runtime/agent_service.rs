@@ -10,7 +10,7 @@ use serde_json::json;
 use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval};
-use wire::net::{self, AgentEvent, Hub, NetError, Welcome};
+use wire::net::{self, AgentBootstrap, AgentEvent, AgentServer, NetError};
 use wire::transport::Incoming;
 use workers::labeller::HEARTBEAT_INTERVAL;
 
@@ -21,18 +21,18 @@ use crate::process_config::{self, AgentConfig};
 
 /// Lets agents join if this run listens.
 pub struct AgentService {
-    hub: Option<Hub>,
+    hub: Option<AgentServer>,
     store: Store,
     mixture: Arc<Mixture>,
 }
 
 /// Closes the server.
-pub struct Handle(Option<net::Handle>);
+pub struct AgentServerHandle(Option<net::AgentServerHandle>);
 
 impl Handle {
     /// Tells agents that there is no more work.
     pub fn close(&self) {
-        self.0.iter().for_each(net::Handle::close);
+        self.0.iter().for_each(net::AgentServerHandle::close);
     }
 }
 
@@ -55,12 +55,14 @@ impl AgentService {
             silence_limit: config.run.silence_limit.get(),
             restarts: config.run.restarts,
         };
-        let welcome =
-            Welcome { setup: process_config::to_bytes(&setup), files: BTreeMap::from([(model_hash, model)]) };
+        let welcome = AgentBootstrap {
+            setup: process_config::to_bytes(&setup),
+            files: BTreeMap::from([(model_hash, model)]),
+        };
         let patience = Duration::from_secs_f64(config.run.agent_silence_limit.get());
-        let hub = Hub::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
+        let hub = AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
         let hub = hub.map_err(|error| match error {
-            NetError::Ended { .. } => Failure::failed(error),
+            NetError::SessionClosed { .. } => Failure::failed(error),
             error => Failure::input(error),
         })?;
         listen.announce(hub.endpoint())?;
@@ -69,7 +71,7 @@ impl AgentService {
     }
 
     pub fn handle(&self) -> Handle {
-        Handle(self.hub.as_ref().map(Hub::handle))
+        Handle(self.hub.as_ref().map(AgentServer::handle))
     }
 
     /// Serves agents until there is no more work and the last agent has left.
@@ -131,11 +133,11 @@ async fn record_event(
     let now = unix_milliseconds();
     let (agent, what, state) = match event {
         AgentEvent::Joined(agent) => (agent, "joined", "running"),
-        AgentEvent::Silent(agent) => (agent, "sends no heartbeat", "silent"),
-        AgentEvent::Back(agent) => (agent, "is back", "running"),
+        AgentEvent::Unresponsive(agent) => (agent, "sends no heartbeat", "silent"),
+        AgentEvent::Recovered(agent) => (agent, "is back", "running"),
         AgentEvent::Lost(agent) => (agent, "timed out: its walks go to other walkers", "lost"),
         AgentEvent::Left(agent) => (agent, "left", "left"),
-        AgentEvent::Dropped(why) => {
+        AgentEvent::MessageRejected(why) => {
             log_and_warn(format_args!("rejected a message from another host: {why}"));
             return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
         }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use orchestrator::launcher::{Children, Event, Launch};
-use orchestrator::supervisor::{Limits, Standing};
+use orchestrator::launcher::{ChildEvent, Children, Launch};
+use orchestrator::supervisor::{ChildState, Limits};
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval};
@@ -62,7 +62,7 @@ pub async fn run(
     loop {
         let done = tokio::select! {
             event = manager.labellers.children.next() => match event {
-                Event::AllGone => break,
+                ChildEvent::AllExited => break,
                 event => manager.handle(event).await,
             },
             _ = ticks.tick() => manager.update().await,
@@ -85,9 +85,14 @@ pub async fn run(
 }
 
 fn children(pool: LabelPool) -> Children {
-    let limits = Limits { silence: LABELLER_TIMEOUT, grace: pool.grace + RELEASE_TIME, ..Limits::default() };
-    let LabelPool { number, location, label_setup, until_empty, grace } = pool;
-    let slot = PoolConfig { parent: std::process::id(), until_empty, grace: grace.as_secs_f64() };
+    let limits = Limits {
+        heartbeat_timeout: LABELLER_TIMEOUT,
+        grace_period: pool.grace_period + RELEASE_TIME,
+        ..Limits::default()
+    };
+    let LabelPool { number, location, label_setup, until_empty, grace_period } = pool;
+    let slot =
+        PoolConfig { parent: std::process::id(), until_empty, grace_period: grace_period.as_secs_f64() };
     let setup = LabellerConfig::new(location, label_setup);
     Children::new(number, limits, move |_, incarnation| {
         let restarts = incarnation.saturating_sub(1);
@@ -106,20 +111,20 @@ struct PoolManager<'a> {
 }
 
 impl PoolManager<'_> {
-    async fn handle(&mut self, event: Event) -> Result<(), StoreError> {
+    async fn handle(&mut self, event: ChildEvent) -> Result<(), StoreError> {
         match event {
-            Event::Started { number, pid, .. } => self.labellers.started(number, pid),
-            Event::Said { number, line } => self.display.child_line(number, &line),
-            Event::Ended { number, ended } => {
-                if !matches!(ended.then, Standing::GoneHome) {
-                    self.display.line(&format!("slot {number}: {}; {}", ended.ending, ended.then));
+            ChildEvent::Started { number, pid, .. } => self.labellers.started(number, pid),
+            ChildEvent::Stderr { number, line } => self.display.child_line(number, &line),
+            ChildEvent::Ended { number, ended } => {
+                if !matches!(ended.then, ChildState::Exited) {
+                    self.display.line(&format!("slot {number}: {}; {}", ended.reason, ended.then));
                 }
                 let record = self.labellers.ended(self.store, number, &ended).await?;
                 if let Some(record) = record {
                     process_records::write_end(self.store, record, &ended).await?;
                 }
             }
-            Event::AllGone => {}
+            ChildEvent::AllExited => {}
         }
         Ok(())
     }

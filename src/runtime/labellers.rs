@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use orchestrator::launcher::Children;
-use orchestrator::supervisor::Ended;
+use orchestrator::supervisor::ChildExit;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 
 /// The labeller processes.
@@ -38,15 +38,15 @@ impl Labellers {
         &mut self,
         store: &Store,
         number: u32,
-        ended: &Ended,
+        ended: &ChildExit,
     ) -> Result<Option<ProcessRecord>, StoreError> {
         let pid = self.pids.remove(&number);
         let labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
         let record = labellers.into_iter().rfind(|record| is_process(record, pid));
         let now = unix_milliseconds();
-        if let Some(record) = record.as_ref().filter(|_| ended.ending.is_own_fault()) {
+        if let Some(record) = record.as_ref().filter(|_| ended.reason.is_crash()) {
             // Count the attempt as failed: a structure that kills labellers must not do so for ever.
-            let log = ended.ending.to_string();
+            let log = ended.reason.to_string();
             store.fail_leases_of(&record.id, "crashed", &log, self.attempts, now).await?;
         }
         store.release_leases_of_dead_processes(now).await?;
@@ -55,7 +55,7 @@ impl Labellers {
 
     /// Reads their heartbeats. A labeller that has sent them for longer than `proven` counts as working.
     pub async fn read_heartbeats(&mut self, store: &Store, proven: Duration) -> Result<(), StoreError> {
-        let signs = self.children.signs();
+        let heartbeats = self.children.heartbeats();
         let records = store.processes(Some(ProcessRecord::LABELLER)).await?;
         for (&number, &pid) in &self.pids {
             let Some(record) = records.iter().rfind(|record| is_process(record, Some(pid))) else {
@@ -68,9 +68,9 @@ impl Labellers {
             let since = before.map_or_else(Instant::now, |(_, since)| since);
             self.seen.insert(number, (record.last_seen, since));
             if since.elapsed() > proven {
-                signs.useful(number);
+                signs.delivered(number);
             } else {
-                signs.heard(number);
+                signs.heartbeat(number);
             }
         }
         Ok(())
@@ -78,8 +78,8 @@ impl Labellers {
 
     /// Treats all labellers as alive while their heartbeats cannot be read.
     pub fn assume_all_alive(&self) {
-        let signs = self.children.signs();
-        self.pids.keys().for_each(|number| signs.heard(*number));
+        let heartbeats = self.children.heartbeats();
+        self.pids.keys().for_each(|number| heartbeats.heartbeat(*number));
     }
 }
 

@@ -33,9 +33,9 @@ impl Listen {
         let Some(tls) = &self.tls else { return Ok(()) };
         let checked = tls.check_for_orchestrator().map_err(Failure::input)?;
         checked.warnings.iter().for_each(|warning| log_and_warn(format_args!("WARNING: {warning}")));
-        let endpoint = self.endpoint.of_host(&self.host).map_err(Failure::input)?;
+        let endpoint = self.endpoint.with_host_name(&self.host).map_err(Failure::input)?;
         let host = endpoint.plain_host();
-        if checked.is_for(host) {
+        if checked.is_valid_for(host) {
             return Ok(());
         }
         let names = checked.names.join(", ");
@@ -55,8 +55,8 @@ impl Listen {
     /// Announces the endpoint in the file.
     pub fn announce(&self, endpoint: &Endpoint) -> Result<(), Failure> {
         let Some(path) = &self.announce else { return Ok(()) };
-        let endpoint = endpoint.of_host(&self.host).map_err(Failure::input)?;
-        write_announcement(path, &Announcement::At(endpoint))
+        let endpoint = endpoint.with_host_name(&self.host).map_err(Failure::input)?;
+        write_announcement(path, &Announcement::Endpoint(endpoint))
     }
 
     /// Removes the announcement of an earlier run.

@@ -65,7 +65,7 @@ pub struct RunContext<'a> {
 const STOP_MESSAGE: &str = "stopping: walks are checkpointed …";
 
 /// The task that runs the reactor.
-type ReactorTask = tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>;
+type ReactorTask = tokio::task::JoinHandle<Result<reactor::RunOutcome, reactor::ReactorError>>;
 
 /// Starts the reactor and displays its progress.
 fn start_reactor(
@@ -77,12 +77,12 @@ fn start_reactor(
     let config = &run.campaign.config;
     let walk_steps = config.walk.equilibration + config.walk.steps.get();
     let mut ends = WalkEnds::default();
-    selector.ended().for_each(|(walk, end, reason)| ends.add(walk.0, end, reason));
+    selector.ended_walks().for_each(|(walk, end, reason)| ends.add(walk.0, end, reason));
     let mut display =
-        Display::new(walk_steps, selector.standing(walk_steps), ends, ForgettingRule::new(&config.calm));
+        Display::new(walk_steps, selector.walk_progress(walk_steps), ends, ForgettingRule::new(&config.calm));
     let queue_limit = u64::from(config.label.queue_limit.get());
     if config.label.queue_full == QueueFull::Raise {
-        selector.raise_above(queue_limit);
+        selector.raise_threshold_above(queue_limit);
     }
     let reactor = Reactor {
         selector,

@@ -17,7 +17,7 @@ use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Sleep, sleep};
 use wire::ipc::{Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 
 use super::agent_service::{self, AgentService};
 use super::process_manager::{self, ProcessManager};
@@ -35,8 +35,8 @@ pub const LABELLER_TIMEOUT: Duration = Duration::from_secs(60);
 /// Runs the campaign until it is finished or stopped.
 ///
 /// Await this on the main thread: the walkers end with the thread that starts them.
-pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
-    let place = Place::of(run.directory).map_err(Failure::failed)?;
+pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
+    let place = ShmDir::for_campaign(run.directory).map_err(Failure::failed)?;
     let ended = run_in(&place, run, selector).await;
     // No process needs the shared memory any more. The next start removes what cannot be removed now.
     let removed = place.remove().map_err(Failure::failed);
@@ -45,7 +45,11 @@ pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::End
     Ok(ended)
 }
 
-async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
+async fn run_in(
+    place: &ShmDir,
+    run: RunContext<'_>,
+    selector: Selector,
+) -> Result<reactor::RunOutcome, Failure> {
     let RunContext { campaign, store, process, .. } = run;
     let walkers = wanted_walkers(campaign);
     let mixture = Arc::clone(selector.mixture());
@@ -64,13 +68,17 @@ async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Resul
         handles.1.notify_one();
     });
     let limits = Limits {
-        silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
-        restarts: campaign.config.run.restarts,
+        heartbeat_timeout: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
+        max_restarts: campaign.config.run.restarts,
         ..Limits::default()
     };
     let line = server.handle();
     let walkers = Children::new(walkers, limits, spawn::walker_launcher(campaign, line.clone())?);
-    let limits = Limits { silence: limits.silence.max(LABELLER_TIMEOUT), outlives: true, ..limits };
+    let limits = Limits {
+        heartbeat_timeout: limits.heartbeat_timeout.max(LABELLER_TIMEOUT),
+        detached: true,
+        ..limits
+    };
     let labellers = spawn::start_labellers(run, limits).await?;
     let manager =
         ProcessManager::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
@@ -101,7 +109,7 @@ enum ManagerEvent {
     /// A stop was requested.
     StopRequested,
     /// The reactor has ended.
-    ReactorEnded(Result<reactor::Ended, Failure>),
+    ReactorEnded(Result<reactor::RunOutcome, Failure>),
     /// The transport has ended.
     TransportEnded(Result<(), Failure>),
 }
@@ -114,7 +122,7 @@ async fn supervise(
     agents: agent_service::Handle,
     mut serving: JoinHandle<Result<(), Failure>>,
     stop: &Notify,
-) -> Result<reactor::Ended, Failure> {
+) -> Result<reactor::RunOutcome, Failure> {
     let (mut reactor_result, mut transport_result, mut stop_requested) = (None, None, false);
     let mut database_deadline = None;
     while reactor_result.is_none() || transport_result.is_none() || !manager.has_ended() {
@@ -137,7 +145,7 @@ async fn supervise(
             ManagerEvent::ReactorEnded(ended) => {
                 agents.close();
                 match ended {
-                    Ok(reactor::Ended::Done) => manager.wait_for_labels(),
+                    Ok(reactor::RunOutcome::Finished) => manager.wait_for_labels(),
                     _ => manager.stop(),
                 }
                 reactor_result = Some(ended);
@@ -153,9 +161,9 @@ async fn supervise(
     transport_result.transpose()?;
     manager.failure()?;
     match reactor_result.transpose()? {
-        Some(reactor::Ended::Done) if !stop_requested => Ok(reactor::Ended::Done),
+        Some(reactor::RunOutcome::Finished) if !stop_requested => Ok(reactor::RunOutcome::Finished),
         // Every walk may be over, but the labellers were asked to stop and may have left jobs.
-        _ => Ok(reactor::Ended::Stopped),
+        _ => Ok(reactor::RunOutcome::Stopped),
     }
 }
 

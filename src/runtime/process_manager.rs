@@ -5,10 +5,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use orchestrator::launcher::{self, Children};
-use orchestrator::supervisor::Standing;
+use orchestrator::supervisor::ChildState;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
-use wire::ipc::Handle;
+use wire::ipc::ServerHandle;
 use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::db_status::DbStatus;
@@ -26,7 +26,7 @@ pub const PROVEN_AFTER: Duration = Duration::from_secs(10);
 pub struct ProcessManager<'a> {
     store: &'a Store,
     records: ProcessRecords<'a>,
-    line: Handle,
+    line: ServerHandle,
     walkers: Children,
     labellers: Labellers,
     heartbeats: Interval,
@@ -43,9 +43,9 @@ pub struct ProcessManager<'a> {
 /// An event to handle.
 pub enum Event {
     /// From a walker.
-    Walker(launcher::Event),
+    Walker(launcher::ChildEvent),
     /// From a labeller.
-    Labeller(launcher::Event),
+    Labeller(launcher::ChildEvent),
     /// Heartbeats are due.
     Heartbeat,
     /// A check for unfinished labels is due.
@@ -57,7 +57,7 @@ impl<'a> ProcessManager<'a> {
     pub fn new(
         store: &'a Store,
         process: ProcessRecord,
-        line: Handle,
+        line: ServerHandle,
         mut walkers: Children,
         labellers: Labellers,
         stopping: Arc<AtomicBool>,
@@ -82,10 +82,10 @@ impl<'a> ProcessManager<'a> {
 
     /// A callback for messages of walkers: takes the walker's number and whether the message delivered something.
     pub fn listener(&self) -> impl FnMut(u32, bool) + Send + 'static {
-        let (signs, heard) = (self.walkers.signs(), self.records.listener());
+        let (signs, heard) = (self.walkers.heartbeats(), self.records.listener());
         move |walker, useful| {
             heard(walker);
-            if useful { signs.useful(walker) } else { signs.heard(walker) }
+            if useful { signs.delivered(walker) } else { signs.heartbeat(walker) }
         }
     }
 
@@ -160,21 +160,23 @@ impl<'a> ProcessManager<'a> {
         self.stop();
     }
 
-    async fn handle_walker(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+    async fn handle_walker(&mut self, event: launcher::ChildEvent) -> Result<(), StoreError> {
         match event {
-            launcher::Event::Started { number, incarnation, pid } => {
+            launcher::ChildEvent::Started { number, incarnation, pid } => {
                 self.records.walker_started(number, incarnation, pid).await?;
             }
-            launcher::Event::Said { number, line } => log_and_print(format_args!("walker {number}: {line}")),
-            launcher::Event::Ended { number, ended } => {
-                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
-                if ended.then == Standing::GoneHome {
+            launcher::ChildEvent::Stderr { number, line } => {
+                log_and_print(format_args!("walker {number}: {line}"))
+            }
+            launcher::ChildEvent::Ended { number, ended } => {
+                self.line.lost(number, ended.incarnation, ended.reason.is_crash());
+                if ended.then == ChildState::Exited {
                     // There is no more work for the other walkers either.
                     self.walkers.close();
                 }
                 self.records.walker_ended(number, &ended).await?;
             }
-            launcher::Event::AllGone => {
+            launcher::ChildEvent::AllExited => {
                 self.ended[0] = true;
                 self.line.close();
                 let given_up = all_failed_message(&mut self.walkers);
@@ -184,17 +186,17 @@ impl<'a> ProcessManager<'a> {
         Ok(())
     }
 
-    async fn handle_labeller(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+    async fn handle_labeller(&mut self, event: launcher::ChildEvent) -> Result<(), StoreError> {
         match event {
-            launcher::Event::Started { number, pid, .. } => self.labellers.started(number, pid),
-            launcher::Event::Said { number, line } => {
+            launcher::ChildEvent::Started { number, pid, .. } => self.labellers.started(number, pid),
+            launcher::ChildEvent::Stderr { number, line } => {
                 log_and_print(format_args!("labeller {number}: {line}"))
             }
-            launcher::Event::Ended { number, ended } => {
+            launcher::ChildEvent::Ended { number, ended } => {
                 let record = self.labellers.ended(self.store, number, &ended).await?;
                 self.records.labeller_ended(number, record, &ended).await?;
             }
-            launcher::Event::AllGone => {
+            launcher::ChildEvent::AllExited => {
                 self.ended[1] = true;
                 let given_up = all_failed_message(&mut self.labellers.children);
                 self.fail_if_none_left("labeller", given_up);
@@ -230,7 +232,7 @@ impl<'a> ProcessManager<'a> {
 /// How the last process failed, if all of them have failed for good.
 pub fn all_failed_message(children: &mut Children) -> Option<String> {
     let status = children.status();
-    let given_up = status.iter().all(|child| child.standing == Standing::GivenUp);
+    let given_up = status.iter().all(|child| child.state == ChildState::Failed);
     let last = status.last().filter(|_| given_up)?;
     let how = last.last_failure.as_ref().map(ToString::to_string).unwrap_or_default();
     Some(format!("each failed after {} restarts, number {} with {how}", last.restarts, last.number))

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
 
-use orchestrator::supervisor::{Ended, Standing};
+use orchestrator::supervisor::{ChildExit, ChildState};
 use serde_json::json;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use wire::ipc::Traffic;
@@ -55,11 +55,11 @@ impl<'a> ProcessRecords<'a> {
     }
 
     /// Records the end of a walker process.
-    pub async fn walker_ended(&mut self, number: u32, ended: &Ended) -> Result<(), StoreError> {
+    pub async fn walker_ended(&mut self, number: u32, ended: &ChildExit) -> Result<(), StoreError> {
         let record = self.walkers.remove(&number);
         // A process that could not be started has no record.
         let record = record.unwrap_or_else(|| new_record(ProcessRecord::WALKER, number, 0));
-        if ended.then != Standing::GoneHome {
+        if ended.then != ChildState::Exited {
             self.walkers.insert(number, with_end(record.clone(), ended));
         }
         log_end(ProcessRecord::WALKER, number, ended);
@@ -71,7 +71,7 @@ impl<'a> ProcessRecords<'a> {
         &self,
         number: u32,
         record: Option<ProcessRecord>,
-        ended: &Ended,
+        ended: &ChildExit,
     ) -> Result<(), StoreError> {
         let record = record.unwrap_or_else(|| new_record(ProcessRecord::LABELLER, number, 0));
         log_end(ProcessRecord::LABELLER, number, ended);
@@ -86,9 +86,9 @@ impl<'a> ProcessRecords<'a> {
             let heard = self.heard.get(*number as usize).map_or(0, |heard| heard.load(Ordering::Relaxed));
             record.last_seen = record.last_seen.max(heard);
         }
-        let rejected = (traffic.dropped > self.dropped).then(|| {
-            let last = traffic.last_dropped.unwrap_or_default();
-            format!("{} messages rejected; the last: {last}", traffic.dropped)
+        let rejected = (traffic.rejected > self.rejected).then(|| {
+            let last = traffic.last_rejected.unwrap_or_default();
+            format!("{} messages rejected; the last: {last}", traffic.rejected)
         });
         if let Some(rejected) = &rejected {
             self.process.remark.clone_from(rejected);
@@ -97,31 +97,31 @@ impl<'a> ProcessRecords<'a> {
         self.store.upsert_processes(&records).await?;
         if let Some(rejected) = rejected {
             log_and_warn(&rejected);
-            let detail = json!({ "dropped": traffic.dropped, "remark": rejected });
+            let detail = json!({ "rejected": traffic.rejected, "remark": rejected });
             self.store.log_operation(now, "messages_dropped", &detail).await?;
-            self.dropped = traffic.dropped;
+            self.dropped = traffic.rejected;
         }
         Ok(())
     }
 }
 
 /// Records how a process ended.
-pub async fn write_end(store: &Store, record: ProcessRecord, ended: &Ended) -> Result<(), StoreError> {
-    if ended.then == Standing::GoneHome {
+pub async fn write_end(store: &Store, record: ProcessRecord, ended: &ChildExit) -> Result<(), StoreError> {
+    if ended.then == ChildState::Exited {
         return store.remove_process(&record.id).await;
     }
     let record = with_end(record, ended);
     store.upsert_process(&record).await?;
     let detail = json!({
         "kind": record.kind, "number": record.number, "incarnation": ended.incarnation,
-        "how": ended.ending.to_string(), "then": ended.then.to_string(),
+        "how": ended.reason.to_string(), "then": ended.then.to_string(),
     });
     store.log_operation(unix_milliseconds(), "process_ended", &detail).await
 }
 
-fn log_end(kind: &str, number: u32, ended: &Ended) {
-    if ended.then != Standing::GoneHome {
-        log_and_warn(format_args!("{kind} {number}: {}; {}", ended.ending, ended.then));
+fn log_end(kind: &str, number: u32, ended: &ChildExit) {
+    if ended.then != ChildState::Exited {
+        log_and_warn(format_args!("{kind} {number}: {}; {}", ended.reason, ended.then));
     }
 }
 
@@ -130,11 +130,11 @@ fn new_record(kind: &str, number: u32, pid: u32) -> ProcessRecord {
 }
 
 /// The record of a process with its end.
-fn with_end(mut record: ProcessRecord, ended: &Ended) -> ProcessRecord {
+fn with_end(mut record: ProcessRecord, ended: &ChildExit) -> ProcessRecord {
     record.state = match ended.then {
-        Standing::Pausing { .. } => "pausing".to_owned(),
+        ChildState::BackingOff { .. } => "pausing".to_owned(),
         then => then.to_string(),
     };
-    record.remark = ended.ending.to_string();
+    record.remark = ended.reason.to_string();
     record
 }

@@ -5,7 +5,7 @@ use std::io::{ErrorKind, Result};
 use std::path::Path;
 
 use tempfile::{Builder, TempDir};
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 
 /// Prefix of the directories' names.
 const PREFIX: &str = "calmwalk-agent-";
@@ -42,7 +42,7 @@ impl ScratchDir {
 
 /// Removes what killed agents left on this host, as far as permissions allow.
 pub fn clean() {
-    for place in Place::all().unwrap_or_default() {
+    for place in ShmDir::all().unwrap_or_default() {
         let Some(directory) = place.campaign_directory() else { continue };
         // Those of running agents are locked and stay.
         if is_scratch(directory) && place.remove().is_ok() {

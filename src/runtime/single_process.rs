@@ -11,7 +11,7 @@ use potentials::grace::Threads;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 use wire::transport::{InProcess, Incoming};
 use workers::labeller::{self, ExitPolicy, HEARTBEAT_INTERVAL, LabellerSettings, Shutdown, Timing};
 use workers::walk::WalkContext;
@@ -28,8 +28,8 @@ use crate::campaign::Campaign;
 use crate::exit_status::Failure;
 
 /// Runs the campaign until it is finished or stopped.
-pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
-    if let Ok(place) = Place::of(run.directory) {
+pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
+    if let Ok(place) = ShmDir::for_campaign(run.directory) {
         // Removes what a killed run left in shared memory. This run needs nothing there.
         let _ = place.remove();
     }
@@ -84,7 +84,7 @@ impl Tasks {
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign, because its queue could only grow.
-    async fn finish(mut self) -> Result<reactor::Ended, Failure> {
+    async fn finish(mut self) -> Result<reactor::RunOutcome, Failure> {
         let mut failure = None;
         let ended = loop {
             tokio::select! {
@@ -100,7 +100,9 @@ impl Tasks {
             self.stopping.store(true, Ordering::Relaxed);
             self.closing.stop();
         }
-        if let Some(store) = self.external_labels.filter(|_| matches!(ended, Ok(reactor::Ended::Done))) {
+        if let Some(store) =
+            self.external_labels.filter(|_| matches!(ended, Ok(reactor::RunOutcome::Finished)))
+        {
             wait_for_labels(&store, &self.closing).await?;
         }
         let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
@@ -114,7 +116,7 @@ impl Tasks {
         match failure {
             Some(failure) => Err(failure),
             // Every walk is over, but the labellers were asked to stop and may have left jobs.
-            None if self.closing.is_stopping() => Ok(reactor::Ended::Stopped),
+            None if self.closing.is_stopping() => Ok(reactor::RunOutcome::Stopped),
             None => Ok(ended),
         }
     }

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use orchestrator::launcher::{Children, Launch, ask_to_end};
+use orchestrator::launcher::{Children, Launch, request_exit};
 use orchestrator::supervisor::Limits;
 use store::{ProcessRecord, Store, StoreError};
-use wire::ipc::Handle;
+use wire::ipc::ServerHandle;
 
 use super::RunContext;
 use super::labellers::Labellers;
@@ -20,7 +20,7 @@ use crate::process_config::{self, LabellerConfig, WalkerConfig};
 /// Returns the function that launches a walker.
 pub fn walker_launcher(
     campaign: &Campaign,
-    line: Handle,
+    line: ServerHandle,
 ) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, Failure> {
     let (model, model_hash) =
         (absolute(campaign.config.potential.model.get_ref())?, campaign.hash_of("potential.model"));
@@ -31,7 +31,7 @@ pub fn walker_launcher(
         line.expect(number, incarnation);
         let setup = WalkerConfig {
             parent,
-            door: line.door(number, incarnation),
+            door: line.connect_info(number, incarnation),
             model: model.clone(),
             model_hash: model_hash.clone(),
             precision,
@@ -71,7 +71,7 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
         match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.start_time).is_ok()) {
             Some(number) => drop(adopted.insert(number, found.pid)),
             // Ignore a labeller that has ended meanwhile.
-            None => drop(ask_to_end(found.pid, &found.start_time)),
+            None => drop(request_exit(found.pid, &found.start_time)),
         }
     }
     Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
@@ -80,7 +80,7 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
 /// Asks the labellers of an earlier run to end, because this run makes labels itself.
 pub async fn stop_labellers(store: &Store) -> Result<(), Failure> {
     for found in running_labellers(store).await? {
-        let _ = ask_to_end(found.pid, &found.start_time);
+        let _ = request_exit(found.pid, &found.start_time);
     }
     Ok(())
 }

@@ -9,7 +9,7 @@ use axum::extract::State;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use orchestrator::supervisor::{ChildStatus, Standing};
+use orchestrator::supervisor::{ChildState, ChildStatus};
 use workers::agent::AgentMetrics;
 
 use super::exposition::{CONTENT_TYPE, Text};
@@ -54,7 +54,7 @@ fn text(numbers: &AgentMetrics, walkers: &[ChildStatus]) -> String {
 
 fn walker_metrics(text: &mut Text, numbers: &AgentMetrics, walkers: &[ChildStatus]) {
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
-    walkers.iter().for_each(|walker| *states.entry(state_name(walker.standing)).or_default() += 1);
+    walkers.iter().for_each(|walker| *states.entry(state_name(walker.state)).or_default() += 1);
     let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
     let samples: Vec<_> =
         labels.iter().zip(states.values()).map(|(labels, count)| (&labels[..], *count as f64)).collect();
@@ -75,14 +75,14 @@ fn walker_metrics(text: &mut Text, numbers: &AgentMetrics, walkers: &[ChildStatu
 fn assignment_metrics(text: &mut Text, numbers: &AgentMetrics) {
     let taken = numbers.assignments_received as f64;
     text.counter(
-        "calmwalk_agent_turns_taken_total",
+        "calmwalk_agent_assignments_received_total",
         "Assignments received from the orchestrator.",
         &[(&[], taken)],
     );
     let assignments = &numbers.assignments;
     let outcomes = [
         ("candidate", assignments.candidate),
-        ("turn", assignments.steps_done),
+        ("steps_done", assignments.steps_done),
         ("paused", assignments.paused),
         ("ended", assignments.ended),
         ("lost", assignments.lost),
@@ -91,7 +91,7 @@ fn assignment_metrics(text: &mut Text, numbers: &AgentMetrics) {
     let samples: Vec<_> =
         labels.iter().zip(outcomes).map(|(labels, (_, count))| (&labels[..], count as f64)).collect();
     text.counter(
-        "calmwalk_agent_turns_total",
+        "calmwalk_agent_assignments_total",
         "Assignments by outcome, as acknowledged by the orchestrator.",
         &samples,
     );
@@ -134,13 +134,13 @@ fn optional_gauge(text: &mut Text, name: &str, help: &str, value: Option<f64>) {
     }
 }
 
-fn state_name(standing: Standing) -> &'static str {
+fn state_name(standing: ChildState) -> &'static str {
     match standing {
-        Standing::Starting => "starting",
-        Standing::Running => "running",
-        Standing::Pausing { .. } => "pausing",
-        Standing::Ending => "ending",
-        Standing::GoneHome => "gone_home",
-        Standing::GivenUp => "given_up",
+        ChildState::Starting => "starting",
+        ChildState::Running => "running",
+        ChildState::BackingOff { .. } => "pausing",
+        ChildState::Stopping => "ending",
+        ChildState::Exited => "gone_home",
+        ChildState::Failed => "given_up",
     }
 }

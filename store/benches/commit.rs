@@ -14,7 +14,7 @@ use common::{CAMPAIGN, commit_of, server, walk};
 use sqlx::postgres::PgConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
 use store::{AtomGrades, CandidateRecord, Commit, ComponentRecord, Fate, Location};
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 const ATOMS: usize = 108;
@@ -88,7 +88,7 @@ fn record(number: usize) -> CandidateRecord {
         periodic: [true; 3],
     };
     let grades = || AtomGrades { gamma: noise(1, ATOMS), gamma_nbr: noise(2, ATOMS) };
-    let content = ContentHash::of(&structure);
+    let content = ContentHash::from_structure(&structure);
     let block = CandidateBlock::encode(&Candidate {
         id: CandidateId { campaign: CAMPAIGN, walk: WalkId(0), segment: 0, step: number as u64, content },
         origin: Origin::Biased,
@@ -105,7 +105,7 @@ fn record(number: usize) -> CandidateRecord {
     });
     CandidateRecord {
         block,
-        fate: if number.is_multiple_of(2) { Fate::Accepted } else { Fate::Declined(Decline::Covered) },
+        fate: if number.is_multiple_of(2) { Fate::Accepted } else { Fate::Declined(DeclineReason::Covered) },
         seed_structure: 0,
         selector: grades(),
         original: grades(),

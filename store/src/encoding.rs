@@ -24,7 +24,7 @@ pub fn encode_structure(structure: &Structure) -> Vec<u8> {
 /// Decodes a structure and checks its hash.
 pub fn decode_structure(bytes: &[u8], hash: &[u8]) -> Result<Structure> {
     parse_structure(bytes)
-        .filter(|structure| ContentHash::of(structure).0 == hash)
+        .filter(|structure| ContentHash::from_structure(structure).0 == hash)
         .ok_or_else(|| StoreError::damaged("a structure", "its content does not match its hash"))
 }
 
@@ -92,7 +92,7 @@ mod tests {
             cell: Cell([[4.0, 0.1, 0.0], [0.0, 5.0, 0.0], [0.3, 0.0, 6.0]]),
             periodic: [true, false, true],
         };
-        let hash = ContentHash::of(&structure).0;
+        let hash = ContentHash::from_structure(&structure).0;
         let bytes = encode_structure(&structure);
         assert_eq!(decode_structure(&bytes, &hash).unwrap(), structure);
         for at in 0..bytes.len() {

@@ -5,7 +5,7 @@ use std::fmt;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
-use wire::messages::{Decline, Progress};
+use wire::messages::{DeclineReason, Progress};
 use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 /// Properties of a campaign, written when it is created.
@@ -54,7 +54,7 @@ pub enum Fate {
     /// In the data set, with a label job.
     Accepted,
     /// Not in the data set.
-    Declined(Decline),
+    Declined(DeclineReason),
 }
 
 impl Fate {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use store::{Commit, ComponentRecord, ExportFilter, Fate, JobState, ProcessRecord, Store, StoreError};
 use wire::Origin;
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 
 use crate::common::*;
 
@@ -16,7 +16,7 @@ use crate::common::*;
 fn numbered(k: u32) -> Commit {
     let records = vec![
         candidate(k, 1, Origin::Biased, Fate::Accepted),
-        candidate(k, 2, Origin::Biased, Fate::Declined(Decline::Covered)),
+        candidate(k, 2, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
     ];
     Commit {
         components: vec![ComponentRecord { element: 0, slot: 0, bytes: k.to_le_bytes().to_vec() }],

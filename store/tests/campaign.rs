@@ -3,7 +3,7 @@
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
 };
-use wire::messages::{Decline, Progress};
+use wire::messages::{DeclineReason, Progress};
 use wire::{Origin, WalkId};
 
 use crate::common::*;
@@ -33,12 +33,12 @@ async fn a_campaign_is_created_once_and_opened_often() {
 }
 
 fn mixed_commit() -> Commit {
-    let mut declined = candidate(1, 20, Origin::Biased, Fate::Declined(Decline::Covered));
+    let mut declined = candidate(1, 20, Origin::Biased, Fate::Declined(DeclineReason::Covered));
     declined.keep_features = false;
     let candidates = vec![
         candidate(0, 10, Origin::Biased, Fate::Accepted),
         declined,
-        candidate(1, 30, Origin::Biased, Fate::Declined(Decline::Guard)),
+        candidate(1, 30, Origin::Biased, Fate::Declined(DeclineReason::Guard)),
         candidate(2, 10, Origin::Control, Fate::Accepted),
     ];
     Commit {
@@ -278,7 +278,7 @@ async fn the_newest_decisions_are_summarized() {
     let store = home.create().await;
     let records = vec![
         candidate(0, 1, Origin::Biased, Fate::Accepted),
-        candidate(0, 2, Origin::Biased, Fate::Declined(Decline::Covered)),
+        candidate(0, 2, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
     ];
     let mut commit = commit_of(records);
     commit.decisions.push(Decision {

@@ -1,7 +1,7 @@
 //! The history of a candidate, found by number, name or prefix.
 
 use store::{CandidateRef, Commit, CoveredCandidate, Fate, JobState, LabelStatus, StoreError};
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 use wire::{Origin, WalkId};
 
 use crate::common::*;
@@ -11,11 +11,11 @@ async fn a_candidate_is_found_with_related_records() {
     let home = Home::new();
     let store = home.create().await.with_caller_clock();
     // Their walkers saw version 3; each decision adds a version.
-    let covered = Fate::Declined(Decline::Covered);
+    let covered = Fate::Declined(DeclineReason::Covered);
     let records = [
         candidate(0, 4, Origin::Biased, Fate::Accepted),
         candidate(1, 5, Origin::Biased, covered),
-        candidate(1, 6, Origin::Biased, Fate::Declined(Decline::Guard)),
+        candidate(1, 6, Origin::Biased, Fate::Declined(DeclineReason::Guard)),
         candidate(11, 7, Origin::Biased, covered),
     ];
     let named = |k: usize| CandidateRef { decision: k as i64 + 1, candidate: name_of(&records[k]) };

@@ -2,7 +2,7 @@
 
 use store::{Commit, Decision, Fate, Finding, Store};
 use wire::Origin;
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 
 use crate::common::*;
 
@@ -11,7 +11,7 @@ pub async fn whole(home: &Home) -> Store {
     let store = home.create().await;
     let records = vec![
         candidate(0, 1, Origin::Biased, Fate::Accepted),
-        candidate(0, 2, Origin::Biased, Fate::Declined(Decline::Covered)),
+        candidate(0, 2, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
         candidate(1, 1, Origin::Control, Fate::Accepted),
     ];
     let mut commit = Commit { walks: vec![walk(0, 1), walk(1, 1)], ..commit_of(records) };

@@ -12,7 +12,7 @@ use store::{
     CampaignLock, Commit, CompleteOutcome, ComponentRecord, ExportFilter, Fate, JobState, Store, StoreError,
 };
 use wire::Origin;
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 
 use crate::common::*;
 
@@ -24,7 +24,7 @@ const LIMIT: u32 = 3;
 fn numbered_commit(k: u64) -> Commit {
     let mut commit = commit_of(vec![
         candidate(0, 3 * k, Origin::Biased, Fate::Accepted),
-        candidate(0, 3 * k + 1, Origin::Biased, Fate::Declined(Decline::Covered)),
+        candidate(0, 3 * k + 1, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
         candidate(0, 3 * k + 2, Origin::Biased, Fate::Accepted),
     ]);
     commit.components = vec![ComponentRecord { element: 0, slot: 0, bytes: k.to_le_bytes().to_vec() }];

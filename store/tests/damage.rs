@@ -10,7 +10,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection, Row};
 use store::{Commit, ComponentRecord, DATABASE, ExportFilter, Fate, Store, StoreError};
 use wire::Origin;
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 
 use crate::common::*;
 
@@ -102,7 +102,7 @@ async fn full(directory: &Path, accepted: u64) -> Store {
     for step in 1..=accepted {
         let kind = if step % 3 == 0 { Origin::Control } else { Origin::Biased };
         let mut records = vec![candidate(0, step, kind, Fate::Accepted)];
-        records.push(candidate(1, step, Origin::Biased, Fate::Declined(Decline::Covered)));
+        records.push(candidate(1, step, Origin::Biased, Fate::Declined(DeclineReason::Covered)));
         let mut walks = vec![walk(0, step), walk(1, step)];
         walks[0].accepted = u32::try_from(step).unwrap();
         walks[1].accepted = 0;

@@ -5,7 +5,7 @@ use store::{
     Commit, CompleteOutcome, ExclusionChange, ExportFilter, Fate, JobState, LabelStatus, Lease, ListOrder,
     ListedCandidate, Protocol, RelabelRequest, Store, StoreError, WalkRecord,
 };
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 use wire::{ContentHash, Origin};
 
 use crate::common::*;
@@ -32,7 +32,7 @@ fn names(ids: &[&str]) -> Vec<String> {
 }
 
 fn content(step: u64) -> ContentHash {
-    ContentHash::of(&structure(1e-6 * step as f64))
+    ContentHash::from_structure(&structure(1e-6 * step as f64))
 }
 
 /// Energies in an export, by protocol.
@@ -113,7 +113,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_included_again() {
 async fn either_all_named_structures_are_excluded_or_none() {
     let home = Home::new();
     let (store, candidates) = labelled(&home, 2).await;
-    let covered = candidate(0, 7, Origin::Biased, Fate::Declined(Decline::Covered));
+    let covered = candidate(0, 7, Origin::Biased, Fate::Declined(DeclineReason::Covered));
     let waiting = candidate(0, 8, Origin::Biased, Fate::Accepted);
     store.commit(&commit_of(vec![covered.clone(), waiting.clone()])).await.unwrap();
     for (wrong, why) in

@@ -165,7 +165,7 @@ async fn collected_structures_come_with_their_labels() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     store.commit(&commit_of(vec![candidate(1, 9, Origin::Control, Fate::Accepted)])).await.unwrap();
-    let declined = Fate::Declined(wire::messages::Decline::Covered);
+    let declined = Fate::Declined(wire::messages::DeclineReason::Covered);
     store.commit(&commit_of(vec![candidate(0, 10, Origin::Biased, declined)])).await.unwrap();
     let dft = protocol("dft").hash;
     let mut found = Vec::new();

@@ -29,7 +29,7 @@ async fn jobs_are_leased_by_priority_then_age_and_return_on_expiry() {
     store.prioritise_job(&names[2], 20, 0).await.unwrap();
     let first = lease(&store, "host-1/a", 0).await.unwrap();
     assert_eq!((first.candidate.as_str(), first.attempt), (names[2].as_str(), 1));
-    assert_eq!(ContentHash::of(&first.structure), ContentHash::of(&structure(3e-6)));
+    assert_eq!(ContentHash::from_structure(&first.structure), ContentHash::from_structure(&structure(3e-6)));
     store.record_calculation(&first, "slurm 17", &CalculationRecord::default()).await.unwrap();
     assert_eq!(lease(&store, "host-1/b", 0).await.unwrap().candidate, names[0]);
     assert_eq!(lease(&store, "host-2", 0).await.unwrap().candidate, names[1]);
@@ -66,7 +66,10 @@ async fn the_first_result_becomes_the_label() {
     assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), FailOutcome::LeaseLost);
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
 
-    let history = store.label_history(ContentHash::of(&holds.structure), protocol("dft").hash).await.unwrap();
+    let history = store
+        .label_history(ContentHash::from_structure(&holds.structure), protocol("dft").hash)
+        .await
+        .unwrap();
     let lines: Vec<_> = history.iter().map(|record| (record.status, record.label.energy)).collect();
     assert_eq!(lines, [(LabelStatus::Label, -1.0), (LabelStatus::Check, -2.0)]);
     assert_eq!(history[0].source, LabelSource::Attempt { job: lost.job, attempt: lost.attempt });
@@ -283,7 +286,8 @@ async fn imports_label_waiting_jobs_and_can_be_repeated() {
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
     assert_eq!(state(&store, &names[1]).await, JobState::Queued);
     let known = store.known_hashes().await.unwrap();
-    let expected: Vec<_> = [1e-6, 2e-6, 50.0, 1e-6].map(|shift| ContentHash::of(&structure(shift))).into();
+    let expected: Vec<_> =
+        [1e-6, 2e-6, 50.0, 1e-6].map(|shift| ContentHash::from_structure(&structure(shift))).into();
     assert_eq!(known, expected);
     // All frames or none.
     let mut wrong = label(-6.0);
@@ -424,7 +428,7 @@ async fn the_cost_of_a_calculation_is_counted_once() {
     let shown = store.queue_show(&names[0]).await.unwrap();
     assert_eq!(shown.attempts_made[1].made, made);
     assert_eq!(shown.attempts_made[1].log.as_deref(), Some("the end"));
-    let hash = ContentHash::of(&second.structure);
+    let hash = ContentHash::from_structure(&second.structure);
     assert_eq!(store.label_history(hash, protocol("dft").hash).await.unwrap()[0].label, label);
 
     // A corrected time of a finished calculation changes the total by the difference.

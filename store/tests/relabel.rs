@@ -30,7 +30,10 @@ async fn campaign_with(home: &Home, candidates: u64, labelled: u64) -> (Store, V
     for energy in 1..=labelled {
         assert_eq!(label_next(&store, &protocol("dft"), -(energy as f64), 0).await, CompleteOutcome::Label);
     }
-    (store, (1..=candidates).map(|step| ContentHash::of(&structure(1e-6 * step as f64))).collect())
+    (
+        store,
+        (1..=candidates).map(|step| ContentHash::from_structure(&structure(1e-6 * step as f64))).collect(),
+    )
 }
 
 async fn again(store: &Store, structures: &[ContentHash], again: bool) -> RelabelCounts {
@@ -88,7 +91,7 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     whole(&store).await;
 
     let found = lease(&store, &dft, 300).await.unwrap();
-    assert_eq!(ContentHash::of(&found.structure), structures[0]);
+    assert_eq!(ContentHash::from_structure(&found.structure), structures[0]);
     assert!(found.overruled && found.failures.is_empty() && found.attempt == 2);
     assert_eq!(store.complete(&found, &label(-1.5), 400).await.unwrap(), CompleteOutcome::Label);
     assert_eq!(

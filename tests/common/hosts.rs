@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use tempfile::TempDir;
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 
 use super::campaign::{Outcome, Small, outcome};
 use super::processes::{assert_no_leftovers, processes_in, wait_until};
@@ -79,8 +79,8 @@ impl Hosts {
                 fs::read_dir(host.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
             assert_eq!(left, [host.path().join("said")]);
             let here =
-                |place: &Place| place.campaign_directory().is_some_and(|of| of.starts_with(host.path()));
-            assert!(!Place::all().unwrap().iter().any(here));
+                |place: &ShmDir| place.campaign_directory().is_some_and(|of| of.starts_with(host.path()));
+            assert!(!ShmDir::all().unwrap().iter().any(here));
         }
     }
 }

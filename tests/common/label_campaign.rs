@@ -193,7 +193,7 @@ pub async fn check_single_labels(store: &Store) -> usize {
     let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
     let mut structures = BTreeSet::new();
     for row in store.labelled(&filter, None, u32::MAX).await.unwrap() {
-        let structure = ContentHash::of(&row.structure);
+        let structure = ContentHash::from_structure(&row.structure);
         assert_eq!(store.label_history(structure, protocol).await.unwrap().len(), 1);
         assert_eq!((row.label.energy, row.label.forces[0]), (-1.5, [0.25, 0.0, 0.0]));
         // Two walks may have found the same structure.
@@ -228,7 +228,7 @@ fn collected(step: u64, structure: Structure, features: Vec<f64>) -> Candidate {
         walk: WalkId(0),
         segment: 0,
         step,
-        content: ContentHash::of(&structure),
+        content: ContentHash::from_structure(&structure),
     };
     Candidate {
         id,

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection, PgConnection};
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 
 /// A process in a directory: its pid and its command.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -121,7 +121,7 @@ pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
 /// Checks that a finished campaign left no process and nothing in shared memory.
 pub fn assert_no_leftovers(directory: &Path) {
     wait_until("every process is gone", || processes_in(directory).is_empty());
-    let place = Place::of(directory).expect("the campaign's directory");
+    let place = ShmDir::for_campaign(directory).expect("the campaign's directory");
     assert!(!place.directory().exists(), "{} is left", place.directory().display());
     let files = fs::read_dir("/dev/shm").expect("/dev/shm").flatten();
     let left: Vec<_> = files.map(|file| file.file_name().to_string_lossy().into_owned()).collect();

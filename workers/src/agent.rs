@@ -16,8 +16,8 @@ use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use wire::WalkId;
 use wire::messages::{Progress, Report};
-use wire::net::{Joined, Parted, Slot, Told, Uplink};
-use wire::transport::{Incoming, Work};
+use wire::net::{AgentClient, LinkError, Membership, Slot, SlotReport};
+use wire::transport::{Incoming, WorkItem};
 
 pub use self::metrics::{AgentMetrics, AssignmentCounts};
 use self::pool::AssignmentPool;
@@ -59,9 +59,9 @@ pub enum AgentEvent {
 /// Runs the agent's part of a campaign.
 pub struct Agent {
     /// The connection to the orchestrator.
-    pub uplink: Arc<Uplink>,
+    pub uplink: Arc<AgentClient>,
     /// The registration with the orchestrator.
-    pub joined: Joined,
+    pub joined: Membership,
     /// Messages from the walkers of this host.
     pub incoming: mpsc::Receiver<Incoming>,
     /// Set from outside to stop: walkers are dismissed, with their assignments as they are.
@@ -73,15 +73,15 @@ pub struct Agent {
 }
 
 /// The result of an exchange about a slot.
-type ExchangeResult = (Slot, Told, Result<Option<Work>, Parted>);
+type ExchangeResult = (Slot, SlotReport, Result<Option<WorkItem>, LinkError>);
 
 /// The reply to the query whether to stop, and how long it took.
-type StopReply = (Result<Option<bool>, Parted>, Duration);
+type StopReply = (Result<Option<bool>, LinkError>, Duration);
 
 /// State of the agent's exchange with the orchestrator.
 struct AgentState {
-    uplink: Arc<Uplink>,
-    joined: Arc<Joined>,
+    uplink: Arc<AgentClient>,
+    joined: Arc<Membership>,
     pool: AssignmentPool,
     in_flight: FuturesUnordered<BoxFuture<'static, ExchangeResult>>,
     /// Number of exchanges in flight that deliver something.
@@ -89,9 +89,9 @@ struct AgentState {
     /// The pending query whether to stop.
     stop_query: Option<BoxFuture<'static, StopReply>>,
     /// A new registration in progress, after this one was lost …
-    joining: Option<BoxFuture<'static, Result<Joined, Parted>>>,
+    joining: Option<BoxFuture<'static, Result<Membership, LinkError>>>,
     /// … which takes effect when every exchange of the old one is complete.
-    next_joined: Option<Joined>,
+    next_joined: Option<Membership>,
     /// When the orchestrator last replied.
     heard: Instant,
     metrics: Arc<Mutex<AgentMetrics>>,
@@ -106,10 +106,10 @@ impl Agent {
     ///
     /// # Errors
     /// The orchestrator is unresponsive, or its program is incompatible with this one.
-    pub async fn run(mut self, mut watch: impl FnMut(AgentEvent)) -> Result<AgentExit, Parted> {
+    pub async fn run(mut self, mut watch: impl FnMut(AgentEvent)) -> Result<AgentExit, LinkError> {
         let slots = self.joined.slots();
         let uplink = Arc::clone(&self.uplink);
-        let mut over = pin!(uplink.address().over());
+        let mut over = pin!(uplink.address().wait_until_over());
         let mut state = AgentState::new(self.uplink, self.joined, self.metrics);
         state.metrics().mixture_version = Some(state.joined.newest().await.version());
         state.start(slots);
@@ -164,7 +164,7 @@ async fn answer_to<T>(stop_query: &mut Option<BoxFuture<'static, T>>) -> T {
 }
 
 impl AgentState {
-    fn new(uplink: Arc<Uplink>, joined: Joined, metrics: Arc<Mutex<AgentMetrics>>) -> Self {
+    fn new(uplink: Arc<AgentClient>, joined: Membership, metrics: Arc<Mutex<AgentMetrics>>) -> Self {
         Self {
             uplink,
             joined: Arc::new(joined),
@@ -200,8 +200,8 @@ impl AgentState {
     }
 
     /// Starts to deliver the result of a slot's assignment and to ask for the next one.
-    fn exchange(&mut self, mut slot: Slot, told: Told) {
-        self.delivering += usize::from(!matches!(told, Told::Nothing));
+    fn exchange(&mut self, mut slot: Slot, told: SlotReport) {
+        self.delivering += usize::from(!matches!(told, SlotReport::Empty));
         let joined = Arc::clone(&self.joined);
         self.in_flight.push(Box::pin(async move {
             let result = slot.exchange(&joined, &told).await;
@@ -216,13 +216,13 @@ impl AgentState {
                 self.forward_progress(walk, progress);
                 None
             }
-            Incoming::Free { walker, report, reply } => {
+            Incoming::Idle { walker, report, reply } => {
                 if let Some(Report { walk, progress, .. }) = &report {
                     self.metrics().record_progress(*walk, progress);
                 }
                 self.pool.walker_idle(walker, report, reply)
             }
-            Incoming::Gone { walker, fault } => self.pool.walker_lost(walker, fault),
+            Incoming::Lost { walker, crashed } => self.pool.walker_lost(walker, crashed),
         };
         if let Some((slot, told)) = next {
             self.exchange(slot, told);
@@ -241,9 +241,9 @@ impl AgentState {
         self.delivering + self.pool.unsent()
     }
 
-    fn exchanged(&mut self, (slot, told, result): ExchangeResult) -> Result<(), Parted> {
+    fn exchanged(&mut self, (slot, told, result): ExchangeResult) -> Result<(), LinkError> {
         self.mark_heard();
-        self.delivering -= usize::from(!matches!(told, Told::Nothing));
+        self.delivering -= usize::from(!matches!(told, SlotReport::Empty));
         if result.is_ok() {
             self.metrics().delivered(&told);
         }
@@ -253,7 +253,7 @@ impl AgentState {
                 self.pool.assign(slot, work);
             }
             Ok(None) => self.pool.slot_closed(),
-            Err(Parted::Stranger(_)) => {
+            Err(LinkError::RejoinRequired(_)) => {
                 self.pool.keep_unsent(told);
                 self.rejoin();
             }
@@ -273,7 +273,7 @@ impl AgentState {
         }
     }
 
-    fn has_joined(&mut self, joined: Joined) {
+    fn has_joined(&mut self, joined: Membership) {
         self.next_joined = Some(joined);
         self.switch_session();
     }
@@ -291,10 +291,10 @@ impl AgentState {
 
     /// Queries whether to stop. Fails if the orchestrator has been unresponsive for longer than
     /// `orchestrator_timeout`. Returns an event if its responsiveness changed.
-    fn poll(&mut self, orchestrator_timeout: Duration) -> Result<Option<AgentEvent>, Parted> {
+    fn poll(&mut self, orchestrator_timeout: Duration) -> Result<Option<AgentEvent>, LinkError> {
         let silence = self.heard.elapsed();
         if silence > orchestrator_timeout {
-            return Err(Parted::Silence { minutes: orchestrator_timeout.as_secs_f64() / 60.0 });
+            return Err(LinkError::Timeout { minutes: orchestrator_timeout.as_secs_f64() / 60.0 });
         }
         let joined = Arc::clone(&self.joined);
         self.stop_query.get_or_insert_with(|| {
@@ -311,12 +311,12 @@ impl AgentState {
 
     fn handle_stop_reply(
         &mut self,
-        told: Result<Option<bool>, Parted>,
+        told: Result<Option<bool>, LinkError>,
         took: Duration,
-    ) -> Result<bool, Parted> {
+    ) -> Result<bool, LinkError> {
         match told {
             Ok(None) => return Ok(false),
-            Err(Parted::Stranger(_)) => self.rejoin(),
+            Err(LinkError::RejoinRequired(_)) => self.rejoin(),
             Err(parted) => return Err(parted),
             Ok(Some(_)) => {}
         }
@@ -342,7 +342,7 @@ impl AgentState {
     async fn flush(&mut self) {
         while self.delivering > 0 {
             let Some((_, told, _)) = self.in_flight.next().await else { return };
-            self.delivering -= usize::from(!matches!(told, Told::Nothing));
+            self.delivering -= usize::from(!matches!(told, SlotReport::Empty));
         }
     }
 }

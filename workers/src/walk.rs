@@ -13,7 +13,7 @@ use calm::{CollectionRule, Mixture};
 use md::{Dynamics, DynamicsError, Stream};
 use potentials::grace::{Grace, GraceModel, Instructions, Threads};
 use potentials::{Zbl, ZblRangeError};
-use wire::messages::{Assignment, End, Outcome, Progress, Report, Verdict};
+use wire::messages::{Assignment, Outcome, Progress, Report, Verdict, WalkEnd};
 use wire::{Candidate, Origin};
 
 use crate::bias::{BiasedPotential, UngradedError};
@@ -58,15 +58,15 @@ pub fn advance(
     stopping: impl Fn() -> bool,
     on_progress: impl Fn(Progress),
 ) -> Report<Candidate> {
-    let (walk, turn) = (assignment.walk, assignment.turn);
+    let (walk, number) = (assignment.walk, assignment.number);
     let mut running = match Walk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(error) => {
-            let end = End::BadStart { reason: error.to_string() };
+            let end = WalkEnd::BadStart { reason: error.to_string() };
             let checkpoint = assignment.checkpoint.clone().unwrap_or_default();
             return Report {
                 walk,
-                turn,
+                assignment: number,
                 outcome: Outcome::Ended(end),
                 checkpoint,
                 progress: Progress::default(),
@@ -74,9 +74,9 @@ pub fn advance(
         }
     };
     let outcome = running.run(&stopping, &on_progress).unwrap_or_else(|error| {
-        Outcome::Ended(End::BlewUp { reason: format!("at step {}: {error}", running.step()) })
+        Outcome::Ended(WalkEnd::BlewUp { reason: format!("at step {}: {error}", running.step()) })
     });
-    Report { walk, turn, outcome, checkpoint: running.encode(), progress: running.progress() }
+    Report { walk, assignment: number, outcome, checkpoint: running.encode(), progress: running.progress() }
 }
 
 /// A walk during an assignment.
@@ -114,7 +114,7 @@ impl<'a> Walk<'a> {
             }
         };
         potential.state = state.bias;
-        let collection = settings.collection.with_threshold_factor(assignment.raised);
+        let collection = settings.collection.with_threshold_factor(assignment.threshold_factor);
         let mut walk =
             Self { settings, assignment, model, mixture_version, collection, dynamics, potential, state };
         walk.apply_verdict();
@@ -143,13 +143,13 @@ impl<'a> Walk<'a> {
         let last = self.settings.equilibration + self.settings.steps;
         loop {
             if self.step() >= last {
-                return Ok(Outcome::Ended(End::Steps));
+                return Ok(Outcome::Ended(WalkEnd::Steps));
             }
-            if self.step() >= self.assignment.until {
-                return Ok(Outcome::Turn);
+            if self.step() >= self.assignment.last_step {
+                return Ok(Outcome::StepsDone);
             }
             if stopping() {
-                return Ok(Outcome::Paused);
+                return Ok(Outcome::Interrupted);
             }
             self.advance_one_step()?;
             if let Some(outcome) = self.inspect_step()? {
@@ -183,7 +183,7 @@ impl<'a> Walk<'a> {
     fn inspect_step(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let step = self.step();
         if self.is_control() {
-            let wanted = self.assignment.wanted.contains(&step);
+            let wanted = self.assignment.frame_steps.contains(&step);
             return if wanted { Ok(Some(Outcome::Candidate(self.candidate()?))) } else { Ok(None) };
         }
         let biased_steps = step.checked_sub(self.settings.equilibration);
@@ -231,7 +231,7 @@ impl<'a> Walk<'a> {
             return Ok(None);
         }
         if self.state.returns == guard.most_returns || self.state.good.is_empty() {
-            return Ok(Some(Outcome::Ended(End::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
+            return Ok(Some(Outcome::Ended(WalkEnd::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
         }
         self.roll_back()?;
         Ok(None)

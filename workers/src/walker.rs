@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use tracing::debug;
 use wire::Candidate;
-use wire::messages::{End, Outcome, Progress, Report};
-use wire::transport::{Transport, Work};
+use wire::messages::{Outcome, Progress, Report, WalkEnd};
+use wire::transport::{Transport, WorkItem};
 
 use crate::walk::{WalkContext, advance};
 
@@ -40,7 +40,7 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) -> WalkerExit 
     WalkerExit::Dismissed
 }
 
-fn run_assignment(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report<Candidate> {
+fn run_assignment(context: &WalkContext, work: &WorkItem, transport: &impl Transport) -> Report<Candidate> {
     let walk = work.assignment.walk;
     let stopping = || transport.stopping();
     let last = Cell::new(Instant::now());
@@ -54,24 +54,33 @@ fn run_assignment(context: &WalkContext, work: &Work, transport: &impl Transport
 }
 
 /// Logs the outcome of an assignment.
-fn log_outcome(work: &Work, made: &Report<Candidate>, time: Duration) {
-    let (walk, turn, seconds) = (made.walk.0, made.turn, time.as_secs_f64());
+fn log_outcome(work: &WorkItem, made: &Report<Candidate>, time: Duration) {
+    let (walk, assignment, seconds) = (made.walk.0, made.assignment, time.as_secs_f64());
     let Progress { step, gamma_max, .. } = made.progress;
     let version = work.mixture.version();
     let outcome = match &made.outcome {
         Outcome::Candidate(_) => "candidate",
-        Outcome::Turn => "turn",
-        Outcome::Paused => "paused",
+        Outcome::StepsDone => "steps_done",
+        Outcome::Interrupted => "paused",
         Outcome::Ended(_) => "ended",
     };
-    debug!(walk, turn, step, gamma_max, mixture_version = version, seconds, outcome, "made a turn");
+    debug!(
+        walk,
+        assignment,
+        step,
+        gamma_max,
+        mixture_version = version,
+        seconds,
+        outcome,
+        "finished an assignment"
+    );
 }
 
-fn crash_report(work: &Work) -> Report<Candidate> {
-    let end = End::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
+fn crash_report(work: &WorkItem) -> Report<Candidate> {
+    let end = WalkEnd::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
     Report {
         walk: work.assignment.walk,
-        turn: work.assignment.turn,
+        assignment: work.assignment.number,
         outcome: Outcome::Ended(end),
         checkpoint: work.assignment.checkpoint.clone().unwrap_or_default(),
         progress: Progress::default(),

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use atoms::{Evaluation, NeighbourList, Potential, Structure, Vec3, cell, read_extxyz};
 use calm::{Artifact, CollectionRule, Grades, Mixture};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
-use wire::messages::{Assignment, End, Outcome, Report, Verdict};
+use wire::messages::{Assignment, Outcome, Report, Verdict, WalkEnd};
 use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::bias::BiasedPotential;
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
@@ -64,15 +64,15 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([1; 16]),
         walk: WalkId(0),
-        turn: 0,
+        number: 0,
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure: structure,
         checkpoint: None,
         verdict: None,
-        until,
-        wanted: Vec::new(),
-        raised: 1.0,
+        last_step: until,
+        frame_steps: Vec::new(),
+        threshold_factor: 1.0,
     }
 }
 
@@ -89,8 +89,8 @@ fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) ->
     loop {
         let report = run(settings, &turn);
         turn.checkpoint = Some(report.checkpoint.clone());
-        turn.until = report.progress.step + turn_steps;
-        turn.turn += 1;
+        turn.last_step = report.progress.step + turn_steps;
+        turn.number += 1;
         turn.verdict = matches!(report.outcome, Outcome::Candidate(_)).then_some(Verdict::Accepted);
         let ended = matches!(report.outcome, Outcome::Ended(_));
         reports.push(report);
@@ -104,10 +104,10 @@ fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) ->
 fn a_split_assignment_gives_the_same_result() {
     let settings = WalkSettings { collection: never(), ..settings() };
     let whole = run(&settings, &assignment(seed_structure("vacancy"), 120));
-    assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::Turn, 120));
+    assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 120));
     let mut turn = assignment(seed_structure("vacancy"), 0);
     for until in [1, 19, 20, 21, 33, 90, 120] {
-        turn.until = until;
+        turn.last_step = last_step;
         turn.checkpoint = Some(run(&settings, &turn).checkpoint);
     }
     assert_eq!(turn.checkpoint, Some(whole.checkpoint));
@@ -121,14 +121,14 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
     let checkpoint = run(&settings, &turn).checkpoint;
     let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
     let mixture = mixture();
-    turn.until = 115;
+    turn.last_step = 115;
     let mut refused = 0;
     for number in 0..mutate::mutations(60) {
         turn.checkpoint = Some(mutate::mutated(&checkpoint, number));
         let go = || advance(&context, &turn, Arc::clone(&mixture), || false, |_| {});
         let report = catch_unwind(AssertUnwindSafe(go));
         let report = report.unwrap_or_else(|_| panic!("a panic at mutation {number}"));
-        refused += u32::from(matches!(report.outcome, Outcome::Ended(End::BadStart { .. })));
+        refused += u32::from(matches!(report.outcome, Outcome::Ended(WalkEnd::BadStart { .. })));
     }
     assert!(refused > 0);
 }
@@ -242,7 +242,7 @@ fn the_skin_changes_nothing() {
         let report = run(&settings, &assignment(cluster.clone(), 4020));
         (report.outcome, report.progress.step)
     });
-    let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(End::BlewUp { reason }) if reason.contains("no neighbour"));
+    let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(WalkEnd::BlewUp { reason }) if reason.contains("no neighbour"));
     assert!(lost(&ends[0].0), "{:?}", ends[0]);
     assert!(ends.iter().all(|end| *end == ends[0]), "{ends:?}");
 }
@@ -255,7 +255,7 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
     let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
     let last = reports.last().unwrap();
     assert!(
-        matches!(&last.outcome, Outcome::Ended(End::Trapped { guard }) if guard == "shortest-bond"),
+        matches!(&last.outcome, Outcome::Ended(WalkEnd::Trapped { guard }) if guard == "shortest-bond"),
         "{last:?}"
     );
     assert_eq!(last.progress.returns, settings.guard.most_returns);
@@ -267,7 +267,7 @@ fn a_diverging_walk_ends_with_its_reason() {
     let guard = GuardSettings { highest_temperature: 900.0, ..settings().guard };
     let settings = WalkSettings { temperature: 2500.0, collection: never(), guard, ..settings() };
     let report = run(&settings, &assignment(seed_structure("fcc-100"), 600));
-    let Outcome::Ended(End::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };
+    let Outcome::Ended(WalkEnd::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };
     assert!(reason.contains("above the allowed 900 K"), "{reason}");
 }
 
@@ -277,16 +277,16 @@ fn a_control_walk_gives_the_requested_frames_and_follows_the_biased_one_until_th
     let mut control = assignment(seed_structure("slab-111"), 90);
     control.origin = Origin::Control;
     control.walk = WalkId(9);
-    control.wanted = vec![25, 90];
+    control.frame_steps = vec![25, 90];
     let report = run(&settings, &control);
     let Outcome::Candidate(candidate) = &report.outcome else { panic!("{report:?}") };
     assert_eq!((candidate.id.step, candidate.origin), (25, Origin::Control));
     // The bias is zero for its first ten evaluations: up to step 30 both trajectories agree.
     let same = |until: u64| {
         let quiet = WalkSettings { collection: never(), ..settings.clone() };
-        let biased = run(&quiet, &assignment(seed_structure("slab-111"), until));
-        let mut control = Assignment { wanted: Vec::new(), ..control.clone() };
-        control.until = until;
+        let biased = run(&quiet, &assignment(seed_structure("slab-111"), last_step));
+        let mut control = Assignment { frame_steps: Vec::new(), ..control.clone() };
+        control.last_step = last_step;
         let state =
             |report: &Report<Candidate>| (report.progress.temperature, report.progress.relative_volume);
         state(&biased) == state(&run(&quiet, &control))

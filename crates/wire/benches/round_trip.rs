@@ -1,10 +1,11 @@
-//! Round trip walker → server → walker: a walker's process offers candidates, a task that decides nothing answers.
+//! Round trip walker → server → walker. A walker's process sends candidates, and a task answers immediately.
 //! `cargo bench -p wire --bench round_trip`
 //!
-//! `encode` is the walker's part: control message and candidate, written once. `check` is the server's: checksums,
-//! content hash, decoding. What remains of the whole is the transport: two wake-ups of sleeping processes, the answer,
-//! the end of the old report. The whole is what a walker waits. Beside it, a byte to `cat` and back through pipes: two
-//! bare wake-ups. All that with processors at work, as they are in a campaign, and with idle ones, which take longer to wake.
+//! `encode` is the walker's share: encoding control message and candidate. `check` is the server's share: checksums,
+//! content hash, decoding. The rest is the transport: two wakeups of sleeping processes, the answer, and releasing the
+//! old report. The total is the time a walker waits. For comparison, a byte is sent to `cat` and back through pipes:
+//! two wakeups without anything else. All is measured with busy processors, as in a campaign, and with idle ones, which
+//! take longer to wake.
 
 use std::io::{Read, Write};
 use std::process::{Child, Command, Stdio};
@@ -16,22 +17,22 @@ use std::time::{Duration, Instant};
 use atoms::{Cell, Species, Structure};
 use calm::{Component, Mixture};
 use tokio::sync::mpsc;
-use wire::ipc::{Door, IpcWalker, Server, Sizes, space_needed};
+use wire::ipc::{ConnectInfo, IpcWalker, Server, Sizes, space_needed};
 use wire::messages::{Assignment, Outcome, Progress, Report};
 use wire::mixture::SharedMixture;
-use wire::place::Place;
-use wire::transport::{Incoming, Transport, Work};
+use wire::shm_dir::ShmDir;
+use wire::transport::{Incoming, Transport, WorkItem};
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
 const DOOR: &str = "CALMWALK_BENCH_DOOR";
 const TRIPS: usize = 2_000;
-/// Not counted: memory that is touched for the first time.
+/// Number of round trips before the measurement, in which memory is first accessed.
 const WARM_UP: usize = 100;
 
-/// Atoms and features: 1 kB to 4 MB. The fourth is a candidate as the paper has them.
+/// Atoms and features: 1 kB to 4 MB. The fourth has the size of a candidate in the paper.
 const SIZES: [(usize, usize); 6] = [(8, 4), (32, 24), (108, 32), (108, 131), (500, 131), (1000, 515)];
 
-/// Bytes of a checkpoint of 108 atoms. It goes with each report and comes with each turn, whatever the candidate.
+/// Size of a checkpoint of 108 atoms, bytes. It is part of every report and assignment.
 const CHECKPOINT: usize = 20_000;
 
 fn main() {
@@ -49,7 +50,7 @@ fn main() {
     }
 }
 
-/// Processes that keep every processor awake and give way to all others.
+/// Low-priority processes that keep every processor busy.
 struct AtWork(Vec<Child>);
 
 impl AtWork {
@@ -71,7 +72,7 @@ impl Drop for AtWork {
     }
 }
 
-/// A byte to another process and back.
+/// Sends a byte to another process and back.
 fn bare_wake_ups() {
     let mut cat =
         Command::new("cat").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("cat is there");
@@ -88,10 +89,10 @@ fn bare_wake_ups() {
     println!("  bare wake-ups through pipes: {median:.1} µs ({worst:.1})");
 }
 
-/// The walker's process: all sizes one after the other.
-fn walk(door: &Door) {
+/// The walker's process: all sizes in sequence.
+fn walk(door: &ConnectInfo) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
-    let mut checked = walker.exchange(None).expect("a turn").assignment.turn;
+    let mut checked = walker.exchange(None).expect("an assignment").assignment.number;
     println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
     for (atoms, features) in SIZES {
         let candidate = candidate(atoms, features);
@@ -100,13 +101,13 @@ fn walk(door: &Door) {
             let outcome = Outcome::Candidate(candidate.clone());
             let checkpoint = vec![0; CHECKPOINT];
             let progress = Progress::default();
-            let report = Report { walk: WalkId(0), turn: trip as u64, outcome, checkpoint, progress };
+            let report = Report { walk: WalkId(0), assignment: trip as u64, outcome, checkpoint, progress };
             let (begin, encoding) = (Instant::now(), walker.encoding());
-            let work = walker.exchange(Some(report)).expect("a turn");
+            let work = walker.exchange(Some(report)).expect("an assignment");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);
-            // The server's clock comes with the turn.
+            // The server's time is encoded in the number of the assignment.
             let check = Duration::from_nanos(
-                work.assignment.turn - std::mem::replace(&mut checked, work.assignment.turn),
+                work.assignment.number - std::mem::replace(&mut checked, work.assignment.number),
             );
             if trip >= WARM_UP {
                 times.push([whole, encode, check, whole.saturating_sub(encode + check)]);
@@ -137,32 +138,32 @@ fn quantiles(mut times: Vec<Duration>) -> (f64, f64) {
 async fn orchestrate() {
     tokio::task::spawn_blocking(bare_wake_ups).await.expect("a measurement");
     let directory = tempfile::tempdir().expect("a directory");
-    let place = Place::of(directory.path()).expect("a place");
+    let place = ShmDir::for_campaign(directory.path()).expect("a place");
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
     let prepared = place.prepare(space_needed(&sizes)).expect("enough shared memory");
     let mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
     let server = Server::open(&place, sizes, 1).expect("a transport");
     let handle = server.handle();
     handle.expect(0, 1);
-    let door = serde_json::to_string(&handle.door(0, 1)).expect("plain data");
+    let door = serde_json::to_string(&handle.connect_info(0, 1)).expect("plain data");
     let (to_reactor, mut incoming) = mpsc::channel(64);
     let running = tokio::spawn(server.run(mixtures, to_reactor, |_, _| {}));
     let clock = handle.clone();
     let deciding = tokio::spawn(async move {
         let mixture = Arc::new(mixture());
         while let Some(incoming) = incoming.recv().await {
-            if let Incoming::Free { report, reply, .. } = incoming {
+            if let Incoming::Idle { report, reply, .. } = incoming {
                 drop(report);
                 let checking = clock.traffic().checking.as_nanos() as u64;
                 let _ = reply
-                    .send(Some(Work { assignment: assignment(checking), mixture: Arc::clone(&mixture) }));
+                    .send(Some(WorkItem { assignment: assignment(checking), mixture: Arc::clone(&mixture) }));
             }
         }
     });
     let this = std::env::current_exe().expect("this program");
     let mut walker = Command::new(this).env(DOOR, door).stdin(Stdio::null()).spawn().expect("a process");
     tokio::task::spawn_blocking(move || walker.wait()).await.expect("a wait").expect("a process");
-    handle.gone(0, 1, false);
+    handle.lost(0, 1, false);
     handle.close();
     running.await.expect("a task").expect("a transport");
     deciding.await.expect("a task");
@@ -177,27 +178,27 @@ fn structure(atoms: usize) -> Structure {
     Structure { species, positions, cell, periodic: [true; 3] }
 }
 
-/// The next turn.
-fn assignment(turn: u64) -> Assignment {
+/// The next assignment.
+fn assignment(number: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([7; 16]),
         walk: WalkId(0),
-        turn,
+        number,
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure: structure(108),
         checkpoint: Some(vec![1; CHECKPOINT]),
         verdict: None,
-        until: 1000,
-        wanted: Vec::new(),
-        raised: 1.0,
+        last_step: 1000,
+        frame_steps: Vec::new(),
+        threshold_factor: 1.0,
     }
 }
 
 fn candidate(atoms: usize, features: usize) -> Candidate {
     let structure = structure(atoms);
     let numbers = |count: usize| (0..count).map(|k| (k as f64).sin()).collect();
-    let content = ContentHash::of(&structure);
+    let content = ContentHash::from_structure(&structure);
     Candidate {
         id: CandidateId { campaign: CampaignId([7; 16]), walk: WalkId(0), segment: 0, step: 1, content },
         origin: Origin::Biased,

@@ -1,7 +1,7 @@
-//! The shared mixture measured: making it, evaluating in it against private memory, and how soon a new component is
-//! seen by 16 other processes.
+//! Benchmark of the shared mixture: its creation, evaluation compared with private memory, and the delay until 16 other
+//! processes see a new component.
 //!
-//! `cargo bench -p wire --bench shared_mixture`; it takes about 1.5 GB of memory, 0.5 GB of it in /dev/shm.
+//! `cargo bench -p wire --bench shared_mixture` needs about 1.5 GB of memory, 0.5 GB of it in /dev/shm.
 
 use std::hint::black_box;
 use std::io::{Read, Write};
@@ -16,14 +16,14 @@ use wire::{MixtureReader, SharedMixture};
 
 const READERS: u32 = 16;
 
-/// Elements, components of each, features.
+/// Number of elements, components per element, and features.
 #[derive(Clone, Copy)]
 struct Size {
     name: &'static str,
     elements: usize,
     components: usize,
     dimension: usize,
-    /// Independent copies in memory.
+    /// Number of independent copies in memory.
     placements: usize,
 }
 
@@ -49,7 +49,7 @@ fn main() {
     }
 }
 
-/// Nanoseconds of the clock that all processes share.
+/// The clock that all processes share, ns.
 fn now() -> u64 {
     let time = clock_gettime(ClockId::Monotonic);
     time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
@@ -98,7 +98,7 @@ fn creation(path: &Path, mixture: &Mixture) {
     drop(shared);
 }
 
-/// γ and its gradient, private against shared, in pairs of alternating order over several placements of each.
+/// γ and its gradient, private and shared, in pairs of alternating order for several copies of each.
 fn evaluation(folder: &Path, size: Size, mixture: &Mixture) {
     let mut places = Vec::new();
     for place in 0..size.placements {
@@ -120,7 +120,7 @@ fn evaluation(folder: &Path, size: Size, mixture: &Mixture) {
                 let [first, second] = if (round + place) % 2 == 0 { [own, &**lent] } else { [lent, own] };
                 let times = [work(first), work(second)];
                 let [a, b] = if (round + place) % 2 == 0 { times } else { [times[1], times[0]] };
-                // The first round takes the pages in.
+                // The first round loads the pages.
                 if round > 0 {
                     private.push(a);
                     shared.push(b);
@@ -147,7 +147,7 @@ struct Case {
 impl Case {
     fn new(size: Size, mixture: &Mixture, atoms: usize) -> Self {
         let mut random = Random(2);
-        // An alloy of at most five elements spread over the table.
+        // An alloy of at most five elements, spread over the table.
         let element = |atom: usize| (atom % 5 * size.elements / 5).min(size.elements - 1);
         let elements: Vec<usize> = (0..atoms).map(element).collect();
         let features = elements.iter().enumerate().flat_map(|(atom, &element)| {
@@ -157,7 +157,7 @@ impl Case {
         Self { features: features.collect(), elements }
     }
 
-    /// One evaluation with gradient: its time in seconds.
+    /// Evaluates with gradient and returns the time, s.
     fn work(&self) -> impl FnMut(&Mixture) -> f64 {
         let (mut grades, mut gradient) = (Grades::default(), vec![0.0; self.features.len()]);
         move |mixture| {
@@ -176,13 +176,13 @@ fn median(numbers: &mut [f64]) -> f64 {
 }
 
 /// A new component, from the start of `publish` until the last of 16 processes has pinned the version and graded an
-/// atom with it. A process is woken by its pipe, as it would be by a message.
+/// atom with it. Each process is woken through its pipe, as by a message.
 fn visibility(path: &Path, size: Size, mut mixture: Arc<Mixture>) {
     let mut shared = SharedMixture::create(path, &mixture, READERS).expect("room in /dev/shm");
     let mut readers: Vec<Child> = (0..READERS).map(|number| start(path, number)).collect();
     let (mut random, mut seen) = (Random(3), [const { Vec::new() }; 4]);
-    for turn in 0..400 {
-        let place = turn * 7 % (size.elements * size.components);
+    for repetition in 0..400 {
+        let place = repetition * 7 % (size.elements * size.components);
         let (element, slot) = (place / size.components, place % size.components);
         let component = component(&mut random, size.dimension);
         let next = mixture.with_changes(&[ChangedComponent { element, slot, component }]);
@@ -198,7 +198,7 @@ fn visibility(path: &Path, size: Size, mut mixture: Arc<Mixture>) {
         }
         let answers: Vec<[u64; 3]> = readers.iter_mut().map(answer).collect();
         let last = |which: usize| answers.iter().map(|answer| answer[which]).max().unwrap_or(0);
-        if turn >= 20 {
+        if repetition >= 20 {
             let times = [published - start, last(1), last(2), last(0) - start];
             seen.iter_mut().zip(times).for_each(|(seen, time)| seen.push(time as f64 / 1e3));
         }
@@ -221,7 +221,7 @@ fn start(path: &Path, number: u32) -> Child {
     command.spawn().expect("a process")
 }
 
-/// End of the evaluation, time of the pin, time of the evaluation, ns.
+/// End of the evaluation, duration of the pin, duration of the evaluation, ns.
 fn answer(reader: &mut Child) -> [u64; 3] {
     let mut bytes = [[0; 8]; 3];
     let pipe = reader.stdout.as_mut().expect("piped");
@@ -229,7 +229,7 @@ fn answer(reader: &mut Child) -> [u64; 3] {
     bytes.map(u64::from_le_bytes)
 }
 
-/// The other side of [`visibility`].
+/// The reader's process of [`visibility`].
 fn read(path: &Path, number: u32) {
     let mut reader = MixtureReader::open(path, number).expect("a sound file");
     let (mut input, mut output) = (std::io::stdin(), std::io::stdout());

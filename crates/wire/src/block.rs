@@ -1,5 +1,5 @@
-//! A candidate as one block of bytes: a little-endian header, then 8-byte-aligned arrays. The same bytes
-//! serve memory, network, database and numpy; reading them copies nothing.
+//! A candidate as one block of bytes: a little-endian header followed by 8-byte-aligned arrays. Memory, network,
+//! database and NumPy use the same bytes, and reading them copies nothing.
 //!
 //! | array | type | shape |
 //! | --- | --- | --- |
@@ -10,8 +10,8 @@
 //! | γ_nbr under the walker's mixture | f64 | n |
 //! | features z | f64 | n × D |
 //!
-//! The arrays follow the header in this order without gaps, so their places follow from
-//! n and D; the header repeats the length of the whole, and a CRC-32 of everything after itself.
+//! The arrays follow the header in this order without gaps, so n and D determine their offsets. The header contains the
+//! total length and a CRC-32 of everything after the checksum.
 
 mod candidate;
 mod layout;
@@ -22,44 +22,44 @@ use std::sync::Arc;
 
 use zerocopy::IntoBytes;
 
-use layout::{Counts, HEADER, Header, VERSION, length, seal};
+use layout::{Counts, HEADER, Header, VERSION, length, write_checksum};
 
 pub use candidate::Candidate;
 pub use view::CandidateView;
 
-/// Why bytes are not a candidate.
+/// Why bytes are not a valid candidate block.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BlockError {
-    /// Fewer bytes than a header.
-    #[error("a candidate block of {0} bytes: its header alone has {HEADER}")]
+    /// Shorter than the header.
+    #[error("candidate block too short: {0} bytes, the header alone has {HEADER}")]
     Short(usize),
-    /// Bytes that cannot be read in place.
-    #[error("a candidate block whose bytes are not aligned to 8: copy it first")]
+    /// Not aligned, so the block cannot be read in place.
+    #[error("candidate block is not aligned to 8 bytes: copy it first")]
     Unaligned,
-    /// Another file or message.
+    /// Wrong magic bytes.
     #[error("not a candidate block (it begins with {0:02x?})")]
     Magic([u8; 8]),
-    /// A block of another version of this program.
-    #[error("a candidate block of version {0}; this program reads version {VERSION}")]
+    /// Another format version.
+    #[error("candidate block of version {0}, expected version {VERSION}")]
     Version(u32),
-    /// Length and counts do not agree.
-    #[error("a candidate block of {found} bytes whose header says {expected}")]
+    /// The length does not match the header.
+    #[error("candidate block of {found} bytes, its header says {expected}")]
     Length {
-        /// Bytes at hand.
+        /// Actual length, bytes.
         found: u64,
-        /// Bytes that the header asks for.
+        /// Length according to the header, bytes.
         expected: u64,
     },
-    /// Damaged.
-    #[error("a damaged candidate block: checksum {found:08x}, expected {expected:08x}")]
+    /// Wrong checksum.
+    #[error("damaged candidate block: checksum {found:08x}, expected {expected:08x}")]
     Checksum {
-        /// Of the bytes at hand.
+        /// Checksum of the bytes.
         found: u32,
-        /// In the header.
+        /// Checksum in the header.
         expected: u32,
     },
-    /// A field with a value that has no meaning.
-    #[error("a candidate block with {field} = {value}")]
+    /// A field with an invalid value.
+    #[error("candidate block with invalid {field}: {value}")]
     Field {
         /// Name of the field.
         field: &'static str,
@@ -68,62 +68,62 @@ pub enum BlockError {
     },
 }
 
-/// A checked block, in memory of this process or in memory that a walker shares. Clones share it.
+/// A validated block, in memory of this process or in shared memory of a walker. Clones share the memory.
 #[derive(Clone)]
 pub struct CandidateBlock {
     owner: Arc<dyn AsRef<[u8]> + Send + Sync>,
-    /// As they were checked: what a walker might write to its memory afterwards moves no array.
+    /// Kept from validation, so that a later write of a walker to its memory cannot change the extent of an array.
     counts: Counts,
 }
 
-/// Memory of this process, aligned to 8.
-struct Words(Vec<u64>);
+/// Memory of this process, aligned to 8 bytes.
+struct AlignedBytes(Vec<u64>);
 
 impl CandidateBlock {
     /// Encodes a candidate into memory of this process.
     ///
     /// # Panics
-    /// As [`Candidate::encode_into`].
+    /// See [`Candidate::encode_into`].
     pub fn encode(candidate: &Candidate) -> Self {
         let mut words = vec![0_u64; candidate.encoded_len() / 8];
         candidate.encode_into(words.as_mut_bytes());
         let counts = Counts { atoms: candidate.structure.len(), features: candidate.feature_dimension() };
-        Self { owner: Arc::new(Words(words)), counts }
+        Self { owner: Arc::new(AlignedBytes(words)), counts }
     }
 
-    /// Checks a block where it stands and keeps its owner, copying nothing. The bytes must not change any more.
+    /// Validates a block in place and keeps its owner, without copying. The bytes must not change afterwards.
     ///
     /// # Errors
-    /// Other or damaged bytes, bytes that are not aligned to 8.
+    /// Invalid or damaged bytes, or bytes that are not aligned to 8.
     pub fn in_place(owner: Arc<dyn AsRef<[u8]> + Send + Sync>) -> Result<Self, BlockError> {
         let counts = CandidateView::new((*owner).as_ref())?.counts;
         Ok(Self { owner, counts })
     }
 
-    /// Copies and checks `bytes`.
+    /// Copies and validates `bytes`.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, BlockError> {
         let mut words = vec![0_u64; bytes.len().div_ceil(8)];
         let (copy, _) = words.as_mut_bytes().split_at_mut(bytes.len());
         copy.copy_from_slice(bytes);
         let counts = CandidateView::new(copy)?.counts;
-        Ok(Self { owner: Arc::new(Words(words)), counts })
+        Ok(Self { owner: Arc::new(AlignedBytes(words)), counts })
     }
 
-    /// The bytes, 8-byte aligned.
+    /// The bytes of the block, aligned to 8.
     pub fn as_bytes(&self) -> &[u8] {
         (*self.owner).as_ref()
     }
 
-    /// The block read in place.
+    /// A view that reads the block in place.
     pub fn view(&self) -> CandidateView<'_> {
         CandidateView::arrays(self.as_bytes(), self.counts)
-            .expect("its owner gives the bytes that were checked")
+            .expect("the owner returns the bytes that were validated")
     }
 
-    /// The same block with other features ([n × D]), such as those that it had before they were kept apart.
+    /// A copy of the block with other features ([n × D]), for example to restore features that were stored separately.
     ///
     /// # Errors
-    /// [`BlockError::Field`] if they are not as many for each atom.
+    /// [`BlockError::Field`] if the number of features is not a multiple of the number of atoms.
     pub fn with_features(&self, features: &[f64]) -> Result<Self, BlockError> {
         let header = self.view().header;
         let atoms = self.counts.atoms;
@@ -135,23 +135,23 @@ impl CandidateBlock {
         let length = length(atoms as u64, counts.features as u64);
         let mut words = vec![0_u64; length as usize / 8];
         let bytes = words.as_mut_bytes();
-        // They stand last.
-        let (before, place) = bytes.split_at_mut(bytes.len() - size_of_val(features));
+        // The features come last.
+        let (before, tail) = bytes.split_at_mut(bytes.len() - size_of_val(features));
         before.copy_from_slice(&self.as_bytes()[..before.len()]);
-        place.copy_from_slice(features.as_bytes());
+        tail.copy_from_slice(features.as_bytes());
         let header = Header { length, features: counts.features as u64, ..header.clone() };
         bytes[..HEADER].copy_from_slice(header.as_bytes());
-        seal(bytes);
-        Ok(Self { owner: Arc::new(Words(words)), counts })
+        write_checksum(bytes);
+        Ok(Self { owner: Arc::new(AlignedBytes(words)), counts })
     }
 
-    /// The same block without its features, for a store that keeps those apart.
+    /// A copy of the block without features, for stores that keep them separately.
     pub fn without_features(&self) -> Self {
         self.with_features(&[]).expect("none for each atom")
     }
 }
 
-impl AsRef<[u8]> for Words {
+impl AsRef<[u8]> for AlignedBytes {
     fn as_ref(&self) -> &[u8] {
         self.0.as_bytes()
     }

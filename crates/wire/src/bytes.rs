@@ -1,12 +1,12 @@
-//! Bytes for serde as what they are. By itself serde takes them one by one, which costs more than all the rest of a
-//! message with a checkpoint; the encoding is the same.
+//! Serializes byte arrays as bytes. By default serde handles them element by element, which dominates the cost of a
+//! message with a checkpoint. The encoding is the same.
 
 use std::fmt;
 
 use serde::de::{Deserializer, Error, Visitor};
 use serde::ser::Serializer;
 
-/// For fields of type `&[u8]`, which serde reads as bytes but writes one by one.
+/// For fields of type `&[u8]`, which serde deserializes as bytes but serializes element by element.
 pub(crate) fn serialize<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_bytes(bytes)
 }

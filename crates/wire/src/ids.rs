@@ -1,5 +1,5 @@
-//! Identifiers. A candidate's is made of campaign, walk, segment, step and content, so that sending it
-//! twice changes nothing and no two structures share one.
+//! Identifiers. The id of a candidate consists of campaign, walk, segment, step and content, so no two structures share
+//! an id and sending a candidate twice has no effect.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,7 +7,7 @@ use std::str::FromStr;
 use atoms::Structure;
 use serde::{Deserialize, Serialize};
 
-/// A text that is no identifier of the kind expected.
+/// Text that is not a valid identifier.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("'{found}' is not {expected}")]
 pub struct IdError {
@@ -15,21 +15,21 @@ pub struct IdError {
     expected: &'static str,
 }
 
-/// A campaign: the hash of what must not change while it lasts.
+/// A campaign: the hash of everything that must not change during the campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct CampaignId(pub [u8; 16]);
 
-/// One walk of a campaign, counted from 0 in the order in which walks are begun.
+/// A walk of a campaign, numbered from 0 in the order of creation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct WalkId(pub u32);
 
-/// Whether a walk is driven by the bias, or is the unbiased control of one that is.
+/// Whether a walk is biased, or the unbiased control of a biased walk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Origin {
     /// Driven by the gradient of the grade.
     Biased,
-    /// τ = 0 and no updates, with the random numbers of the biased walk that it matches.
+    /// τ = 0 and no mixture updates, with the random numbers of the biased walk it matches.
     Control,
 }
 
@@ -43,13 +43,13 @@ impl Origin {
     }
 }
 
-/// BLAKE3 of species, positions, cell and periodicity, bit by bit.
+/// BLAKE3 hash of species, positions, cell and periodicity, bit by bit.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct ContentHash(pub [u8; 32]);
 
 impl ContentHash {
-    /// The hash of a structure. Two structures share it only if every number has the same bits.
-    pub fn of(structure: &Structure) -> Self {
+    /// Hashes a structure. Two structures have the same hash only if all their numbers are bitwise equal.
+    pub fn from_structure(structure: &Structure) -> Self {
         let mut hasher = blake3::Hasher::new();
         hasher.update(b"calmwalk structure 1");
         hasher.update(&(structure.len() as u64).to_le_bytes());
@@ -64,19 +64,19 @@ impl ContentHash {
     }
 }
 
-/// The name of a candidate, written `campaign-walk.segment.step-content`, for example
-/// `9f8e7d6c-3.0.1240-0123456789abcdef` (the first 4 bytes of the campaign, the first 8 of the content).
+/// Id of a candidate, written `campaign-walk.segment.step-content`, for example `9f8e7d6c-3.0.1240-0123456789abcdef`
+/// (first 4 bytes of the campaign, first 8 bytes of the content).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct CandidateId {
     /// Campaign.
     pub campaign: CampaignId,
     /// Walk.
     pub walk: WalkId,
-    /// Piece of the walk between two returns to a checkpoint, from 0.
+    /// Piece of the walk between two rollbacks, from 0.
     pub segment: u32,
-    /// Step of the walk, equilibration included.
+    /// Step of the walk, including equilibration.
     pub step: u64,
-    /// The structure.
+    /// Hash of the structure.
     pub content: ContentHash,
 }
 

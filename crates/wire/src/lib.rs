@@ -1,20 +1,20 @@
-//! What actors say to each other: identifiers, the candidate as one block of bytes, small control
-//! messages, and the [`transport`] that carries them.
+//! Messages between the processes of a campaign: identifiers, the candidate as one block of bytes, control messages,
+//! and the [`transport`] that carries them.
 
-// Tests in here draw their candidates where those in `tests` do.
+// Lets unit tests share the candidate strategies of `tests`.
 #[cfg(test)]
 extern crate self as wire;
 
 pub mod block;
 mod bytes;
 mod control;
-mod exchange;
 pub mod ids;
 pub mod ipc;
 pub mod messages;
 pub mod mixture;
 pub mod net;
-pub mod place;
+mod protocol;
+pub mod shm_dir;
 pub mod transport;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};

@@ -1,6 +1,6 @@
-//! Control messages. A walker holds nothing between two of them: an [`Assignment`] is all that it needs to
-//! go on with a walk, a [`Report`] is all that came of it. The same checkpoint gives the same report,
-//! whoever works on it and however often, which is what makes a campaign crash-only.
+//! Control messages. Walkers are stateless between messages: an [`Assignment`] is all a walker needs to continue a
+//! walk, and a [`Report`] is the complete result. The same checkpoint gives the same report on any walker, any number
+//! of times, which makes a campaign crash-only.
 
 use atoms::Structure;
 use serde::{Deserialize, Serialize};
@@ -8,65 +8,65 @@ use serde::{Deserialize, Serialize};
 use crate::block::CandidateBlock;
 use crate::ids::{CampaignId, Origin, WalkId};
 
-/// A turn of one walk, for whichever walker is free.
+/// A piece of one walk, for any idle walker.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Assignment {
-    /// Campaign, for the ids of candidates.
+    /// Campaign, used in candidate ids.
     pub campaign: CampaignId,
     /// The walk.
     pub walk: WalkId,
-    /// Counts the turns of the walk; a report of another turn is out of date.
-    pub turn: u64,
-    /// What kind of walk.
+    /// Number of this assignment within the walk, from 0. Reports with another number are stale.
+    pub number: u64,
+    /// Biased or control.
     pub origin: Origin,
-    /// The walk whose random numbers it uses: itself, or the biased walk that a control matches.
+    /// The walk whose random numbers are used: this walk, or the biased walk that a control walk matches.
     pub random_walk: WalkId,
-    /// Where it starts.
+    /// Starting structure.
     pub seed_structure: Structure,
-    /// The walker's own state of the walk; none at the start of it.
+    /// The walker's checkpoint of the walk; `None` at the start.
     #[serde(with = "crate::bytes::optional")]
     pub checkpoint: Option<Vec<u8>>,
-    /// What became of the candidate that its last turn ended with.
+    /// The decision on the candidate that ended the previous assignment.
     pub verdict: Option<Verdict>,
-    /// Stop at this step at the latest.
-    pub until: u64,
-    /// A control walk: the steps whose frames are wanted, ascending. Otherwise empty.
-    pub wanted: Vec<u64>,
-    /// Factor on the threshold of the collection rule: 1, or more while many structures wait for labels.
-    pub raised: f64,
+    /// Last step of this assignment.
+    pub last_step: u64,
+    /// Control walks: steps whose frames are collected, ascending. Empty for biased walks.
+    pub frame_steps: Vec<u64>,
+    /// Factor on the threshold of the collection rule: 1, or larger while many structures wait for labels.
+    pub threshold_factor: f64,
 }
 
-/// The answer to a candidate.
+/// The decision on a candidate, as the walker receives it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// Taken into the data set; the mixture covers it from now on.
+    /// Added to the data set; the updated mixture covers it.
     Accepted,
-    /// Not taken.
-    Declined(Decline),
+    /// Rejected, with the reason.
+    Declined(DeclineReason),
 }
 
-/// Why a candidate is not taken.
+/// Why a candidate was declined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Decline {
-    /// The newest mixture covers it: another walk found its like meanwhile.
+pub enum DeclineReason {
+    /// The newest mixture covers it: another walk found a similar structure first.
     Covered,
-    /// The very same structure is known already.
+    /// An identical structure is already known.
     Duplicate,
-    /// The selector's guard: atoms too close.
+    /// The selector's guard: atoms are too close.
     Guard,
-    /// The seed structure or the campaign has as many as it may have.
+    /// The seed structure or the campaign has reached its maximum number of structures.
     Budget,
-    /// So many structures wait for labels that the threshold was raised, above it.
+    /// The grade is below the threshold, which was raised because many structures wait for labels.
     Backlog,
 }
 
-impl Decline {
-    /// Every reason, in the order of summaries.
+impl DeclineReason {
+    /// All reasons, in the order of summaries.
     pub const ALL: [Self; 5] = [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget, Self::Backlog];
 
-    /// `"covered"`, `"duplicate"`, `"guard"`, `"budget"`, `"backlog"`.
+    /// The serialized name: `"covered"`, `"duplicate"`, `"guard"`, `"budget"` or `"backlog"`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Covered => "covered",
@@ -78,49 +78,49 @@ impl Decline {
     }
 }
 
-/// How a turn ended. A walker gives its candidate as a [`crate::Candidate`], which the transport encodes where it is
-/// to be read; it arrives as a block.
+/// How an assignment ended. A walker holds its candidate as a [`crate::Candidate`]; the transport encodes it directly
+/// into the memory where it is read, so the reactor receives a block.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome<C = CandidateBlock> {
-    /// With a candidate (or, in a control walk, a wanted frame).
+    /// With a candidate (in a control walk: a requested frame).
     Candidate(C),
-    /// At its last step.
-    Turn,
-    /// Before that, because the process was asked to stop: the same turn goes on later.
-    Paused,
-    /// The walk is over.
-    Ended(End),
+    /// All steps of the assignment are done.
+    StepsDone,
+    /// The process was asked to stop; the same assignment continues later.
+    Interrupted,
+    /// The walk has ended.
+    Ended(WalkEnd),
 }
 
-/// Why a walk is over.
+/// Why a walk ended.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum End {
-    /// It made all its steps.
+pub enum WalkEnd {
+    /// All steps are done.
     Steps,
-    /// Its seed structure has given as many structures as it may.
+    /// The maximum number of structures from this seed structure was collected.
     Collected,
-    /// The campaign has as many structures as it may have.
+    /// The campaign has reached its maximum number of structures.
     Budget,
-    /// A guard refused it too often, after the allowed number of returns to a checkpoint.
+    /// A guard rejected it too often, after the allowed number of rollbacks.
     Trapped {
-        /// The guard.
+        /// Name of the guard.
         guard: String,
     },
-    /// Non-finite forces, an absurd temperature, lost atoms.
+    /// Non-finite forces, an unphysical temperature, or lost atoms.
     BlewUp {
-        /// What was seen.
+        /// Details.
         reason: String,
     },
-    /// The seed structure itself cannot be walked from.
+    /// The walk cannot start from its seed structure.
     BadStart {
-        /// What was seen.
+        /// Details.
         reason: String,
     },
 }
 
-impl End {
-    /// `"steps"`, `"collected"`, `"budget"`, `"trapped"`, `"blew_up"`, `"bad_start"`.
+impl WalkEnd {
+    /// The serialized name: `"steps"`, `"collected"`, `"budget"`, `"trapped"`, `"blew_up"` or `"bad_start"`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Steps => "steps",
@@ -133,43 +133,43 @@ impl End {
     }
 }
 
-/// What came of a turn.
+/// The result of an assignment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report<C = CandidateBlock> {
     /// The walk.
     pub walk: WalkId,
-    /// The turn it answers.
-    pub turn: u64,
+    /// Number of the assignment that this report answers.
+    pub assignment: u64,
     /// How it ended.
     pub outcome: Outcome<C>,
-    /// The walker's state of the walk from which the next turn goes on.
+    /// The walker's checkpoint of the walk, from which the next assignment continues.
     pub checkpoint: Vec<u8>,
-    /// Where the walk stands.
+    /// Current state of the walk.
     pub progress: Progress,
 }
 
 impl<C> Report<C> {
-    /// The same report with its candidate in another form.
+    /// Converts the candidate of the report.
     pub fn map_candidate<D>(self, form: impl FnOnce(C) -> D) -> Report<D> {
         let outcome = match self.outcome {
             Outcome::Candidate(candidate) => Outcome::Candidate(form(candidate)),
-            Outcome::Turn => Outcome::Turn,
-            Outcome::Paused => Outcome::Paused,
+            Outcome::StepsDone => Outcome::StepsDone,
+            Outcome::Interrupted => Outcome::Interrupted,
             Outcome::Ended(end) => Outcome::Ended(end),
         };
-        let Self { walk, turn, checkpoint, progress, .. } = self;
-        Report { walk, turn, outcome, checkpoint, progress }
+        let Self { walk, assignment, checkpoint, progress, .. } = self;
+        Report { walk, assignment, outcome, checkpoint, progress }
     }
 }
 
-/// Where a walk stands; also sent while a turn lasts, for those who watch.
+/// Current state of a walk. Walkers also send it while they work, for display.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
-    /// Step, equilibration included.
+    /// Step, including equilibration.
     pub step: u64,
     /// Segment.
     pub segment: u32,
-    /// Uncertainty-force scale τ in force.
+    /// Current uncertainty-force scale τ.
     pub tau: f64,
     /// Kinetic temperature, K.
     pub temperature: f64,
@@ -177,10 +177,10 @@ pub struct Progress {
     pub relative_volume: f64,
     /// Largest γ of the last graded step.
     pub gamma_max: f64,
-    /// Refusals by the walker's own guard so far.
+    /// Number of rejections by the walker's guard.
     pub refused: u64,
-    /// Returns to a checkpoint so far.
+    /// Number of rollbacks.
     pub returns: u32,
-    /// The steps from which and to which it last returned, for the decision log; not stored beside it.
+    /// Start and target step of the last rollback, for the decision log; not stored with the progress.
     pub last_return: Option<(u64, u64)>,
 }

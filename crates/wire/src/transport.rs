@@ -1,5 +1,5 @@
-//! How a walker speaks to the reactor. Whatever carries the messages, the reactor sees one channel of
-//! [`Incoming`]; a walker sees a [`Transport`].
+//! Communication between walkers and the reactor. With every transport, the reactor receives from one channel of
+//! [`Incoming`], and a walker uses a [`Transport`].
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,53 +12,53 @@ use crate::block::{Candidate, CandidateBlock};
 use crate::ids::WalkId;
 use crate::messages::{Assignment, Progress, Report};
 
-/// A turn and the mixture that holds in it.
+/// An assignment with its mixture.
 #[derive(Clone, Debug)]
-pub struct Work {
-    /// The turn.
+pub struct WorkItem {
+    /// The assignment.
     pub assignment: Assignment,
-    /// The mixture, evaluated in place.
+    /// The mixture to use, evaluated in place.
     pub mixture: Arc<Mixture>,
 }
 
-/// A walker's end of the line.
+/// A walker's end of a transport.
 pub trait Transport: Send {
-    /// Delivers what came of the last turn (nothing at first) and waits for the next; `None` when there is
-    /// no more work, or nobody to give it. A report is safe only once this has returned `Some`.
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work>;
+    /// Delivers the last report (`None` at first) and waits for the next assignment. Returns `None` when there is no
+    /// more work or the orchestrator is gone. The report is committed only if this returns `Some`.
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem>;
 
-    /// Tells those who watch where a walk stands. May be lost.
+    /// Sends the current state of a walk, for display. May be lost.
     fn progress(&self, walk: WalkId, progress: Progress);
 
-    /// Whether the walker was asked to stop at the next step.
+    /// Whether the walker was asked to stop after the current step.
     fn stopping(&self) -> bool;
 }
 
-/// What the reactor receives.
+/// What the reactor receives from walkers.
 #[derive(Debug)]
 pub enum Incoming {
-    /// A walker is free.
-    Free {
-        /// Which walker.
+    /// A walker has nothing to do.
+    Idle {
+        /// Number of the walker.
         walker: u32,
-        /// What came of its last turn.
+        /// Report on its last assignment.
         report: Option<Report>,
-        /// Where its next turn goes; `None` sends it home.
-        reply: oneshot::Sender<Option<Work>>,
+        /// Receives the next assignment; `None` shuts the walker down.
+        reply: oneshot::Sender<Option<WorkItem>>,
     },
-    /// Where a walk stands.
+    /// Current state of a walk.
     Progress(WalkId, Progress),
-    /// A walker is no more, with or without a turn in hand.
-    Gone {
-        /// Which walker.
+    /// A walker has exited, with or without an assignment.
+    Lost {
+        /// Number of the walker.
         walker: u32,
-        /// Whether it died by its own fault, as in a crash, and was not killed from outside: the turn in its hand may do
-        /// the same to the next one.
-        fault: bool,
+        /// Whether it crashed, as opposed to being killed from outside: the assignment may crash the next walker as
+        /// well.
+        crashed: bool,
     },
 }
 
-/// The transport between threads of one process: values move, only the candidate takes its one form.
+/// The transport between threads of one process. Values are moved; only the candidate is encoded.
 #[derive(Debug)]
 pub struct InProcess {
     walker: u32,
@@ -67,24 +67,24 @@ pub struct InProcess {
 }
 
 impl InProcess {
-    /// The end of walker number `walker` of a line into `to_reactor`. Setting `stopping` asks it to stop.
+    /// The end of walker number `walker`. Setting `stopping` asks the walker to stop.
     pub fn new(walker: u32, to_reactor: mpsc::Sender<Incoming>, stopping: Arc<AtomicBool>) -> Self {
         Self { walker, to_reactor, stopping }
     }
 }
 
 impl Transport for InProcess {
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work> {
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem> {
         let report =
             report.map(|report| report.map_candidate(|candidate| CandidateBlock::encode(&candidate)));
         let (reply, answer) = oneshot::channel();
-        let message = Incoming::Free { walker: self.walker, report, reply };
+        let message = Incoming::Idle { walker: self.walker, report, reply };
         self.to_reactor.blocking_send(message).ok()?;
         answer.blocking_recv().ok().flatten()
     }
 
     fn progress(&self, walk: WalkId, progress: Progress) {
-        // A full channel means that the reactor is busy: whoever watches can do without this one.
+        // A full channel means that the reactor is busy. Progress may be lost.
         let _ = self.to_reactor.try_send(Incoming::Progress(walk, progress));
     }
 
@@ -93,12 +93,12 @@ impl Transport for InProcess {
     }
 }
 
-/// Also when the walker's thread panics: its turn must not be waited for.
+/// Also runs when the walker's thread panics, so that the reactor does not wait for its assignment.
 impl Drop for InProcess {
     fn drop(&mut self) {
-        let gone = Incoming::Gone { walker: self.walker, fault: false };
-        if let Err(TrySendError::Full(gone)) = self.to_reactor.try_send(gone) {
-            let _ = self.to_reactor.blocking_send(gone);
+        let lost = Incoming::Lost { walker: self.walker, crashed: false };
+        if let Err(TrySendError::Full(lost)) = self.to_reactor.try_send(lost) {
+            let _ = self.to_reactor.blocking_send(lost);
         }
     }
 }

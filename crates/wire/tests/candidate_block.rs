@@ -1,4 +1,4 @@
-//! A block gives back every bit that went in, and refuses every byte that did not.
+//! A block preserves every bit, and rejects every damaged byte.
 
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -6,7 +6,7 @@ use wire::{BlockError, Candidate, CandidateBlock, CandidateView};
 
 use crate::common::{bits, candidate};
 
-/// Places in the header.
+/// Offsets in the header.
 const LENGTH: usize = 16;
 const ATOMS: usize = 24;
 const FEATURES: usize = 32;
@@ -26,7 +26,7 @@ fn assert_same_bits(a: &Candidate, b: &Candidate) {
     assert_eq!(bits(&a.features), bits(&b.features));
 }
 
-/// The bytes with another number at a place of the header and the checksum that then fits.
+/// The block with other numbers at these header offsets, and a valid checksum.
 fn with_number(block: &CandidateBlock, numbers: &[(usize, u64)]) -> Vec<u8> {
     let mut bytes = block.as_bytes().to_vec();
     for (place, number) in numbers {
@@ -43,7 +43,7 @@ fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
 
 proptest! {
     #[test]
-    fn every_bit_comes_back(candidate in candidate()) {
+    fn every_bit_survives_a_round_trip(candidate in candidate()) {
         let block = CandidateBlock::encode(&candidate);
         prop_assert_eq!(block.as_bytes().len() % 8, 0);
         let copy = CandidateBlock::from_bytes(block.as_bytes()).unwrap();
@@ -55,7 +55,7 @@ proptest! {
     }
 
     #[test]
-    fn a_changed_byte_is_refused(candidate in candidate(), at in any::<prop::sample::Index>(), change in 1..=255_u8) {
+    fn changed_bytes_are_rejected(candidate in candidate(), at in any::<prop::sample::Index>(), change in 1..=255_u8) {
         let mut bytes = CandidateBlock::encode(&candidate).as_bytes().to_vec();
         let at = at.index(bytes.len());
         bytes[at] ^= change;
@@ -63,7 +63,7 @@ proptest! {
     }
 
     #[test]
-    fn missing_and_added_bytes_are_refused(
+    fn missing_and_extra_bytes_are_rejected(
         candidate in candidate(), at in any::<prop::sample::Index>(), added in vec(any::<u8>(), 1..20),
     ) {
         let bytes = CandidateBlock::encode(&candidate).as_bytes().to_vec();
@@ -75,14 +75,14 @@ proptest! {
     }
 
     #[test]
-    fn random_bytes_are_refused(bytes in vec(any::<u8>(), 0..600)) {
+    fn random_bytes_are_rejected(bytes in vec(any::<u8>(), 0..600)) {
         prop_assert!(CandidateBlock::from_bytes(&bytes).is_err());
         prop_assert!(CandidateView::new(&bytes).is_err());
     }
 
-    /// Counts are checked before anything is taken by them, also where the checksum fits.
+    /// Counts are validated before memory is accessed, even if the checksum is valid.
     #[test]
-    fn absurd_counts_are_refused(
+    fn excessive_counts_are_rejected(
         candidate in candidate(), atoms in any::<u64>(), features in any::<u64>(), length in any::<u64>(),
     ) {
         let block = CandidateBlock::encode(&candidate);
@@ -100,7 +100,7 @@ proptest! {
     }
 
     #[test]
-    fn a_block_without_features_is_the_same_in_all_else(candidate in candidate()) {
+    fn removing_features_keeps_everything_else(candidate in candidate()) {
         let block = CandidateBlock::encode(&candidate).without_features();
         prop_assert_eq!(block.as_bytes().len(), HEADER + 72 * candidate.gamma.len());
         prop_assert_eq!(block.view().feature_dimension(), 0);
@@ -128,7 +128,7 @@ fn every_single_byte_counts() {
 }
 
 #[test]
-fn counts_whose_product_overflows_are_refused() {
+fn overflowing_counts_are_rejected() {
     let block = some_block();
     let edges = [0, 1 << 31, (1 << 32) - 1, 1 << 32, 1 << 60, 1 << 63, u64::MAX / 8, u64::MAX];
     for atoms in edges {
@@ -141,7 +141,7 @@ fn counts_whose_product_overflows_are_refused() {
 }
 
 #[test]
-fn what_is_wrong_is_said() {
+fn errors_are_specific() {
     let block = some_block();
     let bytes = block.as_bytes();
     let error = |bytes: &[u8]| CandidateBlock::from_bytes(bytes).unwrap_err();
@@ -170,7 +170,7 @@ fn what_is_wrong_is_said() {
 }
 
 #[test]
-fn bytes_that_are_not_aligned_are_refused_in_place_and_copied_well() {
+fn unaligned_bytes_are_rejected_in_place_but_can_be_copied() {
     let block = some_block();
     let mut words = vec![0_u64; block.as_bytes().len() / 8 + 1];
     for shift in 1..8 {
@@ -183,14 +183,14 @@ fn bytes_that_are_not_aligned_are_refused_in_place_and_copied_well() {
 }
 
 #[test]
-#[should_panic = "the hash of this very structure"]
-fn a_candidate_with_the_name_of_another_is_not_encoded() {
+#[should_panic = "the id contains the hash of the structure"]
+fn candidates_with_a_wrong_id_are_not_encoded() {
     let mut candidate = some_block().view().to_candidate();
     candidate.structure.positions[0][0] = 1.0;
     CandidateBlock::encode(&candidate);
 }
 
-/// Memory that somebody else owns.
+/// Memory with another owner.
 struct Lent(Vec<u64>, usize);
 
 impl AsRef<[u8]> for Lent {
@@ -200,7 +200,7 @@ impl AsRef<[u8]> for Lent {
 }
 
 #[test]
-fn a_block_in_place_is_checked_and_not_copied() {
+fn blocks_in_place_are_validated_without_copying() {
     let block = some_block();
     let mut words = vec![0_u64; block.as_bytes().len() / 8 + 1];
     zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice())[8..].copy_from_slice(block.as_bytes());
@@ -219,7 +219,7 @@ fn a_block_in_place_is_checked_and_not_copied() {
     ));
 }
 
-/// Memory that is written to behind the back of whoever reads it.
+/// Memory that is modified while it is in use.
 struct Unsteady {
     now: std::sync::atomic::AtomicBool,
     checked: Vec<u64>,
@@ -234,7 +234,7 @@ impl AsRef<[u8]> for Unsteady {
 }
 
 #[test]
-fn what_is_written_after_the_check_leads_nowhere() {
+fn writes_after_validation_do_no_harm() {
     let block = some_block();
     let words = |bytes: &[u8]| {
         let mut words = vec![0_u64; bytes.len() / 8];

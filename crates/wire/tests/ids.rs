@@ -7,7 +7,7 @@ use crate::common::usable_structure;
 
 proptest! {
     #[test]
-    fn campaigns_and_hashes_come_back_from_text(a in any::<[u8; 16]>(), b in any::<[u8; 32]>()) {
+    fn ids_survive_a_round_trip_through_text(a in any::<[u8; 16]>(), b in any::<[u8; 32]>()) {
         let (campaign, hash) = (CampaignId(a), ContentHash(b));
         prop_assert_eq!(campaign.to_string().parse(), Ok(campaign));
         prop_assert_eq!(campaign.to_string().to_uppercase().parse(), Ok(campaign));
@@ -16,17 +16,17 @@ proptest! {
     }
 
     #[test]
-    fn other_text_is_refused(text in ".{0,70}") {
+    fn other_text_is_rejected(text in ".{0,70}") {
         let is_hexadecimal = text.bytes().all(|byte| byte.is_ascii_hexdigit());
         prop_assert_eq!(text.parse::<CampaignId>().is_ok(), is_hexadecimal && text.len() == 32);
         prop_assert_eq!(text.parse::<ContentHash>().is_ok(), is_hexadecimal && text.len() == 64);
     }
 
-    /// Any one number of a structure changes its hash; nothing else does.
+    /// Changing any number of a structure changes its hash; nothing else does.
     #[test]
-    fn a_hash_tells_structures_apart(structure in usable_structure(), at in any::<prop::sample::Index>()) {
-        let hash = ContentHash::of(&structure);
-        prop_assert_eq!(ContentHash::of(&structure.clone()), hash);
+    fn different_structures_have_different_hashes(structure in usable_structure(), at in any::<prop::sample::Index>()) {
+        let hash = ContentHash::from_structure(&structure);
+        prop_assert_eq!(ContentHash::from_structure(&structure.clone()), hash);
         let mut others = vec![structure.clone(); 4];
         let x = &mut others[0].positions.as_flattened_mut()[at.index(3 * structure.len())];
         *x = f64::from_bits(x.to_bits() ^ 1);
@@ -35,13 +35,13 @@ proptest! {
         let species = &mut others[3].species[at.index(structure.len())];
         *species = atoms::Species::from_atomic_number(species.atomic_number() % 118 + 1).unwrap();
         for other in others {
-            prop_assert_ne!(ContentHash::of(&other), hash);
+            prop_assert_ne!(ContentHash::from_structure(&other), hash);
         }
     }
 }
 
 #[test]
-fn signs_are_no_digits() {
+fn signs_are_not_digits() {
     let text = "+f".repeat(16);
     let error = text.parse::<CampaignId>().unwrap_err();
     assert_eq!(error.to_string(), format!("'{text}' is not a campaign id (32 hexadecimal digits)"));
@@ -49,7 +49,7 @@ fn signs_are_no_digits() {
 }
 
 #[test]
-fn a_candidate_is_named_by_all_that_it_is_made_of() {
+fn candidate_ids_contain_every_part() {
     let id = CandidateId {
         campaign: CampaignId(std::array::from_fn(|k| 0x9f - 0x11 * k.min(3) as u8)),
         walk: WalkId(3),

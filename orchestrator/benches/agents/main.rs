@@ -1,17 +1,17 @@
-//! A thousand simulated walkers on 32 simulated agents against one orchestrator: its reactor, its database and its end of
-//! the lines between hosts are what campaigns have; agents connect over TCP and keep their mixture in shared memory as
-//! theirs do. Walkers do no dynamics: after a while they offer a candidate that was recorded, 2 % of them new.
+//! A thousand simulated walkers on 32 simulated agents with one orchestrator. Reactor, database and transport between
+//! hosts are those of real campaigns; agents connect over TCP and keep their mixture in shared memory. Walkers do no
+//! dynamics: after some time they offer a recorded candidate, and 2 % of the candidates are new.
 //!
-//! `cargo bench -p orchestrator --bench agents`; behind `--` candidates a second that walkers offer (0: as many as they
-//! can) and seconds. With a PostgreSQL server if `CALMWALK_POSTGRES` is its URL, see `.ci/postgres`; else SQLite. The
-//! figures are in `docs/benchmarks.md`.
+//! `cargo bench -p orchestrator --bench agents`, with two optional arguments after `--`: candidates per second of all
+//! walkers (0: as many as possible), and duration in seconds. Uses the PostgreSQL server at the URL in
+//! `CALMWALK_POSTGRES` if set, see `.ci/postgres`, or else SQLite. Results are in `docs/benchmarks.md`.
 #![allow(dead_code, reason = "the other benches use the rest of what they share")]
 
 #[path = "../selector/campaign.rs"]
 mod campaign;
 #[path = "../selector/database.rs"]
 mod database;
-mod head;
+mod orchestrator;
 #[path = "../selector/random.rs"]
 mod random;
 #[path = "../selector/recording.rs"]
@@ -24,17 +24,17 @@ const AGENTS: usize = 32;
 const WALKERS: usize = 1024;
 const RATE: f64 = 400.0;
 const SECONDS: f64 = 60.0;
-/// Periods in which figures are shown, one beside the other: what grows is seen.
+/// Number of periods with separate results, which show growth.
 const PERIODS: usize = 4;
 
-/// What is to be simulated.
+/// What to simulate.
 #[derive(Clone, Copy)]
 struct Plan {
     port: u16,
-    /// Candidates a second that all walkers together offer; 0 for as many as they can.
+    /// Candidates per second of all walkers; 0 for as many as possible.
     rate: f64,
     duration: Duration,
-    /// From when on it counts, s: by then agents have joined and walkers have their first turns.
+    /// Start of the measurement, s: agents have joined and walkers have their first assignments by then.
     begun: f64,
 }
 
@@ -50,7 +50,12 @@ fn main() {
         Some(&[port, begun]) => {
             runtime.block_on(simulated::agents(Plan { port: port as u16, rate, duration, begun }))
         }
-        _ => runtime.block_on(head::lead(Plan { port: free_port(), rate, duration, begun: now() + START })),
+        _ => runtime.block_on(orchestrator::lead(Plan {
+            port: free_port(),
+            rate,
+            duration,
+            begun: now() + START,
+        })),
     }
 }
 
@@ -62,18 +67,18 @@ fn endpoint(plan: Plan) -> wire::net::Endpoint {
     format!("tcp/127.0.0.1:{}", plan.port).parse().unwrap()
 }
 
-/// In which of the periods a time is.
+/// The period that contains a time.
 fn period(time: f64, plan: Plan) -> Option<usize> {
     let period = PERIODS as f64 * (time - plan.begun) / plan.duration.as_secs_f64();
     (0.0..PERIODS as f64).contains(&period).then_some(period as usize)
 }
 
-/// The clock of this host, s: both processes have the same.
+/// The clock of this host, shared by both processes, s.
 fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64()
 }
 
-/// A quantile of numbers, which it sorts; NaN of none.
+/// A quantile of numbers, which it sorts; NaN without any.
 fn quantile(numbers: &mut [f64], share: f64) -> f64 {
     numbers.sort_by(f64::total_cmp);
     let last = numbers.len().saturating_sub(1);

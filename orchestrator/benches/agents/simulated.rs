@@ -9,32 +9,32 @@ use serde::{Deserialize, Serialize};
 use tokio::time::{Instant, sleep};
 use wire::messages::Assignment;
 use wire::mixture::SharedMixture;
-use wire::net::{Address, Agent, Joined, Slot, Told, Uplink};
+use wire::net::{Address, Agent, AgentClient, Membership, Slot, SlotReport};
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash};
 
 use crate::random::Random;
 use crate::recording::{Model, progress};
 use crate::{AGENTS, PERIODS, Plan, WALKERS, campaign, endpoint, now, period};
 
-/// Recorded candidates.
+/// Number of recorded candidates.
 const RECORDED: usize = 16;
-/// One of so many candidates is new to the mixture …
+/// One of this number of candidates is new to the mixture …
 const NEW: u64 = 50;
 /// … with an atom of this grade.
 const GRADE: f64 = 2.0;
 
-/// What the agents have seen.
+/// Measurements of the agents.
 #[derive(Default, Deserialize, Serialize)]
 pub struct Seen {
-    /// How long walkers waited from an offer to the next turn, of each period, s.
+    /// Time from an offer to the next assignment in each period, s.
     pub waits: [Vec<f64>; PERIODS],
-    /// Of each agent the versions of the mixture, and when they were in its shared memory, s.
+    /// For each agent: mixture versions, and when they were in its shared memory, s.
     pub versions: Vec<Vec<(u64, f64)>>,
 }
 
-/// A host.
+/// A simulated host.
 struct Host {
-    joined: Joined,
+    joined: Membership,
     shared: Mutex<(SharedMixture, Vec<(u64, f64)>)>,
 }
 
@@ -77,17 +77,17 @@ impl Host {
             pid: std::process::id(),
             program_version: "bench".into(),
             walkers,
-            ahead: 0,
+            prefetch: 0,
         };
-        let address = Address::At(endpoint(plan));
-        let uplink = Uplink::open(&address, None, agent, |why| eprintln!("waiting: {why}")).await;
+        let address = Address::Endpoint(endpoint(plan));
+        let uplink = AgentClient::open(&address, None, agent, |why| eprintln!("waiting: {why}")).await;
         let joined = Arc::new(uplink.unwrap()).join().await.unwrap();
         let newest = joined.newest().await;
         let shared = SharedMixture::create(&directory.join(number.to_string()), &newest, walkers).unwrap();
         Self { joined, shared: Mutex::new((shared, Vec::new())) }
     }
 
-    /// What an agent does with the mixture of a turn before a walker gets it.
+    /// Publishes the mixture of an assignment before a walker gets it, as agents do.
     fn publish(&self, mixture: &Arc<Mixture>) {
         let (shared, versions) = &mut *self.shared.lock().unwrap();
         shared.publish(mixture).unwrap();
@@ -97,7 +97,7 @@ impl Host {
     }
 }
 
-/// A walker that does no dynamics.
+/// A walker without dynamics.
 struct Walker {
     recorded: Arc<Vec<Candidate>>,
     host: Arc<Host>,
@@ -106,39 +106,42 @@ struct Walker {
 }
 
 impl Walker {
-    /// Offers until it is sent home. When it offered, and how long it waited, s.
+    /// Sends offers until it is shut down. Returns the time of each offer, and how long the walker waited, s.
     async fn work(mut self, mut slot: Slot, plan: Plan) -> Vec<(f64, f64)> {
-        let (mut told, mut waits) = (Told::Nothing, Vec::new());
+        let (mut report, mut waits) = (SlotReport::Empty, Vec::new());
         loop {
             let (offered, begun) = (now(), Instant::now());
-            let work = slot.exchange(&self.host.joined, &told).await.unwrap();
+            let work = slot.exchange(&self.host.joined, &report).await.unwrap();
             waits.push((offered, begun.elapsed().as_secs_f64()));
             let Some(work) = work else { return waits };
             self.host.publish(&work.mixture);
             let walk = if plan.rate > 0.0 { WALKERS as f64 / plan.rate } else { 0.0 };
             sleep(Duration::from_secs_f64(walk * (0.5 + self.random.uniform()))).await;
             let candidate = self.candidate(&work.assignment, &work.mixture);
-            told = Told::Report(campaign::report(&work.assignment, Some(CandidateBlock::encode(&candidate))));
+            report = SlotReport::Report(campaign::report(
+                &work.assignment,
+                Some(CandidateBlock::encode(&candidate)),
+            ));
         }
     }
 
-    /// One that was recorded, moved a little as a whole, so that it is no duplicate.
+    /// A recorded candidate with all atoms shifted slightly, so that it is no duplicate.
     fn candidate(&mut self, assignment: &Assignment, mixture: &Mixture) -> Candidate {
-        let (walk, turn) = (u64::from(assignment.walk.0), assignment.turn);
-        let mut candidate = self.recorded[(walk + turn) as usize % RECORDED].clone();
-        let shift = 1e-9 * (walk + WALKERS as u64 * turn) as f64;
+        let (walk, number) = (u64::from(assignment.walk.0), assignment.number);
+        let mut candidate = self.recorded[(walk + number) as usize % RECORDED].clone();
+        let shift = 1e-9 * (walk + WALKERS as u64 * number) as f64;
         candidate.structure.positions.iter_mut().for_each(|position| position[0] += shift);
-        let step = progress(turn).step;
-        let content = ContentHash::of(&candidate.structure);
+        let step = progress(number).step;
+        let content = ContentHash::from_structure(&candidate.structure);
         candidate.id = CandidateId { walk: assignment.walk, step, content, ..candidate.id };
         candidate.mixture_version = mixture.version();
-        if (walk + turn).is_multiple_of(NEW) {
+        if (walk + number).is_multiple_of(NEW) {
             self.make_new(&mut candidate, mixture);
         }
         candidate
     }
 
-    /// Moves the features of the first atom in a random direction until it has the grade of something new.
+    /// Moves the features of the first atom in a random direction until the candidate has the grade of a new structure.
     fn make_new(&mut self, candidate: &mut Candidate, mixture: &Mixture) {
         let dimension = mixture.dimension();
         let before = candidate.features[..dimension].to_vec();
@@ -148,7 +151,7 @@ impl Walker {
             self.grades.evaluate(mixture, &[0], &moved, None).unwrap();
             (moved, self.grades.gamma[0])
         };
-        // γ grows with the distance: double it until it is enough, then halve the interval.
+        // γ increases with the distance: double it until it is large enough, then bisect.
         let (mut low, mut high) = (0.0, 1e-6);
         while moved(high).1 < GRADE {
             (low, high) = (high, 2.0 * high);

@@ -1,8 +1,9 @@
-//! A campaign with a million decisions behind it, and a million label jobs in its queue: how long it takes to go on
-//! with it, and what a look at the queue costs.
+//! Benchmark of a campaign with a million decisions and a million queued label jobs: the time to continue it, and the
+//! cost of queries of the queue.
 //!
-//! `cargo bench -p orchestrator --bench scale`; a number behind `--` is how many decisions. With a PostgreSQL server too if
-//! `CALMWALK_POSTGRES` is its URL, see `.ci/postgres`. The figures are in `docs/benchmarks.md`.
+//! `cargo bench -p orchestrator --bench scale`, with the number of decisions as an optional argument after `--`. Also
+//! uses the PostgreSQL server at the URL in `CALMWALK_POSTGRES` if set, see `.ci/postgres`. Results are in
+//! `docs/benchmarks.md`.
 #![allow(dead_code, reason = "the other bench uses the rest of what they share")]
 
 #[path = "../selector/campaign.rs"]
@@ -19,7 +20,7 @@ use std::time::{Duration, Instant};
 
 use atoms::{Cell, Structure};
 use database::Database;
-use orchestrator::selector::{Next, Selector, Snapshot};
+use orchestrator::selector::{Scheduling, Selector, SelectorSnapshot};
 use recording::{CAMPAIGN, Model, crystal};
 use store::{
     AtomGrades, CandidateRecord, Commit, ComponentRecord, Decision, Fate, JobState, Label, Location, Store,
@@ -27,12 +28,12 @@ use store::{
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 const DECISIONS: usize = 1_000_000;
-/// Decisions of a commit.
+/// Decisions per commit.
 const GROUP: usize = 1000;
 const WALKS: usize = 1000;
-/// How often each look is taken.
+/// Number of repetitions of each query.
 const LOOKS: usize = 50;
-/// Jobs of a page.
+/// Jobs per page.
 const PAGE: u32 = 50;
 
 fn main() {
@@ -49,14 +50,14 @@ fn main() {
     }
 }
 
-/// Every decision an accept, each with its job; then the walks with their checkpoints.
+/// Writes decisions that are all accepts, each with its job; then the walks with their checkpoints.
 async fn fill(model: &Model, location: Location, decisions: usize) -> Duration {
     let store = campaign::create_store(location, WALKS).await;
     let begun = Instant::now();
     for first in (0..decisions).step_by(GROUP) {
         store.commit(&group(first..(first + GROUP).min(decisions))).await.unwrap();
     }
-    let mut walks = campaign::selector(model, WALKS, &campaign::settings(1.5)).begin_walks();
+    let mut walks = campaign::selector(model, WALKS, &campaign::settings(1.5)).start_walks();
     for walk in &mut walks.walks {
         walk.checkpoint = Some(vec![1; campaign::CHECKPOINT]);
         walk.accepted = (decisions / WALKS) as u32;
@@ -81,7 +82,7 @@ fn group(numbers: std::ops::Range<usize>) -> Commit {
     Commit { decisions: candidates.iter().map(decision).collect(), candidates, ..Commit::default() }
 }
 
-/// Two atoms without features: small, and none like another.
+/// Two atoms without features: small, and unique.
 fn record(number: usize) -> CandidateRecord {
     let structure = Structure {
         species: crystal().species[..2].to_vec(),
@@ -95,7 +96,7 @@ fn record(number: usize) -> CandidateRecord {
         walk: WalkId((number % WALKS) as u32),
         segment: 0,
         step: (number / WALKS) as u64,
-        content: ContentHash::of(&structure),
+        content: ContentHash::from_structure(&structure),
     };
     let block = CandidateBlock::encode(&Candidate {
         id,
@@ -122,11 +123,11 @@ fn record(number: usize) -> CandidateRecord {
     }
 }
 
-/// From nothing to the first turn, as `calmwalk run` does it, without the files of the configuration.
+/// From startup to the first assignment, as in `calmwalk run`, without the files of the configuration.
 async fn recover(model: &Model, location: Location) {
     let begun = Instant::now();
     let store = Store::open(location).await.unwrap();
-    let snapshot = Snapshot {
+    let snapshot = SelectorSnapshot {
         walks: store.load_walks().await.unwrap(),
         components: store.load_components().await.unwrap(),
         known: store.known_hashes().await.unwrap(),
@@ -139,8 +140,8 @@ async fn recover(model: &Model, location: Location) {
     let settings = campaign::settings(1.5);
     let mut selector =
         Selector::restore(settings, CAMPAIGN, seeds, grader, original, training, snapshot).unwrap();
-    selector.begin_walks();
-    assert!(matches!(selector.next_turn(), Next::Turn(_)));
+    selector.start_walks();
+    assert!(matches!(selector.next_assignment(), Scheduling::Assign(_)));
     println!("  gone on after {:.2} s", begun.elapsed().as_secs_f64());
     store.close().await;
 }

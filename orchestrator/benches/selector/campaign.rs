@@ -1,4 +1,4 @@
-//! A campaign in live mode whose walkers offer what was recorded, as fast as it is taken.
+//! A campaign in live mode whose walkers offer recorded candidates as fast as possible.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -7,27 +7,27 @@ use calm::forgetting::ForgettingAlarm;
 use calm::rules::Positive;
 use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
-use orchestrator::selector::{Mode, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
+use orchestrator::selector::{Mode, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use store::{Campaign, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
-use wire::messages::{Assignment, End, Outcome, Report};
+use wire::messages::{Assignment, Outcome, Report, WalkEnd};
 use wire::transport::Incoming;
 use wire::{CandidateBlock, ContentHash};
 
 use crate::recording::{CAMPAIGN, Model, crystal, progress};
 
-/// Bytes of a walk's checkpoint with 108 atoms: three states of positions, velocities, forces and energies.
+/// Size of a walk's checkpoint with 108 atoms, bytes: three states of positions, velocities, forces and energies.
 pub const CHECKPOINT: usize = 27_000;
-/// Reports under way between walkers and reactor, as in a campaign.
+/// Capacity of the channel from walkers to reactor, as in a campaign.
 const CHANNEL: usize = 64;
 
-/// The paper's rules for aluminium; structures are collected from `threshold` on (the paper: γ_max > 1.5).
+/// The paper's rules for aluminium; structures are collected above `threshold` (in the paper, γ_max > 1.5).
 pub fn settings(threshold: f64) -> Settings {
     let positive = |number: f64| Positive::try_from(number).unwrap();
     Settings {
         mode: Mode::Live,
         walks_per_round: 1,
-        turn_steps: 1000,
+        steps_per_assignment: 1000,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
             combination: CovarianceUpdateKind::Convex,
@@ -36,24 +36,32 @@ pub fn settings(threshold: f64) -> Settings {
         },
         forgetting_alarm: ForgettingAlarm::default(),
         collection: CollectionRule::MaximumGrade { threshold: positive(threshold) },
-        per_seed: u32::MAX,
-        total: None,
+        max_per_seed_structure: u32::MAX,
+        max_structures: None,
         control: false,
-        least_distance: (1.2, 0.75),
+        min_distance: (1.2, 0.75),
         declined_feature_bytes: 1_000_000_000,
     }
 }
 
-/// A selector at the start of the campaign, one seed structure a walk.
+/// A selector at the start of the campaign, with one seed structure per walk.
 pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
     let seeds = seeds(walks);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
     let training = Some(model.training.clone());
-    Selector::restore(settings.clone(), CAMPAIGN, seeds, grader, original, training, Snapshot::default())
-        .unwrap()
+    Selector::restore(
+        settings.clone(),
+        CAMPAIGN,
+        seeds,
+        grader,
+        original,
+        training,
+        SelectorSnapshot::default(),
+    )
+    .unwrap()
 }
 
-/// Where walks start.
+/// The seed structures.
 pub fn seeds(walks: usize) -> Vec<SeedStructure> {
     (0..walks).map(|k| SeedStructure { name: format!("fcc-{k}"), structure: crystal() }).collect()
 }
@@ -82,20 +90,20 @@ pub async fn create_store(location: Location, walks: usize) -> Store {
     store
 }
 
-/// What a walk offers next, or its end.
+/// The next candidate of a walk, or its end.
 pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Report {
     let mut checkpoint = vec![0; CHECKPOINT];
-    checkpoint[..8].copy_from_slice(&assignment.turn.to_le_bytes());
+    checkpoint[..8].copy_from_slice(&assignment.number.to_le_bytes());
     Report {
         walk: assignment.walk,
-        turn: assignment.turn,
-        outcome: block.map_or(Outcome::Ended(End::Steps), Outcome::Candidate),
+        assignment: assignment.number,
+        outcome: block.map_or(Outcome::Ended(WalkEnd::Steps), Outcome::Candidate),
         checkpoint,
-        progress: progress(assignment.turn),
+        progress: progress(assignment.number),
     }
 }
 
-/// How the whole way through reactor, selector and database went.
+/// Measurements of the whole path through reactor, selector and database.
 #[derive(Default)]
 pub struct Run {
     pub wall: Duration,
@@ -107,7 +115,7 @@ pub struct Run {
     pub commits: usize,
 }
 
-/// Every recorded candidate from walkers side by side, through the reactor, into the database.
+/// Sends every recorded candidate from concurrent walkers through the reactor to the database.
 pub async fn run(
     model: &Model,
     settings: &Settings,
@@ -117,7 +125,7 @@ pub async fn run(
     let walks = recording.len();
     let store = create_store(location, walks).await;
     let mut selector = selector(model, walks, settings);
-    store.commit(&selector.begin_walks()).await.unwrap();
+    store.commit(&selector.start_walks()).await.unwrap();
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let reactor =
         Reactor { selector, store: store.clone(), incoming, stopping: Arc::default(), queue_limit: u64::MAX };
@@ -132,7 +140,7 @@ pub async fn run(
         .collect();
     drop(to_reactor);
     let mut run = Run::default();
-    reactor.run(|notice| run.take_in(&notice)).await.unwrap();
+    reactor.run(|notice| run.record(&notice)).await.unwrap();
     (run.wall, run.processor) = (begun.elapsed(), processor_time() - used);
     for walker in walkers {
         walker.await.unwrap();
@@ -141,8 +149,8 @@ pub async fn run(
     run
 }
 
-/// A walker as the reactor sees it: whatever walk it is given, the next of what was recorded of it is offered. The
-/// bytes are checked where they stand, as those from another process are.
+/// A walker as the reactor sees it: it offers the next recorded candidate of any walk it is assigned. The block is
+/// validated in place, like one from another process.
 async fn walk(
     walker: u32,
     to_reactor: &mpsc::Sender<Incoming>,
@@ -151,14 +159,14 @@ async fn walk(
     let mut next = None;
     loop {
         let (reply, answer) = oneshot::channel();
-        to_reactor.send(Incoming::Free { walker, report: next.take(), reply }).await.unwrap();
+        to_reactor.send(Incoming::Idle { walker, report: next.take(), reply }).await.unwrap();
         let Ok(Some(work)) = answer.await else { return };
         let block = offers[work.assignment.walk.0 as usize].lock().unwrap().next();
         next = Some(report(&work.assignment, block.map(checked)));
     }
 }
 
-/// The block once more, its bytes checked.
+/// The block after another validation.
 pub fn checked(block: CandidateBlock) -> CandidateBlock {
     CandidateBlock::in_place(Arc::new(Bytes(block))).unwrap()
 }
@@ -172,21 +180,21 @@ impl AsRef<[u8]> for Bytes {
 }
 
 impl Run {
-    fn take_in(&mut self, notice: &Notice<'_>) {
+    fn record(&mut self, notice: &Notice<'_>) {
         let Notice::Committed(commit) = notice else { return };
         self.commits += 1;
         for candidate in &commit.candidates {
             self.candidates += 1;
             match candidate.fate {
                 Fate::Accepted => self.accepted += 1,
-                Fate::Declined(wire::messages::Decline::Covered) => self.covered += 1,
+                Fate::Declined(wire::messages::DeclineReason::Covered) => self.covered += 1,
                 Fate::Declined(_) => {}
             }
         }
     }
 }
 
-/// Time that all threads of this process have spent on processors, in steps of 10 ms (Linux).
+/// Processor time of all threads of this process, in steps of 10 ms (Linux).
 fn processor_time() -> Duration {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();

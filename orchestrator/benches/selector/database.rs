@@ -1,19 +1,19 @@
-//! The databases that candidates go into.
+//! The databases for the benchmark.
 
 use sqlx::postgres::PgConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
 use store::Location;
 use tempfile::TempDir;
 
-/// Which one.
+/// Kind of database.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Database {
     Sqlite,
-    /// The server whose URL is `CALMWALK_POSTGRES`.
+    /// The server with the URL in `CALMWALK_POSTGRES`.
     Postgres,
 }
 
-/// Room for a campaign, which goes when this is dropped, or the next is made on the server.
+/// A campaign's location. It is removed when this is dropped or, on a server, when the next is created.
 pub struct Room {
     pub location: Location,
     pub directory: TempDir,

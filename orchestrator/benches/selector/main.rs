@@ -1,7 +1,7 @@
-//! Recorded candidates through reactor, selector and database as fast as they go, and where the time goes.
+//! Throughput of recorded candidates through reactor, selector and database, and the time of each stage.
 //!
-//! `cargo bench -p orchestrator --bench selector`; with a PostgreSQL server too if `CALMWALK_POSTGRES` is its URL, see
-//! `.ci/postgres`. The figures are in `docs/benchmarks.md`.
+//! `cargo bench -p orchestrator --bench selector`. Also uses the PostgreSQL server at the URL in `CALMWALK_POSTGRES` if
+//! set, see `.ci/postgres`. Results are in `docs/benchmarks.md`.
 
 mod campaign;
 mod database;
@@ -17,11 +17,11 @@ use recording::{Model, Plan};
 use stages::{Stages, plain_inserts};
 use wire::CandidateBlock;
 
-/// Walks, and walkers side by side: as many as it takes at least to find so much.
+/// Number of walks and of concurrent walkers: at least as many as needed to find this many candidates.
 const WALKS: usize = 64;
-/// A walker's threshold of γ_max (paper).
+/// A walker's threshold for γ_max (paper).
 const THRESHOLD: f64 = 1.5;
-/// One so low that every candidate is accepted.
+/// A threshold so low that every candidate is accepted.
 const ALL: f64 = 0.1;
 
 fn main() {
@@ -32,7 +32,7 @@ fn main() {
         kinds: 200,
         of_kind: 12,
         collection: campaign::settings(THRESHOLD).collection,
-        least_distance: 2.15,
+        min_distance: 2.15,
     };
     let recording = model.record(plan);
     println!("mostly covered");
@@ -45,14 +45,14 @@ fn main() {
     runtime.block_on(measure(&model, &model.record(plan), campaign::settings(ALL)));
 }
 
-/// One setting, with every database.
+/// Measures one setting with every database.
 async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], settings: Settings) {
     for database in Database::all() {
         measure_with(database, model, recording, &settings).await;
     }
 }
 
-/// The whole way, then each stage alone.
+/// Measures the whole path, then each stage alone.
 async fn measure_with(
     database: Database,
     model: &Model,

@@ -1,4 +1,4 @@
-//! A small deterministic sequence (SplitMix64).
+//! A small deterministic random number generator (SplitMix64).
 
 use std::f64::consts::TAU;
 
@@ -16,12 +16,12 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// Above 0, not above 1.
+    /// Uniform in (0, 1].
     pub fn uniform(&mut self) -> f64 {
         ((self.next() >> 11) + 1) as f64 / (1_u64 << 53) as f64
     }
 
-    /// Of mean 0 and variance 1 (Box–Muller).
+    /// Normal with mean 0 and variance 1 (Box–Muller).
     pub fn normal(&mut self) -> f64 {
         (-2.0 * self.uniform().ln()).sqrt() * (TAU * self.uniform()).cos()
     }

@@ -1,4 +1,4 @@
-//! Recorded candidates: hot and strained aluminium of 108 atoms with the features of a real model.
+//! Recorded candidates: hot and strained aluminium of 108 atoms, with the features of a real model.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use crate::random::Random;
 
 /// A model with the mixture of its training frames.
 const DATA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/data/al_eam_1l");
-/// Every second training frame is watched, which is what a campaign thins these frames to.
+/// Every second training frame is monitored; campaigns thin these frames to as many.
 const WATCH_EVERY: usize = 2;
 /// Lattice constant of the seed structure, Å, and its repetitions.
 const LATTICE_CONSTANT: f64 = 4.05;
@@ -25,7 +25,7 @@ const REPETITIONS: usize = 3;
 
 pub const CAMPAIGN: CampaignId = CampaignId([0xbe; 16]);
 
-/// A model as candidates need it.
+/// What candidates need of a model.
 pub struct Model {
     grace: Arc<GraceModel>,
     pub grader: Grader,
@@ -33,19 +33,19 @@ pub struct Model {
     pub training: TrainingFrames,
 }
 
-/// What is to be recorded.
+/// What to record.
 #[derive(Clone, Copy)]
 pub struct Plan {
-    /// Walks that the candidates are dealt to.
+    /// Number of walks that share the candidates.
     pub walks: usize,
-    /// States of strain and disorder that the walks come through, one after the other.
+    /// Number of states of strain and disorder that the walks visit in sequence.
     pub kinds: usize,
-    /// Candidates of each, which differ by a small displacement.
+    /// Number of candidates in each state, which differ by a small displacement.
     pub of_kind: usize,
-    /// When a walker takes a structure for a candidate.
+    /// When a walker collects a structure.
     pub collection: CollectionRule,
-    /// Shortest distance that the walker's guard lets pass, Å.
-    pub least_distance: f64,
+    /// Minimum distance of the walker's guard, Å.
+    pub min_distance: f64,
 }
 
 impl Model {
@@ -68,7 +68,7 @@ impl Model {
         Self { grace, grader, original, training }
     }
 
-    /// Blocks of each walk in the order in which the walk offers them.
+    /// Blocks of each walk, in the order in which the walk offers them.
     pub fn record(&self, plan: Plan) -> Vec<Vec<CandidateBlock>> {
         let cores = thread::available_parallelism().map_or(1, |cores| cores.get());
         let kinds = (0..plan.kinds).collect::<Vec<_>>();
@@ -94,12 +94,12 @@ impl Model {
         let mut structure = crystal();
         displace(&mut structure, LIKENESS, &mut Random::new(number));
         let any = CollectionRule::MaximumGrade { threshold: Positive::try_from(f64::MIN_POSITIVE).unwrap() };
-        let plan = Plan { walks: 1, kinds: 1, of_kind: 1, collection: any, least_distance: 1.0 };
+        let plan = Plan { walks: 1, kinds: 1, of_kind: 1, collection: any, min_distance: 1.0 };
         let candidate = self.candidate(plan, number, structure, &mut Evaluator::new(&self.grace));
         candidate.expect("any structure is collected")
     }
 
-    /// The candidates of one kind. One that the original mixture covers, or whose atoms come too close, is drawn again.
+    /// The candidates of one state. Draws another one if the original mixture covers it, or if atoms are too close.
     fn kind(&self, plan: Plan, kind: usize) -> Vec<CandidateBlock> {
         let mut random = Random::new(kind as u64);
         let mut evaluator = Evaluator::new(&self.grace);
@@ -116,7 +116,7 @@ impl Model {
         }
     }
 
-    /// What a walker would offer, if it would.
+    /// The candidate, if a walker would collect the structure.
     fn candidate(
         &self,
         plan: Plan,
@@ -125,7 +125,7 @@ impl Model {
         evaluator: &mut Evaluator,
     ) -> Option<Candidate> {
         let bonds = self.grader.bonds(&structure).unwrap();
-        if bonds.shortest < plan.least_distance {
+        if bonds.shortest < plan.min_distance {
             return None;
         }
         evaluator.forward(&structure);
@@ -142,7 +142,7 @@ impl Model {
                 walk: WalkId((number % plan.walks as u64) as u32),
                 segment: progress.segment,
                 step: progress.step,
-                content: ContentHash::of(&structure),
+                content: ContentHash::from_structure(&structure),
             },
             origin: Origin::Biased,
             mixture_version: 0,
@@ -159,7 +159,7 @@ impl Model {
     }
 }
 
-/// Where a walk stands with its candidate of that number.
+/// State of a walk at its candidate with this number.
 pub fn progress(number: u64) -> Progress {
     Progress { step: 20 * (number + 1), temperature: 600.0, relative_volume: 1.0, ..Progress::default() }
 }
@@ -181,14 +181,14 @@ pub fn crystal() -> Structure {
     }
 }
 
-/// Strained and disordered aluminium, and how much its likes differ from it.
+/// A strained and disordered aluminium structure.
 struct State(Structure);
 
-/// Standard deviation of each coordinate among the likes of a state, Å.
+/// Standard deviation of each coordinate among the candidates of a state, Å.
 const LIKENESS: f64 = 0.02;
 
 impl State {
-    /// Stretched by up to 14 %, sheared, and each coordinate displaced by 0.1 to 0.35 Å.
+    /// Strained by up to 14 %, sheared, and each coordinate displaced by 0.1 to 0.35 Å.
     fn draw(random: &mut Random) -> Self {
         let stretch = 1.0 + 0.14 * random.uniform();
         let [xx, yy, zz, yz, xz, xy] = [(); 6].map(|()| 0.05 * random.normal());
@@ -215,7 +215,7 @@ fn displace(structure: &mut Structure, deviation: f64, random: &mut Random) {
     }
 }
 
-/// The model at work.
+/// The model in use.
 struct Evaluator {
     grace: Grace,
     neighbours: NeighbourList,

@@ -1,4 +1,4 @@
-//! The stages of a candidate's way, each alone on one thread, with the candidates of the whole run.
+//! The stages of a candidate's path, each measured alone on one thread, with the candidates of the whole run.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use calm::Mixture;
 use calm::forgetting::grade_distribution;
-use orchestrator::reactor::group;
-use orchestrator::selector::{Next, Settings};
+use orchestrator::reactor::commit_batch;
+use orchestrator::selector::{Scheduling, Settings};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection};
 use store::{Commit, Location};
@@ -16,7 +16,7 @@ use wire::CandidateBlock;
 use crate::campaign::{checked, create_store, report, selector};
 use crate::recording::Model;
 
-/// Time spent in each stage; the indented ones are parts of the one before.
+/// Time spent in each stage; indented stages are parts of the one before.
 #[derive(Default)]
 pub struct Stages {
     pub check: Duration,
@@ -36,8 +36,8 @@ fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
 }
 
 impl Stages {
-    /// Everything through the selector, without a reactor, and each part of a decision again by itself; then the commits
-    /// into a database, in groups of this size.
+    /// Passes everything through the selector without a reactor, and repeats each part of a decision by itself; then
+    /// writes the commits to a database in groups of this size.
     pub async fn measure(
         model: &Model,
         settings: &Settings,
@@ -58,17 +58,17 @@ impl Stages {
         recording: &[Vec<CandidateBlock>],
     ) -> Vec<Commit> {
         let mut selector = selector(model, recording.len(), settings);
-        let mut commits = vec![selector.begin_walks()];
+        let mut commits = vec![selector.start_walks()];
         let mut offers: Vec<_> = recording.iter().map(|blocks| blocks.iter()).collect();
-        let mut turns = Vec::new();
+        let mut assignments = Vec::new();
         loop {
-            while let Next::Turn(assignment) = selector.next_turn() {
-                turns.push(assignment);
+            while let Scheduling::Assign(assignment) = selector.next_assignment() {
+                assignments.push(assignment);
             }
-            if turns.is_empty() {
+            if assignments.is_empty() {
                 return commits;
             }
-            for assignment in turns.drain(..) {
+            for assignment in assignments.drain(..) {
                 let block = offers[assignment.walk.0 as usize].next();
                 let before = Arc::clone(selector.mixture());
                 let report = report(&assignment, block.cloned());
@@ -80,7 +80,7 @@ impl Stages {
         }
     }
 
-    /// The parts of a decision, done once more.
+    /// Repeats the parts of a decision.
     fn parts(
         &mut self,
         model: &Model,
@@ -110,7 +110,7 @@ impl Stages {
         let mut commits = commits.into_iter().peekable();
         while commits.peek().is_some() {
             let mut whole = Commit::default();
-            commits.by_ref().take(size).for_each(|commit| group::append(&mut whole, commit));
+            commits.by_ref().take(size).for_each(|commit| commit_batch::append(&mut whole, commit));
             let begun = Instant::now();
             store.commit(&whole).await.unwrap();
             self.commit += begun.elapsed();
@@ -119,8 +119,8 @@ impl Stages {
     }
 }
 
-/// Time that SQLite itself, with its own settings of pages and log, takes for as many rows of so many bytes, in
-/// transactions of a group each.
+/// Time that SQLite itself, with its own settings of pages and log, needs to insert as many rows of the same size, in
+/// one transaction per group.
 pub async fn plain_inserts(rows: usize, bytes: usize, group: usize, directory: &Path) -> Duration {
     let options =
         SqliteConnectOptions::new().filename(directory.join("plain.sqlite")).create_if_missing(true);

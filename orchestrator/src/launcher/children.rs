@@ -1,4 +1,4 @@
-//! The shell round the supervisor: the processes of one kind, kept alive.
+//! Runs the processes of one kind for the supervisor.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -9,205 +9,205 @@ use rustix::process::Signal;
 use tokio::sync::mpsc;
 
 use super::Launch;
+use super::child_monitor::{self, ChildNews, ChildReporter};
+use super::heartbeats::Heartbeats;
 use super::process::{AdoptError, Process};
-use super::signs::Signs;
-use super::watch::{self, News, Teller};
-use crate::supervisor::{ChildStatus, Ended, Ending, Limits, Order, Supervisor};
+use crate::supervisor::{Action, ChildExit, ChildStatus, ExitReason, Limits, Supervisor};
 
-/// Lines and ends that wait to be told; who writes more waits.
-const NEWS: usize = 64;
+/// Maximum number of queued lines and exits; further writers wait.
+const MAX_QUEUED: usize = 64;
 
-/// What happened to the children.
+/// An event of the children.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Event {
+pub enum ChildEvent {
     /// A process was started.
     Started {
-        /// Which child.
+        /// Number of the child.
         number: u32,
-        /// The how-manieth start of this child, from 1.
+        /// Start count of this child, from 1.
         incarnation: u32,
-        /// Process number.
+        /// Process id.
         pid: u32,
     },
-    /// A line that a process wrote to its standard error.
-    Said {
-        /// Which child.
+    /// A process wrote a line to its standard error.
+    Stderr {
+        /// Number of the child.
         number: u32,
-        /// The line, without its end.
+        /// The line, without line ending.
         line: String,
     },
-    /// A process ended, or could not be started. It has been reaped.
+    /// A process exited and was waited for, or could not be started.
     Ended {
-        /// Which child.
+        /// Number of the child.
         number: u32,
-        /// How, and what becomes of the child.
-        ended: Ended,
+        /// The exit and the new state of the child.
+        ended: ChildExit,
     },
-    /// No process is left and none will be started. Nothing comes after it.
-    AllGone,
+    /// No process is running and none will be started. The last event.
+    AllExited,
 }
 
-/// Processes of one kind, numbered from 0, which are started, watched and started again as the
-/// [supervisor](crate::supervisor) orders.
+/// Processes of one kind, numbered from 0, which are started, monitored and restarted as the
+/// [supervisor](crate::supervisor) decides.
 pub struct Children {
     supervisor: Supervisor,
-    /// What to start for a number and incarnation.
+    /// How to start the process with this number and incarnation.
     launch: Box<dyn FnMut(u32, u32) -> Launch + Send>,
     processes: BTreeMap<u32, Process>,
-    signs: Signs,
-    teller: mpsc::Sender<(u32, News)>,
-    news: mpsc::Receiver<(u32, News)>,
-    /// What happened and was not told yet.
-    events: VecDeque<Event>,
-    told_all_gone: bool,
+    heartbeats: Heartbeats,
+    reporter: mpsc::Sender<(u32, ChildNews)>,
+    news: mpsc::Receiver<(u32, ChildNews)>,
+    /// Events that were not returned yet.
+    events: VecDeque<ChildEvent>,
+    reported_all_exited: bool,
 }
 
 impl Children {
-    /// So many children; [`Self::next`] starts them, each as `launch` says for its number and incarnation.
+    /// This number of children. [`Self::next`] starts them; `launch` says how for each number and incarnation.
     pub fn new(
         children: u32,
         limits: Limits,
         launch: impl FnMut(u32, u32) -> Launch + Send + 'static,
     ) -> Self {
-        let (teller, news) = mpsc::channel(NEWS);
+        let (reporter, news) = mpsc::channel(MAX_QUEUED);
         Self {
             supervisor: Supervisor::new(children, limits),
             launch: Box::new(launch),
             processes: BTreeMap::new(),
-            signs: Signs::new(children),
-            teller,
+            heartbeats: Heartbeats::new(children),
+            reporter,
             news,
             events: VecDeque::new(),
-            told_all_gone: false,
+            reported_all_exited: false,
         }
     }
 
-    /// Takes the process `pid` that was born at `birth` ([`store::process_start_time`]) for a child that was not started yet.
-    /// It need not be a child of this process; of its end no more can be known than that it came. To be called inside the
+    /// Adopts process `pid`, which started at `birth` ([`store::process_start_time`]), as a child that was never started. It
+    /// need not be a child of this process, but then the reason of its exit remains unknown. Must be called in a tokio
     /// runtime.
     pub fn adopt(&mut self, number: u32, pid: u32, birth: &str) -> Result<(), AdoptError> {
-        let process = Process::find(pid, birth)?;
+        let process = Process::open_running(pid, birth)?;
         let end = process.end().map_err(|error| AdoptError::Refused { pid, error })?;
-        if !self.supervisor.adopt(number, self.signs.now()) {
-            return Err(AdoptError::Taken { pid, number });
+        if !self.supervisor.adopt(number, self.heartbeats.now()) {
+            return Err(AdoptError::NotAdoptable { pid, number });
         }
         self.processes.insert(number, process);
-        tokio::spawn(watch::stranger(end, self.teller(number)));
+        tokio::spawn(child_monitor::monitor_adopted(end, self.reporter(number)));
         Ok(())
     }
 
-    /// Where signs of life go.
-    pub fn signs(&self) -> Signs {
-        self.signs.clone()
+    /// Where to send heartbeats.
+    pub fn heartbeats(&self) -> Heartbeats {
+        self.heartbeats.clone()
     }
 
-    /// Ends the whole set in order: SIGTERM now, SIGKILL when the time of grace is over.
+    /// Stops all processes: SIGTERM now, SIGKILL after the grace period.
     pub fn stop(&mut self) {
-        self.collect_signs();
-        let orders = self.supervisor.stop(self.signs.now());
-        self.obey(orders);
+        self.collect_heartbeats();
+        let actions = self.supervisor.stop(self.heartbeats.now());
+        self.execute(actions);
     }
 
-    /// There is no more work: nobody is started any more.
+    /// There is no more work: starts no more processes.
     pub fn close(&mut self) {
         self.supervisor.close();
     }
 
-    /// Where the children stand.
+    /// Status of the children.
     pub fn status(&mut self) -> Vec<ChildStatus> {
-        self.collect_signs();
-        self.supervisor.status(self.signs.now()).collect()
+        self.collect_heartbeats();
+        self.supervisor.status(self.heartbeats.now()).collect()
     }
 
-    /// The next thing that happens, and everything that has to be done until then: nobody is started or killed while
-    /// this is not awaited. To be awaited on the main thread: see [`crate::launcher`]. Dropped while it waits, it has lost nothing.
-    pub async fn next(&mut self) -> Event {
+    /// Returns the next event and performs all actions until then: no process is started or killed unless this is
+    /// awaited. Await it on the main thread, see [`crate::launcher`]. Cancel safe.
+    pub async fn next(&mut self) -> ChildEvent {
         loop {
-            // Whoever is told of an end has to know of it before the next start.
+            // The caller must learn of an exit before the next start.
             if let Some(event) = self.events.pop_front() {
                 return event;
             }
-            self.collect_signs();
-            let orders = self.supervisor.due(self.signs.now());
-            self.obey(orders);
+            self.collect_heartbeats();
+            let actions = self.supervisor.due_actions(self.heartbeats.now());
+            self.execute(actions);
             if let Some(event) = self.events.pop_front() {
                 return event;
             }
-            if self.supervisor.is_over() && !self.told_all_gone {
-                self.told_all_gone = true;
-                return Event::AllGone;
+            if self.supervisor.is_over() && !self.reported_all_exited {
+                self.reported_all_exited = true;
+                return ChildEvent::AllExited;
             }
-            let due = self.supervisor.next().and_then(|due| self.signs.instant(due));
+            let due = self.supervisor.next_deadline().and_then(|due| self.heartbeats.instant(due));
             tokio::select! {
-                Some((number, news)) = self.news.recv() => self.take_in(number, news),
+                Some((number, news)) = self.news.recv() => self.process_news(number, news),
                 () = sleep_until(due) => {}
             }
         }
     }
 
-    fn collect_signs(&mut self) {
-        for (number, heard, useful) in self.signs.collect() {
-            if useful {
-                self.supervisor.useful(number, heard);
+    fn collect_heartbeats(&mut self) {
+        for (number, heard, delivered) in self.heartbeats.collect() {
+            if delivered {
+                self.supervisor.delivered(number, heard);
             } else {
-                self.supervisor.heard(number, heard);
+                self.supervisor.heartbeat(number, heard);
             }
         }
     }
 
-    fn take_in(&mut self, number: u32, news: News) {
+    fn process_news(&mut self, number: u32, news: ChildNews) {
         match news {
-            News::Said(line) => self.events.push_back(Event::Said { number, line }),
-            News::Ended(ending) => {
+            ChildNews::Stderr(line) => self.events.push_back(ChildEvent::Stderr { number, line }),
+            ChildNews::Ended(reason) => {
                 self.processes.remove(&number);
-                // What it did before it ended.
-                self.collect_signs();
-                self.ended(number, ending);
+                // Heartbeats from before the exit.
+                self.collect_heartbeats();
+                self.ended(number, reason);
             }
         }
     }
 
-    fn ended(&mut self, number: u32, ending: Ending) {
-        if let Some(ended) = self.supervisor.ended(number, ending, self.signs.now()) {
-            self.events.push_back(Event::Ended { number, ended });
+    fn ended(&mut self, number: u32, reason: ExitReason) {
+        if let Some(ended) = self.supervisor.ended(number, reason, self.heartbeats.now()) {
+            self.events.push_back(ChildEvent::Ended { number, ended });
         }
     }
 
-    fn obey(&mut self, orders: Vec<Order>) {
-        for order in orders {
-            match order {
-                Order::Start { number, incarnation } => match self.start(number, incarnation) {
-                    Ok(pid) => self.events.push_back(Event::Started { number, incarnation, pid }),
-                    Err(error) => self.ended(number, not_started(&error)),
+    fn execute(&mut self, actions: Vec<Action>) {
+        for action in actions {
+            match action {
+                Action::Start { number, incarnation } => match self.start(number, incarnation) {
+                    Ok(pid) => self.events.push_back(ChildEvent::Started { number, incarnation, pid }),
+                    Err(error) => self.ended(number, start_failure(&error)),
                 },
-                Order::Terminate { number } => self.signal(number, Signal::TERM),
-                Order::Kill { number } => self.signal(number, Signal::KILL),
+                Action::Terminate { number } => self.signal(number, Signal::TERM),
+                Action::Kill { number } => self.signal(number, Signal::KILL),
             }
         }
     }
 
     fn start(&mut self, number: u32, incarnation: u32) -> io::Result<u32> {
         let (mut child, setup) = (self.launch)(number, incarnation).start()?;
-        let pid = child.id().ok_or_else(|| io::Error::other("it ended before it could be watched"))?;
-        let process = Process::of_child(pid).inspect_err(|_| {
-            // What cannot be signalled later must not live.
+        let pid = child.id().ok_or_else(|| io::Error::other("it exited before it could be monitored"))?;
+        let process = Process::from_child(pid).inspect_err(|_| {
+            // A process that cannot be signalled later must not live.
             let _ = child.start_kill();
         })?;
         self.processes.insert(number, process);
-        tokio::spawn(watch::child(child, setup, self.teller(number)));
+        tokio::spawn(child_monitor::monitor_child(child, setup, self.reporter(number)));
         Ok(pid)
     }
 
     fn signal(&mut self, number: u32, signal: Signal) {
         let sent = self.processes.get(&number).map(|process| process.signal(signal));
         if let Some(Err(error)) = sent {
-            let line = format!("signal {} could not be sent to it: {error}", signal.as_raw());
-            self.events.push_back(Event::Said { number, line });
+            let line = format!("cannot send signal {} to it: {error}", signal.as_raw());
+            self.events.push_back(ChildEvent::Stderr { number, line });
         }
     }
 
-    fn teller(&self, number: u32) -> Teller {
-        Teller { number, news: self.teller.clone() }
+    fn reporter(&self, number: u32) -> ChildReporter {
+        ChildReporter { number, news: self.reporter.clone() }
     }
 }
 
@@ -217,15 +217,15 @@ impl fmt::Debug for Children {
     }
 }
 
-/// The end of a start that failed.
-fn not_started(error: &io::Error) -> Ending {
+/// The exit reason of a failed start.
+fn start_failure(error: &io::Error) -> ExitReason {
     let is_shortage = error.raw_os_error().is_some_and(|number| {
         [libc::EMFILE, libc::ENFILE, libc::EAGAIN, libc::ENOMEM, libc::ENOBUFS].contains(&number)
     });
-    Ending::NotStarted { reason: error.to_string(), is_shortage }
+    ExitReason::StartFailed { reason: error.to_string(), is_shortage }
 }
 
-/// Sleeps until then, or for ever.
+/// Sleeps until this time, or forever.
 async fn sleep_until(due: Option<Instant>) {
     match due {
         Some(due) => tokio::time::sleep_until(due.into()).await,

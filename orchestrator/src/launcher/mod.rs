@@ -1,22 +1,22 @@
-//! Processes on this host: started, listened to, waited for, and signalled.
+//! Processes on this host: starting, monitoring, waiting and signalling.
 //!
-//! **The thread that starts a process must live as long as this one.** A child that ends with its parent
-//! ([`end_with_parent`]) does so when the *thread* that started it ends, so a thread of a pool will not do.
-//! [`Children`] starts processes where [`Children::next`] is awaited: that has to be the future that `block_on` runs on the
-//! main thread, not a spawned task.
+//! **The thread that starts a process must live as long as this process.** A child that exits with its parent
+//! ([`end_with_parent`]) is killed when the *thread* that started it exits, so threads of a pool are unsuitable.
+//! [`Children`] starts processes where [`Children::next`] is awaited: this must be the future that `block_on` runs on
+//! the main thread, not a spawned task.
 //!
-//! **A child that outlives its parent** ([`own_session`]) has nobody any more who reads its standard error: what it
-//! writes there fails from then on (`EPIPE`), and `eprintln!` panics of that. It has to use `writeln!` and let it fail.
+//! **A child that outlives its parent** ([`start_own_session`]) loses the reader of its standard error: writes then
+//! fail with `EPIPE`, and `eprintln!` panics. Use `writeln!` and ignore its errors.
 
-mod child_side;
+mod child_monitor;
 mod children;
 mod descriptors;
-mod lines;
+mod heartbeats;
+mod line_splitter;
 mod process;
-mod signs;
+mod process_setup;
 #[cfg(test)]
 mod tests;
-mod watch;
 
 use std::ffi::{OsStr, OsString};
 use std::io;
@@ -25,13 +25,13 @@ use std::process::Stdio;
 
 use tokio::process::{Child, Command};
 
-pub use child_side::{ParentGone, be_called, end_with_parent, own_session};
-pub use children::{Children, Event};
+pub use children::{ChildEvent, Children};
 pub use descriptors::raise_descriptor_limit;
-pub use process::{AdoptError, ask_to_end};
-pub use signs::Signs;
+pub use heartbeats::Heartbeats;
+pub use process::{AdoptError, request_exit};
+pub use process_setup::{ParentExited, end_with_parent, set_process_name, start_own_session};
 
-/// What to start.
+/// How to start a process.
 #[derive(Clone, Debug)]
 pub struct Launch {
     program: PathBuf,
@@ -43,14 +43,14 @@ pub struct Launch {
 }
 
 impl Launch {
-    /// This program once more, the very file that runs now even if another has taken its place on the disk since. It
-    /// reads `setup` from its standard input up to the end.
+    /// Starts this program again, from the file that is running now even if it has been replaced on disk. It reads
+    /// `setup` from its standard input.
     ///
-    /// It has a process group of its own, so that Ctrl-C at the terminal reaches its parent only.
+    /// It gets its own process group, so that Ctrl-C in the terminal reaches only its parent.
     pub fn this_program(arguments: impl IntoIterator<Item = impl Into<OsString>>, setup: Vec<u8>) -> Self {
         Self {
             program: PathBuf::from("/proc/self/exe"),
-            // The name that this process was called by; people look for it in lists of processes.
+            // The name by which this process was called, as users see it in process lists.
             name: std::env::args_os().next().unwrap_or_else(|| "calmwalk".into()),
             arguments: arguments.into_iter().map(Into::into).collect(),
             setup,
@@ -59,24 +59,24 @@ impl Launch {
         }
     }
 
-    /// Leaves it in the process group of its parent, as whoever calls [`own_session`] needs it: the leader of a group
-    /// cannot begin a session.
+    /// Keeps it in the process group of its parent, as required for [`start_own_session`]: the leader of a process
+    /// group cannot start a session.
     pub fn for_own_session(self) -> Self {
         Self { own_group: false, ..self }
     }
 
-    /// Keeps from it the variables by which clients of a database server find it and its password: `PGPASSWORD` and the like.
+    /// Removes the environment variables with the address and password of a database server, such as `PGPASSWORD`.
     pub fn without_database(self) -> Self {
         Self { has_database: false, ..self }
     }
 
-    /// Starts it, and gives it away to be watched together with what it is to read.
+    /// Starts the process. Returns it with its setup, for the monitor.
     fn start(self) -> io::Result<(Child, Vec<u8>)> {
         let mut command = Command::new(&self.program);
         command.arg0(&self.name).args(&self.arguments);
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
         if !self.has_database {
-            std::env::vars_os().map(|(name, _)| name).filter(|name| is_for_databases(name)).for_each(
+            std::env::vars_os().map(|(name, _)| name).filter(|name| is_postgres_variable(name)).for_each(
                 |name| {
                     command.env_remove(name);
                 },
@@ -85,27 +85,28 @@ impl Launch {
         if self.own_group {
             command.process_group(0);
         }
-        keep_to_ourselves(&mut command);
+        limit_inheritance(&mut command);
         Ok((command.spawn()?, self.setup))
     }
 }
 
-/// Whether an environment variable of this name is one of PostgreSQL's.
-fn is_for_databases(name: &OsStr) -> bool {
+/// Whether an environment variable belongs to PostgreSQL.
+fn is_postgres_variable(name: &OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b"PG")
 }
 
-/// Gives the child the user's limit of descriptors, and nothing to inherit but its three standard streams. What is opened for
-/// shared memory is not marked to be closed, and a labeller, which outlives this process, would keep that memory.
+/// Restores the user's limit of file descriptors in the child, and closes all but its three standard streams. File
+/// descriptors of shared memory are not close-on-exec, and a labeller, which outlives this process, would keep that
+/// memory.
 #[allow(unsafe_code)]
-fn keep_to_ourselves(command: &mut Command) {
+fn limit_inheritance(command: &mut Command) {
     let close_the_rest = || {
-        // SAFETY: a system call that takes numbers and touches no memory.
+        // SAFETY: a system call that takes numbers and accesses no memory.
         match unsafe { libc::close_range(3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC as libc::c_int) } {
             0 => descriptors::restore_descriptor_limit(),
             _ => Err(io::Error::last_os_error()),
         }
     };
-    // SAFETY: between fork and exec nothing is done but two system calls; they allocate nothing and take no lock.
+    // SAFETY: between fork and exec there are only two system calls, which allocate nothing and take no lock.
     unsafe { command.pre_exec(close_the_rest) };
 }

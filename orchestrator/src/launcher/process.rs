@@ -1,4 +1,4 @@
-//! A process under a handle that belongs to it alone: its number may be given to another one when it is gone.
+//! Handles of processes. Unlike its process id, the handle of a process is never reused.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -8,61 +8,61 @@ use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-/// Why a process that was started elsewhere cannot be had.
+/// Why a running process cannot be adopted.
 #[derive(Debug, thiserror::Error)]
 pub enum AdoptError {
-    /// No process has this number, or another one has it now.
-    #[error("process {pid} is gone")]
+    /// No process has this id any more, or another one.
+    #[error("process {pid} has exited")]
     Gone {
-        /// The number that it had.
+        /// The process id.
         pid: u32,
     },
-    /// The child has a process already, or is none of the set.
+    /// The child already had a process, or does not exist.
     #[error(
-        "process {pid} cannot be taken for number {number}: it had a process before, or there is no such number"
+        "cannot adopt process {pid} as number {number}: this number had a process before, or does not exist"
     )]
-    Taken {
-        /// Its process number.
+    NotAdoptable {
+        /// The process id.
         pid: u32,
-        /// The child.
+        /// Number of the child.
         number: u32,
     },
     /// The system refused.
-    #[error("process {pid} cannot be watched or signalled: {error}")]
+    #[error("cannot monitor or signal process {pid}: {error}")]
     Refused {
-        /// Its process number.
+        /// The process id.
         pid: u32,
-        /// Why.
+        /// The error.
         error: io::Error,
     },
 }
 
-/// A living process, or one that is not reaped yet.
+/// A process that is running, or was not waited for.
 #[derive(Debug)]
 pub(super) struct Process {
     handle: OwnedFd,
 }
 
 impl Process {
-    /// The handle of a child that nobody has reaped yet.
-    pub fn of_child(pid: u32) -> io::Result<Self> {
+    /// The handle of a child process that was not waited for.
+    pub fn from_child(pid: u32) -> io::Result<Self> {
         Ok(Self { handle: open(pid)? })
     }
 
-    /// The handle of the process with this number that was born then, [`store::process_start_time`] has it.
-    pub fn find(pid: u32, birth: &str) -> Result<Self, AdoptError> {
+    /// The handle of the process with this id and start time ([`store::process_start_time`]).
+    pub fn open_running(pid: u32, birth: &str) -> Result<Self, AdoptError> {
         let handle = open(pid).map_err(|error| match error {
             Errno::SRCH | Errno::INVAL => AdoptError::Gone { pid },
             error => AdoptError::Refused { pid, error: error.into() },
         })?;
-        // Only now, since from here on the handle keeps to one process whatever becomes of the number.
+        // Checked only now, since the handle belongs to one process whatever happens to the id.
         match store::process_start_time(pid) {
             Some(found) if found == birth => Ok(Self { handle }),
             _ => Err(AdoptError::Gone { pid }),
         }
     }
 
-    /// A second handle, which turns readable when the process ends.
+    /// A second handle, which becomes readable when the process exits.
     #[allow(
         deprecated,
         reason = "for types that change their descriptor; an OwnedFd never does, and the successor is unsafe"
@@ -71,7 +71,7 @@ impl Process {
         AsyncFd::with_interest(self.handle.try_clone()?, Interest::READABLE)
     }
 
-    /// Sends a signal; one to a process that has ended meanwhile goes nowhere.
+    /// Sends a signal. Does nothing if the process has exited.
     pub fn signal(&self, signal: Signal) -> io::Result<()> {
         match pidfd_send_signal(&self.handle, signal) {
             Ok(()) | Err(Errno::SRCH) => Ok(()),
@@ -80,10 +80,10 @@ impl Process {
     }
 }
 
-/// Asks the process `pid` that was born at `birth` ([`store::process_start_time`]) to end in order (SIGTERM), and does not wait
-/// for it: a labeller of an earlier run, say, that cannot be adopted because it works to another protocol.
-pub fn ask_to_end(pid: u32, birth: &str) -> Result<(), AdoptError> {
-    let sent = Process::find(pid, birth)?.signal(Signal::TERM);
+/// Asks the process `pid`, which started at `birth` ([`store::process_start_time`]), to exit (SIGTERM), without waiting for
+/// it. Used for a labeller of an earlier run that cannot be adopted because it uses another label protocol.
+pub fn request_exit(pid: u32, birth: &str) -> Result<(), AdoptError> {
+    let sent = Process::open_running(pid, birth)?.signal(Signal::TERM);
     sent.map_err(|error| AdoptError::Refused { pid, error })
 }
 

@@ -1,12 +1,12 @@
-//! What a commit is in the log.
+//! Logging of commits.
 
 use std::time::Duration;
 
 use store::records::Commit;
 use tracing::{debug, info};
 
-/// A commit that took so long, with its decisions. What is taken into the data set and what happens to walks is more serious than
-/// what is declined, of which there is a lot.
+/// Logs a commit with its decisions, and the time it took. Accepted candidates and events of walks have a higher level
+/// than declined candidates, which are frequent.
 pub fn committed(commit: &Commit, time: Duration) {
     for decision in &commit.decisions {
         let (kind, walk) = (decision.kind, decision.walk.map(|walk| walk.0));

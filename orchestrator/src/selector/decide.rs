@@ -1,4 +1,4 @@
-//! What becomes of the reports of a round, one after the other in walk order.
+//! Decisions on the reports of a round, in the order of walks.
 
 use std::collections::BTreeSet;
 use std::panic::resume_unwind;
@@ -10,18 +10,18 @@ use calm::grade::maximum;
 use calm::{GradeError, Grades, Mixture, UpdateOutcome};
 use serde_json::json;
 use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
-use wire::messages::{Decline, End, Outcome, Verdict};
+use wire::messages::{DeclineReason, Outcome, Verdict, WalkEnd};
 use wire::{CandidateBlock, ContentHash, WalkId};
 
-use super::judge::Judge;
-use super::{Examined, ExaminedReport, SelectorError, UpdateProtocol};
+use super::decision_state::DecisionState;
+use super::{RegradedCandidate, RegradedReport, SelectorError, UpdateProtocol};
 
-/// Priority of the label jobs of biased candidates; control frames come after them.
+/// Priority of label jobs of biased candidates; control frames come after them.
 const BIASED_PRIORITY: i32 = 10;
 const CONTROL_PRIORITY: i32 = 0;
 
-/// Features of the original training frames, whose γ under the live mixture is watched: a mixture that moves must
-/// not forget what the potential was trained on.
+/// Features of the original training frames. Their γ under the live mixture is monitored: the mixture must not forget
+/// what the potential was trained on.
 #[derive(Clone, Debug)]
 pub struct TrainingFrames {
     /// Element index of each atom.
@@ -33,13 +33,13 @@ pub struct TrainingFrames {
 }
 
 impl TrainingFrames {
-    /// Training frames with these features, graded under the original mixture.
+    /// Training frames with these features; grades them under the original mixture.
     pub fn new(elements: Vec<usize>, features: Vec<f64>, original: &Mixture) -> Result<Self, GradeError> {
         let original = grade_distribution(original, &elements, &features)?;
         Ok(Self { elements, features, original })
     }
 
-    /// Their grades under another mixture, on every core: no atom's grade depends on the others.
+    /// Their grades under another mixture, computed on all cores, since atoms are independent.
     fn grades(&self, mixture: &Mixture) -> Result<GradeDistribution, SelectorError> {
         let cores = available_parallelism().map_or(1, |cores| cores.get());
         let atoms = self.elements.len().div_ceil(cores).max(1);
@@ -63,48 +63,48 @@ fn gamma(mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result<Vec<
     Ok(grades.gamma)
 }
 
-impl Judge {
+impl DecisionState {
     /// Decides on the reports of a round, in order.
-    pub fn decide(&mut self, reports: Vec<ExaminedReport>) -> Result<Commit, SelectorError> {
+    pub fn decide(&mut self, reports: Vec<RegradedReport>) -> Result<Commit, SelectorError> {
         let mut commit = Commit::default();
         let mut touched = BTreeSet::new();
         for report in reports {
             let id = report.walk;
             touched.insert(id);
-            self.take_in(&report, &mut commit);
+            self.apply_report(&report, &mut commit);
             match report.outcome {
-                Outcome::Candidate(examined) if self.walks[&id].is_biased() => {
-                    self.decide_candidate(id, examined?, &mut commit)?;
+                Outcome::Candidate(regraded) if self.walks[&id].is_biased() => {
+                    self.decide_candidate(id, regraded?, &mut commit)?;
                 }
-                Outcome::Candidate(examined) => self.keep_control_frame(id, examined?, &mut commit)?,
+                Outcome::Candidate(regraded) => self.keep_control_frame(id, regraded?, &mut commit)?,
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
-                // A control walk whose frames did not come will not give them in another turn either.
-                Outcome::Turn if self.walks[&id].missed_its_frames() => {
-                    self.end_walk(id, &End::Steps, &mut commit);
+                // A control walk that missed its last frame will not provide it in a later assignment.
+                Outcome::StepsDone if self.walks[&id].missed_its_frames() => {
+                    self.end_walk(id, &WalkEnd::Steps, &mut commit);
                 }
-                Outcome::Turn | Outcome::Paused => {}
+                Outcome::StepsDone | Outcome::Interrupted => {}
             }
         }
         touched.extend(self.end_by_budget(&mut commit));
-        touched.extend(self.begin_controls(&mut commit));
+        touched.extend(self.start_controls(&mut commit));
         commit.walks = touched.iter().map(|id| self.walks[id].to_record()).collect();
-        self.seal(&mut commit);
+        self.add_values(&mut commit);
         Ok(commit)
     }
 
-    /// Moves the walk to where its turn ended, and logs returns to a checkpoint.
-    fn take_in(&mut self, report: &ExaminedReport, commit: &mut Commit) {
-        let turn_steps = self.settings.turn_steps;
+    /// Updates the walk from the report, and logs rollbacks.
+    fn apply_report(&mut self, report: &RegradedReport, commit: &mut Commit) {
+        let steps_per_assignment = self.settings.steps_per_assignment;
         let walk = self.walk_mut(report.walk);
-        let returned = report.progress.segment > walk.memory.segment;
-        walk.memory.segment = walk.memory.segment.max(report.progress.segment);
+        let returned = report.progress.segment > walk.state.segment;
+        walk.state.segment = walk.state.segment.max(report.progress.segment);
         walk.record.turn += 1;
-        if !matches!(report.outcome, Outcome::Ended(End::BadStart { .. })) {
+        if !matches!(report.outcome, Outcome::Ended(WalkEnd::BadStart { .. })) {
             walk.record.checkpoint = Some(report.checkpoint.clone());
             walk.record.progress = report.progress.clone();
         }
-        walk.memory.verdict = None;
-        walk.set_until(turn_steps);
+        walk.state.verdict = None;
+        walk.set_last_step(steps_per_assignment);
         if returned {
             let progress = &report.progress;
             let (from, to) = progress.last_return.unzip();
@@ -115,14 +115,14 @@ impl Judge {
         }
     }
 
-    /// Decides on a candidate of a biased walk, and ends the walk if that was its last.
+    /// Decides on a candidate of a biased walk, and ends the walk if it has reached its limit.
     pub fn decide_candidate(
         &mut self,
         id: WalkId,
-        examined: Examined,
+        regraded: RegradedCandidate,
         commit: &mut Commit,
     ) -> Result<(), SelectorError> {
-        let graded = examined.under(&self.mixture)?;
+        let graded = regraded.with_mixture(&self.mixture)?;
         let view = graded.block.view();
         let candidate = view.id();
         self.staleness.add(self.mixture.version().saturating_sub(view.mixture_version()));
@@ -131,10 +131,10 @@ impl Judge {
             "selector": grade_summary(&graded.selector.gamma, self.mixture.version()),
             "original": grade_summary(&graded.original.gamma, 0),
         });
-        if self.raised > 1.0 {
-            detail["raised_by"] = json!(self.raised);
+        if self.threshold_factor > 1.0 {
+            detail["raised_by"] = json!(self.threshold_factor);
             detail["threshold"] =
-                json!(self.settings.collection.with_threshold_factor(self.raised).threshold());
+                json!(self.settings.collection.with_threshold_factor(self.threshold_factor).threshold());
         }
         let (fate, verdict) = match self.reason_to_decline(id, candidate.content, &graded) {
             Some(reason) => {
@@ -147,47 +147,47 @@ impl Judge {
                 (Fate::Accepted, Verdict::Accepted)
             }
         };
-        let keep_features = self.keeps_features(fate, &graded.block);
-        self.put_down(id, graded, fate, keep_features, detail, commit);
+        let keep_features = self.should_keep_features(fate, &graded.block);
+        self.record_decision(id, graded, fate, keep_features, detail, commit);
         let walk = self.walk_mut(id);
-        walk.memory.verdict = Some(verdict);
-        if walk.record.accepted >= self.settings.per_seed {
-            self.end_walk(id, &End::Collected, commit);
+        walk.state.verdict = Some(verdict);
+        if walk.record.accepted >= self.settings.max_per_seed_structure {
+            self.end_walk(id, &WalkEnd::Collected, commit);
         }
         Ok(())
     }
 
-    /// A wanted frame of a control walk: labelled like a candidate, but no mixture learns from it.
+    /// Records a requested frame of a control walk: it is labelled like a candidate, but does not update the mixture.
     pub fn keep_control_frame(
         &mut self,
         id: WalkId,
-        examined: Examined,
+        regraded: RegradedCandidate,
         commit: &mut Commit,
     ) -> Result<(), SelectorError> {
-        let graded = examined.under(&self.mixture)?;
+        let graded = regraded.with_mixture(&self.mixture)?;
         let step = graded.block.view().id().step;
         let detail = json!({ "original": grade_summary(&graded.original.gamma, 0) });
-        self.put_down(id, graded, Fate::Accepted, true, detail, commit);
+        self.record_decision(id, graded, Fate::Accepted, true, detail, commit);
         let walk = self.walk_mut(id);
         walk.record.accepted += 1;
-        walk.memory.wanted.retain(|wanted| *wanted > step);
-        if walk.memory.wanted.is_empty() {
-            self.end_walk(id, &End::Collected, commit);
+        walk.state.wanted.retain(|wanted| *wanted > step);
+        if walk.state.wanted.is_empty() {
+            self.end_walk(id, &WalkEnd::Collected, commit);
         }
         Ok(())
     }
 
-    /// Puts a decision and the candidate that it is about into the commit.
-    fn put_down(
+    /// Adds a decision with its candidate to the commit.
+    fn record_decision(
         &self,
         id: WalkId,
-        graded: Examined,
+        graded: RegradedCandidate,
         fate: Fate,
         keep_features: bool,
         detail: serde_json::Value,
         commit: &mut Commit,
     ) {
-        let Examined { block, selector, original, .. } = graded;
+        let RegradedCandidate { block, selector, original, .. } = graded;
         let (walk, candidate) = (&self.walks[&id], Some(block.view().id()));
         let (kind, priority) = match fate {
             _ if !walk.is_biased() => ("control", CONTROL_PRIORITY),
@@ -207,29 +207,38 @@ impl Judge {
         });
     }
 
-    /// The first reason, if any, in the order: guard, duplicate, budget, covered, backlog.
-    fn reason_to_decline(&self, id: WalkId, content: ContentHash, graded: &Examined) -> Option<Decline> {
+    /// The first applicable reason to decline, in the order guard, duplicate, budget, covered, backlog.
+    fn reason_to_decline(
+        &self,
+        id: WalkId,
+        content: ContentHash,
+        graded: &RegradedCandidate,
+    ) -> Option<DeclineReason> {
         let walk = &self.walks[&id].record;
-        if graded.bonds.shortest < self.least_distances[walk.seed_structure as usize] {
-            Some(Decline::Guard)
+        if graded.bonds.shortest < self.min_distances[walk.seed_structure as usize] {
+            Some(DeclineReason::Guard)
         } else if self.known.contains(&content) {
-            Some(Decline::Duplicate)
-        } else if walk.accepted >= self.settings.per_seed || self.is_used_up() {
-            Some(Decline::Budget)
+            Some(DeclineReason::Duplicate)
+        } else if walk.accepted >= self.settings.max_per_seed_structure || self.is_budget_exhausted() {
+            Some(DeclineReason::Budget)
         } else if !self.settings.collection.is_met(&graded.selector.gamma) {
-            Some(Decline::Covered)
-        } else if !self.settings.collection.with_threshold_factor(self.raised).is_met(&graded.selector.gamma)
+            Some(DeclineReason::Covered)
+        } else if !self
+            .settings
+            .collection
+            .with_threshold_factor(self.threshold_factor)
+            .is_met(&graded.selector.gamma)
         {
-            Some(Decline::Backlog)
+            Some(DeclineReason::Backlog)
         } else {
             None
         }
     }
 
-    /// Makes the mixture cover the candidate: the next version, in the commit.
+    /// Updates the mixture to cover the candidate, and adds the new version to the commit.
     fn update(
         &mut self,
-        graded: &Examined,
+        graded: &RegradedCandidate,
         commit: &mut Commit,
         detail: &mut serde_json::Value,
     ) -> Result<(), SelectorError> {
@@ -261,11 +270,11 @@ impl Judge {
         self.known.insert(content);
         let walk = self.walk_mut(id);
         walk.record.accepted += 1;
-        walk.memory.accepted_steps.push(step);
+        walk.state.accepted_steps.push(step);
     }
 
-    /// Feature vectors of accepted candidates are always kept, those of declined ones within a byte budget.
-    fn keeps_features(&mut self, fate: Fate, block: &CandidateBlock) -> bool {
+    /// Features of accepted candidates are always stored, those of declined candidates within a limit.
+    fn should_keep_features(&mut self, fate: Fate, block: &CandidateBlock) -> bool {
         if fate == Fate::Accepted {
             return true;
         }
@@ -277,11 +286,11 @@ impl Judge {
         keeps
     }
 
-    fn end_walk(&mut self, id: WalkId, end: &End, commit: &mut Commit) {
-        self.end_walk_as(id, end.name(), reason_of(end), commit);
+    fn end_walk(&mut self, id: WalkId, end: &WalkEnd, commit: &mut Commit) {
+        self.end_walk_as(id, end.name(), describe_end(end), commit);
     }
 
-    /// Ends a walk, which has that state from now on, for a reason in words.
+    /// Ends a walk with this final state, and the reason as text.
     pub fn end_walk_as(&mut self, id: WalkId, end: &str, reason: String, commit: &mut Commit) {
         let walk = self.walk_mut(id);
         (walk.record.state, walk.record.reason) = (end.to_owned(), reason);
@@ -292,7 +301,7 @@ impl Judge {
         let restart = walk.is_biased() && self.settings.update == UpdateProtocol::Restarted;
         if restart {
             let next_version = self.mixture.version() + 1;
-            self.mixture = Arc::new(self.examiner.original.at_version(next_version));
+            self.mixture = Arc::new(self.regrader.original.at_version(next_version));
             commit.components.clear();
             commit.restart_mixture = true;
             if let Some(training) = &self.training {
@@ -302,19 +311,20 @@ impl Judge {
         commit.decisions.push(self.decision("ended", id, detail));
     }
 
-    /// Ends the biased walks that nobody has in hand once the campaign has as many structures as it may have.
+    /// Ends the unassigned biased walks once the campaign has its maximum number of structures.
     fn end_by_budget(&mut self, commit: &mut Commit) -> Vec<WalkId> {
-        if !self.is_used_up() {
+        if !self.is_budget_exhausted() {
             return Vec::new();
         }
-        let idle = self.walks.values().filter(|walk| walk.is_biased() && !walk.has_ended() && !walk.out);
+        let idle =
+            self.walks.values().filter(|walk| walk.is_biased() && !walk.has_ended() && !walk.is_assigned);
         let idle: Vec<_> = idle.map(|walk| walk.record.walk).collect();
-        idle.iter().for_each(|id| self.end_walk(*id, &End::Budget, commit));
+        idle.iter().for_each(|id| self.end_walk(*id, &WalkEnd::Budget, commit));
         idle
     }
 
-    /// The controls of biased walks that have ended; touches both.
-    fn begin_controls(&mut self, commit: &mut Commit) -> Vec<WalkId> {
+    /// Creates the control walks of biased walks that have ended. Returns all changed walks.
+    fn start_controls(&mut self, commit: &mut Commit) -> Vec<WalkId> {
         let mut touched = Vec::new();
         if !self.settings.control {
             return touched;
@@ -323,32 +333,32 @@ impl Judge {
             self.walks.iter().filter(|(_, walk)| walk.needs_control()).map(|(id, _)| *id).collect();
         for id in ended {
             let control_id = self.next_walk_id();
-            commit.decisions.push(self.begin_control(control_id, id));
+            commit.decisions.push(self.start_control(control_id, id));
             touched.extend([id, control_id]);
         }
         touched
     }
 
-    /// Begins the control of the biased walk `of`, which must be there.
-    pub fn begin_control(&mut self, id: WalkId, of: WalkId) -> Decision {
-        let turn_steps = self.settings.turn_steps;
-        let control = self.walk_mut(of).control(id, turn_steps);
-        let detail = json!({ "control_of": of, "wanted": control.memory.wanted });
+    /// Creates the control walk of the biased walk `of`, which must exist.
+    pub fn start_control(&mut self, id: WalkId, of: WalkId) -> Decision {
+        let steps_per_assignment = self.settings.steps_per_assignment;
+        let control = self.walk_mut(of).new_control(id, steps_per_assignment);
+        let detail = json!({ "control_of": of, "wanted": control.state.wanted });
         self.walks.insert(id, control);
         self.decision("begun", id, detail)
     }
 }
 
-/// Why a walk ended, in words, where its name does not say it all.
-fn reason_of(end: &End) -> String {
+/// Why a walk ended, as text, if the name of the end is not sufficient.
+fn describe_end(end: &WalkEnd) -> String {
     match end {
-        End::Steps | End::Collected | End::Budget => String::new(),
-        End::Trapped { guard } => format!("refused by the {guard} guard again and again"),
-        End::BlewUp { reason } | End::BadStart { reason } => reason.clone(),
+        WalkEnd::Steps | WalkEnd::Collected | WalkEnd::Budget => String::new(),
+        WalkEnd::Trapped { guard } => format!("refused by the {guard} guard again and again"),
+        WalkEnd::BlewUp { reason } | WalkEnd::BadStart { reason } => reason.clone(),
     }
 }
 
-/// The value by which those who watch see what the mixture still knows.
+/// The value that shows how well the mixture still covers the training frames.
 fn training_frames(grades: &GradeDistribution, alarm: bool) -> (String, String) {
     let mut value = json!(grades);
     value["alarm"] = json!(alarm);

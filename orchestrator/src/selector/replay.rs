@@ -1,7 +1,7 @@
-//! The recorded stream of candidates and ends of walks once more before the judge, by the same rules or by others.
+//! Replays the decision log of a campaign, with the same rules or with others.
 //!
-//! What walkers said is taken from the log: which structures they offered and when, where they went back to a checkpoint,
-//! how their walks ended. What the judge said is decided anew. By the same rules every decision must come out the same.
+//! The actions of walkers are taken from the log: which structures they offered and when, rollbacks, and ends of walks.
+//! The decisions are made again. With the same rules, every decision must be the same.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -11,27 +11,29 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, LoggedDecision};
-use wire::messages::End;
+use wire::messages::WalkEnd;
 use wire::{ContentHash, WalkId};
 
-use super::judge::{Judge, restored_mixture};
+use super::decision_state::{DecisionState, restored_mixture};
 use super::rules::CONFIGURATION;
-use super::{Examined, Examiner, SeedStructure, SelectorError, Settings, Snapshot, TrainingFrames};
+use super::{
+    RegradedCandidate, Regrader, SeedStructure, SelectorError, SelectorSnapshot, Settings, TrainingFrames,
+};
 use crate::grader::Grader;
 
 /// Why a log cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
-    /// The judge gave up.
+    /// The selector failed.
     #[error("decision {sequence}: {source}")]
     Selector {
         /// Number of the decision.
         sequence: i64,
-        /// Why.
+        /// The error.
         source: Box<SelectorError>,
     },
-    /// A log that no selector wrote.
-    #[error("decision {sequence} ({kind}): {problem}: the database is damaged; restore it from a copy")]
+    /// The log is damaged.
+    #[error("decision {sequence} ({kind}): {problem}: the database is damaged; restore it from a backup")]
     Damaged {
         /// Number of the decision.
         sequence: i64,
@@ -40,36 +42,36 @@ pub enum ReplayError {
         /// What is wrong.
         problem: String,
     },
-    /// The settings do not go with the campaign.
+    /// The settings do not match the campaign.
     #[error(transparent)]
     Settings(Box<SelectorError>),
 }
 
-/// What comes of a place of the log now.
+/// The result of replaying a decision.
 #[derive(Debug)]
-pub struct Replayed {
-    /// The decision.
+pub struct ReplayedDecision {
+    /// The new decision.
     pub decision: Decision,
-    /// The candidate that it is about, if it is about one.
+    /// Its candidate, if it has one.
     pub candidate: Option<CandidateRecord>,
 }
 
-/// A campaign that is replayed.
+/// A replay.
 pub struct Replay {
-    judge: Judge,
+    decisions: DecisionState,
     seeds: Vec<SeedStructure>,
-    /// Imported structures in the order in which they came.
+    /// Imported structures in order of import.
     imported: Vec<ContentHash>,
-    /// Keys of the configuration that are not those of the campaign.
+    /// Configuration keys that differ from the campaign's.
     set: HashSet<String>,
-    /// The end of a walk that came with the last candidate.
+    /// The end of a walk that resulted from the last candidate.
     ended: Option<Decision>,
     cut_short: u64,
 }
 
 impl Replay {
-    /// A campaign before its first decision: `settings` are those of its begin, but for the keys in `set`, which the log
-    /// cannot change.
+    /// A replay before the first decision. `settings` are those at the start of the campaign, except for the keys in
+    /// `set`, which the log does not change.
     pub fn new(
         settings: Settings,
         set: HashSet<String>,
@@ -79,45 +81,46 @@ impl Replay {
         training: Option<TrainingFrames>,
         imported: Vec<ContentHash>,
     ) -> Result<Self, ReplayError> {
-        let judge = Judge::restore(settings, &seeds, grader, original, training, Snapshot::default());
-        let judge = judge.map_err(|source| ReplayError::Settings(Box::new(source)))?;
-        Ok(Self { judge, seeds, imported, set, ended: None, cut_short: 0 })
+        let decisions =
+            DecisionState::restore(settings, &seeds, grader, original, training, SelectorSnapshot::default());
+        let decisions = decisions.map_err(|source| ReplayError::Settings(Box::new(source)))?;
+        Ok(Self { decisions, seeds, imported, set, ended: None, cut_short: 0 })
     }
 
-    /// Whether everything is as it was: then control walks and their frames are replayed too. They decide nothing, and
-    /// other rules would give others.
+    /// Whether all rules are the same. Only then are control walks and their frames replayed: they do not affect
+    /// decisions, and would be different with other rules.
     pub fn is_exact(&self) -> bool {
         self.set.is_empty()
     }
 
-    /// To examine candidates ahead of [`Self::follow`].
-    pub fn examiner(&self) -> &Examiner {
-        &self.judge.examiner
+    /// Regrades candidates ahead of [`Self::apply`].
+    pub fn regrader(&self) -> &Regrader {
+        &self.decisions.regrader
     }
 
-    /// The mixture in force.
+    /// The current mixture.
     pub fn mixture(&self) -> &Arc<Mixture> {
-        &self.judge.mixture
+        &self.decisions.mixture
     }
 
-    /// Walks that a budget or their seed structure's limit ended, and that these rules would have let go on.
+    /// Number of walks that ended because of a limit in the log, but would have continued with these rules.
     pub fn cut_short(&self) -> u64 {
         self.cut_short
     }
 
-    /// Whether by these rules it would come to a decision about a candidate at all.
-    pub fn comes_to(&self, recorded: &LoggedDecision) -> Result<bool, ReplayError> {
+    /// Whether a decision about the candidate is made with these rules.
+    pub fn is_reached(&self, recorded: &LoggedDecision) -> Result<bool, ReplayError> {
         Ok(self.walk_under_way(recorded)?.is_some())
     }
 
-    /// Goes on by one decision of the log, which have to come in order; a decision about a candidate comes with it. Nothing
-    /// comes of it if by these rules it would not have come to it: the walk was over.
-    pub fn follow(
+    /// Replays the next decision of the log, with its candidate if it has one. Returns `None` if this decision is not
+    /// made with these rules, since the walk has ended.
+    pub fn apply(
         &mut self,
         recorded: &LoggedDecision,
-        candidate: Option<Examined>,
-    ) -> Result<Option<Replayed>, ReplayError> {
-        self.judge.round = recorded.round;
+        candidate: Option<RegradedCandidate>,
+    ) -> Result<Option<ReplayedDecision>, ReplayError> {
+        self.decisions.round = recorded.round;
         let ended = self.ended.take();
         let decision = match recorded.kind.as_str() {
             "accepted" | "declined" | "control" => return self.candidate(recorded, candidate),
@@ -130,26 +133,26 @@ impl Replay {
                 Some(ended) if ended.walk.map(|walk| walk.0) == recorded.walk => Some(ended),
                 _ => self.end(recorded)?,
             },
-            _ => return Err(damaged(recorded, "a kind that this version does not know")),
+            _ => return Err(damaged(recorded, "its kind is unknown to this version")),
         };
-        Ok(decision.map(|decision| Replayed { decision, candidate: None }))
+        Ok(decision.map(|decision| ReplayedDecision { decision, candidate: None }))
     }
 
     fn candidate(
         &mut self,
         recorded: &LoggedDecision,
-        candidate: Option<Examined>,
-    ) -> Result<Option<Replayed>, ReplayError> {
+        candidate: Option<RegradedCandidate>,
+    ) -> Result<Option<ReplayedDecision>, ReplayError> {
         let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
-        let examined = candidate.ok_or_else(|| damaged(recorded, "its candidate is missing"))?;
-        let step = examined.block.view().id().step;
-        self.judge.raised = recorded.detail["raised_by"].as_f64().unwrap_or(1.0);
-        let walk = self.judge.walk_mut(id);
+        let regraded = candidate.ok_or_else(|| damaged(recorded, "its candidate is missing"))?;
+        let step = regraded.block.view().id().step;
+        self.decisions.threshold_factor = recorded.detail["raised_by"].as_f64().unwrap_or(1.0);
+        let walk = self.decisions.walk_mut(id);
         walk.record.progress.step = step;
         let (mut commit, biased) = (Commit::default(), walk.is_biased());
         let decided = match biased {
-            true => self.judge.decide_candidate(id, examined, &mut commit),
-            false => self.judge.keep_control_frame(id, examined, &mut commit),
+            true => self.decisions.decide_candidate(id, regraded, &mut commit),
+            false => self.decisions.keep_control_frame(id, regraded, &mut commit),
         };
         decided.map_err(|source| ReplayError::Selector {
             sequence: recorded.sequence,
@@ -159,7 +162,7 @@ impl Replay {
         let decision = decisions.next();
         self.ended = decisions.next();
         let candidate = commit.candidates.pop();
-        Ok(decision.map(|decision| Replayed { decision, candidate }))
+        Ok(decision.map(|decision| ReplayedDecision { decision, candidate }))
     }
 
     fn import(&mut self, recorded: &LoggedDecision) -> Result<Decision, ReplayError> {
@@ -172,24 +175,24 @@ impl Replay {
         let known = known.ok_or_else(|| {
             damaged(
                 recorded,
-                &format!("{structures} imported structures, but {} are there", self.imported.len()),
+                &format!("{structures} imported structures, but only {} exist", self.imported.len()),
             )
         })?;
-        self.judge.known.extend(known);
-        Ok(self.judge.of_campaign("imported", recorded.detail.clone()))
+        self.decisions.known.extend(known);
+        Ok(self.decisions.campaign_decision("imported", recorded.detail.clone()))
     }
 
-    /// Takes the rules that the campaign went on by, but for those that are set.
+    /// Applies the changed rules, except for the keys in `set`.
     fn change_rules(&mut self, recorded: &LoggedDecision) -> Result<Decision, ReplayError> {
-        let mut rules = self.judge.settings.changeable().to_map();
+        let mut rules = self.decisions.settings.changeable_rules().to_map();
         for (key, value) in read::<Map<String, Value>>(recorded)? {
             if !self.set.contains(&key) {
                 rules.insert(key, value);
             }
         }
         let rules = serde_json::from_value(Value::Object(rules));
-        self.judge.settings.change(&rules.map_err(|error| damaged(recorded, &error.to_string()))?);
-        Ok(self.judge.of_campaign(CONFIGURATION, recorded.detail.clone()))
+        self.decisions.settings.apply_rules(&rules.map_err(|error| damaged(recorded, &error.to_string()))?);
+        Ok(self.decisions.campaign_decision(CONFIGURATION, recorded.detail.clone()))
     }
 
     fn begin(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
@@ -199,34 +202,34 @@ impl Replay {
             Biased { seed_structure: String },
             Control { control_of: WalkId },
         }
-        // Control walks are left out where rules are others, but the numbers stay those of the log.
-        let id = if self.is_exact() { self.judge.next_walk_id() } else { walk(recorded)? };
+        // With other rules there are no control walks, but walks keep their numbers from the log.
+        let id = if self.is_exact() { self.decisions.next_walk_id() } else { walk(recorded)? };
         match read(recorded)? {
             Detail::Biased { seed_structure: name } => {
                 let seed = self.seeds.iter().position(|seed| seed.name == name);
                 let seed =
                     seed.ok_or_else(|| damaged(recorded, &format!("there is no seed structure '{name}'")))?;
-                Ok(Some(self.judge.begin_walk(id, seed, &name)))
+                Ok(Some(self.decisions.start_walk(id, seed, &name)))
             }
             Detail::Control { control_of } if self.is_exact() => {
-                let is_there = self.judge.walks.contains_key(&control_of);
-                Ok(is_there.then(|| self.judge.begin_control(id, control_of)))
+                let is_there = self.decisions.walks.contains_key(&control_of);
+                Ok(is_there.then(|| self.decisions.start_control(id, control_of)))
             }
             Detail::Control { .. } => Ok(None),
         }
     }
 
-    /// A walk that has ended for good by these rules stays ended.
+    /// A walk that has reached a limit of these rules is not resumed.
     fn resume(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
         let id = walk(recorded)?;
-        let goes_on = self.judge.walks.contains_key(&id) && self.judge.may_go_on(id);
-        Ok(goes_on.then(|| self.judge.resume(id)))
+        let goes_on = self.decisions.walks.contains_key(&id) && self.decisions.can_resume(id);
+        Ok(goes_on.then(|| self.decisions.resume(id)))
     }
 
-    /// A return to a checkpoint is what the walker said.
+    /// Rollbacks are actions of the walker.
     fn segment(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
         let id = self.walk_under_way(recorded)?;
-        Ok(id.map(|id| self.judge.decision("segment", id, recorded.detail.clone())))
+        Ok(id.map(|id| self.decisions.decision("segment", id, recorded.detail.clone())))
     }
 
     fn end(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
@@ -238,34 +241,35 @@ impl Replay {
         }
         let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
         let Detail { end, reason, step } = read(recorded)?;
-        let collected = end == End::Collected.name();
+        let collected = end == WalkEnd::Collected.name();
         if collected && self.is_exact() {
-            // That would have been the judge's own word.
+            // The selector itself would have ended the walk.
             return Ok(None);
         }
-        let budget = end == End::Budget.name() && !self.judge.is_used_up();
+        let budget = end == WalkEnd::Budget.name() && !self.decisions.is_budget_exhausted();
         self.cut_short += u64::from(collected || budget);
-        self.judge.walk_mut(id).record.progress.step = step;
+        self.decisions.walk_mut(id).record.progress.step = step;
         let mut commit = Commit::default();
-        self.judge.end_walk_as(id, &end, reason, &mut commit);
+        self.decisions.end_walk_as(id, &end, reason, &mut commit);
         Ok(commit.decisions.pop())
     }
 
-    /// The walk of a decision, if it is there and not over.
+    /// The walk of a decision, if it exists and has not ended.
     fn walk_under_way(&self, recorded: &LoggedDecision) -> Result<Option<WalkId>, ReplayError> {
         let id = walk(recorded)?;
-        Ok(self.judge.walks.get(&id).filter(|walk| !walk.has_ended()).map(|_| id))
+        Ok(self.decisions.walks.get(&id).filter(|walk| !walk.has_ended()).map(|_| id))
     }
 
-    /// The first place (element index, slot) at which the mixture is not, byte for byte, what the store has of it.
-    pub fn other_component(
+    /// The first component (element index, slot) in which the mixture differs from the stored one, compared byte by
+    /// byte.
+    pub fn first_different_component(
         &self,
         version: u64,
         stored: &[ComponentRecord],
     ) -> Result<Option<(usize, usize)>, ReplayError> {
-        let stored = restored_mixture(&self.judge.examiner.original, version, stored);
+        let stored = restored_mixture(&self.decisions.regrader.original, version, stored);
         let stored = stored.map_err(|source| ReplayError::Settings(Box::new(source)))?;
-        let mut places = self.judge.mixture.iter().zip(stored.iter());
+        let mut places = self.decisions.mixture.iter().zip(stored.iter());
         let other = places.find(|((.., now), (.., stored))| now.to_bytes() != stored.to_bytes());
         Ok(other.map(|((element, slot, _), _)| (element, slot)))
     }

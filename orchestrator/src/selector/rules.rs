@@ -1,5 +1,5 @@
-//! Rules that may change while a campaign lasts. The decision log says when: decisions follow from it and from nothing
-//! else.
+//! Rules that may change during a campaign. The decision log records every change, so that decisions depend only on the
+//! log.
 
 use calm::forgetting::ForgettingAlarm;
 use calm::rules::Fraction;
@@ -8,26 +8,26 @@ use serde_json::{Map, Value};
 
 use super::Settings;
 
-/// The value under which they are committed, and the kind of the decision that says that they have changed.
+/// Key under which the rules are committed, and kind of the decision that records a change.
 pub(super) const RULES: &str = "rules";
 pub(super) const CONFIGURATION: &str = "configuration";
 
-/// Those of the settings that may change and that decisions depend on, by the keys of the configuration.
+/// The settings that may change and that affect decisions, by configuration key.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ChangeableRules {
-    /// See [`Settings::per_seed`].
+    /// See [`Settings::max_per_seed_structure`].
     #[serde(rename = "collect.per_seed")]
-    pub per_seed: u32,
-    /// See [`Settings::total`]: the least of what the keys say that limit it.
+    pub max_per_seed_structure: u32,
+    /// See [`Settings::max_structures`]: the smallest of the configured limits.
     #[serde(rename = "collect.total")]
-    pub total: Option<u32>,
+    pub max_structures: Option<u32>,
     /// See [`ForgettingAlarm`].
     #[serde(rename = "calm.forgetting_alarm")]
     pub forgetting_alarm: Fraction,
 }
 
 impl ChangeableRules {
-    /// By key.
+    /// The rules by key.
     pub fn to_map(&self) -> Map<String, Value> {
         let value = serde_json::to_value(self).expect("plain data becomes JSON");
         value.as_object().cloned().unwrap_or_default()
@@ -35,19 +35,19 @@ impl ChangeableRules {
 }
 
 impl Settings {
-    /// Those that may change.
-    pub fn changeable(&self) -> ChangeableRules {
+    /// The rules that may change.
+    pub fn changeable_rules(&self) -> ChangeableRules {
         ChangeableRules {
-            per_seed: self.per_seed,
-            total: self.total,
+            max_per_seed_structure: self.max_per_seed_structure,
+            max_structures: self.max_structures,
             forgetting_alarm: self.forgetting_alarm.share_above_one,
         }
     }
 
-    /// Takes others from now on.
-    pub fn change(&mut self, rules: &ChangeableRules) {
-        let ChangeableRules { per_seed, total, forgetting_alarm } = *rules;
-        (self.per_seed, self.total) = (per_seed, total);
+    /// Applies changed rules.
+    pub fn apply_rules(&mut self, rules: &ChangeableRules) {
+        let ChangeableRules { max_per_seed_structure, max_structures, forgetting_alarm } = *rules;
+        (self.max_per_seed_structure, self.max_structures) = (max_per_seed_structure, max_structures);
         self.forgetting_alarm = ForgettingAlarm { share_above_one: forgetting_alarm };
     }
 }

@@ -1,40 +1,40 @@
-//! How old the mixture was that walkers saw when what they found came to a decision.
+//! Age of the walker's mixture at the time of the decision.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-/// Ages up to this are counted each by itself, larger ones with all that have the same leading binary digits, as many
-/// as this has: the histogram stays small, and no age is off by more than a thirtieth.
+/// Ages up to this value are counted exactly; larger ones are binned by their leading binary digits. The histogram
+/// stays small, and the error is at most 1/30.
 const EXACT: u64 = 1 << 6;
 
-/// A histogram of ages in versions: that of the selector's mixture at the decision less that of the walker's.
+/// Histogram of ages in versions: the selector's mixture version at the decision minus that of the walker.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Staleness {
-    /// Decisions by age.
+    /// Number of decisions by age.
     counts: BTreeMap<u64, u64>,
     largest: u64,
 }
 
 impl Staleness {
-    /// Counts a decision.
+    /// Adds a decision.
     pub fn add(&mut self, versions: u64) {
         let digits = (versions / EXACT).checked_ilog2().map_or(0, |digits| digits + 1);
         *self.counts.entry(versions >> digits << digits).or_default() += 1;
         self.largest = self.largest.max(versions);
     }
 
-    /// Decisions that were counted.
+    /// Number of decisions.
     pub fn decisions(&self) -> u64 {
         self.counts.values().sum()
     }
 
-    /// Share of them about candidates whose walkers saw the newest mixture; NaN without any.
+    /// Fraction of decisions for which the walker had the newest mixture; NaN without any.
     pub fn share_of_newest(&self) -> f64 {
         self.counts.get(&0).copied().unwrap_or(0) as f64 / self.decisions() as f64
     }
 
-    /// The least age that is at least as large as this share of all; 0 without any.
+    /// The smallest age that is at least as large as this fraction of all ages; 0 without any.
     pub fn quantile(&self, share: f64) -> u64 {
         let rank = share * self.decisions() as f64;
         let mut below = 0;
@@ -45,7 +45,7 @@ impl Staleness {
         self.counts.iter().find(reaches).map_or(0, |(age, _)| *age)
     }
 
-    /// The largest age, exactly.
+    /// The largest age, exact.
     pub fn largest(&self) -> u64 {
         self.largest
     }
@@ -76,7 +76,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn quantiles_are_those_of_the_ages_but_for_a_thirtieth(
+        fn quantiles_are_accurate_to_a_thirtieth(
             mut ages in prop::collection::vec(prop_oneof![0..200_u64, any::<u64>()], 1..200), share in 0.0..=1.0_f64,
         ) {
             let staleness = of(&ages);

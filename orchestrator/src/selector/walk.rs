@@ -1,34 +1,34 @@
-//! One walk as the selector sees it.
+//! A walk, as the selector sees it.
 
 use serde::{Deserialize, Serialize};
 use store::records::WalkRecord;
-use wire::messages::{End, Progress, Report, Verdict};
+use wire::messages::{Progress, Report, Verdict, WalkEnd};
 use wire::{Origin, WalkId};
 
 use super::SelectorError;
 
-/// A walk: what the store holds of it, and whether a walker has it in hand.
+/// A walk: its stored record, and whether it is assigned.
 pub(super) struct Walk {
     pub record: WalkRecord,
-    pub memory: Memory,
-    /// A walker works on its turn.
-    pub out: bool,
+    pub state: SelectorState,
+    /// Whether a walker works on it.
+    pub is_assigned: bool,
 }
 
-/// What the selector itself remembers of a walk from one turn to the next.
+/// State of a walk that the selector keeps between assignments.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Memory {
-    /// The answer to the candidate that the last turn ended with.
+pub(super) struct SelectorState {
+    /// The decision on the candidate that ended the last assignment.
     pub verdict: Option<Verdict>,
-    /// Segment of the last turn that ended; the walk may be further since, if it was interrupted.
+    /// Segment at the end of the last completed assignment. An interrupted walk may be in a later one.
     pub segment: u32,
-    /// Last step of the turn.
+    /// Last step of the next assignment.
     pub until: u64,
-    /// Control walk: steps whose frames are still wanted.
+    /// Control walk: steps of the remaining frames.
     pub wanted: Vec<u64>,
     /// Biased walk: steps at which structures were accepted.
     pub accepted_steps: Vec<u64>,
-    /// Of them, those whose control frames a control walk was begun for.
+    /// Number of accepted steps for which a control walk exists.
     pub controlled: usize,
 }
 
@@ -47,37 +47,37 @@ impl Walk {
             selector_state: String::new(),
             checkpoint: None,
         };
-        Self { record, memory: Memory { until, ..Memory::default() }, out: false }
+        Self { record, state: SelectorState { until, ..SelectorState::default() }, is_assigned: false }
     }
 
-    /// Whether structures were accepted from it that no control walk was begun for.
+    /// Whether it has accepted structures without a control walk.
     pub fn needs_control(&self) -> bool {
-        self.is_biased() && self.has_ended() && self.memory.controlled < self.memory.accepted_steps.len()
+        self.is_biased() && self.has_ended() && self.state.controlled < self.state.accepted_steps.len()
     }
 
-    /// The unbiased control of a biased walk: frames at the steps at which that one collected.
-    pub fn control(&mut self, walk: WalkId, turn_steps: u64) -> Self {
+    /// The unbiased control of a biased walk, with frames at the steps where the biased walk collected.
+    pub fn new_control(&mut self, walk: WalkId, steps_per_assignment: u64) -> Self {
         let mut control = Self::new(walk, self.record.seed_structure, 0);
         control.record.origin = Origin::Control;
         control.record.partner = Some(self.record.walk);
-        let wanted = &mut control.memory.wanted;
-        wanted.extend(&self.memory.accepted_steps[self.memory.controlled..]);
-        self.memory.controlled = self.memory.accepted_steps.len();
+        let wanted = &mut control.state.wanted;
+        wanted.extend(&self.state.accepted_steps[self.state.controlled..]);
+        self.state.controlled = self.state.accepted_steps.len();
         wanted.sort_unstable();
         wanted.dedup();
-        control.set_until(turn_steps);
+        control.set_last_step(steps_per_assignment);
         control
     }
 
     pub fn restore(record: WalkRecord) -> Result<Self, SelectorError> {
-        let memory = serde_json::from_str(&record.selector_state).map_err(|error| {
+        let state = serde_json::from_str(&record.selector_state).map_err(|error| {
             SelectorError::Snapshot(format!("state of walk {} is damaged: {error}", record.walk))
         })?;
-        Ok(Self { record, memory, out: false })
+        Ok(Self { record, state, is_assigned: false })
     }
 
     pub fn to_record(&self) -> WalkRecord {
-        let selector_state = serde_json::to_string(&self.memory).expect("plain data becomes JSON");
+        let selector_state = serde_json::to_string(&self.state).expect("plain data becomes JSON");
         WalkRecord { selector_state, ..self.record.clone() }
     }
 
@@ -89,27 +89,29 @@ impl Walk {
         !matches!(self.record.state.as_str(), "waiting" | "running")
     }
 
-    /// The next turn ends after `turn_steps` at the latest, that of a control walk at its last wanted frame.
-    pub fn set_until(&mut self, turn_steps: u64) {
-        let until = self.record.progress.step + turn_steps;
-        self.memory.until = self.memory.wanted.last().map_or(until, |last| until.min(*last));
+    /// Sets the last step of the next assignment: after `steps_per_assignment` steps, or at a control walk's last frame
+    /// if that is earlier.
+    pub fn set_last_step(&mut self, steps_per_assignment: u64) {
+        let until = self.record.progress.step + steps_per_assignment;
+        self.state.until = self.state.wanted.last().map_or(until, |last| until.min(*last));
     }
 
-    /// Whether a control walk has passed its last wanted frame without giving it.
+    /// Whether a control walk is past its last frame without having provided it.
     pub fn missed_its_frames(&self) -> bool {
-        self.memory.wanted.last().is_some_and(|last| self.record.progress.step >= *last)
+        self.state.wanted.last().is_some_and(|last| self.record.progress.step >= *last)
     }
 
-    /// Keeps where a turn was interrupted: the same turn goes on from there. A verdict that the turn began with is
-    /// in the checkpoint by now.
-    pub fn pause<C>(&mut self, report: Report<C>) {
+    /// Records where an assignment was interrupted; it continues from there. The checkpoint already accounts for the
+    /// verdict with which it started.
+    pub fn interrupt<C>(&mut self, report: Report<C>) {
         self.record.checkpoint = Some(report.checkpoint);
         self.record.progress = report.progress;
-        self.memory.verdict = None;
+        self.state.verdict = None;
     }
 
-    /// Whether it ended for no other reason than a budget.
+    /// Whether it ended only because of a limit.
     pub fn ended_by_budget(&self) -> bool {
-        self.is_biased() && [End::Collected, End::Budget].iter().any(|end| self.record.state == end.name())
+        self.is_biased()
+            && [WalkEnd::Collected, WalkEnd::Budget].iter().any(|end| self.record.state == end.name())
     }
 }

@@ -1,4 +1,4 @@
-//! The jobs of a campaign, as Slurm's own commands show and take them.
+//! The jobs of a campaign, through Slurm's commands.
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
@@ -9,37 +9,37 @@ use ::slurm::{SlurmClient, SlurmError};
 use super::job::{Job, JobNames, Role, comment};
 use super::plan::Submission;
 
-/// Slurm, as far as this host can reach it.
+/// Slurm's commands on this host.
 #[derive(Clone, Debug)]
 pub struct Slurm {
     commands: SlurmClient,
 }
 
-/// Everything about a submission that is the same for all jobs of a kind.
+/// Options of a submission that are the same for all jobs of a kind.
 #[derive(Clone, Debug)]
-pub struct Request<'a> {
-    /// The job's script.
+pub struct JobOptions<'a> {
+    /// Job script.
     pub script: PathBuf,
-    /// What it says goes here.
+    /// File for its output.
     pub log: PathBuf,
-    /// Where it begins.
+    /// Working directory.
     pub directory: &'a Path,
-    /// Walkers, of an agent.
+    /// Number of walkers of an agent.
     pub walkers: u32,
-    /// The job in which the orchestrator is, which agents and labellers follow.
+    /// Job of the orchestrator; agents and labellers start after it.
     pub orchestrator: Option<u64>,
-    /// Further options of `sbatch`.
+    /// Additional options of `sbatch`.
     pub options: &'a [String],
 }
 
 impl Slurm {
-    /// Who does not wait for an answer for longer than this.
-    pub fn with_patience(patience: Duration) -> Self {
-        Self { commands: SlurmClient::with_timeout(patience) }
+    /// With a timeout for each command.
+    pub fn with_timeout(timeout: Duration) -> Self {
+        Self { commands: SlurmClient::with_timeout(timeout) }
     }
 
-    /// The jobs of a campaign that this user has: all that wait or run, and those that have ended within the last minutes
-    /// (`MinJobAge` in Slurm's configuration).
+    /// The jobs of a campaign that belong to this user: all pending and running ones, and those that ended within the
+    /// last minutes (`MinJobAge` in Slurm's configuration).
     pub async fn jobs(&self, names: &JobNames) -> Result<Vec<Job>, SlurmError> {
         let text = self.commands.queue(Job::FORMAT, &["--states=all"]).await?;
         let job = |line: &str| {
@@ -50,30 +50,30 @@ impl Slurm {
         text.lines().filter_map(job).collect()
     }
 
-    /// The exit code of a job that has ended as `code:signal`, while Slurm still knows it.
+    /// Exit code of an ended job as `code:signal`, while Slurm still knows it.
     pub async fn exit_code(&self, id: u64) -> Result<Option<String>, SlurmError> {
         self.commands.exit_code(id).await
     }
 
-    /// Submits a job and returns its number.
+    /// Submits a job and returns its id.
     pub async fn submit(
         &self,
         names: &JobNames,
         submission: &Submission,
-        request: &Request<'_>,
+        request: &JobOptions<'_>,
     ) -> Result<u64, SlurmError> {
         self.commands.submit(&request.arguments(names, submission)).await
     }
 
-    /// Has jobs ended: each process of theirs gets SIGTERM, and SIGKILL after Slurm's `KillWait`. Those that have ended
-    /// are no error.
+    /// Cancels jobs: each of their processes gets SIGTERM, and SIGKILL after Slurm's `KillWait`. Jobs that have already
+    /// ended are not an error.
     pub async fn cancel(&self, ids: &[u64]) -> Result<(), SlurmError> {
         self.commands.cancel(ids).await
     }
 }
 
-impl Request<'_> {
-    /// What `sbatch` is called with. Options on the command line go before those of the script.
+impl JobOptions<'_> {
+    /// Arguments of `sbatch`. Options on the command line take precedence over those in the script.
     pub fn arguments(&self, names: &JobNames, submission: &Submission) -> Vec<OsString> {
         let role = submission.role;
         let mut dependency = vec!["singleton".to_owned()];
@@ -82,13 +82,13 @@ impl Request<'_> {
             dependency.push(format!("after:{id}"));
         }
         let mut arguments: Vec<OsString> = self.options.iter().map(Into::into).collect();
-        arguments.push(format!("--job-name={}", names.of(role)).into());
+        arguments.push(format!("--job-name={}", names.job_name(role)).into());
         arguments.push(format!("--dependency={}", dependency.join(",")).into());
         if let Role::Agent(_) = role {
             arguments.push(format!("--comment={}", comment(self.walkers)).into());
         }
         arguments.push(with("--chdir=", self.directory.as_os_str()));
-        // sbatch puts numbers of the job in the place of letters after '%'.
+        // sbatch replaces letters after '%' by numbers of the job.
         arguments.push(format!("--output={}", self.log.display().to_string().replace('%', "%%")).into());
         arguments.push(self.script.clone().into());
         arguments

@@ -1,52 +1,52 @@
-//! Jobs: their names, and what `squeue` says about them.
+//! Jobs: their names, and the output of `squeue`.
 
 use std::fmt;
 
 use ::slurm::JobPhase;
 
-/// What a job of a campaign does.
+/// Role of a job in a campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
-    /// Leads the campaign.
+    /// Runs the orchestrator.
     Orchestrator,
-    /// Walkers on one node; which agent, from 0.
+    /// Runs an agent with walkers on one node; number of the agent, from 0.
     Agent(u32),
-    /// Makes labels; which labeller job, from 0.
+    /// Runs labellers; number of the job, from 0.
     Labeller(u32),
 }
 
-/// The names of the jobs of one campaign.
+/// Names of the jobs of one campaign.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct JobNames {
     prefix: String,
 }
 
-/// A job, as `squeue` shows it.
+/// A job, as shown by `squeue`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Job {
-    /// Its number.
+    /// Job id.
     pub id: u64,
-    /// What it does.
+    /// Role.
     pub role: Role,
-    /// Its state in Slurm's words, as `RUNNING`.
+    /// State as named by Slurm, for example `RUNNING`.
     pub state: String,
-    /// Where it runs or ran; empty for one that waits.
+    /// Nodes; empty while it is pending.
     pub nodes: String,
-    /// When it began, or will as far as is known: local time as 2026-11-21T20:15:00, or `N/A`.
+    /// Start time, expected or actual: local time as 2026-11-21T20:15:00, or `N/A`.
     pub start: String,
-    /// How long it may go on: days-hours:minutes:seconds, or what else Slurm says.
+    /// Remaining time: days-hours:minutes:seconds, or another text of Slurm.
     pub time_left: String,
-    /// Walkers of an agent, if Slurm has kept what was written down at its submission.
+    /// Number of walkers of an agent, if Slurm kept the job's comment.
     pub walkers: Option<u32>,
-    /// Why it waits or how it ended, in Slurm's words; `None` where there is no reason.
+    /// Why it is pending or has ended, as named by Slurm; `None` without a reason.
     pub reason: Option<String>,
 }
 
-/// Before the number of walkers in the comment of an agent's job.
+/// Precedes the number of walkers in the comment of an agent's job.
 const WALKERS: &str = "walkers=";
 
 impl Role {
-    /// `orchestrator`, `agent-3`, `labeller-0`.
+    /// The serialized name, for example `orchestrator`, `agent-3`, `labeller-0`.
     pub fn name(self) -> String {
         match self {
             Self::Orchestrator => "orchestrator".to_owned(),
@@ -55,7 +55,7 @@ impl Role {
         }
     }
 
-    fn of(name: &str) -> Option<Self> {
+    fn from_name(name: &str) -> Option<Self> {
         let number = |text: &str| text.parse().ok();
         match name.split_once('-') {
             None => (name == "orchestrator").then_some(Self::Orchestrator),
@@ -77,30 +77,30 @@ impl fmt::Display for Role {
 }
 
 impl JobNames {
-    /// Of the campaign with this identifier, of letters and digits.
+    /// Names for the campaign with this identifier, which consists of letters and digits.
     pub fn new(campaign: &str) -> Self {
         Self { prefix: format!("calmwalk-{campaign}-") }
     }
 
-    /// The name of the job that does this.
-    pub fn of(&self, role: Role) -> String {
+    /// Name of the job with this role.
+    pub fn job_name(&self, role: Role) -> String {
         format!("{}{}", self.prefix, role.name())
     }
 
-    /// What the job of this name does, if it is one of the campaign.
+    /// Role of the job with this name, if it belongs to the campaign.
     pub fn role(&self, name: &str) -> Option<Role> {
-        Role::of(name.strip_prefix(&self.prefix)?)
+        Role::from_name(name.strip_prefix(&self.prefix)?)
     }
 }
 
 impl Job {
-    /// What `squeue` is to write about each job, one on a line.
+    /// Format of `squeue`'s output, one line per job.
     pub(super) const FORMAT: &str = "%i|%T|%j|%N|%S|%L|%k|%r";
 
-    /// A line of `squeue`; `Ok(None)` if it is about a job of something else.
+    /// Parses a line of `squeue`; `Ok(None)` if the job does not belong to the campaign.
     ///
     /// # Errors
-    /// A job of the campaign about which something else is said than what was asked for.
+    /// A job of the campaign with unexpected fields.
     pub(super) fn parse(line: &str, names: &JobNames) -> Result<Option<Self>, ()> {
         let fields: Vec<_> = line.splitn(8, '|').collect();
         let Some(role) = fields.get(2).and_then(|name| names.role(name)) else { return Ok(None) };
@@ -117,13 +117,13 @@ impl Job {
         }))
     }
 
-    /// Where it stands.
+    /// JobPhase from_state the job.
     pub fn phase(&self) -> JobPhase {
         JobPhase::from_state(&self.state)
     }
 }
 
-/// What is written into the comment of an agent's job.
+/// The comment of an agent's job.
 pub(super) fn comment(walkers: u32) -> String {
     format!("{WALKERS}{walkers}")
 }
@@ -136,14 +136,14 @@ mod tests {
     fn names_belong_to_one_campaign() {
         let names = JobNames::new("1a2b");
         for role in [Role::Orchestrator, Role::Agent(0), Role::Agent(4000), Role::Labeller(7)] {
-            assert_eq!(names.role(&names.of(role)), Some(role));
-            assert_eq!(JobNames::new("1a2").role(&names.of(role)), None);
-            assert_eq!(JobNames::new("1a2b3").role(&names.of(role)), None);
+            assert_eq!(names.role(&names.job_name(role)), Some(role));
+            assert_eq!(JobNames::new("1a2").role(&names.job_name(role)), None);
+            assert_eq!(JobNames::new("1a2b3").role(&names.job_name(role)), None);
         }
         for name in ["", "calmwalk-1a2b-", "calmwalk-1a2b-agent", "calmwalk-1a2b-agent-x", "agent-1"] {
             assert_eq!(names.role(name), None, "{name}");
         }
-        assert_eq!(names.of(Role::Agent(3)), "calmwalk-1a2b-agent-3");
+        assert_eq!(names.job_name(Role::Agent(3)), "calmwalk-1a2b-agent-3");
     }
 
     #[test]
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn other_jobs_are_passed_over_and_half_lines_are_not() {
+    fn other_jobs_are_skipped_and_incomplete_lines_are_errors() {
         let names = JobNames::new("1a");
         for line in ["", "12|RUNNING|relax|node7|N/A|1:00|(null)|None", "12_[1-3]|PENDING|a|b"] {
             assert_eq!(Job::parse(line, &names), Ok(None), "{line}");

@@ -1,12 +1,11 @@
 //! The jobs of a campaign in the batch system Slurm.
 //!
-//! A campaign has one job for its orchestrator, one for each agent, one for each labeller. Each has a [name](JobNames) that
-//! is used for nothing else, and depends on being the only one of that name (`singleton`): of two that were submitted at
-//! the same moment one waits for the end of the other. So Slurm itself sees to it that there are never two orchestrators
-//! nor more agents than asked for, whoever launches how often.
+//! A campaign has one job for its orchestrator, one for each agent and one for each labeller. Each job has a
+//! unique [name](JobNames) and depends on being the only job with that name (`singleton`): if two are submitted at the
+//! same time, one waits for the end of the other. Slurm itself thus ensures that there is at most one orchestrator, and
+//! no more agents than requested, however often jobs are launched.
 //!
-//! What to do about the jobs that there are is decided by a pure function, [`plan`]; [`Slurm`] asks and tells Slurm's own
-//! commands.
+//! A pure function, [`plan()`], decides which jobs to submit and to cancel; [`Slurm`] calls Slurm's commands.
 
 mod commands;
 mod job;
@@ -14,6 +13,6 @@ mod plan;
 mod stop;
 
 pub use ::slurm::{JobPhase, SlurmError};
-pub use commands::{Request, Slurm};
+pub use commands::{JobOptions, Slurm};
 pub use job::{Job, JobNames, Role};
-pub use plan::{Plan, Submission, Wanted, plan};
+pub use plan::{DesiredJobs, Plan, Submission, plan};

@@ -1,4 +1,4 @@
-//! What is to be submitted and cancelled: a function of what is asked for and what there is.
+//! Decides which jobs to submit and to cancel, as a function of the desired and the existing jobs.
 
 use std::cmp::Reverse;
 
@@ -6,66 +6,66 @@ use ::slurm::JobPhase;
 
 use super::job::{Job, Role};
 
-/// What is asked for, beside an orchestrator.
+/// The desired jobs, in addition to the orchestrator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Wanted {
-    /// Jobs with an agent.
+pub struct DesiredJobs {
+    /// Number of jobs with an agent.
     pub agents: u32,
-    /// Walkers of each.
+    /// Number of walkers per agent.
     pub walkers: u32,
-    /// Jobs with labellers.
+    /// Number of jobs with labellers.
     pub labellers: u32,
 }
 
 /// A job to submit.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Submission {
-    /// What it does.
+    /// Role.
     pub role: Role,
-    /// Jobs that must have ended before it begins.
+    /// Jobs that must have ended before it starts.
     pub after_end_of: Vec<u64>,
 }
 
-/// What is to be done.
+/// The jobs to cancel and to submit.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Plan {
-    /// Jobs that are not wanted: of agents that are too many, those that wait behind another of the same name, agents
-    /// with another number of walkers.
+    /// Jobs that are not desired: surplus agents, jobs that wait for another job of the same name, and agents with
+    /// another number of walkers.
     pub cancel: Vec<u64>,
-    /// Jobs that are missing; the orchestrator first.
+    /// Missing jobs, starting with the orchestrator.
     pub submit: Vec<Submission>,
 }
 
-impl Wanted {
-    /// Every job that there is to be.
+impl DesiredJobs {
+    /// Roles of all desired jobs.
     pub fn roles(&self) -> impl Iterator<Item = Role> + use<> {
         let agents = (0..self.agents).map(Role::Agent);
         let labellers = (0..self.labellers).map(Role::Labeller);
         [Role::Orchestrator].into_iter().chain(agents).chain(labellers)
     }
 
-    /// Whether a job is what it would be submitted as.
+    /// Whether a job has the desired number of walkers.
     fn fits(&self, job: &Job) -> bool {
         match (job.role, job.walkers) {
-            // Where comments are not kept nobody knows.
+            // Unknown where Slurm does not keep comments.
             (Role::Agent(_), Some(walkers)) => walkers == self.walkers,
             _ => true,
         }
     }
 }
 
-/// What is to be done so that the jobs that live are those that are wanted, each once.
+/// Decides which jobs to submit and to cancel, so that each desired job exists once.
 ///
-/// The same is decided for the same jobs, so that two who launch at the same moment agree about which of two jobs is to stay.
-pub fn plan(wanted: &Wanted, jobs: &[Job]) -> Plan {
+/// The result depends only on the arguments, so that two concurrent launches agree on which of two jobs stays.
+pub fn plan(wanted: &DesiredJobs, jobs: &[Job]) -> Plan {
     let mut plan = Plan::default();
     let mut living: Vec<_> = jobs.iter().filter(|job| job.phase() != JobPhase::Over).collect();
-    // Those that run before those that wait, and of these the first.
+    // Running jobs before pending ones, and then the oldest first.
     living.sort_by_key(|job| (Reverse(job.phase() == JobPhase::Running), job.id));
     for role in wanted.roles() {
         let (of_role, others): (Vec<_>, Vec<_>) = living.into_iter().partition(|job| job.role == role);
         living = others;
-        // One that ends may come back, or may not: in its place another waits for its end.
+        // A job that is completing may or may not be requeued: its replacement waits for its end.
         let staying: Vec<_> = of_role.iter().filter(|job| job.phase() != JobPhase::Completing).collect();
         let kept = staying.iter().find(|job| wanted.fits(job)).map(|job| job.id);
         plan.cancel.extend(staying.iter().map(|job| job.id).filter(|id| Some(*id) != kept));

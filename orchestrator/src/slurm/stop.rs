@@ -1,4 +1,4 @@
-//! Ending the jobs of a campaign in order: agents deliver what they have to the orchestrator, which goes last.
+//! Stopping the jobs of a campaign in order: agents deliver their reports to the orchestrator, which stops last.
 
 use std::time::{Duration, Instant};
 
@@ -8,15 +8,15 @@ use tokio::time::sleep;
 use super::commands::Slurm;
 use super::job::{Job, JobNames, Role};
 
-/// Between two looks at jobs that are ending.
-const LOOK: Duration = Duration::from_secs(1);
-/// What does not end by itself is killed by Slurm (`KillWait`, 30 s by default); one whose node is lost stays for longer,
-/// and is not waited for.
-const PATIENCE: Duration = Duration::from_secs(90);
+/// Interval between checks of stopping jobs.
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
+/// Timeout for jobs to end. Slurm kills jobs that do not exit (`KillWait`, 30 s by default); jobs on a lost node remain
+/// longer and are not waited for.
+const STOP_TIMEOUT: Duration = Duration::from_secs(90);
 
 impl Slurm {
-    /// Ends agents and labellers, and when they are gone the orchestrator, but for the job that this is called from.
-    /// Returns how many jobs there were.
+    /// Cancels agents and labellers, waits until they have ended, and then cancels the orchestrator, except for the job
+    /// of the caller. Returns the number of cancelled jobs.
     pub async fn stop(&self, names: &JobNames, own: Option<u64>) -> Result<usize, SlurmError> {
         let begun = Instant::now();
         let mut ended = std::collections::BTreeSet::new();
@@ -26,20 +26,20 @@ impl Slurm {
                 .iter()
                 .filter(|job| job.phase() != JobPhase::Over && Some(job.id) != own)
                 .partition(|job| job.role == Role::Orchestrator);
-            let last = working.is_empty() || begun.elapsed() > PATIENCE;
+            let last = working.is_empty() || begun.elapsed() > STOP_TIMEOUT;
             let now = if last { leading } else { working };
-            // One that was about to be requeued waits again now.
-            let asked: Vec<_> = now.iter().filter(|job| is_left(job)).map(|job| job.id).collect();
+            // A job that was about to be requeued is pending again.
+            let asked: Vec<_> = now.iter().filter(|job| is_active(job)).map(|job| job.id).collect();
             self.cancel(&asked).await?;
             ended.extend(asked);
-            if now.is_empty() || begun.elapsed() > 2 * PATIENCE {
+            if now.is_empty() || begun.elapsed() > 2 * STOP_TIMEOUT {
                 return Ok(ended.len());
             }
-            sleep(LOOK).await;
+            sleep(POLL_INTERVAL).await;
         }
     }
 
-    /// Takes away the jobs that have not begun.
+    /// Cancels the pending jobs.
     pub async fn withdraw(&self, names: &JobNames) -> Result<usize, SlurmError> {
         let jobs = self.jobs(names).await?;
         let waiting = jobs.iter().filter(|job| job.phase() == JobPhase::Pending);
@@ -49,7 +49,7 @@ impl Slurm {
     }
 }
 
-/// Whether it has not been asked to end, or was and is requeued.
-fn is_left(job: &Job) -> bool {
+/// Whether it has not been asked to end, or was requeued.
+fn is_active(job: &Job) -> bool {
     job.phase() != JobPhase::Completing
 }

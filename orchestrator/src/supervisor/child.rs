@@ -1,44 +1,45 @@
-//! One child: where it stands and what it waits for.
+//! State of one child process.
 
 use std::time::Duration;
 
-use super::{ChildStatus, Ending, Limits, Order, Standing};
+use super::{Action, ChildState, ChildStatus, ExitReason, Limits};
 
-/// Where a child stands, with the times that decide what comes next.
+/// State of a child, with the times that determine its next action.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum State {
-    /// No process; the next start is due then.
+    /// No process; start one at this time.
     Waiting { until: Duration },
-    /// A process that was last heard of then, if it ever was: else it was started then.
+    /// A process with its last heartbeat, or its start time if `yet` is false.
     Running { heard: Duration, yet: bool },
-    /// A process that was told to end.
-    Leaving { since: Duration },
-    /// A process that was killed, and why.
-    Killed { overdue: Overdue },
-    /// No process: ended in order.
-    Home,
-    /// No process: failed too often.
-    GivenUp,
+    /// The process was asked to exit.
+    Stopping { since: Duration },
+    /// The process was killed, with the reason.
+    Killed { reason: KillReason },
+    /// No process: it exited normally.
+    Exited,
+    /// No process: it failed too often.
+    Failed,
 }
 
-/// What a process was killed for.
+/// Why a process was killed.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Overdue {
-    Silent(Duration),
-    Lingering(Duration),
+pub(super) enum KillReason {
+    Unresponsive(Duration),
+    StopTimeout(Duration),
 }
 
 #[derive(Clone, Debug)]
 pub(super) struct Child {
     pub state: State,
-    /// Starts so far.
+    /// Number of starts.
     pub incarnation: u32,
-    /// Failures in a row, without anything useful in between.
+    /// Consecutive failures without a delivery.
     pub failures: u32,
-    /// Starts in a row that failed because the host lacked something. They do not count as failures of the child.
+    /// Consecutive starts that failed because of a shortage of resources on the host. They are not failures of the
+    /// child.
     shortages: u32,
     restarts: u32,
-    last_failure: Option<Ending>,
+    last_failure: Option<ExitReason>,
 }
 
 impl Default for Child {
@@ -49,91 +50,97 @@ impl Default for Child {
 }
 
 impl Child {
-    /// Whether it never had a process, and may have one.
+    /// Whether it never had a process and can still have one.
     pub fn is_fresh(&self) -> bool {
         self.incarnation == 0 && self.last_failure.is_none() && matches!(self.state, State::Waiting { .. })
     }
 
-    /// What its process ended of: of what it was killed for, if it was. `None` if it had no process.
-    pub fn judge(&self, ending: Ending) -> Option<Ending> {
+    /// Why its process exited; if it was killed, the reason for that. `None` if it had no process.
+    pub fn exit_reason(&self, reason: ExitReason) -> Option<ExitReason> {
         match self.state {
-            State::Running { .. } | State::Leaving { .. } => Some(ending),
-            // It may have ended by itself just before the signal.
-            State::Killed { .. } if !matches!(ending, Ending::Signal { signal: 9, .. } | Ending::Unseen) => {
-                Some(ending)
+            State::Running { .. } | State::Stopping { .. } => Some(reason),
+            // It may have exited by itself just before the signal.
+            State::Killed { .. }
+                if !matches!(reason, ExitReason::Signal { signal: 9, .. } | ExitReason::Unknown) =>
+            {
+                Some(reason)
             }
-            State::Killed { overdue: Overdue::Silent(silence) } => Some(Ending::Silent(silence)),
-            State::Killed { overdue: Overdue::Lingering(grace) } => Some(Ending::Lingering(grace)),
-            State::Waiting { .. } | State::Home | State::GivenUp => None,
+            State::Killed { reason: KillReason::Unresponsive(silence) } => {
+                Some(ExitReason::Unresponsive(silence))
+            }
+            State::Killed { reason: KillReason::StopTimeout(grace) } => Some(ExitReason::StopTimeout(grace)),
+            State::Waiting { .. } | State::Exited | State::Failed => None,
         }
     }
 
-    /// Decides what becomes of it without its process.
-    pub fn leave(&mut self, ending: &Ending, limits: &Limits, stopping: bool, now: Duration) {
-        let may_leave = stopping || !limits.outlives;
-        let failed = !(may_leave && ending.is_in_order() || stopping && ending.is_what_stop_asks_for());
-        self.shortages = if ending.is_shortage() { self.shortages.saturating_add(1) } else { 0 };
+    /// Determines the next state after its process has exited.
+    pub fn exited(&mut self, reason: &ExitReason, limits: &Limits, stopping: bool, now: Duration) {
+        let may_leave = stopping || !limits.detached;
+        let failed = !(may_leave && reason.is_success() || stopping && reason.is_expected_after_stop());
+        self.shortages = if reason.is_shortage() { self.shortages.saturating_add(1) } else { 0 };
         if failed {
-            self.failures = self.failures.saturating_add(u32::from(!ending.is_shortage()));
-            self.last_failure = Some(ending.clone());
+            self.failures = self.failures.saturating_add(u32::from(!reason.is_shortage()));
+            self.last_failure = Some(reason.clone());
         }
         self.state = if stopping || !failed {
-            State::Home
+            State::Exited
         } else if self.shortages > 0 {
-            State::Waiting { until: now.saturating_add(pause(limits, self.shortages)) }
-        } else if self.failures > limits.restarts {
-            State::GivenUp
+            State::Waiting { until: now.saturating_add(backoff(limits, self.shortages)) }
+        } else if self.failures > limits.max_restarts {
+            State::Failed
         } else {
-            State::Waiting { until: now.saturating_add(pause(limits, self.failures)) }
+            State::Waiting { until: now.saturating_add(backoff(limits, self.failures)) }
         };
     }
 
-    /// What is due of it by now; it counts as done.
-    pub fn due(&mut self, number: u32, limits: &Limits, now: Duration) -> Option<Order> {
-        if self.next(limits).is_none_or(|due| due > now) {
+    /// The action that is due, which then counts as done.
+    pub fn due_action(&mut self, number: u32, limits: &Limits, now: Duration) -> Option<Action> {
+        if self.next_deadline(limits).is_none_or(|due| due > now) {
             return None;
         }
-        let (state, order) = match self.state {
+        let (state, action) = match self.state {
             State::Waiting { .. } => {
                 self.incarnation += 1;
                 self.restarts += u32::from(self.last_failure.is_some());
-                let start = Order::Start { number, incarnation: self.incarnation };
+                let start = Action::Start { number, incarnation: self.incarnation };
                 (State::Running { heard: now, yet: false }, start)
             }
-            State::Running { .. } => {
-                (State::Killed { overdue: Overdue::Silent(limits.silence) }, Order::Kill { number })
-            }
-            State::Leaving { .. } if limits.outlives => {
-                self.state = State::Home;
+            State::Running { .. } => (
+                State::Killed { reason: KillReason::Unresponsive(limits.heartbeat_timeout) },
+                Action::Kill { number },
+            ),
+            State::Stopping { .. } if limits.detached => {
+                self.state = State::Exited;
                 return None;
             }
-            State::Leaving { .. } => {
-                (State::Killed { overdue: Overdue::Lingering(limits.grace) }, Order::Kill { number })
-            }
-            State::Killed { .. } | State::Home | State::GivenUp => return None,
+            State::Stopping { .. } => (
+                State::Killed { reason: KillReason::StopTimeout(limits.grace_period) },
+                Action::Kill { number },
+            ),
+            State::Killed { .. } | State::Exited | State::Failed => return None,
         };
         self.state = state;
-        Some(order)
+        Some(action)
     }
 
-    /// When something will be due of it.
-    pub fn next(&self, limits: &Limits) -> Option<Duration> {
+    /// Time of the next action.
+    pub fn next_deadline(&self, limits: &Limits) -> Option<Duration> {
         match self.state {
             State::Waiting { until } => Some(until),
-            State::Running { heard, .. } => Some(heard.saturating_add(limits.silence)),
-            State::Leaving { since } => Some(since.saturating_add(limits.grace)),
-            State::Killed { .. } | State::Home | State::GivenUp => None,
+            State::Running { heard, .. } => Some(heard.saturating_add(limits.heartbeat_timeout)),
+            State::Stopping { since } => Some(since.saturating_add(limits.grace_period)),
+            State::Killed { .. } | State::Exited | State::Failed => None,
         }
     }
 
-    pub fn standing(&self, now: Duration) -> Standing {
+    pub fn public_state(&self, now: Duration) -> ChildState {
         match self.state {
-            State::Waiting { until } => Standing::Pausing { left: until.saturating_sub(now) },
-            State::Running { yet: false, .. } => Standing::Starting,
-            State::Running { yet: true, .. } => Standing::Running,
-            State::Leaving { .. } | State::Killed { .. } => Standing::Ending,
-            State::Home => Standing::GoneHome,
-            State::GivenUp => Standing::GivenUp,
+            State::Waiting { until } => ChildState::BackingOff { left: until.saturating_sub(now) },
+            State::Running { yet: false, .. } => ChildState::Starting,
+            State::Running { yet: true, .. } => ChildState::Running,
+            State::Stopping { .. } | State::Killed { .. } => ChildState::Stopping,
+            State::Exited => ChildState::Exited,
+            State::Failed => ChildState::Failed,
         }
     }
 
@@ -141,15 +148,15 @@ impl Child {
         ChildStatus {
             number,
             incarnation: self.incarnation,
-            standing: self.standing(now),
+            state: self.public_state(now),
             restarts: self.restarts,
             last_failure: self.last_failure.clone(),
         }
     }
 }
 
-/// The pause after so many failures in a row: it doubles from the first to the longest.
-fn pause(limits: &Limits, failures: u32) -> Duration {
+/// Backoff after this number of consecutive failures; doubles up to the maximum.
+fn backoff(limits: &Limits, failures: u32) -> Duration {
     let doublings = 1u32.checked_shl(failures.saturating_sub(1)).unwrap_or(u32::MAX);
-    limits.first_pause.saturating_mul(doublings).min(limits.longest_pause)
+    limits.initial_backoff.saturating_mul(doublings).min(limits.max_backoff)
 }

@@ -1,137 +1,137 @@
-//! The supervisor: which of a numbered set of processes is to be started, told to end, or killed, and when.
+//! The supervisor: decides which of a numbered set of processes to start, stop or kill, and when.
 //!
-//! A pure, synchronous core: what happened to the processes goes in, orders come out. It reads no clock and knows
-//! no process; every time is one since a fixed instant of whoever asks, [`crate::launcher::Children`] say.
+//! A pure, synchronous core: events of the processes go in, actions come out. It reads no clock and handles no process;
+//! all times are relative to a fixed instant chosen by the caller, for example [`crate::launcher::Children`].
 //!
-//! A child that ended without having been sent home is started again after a pause, which doubles with each failure in a
-//! row. Being useful (a delivered report, a label) ends the row: a sign of life alone does not, or a child that dies
-//! of its first piece of work would be started for ever.
+//! A child that exits before its work is finished is restarted after a backoff, which doubles with each consecutive
+//! failure. A delivery (a report, a label) resets the count of failures. A heartbeat does not, or a child that crashes
+//! in its first piece of work would be restarted forever.
 //!
-//! A start that fails because the host lacks descriptors, processes or memory says nothing about the child: it is tried again,
-//! after pauses that double likewise, and never ends in giving up.
+//! If a start fails because the host lacks file descriptors, processes or memory, this says nothing about the child:
+//! the start is repeated with the same doubling backoff, without limit.
 
 mod child;
-mod ending;
+mod exit_reason;
 
 use std::time::Duration;
 
 use child::{Child, State};
-pub use ending::Ending;
+pub use exit_reason::ExitReason;
 
-/// How patient a supervisor is.
+/// Timeouts and limits of a supervisor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// A child that gave no sign of life for so long, from its start on, hangs and is killed.
-    pub silence: Duration,
-    /// Pause before the start after a first failure; it doubles with each further one in a row.
-    pub first_pause: Duration,
-    /// No pause is longer.
-    pub longest_pause: Duration,
-    /// A child is started again so many times in a row without having been useful; the failure after that is its last.
-    pub restarts: u32,
-    /// What is left so long after it was told to end is killed; if it outlives its parent, it is left to itself.
-    pub grace: Duration,
-    /// The children work for the campaign, not for the parent: they may go on without it, and one that leaves while
-    /// there is work has failed, whatever its exit code.
-    pub outlives: bool,
+    /// A child without heartbeat for this time is considered hung and killed.
+    pub heartbeat_timeout: Duration,
+    /// Delay before the restart after the first failure; doubles with each consecutive failure.
+    pub initial_backoff: Duration,
+    /// Maximum delay before a restart.
+    pub max_backoff: Duration,
+    /// Maximum number of consecutive restarts without a delivery; the child fails after that.
+    pub max_restarts: u32,
+    /// Time between asking a process to exit and killing it. Detached processes are left running instead.
+    pub grace_period: Duration,
+    /// Whether the children work for the campaign and not for the parent: they may continue without it, and exiting
+    /// while there is work is a failure, whatever the exit code.
+    pub detached: bool,
 }
 
 impl Default for Limits {
     fn default() -> Self {
         let seconds = Duration::from_secs;
         Self {
-            silence: seconds(120),
-            first_pause: seconds(1),
-            longest_pause: seconds(60),
-            restarts: 5,
-            grace: seconds(30),
-            outlives: false,
+            heartbeat_timeout: seconds(120),
+            initial_backoff: seconds(1),
+            max_backoff: seconds(60),
+            max_restarts: 5,
+            grace_period: seconds(30),
+            detached: false,
         }
     }
 }
 
-/// What is to be done with a process.
+/// What to do with a process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Order {
-    /// Start it. It counts as started from here on; if that fails, it has ended as [`Ending::NotStarted`].
+pub enum Action {
+    /// Start it. It counts as started from now on; if the start fails, it has exited with [`ExitReason::StartFailed`].
     Start {
-        /// Which child.
+        /// Number of the child.
         number: u32,
-        /// The how-manieth start of this child, from 1: never the same twice.
+        /// Start count of this child, from 1.
         incarnation: u32,
     },
-    /// Ask it to end in order (SIGTERM).
+    /// Ask it to exit (SIGTERM).
     Terminate {
-        /// Which child.
+        /// Number of the child.
         number: u32,
     },
-    /// End it (SIGKILL).
+    /// Kill it (SIGKILL).
     Kill {
-        /// Which child.
+        /// Number of the child.
         number: u32,
     },
 }
 
-/// Where a child stands.
+/// State of a child.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Standing {
-    /// Started, and not heard of yet.
+pub enum ChildState {
+    /// Started, without a heartbeat so far.
     Starting,
-    /// At work.
+    /// Running.
     Running,
-    /// To be started again in a while.
-    Pausing {
-        /// For so long yet.
+    /// Waiting for a restart.
+    BackingOff {
+        /// Remaining time.
         left: Duration,
     },
-    /// Told to end, or killed, and not gone yet.
-    Ending,
-    /// Ended in order; it will not be started again.
-    GoneHome,
-    /// Failed too often in a row; it will not be started again.
-    GivenUp,
+    /// Asked to exit, or killed, and still running.
+    Stopping,
+    /// Exited normally; it is not restarted.
+    Exited,
+    /// Failed too often; it is not restarted.
+    Failed,
 }
 
-impl std::fmt::Display for Standing {
+impl std::fmt::Display for ChildState {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Starting => f.write_str("starting"),
             Self::Running => f.write_str("running"),
-            Self::Pausing { left } => write!(f, "pausing for {} s", left.as_secs_f64().ceil()),
-            Self::Ending => f.write_str("ending"),
-            Self::GoneHome => f.write_str("gone home"),
-            Self::GivenUp => f.write_str("given up"),
+            Self::BackingOff { left } => write!(f, "pausing for {} s", left.as_secs_f64().ceil()),
+            Self::Stopping => f.write_str("ending"),
+            Self::Exited => f.write_str("gone home"),
+            Self::Failed => f.write_str("given up"),
         }
     }
 }
 
-/// What there is to say of a child.
+/// Status of a child.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChildStatus {
-    /// Which child.
+    /// Number of the child.
     pub number: u32,
-    /// Starts so far; 0 if the process was adopted and is still that one.
+    /// Start count; 0 for an adopted process.
     pub incarnation: u32,
-    /// Where it stands.
-    pub standing: Standing,
-    /// Starts that followed a failure.
+    /// State.
+    pub state: ChildState,
+    /// Number of restarts after a failure.
     pub restarts: u32,
-    /// How it failed last, if it ever did.
-    pub last_failure: Option<Ending>,
+    /// The last failure.
+    pub last_failure: Option<ExitReason>,
 }
 
-/// The end of a process, as the supervisor judges it.
+/// The exit of a process, as the supervisor interprets it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Ended {
-    /// Which start it was; 0 for an adopted process.
+pub struct ChildExit {
+    /// Start count of the process; 0 for an adopted process.
     pub incarnation: u32,
-    /// How it ended: in place of the signal, why it was sent.
-    pub ending: Ending,
-    /// What becomes of the child: pausing, gone home or given up.
-    pub then: Standing,
+    /// Why it exited; if it was killed, why.
+    pub reason: ExitReason,
+    /// State of the child after the exit: backing off, exited or failed.
+    pub then: ChildState,
 }
 
-/// Watches the children of one kind, numbered from 0.
+/// Supervises the children of one kind, numbered from 0.
 #[derive(Clone, Debug)]
 pub struct Supervisor {
     limits: Limits,
@@ -140,13 +140,13 @@ pub struct Supervisor {
 }
 
 impl Supervisor {
-    /// So many children, all of which are due to be started.
+    /// This number of children, all due to be started.
     pub fn new(children: u32, limits: Limits) -> Self {
         Self { limits, children: (0..children).map(|_| Child::default()).collect(), stopping: false }
     }
 
-    /// Takes a living process for a child that was not started yet. Refused (`false`) when there is no such child,
-    /// when it was started before, and after a stop.
+    /// Adopts a running process as a child that was never started. Returns `false` if there is no such child, if it was
+    /// started before, or after a stop.
     pub fn adopt(&mut self, number: u32, now: Duration) -> bool {
         match self.child(number) {
             Some(child) if child.is_fresh() => {
@@ -157,78 +157,79 @@ impl Supervisor {
         }
     }
 
-    /// A sign of life.
-    pub fn heard(&mut self, number: u32, now: Duration) {
-        // Signs of a process that is dead or being killed come late and mean nothing.
+    /// Records a heartbeat.
+    pub fn heartbeat(&mut self, number: u32, now: Duration) {
+        // Late heartbeats of a process that is dead or being killed mean nothing.
         if let Some(State::Running { heard, yet }) = self.child(number).map(|child| &mut child.state) {
             *heard = now.max(*heard);
             *yet = true;
         }
     }
 
-    /// The child delivered something: whatever failed before, its next failure is a first one.
-    pub fn useful(&mut self, number: u32, now: Duration) {
-        self.heard(number, now);
-        // It may have died since: what it delivered counts all the same.
+    /// Records a delivery, which resets the count of failures.
+    pub fn delivered(&mut self, number: u32, now: Duration) {
+        self.heartbeat(number, now);
+        // The process may have died since; its delivery still counts.
         if let Some(child) = self.child(number) {
             child.failures = 0;
         }
     }
 
-    /// The process of a child is gone (and reaped, if it was a child). `None` if it had none.
-    pub fn ended(&mut self, number: u32, ending: Ending, now: Duration) -> Option<Ended> {
+    /// Records that a child's process has exited (and was waited for, if it was a child process). `None` if it had
+    /// none.
+    pub fn ended(&mut self, number: u32, reason: ExitReason, now: Duration) -> Option<ChildExit> {
         let (limits, stopping) = (self.limits, self.stopping);
         let child = self.child(number)?;
-        let ending = child.judge(ending)?;
-        child.leave(&ending, &limits, stopping, now);
-        Some(Ended { incarnation: child.incarnation, ending, then: child.standing(now) })
+        let reason = child.exit_reason(reason)?;
+        child.exited(&reason, &limits, stopping, now);
+        Some(ChildExit { incarnation: child.incarnation, reason, then: child.public_state(now) })
     }
 
-    /// There is no more work: nothing is started any more.
+    /// There is no more work: starts no more processes.
     pub fn close(&mut self) {
         self.stopping = true;
         for child in &mut self.children {
             if let State::Waiting { .. } = child.state {
-                child.state = State::Home;
+                child.state = State::Exited;
             }
         }
     }
 
-    /// The whole set is to end: nothing is started any more, what runs is told to end, and killed by [`Self::due`]
-    /// when its time of grace is over.
-    pub fn stop(&mut self, now: Duration) -> Vec<Order> {
+    /// Stops all children: starts no more processes and asks the running ones to exit. [`Self::due_actions`] kills them
+    /// after the grace period.
+    pub fn stop(&mut self, now: Duration) -> Vec<Action> {
         self.close();
-        let mut orders = Vec::new();
+        let mut actions = Vec::new();
         for (number, child) in (0..).zip(&mut self.children) {
             if let State::Running { .. } = child.state {
-                child.state = State::Leaving { since: now };
-                orders.push(Order::Terminate { number });
+                child.state = State::Stopping { since: now };
+                actions.push(Action::Terminate { number });
             }
         }
-        orders
+        actions
     }
 
-    /// What is due by now. To be asked at [`Self::next`], and after anything else that happened.
-    pub fn due(&mut self, now: Duration) -> Vec<Order> {
+    /// The actions that are due. Call it at [`Self::next_deadline`], and after every other event.
+    pub fn due_actions(&mut self, now: Duration) -> Vec<Action> {
         let limits = self.limits;
-        if self.overslept(now) {
-            self.listen_anew(now);
+        if self.was_suspended(now) {
+            self.reset_heartbeats(now);
         }
-        let due = |(number, child): (u32, &mut Child)| child.due(number, &limits, now);
+        let due = |(number, child): (u32, &mut Child)| child.due_action(number, &limits, now);
         (0..).zip(&mut self.children).filter_map(due).collect()
     }
 
-    /// When something will be due if nothing happens until then.
-    pub fn next(&self) -> Option<Duration> {
-        self.children.iter().filter_map(|child| child.next(&self.limits)).min()
+    /// Time of the next action if no event happens before.
+    pub fn next_deadline(&self) -> Option<Duration> {
+        self.children.iter().filter_map(|child| child.next_deadline(&self.limits)).min()
     }
 
-    /// Whether no process is left and none will be started.
+    /// Whether no process is running and none will be started.
     pub fn is_over(&self) -> bool {
-        self.children.iter().all(|child| matches!(child.state, State::Home | State::GivenUp))
+        self.children.iter().all(|child| matches!(child.state, State::Exited | State::Failed))
     }
 
-    /// Where each of the children stands.
+    /// Status of all children.
     pub fn status(&self, now: Duration) -> impl Iterator<Item = ChildStatus> {
         (0..).zip(&self.children).map(move |(number, child)| child.status(number, now))
     }
@@ -237,13 +238,13 @@ impl Supervisor {
         self.children.get_mut(usize::try_from(number).ok()?)
     }
 
-    /// Whether whoever was to ask at [`Self::next`] was itself held up, by Ctrl-Z or a host that was suspended.
-    /// Nobody listened in that time, so that no silence is proved.
-    fn overslept(&self, now: Duration) -> bool {
-        self.next().is_some_and(|due| now.saturating_sub(due) > self.limits.silence / 10)
+    /// Whether the caller itself was suspended past [`Self::next_deadline`], by Ctrl-Z or because the host was
+    /// suspended. Heartbeats were not received in that time, so their absence proves nothing.
+    fn was_suspended(&self, now: Duration) -> bool {
+        self.next_deadline().is_some_and(|due| now.saturating_sub(due) > self.limits.heartbeat_timeout / 10)
     }
 
-    fn listen_anew(&mut self, now: Duration) {
+    fn reset_heartbeats(&mut self, now: Duration) {
         for child in &mut self.children {
             if let State::Running { heard, .. } = &mut child.state {
                 *heard = now;

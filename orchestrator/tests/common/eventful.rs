@@ -1,43 +1,43 @@
-//! Campaigns of scripted walks to which things happen.
+//! Campaigns of scripted walks with arbitrary events.
 
 use std::sync::Arc;
 
-use orchestrator::selector::{Mode, Next, Selector, Settings, Snapshot, UpdateProtocol};
+use orchestrator::selector::{Mode, Scheduling, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use store::records::Commit;
 use wire::messages::Outcome;
-use wire::transport::Work;
+use wire::transport::WorkItem;
 
 use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
 use super::{restore, settings};
 
-/// Label jobs above which a live campaign raises its threshold.
+/// Number of label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
 
-fn open(settings: &Settings, seeds: usize, snapshot: Snapshot) -> Selector {
+fn open(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     let mut selector = restore(settings, seeds, snapshot);
     if settings.mode == Mode::Live {
-        selector.raise_above(QUEUE_LIMIT);
+        selector.raise_threshold_above(QUEUE_LIMIT);
     }
     selector
 }
 
-/// What happens next while a campaign runs.
+/// The next event of a campaign.
 #[derive(Clone, Copy, Debug)]
 pub enum Act {
-    /// A free walker asks for a turn.
+    /// An idle walker asks for an assignment.
     Ask,
-    /// One of the walkers at work (the index picks) delivers its report.
+    /// A busy walker (chosen by the index) delivers its report.
     Deliver(prop::sample::Index),
-    /// One of them is interrupted after so many steps.
+    /// A busy walker is interrupted after this number of steps.
     Interrupt(prop::sample::Index, u64),
-    /// One of them is lost.
+    /// A busy walker is lost.
     Lose(prop::sample::Index),
-    /// So many structures wait for labels.
+    /// This number of structures waits for labels.
     Queue(u64),
-    /// All processes die, and the campaign is started again.
+    /// All processes die, and the campaign is restarted.
     Crash,
 }
 
@@ -57,7 +57,7 @@ pub fn acts() -> impl Strategy<Value = Vec<Act>> {
 }
 
 fn event() -> impl Strategy<Value = Event> {
-    // Few numbers and directions, so that duplicates and structures that are covered meanwhile are common.
+    // Few numbers and directions, so that duplicates and covered structures are frequent.
     let structure = (0..12_u64, 0..3_usize, 1.0..9.0, prop::bool::weighted(0.1)).prop_map(
         |(number, direction, far, close)| {
             let mut z = [0.0; 3];
@@ -81,11 +81,11 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
     let update =
         prop::sample::select(vec![UpdateProtocol::Carried, UpdateProtocol::Restarted, UpdateProtocol::Never]);
     (1..5_usize, update, 1..6_u32, prop::option::of(1..12_u32), any::<bool>(), 0..300_u64).prop_map(
-        |(walks, update, per_seed, total, control, declined_feature_bytes)| Settings {
+        |(walks, update, max_per_seed_structure, total, control, declined_feature_bytes)| Settings {
             walks_per_round: if update == UpdateProtocol::Restarted { 1 } else { walks },
             update,
-            per_seed,
-            total,
+            max_per_seed_structure,
+            max_structures: total,
             control,
             declined_feature_bytes,
             ..settings(Mode::Reproducible)
@@ -93,24 +93,24 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
     )
 }
 
-/// A campaign on its way: the selector, its store, and walkers with turns in hand.
+/// A running campaign: the selector, its store, and busy walkers.
 pub struct Campaign<'a> {
     settings: &'a Settings,
     scripts: &'a [Script],
     walkers: usize,
     pub selector: Selector,
     pub store: MemoryStore,
-    at_work: Vec<Work>,
-    /// All commits but those that only keep where an interrupted walk stands.
+    at_work: Vec<WorkItem>,
+    /// All commits except those that only record interrupted walks.
     pub commits: Vec<Commit>,
 }
 
 impl<'a> Campaign<'a> {
     pub fn begin(settings: &'a Settings, scripts: &'a [Script], walkers: usize) -> Self {
-        let selector = open(settings, scripts.len(), Snapshot::default());
+        let selector = open(settings, scripts.len(), SelectorSnapshot::default());
         let (store, at_work, commits) = (MemoryStore::default(), Vec::new(), Vec::new());
         let mut campaign = Self { settings, scripts, walkers, selector, store, at_work, commits };
-        let commit = campaign.selector.begin_walks();
+        let commit = campaign.selector.start_walks();
         campaign.commit(commit);
         campaign
     }
@@ -123,36 +123,36 @@ impl<'a> Campaign<'a> {
         }
     }
 
-    /// Gives a turn to a free walker, if there are both.
+    /// Gives an assignment to an idle walker, if there are both.
     fn ask(&mut self) -> bool {
         if self.at_work.len() == self.walkers {
             return false;
         }
-        match self.selector.next_turn() {
-            Next::Turn(assignment) => {
+        match self.selector.next_assignment() {
+            Scheduling::Assign(assignment) => {
                 let mixture = Arc::clone(self.selector.mixture());
-                self.at_work.push(Work { assignment: *assignment, mixture });
+                self.at_work.push(WorkItem { assignment: *assignment, mixture });
                 true
             }
-            Next::Wait => {
+            Scheduling::Wait => {
                 assert!(!self.at_work.is_empty(), "nothing to wait for");
                 false
             }
-            Next::Done => {
+            Scheduling::Done => {
                 assert!(self.selector.is_done() && self.at_work.is_empty());
                 false
             }
         }
     }
 
-    fn take(&mut self, index: prop::sample::Index) -> Option<Work> {
+    fn take(&mut self, index: prop::sample::Index) -> Option<WorkItem> {
         (!self.at_work.is_empty()).then(|| self.at_work.remove(index.index(self.at_work.len())))
     }
 
-    fn deliver(&mut self, work: &Work, pause_after: Option<u64>) {
+    fn deliver(&mut self, work: &WorkItem, pause_after: Option<u64>) {
         let seed = self.store.walks[&work.assignment.walk].seed_structure as usize;
         let report = advance(&self.scripts[seed], &work.assignment, &work.mixture, pause_after);
-        let paused = report.outcome == Outcome::Paused;
+        let paused = report.outcome == Outcome::Interrupted;
         let commit = self.selector.report(report).unwrap();
         assert!(!paused || commit.is_some(), "an interrupted walk is kept at once");
         if let Some(commit) = commit {
@@ -163,15 +163,15 @@ impl<'a> Campaign<'a> {
     fn crash(&mut self) {
         self.at_work.clear();
         self.selector = open(self.settings, self.scripts.len(), self.store.snapshot());
-        assert!(self.selector.begin_walks().walks.is_empty());
+        assert!(self.selector.start_walks().walks.is_empty());
     }
 
-    /// Everybody dies, and the campaign goes on by other settings.
+    /// All processes die, and the campaign continues with other settings.
     pub fn go_on(&mut self, settings: &'a Settings) {
         self.at_work.clear();
         self.settings = settings;
         self.selector = open(self.settings, self.scripts.len(), self.store.snapshot());
-        let commit = self.selector.begin_walks();
+        let commit = self.selector.start_walks();
         self.commit(commit);
     }
 
@@ -187,13 +187,13 @@ impl<'a> Campaign<'a> {
         };
         let Some(work) = self.take(index) else { return };
         match act {
-            Act::Lose(_) => self.selector.lost(work.assignment.walk),
+            Act::Lose(_) => self.selector.assignment_lost(work.assignment.walk),
             Act::Interrupt(_, steps) => self.deliver(&work, Some(steps)),
             _ => self.deliver(&work, None),
         }
     }
 
-    /// Goes on without incidents until all walks are over; with `crash_often`, every commit is followed by a crash.
+    /// Continues without incidents until all walks have ended; with `crash_often`, with a crash after every commit.
     pub fn finish(mut self, crash_often: bool) -> Self {
         for _ in 0..10_000 {
             if self.selector.is_done() {
@@ -209,7 +209,7 @@ impl<'a> Campaign<'a> {
         panic!("the campaign does not end");
     }
 
-    /// Everything that must be the same, as text: numbers are written so that other bits are other text.
+    /// Everything that must be equal, as text. Different bits of a number give different text.
     pub fn content(&self) -> Vec<String> {
         let rest = format!("{:?} {:?} {:?}", self.store.walks, self.store.components, self.store.values);
         self.commits.iter().map(|commit| format!("{commit:?}")).chain([rest]).collect()

@@ -1,8 +1,8 @@
-//! The store as the selector sees it, in memory: what is committed, and what comes out of it again.
+//! The store as the selector sees it, in memory.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use orchestrator::selector::Snapshot;
+use orchestrator::selector::SelectorSnapshot;
 use store::records::{Commit, ComponentRecord, Decision, Fate, WalkRecord};
 use wire::{ContentHash, Origin, WalkId};
 
@@ -18,7 +18,7 @@ pub struct MemoryStore {
 }
 
 impl MemoryStore {
-    /// Takes a commit as the database does, with what that refuses.
+    /// Applies a commit like the database, with the same checks.
     pub fn commit(&mut self, commit: &Commit) {
         let decided: Vec<_> = commit.decisions.iter().filter_map(|decision| decision.candidate).collect();
         let there: Vec<_> = commit.candidates.iter().map(|candidate| candidate.block.view().id()).collect();
@@ -41,9 +41,9 @@ impl MemoryStore {
         self.values.extend(commit.values.iter().cloned());
     }
 
-    pub fn snapshot(&self) -> Snapshot {
+    pub fn snapshot(&self) -> SelectorSnapshot {
         let components = self.components.iter();
-        Snapshot {
+        SelectorSnapshot {
             imported: self.imported.len() as u64,
             walks: self.walks.values().cloned().collect(),
             components: components

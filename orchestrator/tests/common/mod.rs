@@ -1,4 +1,4 @@
-//! A campaign without a potential: a mixture made up, structures made up, and features as a test wants them.
+//! A campaign without a potential: synthetic mixture and structures, and arbitrary features.
 pub mod eventful;
 pub mod memory;
 pub mod scripted;
@@ -13,26 +13,26 @@ use calm::{
 };
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    Mode, Next, SeedStructure, Selector, Settings, Snapshot, TrainingFrames, UpdateProtocol,
+    Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol,
 };
 use store::records::Commit;
-use wire::messages::{Assignment, End, Outcome, Progress, Report};
+use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const DIMENSION: usize = 3;
 pub const ATOMS: usize = 2;
-/// Shortest distance of the seed structures, Å: candidates must keep three quarters of it.
+/// Shortest distance in the seed structures, Å; candidates must keep three quarters of it.
 pub const SHORTEST: f64 = 2.8;
 
-/// Where the two components have their centroids.
+/// Centroids of the two components.
 const CENTROIDS: [[f64; DIMENSION]; 2] = [[0.0; DIMENSION], [20.0, 0.0, 0.0]];
 
 pub fn aluminium() -> Species {
     "Al".parse().unwrap()
 }
 
-/// Two components of unit covariance and θ = 1: γ is the distance of **z** from the nearer centroid.
+/// Two components with unit covariance and θ = 1: γ is the distance of **z** from the nearer centroid.
 pub fn mixture() -> Arc<Mixture> {
     let identity: Vec<f64> =
         (0..DIMENSION * DIMENSION).map(|k| f64::from(k % (DIMENSION + 1) == 0)).collect();
@@ -44,7 +44,7 @@ pub fn mixture() -> Arc<Mixture> {
     Arc::new(Mixture::new(0, vec![CENTROIDS.map(component).to_vec()]).unwrap())
 }
 
-/// Two aluminium atoms so far apart, Å, in a cell that tells structures of different numbers apart.
+/// Two aluminium atoms at this distance, Å, in a cell that depends on the number.
 pub fn structure(number: u64, distance: f64) -> Structure {
     Structure {
         species: vec![aluminium(); ATOMS],
@@ -73,7 +73,7 @@ pub fn settings(mode: Mode) -> Settings {
     Settings {
         mode,
         walks_per_round: 2,
-        turn_steps: 10,
+        steps_per_assignment: 10,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
             combination: CovarianceUpdateKind::Convex,
@@ -82,15 +82,15 @@ pub fn settings(mode: Mode) -> Settings {
         },
         forgetting_alarm: ForgettingAlarm::default(),
         collection: CollectionRule::MaximumGrade { threshold: positive(1.5) },
-        per_seed: 3,
-        total: None,
+        max_per_seed_structure: 3,
+        max_structures: None,
         control: false,
-        least_distance: (1.2, 0.75),
+        min_distance: (1.2, 0.75),
         declined_feature_bytes: 1 << 20,
     }
 }
 
-pub fn restore(settings: &Settings, seeds: usize, snapshot: Snapshot) -> Selector {
+pub fn restore(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     try_restore(settings, seeds, None, snapshot).unwrap()
 }
 
@@ -98,40 +98,40 @@ pub fn try_restore(
     settings: &Settings,
     seeds: usize,
     training: Option<TrainingFrames>,
-    snapshot: Snapshot,
+    snapshot: SelectorSnapshot,
 ) -> Result<Selector, orchestrator::selector::SelectorError> {
     let seeds = (0..seeds).map(seed).collect();
     Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), training, snapshot)
 }
 
-/// A selector at the start of a campaign, its walks begun.
+/// A selector at the start of a campaign, with its walks.
 pub fn begin(settings: &Settings, seeds: usize) -> Selector {
-    let mut selector = restore(settings, seeds, Snapshot::default());
-    selector.begin_walks();
+    let mut selector = restore(settings, seeds, SelectorSnapshot::default());
+    selector.start_walks();
     selector
 }
 
-/// The next turn, which there must be.
-pub fn turn(selector: &mut Selector) -> Assignment {
-    match selector.next_turn() {
-        Next::Turn(assignment) => *assignment,
-        other => panic!("expected a turn, found {other:?}"),
+/// The next assignment, which must exist.
+pub fn next_assignment(selector: &mut Selector) -> Assignment {
+    match selector.next_assignment() {
+        Scheduling::Assign(assignment) => *assignment,
+        other => panic!("expected an assignment, found {other:?}"),
     }
 }
 
-/// Features of a structure: the first atom at the first centroid, the second so far from it, γ = |z|.
+/// Features of a structure: the first atom at the first centroid, the second at **z** from it, so γ = |z|.
 pub fn features(z: [f64; DIMENSION]) -> Vec<f64> {
     [CENTROIDS[0], z].concat()
 }
 
-/// The largest γ of those features.
+/// The largest γ of these features.
 pub fn gamma_max(mixture: &Mixture, z: [f64; DIMENSION]) -> f64 {
     let mut grades = calm::Grades::default();
     grades.evaluate(mixture, &[0; ATOMS], &features(z), None).unwrap();
     grades.maximum()
 }
 
-/// What a walker would send of a structure with these features.
+/// The block that a walker would send for a structure with these features.
 pub fn block(
     assignment: &Assignment,
     mixture: &Mixture,
@@ -147,7 +147,7 @@ pub fn block(
             walk: assignment.walk,
             segment: progress.segment,
             step: progress.step,
-            content: ContentHash::of(&structure),
+            content: ContentHash::from_structure(&structure),
         },
         origin: assignment.origin,
         mixture_version: mixture.version(),
@@ -169,10 +169,10 @@ pub fn at(step: u64) -> Progress {
 
 pub fn report(assignment: &Assignment, outcome: Outcome, progress: Progress) -> Report {
     let checkpoint = format!("step {}", progress.step).into_bytes();
-    Report { walk: assignment.walk, turn: assignment.turn, outcome, checkpoint, progress }
+    Report { walk: assignment.walk, assignment: assignment.number, outcome, checkpoint, progress }
 }
 
-/// A report of a candidate at a step: the structure of that number with these features.
+/// A report with a candidate at a step: the structure with this number and these features.
 pub fn offer(
     selector: &Selector,
     assignment: &Assignment,
@@ -184,16 +184,16 @@ pub fn offer(
     report(assignment, Outcome::Candidate(block), at(step))
 }
 
-pub fn ended(assignment: &Assignment, step: u64, end: End) -> Report {
+pub fn ended(assignment: &Assignment, step: u64, end: WalkEnd) -> Report {
     report(assignment, Outcome::Ended(end), at(step))
 }
 
-/// What the selector decides on a report that needs no other.
+/// The selector's decision on a report that completes its round.
 pub fn decided(selector: &mut Selector, report: Report) -> Commit {
     selector.report(report).unwrap().expect("no other report is waited for")
 }
 
-/// Kind of each decision, with the reason where it declines.
+/// Kind of each decision, with the reason if it declines.
 pub fn kinds(commit: &Commit) -> Vec<String> {
     let kind = |decision: &store::records::Decision| match decision.detail.get("reason") {
         Some(reason) if decision.kind == "declined" => format!("declined {}", reason.as_str().unwrap()),

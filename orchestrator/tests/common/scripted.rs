@@ -1,26 +1,26 @@
-//! A walk by script instead of dynamics. Like a real one it is a function of assignment and mixture: the same turn gives
-//! the same report, whoever works on it, however often, and with pauses in between or not.
+//! A scripted walk without dynamics. Like a real walk, it is a function of assignment and mixture: the same assignment
+//! gives the same report on any walker, any number of times, with or without interruptions.
 
 use calm::Mixture;
 use serde::{Deserialize, Serialize};
 use wire::Origin;
-use wire::messages::{Assignment, End, Outcome, Progress, Report};
+use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 
 use super::{DIMENSION, SHORTEST, at, block, gamma_max, structure};
 
-/// What a walk meets at each of its steps, in order.
+/// The events of a walk, one per step.
 pub type Script = Vec<Event>;
 
 #[derive(Clone, Debug)]
 pub enum Event {
     Nothing,
-    /// A structure of this number and features of its second atom; `close` if its atoms are too close.
+    /// A structure with this number and features of its second atom; if `close`, its atoms are too close.
     Structure {
         number: u64,
         z: [f64; DIMENSION],
         close: bool,
     },
-    /// A return to the checkpoint of two steps before.
+    /// A rollback to the checkpoint of two steps before.
     Return,
     BlowUp,
 }
@@ -28,13 +28,13 @@ pub enum Event {
 /// The checkpoint of a scripted walk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct State {
-    /// Events behind it.
+    /// Number of past events.
     events: usize,
     step: u64,
     segment: u32,
 }
 
-/// The turn, paused after so many steps if it lasts longer.
+/// Works on the assignment; interrupted after this number of steps if it takes longer.
 pub fn advance(
     script: &Script,
     assignment: &Assignment,
@@ -47,12 +47,12 @@ pub fn advance(
         .map_or_else(State::default, |bytes| serde_json::from_slice(bytes).unwrap());
     let mut steps = 0;
     let outcome = loop {
-        let Some(event) = script.get(state.events) else { break Outcome::Ended(End::Steps) };
-        if state.step >= assignment.until {
-            break Outcome::Turn;
+        let Some(event) = script.get(state.events) else { break Outcome::Ended(WalkEnd::Steps) };
+        if state.step >= assignment.last_step {
+            break Outcome::StepsDone;
         }
         if pause_after == Some(steps) {
-            break Outcome::Paused;
+            break Outcome::Interrupted;
         }
         steps += 1;
         state.step += 1;
@@ -62,16 +62,22 @@ pub fn advance(
         }
     };
     let checkpoint = serde_json::to_vec(&state).unwrap();
-    Report { walk: assignment.walk, turn: assignment.turn, outcome, checkpoint, progress: progress(&state) }
+    Report {
+        walk: assignment.walk,
+        assignment: assignment.number,
+        outcome,
+        checkpoint,
+        progress: progress(&state),
+    }
 }
 
 fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut State) -> Option<Outcome> {
     if assignment.origin == Origin::Control {
-        // No bias, so it meets nothing of the script; frames are those of another walk.
+        // Without bias, a control walk meets no events of the script; its frames are those of another walk.
         let number = 2_000_000 + 1000 * u64::from(assignment.walk.0) + state.step;
         let frame =
             || block(assignment, mixture, &progress(state), structure(number, SHORTEST), [0.5; DIMENSION]);
-        return assignment.wanted.contains(&state.step).then(|| Outcome::Candidate(frame()));
+        return assignment.frame_steps.contains(&state.step).then(|| Outcome::Candidate(frame()));
     }
     match *event {
         Event::Nothing => None,
@@ -85,7 +91,7 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
             state.step = state.step.saturating_sub(2);
             None
         }
-        Event::BlowUp => Some(Outcome::Ended(End::BlewUp { reason: format!("at step {}", state.step) })),
+        Event::BlowUp => Some(Outcome::Ended(WalkEnd::BlewUp { reason: format!("at step {}", state.step) })),
     }
 }
 

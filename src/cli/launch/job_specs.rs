@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use orchestrator::slurm::{Job, JobNames, JobPhase, Plan, Request, Role, Wanted};
+use orchestrator::slurm::{DesiredJobs, Job, JobNames, JobOptions, JobPhase, Plan, Role};
 use wire::net::Tls;
 
 use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
@@ -33,7 +33,7 @@ impl JobSpecs {
         launch: &Launch,
         campaign: &Campaign,
         directory: &Path,
-        wanted: Wanted,
+        wanted: DesiredJobs,
     ) -> Result<Self, Failure> {
         let folder = directory.join(FOLDER);
         let commands = Commands::new(launch, campaign, directory)?;
@@ -107,13 +107,13 @@ impl JobSpecs {
     }
 
     /// The `sbatch` request of a job.
-    pub fn request(&self, role: Role, orchestrator: Option<u64>) -> Request<'_> {
+    pub fn request(&self, role: Role, orchestrator: Option<u64>) -> JobOptions<'_> {
         let (script, name) = match role {
             Role::Orchestrator => (ORCHESTRATOR, role.name()),
             Role::Agent(_) => (AGENT, role.name()),
             Role::Labeller(_) => (LABELLER, role.name()),
         };
-        Request {
+        JobOptions {
             script: self.folder.join(script),
             log: self.folder.join(format!("{name}.log")),
             directory: &self.directory,
@@ -179,7 +179,7 @@ impl<'a> Commands<'a> {
         words.map(quoted).collect::<Vec<_>>().join(" ")
     }
 
-    fn orchestrator(&self, wanted: Wanted) -> Result<String, Failure> {
+    fn orchestrator(&self, wanted: DesiredJobs) -> Result<String, Failure> {
         let mut words = vec!["run", &self.config, "--directory", &self.directory, WAIT_TIMEOUT];
         if self.launch.adopt {
             words.push("--adopt");
@@ -225,7 +225,7 @@ impl<'a> Commands<'a> {
     fn certificates(&self, role: &str) -> Result<Option<String>, Failure> {
         let Some(tls) = &self.launch.tls else { return Ok(None) };
         let directory = absolute(&tls.join(role))?;
-        let certificates = Tls::in_directory(&directory);
+        let certificates = Tls::from_directory(&directory);
         let checked = match role {
             "orchestrator" => certificates.check_for_orchestrator(),
             _ => certificates.check_for_agent(),

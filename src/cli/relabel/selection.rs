@@ -119,7 +119,7 @@ pub async fn matching(
             let Some(row) = page.last() else { break };
             last = Some(row.cursor);
             let rows = page.iter().filter(|row| condition.matches(&facts(row)));
-            matching.extend(rows.map(|row| ContentHash::of(&row.structure).0));
+            matching.extend(rows.map(|row| ContentHash::from_structure(&row.structure).0));
         }
     }
     let all: Vec<_> = all.into_iter().filter(|structure| matching.contains(&structure.content.0)).collect();

@@ -80,7 +80,7 @@ impl BatchJobs {
 
 /// Active jobs, and for each role without an active job the last one that ended.
 async fn query_slurm(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmError> {
-    let slurm = Slurm::with_patience(TIMEOUT);
+    let slurm = Slurm::with_timeout(TIMEOUT);
     let mut jobs = slurm.jobs(&job_names(location)).await?;
     let mut last: BTreeMap<Role, (bool, u64)> = BTreeMap::new();
     for job in &jobs {

@@ -184,7 +184,7 @@ impl Content for Candidate {
         if view.id().to_string() != self.id || view.id().content.0 != *self.content {
             return Some(format!("its block is that of {}", view.id()));
         }
-        if ContentHash::of(&view.structure()) != view.id().content {
+        if ContentHash::from_structure(&view.structure()) != view.id().content {
             return Some("its structure does not match its hash".to_owned());
         }
         let n = view.numbers.len();

@@ -29,7 +29,8 @@ impl Store {
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let mut imported = ImportCounts::default();
         for (frame, structure, label) in frames {
-            let number = structure_id(&mut transaction, structure, ContentHash::of(structure)).await?;
+            let number =
+                structure_id(&mut transaction, structure, ContentHash::from_structure(structure)).await?;
             check(&mut transaction, number, label).await?;
             let sql = "INSERT INTO import (structure, file, frame, checksum) VALUES ($1, $2, $3, $4)
                        ON CONFLICT (structure) DO NOTHING";

@@ -245,9 +245,12 @@ pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str,
 }
 
 async fn insert_seed_structure(transaction: &mut Transaction, seed_structure: &SeedStructure) -> Result<()> {
-    let structure =
-        structure_id(transaction, &seed_structure.structure, ContentHash::of(&seed_structure.structure))
-            .await?;
+    let structure = structure_id(
+        transaction,
+        &seed_structure.structure,
+        ContentHash::from_structure(&seed_structure.structure),
+    )
+    .await?;
     let sql =
         "INSERT INTO seed_structure (seed, name, source, structure, checksum) VALUES ($1, $2, $3, $4, $5)
                ON CONFLICT (seed) DO UPDATE SET name = $2, source = $3, structure = $4, checksum = $5";

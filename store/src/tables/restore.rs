@@ -1,6 +1,6 @@
 //! The state from which a selector continues, and complete candidates.
 
-use wire::messages::{Decline, Progress};
+use wire::messages::{DeclineReason, Progress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkId};
 
 use crate::Store;
@@ -228,7 +228,9 @@ impl FromRow for StoredCandidate {
         let (fate, reason): (String, Option<String>) = (row.get("fate")?, row.get("reason")?);
         let fate = match (fate.as_str(), reason.as_deref()) {
             ("accepted", None) => Some(Fate::Accepted),
-            (_, reason) => Decline::ALL.into_iter().find(|d| Some(d.name()) == reason).map(Fate::Declined),
+            (_, reason) => {
+                DeclineReason::ALL.into_iter().find(|d| Some(d.name()) == reason).map(Fate::Declined)
+            }
         };
         let [features, selector, original]: [Option<Vec<u8>>; 3] =
             [row.get("features")?, row.get("selector_grades")?, row.get("original_grades")?];

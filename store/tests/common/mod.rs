@@ -73,7 +73,7 @@ pub fn label(energy: f64) -> Label {
 /// The candidate of a walk at a step; both determine its structure.
 pub fn candidate(walk: u32, step: u64, origin: Origin, fate: Fate) -> CandidateRecord {
     let structure = structure(f64::from(walk) + 1e-6 * step as f64);
-    let content = ContentHash::of(&structure);
+    let content = ContentHash::from_structure(&structure);
     let block = CandidateBlock::encode(&Candidate {
         id: CandidateId { campaign: CAMPAIGN, walk: WalkId(walk), segment: 0, step, content },
         origin,

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use store::{CampaignLock, Commit, CompleteOutcome, ComponentRecord, Fate, JobState, Store, StoreError};
 use wire::Origin;
-use wire::messages::Decline;
+use wire::messages::DeclineReason;
 
 use crate::common::*;
 
@@ -25,7 +25,7 @@ fn restart() {
 fn numbered(k: u64) -> Commit {
     let records = vec![
         candidate(0, 2 * k, Origin::Biased, Fate::Accepted),
-        candidate(0, 2 * k + 1, Origin::Biased, Fate::Declined(Decline::Covered)),
+        candidate(0, 2 * k + 1, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
     ];
     Commit {
         components: vec![ComponentRecord { element: 0, slot: 0, bytes: k.to_le_bytes().to_vec() }],

@@ -148,7 +148,7 @@ fn cut_for_good() {
     linked.walker_waits();
     let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(1), "{}", hosts.said(0));
-    let last_words = "calmwalk: the orchestrator has not answered for 0.3 min";
+    let last_words = "calmwalk: no answer from the orchestrator for 0.3 min";
     assert!(hosts.said(0).contains(last_words), "{}", hosts.said(0));
     assert!(
         hosts.orchestrator_stderr().contains("its walks go to other walkers"),

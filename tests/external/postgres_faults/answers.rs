@@ -146,7 +146,7 @@ fn answers_to_commits_get_lost_and_no_job_does() {
         }
         let protocol = store.protocols().await.unwrap()[0].hash;
         for structure in &structures {
-            let labels = store.label_history(ContentHash::of(structure), protocol).await.unwrap();
+            let labels = store.label_history(ContentHash::from_structure(structure), protocol).await.unwrap();
             assert_eq!(labels.len(), 1, "{labels:?}");
         }
     });

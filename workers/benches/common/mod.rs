@@ -45,11 +45,11 @@ impl TimedWalk {
 
     /// Seconds per step, averaged over `steps`.
     pub fn seconds(&mut self, steps: u64) -> f64 {
-        self.assignment.until = EQUILIBRATION + 1 + steps;
+        self.assignment.last_step = EQUILIBRATION + 1 + steps;
         let start = Instant::now();
         let report = run(&self.context, &self.assignment, &self.mixture);
         let seconds = start.elapsed().as_secs_f64();
-        assert_eq!(report.outcome, Outcome::Turn, "the walk makes all its steps");
+        assert_eq!(report.outcome, Outcome::StepsDone, "the walk makes all its steps");
         seconds / steps as f64
     }
 }
@@ -95,15 +95,15 @@ fn assignment(seed_structure: Structure, until: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([1; 16]),
         walk: WalkId(0),
-        turn: 0,
+        number: 0,
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure,
         checkpoint: None,
         verdict: None,
-        until,
-        wanted: Vec::new(),
-        raised: 1.0,
+        last_step: until,
+        frame_steps: Vec::new(),
+        threshold_factor: 1.0,
     }
 }
 

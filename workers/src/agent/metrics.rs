@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use wire::WalkId;
 use wire::messages::{Assignment, Outcome, Progress};
-use wire::net::Told;
+use wire::net::SlotReport;
 
 use super::UNRESPONSIVE_AFTER;
 
@@ -53,7 +53,7 @@ pub struct AssignmentCounts {
 
 #[derive(Clone, Copy, Debug)]
 struct WalkPosition {
-    turn: u64,
+    assignment: u64,
     /// Segment and step; `None` until the start of the assignment is known.
     at: Option<(u32, u64)>,
 }
@@ -68,12 +68,13 @@ impl AgentMetrics {
     pub(super) fn received(&mut self, assignment: &Assignment, mixture_version: u64) {
         self.assignments_received += 1;
         self.mixture_version = self.mixture_version.max(Some(mixture_version));
-        let before = self.walks.get(&assignment.walk).filter(|position| position.turn + 1 == assignment.turn);
+        let before =
+            self.walks.get(&assignment.walk).filter(|position| position.assignment + 1 == assignment.number);
         let at = match (&assignment.checkpoint, before) {
             (None, _) => Some((0, 0)),
             (Some(_), before) => before.and_then(|position| position.at),
         };
-        self.walks.insert(assignment.walk, WalkPosition { turn: assignment.turn, at });
+        self.walks.insert(assignment.walk, WalkPosition { assignment: assignment.number, at });
     }
 
     /// Records the progress of a walk.
@@ -88,15 +89,15 @@ impl AgentMetrics {
     }
 
     /// Counts what the orchestrator has accepted.
-    pub(super) fn delivered(&mut self, told: &Told) {
+    pub(super) fn delivered(&mut self, told: &SlotReport) {
         let counts = &mut self.assignments;
         let count = match told {
-            Told::Nothing => return,
-            Told::Lost { .. } => &mut counts.lost,
-            Told::Report(report) => match report.outcome {
+            SlotReport::Empty => return,
+            SlotReport::Lost { .. } => &mut counts.lost,
+            SlotReport::Report(report) => match report.outcome {
                 Outcome::Candidate(_) => &mut counts.candidate,
-                Outcome::Turn => &mut counts.steps_done,
-                Outcome::Paused => &mut counts.paused,
+                Outcome::StepsDone => &mut counts.steps_done,
+                Outcome::Interrupted => &mut counts.paused,
                 Outcome::Ended(_) => &mut counts.ended,
             },
         };
@@ -107,7 +108,7 @@ impl AgentMetrics {
 #[cfg(test)]
 mod tests {
     use atoms::{Cell, Structure};
-    use wire::messages::{End, Report};
+    use wire::messages::{Report, WalkEnd};
     use wire::{CampaignId, Origin};
 
     use super::*;
@@ -121,15 +122,15 @@ mod tests {
         Assignment {
             campaign: CampaignId([1; 16]),
             walk: WALK,
-            turn,
+            number: turn,
             origin: Origin::Biased,
             random_walk: WALK,
             seed_structure,
             checkpoint,
             verdict: None,
-            until: 100,
-            wanted: Vec::new(),
-            raised: 1.0,
+            last_step: 100,
+            frame_steps: Vec::new(),
+            threshold_factor: 1.0,
         }
     }
 
@@ -165,10 +166,16 @@ mod tests {
         let mut metrics = AgentMetrics::default();
         let report = |outcome| {
             let checkpoint = Vec::new();
-            Told::Report(Report { walk: WALK, turn: 0, outcome, checkpoint, progress: at(0, 1) })
+            SlotReport::Report(Report { walk: WALK, assignment: 0, outcome, checkpoint, progress: at(0, 1) })
         };
-        let ended = || report(Outcome::Ended(End::Steps));
-        for told in [Told::Nothing, report(Outcome::Turn), ended(), ended(), Told::Lost { fault: true }] {
+        let ended = || report(Outcome::Ended(WalkEnd::Steps));
+        for told in [
+            SlotReport::Empty,
+            report(Outcome::StepsDone),
+            ended(),
+            ended(),
+            SlotReport::Lost { crashed: true },
+        ] {
             metrics.delivered(&told);
         }
         let expected = AssignmentCounts { steps_done: 1, ended: 2, lost: 1, ..AssignmentCounts::default() };

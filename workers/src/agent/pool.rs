@@ -5,16 +5,16 @@ use std::collections::{BTreeMap, VecDeque};
 use tokio::sync::oneshot;
 use wire::WalkId;
 use wire::messages::Report;
-use wire::net::{Slot, Told};
-use wire::transport::Work;
+use wire::net::{Slot, SlotReport};
+use wire::transport::WorkItem;
 
 /// The assignments and walkers of a host. `S` is a slot: the orchestrator's entry for one assignment.
 #[derive(Debug)]
 pub(super) struct AssignmentPool<S = Slot> {
     /// Assignments that no walker has started.
-    ready: VecDeque<(S, Work)>,
+    ready: VecDeque<(S, WorkItem)>,
     /// Walkers that wait for an assignment, in order of arrival.
-    waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
+    waiting: VecDeque<(u32, oneshot::Sender<Option<WorkItem>>)>,
     /// The assignment of each busy walker.
     assigned: BTreeMap<u32, (Option<S>, WalkId)>,
     /// Reports whose slots are lost.
@@ -33,14 +33,16 @@ impl<S> Default for AssignmentPool<S> {
 impl<S> AssignmentPool<S> {
     /// Starts with these slots, or replaces lost ones by them. Assignments in progress keep a slot; assignments not
     /// started are dropped. Returns the first message for each free slot.
-    pub(super) fn start(&mut self, slots: Vec<S>) -> Vec<(S, Told)> {
+    pub(super) fn start(&mut self, slots: Vec<S>) -> Vec<(S, SlotReport)> {
         self.open_slots = slots.len();
         self.ready.clear();
         let mut slots = slots.into_iter();
         for (slot, _) in self.assigned.values_mut() {
             *slot = slots.next();
         }
-        slots.map(|slot| (slot, self.unsent.pop_front().map_or(Told::Nothing, Told::Report))).collect()
+        slots
+            .map(|slot| (slot, self.unsent.pop_front().map_or(SlotReport::Empty, SlotReport::Report)))
+            .collect()
     }
 
     /// Handles an idle walker: returns the report of its assignment, and queues it for another one.
@@ -48,14 +50,14 @@ impl<S> AssignmentPool<S> {
         &mut self,
         walker: u32,
         report: Option<Report>,
-        reply: oneshot::Sender<Option<Work>>,
-    ) -> Option<(S, Told)> {
+        reply: oneshot::Sender<Option<WorkItem>>,
+    ) -> Option<(S, SlotReport)> {
         let slot = self.assigned.remove(&walker).and_then(|(slot, _)| slot);
         self.waiting.push_back((walker, reply));
         self.dispatch();
         match (slot, report) {
-            (Some(slot), Some(report)) => Some((slot, Told::Report(report))),
-            (Some(slot), None) => Some((slot, Told::Lost { fault: false })),
+            (Some(slot), Some(report)) => Some((slot, SlotReport::Report(report))),
+            (Some(slot), None) => Some((slot, SlotReport::Lost { crashed: false })),
             (None, report) => {
                 self.unsent.extend(report);
                 None
@@ -64,13 +66,13 @@ impl<S> AssignmentPool<S> {
     }
 
     /// Handles a lost walker: returns the message about its assignment, if it had one.
-    pub(super) fn walker_lost(&mut self, walker: u32, fault: bool) -> Option<(S, Told)> {
+    pub(super) fn walker_lost(&mut self, walker: u32, crashed: bool) -> Option<(S, SlotReport)> {
         let (slot, _) = self.assigned.remove(&walker)?;
-        Some((slot?, Told::Lost { fault }))
+        Some((slot?, SlotReport::Lost { crashed }))
     }
 
     /// Adds an assignment.
-    pub(super) fn assign(&mut self, slot: S, work: Work) {
+    pub(super) fn assign(&mut self, slot: S, work: WorkItem) {
         self.ready.push_back((slot, work));
         self.dispatch();
     }
@@ -81,8 +83,8 @@ impl<S> AssignmentPool<S> {
     }
 
     /// Keeps a report that could not be delivered.
-    pub(super) fn keep_unsent(&mut self, told: Told) {
-        if let Told::Report(report) = told {
+    pub(super) fn keep_unsent(&mut self, told: SlotReport) {
+        if let SlotReport::Report(report) = told {
             self.unsent.push_back(report);
         }
     }

@@ -19,7 +19,7 @@ impl Walk<'_> {
             walk: self.assignment.walk,
             segment: self.state.segment,
             step: self.step(),
-            content: ContentHash::of(&structure),
+            content: ContentHash::from_structure(&structure),
         };
         Ok(Candidate {
             id,

@@ -1,19 +1,19 @@
-//! A candidate as a walker holds it, and how it is written down.
+//! A candidate as a walker holds it, and its encoding.
 
 use atoms::{Matrix3, Structure, Vec3};
 use zerocopy::IntoBytes;
 
-use super::layout::{Header, MAGIC, VERSION, flatten, length, seal};
+use super::layout::{Header, MAGIC, VERSION, flatten, length, write_checksum};
 use crate::ids::{CandidateId, ContentHash, Origin};
 
-/// What a walker knows of a structure when it offers it.
+/// A structure with everything that its walker computed for it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Candidate {
-    /// Its name.
+    /// Identifier.
     pub id: CandidateId,
     /// Biased, or a frame of a control walk.
     pub origin: Origin,
-    /// Version of the mixture that the walker saw.
+    /// Mixture version that the walker used.
     pub mixture_version: u64,
     /// Kinetic temperature, K.
     pub temperature: f64,
@@ -21,11 +21,11 @@ pub struct Candidate {
     pub relative_volume: f64,
     /// Energy of the potential, without bias and ZBL, eV.
     pub energy: f64,
-    /// −∂E/∂ε of the same, eV.
+    /// −∂E/∂ε of the potential, eV.
     pub virial: Matrix3,
     /// The structure.
     pub structure: Structure,
-    /// −∂E/∂r of the same, [n], eV/Å.
+    /// −∂E/∂r of the potential, [n], eV/Å.
     pub forces: Vec<Vec3>,
     /// γ under the walker's mixture, [n].
     pub gamma: Vec<f64>,
@@ -36,27 +36,31 @@ pub struct Candidate {
 }
 
 impl Candidate {
-    /// Bytes of its block.
+    /// Length of the encoded block, bytes.
     pub fn encoded_len(&self) -> usize {
         length(self.structure.len() as u64, self.feature_dimension() as u64) as usize
     }
 
-    /// Features an atom, D.
+    /// Features per atom, D.
     pub(super) fn feature_dimension(&self) -> usize {
         self.features.len().checked_div(self.structure.len()).unwrap_or(0)
     }
 
-    /// Writes its block to `out`, [`Candidate::encoded_len`] bytes. The arrays must have the lengths their
-    /// documentation gives, and its name the hash of its structure.
+    /// Encodes the candidate into `out`, which has [`Candidate::encoded_len`] bytes.
     ///
     /// # Panics
-    /// If they have not: that is an error of the caller, not of input.
+    /// If an array does not have the documented length, or if the id does not contain the hash of the structure. Both
+    /// are errors of the caller, not of input.
     pub fn encode_into(&self, out: &mut [u8]) {
         let Self { structure, forces, gamma, gamma_nbr, features, .. } = self;
         let n = structure.len();
         assert!([structure.positions.len(), forces.len(), gamma.len(), gamma_nbr.len()] == [n; 4] && n > 0);
         assert_eq!(features.len() % n, 0, "features of every atom");
-        assert_eq!(self.id.content, ContentHash::of(structure), "the hash of this very structure");
+        assert_eq!(
+            self.id.content,
+            ContentHash::from_structure(structure),
+            "the id contains the hash of the structure"
+        );
         assert_eq!(out.len(), self.encoded_len(), "room for the block");
         let header = self.header();
         let numbers: Vec<u64> = structure.species.iter().map(|s| u64::from(s.atomic_number())).collect();
@@ -71,11 +75,11 @@ impl Candidate {
         ];
         let mut rest = &mut *out;
         for part in parts {
-            let (place, behind) = rest.split_at_mut(part.len());
-            place.copy_from_slice(part);
-            rest = behind;
+            let (array, after) = rest.split_at_mut(part.len());
+            array.copy_from_slice(part);
+            rest = after;
         }
-        seal(out);
+        write_checksum(out);
     }
 
     fn header(&self) -> Header {

@@ -1,4 +1,4 @@
-//! Where things stand in a block, see [`crate::block`].
+//! Memory layout of a block, see [`crate::block`].
 
 use atoms::Matrix3;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
@@ -8,10 +8,10 @@ compile_error!("candidate blocks are little-endian and read in place");
 
 pub(super) const MAGIC: [u8; 8] = *b"CALMCAND";
 pub(super) const VERSION: u32 = 1;
-/// More atoms or features than this are taken for a damaged header.
+/// Limit for the number of atoms and of features; a header with more is damaged.
 pub(super) const LARGEST: u64 = 1 << 32;
 
-/// The fixed part of a block, 288 bytes.
+/// The header of a block, 288 bytes.
 #[derive(Clone, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
 pub(super) struct Header {
@@ -37,23 +37,23 @@ pub(super) struct Header {
 }
 
 pub(super) const HEADER: usize = size_of::<Header>();
-/// The checksum covers everything behind itself.
+/// The checksum covers everything after this offset.
 pub(super) const CHECKED_FROM: usize = 16;
 
-/// Numbers of atoms and of features an atom.
+/// Number of atoms, and of features per atom.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Counts {
     pub atoms: usize,
     pub features: usize,
 }
 
-/// Bytes of a block with `atoms` atoms and `features` features an atom.
+/// Length of a block with `atoms` atoms and `features` features per atom, bytes.
 pub(super) fn length(atoms: u64, features: u64) -> u64 {
     HEADER as u64 + 8 * atoms * (1 + 3 + 3 + 1 + 1 + features)
 }
 
 /// Writes the checksum of a block into its header.
-pub(super) fn seal(block: &mut [u8]) {
+pub(super) fn write_checksum(block: &mut [u8]) {
     let checksum = crc32fast::hash(&block[CHECKED_FROM..]);
     block[CHECKED_FROM - 4..CHECKED_FROM].copy_from_slice(&checksum.to_le_bytes());
 }

@@ -1,4 +1,4 @@
-//! A block read in place, and all that is checked before.
+//! Reading a block in place, and its validation.
 
 use atoms::{Cell, Matrix3, Species, Structure, Vec3};
 use zerocopy::{CastError, FromBytes};
@@ -28,7 +28,7 @@ pub struct CandidateView<'a> {
 }
 
 impl<'a> CandidateView<'a> {
-    /// Reads `bytes` (8-byte aligned) in place after checking all of them.
+    /// Validates `bytes` (aligned to 8) and returns a view of them.
     pub fn new(bytes: &'a [u8]) -> Result<Self, BlockError> {
         let view = Self::split(bytes)?;
         let expected = view.header.checksum;
@@ -46,13 +46,13 @@ impl<'a> CandidateView<'a> {
         if view.header.periodic.iter().any(|p| *p > 1) || view.header.periodic[3] != 0 {
             return field("periodic", format!("{:?}", view.header.periodic));
         }
-        if ContentHash::of(&view.structure()) != view.id().content {
+        if ContentHash::from_structure(&view.structure()) != view.id().content {
             return field("content hash", view.id().content.to_string());
         }
         Ok(view)
     }
 
-    /// Places of the arrays, checked against the length at hand.
+    /// Locates the arrays and checks their lengths.
     fn split(bytes: &'a [u8]) -> Result<Self, BlockError> {
         let short = || BlockError::Short(bytes.len());
         let (header, _) = Header::ref_from_prefix(bytes).map_err(|error| match error {
@@ -75,7 +75,7 @@ impl<'a> CandidateView<'a> {
         Self::arrays(bytes, Counts { atoms: atoms as usize, features: features as usize })
     }
 
-    /// Places of the arrays of a block with so many atoms and features.
+    /// Locates the arrays of a block with these counts.
     pub(super) fn arrays(bytes: &'a [u8], counts: Counts) -> Result<Self, BlockError> {
         let short = || BlockError::Short(bytes.len());
         let (header, rest) = Header::ref_from_prefix(bytes).map_err(|_| short())?;
@@ -89,7 +89,7 @@ impl<'a> CandidateView<'a> {
         Ok(Self { header, counts, numbers, positions, forces, gamma, gamma_nbr, features })
     }
 
-    /// Its name.
+    /// Identifier.
     pub fn id(&self) -> CandidateId {
         CandidateId {
             campaign: CampaignId(self.header.campaign),
@@ -105,7 +105,7 @@ impl<'a> CandidateView<'a> {
         if self.header.origin == Origin::Control as u32 { Origin::Control } else { Origin::Biased }
     }
 
-    /// Version of the mixture that the walker saw.
+    /// Mixture version that the walker used.
     pub fn mixture_version(&self) -> u64 {
         self.header.mixture_version
     }
@@ -130,12 +130,12 @@ impl<'a> CandidateView<'a> {
         unflatten(&self.header.virial)
     }
 
-    /// Features an atom, D.
+    /// Features per atom, D.
     pub fn feature_dimension(&self) -> usize {
         self.counts.features
     }
 
-    /// The structure, copied out.
+    /// A copy of the structure.
     pub fn structure(&self) -> Structure {
         let species =
             self.numbers.iter().filter_map(|z| Species::from_atomic_number(*z as u8).ok()).collect();
@@ -148,7 +148,7 @@ impl<'a> CandidateView<'a> {
         }
     }
 
-    /// Everything, copied out.
+    /// A copy of the whole candidate.
     pub fn to_candidate(&self) -> Candidate {
         Candidate {
             id: self.id(),

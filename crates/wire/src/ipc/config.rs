@@ -1,5 +1,5 @@
-//! How iceoryx2 is set up. Nothing is left to its defaults that loses messages, blocks on a dead process, or reaches
-//! beyond the campaign's place: the creator of a service sets every limit.
+//! Configuration of iceoryx2. Replaces every default that loses messages, blocks on a dead process, or uses files
+//! outside the campaign's directory. The creator of a service sets all its limits.
 
 use std::path::Path;
 use std::sync::Mutex;
@@ -17,75 +17,76 @@ use iceoryx2::prelude::{SemanticString, ServiceName, ipc_threadsafe};
 use iceoryx2::service::port_factory::request_response;
 
 use super::{IpcError, Sizes};
-use crate::exchange::message::Caller;
-use crate::place;
+use crate::protocol::message::SenderId;
+use crate::shm_dir;
 
 pub(super) type Service = ipc_threadsafe::Service;
-// Messages are words of 8 bytes: bytes aligned to 8 take eight times their number in iceoryx2's segments.
+// Messages are arrays of 8-byte words: iceoryx2 reserves eight times the space for bytes aligned to 8.
 pub(super) type ServerPort = Server<Service, [u64], (), [u64], ()>;
 pub(super) type ClientPort = Client<Service, [u64], (), [u64], ()>;
 pub(super) type Request = ActiveRequest<Service, [u64], (), [u64], ()>;
 pub(super) type Pending = PendingResponse<Service, [u64], (), [u64], ()>;
 type Requests = request_response::PortFactory<Service, [u64], (), [u64], ()>;
 
-/// Candidates of one walker that are read where the walker wrote them. Beyond this number (a reproducible round of many
-/// walks) the server copies them, which frees the walker's memory.
-pub(super) const IN_PLACE: usize = 4;
-/// The same of all walkers, the dead ones among them, whose memory lasts as long as a candidate in it.
-pub(super) const IN_PLACE_IN_ALL: usize = 256;
-/// Requests of one walker that the server may hold: the above, an offer, questions, progress.
-const ACTIVE_REQUESTS: usize = IN_PLACE + 4;
-/// Requests that a walker has memory for. More of them, or larger ones, make iceoryx2 add a segment.
+/// Maximum number of candidates of one walker that the server reads in place. The server copies further ones (in a
+/// reproducible round of many walks), which frees the walker's memory.
+pub(super) const MAX_IN_PLACE: usize = 4;
+/// Maximum number of candidates read in place in total, including those of dead walkers, whose memory is kept as long.
+pub(super) const MAX_IN_PLACE_TOTAL: usize = 256;
+/// Maximum number of active requests of one walker: candidates in place, an offer, polls, progress.
+const ACTIVE_REQUESTS: usize = MAX_IN_PLACE + 4;
+/// Number of request buffers of a walker. If it needs more or larger ones, iceoryx2 adds a segment.
 const REQUEST_BUFFERS: usize = ACTIVE_REQUESTS + 2;
-/// Channels that iceoryx2 has for the answers to one walker, each with a place for one. What nobody has read when its
-/// channel is closed stays there until the channel is used again.
+/// Number of response channels of one walker, each with one slot. An unread response stays in its channel when the
+/// channel is closed, until the channel is used again.
 const CHANNELS: usize = 2 * ACTIVE_REQUESTS + 1;
-/// Answers to one walker that the server has memory for: those in all channels, and one that is being written. More of
-/// them must not be needed: iceoryx2 0.10 adds a segment with more places than it has counters for, and panics.
+/// Number of answer buffers of the server for one walker: one for each channel, and one that is being written. The
+/// server must never need more: iceoryx2 0.10 would add a segment with more slots than counters, and panic.
 const ANSWER_BUFFERS: usize = CHANNELS + 1;
-/// Bytes of a message beside what it was expected to have: iceoryx2's header, the frame.
+/// Overhead of a message, bytes: header of iceoryx2 and frame.
 const MESSAGE_MARGIN: usize = 4096;
-/// Bytes that iceoryx2 uses for the connection with one walker (measured: 270 kB), and for everything else (100 kB).
+/// Memory of iceoryx2 for the connection with one walker (measured: 270 kB), and for everything else (100 kB).
 const CONNECTION_BYTES: u64 = 1 << 19;
 const TABLE_BYTES: u64 = 1 << 20;
 
-/// Shared memory that the messages of a campaign need at most, bytes. Each end reserves its part when it is opened.
+/// Upper bound of the shared memory for the messages of a campaign, bytes. Each end reserves its part when it opens.
 pub fn space_needed(sizes: &Sizes) -> u64 {
     let message = (sizes.message_bytes + 2 * MESSAGE_MARGIN) as u64;
     let messages = REQUEST_BUFFERS * sizes.walkers as usize + answer_buffers(sizes);
     TABLE_BYTES + messages as u64 * message + u64::from(sizes.walkers) * CONNECTION_BYTES
 }
 
-/// Whether a message is as large as was expected, or there is room for a larger one: without room, writing it would be
-/// the end of the process.
-pub(super) fn check_room(length: usize, message_bytes: usize) -> Result<(), IpcError> {
+/// Checks that a message is no larger than expected, or that there is free space for it. Writing it without free space
+/// would kill the process with SIGBUS.
+pub(super) fn check_free_space(length: usize, message_bytes: usize) -> Result<(), IpcError> {
     if length > message_bytes {
-        let free = place::free_space().map_err(|e| IpcError::new("look for room", e))?;
+        let free = shm_dir::free_space().map_err(|e| IpcError::new("query the free space", e))?;
         if free < 2 * length as u64 {
             let why =
-                format!("it has {length} bytes, more than expected, and /dev/shm has {free} bytes free");
+                format!("its {length} bytes are more than expected, and /dev/shm has only {free} bytes free");
             return Err(IpcError::new("carry a message", why));
         }
     }
     Ok(())
 }
 
-/// Answers that the server has memory for.
+/// Number of answer buffers of the server.
 fn answer_buffers(sizes: &Sizes) -> usize {
     ANSWER_BUFFERS * sizes.walkers as usize + 1
 }
 
-/// Words that a message of the expected length has at most.
+/// Maximum number of words of a message of the expected length.
 fn words(message_bytes: usize) -> usize {
     (message_bytes + MESSAGE_MARGIN).div_ceil(8)
 }
 
-/// Processes that may be connected: those at work, and dead ones until they are cleaned away.
+/// Maximum number of connected processes: live ones, and dead ones until they are cleaned up.
 fn processes(sizes: &Sizes) -> usize {
     2 * sizes.walkers as usize + 16
 }
 
-/// This process in the campaign's place. Dead nodes are cleaned away by the server alone, which knows who is dead.
+/// The iceoryx2 node of this process. Only the server cleans up dead nodes, since only it knows which processes are
+/// dead.
 pub(super) fn node(directory: &Path, prefix: &str) -> Result<Node<Service>, IpcError> {
     let root = directory.to_str().and_then(|path| iceoryx2::prelude::Path::new(path.as_bytes()).ok());
     let prefix = FileName::new(prefix.as_bytes()).ok();
@@ -102,7 +103,7 @@ pub(super) fn node(directory: &Path, prefix: &str) -> Result<Node<Service>, IpcE
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     let messages = &mut config.defaults.request_response;
-    messages.server_expired_connection_buffer = IN_PLACE_IN_ALL;
+    messages.server_expired_connection_buffer = MAX_IN_PLACE_TOTAL;
     messages.client_expired_connection_buffer = 4;
     NodeBuilder::new()
         .config(&config)
@@ -115,17 +116,17 @@ fn name(text: &str) -> Result<ServiceName, IpcError> {
     text.try_into().map_err(|e| IpcError::new("name a service", e))
 }
 
-/// The requests of a session; the server creates them.
+/// Creates the request service of a session; called by the server.
 pub(super) fn create_requests(
     node: &Node<Service>,
     sizes: &Sizes,
     session: u64,
 ) -> Result<Requests, IpcError> {
-    node.service_builder(&name(&requests_of(session))?)
+    node.service_builder(&name(&requests_name(session))?)
         .request_response::<[u64], [u64]>()
         .enable_safe_overflow_for_requests(false)
         .enable_safe_overflow_for_responses(false)
-        // So that progress is heard although nobody waits for an answer to it.
+        // Allows progress messages without an answer.
         .enable_fire_and_forget_requests(true)
         .max_active_requests_per_client(ACTIVE_REQUESTS)
         .max_loaned_requests(1)
@@ -139,12 +140,12 @@ pub(super) fn create_requests(
 }
 
 pub(super) fn open_requests(node: &Node<Service>, session: u64) -> Result<Requests, IpcError> {
-    node.service_builder(&name(&requests_of(session))?).request_response::<[u64], [u64]>().open().map_err(
-        |e| IpcError::new("find the orchestrator: it has ended, or this walker is of another run", e),
+    node.service_builder(&name(&requests_name(session))?).request_response::<[u64], [u64]>().open().map_err(
+        |e| IpcError::new("find the orchestrator: it has exited, or this walker belongs to another run", e),
     )
 }
 
-/// A full buffer drops the answer, and the walker's next question brings it: the server waits for nobody.
+/// Drops an answer if the buffer is full, so that the server never blocks; the walker's next poll gets it.
 pub(super) fn server_port(requests: &Requests, sizes: &Sizes) -> Result<ServerPort, IpcError> {
     let buffers = answer_buffers(sizes);
     requests
@@ -158,7 +159,7 @@ pub(super) fn server_port(requests: &Requests, sizes: &Sizes) -> Result<ServerPo
         .map_err(|e| IpcError::new("open the orchestrator's end", e))
 }
 
-/// A full buffer drops the request, which the walker sees and sends it again.
+/// Drops a request if the buffer is full; the walker notices and sends it again.
 pub(super) fn client_port(requests: &Requests, message_bytes: usize) -> Result<ClientPort, IpcError> {
     requests
         .client_builder()
@@ -170,34 +171,42 @@ pub(super) fn client_port(requests: &Requests, message_bytes: usize) -> Result<C
         .map_err(|e| IpcError::new("open a walker's end", e))
 }
 
-/// What wakes the server; the server creates it.
-pub(super) fn create_server_bell(
+/// Creates the event that wakes the server; called by the server.
+pub(super) fn create_server_wakeup(
     node: &Node<Service>,
     sizes: &Sizes,
     session: u64,
 ) -> Result<Listener<Service>, IpcError> {
-    create_bell(node, &server_bell_of(session), processes(sizes))
+    create_wakeup(node, &server_wakeup_name(session), processes(sizes))
 }
 
-pub(super) fn server_bell(node: &Node<Service>, session: u64) -> Result<Notifier<Service>, IpcError> {
-    open_bell(node, &server_bell_of(session))
+pub(super) fn open_server_wakeup(node: &Node<Service>, session: u64) -> Result<Notifier<Service>, IpcError> {
+    open_wakeup(node, &server_wakeup_name(session))
 }
 
-/// What wakes a walker. Each process creates its own, so that one which dies while it does harms nobody else.
-pub(super) fn create_walker_bell(
+/// Creates the event that wakes a walker. Each process creates its own, so that a process that dies here affects no
+/// other.
+pub(super) fn create_walker_wakeup(
     node: &Node<Service>,
-    caller: Caller,
+    sender: SenderId,
 ) -> Result<Listener<Service>, IpcError> {
-    create_bell(node, &walker_bell_of(caller), 4)
+    create_wakeup(node, &walker_wakeup_name(sender), 4)
 }
 
-pub(super) fn walker_bell(node: &Node<Service>, caller: Caller) -> Result<Notifier<Service>, IpcError> {
-    open_bell(node, &walker_bell_of(caller))
+pub(super) fn open_walker_wakeup(
+    node: &Node<Service>,
+    sender: SenderId,
+) -> Result<Notifier<Service>, IpcError> {
+    open_wakeup(node, &walker_wakeup_name(sender))
 }
 
-fn create_bell(node: &Node<Service>, bell: &str, processes: usize) -> Result<Listener<Service>, IpcError> {
+fn create_wakeup(
+    node: &Node<Service>,
+    wakeup: &str,
+    processes: usize,
+) -> Result<Listener<Service>, IpcError> {
     let events = node
-        .service_builder(&name(bell)?)
+        .service_builder(&name(wakeup)?)
         .event()
         .max_listeners(1)
         .max_notifiers(processes)
@@ -216,21 +225,21 @@ fn create_bell(node: &Node<Service>, bell: &str, processes: usize) -> Result<Lis
     events.listener_builder().create().map_err(|e| IpcError::new("listen to events", e))
 }
 
-fn open_bell(node: &Node<Service>, bell: &str) -> Result<Notifier<Service>, IpcError> {
-    let events = node.service_builder(&name(bell)?).event().open();
+fn open_wakeup(node: &Node<Service>, wakeup: &str) -> Result<Notifier<Service>, IpcError> {
+    let events = node.service_builder(&name(wakeup)?).event().open();
     let events = events.map_err(|e| IpcError::new("open the events", e))?;
     events.notifier_builder().create().map_err(|e| IpcError::new("open the events", e))
 }
 
-fn requests_of(session: u64) -> String {
+fn requests_name(session: u64) -> String {
     format!("{session:016x}/requests")
 }
 
-fn server_bell_of(session: u64) -> String {
+fn server_wakeup_name(session: u64) -> String {
     format!("{session:016x}/server")
 }
 
-fn walker_bell_of(Caller { session, walker, incarnation }: Caller) -> String {
+fn walker_wakeup_name(SenderId { session, walker, incarnation }: SenderId) -> String {
     format!("{session:016x}/walker/{walker}/{incarnation}")
 }
 
@@ -238,9 +247,9 @@ fn walker_bell_of(Caller { session, walker, incarnation }: Caller) -> String {
 mod tests {
     use super::*;
 
-    /// A walker that has its answer another way leaves those to its questions where they are.
+    /// A walker that received its answer by another request does not read the answers to its polls.
     #[test]
-    fn answers_that_nobody_reads_leave_room_for_others() {
+    fn unread_answers_leave_room_for_others() {
         let directory = tempfile::tempdir().unwrap();
         let sizes = Sizes { walkers: 1, message_bytes: 64 };
         let node = node(directory.path(), "unread").unwrap();
@@ -255,11 +264,11 @@ mod tests {
         for number in 0..20 * CHANNELS as u64 {
             drop(ask(number));
         }
-        // A channel is free again when it has been looked at: each loses one answer at most.
-        let heard = (0..2 * CHANNELS as u64).filter(|number| {
+        // Reading a channel frees it, so each channel loses at most one answer.
+        let received = (0..2 * CHANNELS as u64).filter(|number| {
             let pending = ask(*number);
             pending.receive().unwrap().is_some_and(|answer| answer.payload() == [*number])
         });
-        assert!(heard.count() >= CHANNELS);
+        assert!(received.count() >= CHANNELS);
     }
 }

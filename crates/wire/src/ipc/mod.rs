@@ -1,23 +1,24 @@
-//! The transport between processes of one host, on [iceoryx2](https://iceoryx.io): an orchestrator with a [`Server`],
-//! walkers with an [`IpcWalker`] each, messages in memory that both map.
+//! The transport between processes of one host, on [iceoryx2](https://iceoryx.io). The orchestrator has a [`Server`],
+//! each walker an [`IpcWalker`]; messages are in shared memory.
 //!
-//! - **One write.** A walker encodes its candidate into the memory in which the selector and the store read it. Nothing
-//!   is copied, unless the server holds more of one walker's candidates than [`config::IN_PLACE`].
-//! - **Delivery is acknowledged.** The answer to a report is sent after its commit; a walker keeps what is unanswered,
-//!   asks, and offers it again if it was lost (see [`crate::exchange`]). Offered twice it is decided once.
-//! - **No polling.** Each end sleeps until the other rings. A walker that waits wakes every two seconds to ask, which is
-//!   its sign of life and finds what was lost.
-//! - **Nobody waits for the dead.** A full buffer drops a message and says so; no call blocks on another process.
-//! - **Strangers are dropped and counted:** other magic, version, length or checksum, other session, walker or
-//!   incarnation. Sockets and segments are the user's alone. A process of the same user that writes into mapped memory
-//!   by force can do harm, as it could with a debugger: this is no border between a user's own processes.
+//! - **Zero copy.** A walker encodes its candidate into the memory in which the selector and the store read it. The
+//!   server copies a candidate only if it already holds [`config::MAX_IN_PLACE`] of the same walker.
+//! - **Acknowledged delivery.** The answer to a report is sent after its commit. A walker keeps an unanswered report,
+//!   polls, and sends it again if it was lost (see [`crate::protocol`]). A report that is sent twice is decided once.
+//! - **No busy waiting.** Each end sleeps until the other wakes it. A waiting walker polls every two seconds, which is
+//!   its heartbeat and detects lost messages.
+//! - **No blocking on dead processes.** If a buffer is full, the message is dropped and the sender gets an error; no
+//!   call blocks on another process.
+//! - **Unexpected messages are rejected and counted:** wrong magic, version, length or checksum, or another session,
+//!   walker or incarnation. Only the user has access to sockets and segments. There is no protection between processes
+//!   of the same user: a process that writes to the mapped memory on purpose can do harm, as with a debugger.
 
+mod borrowed_request;
 mod config;
-mod desk;
-mod echo;
-mod lent;
-mod lines;
+mod connections;
+mod reencode;
 mod server;
+mod session;
 mod walker;
 
 use std::fmt;
@@ -25,68 +26,69 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::exchange::message::Caller;
 use crate::mixture::SharedMixtureError;
+use crate::protocol::message::SenderId;
 
 pub use config::space_needed;
+pub use connections::Traffic;
 #[doc(hidden)]
-pub use echo::echo;
-pub use lines::Traffic;
-pub use server::{Handle, Server};
+pub use reencode::reencode;
+pub use server::{Server, ServerHandle};
 pub use walker::IpcWalker;
 
-/// How much is expected.
+/// Expected load.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sizes {
-    /// Walkers at work at the same time.
+    /// Maximum number of concurrent walkers.
     pub walkers: u32,
-    /// The largest report with its candidate, and the largest assignment, bytes. Larger ones are carried all the same,
-    /// but not counted in [`space_needed`].
+    /// Size of the largest report with its candidate, and of the largest assignment, bytes. Larger messages work, but
+    /// are not counted in [`space_needed`].
     pub message_bytes: usize,
 }
 
-/// All that a walker needs to connect.
+/// Everything a walker needs to connect.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Door {
+pub struct ConnectInfo {
     directory: PathBuf,
     prefix: String,
     mixture: PathBuf,
     message_bytes: usize,
-    caller: Caller,
+    #[serde(rename = "caller")]
+    sender: SenderId,
 }
 
-impl Door {
-    /// The number of the walker that it is for.
+impl ConnectInfo {
+    /// Number of the walker.
     pub fn walker(&self) -> u32 {
-        self.caller.walker
+        self.sender.walker
     }
 }
 
-/// Why the transport does not work.
+/// Why the transport failed.
 #[derive(Debug, thiserror::Error)]
 pub enum IpcError {
-    /// Shared memory or sockets.
+    /// An error of shared memory or sockets.
     #[error("the transport cannot {what}: {why}")]
     Transport {
-        /// What was tried.
+        /// The operation.
         what: &'static str,
-        /// What iceoryx2 or the operating system says.
+        /// Error of iceoryx2 or of the operating system.
         why: String,
     },
     /// The mixture cannot be shared or read.
     #[error(transparent)]
     Mixture(#[from] SharedMixtureError),
     /// The orchestrator does not answer.
-    #[error("the orchestrator has not answered for {seconds} s")]
-    Silence {
-        /// How long.
+    #[error("no answer from the orchestrator for {seconds} s")]
+    Timeout {
+        /// Time since the last answer, s.
         seconds: u64,
     },
-    /// What this walker sends is dropped again and again.
-    #[error("the orchestrator refused a report {times} times: this is a defect of calmwalk")]
-    Refused {
-        /// How often.
+    /// Messages of this walker are rejected repeatedly.
+    #[error("the orchestrator rejected a report {times} times: this is a bug in calmwalk")]
+    Rejected {
+        /// Number of attempts.
         times: u32,
     },
 }

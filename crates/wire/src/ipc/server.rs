@@ -1,4 +1,4 @@
-//! The orchestrator's end: one task that listens, answers, and hands on to the reactor.
+//! The orchestrator's end: a task that receives messages, answers them, and forwards them to the reactor.
 
 use std::future::poll_fn;
 use std::io;
@@ -12,133 +12,143 @@ use tokio::io::unix::AsyncFd;
 use tokio::sync::mpsc;
 
 use super::config::{self, ServerPort, Service};
-use super::desk::Desk;
-use super::lines::{Lines, Traffic};
-use super::{Door, IpcError, Sizes};
-use crate::exchange::message::Caller;
+use super::connections::{Connections, Traffic};
+use super::session::ServerSession;
+use super::{ConnectInfo, IpcError, Sizes};
 use crate::mixture::SharedMixture;
-use crate::place::{self, Place};
+use crate::protocol::message::SenderId;
+use crate::shm_dir::{self, ShmDir};
 use crate::transport::Incoming;
 
-/// Messages that are taken in before the server looks at anything else.
+/// Maximum number of messages handled before other events.
 const BATCH: usize = 64;
 
-/// The orchestrator's end of the transport. Walkers can connect as soon as it is open and are heard when it runs.
+/// The orchestrator's end of the transport. Walkers can connect as soon as it is open; [`Server::run`] handles their
+/// messages.
 pub struct Server {
     port: ServerPort,
-    bell: Listener<Service>,
-    lines: Lines,
-    orders: mpsc::UnboundedReceiver<Order>,
-    handle: Handle,
+    wakeup: Listener<Service>,
+    connections: Connections,
+    commands: mpsc::UnboundedReceiver<Command>,
+    handle: ServerHandle,
 }
 
-/// Speaks to the server's task.
+/// Controls the server's task.
 #[derive(Clone, Debug)]
-pub struct Handle {
-    door: Door,
-    orders: mpsc::UnboundedSender<Order>,
+pub struct ServerHandle {
+    connect_info: ConnectInfo,
+    commands: mpsc::UnboundedSender<Command>,
     traffic: Arc<Mutex<Traffic>>,
 }
 
 #[derive(Debug)]
-enum Order {
+enum Command {
     Expect { walker: u32, incarnation: u32 },
-    Gone { walker: u32, incarnation: u32, fault: bool },
+    Lost { walker: u32, incarnation: u32, crashed: bool },
     Close,
 }
 
-impl Handle {
+impl ServerHandle {
     /// What the walker's process needs to connect.
-    pub fn door(&self, walker: u32, incarnation: u32) -> Door {
-        let caller = Caller { walker, incarnation, ..self.door.caller };
-        Door { caller, ..self.door.clone() }
+    pub fn connect_info(&self, walker: u32, incarnation: u32) -> ConnectInfo {
+        let sender = SenderId { walker, incarnation, ..self.connect_info.sender };
+        ConnectInfo { sender, ..self.connect_info.clone() }
     }
 
-    /// From now on this incarnation of the walker is heard and no other. To be called before its process is started and
-    /// after another, if there was one, has ended: if [`Handle::gone`] has not said so, this does.
+    /// Accepts messages only of this incarnation of the walker from now on. Call it before the process is started and
+    /// after the previous process has exited; it implies [`ServerHandle::lost`] for the previous one.
     pub fn expect(&self, walker: u32, incarnation: u32) {
-        self.order(Order::Expect { walker, incarnation });
+        self.command(Command::Expect { walker, incarnation });
     }
 
-    /// The walker's process is dead and has been waited for: what it held is freed, and the reactor hears of it, and
-    /// whether that was its own fault. Nothing happens if this incarnation is not the expected one any more: what it
-    /// held has been freed, and what is held now belongs to its successor.
-    pub fn gone(&self, walker: u32, incarnation: u32, fault: bool) {
-        self.order(Order::Gone { walker, incarnation, fault });
+    /// Reports that the walker's process has exited and was waited for, and whether it crashed. Frees its resources and
+    /// informs the reactor. Does nothing if another incarnation is expected, since the resources then belong to the
+    /// successor.
+    pub fn lost(&self, walker: u32, incarnation: u32, crashed: bool) {
+        self.command(Command::Lost { walker, incarnation, crashed });
     }
 
-    /// No walker will come any more, and none is alive: [`Server::run`] ends.
+    /// Makes [`Server::run`] return. Call it when no walker is alive and none will be started.
     pub fn close(&self) {
-        self.order(Order::Close);
+        self.command(Command::Close);
     }
 
-    /// What came so far.
+    /// Statistics of received messages.
     pub fn traffic(&self) -> Traffic {
         self.traffic.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    fn order(&self, order: Order) {
-        // After the server's end there is nothing to be done about it.
-        let _ = self.orders.send(order);
+    fn command(&self, command: Command) {
+        // Fails only if the server has already ended.
+        let _ = self.commands.send(command);
     }
 }
 
 impl Server {
-    /// Opens the transport in a place that has been prepared. `session` tells this run of the orchestrator from others.
+    /// Opens the transport in a prepared directory. `session` distinguishes this run of the orchestrator from others.
     ///
     /// # Errors
-    /// Whatever iceoryx2 says.
-    pub fn open(place: &Place, sizes: Sizes, session: u64) -> Result<Self, IpcError> {
-        let node = config::node(place.directory(), place.prefix())?;
-        let bell = config::create_server_bell(&node, &sizes, session)?;
+    /// Errors of iceoryx2 and of the operating system.
+    pub fn open(shm_dir: &ShmDir, sizes: Sizes, session: u64) -> Result<Self, IpcError> {
+        let node = config::node(shm_dir.directory(), shm_dir.prefix())?;
+        let wakeup = config::create_server_wakeup(&node, &sizes, session)?;
         let port = config::server_port(&config::create_requests(&node, &sizes, session)?, &sizes)?;
-        place.close_to_others().map_err(|e| IpcError::new("close its files to other users", e))?;
-        place::reserve(place.prefix(), None).map_err(|e| IpcError::new("reserve its memory", e))?;
-        let (sender, orders) = mpsc::unbounded_channel();
+        shm_dir
+            .restrict_permissions()
+            .map_err(|e| IpcError::new("restrict the permissions of its files", e))?;
+        shm_dir::reserve(shm_dir.prefix(), None).map_err(|e| IpcError::new("reserve its memory", e))?;
+        let (sender, commands) = mpsc::unbounded_channel();
         let traffic = Arc::default();
-        let door = Door {
-            directory: place.directory().to_owned(),
-            prefix: place.prefix().to_owned(),
-            mixture: place.mixture(),
+        let connect_info = ConnectInfo {
+            directory: shm_dir.directory().to_owned(),
+            prefix: shm_dir.prefix().to_owned(),
+            mixture: shm_dir.mixture(),
             message_bytes: sizes.message_bytes,
-            caller: Caller { session, walker: 0, incarnation: 0 },
+            sender: SenderId { session, walker: 0, incarnation: 0 },
         };
-        let handle = Handle { door, orders: sender, traffic: Arc::clone(&traffic) };
-        Ok(Self { port, bell, lines: Lines::new(node, traffic, sizes.message_bytes), orders, handle })
+        let handle = ServerHandle { connect_info, commands: sender, traffic: Arc::clone(&traffic) };
+        Ok(Self {
+            port,
+            wakeup,
+            connections: Connections::new(node, traffic, sizes.message_bytes),
+            commands,
+            handle,
+        })
     }
 
-    /// For whoever starts and ends walkers.
-    pub fn handle(&self) -> Handle {
+    /// Handle for the code that starts and stops walkers.
+    pub fn handle(&self) -> ServerHandle {
         self.handle.clone()
     }
 
-    /// Listens to walkers and hands on to the reactor until [`Handle::close`]. `heard` is told of each walker's messages, and
-    /// whether they brought a report.
+    /// Handles messages of walkers and forwards them to the reactor until [`ServerHandle::close`]. Calls `on_message` for
+    /// each message with the walker's number and whether it contains a report.
     ///
     /// # Errors
-    /// Shared memory or sockets that fail, a mixture that cannot be shared.
+    /// Errors of shared memory or sockets, or a mixture that cannot be shared.
     pub async fn run(
         mut self,
         mixtures: SharedMixture,
         to_reactor: mpsc::Sender<Incoming>,
-        mut heard: impl FnMut(u32, bool) + Send + 'static,
+        mut on_message: impl FnMut(u32, bool) + Send + 'static,
     ) -> Result<(), IpcError> {
-        let mut desk = Desk::new(self.handle.door.caller.session, mixtures, self.lines);
-        let rung = descriptor(&self.bell).map_err(|e| IpcError::new("wait for events", e))?;
+        let mut session =
+            ServerSession::new(self.handle.connect_info.sender.session, mixtures, self.connections);
+        let wakeup = descriptor(&self.wakeup).map_err(|e| IpcError::new("wait for events", e))?;
         let mut more = false;
         loop {
             tokio::select! {
                 biased;
-                order = self.orders.recv() => match order {
-                    Some(Order::Expect { walker, incarnation }) => desk.expect(walker, incarnation),
-                    Some(Order::Gone { walker, incarnation, fault }) => {
-                        desk.gone(walker, incarnation, fault);
-                        // Lets go of the connection as well.
-                        more = take_in(&self.port, &mut desk, &mut heard)?;
+                command = self.commands.recv() => match command {
+                    Some(Command::Expect { walker, incarnation }) => session.expect(walker, incarnation),
+                    Some(Command::Lost { walker, incarnation, crashed }) => {
+                        session.walker_lost(walker, incarnation, crashed);
+                        // This also drops the connection.
+                        more = receive_batch(&self.port, &mut session, &mut on_message)?;
                     }
-                    Some(Order::Close) | None => {
-                        // The reactor waits for the walkers that are gone, also when others keep its channel open.
-                        for incoming in desk.outbox.drain(..) {
+                    Some(Command::Close) | None => {
+                        // The reactor waits for the exits, even if other senders keep its channel open.
+                        for incoming in session.outbox.drain(..) {
                             if to_reactor.send(incoming).await.is_err() {
                                 break;
                             }
@@ -146,34 +156,38 @@ impl Server {
                         return Ok(());
                     }
                 },
-                (walker, work) = poll_fn(|context| desk.poll_decision(context)) => desk.decided(walker, work)?,
-                permit = to_reactor.reserve(), if !desk.outbox.is_empty() => match permit {
-                    Ok(permit) => if let Some(incoming) = desk.outbox.pop_front() { permit.send(incoming) },
-                    // The reactor has ended: whoever waits is sent home.
-                    Err(_) => desk.outbox.clear(),
+                (walker, work) = poll_fn(|context| session.poll_decision(context)) => session.handle_decision(walker, work)?,
+                permit = to_reactor.reserve(), if !session.outbox.is_empty() => match permit {
+                    Ok(permit) => if let Some(incoming) = session.outbox.pop_front() { permit.send(incoming) },
+                    // The reactor has ended: all waiting walkers shut down.
+                    Err(_) => session.outbox.clear(),
                 },
-                () = tokio::task::yield_now(), if more => more = take_in(&self.port, &mut desk, &mut heard)?,
-                guard = rung.readable() => {
+                () = tokio::task::yield_now(), if more => more = receive_batch(&self.port, &mut session, &mut on_message)?,
+                guard = wakeup.readable() => {
                     let mut guard = guard.map_err(|e| IpcError::new("wait for events", e))?;
-                    self.bell.try_wait(|_| {}).map_err(|e| IpcError::new("take in events", e))?;
+                    self.wakeup.try_wait(|_| {}).map_err(|e| IpcError::new("take in events", e))?;
                     guard.clear_ready();
-                    more = take_in(&self.port, &mut desk, &mut heard)?;
+                    more = receive_batch(&self.port, &mut session, &mut on_message)?;
                 }
             }
         }
     }
 }
 
-/// Takes in what has come; whether there may be more.
-fn take_in(port: &ServerPort, desk: &mut Desk, heard: &mut impl FnMut(u32, bool)) -> Result<bool, IpcError> {
+/// Handles received messages. Returns whether there may be more.
+fn receive_batch(
+    port: &ServerPort,
+    session: &mut ServerSession,
+    on_message: &mut impl FnMut(u32, bool),
+) -> Result<bool, IpcError> {
     for _ in 0..BATCH {
         match port.receive() {
             Ok(Some(request)) => {
-                if let Some((walker, reports)) = desk.receive(request) {
-                    heard(walker, reports);
+                if let Some((walker, reports)) = session.receive(request) {
+                    on_message(walker, reports);
                 }
             }
-            // Of a walker that sends without end, or that died while it connected: the others ring again.
+            // The walker sends without pause, or died while connecting. Other walkers will wake the server again.
             Ok(None) | Err(ReceiveError::ExceedsMaxBorrows | ReceiveError::ConnectionFailure(_)) => {
                 return Ok(false);
             }
@@ -182,12 +196,12 @@ fn take_in(port: &ServerPort, desk: &mut Desk, heard: &mut impl FnMut(u32, bool)
     Ok(true)
 }
 
-/// The listener's descriptor, to be waited for by tokio.
+/// The listener's file descriptor, for tokio.
 #[allow(unsafe_code)]
-fn descriptor(bell: &Listener<Service>) -> io::Result<AsyncFd<OwnedFd>> {
-    // SAFETY: the listener, which owns the descriptor, outlives this function; what is kept is a duplicate.
+fn descriptor(wakeup: &Listener<Service>) -> io::Result<AsyncFd<OwnedFd>> {
+    // SAFETY: the listener owns the descriptor and outlives this function; only a duplicate is kept.
     let duplicate =
-        unsafe { BorrowedFd::borrow_raw(bell.file_descriptor().native_handle()) }.try_clone_to_owned()?;
-    // SAFETY: the duplicate is owned by what is returned, which never gives it away, and is closed with it.
+        unsafe { BorrowedFd::borrow_raw(wakeup.file_descriptor().native_handle()) }.try_clone_to_owned()?;
+    // SAFETY: the returned value owns the duplicate, never gives it away, and closes it.
     Ok(unsafe { AsyncFd::register(duplicate) }?)
 }

@@ -1,4 +1,4 @@
-//! A walker's end.
+//! The walker's end.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -15,34 +15,34 @@ use iceoryx2::port::notifier::Notifier;
 use zerocopy::IntoBytes;
 
 use super::config::{self, ClientPort, Pending, Service};
-use super::{Door, IpcError};
+use super::{ConnectInfo, IpcError};
 use crate::block::Candidate;
-use crate::control::seal;
-use crate::exchange::frame;
-use crate::exchange::message::{Answer, Caller, Decision, Letter, Words};
+use crate::control::encode;
 use crate::ids::WalkId;
 use crate::messages::{Progress, Report};
 use crate::mixture::{MixtureReader, SharedMixtureError};
-use crate::place;
-use crate::transport::{Transport, Work};
+use crate::protocol::frame;
+use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
+use crate::shm_dir;
+use crate::transport::{Transport, WorkItem};
 
-/// A walker that waits for an answer asks this often.
-const ASK_EVERY: Duration = Duration::from_secs(2);
-/// It gives up when the orchestrator has been silent for this long: it is stopped or hangs …
-const PATIENCE: Duration = Duration::from_secs(600);
-/// … and earlier when the walker was asked to stop.
-const PATIENCE_WHEN_STOPPING: Duration = Duration::from_secs(20);
-/// What a predecessor held is free after so long at the latest.
-const PATIENCE_FOR_PREDECESSOR: Duration = Duration::from_secs(10);
-/// An offer that the orchestrator says it never had is made this often.
-const OFFERS: u32 = 5;
+/// Interval between polls while waiting for an answer.
+const POLL_INTERVAL: Duration = Duration::from_secs(2);
+/// Timeout for the orchestrator, which may be stopped or hang.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(600);
+/// The timeout after the walker was asked to stop.
+const STOPPING_TIMEOUT: Duration = Duration::from_secs(20);
+/// Timeout for the server to free the slot of the previous process.
+const SLOT_TIMEOUT: Duration = Duration::from_secs(10);
+/// Maximum number of times to send the same offer.
+const MAX_OFFERS: u32 = 5;
 
-/// A walker's end of the transport.
+/// The walker's end of the transport.
 pub struct IpcWalker {
-    caller: Caller,
+    sender: SenderId,
     port: ClientPort,
-    bell: Listener<Service>,
-    server_bell: Notifier<Service>,
+    wakeup: Listener<Service>,
+    server_wakeup: Notifier<Service>,
     mixtures: MixtureReader,
     stopping: Arc<AtomicBool>,
     sequence: u64,
@@ -52,12 +52,12 @@ pub struct IpcWalker {
     _node: Node<Service>,
 }
 
-/// A message that may be answered.
-struct Asked(Pending);
+/// A request that may be answered.
+struct PendingAnswer(Pending);
 
-impl Drop for Asked {
+impl Drop for PendingAnswer {
     fn drop(&mut self) {
-        // What nobody reads would keep its place, which a later answer needs (see `config::ANSWER_BUFFERS`).
+        // Unread answers would occupy slots that later answers need (see `config::ANSWER_BUFFERS`).
         while let Ok(Some(_)) = self.0.receive() {}
     }
 }
@@ -66,102 +66,105 @@ impl IpcWalker {
     /// Connects to the orchestrator. Setting `stopping` asks the walker to stop.
     ///
     /// # Errors
-    /// An orchestrator that is not there, or whatever iceoryx2 says.
-    pub fn connect(door: &Door, stopping: Arc<AtomicBool>) -> Result<Self, IpcError> {
-        let Door { caller, .. } = *door;
-        let node = config::node(&door.directory, &door.prefix)?;
-        let bell = config::create_walker_bell(&node, caller)?;
-        let server_bell = config::server_bell(&node, caller.session)?;
-        let port = config::client_port(&config::open_requests(&node, caller.session)?, door.message_bytes)?;
-        place::reserve(&door.prefix, Some(port.id().value()))
+    /// The orchestrator is not running, or an error of iceoryx2.
+    pub fn connect(connect_info: &ConnectInfo, stopping: Arc<AtomicBool>) -> Result<Self, IpcError> {
+        let ConnectInfo { sender, .. } = *connect_info;
+        let node = config::node(&connect_info.directory, &connect_info.prefix)?;
+        let wakeup = config::create_walker_wakeup(&node, sender)?;
+        let server_wakeup = config::open_server_wakeup(&node, sender.session)?;
+        let port =
+            config::client_port(&config::open_requests(&node, sender.session)?, connect_info.message_bytes)?;
+        shm_dir::reserve(&connect_info.prefix, Some(port.id().value()))
             .map_err(|e| IpcError::new("reserve its memory", e))?;
-        let mixtures = reader(door)?;
+        let mixtures = open_mixture(connect_info)?;
         Ok(Self {
-            caller,
+            sender,
             port,
-            bell,
-            server_bell,
+            wakeup,
+            server_wakeup,
             mixtures,
             stopping,
             sequence: 0,
             failure: None,
             encoding: Cell::default(),
-            message_bytes: door.message_bytes,
+            message_bytes: connect_info.message_bytes,
             _node: node,
         })
     }
 
-    /// Why the last exchange ended without a turn; none if the walker was sent home.
+    /// Why the last exchange returned no assignment; `None` if the walker was shut down.
     pub fn failure(&self) -> Option<&IpcError> {
         self.failure.as_ref()
     }
 
-    /// Time spent so far on encoding messages.
+    /// Total time spent encoding messages.
     pub fn encoding(&self) -> Duration {
         self.encoding.get()
     }
 
-    /// Offers the report until there is an answer.
-    fn converse(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<Work>, IpcError> {
+    /// Sends the report until it is answered.
+    fn exchange_report(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<WorkItem>, IpcError> {
         self.sequence += 1;
-        let (mut offer, mut question) = (self.offer(report)?, None);
-        let (mut offers, mut asked, mut heard) = (1, Instant::now(), Instant::now());
+        let (mut offer, mut poll) = (self.offer(report)?, None);
+        let (mut attempts, mut last_poll, mut last_answer) = (1, Instant::now(), Instant::now());
         loop {
             let decision = match self.answer(offer.as_ref())? {
-                None => self.answer(question.as_ref())?,
+                None => self.answer(poll.as_ref())?,
                 decision => decision,
             };
             match decision {
-                None => self.wait_for(asked, heard)?,
-                Some(Decision::Wait) => heard = Instant::now(),
-                Some(Decision::Home) => return Ok(None),
-                Some(Decision::Turn { mixture_version, assignment }) => {
+                None => self.wait(last_poll, last_answer)?,
+                Some(AnswerBody::Pending) => last_answer = Instant::now(),
+                Some(AnswerBody::Shutdown) => return Ok(None),
+                Some(AnswerBody::Assignment { mixture_version, assignment }) => {
                     let mixture = self.mixtures.pin(mixture_version)?;
-                    return Ok(Some(Work { assignment: assignment.into_owned(), mixture }));
+                    return Ok(Some(WorkItem { assignment: assignment.into_owned(), mixture }));
                 }
-                Some(Decision::Unknown) if offers == OFFERS => {
-                    return Err(IpcError::Refused { times: OFFERS });
+                Some(AnswerBody::Unknown) if attempts == MAX_OFFERS => {
+                    return Err(IpcError::Rejected { times: MAX_OFFERS });
                 }
-                Some(Decision::Unknown) => {
-                    (offer, question) = (self.offer(report)?, None);
-                    (offers, heard) = (offers + 1, Instant::now());
+                Some(AnswerBody::Unknown) => {
+                    (offer, poll) = (self.offer(report)?, None);
+                    (attempts, last_answer) = (attempts + 1, Instant::now());
                 }
             }
-            if asked.elapsed() >= ASK_EVERY {
-                asked = Instant::now();
-                question = self.send(Words::Ask { sequence: self.sequence }, None)?;
+            if last_poll.elapsed() >= POLL_INTERVAL {
+                last_poll = Instant::now();
+                poll = self.send(Payload::Poll { sequence: self.sequence }, None)?;
             }
         }
     }
 
-    /// Sleeps until the server rings or it is time to ask again. A signal may end it earlier.
-    fn wait_for(&self, asked: Instant, heard: Instant) -> Result<(), IpcError> {
-        let patience = if self.stopping() { PATIENCE_WHEN_STOPPING } else { PATIENCE };
-        if heard.elapsed() > patience {
-            return Err(IpcError::Silence { seconds: patience.as_secs() });
+    /// Sleeps until the server wakes this walker or the next poll is due. A signal may end the sleep early.
+    fn wait(&self, last_poll: Instant, last_answer: Instant) -> Result<(), IpcError> {
+        let timeout = if self.stopping() { STOPPING_TIMEOUT } else { ANSWER_TIMEOUT };
+        if last_answer.elapsed() > timeout {
+            return Err(IpcError::Timeout { seconds: timeout.as_secs() });
         }
-        let due = ASK_EVERY.saturating_sub(asked.elapsed());
-        let _ = self.bell.timed_wait(|_| {}, due);
+        let due = POLL_INTERVAL.saturating_sub(last_poll.elapsed());
+        let _ = self.wakeup.timed_wait(|_| {}, due);
         Ok(())
     }
 
-    fn offer(&self, report: Option<&Report<Candidate>>) -> Result<Option<Asked>, IpcError> {
-        let (offer, candidate) = Words::offer(self.sequence, report);
+    fn offer(&self, report: Option<&Report<Candidate>>) -> Result<Option<PendingAnswer>, IpcError> {
+        let (offer, candidate) = Payload::offer(self.sequence, report);
         self.send(offer, candidate)
     }
 
     /// Sends a message and wakes the server; `None` if it could not be delivered.
-    fn send(&self, words: Words<'_>, candidate: Option<&Candidate>) -> Result<Option<Asked>, IpcError> {
+    fn send(
+        &self,
+        payload: Payload<'_>,
+        candidate: Option<&Candidate>,
+    ) -> Result<Option<PendingAnswer>, IpcError> {
         let begin = Instant::now();
-        let control = seal(&Letter { caller: self.caller, words });
+        let control = encode(&Envelope { sender: self.sender, payload });
         let length = frame::length(control.len(), candidate);
-        config::check_room(length, self.message_bytes)?;
-        let mut memory = self
-            .port
-            .loan_slice_uninit(length / 8)
-            .map_err(|e| IpcError::new("find memory for a message", e))?;
-        frame::fill(initialised(memory.payload_mut()).as_mut_bytes(), &control, candidate);
-        // SAFETY: every word of shared memory has a value.
+        config::check_free_space(length, self.message_bytes)?;
+        let mut memory =
+            self.port.loan_slice_uninit(length / 8).map_err(|e| IpcError::new("allocate a message", e))?;
+        frame::write(initialised(memory.payload_mut()).as_mut_bytes(), &control, candidate);
+        // SAFETY: every word of shared memory is initialized.
         #[allow(unsafe_code)]
         let memory = unsafe { memory.assume_init() };
         self.encoding.set(self.encoding.get() + begin.elapsed());
@@ -169,30 +172,30 @@ impl IpcWalker {
         if pending.number_of_server_connections() == 0 {
             return Ok(None);
         }
-        // A bell that cannot be rung because its buffer is full rings already.
-        let _ = self.server_bell.notify();
-        Ok(Some(Asked(pending)))
+        // If notifying fails because the buffer is full, the server is already about to wake.
+        let _ = self.server_wakeup.notify();
+        Ok(Some(PendingAnswer(pending)))
     }
 
-    /// What has been answered to the present offer.
-    fn answer(&self, asked: Option<&Asked>) -> Result<Option<Decision<'static>>, IpcError> {
-        let Some(Asked(pending)) = asked else { return Ok(None) };
+    /// The answer to the current offer, if it has arrived.
+    fn answer(&self, request: Option<&PendingAnswer>) -> Result<Option<AnswerBody<'static>>, IpcError> {
+        let Some(PendingAnswer(pending)) = request else { return Ok(None) };
         let received = pending.receive().map_err(|e| IpcError::new("receive an answer", e))?;
         let Some(received) = received else { return Ok(None) };
         let unreadable = |why: &dyn Display| IpcError::new("read an answer", why);
         let (control, _) = frame::split(received.payload().as_bytes()).map_err(|e| unreadable(&e))?;
         let answer = Answer::decode(control).map_err(|e| unreadable(&e))?;
-        Ok((answer.sequence == self.sequence).then_some(answer.decision))
+        Ok((answer.sequence == self.sequence).then_some(answer.body))
     }
 }
 
-/// Opens the mixture. What a predecessor held, the server frees when it hears of its end, which may be a moment later
-/// than the start of this process.
-fn reader(door: &Door) -> Result<MixtureReader, SharedMixtureError> {
-    let begun = Instant::now();
+/// Opens the shared mixture. The server frees the slot of the previous process when it learns of its exit, which may be
+/// shortly after this process starts.
+fn open_mixture(connect_info: &ConnectInfo) -> Result<MixtureReader, SharedMixtureError> {
+    let start = Instant::now();
     loop {
-        match MixtureReader::open(&door.mixture, door.caller.walker) {
-            Err(SharedMixtureError::Taken { .. }) if begun.elapsed() < PATIENCE_FOR_PREDECESSOR => {
+        match MixtureReader::open(&connect_info.mixture, connect_info.sender.walker) {
+            Err(SharedMixtureError::SlotTaken { .. }) if start.elapsed() < SLOT_TIMEOUT => {
                 sleep(Duration::from_millis(20));
             }
             opened => return opened,
@@ -201,8 +204,8 @@ fn reader(door: &Door) -> Result<MixtureReader, SharedMixtureError> {
 }
 
 impl Transport for IpcWalker {
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work> {
-        let answer = self.converse(report.as_ref());
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem> {
+        let answer = self.exchange_report(report.as_ref());
         answer.unwrap_or_else(|failure| {
             self.failure = Some(failure);
             None
@@ -210,8 +213,8 @@ impl Transport for IpcWalker {
     }
 
     fn progress(&self, walk: WalkId, progress: Progress) {
-        // May be lost: whoever watches can do without this one.
-        let _ = self.send(Words::Progress(walk, Cow::Owned(progress)), None);
+        // May be lost.
+        let _ = self.send(Payload::Progress(walk, Cow::Owned(progress)), None);
     }
 
     fn stopping(&self) -> bool {
@@ -219,10 +222,10 @@ impl Transport for IpcWalker {
     }
 }
 
-/// Lent memory, to be written to.
+/// The same memory as initialized words.
 #[allow(unsafe_code)]
 fn initialised(memory: &mut [MaybeUninit<u64>]) -> &mut [u64] {
-    // SAFETY: the memory is a file that is mapped: the kernel gave each byte its first value, a zero or what was
-    // written there before.
+    // SAFETY: the memory is a mapped file, so the kernel has initialized every byte, with zero or with what was written
+    // there before.
     unsafe { &mut *(std::ptr::from_mut(memory) as *mut [u64]) }
 }

@@ -1,37 +1,37 @@
-//! What can go wrong with the shared mixture.
+//! Errors of the shared mixture.
 
 use std::io;
 use std::path::PathBuf;
 
 use calm::{ComponentError, MixtureError};
 
-/// Why the shared mixture could not be made, published to or read.
+/// Why the shared mixture cannot be created, published or read.
 #[derive(Debug, thiserror::Error)]
 pub enum SharedMixtureError {
-    /// The operating system refused.
+    /// An error of the operating system.
     #[error("{}: cannot {doing}: {source}", path.display())]
     File {
         /// The file.
         path: PathBuf,
-        /// What was attempted.
+        /// The operation.
         doing: &'static str,
-        /// The answer.
+        /// The error.
         source: io::Error,
     },
-    /// The file system of shared memory is full.
+    /// Not enough shared memory.
     #[error(
-        "{}: {needed} bytes of shared memory are needed and {free} are free; stop what else uses {}, or mount it larger",
+        "{}: {needed} bytes of shared memory are needed, but only {free} are free; free space on {}, or enlarge it",
         path.display(), path.parent().unwrap_or(path).display()
     )]
     Full {
         /// The file.
         path: PathBuf,
-        /// Bytes that had to be reserved.
+        /// Required, bytes.
         needed: u64,
-        /// Bytes that the file system has.
+        /// Free, bytes.
         free: u64,
     },
-    /// Some other file.
+    /// Another kind of file.
     #[error("{}: not a shared mixture (its first bytes are {found:02x?})", path.display())]
     Magic {
         /// The file.
@@ -39,9 +39,9 @@ pub enum SharedMixtureError {
         /// Its first bytes.
         found: [u8; 8],
     },
-    /// Written by another version of the program.
+    /// Another format version.
     #[error(
-        "{}: shared mixture of format {found}, this program reads format {expected}; start all processes from one build",
+        "{}: shared mixture of format {found}, expected format {expected}; use the same version of calmwalk in all processes",
         path.display()
     )]
     Format {
@@ -49,20 +49,20 @@ pub enum SharedMixtureError {
         path: PathBuf,
         /// Its format.
         found: u32,
-        /// That of this program.
+        /// The format of this program.
         expected: u32,
     },
-    /// Contents that contradict each other.
-    #[error("{}: damaged shared mixture: {what}; the orchestrator makes a new one at its next start", path.display())]
+    /// Inconsistent contents.
+    #[error("{}: damaged shared mixture: {what}; the orchestrator creates a new one when it starts", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
         /// What is wrong.
         what: String,
     },
-    /// More components, features or readers than can be addressed.
+    /// A size overflows.
     #[error(
-        "a mixture of {elements} elements and {dimension} features for {readers} readers cannot be shared: its size overflows"
+        "cannot share a mixture of {elements} elements and {dimension} features with {readers} readers: its size overflows"
     )]
     TooLarge {
         /// Elements.
@@ -72,57 +72,55 @@ pub enum SharedMixtureError {
         /// Readers.
         readers: u32,
     },
-    /// A version that has not the components of the first.
-    #[error(
-        "version {version} has other elements, components or features than the shared mixture was made for"
-    )]
+    /// A version of another shape.
+    #[error("version {version} does not match the elements, components or features of the shared mixture")]
     Shape {
         /// The version.
         version: u64,
     },
-    /// More versions alive than there is room for.
+    /// Too many live versions.
     #[error(
-        "version {version} cannot be published: {living} versions of the mixture are still in use in this process, no more fit; \
-         this is a leak, since a walker needs one"
+        "cannot publish version {version}: {living} versions of the mixture are still in use in this process, which is the limit; \
+         this is a leak, since each walker needs only one"
     )]
     TooManyVersions {
         /// The version.
         version: u64,
-        /// How many are alive.
+        /// Number of live versions.
         living: usize,
     },
-    /// A reader beyond those that the file has slots for.
-    #[error("no slot for reader {reader}: the shared mixture was made for {readers}, counted from 0")]
+    /// A reader number without a slot.
+    #[error("no slot for reader {reader}: the shared mixture has {readers} slots, counted from 0")]
     NoSlot {
         /// The reader.
         reader: u32,
         /// Number of slots.
         readers: u32,
     },
-    /// Two readers of one number.
+    /// The slot is in use.
     #[error(
-        "reader {reader} is open already, by process {process}; if that process is dead it must be released first"
+        "reader {reader} is already open in process {process}; if that process is dead, release its slot first"
     )]
-    Taken {
+    SlotTaken {
         /// The reader.
         reader: u32,
-        /// Process id of the one that has the slot.
+        /// Process id of the owner.
         process: u64,
     },
-    /// A version that nobody keeps any more, or that was never published.
+    /// The version was never published, or has been removed.
     #[error(
-        "version {version} of the mixture is not in shared memory (the newest is {newest}); ask for another turn"
+        "version {version} of the mixture is not in shared memory (the newest is {newest}); request another assignment"
     )]
-    Gone {
+    VersionNotFound {
         /// The version.
         version: u64,
-        /// The newest.
+        /// The newest version.
         newest: u64,
     },
-    /// A block whose numbers do not make a component.
+    /// A block that is not a valid component.
     #[error(transparent)]
     Component(#[from] ComponentError),
-    /// Components that do not make a mixture.
+    /// Components that do not form a mixture.
     #[error(transparent)]
     Mixture(#[from] MixtureError),
 }

@@ -1,4 +1,4 @@
-//! A reader: a walker's process.
+//! The reader, used by walkers.
 
 use std::fmt;
 use std::fs::OpenOptions;
@@ -8,28 +8,28 @@ use std::sync::atomic::Ordering;
 
 use calm::{ChangedComponent, Component, Mixture};
 
-use super::control::Control;
+use super::block_reader::{BlockReader, Slot};
 use super::error::SharedMixtureError;
+use super::index::MixtureIndex;
 use super::layout::Layout;
-use super::lender::{Lender, Slot};
-use super::protocol::{NONE, Pinned, Word};
+use super::pinning::{NONE, Pinned, Word};
 
-/// The shared mixture as one reader sees it.
+/// The shared mixture as seen by one reader.
 ///
-/// The reader itself keeps the version it pinned last, so that the next one needs only what changed.
+/// Keeps the last pinned version, so that pinning the next one reads only the changed components.
 #[derive(Debug)]
 pub struct MixtureReader {
-    lender: Lender,
+    block_reader: BlockReader,
     current: Option<Current>,
 }
 
-/// A version as it was made from its row.
+/// A version and its row.
 struct Current {
     mixture: Arc<Mixture>,
     row: Vec<u32>,
 }
 
-/// Without its numbers.
+/// Omits the numbers.
 impl fmt::Debug for Current {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Current").field("version", &self.mixture.version()).finish_non_exhaustive()
@@ -37,10 +37,10 @@ impl fmt::Debug for Current {
 }
 
 impl MixtureReader {
-    /// Opens the shared mixture as reader number `reader`, counted from 0. Each number is for one reader at a time.
+    /// Opens the shared mixture as reader number `reader`, counted from 0. Only one reader can use a number at a time.
     ///
     /// # Errors
-    /// No such file, another kind of file, a damaged one, a number without a slot or in use.
+    /// The file does not exist, is damaged or another kind of file; or the number has no slot or is in use.
     pub fn open(path: &Path, reader: u32) -> Result<Self, SharedMixtureError> {
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         let file = OpenOptions::new().read(true).write(true).open(path);
@@ -49,42 +49,44 @@ impl MixtureReader {
         if reader >= layout.readers {
             return Err(SharedMixtureError::NoSlot { reader, readers: layout.readers });
         }
-        let control = Control::map(&file, &layout).map_err(|source| failed("map", source))?;
-        let (own, owner) = (std::process::id().into(), control.owner(reader));
+        let index = MixtureIndex::map(&file, &layout).map_err(|source| failed("map", source))?;
+        let (own, owner) = (std::process::id().into(), index.owner(reader));
         if let Err(process) = owner.compare_exchange(0, own, Ordering::AcqRel, Ordering::Acquire) {
-            return Err(SharedMixtureError::Taken { reader, process });
+            return Err(SharedMixtureError::SlotTaken { reader, process });
         }
-        let slot = Arc::new(Slot { control, reader });
-        let lender = Lender { path: path.into(), file, layout, slot, extents: Vec::new() };
-        Ok(Self { lender, current: None })
+        let slot = Arc::new(Slot { index, reader });
+        let block_reader = BlockReader { path: path.into(), file, layout, slot, extents: Vec::new() };
+        Ok(Self { block_reader, current: None })
     }
 
-    /// The highest version published.
+    /// The newest version.
     pub fn newest(&self) -> u64 {
-        self.lender.slot.control.newest().look()
+        self.block_reader.slot.index.newest().load_acquire()
     }
 
-    /// A version, evaluated in place. It stays as it is while anybody has it or a component of it.
+    /// A version, evaluated in place. It remains unchanged while the mixture or one of its components is in use.
     ///
     /// # Errors
-    /// The version is not there (any more), or the file is damaged.
+    /// The version does not exist (any more), or the file is damaged.
     pub fn pin(&mut self, version: u64) -> Result<Arc<Mixture>, SharedMixtureError> {
         if let Some(current) = &self.current
             && current.mixture.version() == version
         {
             return Ok(Arc::clone(&current.mixture));
         }
-        let slot = Arc::clone(&self.lender.slot);
-        let gone = || SharedMixtureError::Gone { version, newest: slot.control.newest().look() };
-        let row = (0..self.lender.layout.rows).find(|&row| slot.control.version(row).look() == version);
-        // A row without a version is not a version.
-        let row = row.filter(|_| version != NONE).ok_or_else(gone)?;
-        let pin = slot.control.pin(slot.reader);
-        let _pinned = Pinned::new(pin, slot.control.version(row), version).ok_or_else(gone)?;
-        let row: Vec<u32> = slot.control.row(row).map(|block| block.load(Ordering::Relaxed)).collect();
+        let slot = Arc::clone(&self.block_reader.slot);
+        let not_found =
+            || SharedMixtureError::VersionNotFound { version, newest: slot.index.newest().load_acquire() };
+        let row =
+            (0..self.block_reader.layout.rows).find(|&row| slot.index.version(row).load_acquire() == version);
+        // An empty row has no version.
+        let row = row.filter(|_| version != NONE).ok_or_else(not_found)?;
+        let pin = slot.index.pin(slot.reader);
+        let _pinned = Pinned::new(pin, slot.index.version(row), version).ok_or_else(not_found)?;
+        let row: Vec<u32> = slot.index.row(row).map(|block| block.load(Ordering::Relaxed)).collect();
         let mixture = match &self.current {
-            Some(current) => following(&mut self.lender, current, &row)?.at_version(version),
-            None => Mixture::new(version, elements(&mut self.lender, &row)?)?,
+            Some(current) => following(&mut self.block_reader, current, &row)?.at_version(version),
+            None => Mixture::new(version, elements(&mut self.block_reader, &row)?)?,
         };
         let mixture = Arc::new(mixture);
         self.current = Some(Current { mixture: Arc::clone(&mixture), row });
@@ -93,25 +95,32 @@ impl MixtureReader {
 }
 
 /// All components of a pinned row.
-fn elements(lender: &mut Lender, row: &[u32]) -> Result<Vec<Vec<Arc<Component>>>, SharedMixtureError> {
+fn elements(
+    block_reader: &mut BlockReader,
+    row: &[u32],
+) -> Result<Vec<Vec<Arc<Component>>>, SharedMixtureError> {
     let mut blocks = row.iter();
-    let shape = lender.layout.shape.clone();
+    let shape = block_reader.layout.shape.clone();
     let elements = (0..).zip(shape).map(|(element, count)| {
         let components = (0..count).zip(blocks.by_ref());
-        components.map(|(slot, &block)| lender.lend((element, slot), block)).collect()
+        components.map(|(slot, &block)| block_reader.component((element, slot), block)).collect()
     });
     elements.collect()
 }
 
-/// The current mixture with the components that have other blocks in a pinned row.
+/// The current mixture with the components whose blocks differ in a pinned row.
 ///
-/// A block that the current version holds cannot have been used anew, so the same number is the same component.
-fn following(lender: &mut Lender, current: &Current, row: &[u32]) -> Result<Mixture, SharedMixtureError> {
-    let blocks = row.iter().zip(&current.row).zip(lender.layout.places());
-    let other = blocks.filter(|((new, old), _)| new != old).map(|((&block, _), place)| (place, block));
+/// A block in use by the current version cannot have been reused, so an equal number means the same component.
+fn following(
+    block_reader: &mut BlockReader,
+    current: &Current,
+    row: &[u32],
+) -> Result<Mixture, SharedMixtureError> {
+    let blocks = row.iter().zip(&current.row).zip(block_reader.layout.component_keys());
+    let other = blocks.filter(|((new, old), _)| new != old).map(|((&block, _), key)| (key, block));
     let other: Vec<_> = other.collect();
     let changed = other.into_iter().map(|((element, slot), block)| {
-        let component = lender.lend((element, slot), block)?;
+        let component = block_reader.component((element, slot), block)?;
         Ok(ChangedComponent { element: element as usize, slot: slot as usize, component })
     });
     let changed = changed.collect::<Result<Vec<_>, SharedMixtureError>>()?;

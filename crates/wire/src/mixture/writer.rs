@@ -1,4 +1,4 @@
-//! The writer: the one process that holds the campaign's lock.
+//! The writer: the process that holds the campaign's lock.
 
 use std::fs::{self, File, OpenOptions};
 use std::os::unix::fs::OpenOptionsExt;
@@ -9,36 +9,36 @@ use std::{fmt, io};
 
 use calm::Mixture;
 
-use super::blocks::{Blocks, SPARE};
-use super::control::Control;
+use super::allocator::{BlockAllocator, SPARE};
 use super::error::SharedMixtureError;
+use super::index::MixtureIndex;
 use super::layout::Layout;
-use super::protocol::{NONE, Word, take_away};
+use super::pinning::{NONE, Word, retire_version};
 
-/// The mixture in shared memory, to be published to. There must be one for a file.
+/// The writer's end of the mixture in shared memory. There must be only one for a file.
 ///
-/// Dropping it leaves the file, which readers may still have open: whoever owns the place removes it.
+/// Dropping it keeps the file, which readers may have open; the owner of the directory removes it.
 pub struct SharedMixture {
     layout: Layout,
-    control: Control,
-    blocks: Blocks,
-    /// What stands in each row.
-    living: Vec<Option<Living>>,
-    /// The newest version and its blocks, in the order of a row: what others are compared with.
+    index: MixtureIndex,
+    blocks: BlockAllocator,
+    /// The version in each row.
+    living: Vec<Option<LiveVersion>>,
+    /// The newest version and its row; new versions are compared with it.
     latest: Option<(Mixture, Vec<u32>)>,
 }
 
 /// A version that readers can pin.
 #[derive(Debug)]
-struct Living {
+struct LiveVersion {
     version: u64,
     /// Block of each component.
     blocks: Vec<u32>,
-    /// Those who have the version in this process, and may have promised it to a reader.
+    /// The published `Arc`s; their holders may have assigned the version to a reader.
     owners: Vec<Weak<Mixture>>,
 }
 
-/// Without its numbers.
+/// Omits the numbers.
 impl fmt::Debug for SharedMixture {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let living: Vec<u64> = self.living.iter().flatten().map(|known| known.version).collect();
@@ -47,22 +47,22 @@ impl fmt::Debug for SharedMixture {
 }
 
 impl SharedMixture {
-    /// Bytes of shared memory for a mixture and so many readers at the start. Components that change while readers
-    /// hold older ones come on top, about 8 D² bytes each.
+    /// Initial shared memory for a mixture and a number of readers, bytes. Components that change while readers use
+    /// older ones need about 8 D² bytes each in addition.
     ///
     /// # Errors
     /// The size overflows.
     pub fn space_needed(mixture: &Mixture, readers: u32) -> Result<u64, SharedMixtureError> {
-        Layout::of(mixture, readers).map(|layout| reserved(&layout))
+        Layout::for_mixture(mixture, readers).map(|layout| reserved(&layout))
     }
 
-    /// Makes the file, for the user alone (mode 0600), with `mixture` as its newest version and slots for `readers`
-    /// readers. A file that is there already is removed: those who have it open keep it for themselves.
+    /// Creates the file, accessible only to the user (mode 0600), with `mixture` as its newest version and slots for
+    /// `readers` readers. Replaces an existing file; processes that have it open keep the old one.
     ///
     /// # Errors
-    /// Too little shared memory, sizes that overflow, a path that cannot be written.
+    /// Too little shared memory, sizes that overflow, or a path that cannot be written.
     pub fn create(path: &Path, mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
-        let layout = Layout::of(mixture, readers)?;
+        let layout = Layout::for_mixture(mixture, readers)?;
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         match fs::remove_file(path) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => {
@@ -72,38 +72,38 @@ impl SharedMixture {
         }
         let file = OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(path);
         let file = file.map_err(|source| failed("create", source))?;
-        let made = Self::fill(&file, path, layout, mixture);
-        if made.is_err() {
+        let created = Self::fill(&file, path, layout, mixture);
+        if created.is_err() {
             let _ = fs::remove_file(path);
         }
-        made
+        created
     }
 
     fn fill(file: &File, path: &Path, layout: Layout, mixture: &Mixture) -> Result<Self, SharedMixtureError> {
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         let copy = file.try_clone().map_err(|source| failed("open", source))?;
         file.set_len(reserved(&layout)).map_err(|source| failed("grow", source))?;
-        let mut blocks = Blocks::new(layout.clone(), copy, path.into());
+        let mut blocks = BlockAllocator::new(layout.clone(), copy, path.into());
         blocks.reserve(0, reserved(&layout))?;
         blocks.grow(initial_blocks(&layout))?;
-        let control = Control::map(file, &layout).map_err(|source| failed("map", source))?;
-        control.clear();
+        let index = MixtureIndex::map(file, &layout).map_err(|source| failed("map", source))?;
+        index.clear();
         let mut living = Vec::new();
         living.resize_with(layout.rows as usize, || None);
-        let mut shared = Self { layout, control, blocks, living, latest: None };
+        let mut shared = Self { layout, index, blocks, living, latest: None };
         let blocks = shared.write(mixture)?;
-        shared.enter(0, mixture, blocks, Vec::new());
+        shared.publish_row(0, mixture, blocks, Vec::new());
         shared.layout.write(file).map_err(|source| failed("write the header", source))?;
         Ok(shared)
     }
 
-    /// Makes `mixture` readable for all readers, and keeps it so while it is the newest or this `Arc` lives: hand a
-    /// reader its number only then, and keep the `Arc` until the reader no longer needs to pin it. A version is
-    /// known by its number: one that is there already is not written again.
+    /// Publishes `mixture` to all readers. It stays available while it is the newest or this `Arc` lives: send its
+    /// version to a reader only afterwards, and keep the `Arc` until the reader no longer needs to pin it. Versions are
+    /// identified by number: publishing an existing one does not write it again.
     ///
     /// # Errors
-    /// Too little shared memory (the versions that were there stay), another shape, or more versions in use at once
-    /// than there are rows for.
+    /// Too little shared memory (existing versions stay available), a mixture of another shape, or more live versions
+    /// than rows.
     pub fn publish(&mut self, mixture: &Arc<Mixture>) -> Result<(), SharedMixtureError> {
         let version = mixture.version();
         if let Some(known) = self.living.iter_mut().flatten().find(|known| known.version == version) {
@@ -121,31 +121,31 @@ impl SharedMixture {
         let living = self.living.len();
         let row = row.ok_or(SharedMixtureError::TooManyVersions { version, living })?;
         let blocks = self.write(mixture)?;
-        self.enter(row, mixture, blocks, vec![Arc::downgrade(mixture)]);
+        self.publish_row(row, mixture, blocks, vec![Arc::downgrade(mixture)]);
         Ok(())
     }
 
-    /// Frees the slot of a reader and all that it held. Its process must be dead, or at least must not touch the mixture
-    /// any more: what it reads from then on may change under its eyes.
+    /// Frees a reader's slot and all its reference counts. Its process must be dead, or must not use the mixture any
+    /// more: what it reads may change afterwards.
     pub fn release(&mut self, reader: u32) {
         if reader < self.layout.readers {
-            self.control.pin(reader).put(NONE);
+            self.index.pin(reader).store_release(NONE);
             self.blocks.release(reader);
-            self.control.owner(reader).store(0, Ordering::Release);
+            self.index.owner(reader).store(0, Ordering::Release);
         }
     }
 
-    /// The block of each component of a version: those of the latest for what did not change, new ones for the rest.
+    /// The row of a version: blocks of the latest version for unchanged components, new blocks for the others.
     fn write(&mut self, mixture: &Mixture) -> Result<Vec<u32>, SharedMixtureError> {
         let (mut row, mut written) = (Vec::with_capacity(self.layout.components as usize), Vec::new());
         let mut latest = self.latest.iter().flat_map(|(latest, blocks)| latest.iter().zip(blocks));
-        for (place, (.., component)) in self.layout.places().zip(mixture.iter()) {
+        for (key, (.., component)) in self.layout.component_keys().zip(mixture.iter()) {
             let block = match latest.next() {
                 Some(((.., same), &block)) if Arc::ptr_eq(same, component) => block,
-                _ => match self.blocks.write(place, mixture.version(), component) {
+                _ => match self.blocks.write(key, mixture.version(), component) {
                     Ok(block) => *written.push_mut(block),
                     Err(error) => {
-                        self.blocks.give_back(written.into_iter());
+                        self.blocks.discard(written.into_iter());
                         return Err(error);
                     }
                 },
@@ -155,53 +155,53 @@ impl SharedMixture {
         Ok(row)
     }
 
-    /// Lets readers see a version, of which the blocks are written, in a free row.
-    fn enter(&mut self, row: usize, mixture: &Mixture, blocks: Vec<u32>, owners: Vec<Weak<Mixture>>) {
+    /// Makes a version whose blocks are written visible to readers, in a free row.
+    fn publish_row(&mut self, row: usize, mixture: &Mixture, blocks: Vec<u32>, owners: Vec<Weak<Mixture>>) {
         let version = mixture.version();
-        self.blocks.refer(&blocks);
-        for (word, &block) in self.control.row(row as u32).zip(&blocks) {
+        self.blocks.incref(&blocks);
+        for (word, &block) in self.index.row(row as u32).zip(&blocks) {
             word.store(block, Ordering::Relaxed);
         }
-        self.control.version(row as u32).put(version);
+        self.index.version(row as u32).store_release(version);
         if self.latest.is_none() || version > self.newest() {
-            self.control.newest().put(version);
+            self.index.newest().store_release(version);
             self.latest = Some((mixture.clone(), blocks.clone()));
         }
-        if let Some(place) = self.living.get_mut(row) {
-            *place = Some(Living { version, blocks, owners });
+        if let Some(entry) = self.living.get_mut(row) {
+            *entry = Some(LiveVersion { version, blocks, owners });
         }
     }
 
-    /// Takes away the versions that nobody in this process has, and frees blocks.
+    /// Removes the versions that are no longer in use in this process, and frees blocks.
     fn retire(&mut self) {
         let newest = self.newest();
-        for (row, place) in self.living.iter_mut().enumerate() {
-            let unowned = |known: &Living| known.owners.iter().all(|owner| owner.strong_count() == 0);
-            let old = place.take_if(|known| {
+        for (row, entry) in self.living.iter_mut().enumerate() {
+            let unowned = |known: &LiveVersion| known.owners.iter().all(|owner| owner.strong_count() == 0);
+            let old = entry.take_if(|known| {
                 known.version != newest
                     && unowned(known)
-                    && take_away(self.control.version(row as u32), known.version, self.control.pins())
+                    && retire_version(self.index.version(row as u32), known.version, self.index.pins())
             });
             if let Some(old) = old {
-                self.blocks.let_go(&old.blocks);
+                self.blocks.decref(&old.blocks);
             }
         }
-        self.blocks.collect();
+        self.blocks.reclaim();
     }
 
     fn newest(&self) -> u64 {
-        self.control.newest().look()
+        self.index.newest().load_acquire()
     }
 }
 
-/// Blocks at the start: one for each component and a few to change. An extent has room for them.
+/// Initial number of blocks: one for each component, and spare ones for changes. An extent has room for them.
 fn initial_blocks(layout: &Layout) -> u32 {
     layout.components.saturating_add(SPARE)
 }
 
-/// Bytes to reserve at the start.
+/// Initial size of the file, which is reserved.
 fn reserved(layout: &Layout) -> u64 {
-    layout.extents_at + layout.holds_bytes + layout.block_at(initial_blocks(layout))
+    layout.extents_at + layout.refcount_bytes + layout.block_at(initial_blocks(layout))
 }
 
 fn has_shape(mixture: &Mixture, layout: &Layout) -> bool {

@@ -1,4 +1,4 @@
-//! Where agents look for the orchestrator: always in one place, or wherever a file says that it is now.
+//! How agents find the orchestrator: at a fixed endpoint, or by an endpoint file.
 
 use std::fmt;
 use std::fs;
@@ -10,53 +10,54 @@ use std::time::Duration;
 use tokio::time::sleep;
 
 use super::NetError;
-use super::door::{Endpoint, EndpointError};
+use super::endpoint::{Endpoint, EndpointError};
 
-/// Between two looks whether the campaign is over.
-const LOOK: Duration = Duration::from_secs(5);
-/// What stands in the file of a campaign that is over.
+/// Interval between checks whether the campaign is over.
+const POLL_INTERVAL: Duration = Duration::from_secs(5);
+/// Content of the endpoint file of a campaign that is over.
 const OVER: &str = "over";
 
-/// Where agents look for the orchestrator.
+/// How agents find the orchestrator.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Address {
-    /// It is always here.
-    At(Endpoint),
-    /// It writes into this file where it is, each time that it is started: `@FILE`.
-    In(PathBuf),
+    /// At this endpoint.
+    Endpoint(Endpoint),
+    /// At the endpoint in this file, which the orchestrator writes at every start: `@FILE`.
+    File(PathBuf),
 }
 
-/// What the orchestrator writes into its file: a line of text.
+/// Content of the endpoint file: one line of text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Announcement {
-    /// It is here.
-    At(Endpoint),
+    /// The orchestrator listens here.
+    Endpoint(Endpoint),
     /// There is no more work.
     Over,
 }
 
 impl Address {
-    /// Where the orchestrator is now, as far as is known.
-    pub(super) fn look(&self) -> Result<Announcement, NetError> {
+    /// The current endpoint of the orchestrator.
+    pub(super) fn resolve(&self) -> Result<Announcement, NetError> {
         let path = match self {
-            Self::At(endpoint) => return Ok(Announcement::At(endpoint.clone())),
-            Self::In(path) => path,
+            Self::Endpoint(endpoint) => return Ok(Announcement::Endpoint(endpoint.clone())),
+            Self::File(path) => path,
         };
         let text = fs::read_to_string(path).map_err(|source| match source.kind() {
-            ErrorKind::NotFound => NetError::Nobody { path: path.clone() },
-            _ => NetError::File { path: path.clone(), source },
+            ErrorKind::NotFound => NetError::EndpointFileMissing { path: path.clone() },
+            _ => NetError::EndpointFile { path: path.clone(), source },
         })?;
-        let found = |_| NetError::Announcement { path: path.clone(), found: text.chars().take(80).collect() };
+        let found =
+            |_| NetError::InvalidAnnouncement { path: path.clone(), found: text.chars().take(80).collect() };
         text.parse().map_err(found)
     }
 
-    /// Waits until the file says that the campaign is over.
-    pub async fn over(&self) {
-        if let Self::At(_) = self {
+    /// Waits until the endpoint file says that the campaign is over. Never returns for a fixed endpoint.
+    pub async fn wait_until_over(&self) {
+        if let Self::Endpoint(_) = self {
             std::future::pending().await
         }
-        while !matches!(self.look(), Ok(Announcement::Over)) {
-            sleep(LOOK).await;
+        while !matches!(self.resolve(), Ok(Announcement::Over)) {
+            sleep(POLL_INTERVAL).await;
         }
     }
 }
@@ -66,23 +67,23 @@ impl FromStr for Address {
 
     fn from_str(text: &str) -> Result<Self, EndpointError> {
         match text.strip_prefix('@').filter(|path| !path.is_empty()) {
-            Some(path) => Ok(Self::In(path.into())),
-            None => Ok(Self::At(text.parse()?)),
+            Some(path) => Ok(Self::File(path.into())),
+            None => Ok(Self::Endpoint(text.parse()?)),
         }
     }
 }
 
 impl From<Endpoint> for Address {
     fn from(endpoint: Endpoint) -> Self {
-        Self::At(endpoint)
+        Self::Endpoint(endpoint)
     }
 }
 
 impl fmt::Display for Address {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::At(endpoint) => endpoint.fmt(f),
-            Self::In(path) => write!(f, "@{}", path.display()),
+            Self::Endpoint(endpoint) => endpoint.fmt(f),
+            Self::File(path) => write!(f, "@{}", path.display()),
         }
     }
 }
@@ -93,7 +94,7 @@ impl FromStr for Announcement {
     fn from_str(text: &str) -> Result<Self, EndpointError> {
         match text.trim_end() {
             OVER => Ok(Self::Over),
-            endpoint => Ok(Self::At(endpoint.parse()?)),
+            endpoint => Ok(Self::Endpoint(endpoint.parse()?)),
         }
     }
 }
@@ -101,7 +102,7 @@ impl FromStr for Announcement {
 impl fmt::Display for Announcement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::At(endpoint) => writeln!(f, "{endpoint}"),
+            Self::Endpoint(endpoint) => writeln!(f, "{endpoint}"),
             Self::Over => writeln!(f, "{OVER}"),
         }
     }
@@ -122,17 +123,17 @@ mod tests {
     }
 
     #[test]
-    fn a_file_says_where_the_orchestrator_is() {
+    fn endpoint_files_are_resolved() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("endpoint");
         let address: Address = format!("@{}", path.display()).parse().unwrap();
-        assert!(matches!(address.look(), Err(NetError::Nobody { .. })));
-        for announcement in [Announcement::At("tcp/node7:4711".parse().unwrap()), Announcement::Over] {
+        assert!(matches!(address.resolve(), Err(NetError::EndpointFileMissing { .. })));
+        for announcement in [Announcement::Endpoint("tcp/node7:4711".parse().unwrap()), Announcement::Over] {
             fs::write(&path, announcement.to_string()).unwrap();
-            assert_eq!(address.look().unwrap(), announcement);
+            assert_eq!(address.resolve().unwrap(), announcement);
         }
         fs::write(&path, "something else\n").unwrap();
-        let error = address.look().unwrap_err().to_string();
+        let error = address.resolve().unwrap_err().to_string();
         assert!(error.contains("something else") && error.contains("tcp/HOST:PORT"), "{error}");
     }
 }

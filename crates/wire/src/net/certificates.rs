@@ -1,5 +1,5 @@
-//! Certificates of a host, looked at before anything listens or connects: zenoh says of a wrong one no more than that it is
-//! unable to connect.
+//! Validation of certificates before listening or connecting. zenoh reports an invalid certificate only as a failed
+//! connection.
 
 mod error;
 #[cfg(test)]
@@ -24,53 +24,53 @@ use x509_parser::prelude::FromDer;
 use x509_parser::time::ASN1Time;
 
 pub use self::error::{CertificateError, CertificateFault};
-use super::door::Side;
+use super::endpoint::Side;
 
-/// A certificate that expires sooner is worth a warning.
-const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
+/// Warn about certificates that expire within this time.
+const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 24 * 3600);
 
-/// Certificates, as PEM files: both sides show one, and each trusts those that the authority has signed.
+/// Certificates as PEM files. Both sides present a certificate, and each trusts those signed by the authority.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tls {
     /// Certificate of the authority.
     pub authority: PathBuf,
-    /// Own certificate.
+    /// Certificate of this host.
     pub certificate: PathBuf,
     /// Its private key.
     pub key: PathBuf,
 }
 
-/// What there is to say of certificates that can be used.
+/// Result of a successful validation.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CheckedTls {
-    /// The names of the own certificate: host names and addresses.
+    /// Host names and addresses in the certificate of this host.
     pub names: Vec<String>,
-    /// What will be wrong before long, a sentence each.
+    /// Warnings about upcoming problems, one sentence each.
     pub warnings: Vec<String>,
 }
 
-/// What the three files hold.
+/// Content of the three files.
 pub(super) struct Credentials {
     /// The authority.
     pub roots: Arc<RootCertStore>,
-    /// The own certificate, then those between it and the authority.
+    /// The certificate of this host, then the intermediate certificates.
     pub chain: Vec<CertificateDer<'static>>,
-    /// The private key of the first.
+    /// The private key of this host's certificate.
     pub key: PrivateKeyDer<'static>,
 }
 
 impl Tls {
-    /// `authority.pem`, `certificate.pem` and `key.pem` of a directory.
-    pub fn in_directory(directory: &Path) -> Self {
+    /// Uses `authority.pem`, `certificate.pem` and `key.pem` in a directory.
+    pub fn from_directory(directory: &Path) -> Self {
         let [authority, certificate, key] =
             ["authority.pem", "certificate.pem", "key.pem"].map(|name| directory.join(name));
         Self { authority, certificate, key }
     }
 
-    /// Checks that an orchestrator can listen with these certificates: that agents can connect to one of the names of its own.
+    /// Checks that an orchestrator can listen with these certificates, so that agents can connect to one of the names.
     ///
     /// # Errors
-    /// As [`Self::check_for_agent`], and a certificate without names.
+    /// See [`Self::check_for_agent`]; also a certificate without names.
     pub fn check_for_orchestrator(&self) -> Result<CheckedTls, CertificateError> {
         self.check(Side::Orchestrator, SystemTime::now())
     }
@@ -78,8 +78,8 @@ impl Tls {
     /// Checks that an agent can connect with these certificates.
     ///
     /// # Errors
-    /// A file that cannot be read or is damaged, a certificate that is not in force now or that the authority has not
-    /// signed, a key of another certificate.
+    /// A file that cannot be read or is damaged, a certificate that is not currently valid or not signed by the
+    /// authority, or a key that belongs to another certificate.
     pub fn check_for_agent(&self) -> Result<CheckedTls, CertificateError> {
         self.check(Side::Agent, SystemTime::now())
     }
@@ -94,7 +94,7 @@ impl Tls {
             for certificate in &certificates {
                 let parsed = parse(path, certificate)?;
                 warnings.extend(
-                    in_force(&parsed, now)
+                    check_validity(&parsed, now)
                         .map_err(|fault| fault.at(path))?
                         .map(|warning| format!("{} {warning}", path.display())),
                 );
@@ -105,7 +105,7 @@ impl Tls {
             .first()
             .ok_or_else(|| CertificateFault::Empty("certificate").at(&self.certificate))?;
         let names = names(&parse(&self.certificate, own)?);
-        self.is_accepted(&credentials, side, &names, now)?;
+        self.check_accepted(&credentials, side, &names, now)?;
         Ok(CheckedTls { names, warnings })
     }
 
@@ -130,8 +130,8 @@ impl Tls {
         }
     }
 
-    /// Asks what the other side will ask of the own certificate.
-    fn is_accepted(
+    /// Validates this host's certificate as the other side will.
+    fn check_accepted(
         &self,
         credentials: &Credentials,
         side: Side,
@@ -145,7 +145,7 @@ impl Tls {
         let fault = |why: String| CertificateFault::Damaged(why).at(&self.authority);
         let accepted = match side {
             Side::Orchestrator => {
-                // A name with a wildcard stands for any.
+                // Any name matches a wildcard.
                 let name = names.iter().find_map(|name| ServerName::try_from(name.replace('*', "host")).ok());
                 let name = name.ok_or_else(|| CertificateFault::NoNames.at(&self.certificate))?;
                 let verifier = WebPkiServerVerifier::builder_with_provider(roots, provider).build();
@@ -179,8 +179,9 @@ impl Tls {
 }
 
 impl CheckedTls {
-    /// Whether agents may call the host by this name: one of the certificate's, with a wildcard for the first label.
-    pub fn is_for(&self, host: &str) -> bool {
+    /// Whether agents can use this name for the host: it is in the certificate, possibly with a wildcard for the first
+    /// label.
+    pub fn is_valid_for(&self, host: &str) -> bool {
         let address = |text: &str| text.parse::<IpAddr>().ok();
         let host = host.trim_start_matches('[').trim_end_matches(']');
         self.names.iter().any(|name| match name.strip_prefix("*.") {
@@ -191,7 +192,7 @@ impl CheckedTls {
     }
 }
 
-/// What does the arithmetic, as zenoh has it.
+/// The same cryptography provider as zenoh's.
 pub(super) fn provider() -> CryptoProvider {
     ring::default_provider()
 }
@@ -227,8 +228,11 @@ fn parse<'a>(
     parsed.map(|(_, parsed)| parsed).map_err(|why| CertificateFault::Damaged(why.to_string()).at(path))
 }
 
-/// What to say of a certificate that expires soon.
-fn in_force(certificate: &X509Certificate<'_>, now: SystemTime) -> Result<Option<String>, CertificateFault> {
+/// Checks the validity period; returns a warning if the certificate expires soon.
+fn check_validity(
+    certificate: &X509Certificate<'_>,
+    now: SystemTime,
+) -> Result<Option<String>, CertificateFault> {
     let since = now.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let now = i64::try_from(since.as_secs()).unwrap_or(i64::MAX);
     let date = |time: ASN1Time| time.to_datetime().date().to_string();
@@ -238,15 +242,15 @@ fn in_force(certificate: &X509Certificate<'_>, now: SystemTime) -> Result<Option
         Err(CertificateFault::NotYet { from: date(validity.not_before) })
     } else if left < 0 {
         Err(CertificateFault::Expired { on: date(validity.not_after) })
-    } else if left < SOON.as_secs().cast_signed() {
+    } else if left < EXPIRY_WARNING.as_secs().cast_signed() {
         let days = left / (24 * 3600);
-        Ok(Some(format!("expires on {}, in {days} days: make another in time", date(validity.not_after))))
+        Ok(Some(format!("expires on {}, in {days} days: renew it in time", date(validity.not_after))))
     } else {
         Ok(None)
     }
 }
 
-/// Host names and addresses.
+/// Host names and addresses of a certificate.
 fn names(certificate: &X509Certificate<'_>) -> Vec<String> {
     let names = certificate.subject_alternative_name().ok().flatten();
     let names = names.iter().flat_map(|names| &names.value.general_names);

@@ -1,4 +1,4 @@
-//! Files that walkers on other hosts need, by the hash of their content.
+//! Files for walkers on other hosts, by the hash of their content.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -6,8 +6,8 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
 
-/// Bytes that travel in one message.
-const PART: u64 = 4 << 20;
+/// Maximum size of the part in one message, bytes.
+const MAX_PART_BYTES: u64 = 4 << 20;
 
 pub(super) struct Files(BTreeMap<String, PathBuf>);
 
@@ -16,12 +16,12 @@ impl Files {
         Self(files)
     }
 
-    /// Length of a file and its bytes from an offset on, as many as fit into a message; `None` if it is none of ours.
+    /// Length of a file, and a part of it starting at an offset; `None` if the campaign has no such file.
     pub(super) fn part(&self, hash: &str, offset: u64) -> io::Result<Option<(u64, Vec<u8>)>> {
         let Some(path) = self.0.get(hash) else { return Ok(None) };
         let file = File::open(path)?;
         let length = file.metadata()?.len();
-        let mut part = vec![0; length.saturating_sub(offset).min(PART) as usize];
+        let mut part = vec![0; length.saturating_sub(offset).min(MAX_PART_BYTES) as usize];
         file.read_exact_at(&mut part, offset)?;
         Ok(Some((length, part)))
     }

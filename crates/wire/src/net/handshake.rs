@@ -1,4 +1,5 @@
-//! Why no link comes about although somebody listens: found by a TLS handshake of our own. zenoh does not tell.
+//! Diagnoses why a connection fails although the other side listens, by a separate TLS handshake: zenoh does not report
+//! the reason.
 
 use std::io::{self, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -10,62 +11,62 @@ use rustls::version::TLS13;
 use rustls::{AlertDescription, CertificateError as Refusal, ClientConfig, ClientConnection};
 
 use super::certificates::{Tls, provider};
-use super::door::Endpoint;
+use super::endpoint::Endpoint;
 
-/// The other side takes so long for a step at most, or is not there.
-const STEP: Duration = Duration::from_secs(5);
-/// Within so long the other side says that it does not accept our certificate.
-const VERDICT: Duration = Duration::from_secs(2);
+/// Timeout of each step of the handshake.
+const STEP_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time within which the other side rejects our certificate, if it does.
+const REJECTION_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Why two hosts will not speak to each other before one of them has another certificate.
+/// A certificate that prevents a connection.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum HandshakeError {
-    /// This host does not believe the orchestrator.
+    /// This host rejects the orchestrator's certificate.
     #[error(
-        "the certificate that the orchestrator shows at {endpoint} cannot be accepted: {why}; give the orchestrator one \
-         for the name by which agents connect, of the authority in {authority} (docs/hosts.md, \"Certificates\")"
+        "the certificate of the orchestrator at {endpoint} is not acceptable: {why}; give the orchestrator one \
+         for the name to which agents connect, signed by the authority in {authority} (docs/hosts.md, \"Certificates\")"
     )]
-    Theirs {
-        /// Where it listens.
+    ServerCertificate {
+        /// Endpoint of the orchestrator.
         endpoint: Endpoint,
-        /// What is wrong with it.
+        /// The reason.
         why: String,
-        /// Whom this host trusts.
+        /// The authority that this host trusts.
         authority: String,
     },
-    /// The orchestrator does not believe this host.
+    /// The orchestrator rejects this host's certificate.
     #[error(
-        "the orchestrator at {endpoint} refuses the certificate in {certificate}: {why}; give this host one that the \
+        "the orchestrator at {endpoint} rejects the certificate in {certificate}: {why}; give this host one that the \
          orchestrator's authority has signed (docs/hosts.md, \"Certificates\")"
     )]
-    Ours {
-        /// Where it listens.
+    ClientCertificate {
+        /// Endpoint of the orchestrator.
         endpoint: Endpoint,
-        /// Its reason.
+        /// The reason.
         why: String,
-        /// The file that it refuses.
+        /// File of the rejected certificate.
         certificate: String,
     },
 }
 
-/// Connects once and says why there can be no link, if that can be told. Blocks for up to some seconds.
+/// Attempts a handshake and returns the certificate error, if there is one. Blocks for up to a few seconds.
 pub(super) fn probe(endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError> {
     let Some((mut connection, mut stream)) = connect(endpoint, tls) else { return Ok(()) };
     while connection.is_handshaking() {
         if let Err(error) = connection.complete_io(&mut stream) {
-            return verdict(&error, endpoint, tls);
+            return classify(&error, endpoint, tls);
         }
     }
-    // The orchestrator looks at our certificate only now, and waits for the first word if it likes it.
-    let said = stream.set_read_timeout(Some(VERDICT)).and_then(|()| {
-        let mut line = rustls::Stream::new(&mut connection, &mut stream);
-        line.flush()?;
-        line.read(&mut [0])
+    // The orchestrator validates our certificate only now; if it accepts it, it waits for data.
+    let result = stream.set_read_timeout(Some(REJECTION_TIMEOUT)).and_then(|()| {
+        let mut tls_stream = rustls::Stream::new(&mut connection, &mut stream);
+        tls_stream.flush()?;
+        tls_stream.read(&mut [0])
     });
-    said.map_or_else(|error| verdict(&error, endpoint, tls), |_| Ok(()))
+    result.map_or_else(|error| classify(&error, endpoint, tls), |_| Ok(()))
 }
 
-/// A connection that has not said anything yet; `None` if nobody is there.
+/// A connection before the handshake; `None` if nobody listens.
 fn connect(endpoint: &Endpoint, tls: &Tls) -> Option<(ClientConnection, TcpStream)> {
     let credentials = tls.load().ok()?;
     let config = ClientConfig::builder_with_provider(Arc::new(provider()))
@@ -77,23 +78,24 @@ fn connect(endpoint: &Endpoint, tls: &Tls) -> Option<(ClientConnection, TcpStrea
     let name = ServerName::try_from(endpoint.plain_host().to_owned()).ok()?;
     let connection = ClientConnection::new(Arc::new(config), name).ok()?;
     let addresses = (endpoint.plain_host(), endpoint.port()).to_socket_addrs().ok()?;
-    let stream = addresses.into_iter().find_map(|address| TcpStream::connect_timeout(&address, STEP).ok())?;
-    stream.set_read_timeout(Some(STEP)).ok()?;
-    stream.set_write_timeout(Some(STEP)).ok()?;
+    let stream =
+        addresses.into_iter().find_map(|address| TcpStream::connect_timeout(&address, STEP_TIMEOUT).ok())?;
+    stream.set_read_timeout(Some(STEP_TIMEOUT)).ok()?;
+    stream.set_write_timeout(Some(STEP_TIMEOUT)).ok()?;
     Some((connection, stream))
 }
 
-/// What an error means: nothing where the line broke, or whoever listens speaks no TLS.
-fn verdict(error: &io::Error, endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError> {
+/// The certificate error behind an I/O error; none if the connection broke or the other side does not use TLS.
+fn classify(error: &io::Error, endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError> {
     let endpoint = endpoint.clone();
     match error.get_ref().and_then(|source| source.downcast_ref::<rustls::Error>()) {
         Some(rustls::Error::InvalidCertificate(why)) => {
             let authority = tls.authority.display().to_string();
-            Err(HandshakeError::Theirs { endpoint, why: in_words(why), authority })
+            Err(HandshakeError::ServerCertificate { endpoint, why: describe(why), authority })
         }
         Some(rustls::Error::AlertReceived(alert)) => {
             let certificate = tls.certificate.display().to_string();
-            let refused = refusal(*alert).map(|why| HandshakeError::Ours {
+            let refused = alert_reason(*alert).map(|why| HandshakeError::ClientCertificate {
                 endpoint,
                 why: why.to_owned(),
                 certificate,
@@ -104,11 +106,11 @@ fn verdict(error: &io::Error, endpoint: &Endpoint, tls: &Tls) -> Result<(), Hand
     }
 }
 
-fn in_words(why: &Refusal) -> String {
+fn describe(why: &Refusal) -> String {
     match why {
-        Refusal::UnknownIssuer | Refusal::BadSignature => "another authority has signed it".to_owned(),
+        Refusal::UnknownIssuer | Refusal::BadSignature => "it is signed by another authority".to_owned(),
         Refusal::NotValidForNameContext { expected, presented } => {
-            let presented: Vec<_> = presented.iter().map(|name| bare(name)).collect();
+            let presented: Vec<_> = presented.iter().map(|name| bare_name(name)).collect();
             format!("it is for {}, not for {}", presented.join(", "), expected.to_str())
         }
         Refusal::Expired | Refusal::ExpiredContext { .. } => {
@@ -122,16 +124,16 @@ fn in_words(why: &Refusal) -> String {
 }
 
 /// The name in `DnsName("head")`.
-fn bare(name: &str) -> &str {
+fn bare_name(name: &str) -> &str {
     let inside = name.split_once('(').and_then(|(_, rest)| rest.strip_suffix(')'));
     inside.unwrap_or(name).trim_matches('"')
 }
 
-/// What an alert says of our certificate, if it speaks of that.
-fn refusal(alert: AlertDescription) -> Option<&'static str> {
+/// The reason given by an alert, if it concerns our certificate.
+fn alert_reason(alert: AlertDescription) -> Option<&'static str> {
     match alert {
         AlertDescription::UnknownCA | AlertDescription::DecryptError => {
-            Some("another authority has signed it")
+            Some("it is signed by another authority")
         }
         AlertDescription::CertificateExpired => {
             Some("it has expired or is not valid yet, or a clock is wrong")
@@ -140,7 +142,7 @@ fn refusal(alert: AlertDescription) -> Option<&'static str> {
         | AlertDescription::UnsupportedCertificate
         | AlertDescription::CertificateUnknown
         | AlertDescription::CertificateRevoked
-        | AlertDescription::AccessDenied => Some("it is not acceptable there"),
+        | AlertDescription::AccessDenied => Some("it is not acceptable"),
         _ => None,
     }
 }

@@ -1,94 +1,95 @@
-//! What agents ask the orchestrator, and its answers: control messages (see [`crate::control`]), a candidate beside an
-//! offer as over shared memory.
+//! Requests of agents and their answers, encoded as control messages (see [`crate::control`]). Candidates are attached
+//! to offers as over shared memory.
 
 use serde::{Deserialize, Serialize};
 
-use super::changes::Changes;
-use crate::exchange::message::{Answer, Caller, Letter};
+use super::delta::MixtureDelta;
+use crate::protocol::message::{Answer, Envelope, SenderId};
 
-/// The orchestrator answers under this key.
+/// Key under which the orchestrator answers.
 pub(super) const ORCHESTRATOR: &str = "calmwalk/orchestrator";
-/// The signs of life of agents: `calmwalk/agents/ID`.
+/// Prefix of the liveliness tokens of agents: `calmwalk/agents/ID`.
 pub(super) const AGENTS: &str = "calmwalk/agents";
 
-/// Tells an agent from all others, also from one of the same host or before a restart: 32 hexadecimal digits.
+/// Id of an agent, 32 hexadecimal digits. Different for each agent on a host and for each start.
 pub type AgentId = String;
 
-/// Who wants to take part.
+/// An agent.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Agent {
-    /// Made up at its start.
+    /// Random id, created at its start.
     pub id: AgentId,
-    /// Name of its host, for people.
+    /// Name of its host, for display.
     pub host: String,
-    /// Its process there.
+    /// Process id.
     pub pid: u32,
-    /// Version of its program.
+    /// Version of calmwalk.
     pub program_version: String,
-    /// Turns that it works on at the same time.
+    /// Number of walkers.
     pub walkers: u32,
-    /// Turns that it takes beyond those.
-    pub ahead: u32,
+    /// Number of additional assignments to prefetch.
+    pub prefetch: u32,
 }
 
 impl Agent {
-    /// Turns that it may have in hand.
+    /// Maximum number of assignments of the agent.
     pub fn slots(&self) -> u32 {
-        self.walkers.saturating_add(self.ahead)
+        self.walkers.saturating_add(self.prefetch)
     }
 }
 
 #[derive(Serialize, Deserialize)]
 pub(super) enum Request<'a> {
-    /// May I take part?
+    /// Joins the campaign.
     Join(Agent),
-    /// About a slot: what a walker says.
+    /// A walker's message about a slot.
     #[serde(borrow)]
-    Letter(Letter<'a>),
-    /// About a slot, in place of an offer: the walker that worked on its turn is no more.
-    Lost { caller: Caller, sequence: u64, fault: bool },
-    /// The mixture of this version: what differs from the one that is there already, but for the first so many components.
+    Envelope(Envelope<'a>),
+    /// Replaces an offer: the walker that worked on the slot's assignment has exited.
+    Lost { sender: SenderId, sequence: u64, crashed: bool },
+    /// Requests mixture version `wanted`, as a delta to version `have`, without the first `skip` components.
     Mixture { session: u64, have: Option<u64>, wanted: u64, skip: u32 },
-    /// A part of a file that walkers need.
+    /// Requests a part of a file for walkers.
     File { session: u64, hash: String, offset: u64 },
-    /// Are you there, and am I to go on?
-    Here { session: u64 },
-    /// I leave; turns in my hands are free.
+    /// Asks whether the orchestrator is alive and whether to stop.
+    Ping { session: u64 },
+    /// Leaves and returns all assignments.
     Leave { session: u64, id: AgentId },
 }
 
 #[derive(Serialize, Deserialize)]
 pub(super) enum Reply<'a> {
     #[serde(borrow)]
-    Joined(Place<'a>),
-    /// To a letter or a loss.
+    Joined(JoinReply<'a>),
+    /// Answer to an envelope or a loss.
     Answer(Answer<'a>),
     #[serde(borrow)]
-    Mixture(Changes<'a>),
+    Mixture(MixtureDelta<'a>),
     File {
         length: u64,
         #[serde(serialize_with = "crate::bytes::serialize")]
         part: &'a [u8],
     },
-    Here {
+    Pong {
         stopping: bool,
     },
     Left,
-    /// Not from you: you have been taken for dead, or this is another run of the orchestrator. Join anew.
-    Stranger(String),
-    /// This cannot be answered.
-    Refused(String),
+    /// The sender is unknown: the agent was considered lost, or this is another run of the orchestrator. It must join
+    /// again.
+    RejoinRequired(String),
+    /// The request cannot be answered.
+    Rejected(String),
 }
 
-/// A place among the walkers.
+/// Answer to an agent that has joined.
 #[derive(Serialize, Deserialize)]
-pub(super) struct Place<'a> {
+pub(super) struct JoinReply<'a> {
     pub session: u64,
     /// Number of the first slot; the others follow.
     pub first_slot: u32,
-    /// The mixture now.
+    /// Current mixture version.
     pub mixture_version: u64,
-    /// What walkers are started with.
+    /// Configuration for starting walkers.
     #[serde(serialize_with = "crate::bytes::serialize")]
     pub setup: &'a [u8],
 }

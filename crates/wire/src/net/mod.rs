@@ -1,100 +1,102 @@
-//! The transport between hosts, on [zenoh](https://zenoh.io): an orchestrator with a [`Hub`], on every other host an
-//! agent with an [`Uplink`].
+//! The transport between hosts, on [zenoh](https://zenoh.io). The orchestrator has an [`AgentServer`]; every other host
+//! runs an agent with an [`AgentClient`].
 //!
-//! An agent takes part with a number of *slots*: to the reactor each is a walker like those of its own host. What an
-//! agent and the orchestrator say to each other about a slot is what a walker says over shared memory
-//! (`crate::exchange`): offers that are counted and idempotent, answers that come after the commit.
+//! An agent has a number of *slots*. To the reactor, each slot is a walker like those of its own host. Agent and
+//! orchestrator exchange the same messages about a slot as walkers do over shared memory (`crate::protocol`): numbered,
+//! idempotent offers, and answers after the commit.
 //!
-//! - **zenoh promises nothing across a break**, so everything is a question with an answer, asked again until there is
-//!   one. Nothing is published that somebody needs.
-//! - **The mixture travels by components:** only those in which the agent's newest version differs from the one that it needs.
-//! - **Who is taken for dead stays dead.** An agent whose sign of life (a liveliness token) is gone for longer than the
-//!   orchestrator's patience loses its slots, and their walks go to others. Their numbers are never used again: if it comes back, it
-//!   joins anew.
-//! - **Explicit endpoints, no scouting.** Off loopback nothing listens or connects without TLS with certificates on both sides.
+//! - **Every message is a request** that is repeated until it is answered, since zenoh guarantees nothing across a
+//!   broken link. Published messages are never relied on.
+//! - **The mixture is sent as a delta:** only the components in which the agent's newest version differs from the one
+//!   it needs.
+//! - **A lost agent stays lost.** If an agent's heartbeat (a liveliness token) is missing for longer than the timeout,
+//!   the agent loses its slots, and their walks go to others. Slot numbers are never reused: an agent that comes back
+//!   joins again.
+//! - **Explicit endpoints, no scouting.** Except on loopback, listening and connecting require TLS with certificates on
+//!   both sides.
 
 mod address;
+mod agent_client;
+mod agent_server;
 mod certificates;
-mod changes;
-mod desk;
-mod door;
+mod delta;
+mod endpoint;
 mod files;
 mod handshake;
-mod hub;
 mod message;
-mod roster;
+mod registry;
+mod session;
 mod slot;
-mod uplink;
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
 pub use address::{Address, Announcement};
+pub use agent_client::{AgentClient, LinkError, Membership};
+pub use agent_server::{AgentEvent, AgentServer, AgentServerHandle};
 pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
-pub use changes::ChangesError;
-pub use door::{Endpoint, EndpointError};
+pub use delta::DeltaError;
+pub use endpoint::{Endpoint, EndpointError};
 pub use handshake::HandshakeError;
-pub use hub::{AgentEvent, Handle, Hub};
 pub use message::{Agent, AgentId};
-pub use slot::{Slot, Told};
-pub use uplink::{Joined, Parted, Uplink};
+pub use slot::{Slot, SlotReport};
 
-/// What agents need to know of a campaign.
+/// What agents need to know about a campaign.
 #[derive(Clone, Debug, Default)]
-pub struct Welcome {
-    /// What walkers are started with.
+pub struct AgentBootstrap {
+    /// Configuration for starting walkers.
     pub setup: Vec<u8>,
-    /// Files that they read, by the BLAKE3 hash of their content (64 hexadecimal digits).
+    /// Files that walkers read, by the BLAKE3 hash of their content (64 hexadecimal digits).
     pub files: BTreeMap<String, PathBuf>,
 }
 
-/// Why there is no line between hosts.
+/// Why two hosts cannot communicate.
 #[derive(Debug, thiserror::Error)]
 pub enum NetError {
-    /// Anybody could connect.
+    /// The endpoint is reachable by anyone.
     #[error(
-        "{endpoint} can be reached from other hosts, and nothing does that without certificates: \
-         name a directory with authority.pem, certificate.pem and key.pem (docs/hosts.md says how they are made), or use \
-         a loopback address, through an ssh tunnel for instance"
+        "{endpoint} can be reached from other hosts, which requires certificates: \
+         name a directory with authority.pem, certificate.pem and key.pem (see docs/hosts.md), or use \
+         a loopback address, for example through an ssh tunnel"
     )]
     Unprotected {
         /// The endpoint.
         endpoint: Endpoint,
     },
-    /// A certificate or key of this host.
+    /// An unusable certificate or key of this host.
     #[error(transparent)]
     Certificate(#[from] CertificateError),
-    /// A certificate that one side does not accept.
+    /// A certificate that one side rejects.
     #[error(transparent)]
     Handshake(#[from] HandshakeError),
-    /// The file that says where the orchestrator is.
+    /// The endpoint file cannot be read.
     #[error("cannot read {}: {source}", path.display())]
-    File {
+    EndpointFile {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The error.
         source: std::io::Error,
     },
-    /// No orchestrator has said where it is.
-    #[error("no orchestrator has written yet where it is: there is no file {}", path.display())]
-    Nobody {
+    /// The endpoint file does not exist.
+    #[error("endpoint file not found: {}; has `calmwalk run --announce` started?", path.display())]
+    EndpointFileMissing {
         /// The file.
         path: PathBuf,
     },
-    /// The orchestrator has written that there is no more work.
+    /// The endpoint file says that the campaign is over.
     #[error("the campaign is over")]
-    Over,
-    /// A file that does not say where the orchestrator is.
+    CampaignOver,
+    /// The endpoint file has invalid content.
     #[error(
-        "{} does not say where the orchestrator is: expected tcp/HOST:PORT, found {found:?}; \
+        "{} is not an endpoint file: expected tcp/HOST:PORT, found {found:?}; \
          calmwalk run --announce writes such a file",
         path.display()
     )]
-    Announcement {
+    InvalidAnnouncement {
         /// The file.
         path: PathBuf,
-        /// How it begins.
+        /// The beginning of its content.
         found: String,
     },
     /// zenoh cannot listen or connect.
@@ -102,13 +104,13 @@ pub enum NetError {
     Open {
         /// The endpoint.
         endpoint: Endpoint,
-        /// What zenoh says.
+        /// The error of zenoh.
         why: String,
     },
-    /// zenoh has ended.
-    #[error("the line between hosts has ended: {why}")]
-    Ended {
-        /// What zenoh says.
+    /// The zenoh session was closed.
+    #[error("the connection between hosts was closed: {why}")]
+    SessionClosed {
+        /// The error of zenoh.
         why: String,
     },
 }

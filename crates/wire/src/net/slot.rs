@@ -1,123 +1,129 @@
-//! The conversation about one turn that an agent has in hand.
+//! A slot of an agent: the exchange of reports and assignments for one walk at a time.
 
 use std::borrow::Cow;
 use std::sync::Arc;
 
 use tokio::time::Instant;
 
+use super::agent_client::{LinkError, Membership, decode_reply, delay_retry};
 use super::message::{Reply, Request};
-use super::uplink::{Joined, Parted, pause, read};
 use crate::block::CandidateBlock;
-use crate::control::{EncodedReport, checked_assignment, seal};
-use crate::exchange::message::{Answer, Caller, Decision, Letter, Words};
+use crate::control::{EncodedReport, checked_assignment, encode};
 use crate::ids::WalkId;
 use crate::messages::{Outcome, Progress, Report};
-use crate::transport::Work;
+use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
+use crate::transport::WorkItem;
 
-/// A place for one turn at a time.
+/// A slot for one assignment at a time.
 #[derive(Debug)]
 pub struct Slot {
-    caller: Caller,
+    sender: SenderId,
     sequence: u64,
 }
 
-/// What came of the last turn of a slot.
+/// Result of a slot's last assignment.
 #[derive(Clone, Debug)]
-pub enum Told {
-    /// There was none.
-    Nothing,
-    /// This.
+pub enum SlotReport {
+    /// There was no assignment.
+    Empty,
+    /// The walker's report.
     Report(Report),
-    /// The walker that worked on it is no more.
+    /// The walker has exited.
     Lost {
-        /// By its own fault: the turn may do the same to the next one.
-        fault: bool,
+        /// Whether it crashed: the assignment may crash the next walker as well.
+        crashed: bool,
     },
 }
 
 impl Slot {
     pub(super) fn new(session: u64, number: u32) -> Self {
-        Self { caller: Caller { session, walker: number, incarnation: 1 }, sequence: 0 }
+        Self { sender: SenderId { session, walker: number, incarnation: 1 }, sequence: 0 }
     }
 
-    /// Delivers what came of the last turn and waits for the next, through every break of the line; `None` when there is no
-    /// more work. What was told is safe once this has returned.
+    /// Delivers the last report and waits for the next assignment, across broken links. Returns `None` when there is no
+    /// more work. The report is committed once this has returned `Ok`.
     ///
     /// # Errors
-    /// This agent has no place any more.
-    pub async fn exchange(&mut self, joined: &Joined, told: &Told) -> Result<Option<Work>, Parted> {
+    /// The agent must join again, or the orchestrator's answer is invalid.
+    pub async fn exchange(
+        &mut self,
+        membership: &Membership,
+        report: &SlotReport,
+    ) -> Result<Option<WorkItem>, LinkError> {
         self.sequence += 1;
-        let (offer, candidate) = self.offer(told);
-        let question = seal(&Request::Letter(self.letter(Words::Ask { sequence: self.sequence })));
+        let (offer, candidate) = self.offer(report);
+        let poll = encode(&Request::Envelope(self.envelope(Payload::Poll { sequence: self.sequence })));
         let mut offered = false;
         loop {
-            let asked = Instant::now();
+            let sent_at = Instant::now();
             let answer = if offered {
-                joined.uplink().ask(&question, None).await
+                membership.client().send_once(&poll, None).await
             } else {
-                joined.uplink().ask(&offer, candidate).await
+                membership.client().send_once(&offer, candidate).await
             };
-            // Whether it came or not is known by asking.
+            // Whether the offer arrived is found out by polling.
             offered = true;
             let Some(answer) = answer else {
-                pause(asked).await;
+                delay_retry(sent_at).await;
                 continue;
             };
-            let Reply::Answer(Answer { sequence, decision }) = read(&answer)? else {
-                return Err(Parted::Unreadable("it does not answer an offer".to_owned()));
+            let Reply::Answer(Answer { sequence, body }) = decode_reply(&answer)? else {
+                return Err(LinkError::InvalidReply("it is not an answer to an offer".to_owned()));
             };
             if sequence != self.sequence {
-                return Err(Parted::Unreadable(format!(
+                return Err(LinkError::InvalidReply(format!(
                     "it answers offer {sequence}, not {}",
                     self.sequence
                 )));
             }
-            match decision {
-                Decision::Turn { mixture_version, assignment } => {
+            match body {
+                AnswerBody::Assignment { mixture_version, assignment } => {
                     let assignment = checked_assignment(assignment.into_owned())?;
-                    let mixture = joined.mixture(mixture_version).await?;
-                    return Ok(Some(Work { assignment, mixture }));
+                    let mixture = membership.mixture(mixture_version).await?;
+                    return Ok(Some(WorkItem { assignment, mixture }));
                 }
-                Decision::Home => return Ok(None),
-                Decision::Wait => pause(asked).await,
-                Decision::Unknown => offered = false,
+                AnswerBody::Shutdown => return Ok(None),
+                AnswerBody::Pending => delay_retry(sent_at).await,
+                AnswerBody::Unknown => offered = false,
             }
         }
     }
 
-    /// Tells those who watch where a walk stands. May be lost.
+    /// Sends the current state of a walk, for display. May be lost.
     pub fn progress(
         &self,
-        joined: Arc<Joined>,
+        membership: Arc<Membership>,
         walk: WalkId,
         progress: Progress,
     ) -> impl Future<Output = ()> + Send + use<> {
-        let letter = self.letter(Words::Progress(walk, Cow::Owned(progress)));
-        let request = seal(&Request::Letter(letter));
-        async move { drop(joined.uplink().ask(&request, None).await) }
+        let envelope = self.envelope(Payload::Progress(walk, Cow::Owned(progress)));
+        let request = encode(&Request::Envelope(envelope));
+        async move { drop(membership.client().send_once(&request, None).await) }
     }
 
-    fn letter<'a>(&self, words: Words<'a>) -> Letter<'a> {
-        Letter { caller: self.caller, words }
+    fn envelope<'a>(&self, payload: Payload<'a>) -> Envelope<'a> {
+        Envelope { sender: self.sender, payload }
     }
 
-    fn offer<'a>(&self, told: &'a Told) -> (Vec<u8>, Option<&'a [u8]>) {
-        let (caller, sequence) = (self.caller, self.sequence);
-        match told {
-            Told::Nothing => {
-                let words = Words::Offer { sequence, report: None };
-                (seal(&Request::Letter(self.letter(words))), None)
+    fn offer<'a>(&self, slot_report: &'a SlotReport) -> (Vec<u8>, Option<&'a [u8]>) {
+        let (sender, sequence) = (self.sender, self.sequence);
+        match slot_report {
+            SlotReport::Empty => {
+                let payload = Payload::Offer { sequence, report: None };
+                (encode(&Request::Envelope(self.envelope(payload))), None)
             }
-            Told::Report(report) => {
+            SlotReport::Report(report) => {
                 let encoded = EncodedReport::new(report, |block| block.view().id());
-                let words = Words::Offer { sequence, report: Some(encoded) };
+                let payload = Payload::Offer { sequence, report: Some(encoded) };
                 let candidate = match &report.outcome {
                     Outcome::Candidate(block) => Some(CandidateBlock::as_bytes(block)),
                     _ => None,
                 };
-                (seal(&Request::Letter(self.letter(words))), candidate)
+                (encode(&Request::Envelope(self.envelope(payload))), candidate)
             }
-            Told::Lost { fault } => (seal(&Request::Lost { caller, sequence, fault: *fault }), None),
+            SlotReport::Lost { crashed } => {
+                (encode(&Request::Lost { sender, sequence, crashed: *crashed }), None)
+            }
         }
     }
 }

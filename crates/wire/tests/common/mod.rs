@@ -1,11 +1,11 @@
-//! Candidates of any content.
+//! Strategies for arbitrary candidates.
 use atoms::{Cell, Species, Structure, Vec3};
 use proptest::array::{uniform3, uniform9, uniform16};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
-/// Any 64 bits as a number: NaNs with their payloads, infinities, subnormal numbers, −0.
+/// Any 64 bits as a number: NaNs with payload, infinities, subnormal numbers, −0.
 pub fn any_bits() -> impl Strategy<Value = f64> {
     any::<u64>().prop_map(f64::from_bits)
 }
@@ -26,7 +26,7 @@ fn vectors(n: usize) -> impl Strategy<Value = Vec<Vec3>> {
     vec(uniform3(any_bits()), n)
 }
 
-/// A structure of `n` atoms whose numbers may be anything.
+/// A structure of `n` atoms with arbitrary numbers.
 fn any_structure(n: usize) -> impl Strategy<Value = Structure> {
     (vec(species(), n), vectors(n), uniform9(any_bits()), uniform3(any::<bool>())).prop_map(
         |(species, positions, cell, periodic)| Structure {
@@ -38,7 +38,7 @@ fn any_structure(n: usize) -> impl Strategy<Value = Structure> {
     )
 }
 
-/// A structure that can be used.
+/// A valid structure.
 pub fn usable_structure() -> impl Strategy<Value = Structure> {
     (1..6_usize).prop_flat_map(|n| {
         let positions = vec(uniform3(-9.0..9.0), n);
@@ -55,7 +55,7 @@ fn rows(m: [f64; 9]) -> [[f64; 3]; 3] {
     std::array::from_fn(|i| std::array::from_fn(|k| m[3 * i + k]))
 }
 
-/// A candidate of 1 to 5 atoms with 0 to 3 features each.
+/// A candidate of 1 to 5 atoms with 0 to 3 features per atom.
 pub fn candidate() -> impl Strategy<Value = Candidate> {
     (1..6_usize, 0..4_usize).prop_flat_map(|(n, dimension)| {
         let place =
@@ -66,7 +66,7 @@ pub fn candidate() -> impl Strategy<Value = Candidate> {
             |(place, numbers, structure, forces, (gamma, gamma_nbr, features))| {
                 let (campaign, walk, segment, step, origin, mixture_version) = place;
                 let (temperature, relative_volume, energy, virial) = numbers;
-                let content = ContentHash::of(&structure);
+                let content = ContentHash::from_structure(&structure);
                 let (campaign, walk) = (CampaignId(campaign), WalkId(walk));
                 Candidate {
                     id: CandidateId { campaign, walk, segment, step, content },

@@ -1,139 +1,143 @@
-//! Messages that are lost and processes that die.
+//! Lost messages and dead processes.
 
 use std::process::Child;
 use std::time::Duration;
 
-use wire::place::Place;
+use wire::shm_dir::ShmDir;
 use wire::transport::Incoming;
 
-use super::desk::{Desk, check, files_of, work};
 use super::process::{AT_WORK, Role, start};
+use super::test_server::{TestServer, check, files_of, work};
 
 fn kill(child: &mut Child) {
     child.kill().unwrap();
     child.wait().unwrap();
 }
 
-/// The walker speaks before it is expected, and is not heard: as if its offer had been lost.
+/// The walker sends its offer before it is expected. The offer is rejected, as if it had been lost.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_lost_offer_is_found_by_asking() {
+async fn lost_offers_are_found_by_polling() {
     let directory = tempfile::tempdir().unwrap();
-    let mut desk = Desk::open(directory.path(), 1, 1 << 16);
-    let mut walker = start(&Role::Walker(desk.handle.door(0, 1)));
-    while desk.handle.traffic().dropped == 0 {
+    let mut server = TestServer::open(directory.path(), 1, 1 << 16);
+    let mut walker = start(&Role::Walker(server.handle.connect_info(0, 1)));
+    while server.handle.traffic().rejected == 0 {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
-    let reason = desk.handle.traffic().last_dropped.unwrap();
-    assert_eq!(reason, "a message of walker 0, which is not expected");
-    desk.handle.expect(0, 1);
-    let first = desk.offer().await;
-    let last = desk.go_on(first, 1, (3, 4)).await;
+    let reason = server.handle.traffic().last_rejected.unwrap();
+    assert_eq!(reason, "message of unexpected walker 0");
+    server.handle.expect(0, 1);
+    let first = server.offer().await;
+    let last = server.go_on(first, 1, (3, 4)).await;
     last.reply.send(None).unwrap();
     assert!(walker.wait().unwrap().success());
-    desk.close().await;
+    server.close().await;
 }
 
-/// A decision may take longer than a walker waits between two questions: it is the same offer all the while.
+/// A decision may take longer than the walker's poll interval; the offer remains the same.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_slow_decision_is_waited_for() {
+async fn walkers_wait_for_slow_decisions() {
     let directory = tempfile::tempdir().unwrap();
-    let mut desk = Desk::open(directory.path(), 1, 1 << 16);
-    let mut walker = desk.start(0, 1, Role::Walker);
-    let first = desk.offer().await;
-    // An offer and two questions: signs of life.
-    while desk.heard.lock().unwrap().len() < 3 {
+    let mut server = TestServer::open(directory.path(), 1, 1 << 16);
+    let mut walker = server.start(0, 1, Role::Walker);
+    let first = server.offer().await;
+    // An offer and two polls are heartbeats.
+    while server.heard.lock().unwrap().len() < 3 {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
-    assert!(desk.incoming.try_recv().is_err(), "nothing is offered twice");
-    let last = desk.go_on(first, 1, (3, 4)).await;
+    assert!(server.incoming.try_recv().is_err(), "nothing is offered twice");
+    let last = server.go_on(first, 1, (3, 4)).await;
     last.reply.send(None).unwrap();
     assert!(walker.wait().unwrap().success());
-    desk.close().await;
+    server.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_killed_walker_is_replaced() {
     let directory = tempfile::tempdir().unwrap();
-    let mut desk = Desk::open(directory.path(), 2, 1 << 16);
+    let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     for incarnation in 1..8 {
-        // Killed in the middle of a turn.
-        let mut stuck = desk.start(0, incarnation, Role::Stuck);
-        let offer = desk.offer().await;
+        // Killed while working on an assignment.
+        let mut stuck = server.start(0, incarnation, Role::Stuck);
+        let offer = server.offer().await;
         assert_eq!((offer.walker, &offer.report), (0, &None));
         offer.reply.send(Some(work(0, 1, (3, 4)))).unwrap();
-        assert!(matches!(desk.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
+        assert!(matches!(server.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
         kill(&mut stuck);
-        desk.handle.gone(0, incarnation, false);
-        assert!(matches!(desk.next().await, Incoming::Gone { walker: 0, fault: false }));
+        server.handle.lost(0, incarnation, false);
+        assert!(matches!(server.next().await, Incoming::Lost { walker: 0, crashed: false }));
 
-        // Killed while it waits for the answer to a candidate.
-        let mut waiting = desk.start(1, incarnation, Role::Walker);
-        let offer = desk.offer().await;
-        let mut offer = desk.go_on(offer, 1, (3, 4)).await;
+        // Killed while waiting for the answer to a candidate.
+        let mut waiting = server.start(1, incarnation, Role::Walker);
+        let offer = server.offer().await;
+        let mut offer = server.go_on(offer, 1, (3, 4)).await;
         kill(&mut waiting);
-        desk.handle.gone(1, incarnation, true);
-        assert!(matches!(desk.next().await, Incoming::Gone { walker: 1, fault: true }));
+        server.handle.lost(1, incarnation, true);
+        assert!(matches!(server.next().await, Incoming::Lost { walker: 1, crashed: true }));
         check(&offer.report.take().unwrap(), 1, 1, (3, 4));
-        offer.reply.send(None).expect_err("nobody is there to be answered");
+        offer.reply.send(None).expect_err("the walker is dead");
     }
-    let mut walker = desk.start(0, 8, Role::Walker);
-    let offer = desk.offer().await;
-    let offer = desk.go_on(offer, 1, (3, 4)).await;
+    let mut walker = server.start(0, 8, Role::Walker);
+    let offer = server.offer().await;
+    let offer = server.go_on(offer, 1, (3, 4)).await;
     offer.reply.send(None).unwrap();
-    // Its candidate would keep the walker's memory.
+    // Its candidate would keep the walker's memory mapped.
     drop(offer.report);
     assert!(walker.wait().unwrap().success());
-    desk.handle.gone(0, 8, false);
-    assert!(matches!(desk.next().await, Incoming::Gone { walker: 0, fault: false }));
-    assert_eq!(files_of(&desk.place).len(), SERVER_FILES, "{:#?}", files_of(&desk.place));
-    desk.close().await;
+    server.handle.lost(0, 8, false);
+    assert!(matches!(server.next().await, Incoming::Lost { walker: 0, crashed: false }));
+    assert_eq!(files_of(&server.place).len(), SERVER_FILES, "{:#?}", files_of(&server.place));
+    server.close().await;
 }
 
-/// The reactor hears of the last walker's end also if the server is closed at once: others may keep its channel open.
+/// The reactor learns of the last walker's exit even if the server is closed immediately: others may keep its channel
+/// open.
 #[tokio::test(flavor = "multi_thread")]
-async fn an_end_is_told_before_the_server_closes() {
+async fn exits_are_forwarded_before_the_server_closes() {
     let directory = tempfile::tempdir().unwrap();
-    let mut desk = Desk::open(directory.path(), 1, 1 << 16);
-    let mut stuck = desk.start(0, 1, Role::Stuck);
-    desk.offer().await.reply.send(Some(work(0, 1, (3, 4)))).unwrap();
-    assert!(matches!(desk.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
+    let mut server = TestServer::open(directory.path(), 1, 1 << 16);
+    let mut stuck = server.start(0, 1, Role::Stuck);
+    server.offer().await.reply.send(Some(work(0, 1, (3, 4)))).unwrap();
+    assert!(matches!(server.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
     kill(&mut stuck);
-    desk.handle.gone(0, 1, false);
-    desk.handle.close();
-    assert!(matches!(desk.next().await, Incoming::Gone { walker: 0, fault: false }));
-    desk.close().await;
+    server.handle.lost(0, 1, false);
+    server.handle.close();
+    assert!(matches!(server.next().await, Incoming::Lost { walker: 0, crashed: false }));
+    server.close().await;
 }
 
-/// The successor of a dead walker is expected before somebody says that it is dead: nothing of the successor is freed.
+/// A successor is expected before the death of its predecessor is reported: the successor's resources are not freed.
 #[tokio::test(flavor = "multi_thread")]
-async fn late_news_of_a_death_does_no_harm_to_the_successor() {
+async fn late_reports_of_an_exit_do_not_affect_the_successor() {
     let directory = tempfile::tempdir().unwrap();
-    let mut desk = Desk::open(directory.path(), 1, 1 << 16);
-    let mut first = desk.start(0, 1, Role::Stuck);
-    desk.offer().await.reply.send(Some(work(0, 1, (3, 4)))).unwrap();
-    assert!(matches!(desk.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
+    let mut server = TestServer::open(directory.path(), 1, 1 << 16);
+    let mut first = server.start(0, 1, Role::Stuck);
+    server.offer().await.reply.send(Some(work(0, 1, (3, 4)))).unwrap();
+    assert!(matches!(server.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
     kill(&mut first);
 
-    let mut second = desk.start(0, 2, Role::Walker);
-    assert!(matches!(desk.next().await, Incoming::Gone { walker: 0, fault: false }), "of the first, once");
-    let offer = desk.offer().await;
-    desk.handle.gone(0, 1, false);
-    let offer = desk.go_on(offer, 2, (3, 4)).await;
+    let mut second = server.start(0, 2, Role::Walker);
+    assert!(
+        matches!(server.next().await, Incoming::Lost { walker: 0, crashed: false }),
+        "of the first, once"
+    );
+    let offer = server.offer().await;
+    server.handle.lost(0, 1, false);
+    let offer = server.go_on(offer, 2, (3, 4)).await;
     offer.reply.send(None).unwrap();
     assert!(second.wait().unwrap().success());
-    desk.handle.gone(0, 2, true);
-    let gone = desk.next().await;
-    assert!(matches!(gone, Incoming::Gone { walker: 0, fault: true }), "{gone:?}");
-    desk.close().await;
+    server.handle.lost(0, 2, true);
+    let gone = server.next().await;
+    assert!(matches!(gone, Incoming::Lost { walker: 0, crashed: true }), "{gone:?}");
+    server.close().await;
 }
 
 /// Tables of two services, of the server's sockets and data, a counter of processes, and the directory.
 const SERVER_FILES: usize = 7;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_orchestrator_leaves_nothing_that_matters() {
+async fn the_remains_of_a_killed_orchestrator_are_cleaned_up() {
     let directory = tempfile::tempdir().unwrap();
-    let place = Place::of(directory.path()).unwrap();
+    let place = ShmDir::for_campaign(directory.path()).unwrap();
     for _ in 0..2 {
         let mut dead = start(&Role::Orchestrator(directory.path().to_str().unwrap().to_owned()));
         while !directory.path().join(AT_WORK).exists() {
@@ -147,11 +151,11 @@ async fn a_killed_orchestrator_leaves_nothing_that_matters() {
     assert!(left.files > 20 && left.bytes > 50_000, "{left:?}");
     assert_eq!(files_of(&place), [place.directory().display().to_string()]);
 
-    let mut desk = Desk::open(directory.path(), 1, 1 << 16);
-    let mut walker = desk.start(0, 1, Role::Walker);
-    let offer = desk.offer().await;
-    let offer = desk.go_on(offer, 1, (3, 4)).await;
+    let mut server = TestServer::open(directory.path(), 1, 1 << 16);
+    let mut walker = server.start(0, 1, Role::Walker);
+    let offer = server.offer().await;
+    let offer = server.go_on(offer, 1, (3, 4)).await;
     offer.reply.send(None).unwrap();
     assert!(walker.wait().unwrap().success());
-    desk.close().await;
+    server.close().await;
 }

@@ -1,8 +1,8 @@
-//! The transport between processes, with real ones.
+//! The transport between real processes.
 
-mod desk;
 mod exchange;
 mod losses;
-mod places;
 mod process;
-mod strangers;
+mod rejected;
+mod shm_dirs;
+mod test_server;

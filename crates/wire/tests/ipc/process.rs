@@ -1,4 +1,4 @@
-//! The other processes of these tests: this very binary, told by its environment what to be.
+//! Other processes of these tests: this test binary, with a role from its environment.
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -10,29 +10,29 @@ use std::time::Duration;
 use atoms::{Cell, Species, Structure};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
-use wire::ipc::{Door, IpcWalker};
+use wire::ipc::{ConnectInfo, IpcWalker};
 use wire::messages::{Assignment, Outcome, Report};
 use wire::transport::Transport;
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
-use super::desk::Desk;
+use super::test_server::TestServer;
 
 const ROLE: &str = "CALMWALK_TEST_ROLE";
-/// What [`Role::Orchestrator`] makes in its directory when a turn is done.
+/// File that [`Role::Orchestrator`] creates in its directory when an assignment is done.
 pub const AT_WORK: &str = "at-work";
 
-/// What a process is to be.
+/// Role of a process.
 #[derive(Serialize, Deserialize)]
 pub enum Role {
-    /// Ends each turn with [`candidate`] until it is sent home.
-    Walker(Door),
-    /// Takes a turn and never ends it.
-    Stuck(Door),
-    /// An orchestrator of the campaign in that directory with a walker at work.
+    /// Ends each assignment with [`candidate`] until it is shut down.
+    Walker(ConnectInfo),
+    /// Takes an assignment and hangs.
+    Stuck(ConnectInfo),
+    /// An orchestrator of the campaign in this directory, with a busy walker.
     Orchestrator(String),
 }
 
-/// Begins a process.
+/// Starts a process.
 pub fn start(role: &Role) -> Child {
     Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "ipc::process::child", "--ignored", "--nocapture"])
@@ -42,7 +42,7 @@ pub fn start(role: &Role) -> Child {
         .unwrap()
 }
 
-/// No test, but what [`start`] runs.
+/// Not a test: the entry point of processes started by [`start`].
 #[test]
 #[ignore = "run by the others"]
 fn child() {
@@ -55,20 +55,20 @@ fn child() {
     }
 }
 
-fn walk(door: &Door, stuck: bool) {
+fn walk(door: &ConnectInfo, stuck: bool) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).unwrap();
     let mut report = None;
     while let Some(work) = walker.exchange(report.take()) {
-        let Assignment { walk, turn, .. } = work.assignment;
+        let Assignment { walk, number, .. } = work.assignment;
         let candidate = candidate(&work.assignment);
-        let (checkpoint, progress) = (turn.to_le_bytes().to_vec(), progress(turn));
+        let (checkpoint, progress) = (number.to_le_bytes().to_vec(), progress(number));
         walker.progress(walk, progress.clone());
-        assert_eq!(work.mixture.version(), turn, "the version of the turn");
+        assert_eq!(work.mixture.version(), number, "the version of the assignment");
         if stuck {
             sleep(Duration::MAX);
         }
         let outcome = Outcome::Candidate(candidate);
-        report = Some(Report { walk, turn, outcome, checkpoint, progress });
+        report = Some(Report { walk, assignment: number, outcome, checkpoint, progress });
     }
     assert!(walker.failure().is_none(), "{:?}", walker.failure());
 }
@@ -76,12 +76,12 @@ fn walk(door: &Door, stuck: bool) {
 #[expect(clippy::zombie_processes, reason = "killed, and its walker with it")]
 fn orchestrate(directory: &str) {
     tokio::runtime::Runtime::new().unwrap().block_on(async {
-        let mut desk = Desk::open(Path::new(directory), 2, 1 << 16);
-        let _walker = desk.start(0, 1, Role::Walker);
-        let mut last = desk.offer().await;
-        for turn in 1.. {
-            last = desk.go_on(last, turn, (2, 3)).await;
-            if turn == 1 {
+        let mut server = TestServer::open(Path::new(directory), 2, 1 << 16);
+        let _walker = server.start(0, 1, Role::Walker);
+        let mut last = server.offer().await;
+        for number in 1.. {
+            last = server.go_on(last, number, (2, 3)).await;
+            if number == 1 {
                 std::fs::write(Path::new(directory).join(AT_WORK), "").unwrap();
             }
         }
@@ -92,21 +92,21 @@ pub fn progress(step: u64) -> wire::messages::Progress {
     wire::messages::Progress { step, ..Default::default() }
 }
 
-/// A turn at whose end a candidate of so many atoms with so many features is wanted.
-pub fn assignment(walk: u32, turn: u64, (atoms, features): (usize, usize)) -> Assignment {
+/// An assignment that ends with a candidate of this number of atoms and features.
+pub fn assignment(walk: u32, number: u64, (atoms, features): (usize, usize)) -> Assignment {
     let walk = WalkId(walk);
     Assignment {
         campaign: CampaignId([7; 16]),
         walk,
-        turn,
+        number,
         origin: Origin::Biased,
         random_walk: walk,
         seed_structure: structure(atoms),
-        checkpoint: Some(vec![turn as u8; 100]),
+        checkpoint: Some(vec![number as u8; 100]),
         verdict: None,
-        until: features as u64,
-        wanted: Vec::new(),
-        raised: 1.0,
+        last_step: features as u64,
+        frame_steps: Vec::new(),
+        threshold_factor: 1.0,
     }
 }
 
@@ -117,19 +117,19 @@ fn structure(atoms: usize) -> Structure {
     Structure { species, positions, cell, periodic: [true; 3] }
 }
 
-/// The candidate with which a walker of these tests ends this turn.
+/// The candidate that ends this assignment.
 pub fn candidate(assignment: &Assignment) -> Candidate {
-    let Assignment { campaign, walk, turn, ref seed_structure, until: features, .. } = *assignment;
+    let Assignment { campaign, walk, number, ref seed_structure, last_step: features, .. } = *assignment;
     let n = seed_structure.len();
-    let numbers = |count: usize, shift: f64| (0..count).map(|k| k as f64 + shift + turn as f64).collect();
-    let content = ContentHash::of(seed_structure);
+    let numbers = |count: usize, shift: f64| (0..count).map(|k| k as f64 + shift + number as f64).collect();
+    let content = ContentHash::from_structure(seed_structure);
     Candidate {
-        id: CandidateId { campaign, walk, segment: 0, step: turn, content },
+        id: CandidateId { campaign, walk, segment: 0, step: number, content },
         origin: Origin::Biased,
-        mixture_version: turn,
+        mixture_version: number,
         temperature: 300.0,
         relative_volume: 1.0,
-        energy: turn as f64,
+        energy: number as f64,
         virial: [[1.0; 3]; 3],
         structure: seed_structure.clone(),
         forces: vec![[0.5; 3]; n],

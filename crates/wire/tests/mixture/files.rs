@@ -1,4 +1,4 @@
-//! The file: its permissions, damage, lack of memory.
+//! The file: permissions, damage, lack of memory.
 
 use std::fs::{self, OpenOptions};
 use std::os::unix::fs::{FileExt, MetadataExt, PermissionsExt};
@@ -11,7 +11,7 @@ use wire::{MixtureReader, SharedMixture, SharedMixtureError};
 use super::helpers::{check, first, next};
 
 #[test]
-fn the_file_is_the_users_alone_and_as_large_as_announced() {
+fn the_file_is_private_and_has_the_announced_size() {
     let folder = tempdir_in("/dev/shm").unwrap();
     let path = folder.path().join("mixture");
     let shared = SharedMixture::create(&path, &first(), 4).unwrap();
@@ -34,7 +34,7 @@ fn a_new_file_replaces_an_old_one_that_readers_keep() {
 }
 
 #[test]
-fn other_files_are_refused() {
+fn other_files_are_rejected() {
     let folder = tempdir_in("/dev/shm").unwrap();
     let path = folder.path().join("mixture");
     let refused = || MixtureReader::open(&path, 0).unwrap_err();
@@ -51,12 +51,12 @@ fn other_files_are_refused() {
 }
 
 #[test]
-fn no_damage_leads_beyond_the_file() {
+fn damage_never_leads_beyond_the_file() {
     let folder = tempdir_in("/dev/shm").unwrap();
     let path = folder.path().join("mixture");
     let _shared = SharedMixture::create(&path, &first(), 2).unwrap();
     let sound = fs::read(&path).unwrap();
-    // Header and shape: every byte is covered by magic, format or checksum.
+    // Every byte of header and shape is covered by magic, format or checksum.
     for place in 0..52 {
         for bit in [1, 0x80] {
             let mut bytes = sound.clone();
@@ -70,8 +70,8 @@ fn no_damage_leads_beyond_the_file() {
         fs::write(&path, &sound[..length]).unwrap();
         assert!(matches!(MixtureReader::open(&path, 0), Err(SharedMixtureError::Damaged { .. })), "{length}");
     }
-    // The row of version 0 with each block number replaced: another component, another extent, one far away. An extent
-    // has 22 blocks: one for each of six components and 16 to spare.
+    // The row of version 0 with each block number replaced by that of another component, in another extent, or out of
+    // range. An extent has 22 blocks: one for each of six components and 16 spare ones.
     let words = 64 * 3 + 8 * (64 + 4 * 2);
     let row = 4096 + (words as usize).next_multiple_of(64);
     for place in 0..6 {
@@ -88,7 +88,7 @@ fn no_damage_leads_beyond_the_file() {
     }
 }
 
-/// Where the system lets a user mount a file system of their own, a small one is filled to the brim.
+/// Fills a small file system, where the system allows users to mount one.
 #[test]
 fn a_full_file_system_is_an_error() {
     let folder = tempdir_in("/dev/shm").unwrap();
@@ -139,7 +139,7 @@ fn in_a_small_file_system() {
     };
     assert!(matches!(error, SharedMixtureError::Full { free: 0..8192, .. }), "{error}");
     assert!(kept.len() > 10, "{}", kept.len());
-    // What was there is there still, and room made is used.
+    // Existing versions remain, and freed space is used.
     let mut reader = MixtureReader::open(&path, 0).unwrap();
     kept.iter().skip(1).for_each(|mixture| check(&reader.pin(mixture.version()).unwrap()));
     let newest = kept.pop().unwrap();

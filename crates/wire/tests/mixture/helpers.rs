@@ -1,10 +1,10 @@
-//! Mixtures whose contents say which version they belong to.
+//! Mixtures whose numbers encode their version.
 
 use std::sync::Arc;
 
 use calm::{ChangedComponent, Component, Mixture};
 
-/// Features: a block of more than one page.
+/// Number of features; makes a block larger than a page.
 pub const DIMENSION: usize = 24;
 /// Components of each element.
 pub const SHAPE: [usize; 3] = [3, 1, 2];
@@ -25,7 +25,7 @@ impl Random {
     }
 }
 
-/// A component of which every number is `stamp`.
+/// A component in which every number is `stamp`.
 pub fn stamped(stamp: u64) -> Arc<Component> {
     let number = stamp as f64;
     let (centroid, inverse) = (vec![number; DIMENSION], vec![number; DIMENSION * DIMENSION]);
@@ -38,12 +38,12 @@ pub fn first() -> Arc<Mixture> {
     Arc::new(Mixture::new(0, elements.to_vec()).unwrap())
 }
 
-/// Whether a component changes with a version: about every other one does.
+/// Whether a component changes in a version; about every second one does.
 pub fn changes(version: u64, place: usize) -> bool {
     version > 0 && Random(version * 64 + place as u64).below(2) == 0
 }
 
-/// The version at which a component of `version` was made.
+/// The version that introduced a component of `version`.
 pub fn stamp(version: u64, place: usize) -> u64 {
     (0..=version).rev().find(|&version| changes(version, place)).unwrap_or(0)
 }
@@ -58,7 +58,7 @@ pub fn next(mixture: &Mixture) -> Arc<Mixture> {
     Arc::new(mixture.with_changes(&changed).unwrap())
 }
 
-/// Looks at every number of a mixture.
+/// Checks every number of a mixture.
 pub fn check(mixture: &Mixture) {
     assert_eq!(mixture.iter().count(), SHAPE.iter().sum::<usize>());
     for (place, (element, slot, component)) in mixture.iter().enumerate() {

@@ -16,7 +16,7 @@ fn place() -> (TempDir, PathBuf) {
 }
 
 #[test]
-fn what_is_published_is_read() {
+fn published_versions_can_be_read() {
     let (_folder, path) = place();
     let mut mixture = first();
     let mut shared = SharedMixture::create(&path, &mixture, 2).unwrap();
@@ -73,9 +73,9 @@ fn a_version_lives_while_its_arc_does() {
     drop(promised);
     shared.publish(&next(&newest)).unwrap();
     let gone = reader.pin(0);
-    assert!(matches!(gone, Err(SharedMixtureError::Gone { version: 0, newest: 21 })), "{gone:?}");
-    assert!(matches!(reader.pin(7), Err(SharedMixtureError::Gone { version: 7, .. })));
-    assert!(matches!(reader.pin(u64::MAX), Err(SharedMixtureError::Gone { .. })));
+    assert!(matches!(gone, Err(SharedMixtureError::VersionNotFound { version: 0, newest: 21 })), "{gone:?}");
+    assert!(matches!(reader.pin(7), Err(SharedMixtureError::VersionNotFound { version: 7, .. })));
+    assert!(matches!(reader.pin(u64::MAX), Err(SharedMixtureError::VersionNotFound { .. })));
 }
 
 #[test]
@@ -122,20 +122,20 @@ fn a_component_outlives_its_mixture_its_reader_and_the_writer() {
     let mut reader = MixtureReader::open(&path, 0).unwrap();
     let component = Arc::clone(reader.pin(0).unwrap().component(0, 0).unwrap());
     drop(reader);
-    // Enough versions to use every block several times.
+    // Enough versions to reuse every block several times.
     for _ in 0..200 {
         mixture = next(&mixture);
         shared.publish(&mixture).unwrap();
     }
     assert_eq!(component, stamped(0));
     let taken = MixtureReader::open(&path, 0);
-    assert!(matches!(taken, Err(SharedMixtureError::Taken { reader: 0, .. })), "{taken:?}");
+    assert!(matches!(taken, Err(SharedMixtureError::SlotTaken { reader: 0, .. })), "{taken:?}");
     drop((shared, folder));
     assert_eq!(component, stamped(0));
 }
 
 #[test]
-fn a_slot_is_free_again_when_all_is_dropped() {
+fn slots_are_freed_when_everything_is_dropped() {
     let (_folder, path) = place();
     let mixture = first();
     let mut shared = SharedMixture::create(&path, &mixture, 2).unwrap();
@@ -170,7 +170,7 @@ fn the_same_version_is_the_same_mixture_and_unchanged_components_are_shared() {
 }
 
 #[test]
-fn another_shape_is_refused() {
+fn other_shapes_are_rejected() {
     let (_folder, path) = place();
     let mut shared = SharedMixture::create(&path, &first(), 1).unwrap();
     let number = DIMENSION - 1;
@@ -188,7 +188,7 @@ fn another_shape_is_refused() {
 }
 
 #[test]
-fn a_leak_of_versions_is_an_error_that_passes() {
+fn leaking_versions_is_a_recoverable_error() {
     let (_folder, path) = place();
     let mixture = first();
     let mut shared = SharedMixture::create(&path, &mixture, 1).unwrap();
@@ -201,7 +201,7 @@ fn a_leak_of_versions_is_an_error_that_passes() {
         kept.push(mixture);
     };
     assert!(matches!(refused, SharedMixtureError::TooManyVersions { living: 68, .. }), "{refused}");
-    // All of them can still be read, and when one is dropped another fits.
+    // All of them can still be read, and dropping one makes room for another.
     let mut reader = MixtureReader::open(&path, 0).unwrap();
     kept.iter().skip(1).for_each(|mixture| check(&reader.pin(mixture.version()).unwrap()));
     let mixture = next(kept.last().unwrap());

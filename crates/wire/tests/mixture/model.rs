@@ -1,4 +1,4 @@
-//! Any sequence of events against a plain model of what must be readable and how much memory may be taken.
+//! Arbitrary sequences of events, compared with a model of the readable versions and of the memory in use.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -16,23 +16,23 @@ use super::helpers::{DIMENSION, check, first, next, stamp};
 
 const READERS: u32 = 3;
 const COMPONENTS: usize = 6;
-/// Bytes of a block, and of the holds of an extent.
+/// Length of a block, and of the reference counts of an extent.
 const BLOCK: u64 = (64 + 8 * DIMENSION as u64 * (DIMENSION as u64 + 1)).next_multiple_of(4096);
 const HOLDS: u64 = 4096;
-/// Free blocks that may keep their memory.
+/// Number of free blocks that may keep their memory.
 const SPARE: usize = 16;
 
 #[derive(Debug, Clone)]
 enum Event {
-    /// A new version is published; its `Arc` is kept or not.
+    /// Publishes a new version, and keeps its `Arc` or not.
     Publish { keep: bool },
-    /// One of the kept is published again.
+    /// Publishes a kept version again.
     Again(usize),
-    /// One of the kept is dropped.
+    /// Drops a kept version.
     Forget(usize),
-    /// A reader pins a version, so far back from the newest.
+    /// A reader pins a version, `back` versions before the newest.
     Pin { reader: u32, back: u64 },
-    /// A reader drops the oldest it has.
+    /// A reader drops its oldest version.
     Drop { reader: u32 },
     /// A reader's process dies and another takes its number.
     Die { reader: u32 },
@@ -55,9 +55,9 @@ struct Model {
     base: u64,
     shared: SharedMixture,
     newest: Arc<Mixture>,
-    /// Versions whose `Arc` is kept on the writer's side.
+    /// Versions whose `Arc` is kept by the writer.
     kept: BTreeMap<u64, Arc<Mixture>>,
-    /// Versions that can be pinned: what was newest or kept when last something was published.
+    /// Versions that can be pinned: the newest one, and those kept at the last publication.
     living: BTreeSet<u64>,
     readers: Vec<Option<Reader>>,
 }
@@ -117,7 +117,7 @@ impl Model {
             }
             Event::Die { reader } => {
                 let place = &mut self.readers[reader as usize];
-                // A killed process gives nothing back.
+                // A killed process frees nothing.
                 std::mem::forget(place.take());
                 self.shared.release(reader);
                 *place = Some(Reader::open(&self.path, reader));
@@ -137,7 +137,7 @@ impl Model {
                 reader.current = Some(version);
                 reader.held.push(mixture);
             }
-            Err(SharedMixtureError::Gone { newest, .. }) => {
+            Err(SharedMixtureError::VersionNotFound { newest, .. }) => {
                 assert!(!there, "version {version} should be there");
                 assert_eq!(newest, self.newest.version());
             }
@@ -145,7 +145,7 @@ impl Model {
         }
     }
 
-    /// Memory for what is in use and the spare blocks, not more.
+    /// Memory is reserved only for used and spare blocks.
     fn check_memory(&self) {
         let readers = self.readers.iter().flatten();
         let held = readers.clone().flat_map(|reader| &reader.held).map(|mixture| mixture.version());
@@ -168,7 +168,7 @@ proptest! {
     })]
 
     #[test]
-    fn what_is_promised_is_there_and_what_is_held_never_changes(events in vec(event(), 1..120)) {
+    fn assigned_versions_exist_and_used_blocks_never_change(events in vec(event(), 1..120)) {
         let folder = tempfile::tempdir_in("/dev/shm").unwrap();
         let mut model = Model::new(folder.path().join("mixture"));
         events.into_iter().for_each(|event| model.happen(event));

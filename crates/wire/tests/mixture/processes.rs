@@ -1,4 +1,4 @@
-//! Readers in processes of their own, killed at random instants.
+//! Readers in other processes, killed at random times.
 
 use std::io::{Read, Write};
 use std::os::unix::process::ExitStatusExt;
@@ -16,7 +16,7 @@ use super::helpers::{Random, check, first, next};
 const READERS: u32 = 6;
 const VERSIONS: u64 = 3000;
 
-/// A reader's process, and the version promised to it.
+/// A reader's process, and the version assigned to it.
 struct Peer {
     child: Child,
     to_child: Option<ChildStdin>,
@@ -36,7 +36,7 @@ impl Peer {
             .spawn()
             .unwrap();
         let to_child = child.stdin.take();
-        // The test harness writes to stdout, so answers come by stderr, until a panic's message does.
+        // The test harness writes to stdout, so answers use stderr, which also shows panics.
         let mut from_child = child.stderr.take().unwrap();
         let (sender, answers) = channel();
         std::thread::spawn(move || {
@@ -53,7 +53,7 @@ impl Peer {
         self.to_child.as_mut().unwrap().write_all(&mixture.version().to_le_bytes()).unwrap();
     }
 
-    /// Takes the answer to a promise, if it is there; the promise need not be kept any longer.
+    /// Takes the answer if it has arrived; the version then need not be kept any longer.
     fn answered(&mut self, number: u32) {
         if let Ok(answer) = self.answers.try_recv() {
             let promised = self.promised.take().map(|mixture| mixture.version());
@@ -69,7 +69,7 @@ impl Peer {
 }
 
 #[test]
-fn readers_in_other_processes_see_whole_versions_and_may_be_killed() {
+fn readers_in_other_processes_see_complete_versions_and_may_be_killed() {
     let folder = tempfile::tempdir_in("/dev/shm").unwrap();
     let path: PathBuf = folder.path().join("mixture");
     let mut mixture = first();
@@ -101,7 +101,7 @@ fn readers_in_other_processes_see_whole_versions_and_may_be_killed() {
         drop(peer.to_child.take());
         assert!(peer.child.wait().unwrap().success());
     }
-    // Nothing is left behind in the name of the dead: the file is as small as ever.
+    // Nothing remains of dead readers: the file does not grow.
     kept.clear();
     for _ in 0..3 {
         mixture = next(&mixture);
@@ -114,7 +114,7 @@ fn readers_in_other_processes_see_whole_versions_and_may_be_killed() {
 }
 
 #[test]
-#[ignore = "run by readers_in_other_processes_see_whole_versions_and_may_be_killed"]
+#[ignore = "run by readers_in_other_processes_see_complete_versions_and_may_be_killed"]
 fn reader_process() {
     let path = PathBuf::from(std::env::var_os("SHARED_MIXTURE").expect("set by the test that runs this one"));
     let number = std::env::var("READER").unwrap().parse().unwrap();
@@ -129,8 +129,8 @@ fn reader_process() {
             let newest = reader.newest();
             match reader.pin(newest) {
                 Ok(mixture) => held.push(mixture),
-                // It was the newest a moment ago and promised to nobody.
-                Err(SharedMixtureError::Gone { .. }) => {}
+                // It was the newest version a moment ago, and was not assigned.
+                Err(SharedMixtureError::VersionNotFound { .. }) => {}
                 Err(error) => panic!("{error}"),
             }
             while held.len() > 4 {

@@ -1,4 +1,4 @@
-//! Turns, reports, mixtures and files come and go.
+//! Exchange of assignments, reports, mixtures and files.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,112 +6,118 @@ use std::sync::atomic::Ordering;
 
 use wire::WalkId;
 use wire::messages::Progress;
-use wire::net::{AgentEvent, Parted, Told};
+use wire::net::{AgentEvent, LinkError, SlotReport};
 use wire::transport::Incoming;
 
-use super::head::{Head, Wanted, agent, join, mixture, next_version, report, work};
+use super::test_server::{ServerOptions, TestServer, agent, join, mixture, next_version, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn turns_and_reports_come_as_they_were() {
-    let mut head = Head::open(Wanted::default()).await;
-    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
-    assert_eq!(joined.setup, b"the setup");
-    let mut slot = joined.slots().remove(0);
-    let line = Arc::clone(&joined);
+async fn assignments_and_reports_survive_a_round_trip() {
+    let mut server = TestServer::open(ServerOptions::default()).await;
+    let (_client, membership) = join(server.port, agent("a", 1)).await;
+    assert_eq!(membership.setup, b"the setup");
+    let mut slot = membership.slots().remove(0);
+    let line = Arc::clone(&membership);
     let working = tokio::spawn(async move {
-        let mut told = Told::Nothing;
-        let mut turns = 0;
-        while let Some(work) = slot.exchange(&line, &told).await.unwrap() {
-            turns += 1;
-            assert_eq!(work.assignment.turn, turns);
-            assert_eq!(work.mixture.version(), turns, "the version of the turn");
+        let mut last_report = SlotReport::Empty;
+        let mut assignments = 0;
+        while let Some(work) = slot.exchange(&line, &last_report).await.unwrap() {
+            assignments += 1;
+            assert_eq!(work.assignment.number, assignments);
+            assert_eq!(work.mixture.version(), assignments, "the version of the assignment");
             slot.progress(Arc::clone(&line), work.assignment.walk, Progress::default()).await;
-            told = Told::Report(report(&work.assignment));
+            last_report = SlotReport::Report(report(&work.assignment));
         }
-        turns
+        assignments
     });
     let mut mixture = Arc::new(mixture());
     let mut expected = None;
-    for turn in 1..=20 {
-        let mut offer = head.next().await;
+    for number in 1..=20 {
+        let mut offer = server.next().await;
         while let Incoming::Progress(walk, _) = offer {
             assert_eq!(walk, WalkId(5));
-            offer = head.next().await;
+            offer = server.next().await;
         }
-        let Incoming::Free { report: found, reply, .. } = offer else { panic!("{offer:?}") };
+        let Incoming::Idle { report: found, reply, .. } = offer else { panic!("{offer:?}") };
         assert_eq!(found, expected);
-        mixture = next_version(&mixture, turn % 2, turn % 2);
-        let work = work(5, turn as u64, &mixture);
+        mixture = next_version(&mixture, number % 2, number % 2);
+        let work = work(5, number as u64, &mixture);
         expected = Some(report(&work.assignment));
         reply.send(Some(work)).unwrap();
     }
     let last = loop {
-        if let Incoming::Free { report, reply, .. } = head.next().await {
+        if let Incoming::Idle { report, reply, .. } = server.next().await {
             reply.send(None).unwrap();
             break report;
         }
     };
     assert_eq!(last, expected);
     assert_eq!(working.await.unwrap(), 20);
-    // What was received is what was sent, bit by bit, whatever the way from version to version.
-    let newest = joined.newest().await;
+    // The received mixture is bitwise equal, whatever deltas led to it.
+    let newest = membership.newest().await;
     assert_eq!(newest.version(), mixture.version());
     for ((_, _, sent), (_, _, received)) in mixture.iter().zip(newest.iter()) {
         assert_eq!(sent.to_bytes(), received.to_bytes());
     }
-    joined.leave().await;
-    head.event(|event| matches!(event, AgentEvent::Left(_))).await;
-    head.close().await;
+    membership.leave().await;
+    server.event(|event| matches!(event, AgentEvent::Left(_))).await;
+    server.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_walker_that_dies_is_told_of_and_its_slot_goes_on() {
-    let mut head = Head::open(Wanted::default()).await;
-    let (_uplink, joined) = join(head.port, agent("a", 2)).await;
-    let mut slot = joined.slots().remove(1);
+async fn lost_walkers_are_reported_and_their_slots_continue() {
+    let mut server = TestServer::open(ServerOptions::default()).await;
+    let (_client, membership) = join(server.port, agent("a", 2)).await;
+    let mut slot = membership.slots().remove(1);
     let mixture = Arc::new(mixture());
     for fault in [true, false] {
-        let line = Arc::clone(&joined);
-        let told = if fault { Told::Nothing } else { Told::Lost { fault: true } };
-        let turn = tokio::spawn(async move {
-            let work = slot.exchange(&line, &told).await.unwrap();
+        let line = Arc::clone(&membership);
+        let last_report = if fault { SlotReport::Empty } else { SlotReport::Lost { crashed: true } };
+        let exchange = tokio::spawn(async move {
+            let work = slot.exchange(&line, &last_report).await.unwrap();
             (slot, work)
         });
         if !fault {
-            let gone = head.next().await;
-            assert!(matches!(&gone, Incoming::Gone { fault, .. } if *fault), "{gone:?}");
+            let gone = server.next().await;
+            assert!(matches!(&gone, Incoming::Lost { crashed, .. } if *crashed), "{gone:?}");
         }
-        let offer = head.offer().await;
+        let offer = server.offer().await;
         assert_eq!(offer.report, None);
         offer.reply.send(Some(work(1, 1, &mixture))).unwrap();
         let work;
-        (slot, work) = turn.await.unwrap();
+        (slot, work) = exchange.await.unwrap();
         assert!(work.is_some());
     }
-    joined.leave().await;
+    membership.leave().await;
     for _ in 0..2 {
-        assert!(matches!(head.next().await, Incoming::Gone { fault: false, .. }));
+        assert!(matches!(server.next().await, Incoming::Lost { crashed: false, .. }));
     }
-    let told = Told::Nothing;
-    assert!(matches!(slot.exchange(&joined, &told).await, Err(Parted::Stranger(_))), "it has left");
-    head.close().await;
+    let last_report = SlotReport::Empty;
+    assert!(
+        matches!(slot.exchange(&membership, &last_report).await, Err(LinkError::RejoinRequired(_))),
+        "it has left"
+    );
+    server.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn files_come_by_their_hash_and_agents_are_told_to_stop() {
+async fn agents_fetch_files_by_hash_and_learn_of_a_stop() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model");
     let content: Vec<u8> = (0..9_500_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
     std::fs::write(&path, &content).unwrap();
     let files = BTreeMap::from([("0123".to_owned(), path)]);
-    let head = Head::open(Wanted { files, ..Wanted::default() }).await;
-    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
-    assert!(joined.file("0123").await.unwrap() == content);
-    let refused = joined.file("../../etc/passwd").await.unwrap_err();
-    assert!(matches!(&refused, Parted::Refused(why) if why.contains("no file with the hash")), "{refused}");
-    assert_eq!(joined.is_stopping().await.unwrap(), Some(false));
-    head.stopping.store(true, Ordering::Relaxed);
-    assert_eq!(joined.is_stopping().await.unwrap(), Some(true));
-    joined.leave().await;
-    head.close().await;
+    let server = TestServer::open(ServerOptions { files, ..ServerOptions::default() }).await;
+    let (_client, membership) = join(server.port, agent("a", 1)).await;
+    assert!(membership.fetch_file("0123").await.unwrap() == content);
+    let refused = membership.fetch_file("../../etc/passwd").await.unwrap_err();
+    assert!(
+        matches!(&refused, LinkError::Rejected(why) if why.contains("has no file with hash")),
+        "{refused}"
+    );
+    assert_eq!(membership.is_stopping().await.unwrap(), Some(false));
+    server.stopping.store(true, Ordering::Relaxed);
+    assert_eq!(membership.is_stopping().await.unwrap(), Some(true));
+    membership.leave().await;
+    server.close().await;
 }

@@ -7,13 +7,13 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 
-/// What the link does.
+/// State of the link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
     Whole,
-    /// Connections are closed and no others are made.
+    /// Closes all connections and accepts no others.
     Cut,
-    /// Nothing comes through, and nobody is told.
+    /// Forwards nothing, without closing connections.
     Dead,
 }
 

@@ -2,7 +2,7 @@
 
 mod breaks;
 mod exchange;
-mod head;
 mod link;
 mod moves;
 mod security;
+mod test_server;

@@ -1,58 +1,58 @@
-//! The orchestrator comes back somewhere else.
+//! The orchestrator restarts at another endpoint.
 
 use std::fs;
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::timeout;
-use wire::net::{Address, Announcement, NetError, Parted, Told, Uplink};
+use wire::net::{Address, AgentClient, Announcement, LinkError, NetError, SlotReport};
 
-use super::head::{Head, LIMIT, Wanted, agent, endpoint, report, work};
+use super::test_server::{LIMIT, ServerOptions, TestServer, agent, endpoint, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("endpoint");
-    // At once, as a reader sees it.
+    // Written atomically, as seen by a reader.
     let write = |announcement: Announcement| {
         fs::write(path.with_extension("new"), announcement.to_string()).unwrap();
         fs::rename(path.with_extension("new"), &path).unwrap();
     };
-    let address = Address::In(path.clone());
-    // Before it has been anywhere the agent waits.
+    let address = Address::File(path.clone());
+    // The agent waits until the orchestrator has started.
     let (why, whys) = std::sync::mpsc::channel();
     let opening = {
         let address = address.clone();
         let waiting = move |error: &NetError| why.send(error.to_string()).unwrap();
-        tokio::spawn(async move { Uplink::open(&address, None, agent("a", 1), waiting).await.unwrap() })
+        tokio::spawn(async move { AgentClient::open(&address, None, agent("a", 1), waiting).await.unwrap() })
     };
-    let mut head = Head::open(Wanted::default()).await;
+    let mut server = TestServer::open(ServerOptions::default()).await;
     let told = tokio::task::spawn_blocking(move || whys.recv_timeout(LIMIT).unwrap()).await.unwrap();
-    assert!(told.contains("has written yet where it is"), "{told}");
-    write(Announcement::At(endpoint(head.port)));
-    let uplink = Arc::new(timeout(LIMIT, opening).await.expect("in time").unwrap());
-    let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());
+    assert!(told.contains("endpoint file not found"), "{told}");
+    write(Announcement::Endpoint(endpoint(server.port)));
+    let client = Arc::new(timeout(LIMIT, opening).await.expect("in time").unwrap());
+    let membership = Arc::new(timeout(LIMIT, client.join()).await.expect("in time").unwrap());
 
-    let mut slot = joined.slots().remove(0);
-    let mixture = Wanted::default().mixture;
-    let line = Arc::clone(&joined);
-    let turn = tokio::spawn(async move { (slot.exchange(&line, &Told::Nothing).await, slot) });
-    head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
-    let (given, mut slot) = turn.await.unwrap();
-    let told = Told::Report(report(&given.unwrap().unwrap().assignment));
-    let before = head.kill().await;
-    let line = Arc::clone(&joined);
-    let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.map(drop) });
+    let mut slot = membership.slots().remove(0);
+    let mixture = ServerOptions::default().mixture;
+    let line = Arc::clone(&membership);
+    let exchange = tokio::spawn(async move { (slot.exchange(&line, &SlotReport::Empty).await, slot) });
+    server.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
+    let (given, mut slot) = exchange.await.unwrap();
+    let last_report = SlotReport::Report(report(&given.unwrap().unwrap().assignment));
+    let before = server.kill().await;
+    let line = Arc::clone(&membership);
+    let telling = tokio::spawn(async move { slot.exchange(&line, &last_report).await.map(drop) });
     tokio::time::sleep(Duration::from_millis(300)).await;
-    let head = Head::open(Wanted { session: 2, ..Wanted::default() }).await;
-    assert_ne!(head.port, before);
-    write(Announcement::At(endpoint(head.port)));
+    let server = TestServer::open(ServerOptions { session: 2, ..ServerOptions::default() }).await;
+    assert_ne!(server.port, before);
+    write(Announcement::Endpoint(endpoint(server.port)));
     let refused = timeout(LIMIT, telling).await.expect("in time").unwrap();
-    assert!(matches!(refused, Err(Parted::Stranger(_))), "{refused:?}");
-    let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
-    assert!(timeout(Duration::from_millis(300), address.over()).await.is_err());
+    assert!(matches!(refused, Err(LinkError::RejoinRequired(_))), "{refused:?}");
+    let membership = timeout(LIMIT, client.join()).await.expect("in time").unwrap();
+    assert!(timeout(Duration::from_millis(300), address.wait_until_over()).await.is_err());
     write(Announcement::Over);
-    timeout(LIMIT, address.over()).await.expect("in time");
-    joined.leave().await;
-    head.close().await;
+    timeout(LIMIT, address.wait_until_over()).await.expect("in time");
+    membership.leave().await;
+    server.close().await;
 }

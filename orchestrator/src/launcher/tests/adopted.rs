@@ -4,8 +4,8 @@ use std::process::Command;
 
 use super::*;
 
-/// A process that is nobody's child here.
-fn stranger() -> (u32, String) {
+/// A process that is not a child of this process.
+fn adopted_process() -> (u32, String) {
     let script = "sleep 1000 <&- >&- 2>&- & echo $!";
     let output = Command::new("/bin/sh").args(["-c", script]).output().unwrap();
     let pid = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
@@ -14,37 +14,37 @@ fn stranger() -> (u32, String) {
 
 #[tokio::test]
 async fn an_adopted_process_is_watched_and_ended() {
-    let (pid, birth) = stranger();
+    let (pid, birth) = adopted_process();
     let mut children = children(&["exit 0", "exit 0"], LIMITS);
     children.adopt(1, pid, &birth).unwrap();
-    assert!(matches!(children.adopt(1, pid, &birth), Err(AdoptError::Taken { number: 1, .. })));
-    assert!(matches!(children.adopt(2, pid, &birth), Err(AdoptError::Taken { number: 2, .. })));
-    // The other one comes and goes meanwhile.
-    while !matches!(next(&mut children).await, Event::Ended { number: 0, .. }) {}
+    assert!(matches!(children.adopt(1, pid, &birth), Err(AdoptError::NotAdoptable { number: 1, .. })));
+    assert!(matches!(children.adopt(2, pid, &birth), Err(AdoptError::NotAdoptable { number: 2, .. })));
+    // The other child starts and exits meanwhile.
+    while !matches!(next(&mut children).await, ChildEvent::Ended { number: 0, .. }) {}
     assert_eq!(children.status()[1].incarnation, 0);
     children.stop();
-    let ended = Ended { incarnation: 0, ending: Ending::Unseen, then: Standing::GoneHome };
+    let ended = ChildExit { incarnation: 0, reason: ExitReason::Unknown, then: ChildState::Exited };
     assert_eq!(ends(&rest(&mut children).await), [(1, &ended)]);
 }
 
 #[tokio::test]
 async fn an_adopted_process_that_dies_is_replaced() {
-    let (pid, birth) = stranger();
+    let (pid, birth) = adopted_process();
     let mut children = children(&["exit 0"], LIMITS);
     children.adopt(0, pid, &birth).unwrap();
     signal(pid, Signal::KILL);
     let events = rest(&mut children).await;
     let ended = ends(&events);
-    assert_eq!((ended[0].1.incarnation, &ended[0].1.ending), (0, &Ending::Unseen));
-    assert_eq!((ended[1].1.incarnation, ended[1].1.then), (1, Standing::GoneHome));
+    assert_eq!((ended[0].1.incarnation, &ended[0].1.reason), (0, &ExitReason::Unknown));
+    assert_eq!((ended[1].1.incarnation, ended[1].1.then), (1, ChildState::Exited));
 }
 
 #[test]
-fn a_stranger_is_asked_to_end() {
-    let (pid, birth) = stranger();
-    assert!(matches!(ask_to_end(pid, "another/1"), Err(AdoptError::Gone { .. })));
+fn processes_of_earlier_runs_are_asked_to_exit() {
+    let (pid, birth) = adopted_process();
+    assert!(matches!(request_exit(pid, "another/1"), Err(AdoptError::Gone { .. })));
     assert!(store::process_start_time(pid).is_some());
-    ask_to_end(pid, &birth).unwrap();
+    request_exit(pid, &birth).unwrap();
     let begun = std::time::Instant::now();
     let lives =
         || std::fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| !stat.contains(") Z "));
@@ -55,13 +55,13 @@ fn a_stranger_is_asked_to_end() {
 }
 
 #[tokio::test]
-async fn another_process_under_an_old_number_is_not_adopted() {
+async fn reused_process_ids_are_not_adopted() {
     let own = std::process::id();
     let mut children = children(&["exit 0"], LIMITS);
     for (pid, birth) in [(own, "another/1"), (own, ""), (0, ""), (u32::MAX, ""), (i32::MAX as u32, "")] {
         assert!(matches!(children.adopt(0, pid, birth), Err(AdoptError::Gone { .. })), "{pid}");
     }
-    // Nothing came of it: the child is started as if nothing had been.
-    assert!(matches!(next(&mut children).await, Event::Started { incarnation: 1, .. }));
+    // The failed adoption has no effect: the child is started normally.
+    assert!(matches!(next(&mut children).await, ChildEvent::Started { incarnation: 1, .. }));
     rest(&mut children).await;
 }

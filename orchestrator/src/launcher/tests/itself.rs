@@ -7,7 +7,7 @@ use rustix::process::{Resource, Rlimit, getpgid, getpid, getrlimit, setrlimit};
 
 use super::*;
 
-/// The arguments with which this test program runs but one of its tests, one that is not run otherwise.
+/// Arguments that make this test program run only one of its ignored tests.
 fn only(test: &str) -> [String; 4] {
     [format!("launcher::tests::itself::{test}"), "--exact".into(), "--ignored".into(), "--nocapture".into()]
 }
@@ -19,7 +19,7 @@ async fn the_program_starts_itself() {
     });
     let events = rest(&mut children).await;
     assert_eq!(lines(&events), ["read: the setup"]);
-    assert_eq!(ends(&events)[0].1.then, Standing::GoneHome);
+    assert_eq!(ends(&events)[0].1.then, ChildState::Exited);
 }
 
 #[test]
@@ -31,39 +31,42 @@ fn reads_its_setup() {
 }
 
 #[tokio::test]
-async fn a_child_that_the_host_has_no_room_for_is_started_when_there_is() {
+async fn children_start_when_the_host_has_resources_again() {
     let mut children =
         Children::new(1, NO_RESTART, |_, _| Launch::this_program(only("lacks_descriptors"), Vec::new()));
     let events = rest(&mut children).await;
     assert_eq!(lines(&events), ["started in the end"], "{events:?}");
 }
 
-/// In a process of its own, since other tests need descriptors. Its child may not fail even once.
+/// In a process of its own, since other tests need file descriptors. Its child must not fail even once.
 #[tokio::test]
 #[ignore = "runs in a process that another test starts"]
 async fn lacks_descriptors() {
     let limit = |current| Rlimit { current, maximum: getrlimit(Resource::Nofile).maximum };
     let before = getrlimit(Resource::Nofile).current;
     let mut children = children(&["exit 0"], NO_RESTART);
-    // No file that is opened from now on gets a number.
+    // No more files can be opened from now on.
     setrlimit(Resource::Nofile, limit(Some(3))).unwrap();
     for _ in 0..10 {
-        let Event::Ended { ended, .. } = next(&mut children).await else { panic!("it cannot be started") };
-        assert!(matches!(ended.ending, Ending::NotStarted { is_shortage: true, .. }), "{ended:?}");
-        assert!(matches!(ended.then, Standing::Pausing { .. }), "{ended:?}");
+        let ChildEvent::Ended { ended, .. } = next(&mut children).await else {
+            panic!("it cannot be started")
+        };
+        assert!(matches!(ended.reason, ExitReason::StartFailed { is_shortage: true, .. }), "{ended:?}");
+        assert!(matches!(ended.then, ChildState::BackingOff { .. }), "{ended:?}");
     }
     setrlimit(Resource::Nofile, limit(before)).unwrap();
     let events = rest(&mut children).await;
     // One more start may have failed before the limit was raised.
     let (_, last) = *ends(&events).last().unwrap();
-    assert_eq!((&last.ending, last.then), (&exit(0, None), Standing::GoneHome));
+    assert_eq!((&last.reason, last.then), (&exit(0, None), ChildState::Exited));
     writeln!(std::io::stderr(), "started in the end").unwrap();
 }
 
-/// 0 where the session's leader is in another process namespace, as in a container: `getsid` of rustix does not expect that.
+/// 0 if the session leader is in another process namespace, as in a container, which `getsid` of rustix does not
+/// expect.
 fn session_of(pid: Pid) -> i32 {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).unwrap();
-    // The name stands in brackets and may hold anything; state, parent, group and session follow.
+    // The name is in parentheses and may contain anything; state, parent, group and session follow.
     stat.rsplit(')').next().unwrap().split_whitespace().nth(3).unwrap().parse().unwrap()
 }
 
@@ -76,8 +79,8 @@ async fn groups_and_sessions_are_as_asked_for() {
     let (mut pids, mut ready) = ([None; 2], 0);
     while ready < 2 {
         match next(&mut children).await {
-            Event::Started { number, pid, .. } => pids[number as usize] = Pid::from_raw(pid as i32),
-            Event::Said { .. } => ready += 1,
+            ChildEvent::Started { number, pid, .. } => pids[number as usize] = Pid::from_raw(pid as i32),
+            ChildEvent::Stderr { .. } => ready += 1,
             event => panic!("{event:?}"),
         }
     }
@@ -94,13 +97,13 @@ fn waits() {
     let mut setup = String::new();
     std::io::stdin().read_to_string(&mut setup).unwrap();
     if setup == "in its own" {
-        own_session().unwrap();
+        start_own_session().unwrap();
     }
     writeln!(std::io::stderr(), "ready").unwrap();
     std::thread::sleep(if setup.is_empty() { Duration::ZERO } else { LONG });
 }
 
-/// Starts [`tied`] from a thread that ends when the process has tied itself, or has failed to.
+/// Starts [`tied`] from a thread that exits when the process has bound itself to its parent, or has failed to.
 fn tied_to(parent: u32) -> (std::process::ExitStatus, String) {
     let start = move || {
         let mut command = Command::new("/proc/self/exe");
@@ -123,7 +126,7 @@ fn a_process_ends_with_the_thread_that_started_it() {
 }
 
 #[test]
-fn a_process_without_its_parent_does_not_go_on() {
+fn processes_do_not_continue_without_their_parent() {
     let (_, said) = tied_to(std::process::id() + 1);
     assert_eq!(said, "gone");
 }
@@ -139,13 +142,13 @@ fn tied() {
             write!(std::io::stderr(), "tied").unwrap();
             std::thread::sleep(LONG);
         }
-        Err(ParentGone::Other { .. }) => write!(std::io::stderr(), "gone").unwrap(),
+        Err(ParentExited::Other { .. }) => write!(std::io::stderr(), "gone").unwrap(),
         Err(error) => panic!("{error}"),
     }
 }
 
 #[test]
-fn a_name_is_what_lists_of_processes_show() {
-    be_called(c"calm-walker").unwrap();
+fn process_lists_show_the_name() {
+    set_process_name(c"calm-walker").unwrap();
     assert_eq!(std::fs::read_to_string("/proc/thread-self/comm").unwrap(), "calm-walker\n");
 }

@@ -1,4 +1,4 @@
-//! Real processes, small ones.
+//! Tests with real, small processes.
 
 mod adopted;
 mod itself;
@@ -10,21 +10,21 @@ use rustix::process::{Pid, Signal, kill_process};
 use tokio::time::timeout;
 
 use super::*;
-use crate::supervisor::{Ended, Ending, Limits, Standing};
+use crate::supervisor::{ChildExit, ChildState, ExitReason, Limits};
 
-/// Long enough for anything here on a busy machine.
+/// Timeout for anything here on a busy machine.
 const LONG: Duration = Duration::from_secs(120);
 
 const LIMITS: Limits = Limits {
-    silence: LONG,
-    first_pause: Duration::from_millis(5),
-    longest_pause: Duration::from_millis(20),
-    restarts: 2,
-    grace: LONG,
-    outlives: false,
+    heartbeat_timeout: LONG,
+    initial_backoff: Duration::from_millis(5),
+    max_backoff: Duration::from_millis(20),
+    max_restarts: 2,
+    grace_period: LONG,
+    detached: false,
 };
 
-const NO_RESTART: Limits = Limits { restarts: 0, ..LIMITS };
+const NO_RESTART: Limits = Limits { max_restarts: 0, ..LIMITS };
 
 impl Launch {
     fn shell(script: &str) -> Self {
@@ -38,52 +38,52 @@ fn children(scripts: &'static [&'static str], limits: Limits) -> Children {
     Children::new(scripts.len() as u32, limits, launch)
 }
 
-async fn next(children: &mut Children) -> Event {
+async fn next(children: &mut Children) -> ChildEvent {
     timeout(LONG, children.next()).await.expect("an event")
 }
 
-/// Everything that happens from here to the end; of each process nothing is left then.
-async fn rest(children: &mut Children) -> Vec<Event> {
+/// All events until the end, when no process must be left.
+async fn rest(children: &mut Children) -> Vec<ChildEvent> {
     let mut events = Vec::new();
     loop {
         match next(children).await {
-            Event::AllGone => break,
+            ChildEvent::AllExited => break,
             event => events.push(event),
         }
     }
     for event in &events {
-        if let Event::Started { pid, .. } = event {
+        if let ChildEvent::Started { pid, .. } = event {
             assert!(!Path::new(&format!("/proc/{pid}")).exists(), "process {pid} is left");
         }
     }
     events
 }
 
-fn ends(events: &[Event]) -> Vec<(u32, &Ended)> {
+fn ends(events: &[ChildEvent]) -> Vec<(u32, &ChildExit)> {
     let end = events.iter().filter_map(|event| match event {
-        Event::Ended { number, ended } => Some((*number, ended)),
+        ChildEvent::Ended { number, ended } => Some((*number, ended)),
         _ => None,
     });
     end.collect()
 }
 
-fn lines(events: &[Event]) -> Vec<&str> {
+fn lines(events: &[ChildEvent]) -> Vec<&str> {
     let lines = events.iter().filter_map(|event| match event {
-        Event::Said { line, .. } => Some(line.as_str()),
+        ChildEvent::Stderr { line, .. } => Some(line.as_str()),
         _ => None,
     });
     lines.collect()
 }
 
-fn exit(code: i32, words: Option<&str>) -> Ending {
-    Ending::Exit { code, words: words.map(str::to_owned) }
+fn exit(code: i32, stderr: Option<&str>) -> ExitReason {
+    ExitReason::Exit { code, last_line: stderr.map(str::to_owned) }
 }
 
 fn signal(pid: u32, signal: Signal) {
     kill_process(Pid::from_raw(pid as i32).unwrap(), signal).unwrap();
 }
 
-/// Stops a process, and waits until it stands still: a SIGTERM that it gets at the same time would come first.
+/// Stops a process and waits until it is stopped, since a concurrent SIGTERM would come first.
 async fn hold(pid: u32) {
     signal(pid, Signal::STOP);
     while !std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap().contains(") T ") {
@@ -92,83 +92,83 @@ async fn hold(pid: u32) {
 }
 
 #[tokio::test]
-async fn an_exit_code_comes_with_the_last_words() {
+async fn exit_codes_come_with_the_last_line() {
     let mut children = children(&["echo first >&2; printf 'last words' >&2; exit 3"], NO_RESTART);
     let events = rest(&mut children).await;
-    assert!(matches!(events[0], Event::Started { number: 0, incarnation: 1, .. }), "{events:?}");
+    assert!(matches!(events[0], ChildEvent::Started { number: 0, incarnation: 1, .. }), "{events:?}");
     assert_eq!(lines(&events), ["first", "last words"]);
-    let ended = Ended { incarnation: 1, ending: exit(3, Some("last words")), then: Standing::GivenUp };
+    let ended = ChildExit { incarnation: 1, reason: exit(3, Some("last words")), then: ChildState::Failed };
     assert_eq!(ends(&events), [(0, &ended)]);
-    assert_eq!(ended.ending.to_string(), "exit code 3: last words");
+    assert_eq!(ended.reason.to_string(), "exit code 3: last words");
     let nothing_more = timeout(Duration::from_millis(50), children.next()).await;
     assert!(nothing_more.is_err(), "all gone is the end");
 }
 
 #[tokio::test]
-async fn a_setup_larger_than_a_pipe_arrives_whole() {
+async fn setups_larger_than_a_pipe_arrive_completely() {
     let numbers: Vec<String> = (0..100_000).map(|number| number.to_string()).collect();
     let setup = numbers.join("\n").into_bytes();
     let launch = move |_, _| Launch { setup: setup.clone(), ..Launch::shell("cat >&2") };
     let mut children = Children::new(1, NO_RESTART, launch);
     let mut found = Vec::new();
     let ended = loop {
-        // Whoever waits may be called away at any time.
+        // Waiting can be cancelled at any time.
         match timeout(Duration::from_micros(200), children.next()).await {
-            Ok(Event::Said { line, .. }) => found.push(line),
-            Ok(Event::Ended { ended, .. }) => break ended,
-            Ok(Event::Started { .. }) | Err(_) => {}
-            Ok(Event::AllGone) => panic!("without an end"),
+            Ok(ChildEvent::Stderr { line, .. }) => found.push(line),
+            Ok(ChildEvent::Ended { ended, .. }) => break ended,
+            Ok(ChildEvent::Started { .. }) | Err(_) => {}
+            Ok(ChildEvent::AllExited) => panic!("without an end"),
         }
     };
     assert_eq!(found, numbers);
-    assert_eq!((ended.ending, ended.then), (exit(0, Some("99999")), Standing::GoneHome));
+    assert_eq!((ended.reason, ended.then), (exit(0, Some("99999")), ChildState::Exited));
 }
 
 #[tokio::test]
-async fn a_setup_that_nobody_reads_hinders_nobody() {
+async fn unread_setups_do_not_block() {
     let launch = |_, _| Launch { setup: vec![b'x'; 1 << 20], ..Launch::shell("exit 5") };
     let mut children = Children::new(1, NO_RESTART, launch);
-    assert_eq!(ends(&rest(&mut children).await)[0].1.ending, exit(5, None));
+    assert_eq!(ends(&rest(&mut children).await)[0].1.reason, exit(5, None));
 }
 
 #[tokio::test]
-async fn what_fails_again_and_again_is_given_up_and_the_others_go_on() {
+async fn repeated_failures_do_not_affect_other_children() {
     let mut children = children(&["echo no model >&2; exit 7", "exec sleep 1000"], LIMITS);
     let (mut incarnations, mut pauses) = (Vec::new(), Vec::new());
     loop {
         match next(&mut children).await {
-            Event::Started { number: 0, incarnation, .. } => incarnations.push(incarnation),
-            Event::Ended { number, ended } => {
-                assert_eq!((number, ended.ending), (0, exit(7, Some("no model"))));
+            ChildEvent::Started { number: 0, incarnation, .. } => incarnations.push(incarnation),
+            ChildEvent::Ended { number, ended } => {
+                assert_eq!((number, ended.reason), (0, exit(7, Some("no model"))));
                 match ended.then {
-                    Standing::Pausing { left } => pauses.push(left.as_millis()),
-                    then => break assert_eq!(then, Standing::GivenUp),
+                    ChildState::BackingOff { left } => pauses.push(left.as_millis()),
+                    then => break assert_eq!(then, ChildState::Failed),
                 }
             }
-            Event::Started { .. } | Event::Said { .. } => {}
-            Event::AllGone => panic!("one is left"),
+            ChildEvent::Started { .. } | ChildEvent::Stderr { .. } => {}
+            ChildEvent::AllExited => panic!("one is left"),
         }
     }
     assert_eq!((incarnations, pauses), (vec![1, 2, 3], vec![5, 10]));
     let status = children.status();
-    assert_eq!((status[0].standing, status[0].restarts), (Standing::GivenUp, 2));
-    assert_eq!(status[1].standing, Standing::Starting);
-    children.signs().heard(1);
-    assert_eq!(children.status()[1].standing, Standing::Running);
+    assert_eq!((status[0].state, status[0].restarts), (ChildState::Failed, 2));
+    assert_eq!(status[1].state, ChildState::Starting);
+    children.heartbeats().heartbeat(1);
+    assert_eq!(children.status()[1].state, ChildState::Running);
     children.stop();
     assert_eq!(ends(&rest(&mut children).await).len(), 1);
     assert_eq!(children.status()[1].last_failure, None);
 }
 
 #[tokio::test]
-async fn a_delivery_before_the_end_begins_a_new_row() {
-    let mut children = children(&["echo done >&2; exit 1"], Limits { restarts: 1, ..LIMITS });
+async fn a_delivery_before_the_exit_resets_failures() {
+    let mut children = children(&["echo done >&2; exit 1"], Limits { max_restarts: 1, ..LIMITS });
     for _ in 0..5 {
         loop {
             match next(&mut children).await {
-                Event::Said { number, .. } => children.signs().useful(number),
-                Event::Ended { ended, .. } => {
-                    break assert!(matches!(ended.then, Standing::Pausing { .. }), "{ended:?}");
+                ChildEvent::Stderr { number, .. } => children.heartbeats().delivered(number),
+                ChildEvent::Ended { ended, .. } => {
+                    break assert!(matches!(ended.then, ChildState::BackingOff { .. }), "{ended:?}");
                 }
                 _ => {}
             }
@@ -177,64 +177,64 @@ async fn a_delivery_before_the_end_begins_a_new_row() {
 }
 
 #[tokio::test]
-async fn a_delivery_that_nobody_has_looked_at_yet_counts() {
+async fn unread_deliveries_count() {
     let directory = tempfile::tempdir().unwrap();
     let go = directory.path().join("go");
     let script = format!("cd {}; until rm go; do sleep 0.01; done 2>&-; exit 1", directory.path().display());
     let launch = move |_, _| Launch::shell(&script);
-    let mut children = Children::new(1, Limits { restarts: 1, ..LIMITS }, launch);
-    // After a first failure without one, only a delivery keeps the next from being the last.
+    let mut children = Children::new(1, Limits { max_restarts: 1, ..LIMITS }, launch);
+    // After a failure without a delivery, only a delivery prevents the next failure from being the last.
     for delivers in [false, true, true] {
-        assert!(matches!(next(&mut children).await, Event::Started { .. }));
-        let signs = children.signs();
+        assert!(matches!(next(&mut children).await, ChildEvent::Started { .. }));
+        let heartbeats = children.heartbeats();
         let deliver = async {
-            // The end is waited for by now.
+            // The monitor waits for the exit by now.
             tokio::time::sleep(Duration::from_millis(20)).await;
             if delivers {
-                signs.useful(0);
+                heartbeats.delivered(0);
             }
             std::fs::write(&go, "").unwrap();
         };
         let (event, ()) = tokio::join!(next(&mut children), deliver);
-        let Event::Ended { ended, .. } = event else { panic!("{event:?}") };
-        assert_eq!(ended.then, Standing::Pausing { left: LIMITS.first_pause });
+        let ChildEvent::Ended { ended, .. } = event else { panic!("{event:?}") };
+        assert_eq!(ended.then, ChildState::BackingOff { left: LIMITS.initial_backoff });
     }
 }
 
 #[tokio::test]
-async fn a_process_that_says_nothing_from_its_start_is_killed() {
+async fn processes_without_any_heartbeat_are_killed() {
     let silence = Duration::from_millis(200);
-    let mut children = children(&["exec sleep 1000"], Limits { silence, ..NO_RESTART });
+    let mut children = children(&["exec sleep 1000"], Limits { heartbeat_timeout: silence, ..NO_RESTART });
     let events = rest(&mut children).await;
-    assert_eq!(ends(&events)[0].1.ending, Ending::Silent(silence));
+    assert_eq!(ends(&events)[0].1.reason, ExitReason::Unresponsive(silence));
 }
 
 #[tokio::test]
-async fn a_stopped_process_is_killed_and_started_again() {
+async fn stopped_processes_are_killed_and_restarted() {
     const BEATS: u32 = 75;
     let silence = Duration::from_secs(3);
     let beat = "while :; do echo alive >&2; sleep 0.05; done";
     let launch = move |_, _| Launch::shell(beat);
-    let mut children = Children::new(1, Limits { silence, ..LIMITS }, launch);
+    let mut children = Children::new(1, Limits { heartbeat_timeout: silence, ..LIMITS }, launch);
     let (mut beats, mut first) = (0, 0);
     loop {
         match next(&mut children).await {
-            Event::Started { incarnation: 1, pid, .. } => first = pid,
-            Event::Started { incarnation, .. } => break assert_eq!(incarnation, 2),
-            Event::Said { .. } => {
+            ChildEvent::Started { incarnation: 1, pid, .. } => first = pid,
+            ChildEvent::Started { incarnation, .. } => break assert_eq!(incarnation, 2),
+            ChildEvent::Stderr { .. } => {
                 beats += 1;
-                children.signs().heard(0);
-                // After more than the time of silence: it lives as long as it speaks.
+                children.heartbeats().heartbeat(0);
+                // After more than the heartbeat timeout: it lives as long as it sends heartbeats.
                 if beats == BEATS {
                     signal(first, Signal::STOP);
                 }
             }
-            Event::Ended { ended, .. } => {
+            ChildEvent::Ended { ended, .. } => {
                 assert!(beats >= BEATS, "killed while it spoke");
-                assert_eq!(ended.ending, Ending::Silent(silence));
+                assert_eq!(ended.reason, ExitReason::Unresponsive(silence));
                 assert!(!Path::new(&format!("/proc/{first}")).exists());
             }
-            Event::AllGone => panic!("it is to be started again"),
+            ChildEvent::AllExited => panic!("it is to be started again"),
         }
     }
     children.stop();
@@ -242,19 +242,19 @@ async fn a_stopped_process_is_killed_and_started_again() {
 }
 
 #[tokio::test]
-async fn a_stop_ends_those_that_obey_and_kills_those_that_do_not() {
+async fn stopping_kills_children_that_do_not_exit() {
     const SCRIPTS: [&str; 3] = [
         "trap 'exit 130' TERM; echo ready >&2; while :; do sleep 0.02; done",
         "trap '' TERM; echo ready >&2; while :; do sleep 0.02; done",
         "echo ready >&2; exec sleep 1000",
     ];
     let grace = Duration::from_secs(3);
-    let mut children = children(&SCRIPTS, Limits { grace, ..LIMITS });
+    let mut children = children(&SCRIPTS, Limits { grace_period: grace, ..LIMITS });
     let (mut ready, mut last) = (0, 0);
     while ready < SCRIPTS.len() {
         match next(&mut children).await {
-            Event::Started { number: 2, pid, .. } => last = pid,
-            event => ready += usize::from(matches!(event, Event::Said { .. })),
+            ChildEvent::Started { number: 2, pid, .. } => last = pid,
+            event => ready += usize::from(matches!(event, ChildEvent::Stderr { .. })),
         }
     }
     hold(last).await;
@@ -263,57 +263,57 @@ async fn a_stop_ends_those_that_obey_and_kills_those_that_do_not() {
     let events = rest(&mut children).await;
     let mut ends = ends(&events);
     ends.sort_by_key(|(number, _)| *number);
-    let endings: Vec<_> = ends.iter().map(|(_, ended)| ended.ending.clone()).collect();
-    let lingering = Ending::Lingering(grace);
+    let endings: Vec<_> = ends.iter().map(|(_, ended)| ended.reason.clone()).collect();
+    let lingering = ExitReason::StopTimeout(grace);
     assert_eq!(endings, [exit(130, Some("ready")), lingering.clone(), lingering]);
-    assert!(ends.iter().all(|(_, ended)| ended.then == Standing::GoneHome));
+    assert!(ends.iter().all(|(_, ended)| ended.then == ChildState::Exited));
 }
 
 #[tokio::test]
-async fn a_death_by_signal_is_told() {
+async fn exits_by_signal_are_reported() {
     let mut children = children(&["kill -9 $$", "kill -SEGV $$"], NO_RESTART);
     let events = rest(&mut children).await;
-    let mut told: Vec<_> =
-        ends(&events).iter().map(|(number, ended)| (*number, ended.ending.to_string())).collect();
-    told.sort();
-    assert_eq!(told[0].1, "killed by signal 9 (SIGKILL)");
-    assert_eq!(told[1].1, "killed by signal 11 (SIGSEGV)");
+    let mut reasons: Vec<_> =
+        ends(&events).iter().map(|(number, ended)| (*number, ended.reason.to_string())).collect();
+    reasons.sort();
+    assert_eq!(reasons[0].1, "killed by signal 9 (SIGKILL)");
+    assert_eq!(reasons[1].1, "killed by signal 11 (SIGSEGV)");
 }
 
 #[tokio::test]
-async fn what_a_process_leaves_behind_does_not_keep_it() {
-    // The one left behind holds the pipe of the standard error open.
+async fn orphaned_processes_do_not_delay_the_exit() {
+    // The orphaned process keeps the pipe of the standard error open.
     let mut children = children(&["echo here >&2; sleep 20 & printf last >&2; exit 4"], NO_RESTART);
     let begun = std::time::Instant::now();
     let events = rest(&mut children).await;
-    assert_eq!(ends(&events)[0].1.ending, exit(4, Some("last")));
+    assert_eq!(ends(&events)[0].1.reason, exit(4, Some("last")));
     assert!(begun.elapsed() < Duration::from_secs(20), "waited for the wrong process");
 }
 
 #[tokio::test]
-async fn last_words_wait_for_a_slow_listener() {
+async fn the_last_lines_wait_for_a_slow_reader() {
     let mut children = children(&["seq 5000 >&2; echo the reason >&2; exit 4"], NO_RESTART);
     let mut found = 0;
-    let ending = loop {
+    let reason = loop {
         match next(&mut children).await {
-            Event::Said { .. } => found += 1,
-            Event::Ended { ended, .. } => break ended.ending,
-            event => assert!(matches!(event, Event::Started { .. })),
+            ChildEvent::Stderr { .. } => found += 1,
+            ChildEvent::Ended { ended, .. } => break ended.reason,
+            event => assert!(matches!(event, ChildEvent::Started { .. })),
         }
-        // It has ended long before everything is heard.
+        // It exits long before all lines are received.
         if found % 500 == 0 {
-            tokio::time::sleep(watch::LAST_WORDS).await;
+            tokio::time::sleep(child_monitor::STDERR_DRAIN_TIMEOUT).await;
         }
     };
-    assert_eq!((found, ending), (5001, exit(4, Some("the reason"))));
+    assert_eq!((found, reason), (5001, exit(4, Some("the reason"))));
 }
 
 #[tokio::test]
-async fn what_cannot_be_started_is_told() {
+async fn failed_starts_are_reported() {
     let launch = |_, _| Launch { program: "/no/such/program".into(), ..Launch::shell("") };
     let mut children = Children::new(1, LIMITS, launch);
     let events = rest(&mut children).await;
     let ends = ends(&events);
     assert_eq!((events.len(), ends.len()), (3, 3), "nothing but ends");
-    assert!(ends[0].1.ending.to_string().contains("No such file"), "{}", ends[0].1.ending);
+    assert!(ends[0].1.reason.to_string().contains("No such file"), "{}", ends[0].1.reason);
 }

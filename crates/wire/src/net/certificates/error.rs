@@ -1,4 +1,4 @@
-//! What can be wrong with certificates.
+//! Errors of certificates.
 
 use std::path::{Path, PathBuf};
 
@@ -8,79 +8,79 @@ use std::path::{Path, PathBuf};
 pub struct CertificateError {
     /// The file.
     pub path: PathBuf,
-    /// What is wrong with it.
+    /// The problem.
     #[source]
     pub fault: CertificateFault,
 }
 
-/// What is wrong with a certificate or key.
+/// Why a certificate or key cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CertificateFault {
     /// The file cannot be read.
     #[error("cannot be read: {0}")]
     Unreadable(std::io::Error),
-    /// The file has nothing of what is needed.
+    /// The file does not contain what is needed.
     #[error("found no {0}, expected one in PEM format, which begins with -----BEGIN")]
     Empty(&'static str),
-    /// It is there and makes no sense.
-    #[error("damaged: {0}; copy it anew, or make another with configs/certificates.sh")]
+    /// The content is invalid.
+    #[error("damaged: {0}; copy it again, or create a new one with configs/certificates.sh")]
     Damaged(String),
-    /// A private key that takes a passphrase.
+    /// The private key is encrypted.
     #[error(
         "the private key is encrypted, expected one without a passphrase: openssl pkey -in FILE -out FILE removes it"
     )]
     Encrypted,
-    /// A private key that belongs to another certificate.
-    #[error("the private key is not that of {}; copy both from one directory that configs/certificates.sh has made", certificate.display())]
+    /// The private key belongs to another certificate.
+    #[error("the private key does not belong to {}; copy both from the same directory created by configs/certificates.sh", certificate.display())]
     OtherKey {
         /// The certificate.
         certificate: PathBuf,
     },
-    /// A certificate that another authority has signed.
-    #[error("the certificate was not signed by the authority in {}; copy both from one directory that configs/certificates.sh has made", authority.display())]
+    /// The certificate is signed by another authority.
+    #[error("the certificate is not signed by the authority in {}; copy both from the same directory created by configs/certificates.sh", authority.display())]
     OtherAuthority {
         /// The authority.
         authority: PathBuf,
     },
-    /// A certificate that has expired.
+    /// The certificate has expired.
     #[error(
-        "the certificate expired on {on}; make another with configs/certificates.sh, or put this host's clock right"
+        "the certificate expired on {on}; create a new one with configs/certificates.sh, or correct this host's clock"
     )]
     Expired {
-        /// The last day of it.
+        /// Its last day.
         on: String,
     },
-    /// A certificate that is not in force yet.
-    #[error("the certificate is valid from {from} on; this host's clock may be wrong")]
+    /// The certificate is not yet valid.
+    #[error("the certificate is valid only from {from}; this host's clock may be wrong")]
     NotYet {
-        /// The first day of it.
+        /// Its first day.
         from: String,
     },
-    /// A certificate of an orchestrator that names no host.
+    /// The orchestrator's certificate has no host names.
     #[error(
-        "the certificate names no host (subjectAltName), so that no agent can connect; configs/certificates.sh makes one that does"
+        "the certificate has no host names (subjectAltName), so no agent can connect; create one with configs/certificates.sh"
     )]
     NoNames,
-    /// A certificate of an orchestrator that names other hosts.
+    /// The orchestrator's certificate is for other hosts.
     #[error(
-        "the certificate is for {names}, and agents are told to connect to {host}; make one for this name with configs/certificates.sh, or name the host with --host"
+        "the certificate is for {names}, but agents connect to {host}; create one for this name with configs/certificates.sh, or set the host name with --host"
     )]
     OtherNames {
-        /// The names that it has.
+        /// The names in the certificate.
         names: String,
-        /// The name that it lacks.
+        /// The missing name.
         host: String,
     },
-    /// A certificate for something else.
-    #[error("the certificate is not meant for this use: expected {0} among its extended key usages")]
+    /// The certificate is for another purpose.
+    #[error("the certificate is for another purpose: expected {0} among its extended key usages")]
     Purpose(&'static str),
-    /// Something else that the other side will not accept.
-    #[error("the other side will refuse the certificate: {0}")]
+    /// The other side will reject the certificate for another reason.
+    #[error("the other side will reject the certificate: {0}")]
     Refused(String),
 }
 
 impl CertificateFault {
-    /// The fault of a file.
+    /// The error for this file.
     pub fn at(self, path: &Path) -> CertificateError {
         CertificateError { path: path.to_owned(), fault: self }
     }

@@ -29,7 +29,7 @@ impl Authority {
         Self { pem, issuer: Issuer::new(parameters, key) }
     }
 
-    /// Writes the files of a host whose certificate is as `change` has it.
+    /// Writes the files of a host, with changes to its certificate.
     fn host(&self, directory: &Path, change: impl FnOnce(&mut CertificateParams)) -> Tls {
         let key = KeyPair::generate().unwrap();
         let mut parameters = CertificateParams::new(["head".to_owned(), "10.0.0.3".to_owned()]).unwrap();
@@ -41,7 +41,7 @@ impl Authority {
         fs::write(directory.join("authority.pem"), &self.pem).unwrap();
         fs::write(directory.join("certificate.pem"), certificate.pem()).unwrap();
         fs::write(directory.join("key.pem"), key.serialize_pem()).unwrap();
-        Tls::in_directory(directory)
+        Tls::from_directory(directory)
     }
 }
 
@@ -50,7 +50,7 @@ fn refused(tls: &Tls, side: Side) -> String {
 }
 
 #[test]
-fn good_certificates_serve_both_sides() {
+fn valid_certificates_work_on_both_sides() {
     let directory = tempfile::tempdir().unwrap();
     let tls = Authority::new().host(directory.path(), |_| {});
     for side in [Side::Orchestrator, Side::Agent] {
@@ -60,19 +60,19 @@ fn good_certificates_serve_both_sides() {
 }
 
 #[test]
-fn a_certificate_is_for_the_hosts_that_it_names() {
+fn certificates_match_their_host_names() {
     let names = ["head", "*.cluster.example", "10.0.0.3", "::1"].map(str::to_owned).to_vec();
     let checked = CheckedTls { names, warnings: vec![] };
     for host in ["head", "HEAD", "node7.cluster.example", "10.0.0.3", "[::1]", "[0:0:0:0:0:0:0:1]"] {
-        assert!(checked.is_for(host), "{host}");
+        assert!(checked.is_valid_for(host), "{host}");
     }
     for host in ["node7", "cluster.example", "a.b.cluster.example", "10.0.0.4", "[::2]", ""] {
-        assert!(!checked.is_for(host), "{host}");
+        assert!(!checked.is_valid_for(host), "{host}");
     }
 }
 
 #[test]
-fn what_is_wrong_with_a_file_is_said_with_its_name() {
+fn errors_name_the_file() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let authority = Authority::new();
@@ -90,7 +90,7 @@ fn what_is_wrong_with_a_file_is_said_with_its_name() {
         ("key.pem", Some(""), "found no private key"),
         ("key.pem", Some(&authority.pem), "found no private key"),
         ("key.pem", Some(encrypted), "encrypted"),
-        ("key.pem", Some(&other), "not that of"),
+        ("key.pem", Some(&other), "does not belong to"),
         ("authority.pem", Some(no_base64), "damaged"),
         ("certificate.pem", Some(no_base64), "damaged"),
         ("authority.pem", Some(no_certificate), "damaged"),
@@ -110,14 +110,14 @@ fn what_is_wrong_with_a_file_is_said_with_its_name() {
 }
 
 #[test]
-fn certificates_of_another_authority_or_for_something_else_are_refused() {
+fn certificates_of_other_authorities_or_purposes_are_rejected() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let tls = Authority::new().host(here, |_| {});
     fs::write(&tls.authority, Authority::new().pem).unwrap();
     for side in [Side::Orchestrator, Side::Agent] {
         let why = refused(&tls, side);
-        assert!(why.contains("certificate.pem: the certificate was not signed by"), "{why}");
+        assert!(why.contains("certificate.pem: the certificate is not signed by"), "{why}");
     }
     let tls = Authority::new().host(here, |certificate| {
         certificate.extended_key_usages = vec![Purpose::ClientAuth];
@@ -125,12 +125,12 @@ fn certificates_of_another_authority_or_for_something_else_are_refused() {
     assert!(refused(&tls, Side::Orchestrator).contains("serverAuth"));
     assert!(tls.check(Side::Agent, today()).is_ok());
     let tls = Authority::new().host(here, |certificate| certificate.subject_alt_names.clear());
-    assert!(refused(&tls, Side::Orchestrator).contains("names no host"));
-    assert!(tls.check(Side::Agent, today()).is_ok(), "nobody asks an agent for its name");
+    assert!(refused(&tls, Side::Orchestrator).contains("has no host names"));
+    assert!(tls.check(Side::Agent, today()).is_ok(), "an agent needs no name");
 }
 
 #[test]
-fn a_certificate_is_refused_before_and_after_its_time_and_spoken_of_before_its_end() {
+fn certificates_are_rejected_outside_their_validity_with_a_warning_before_expiry() {
     let directory = tempfile::tempdir().unwrap();
     let authority = Authority::new();
     let until = |year, month, day| {
@@ -149,5 +149,5 @@ fn a_certificate_is_refused_before_and_after_its_time_and_spoken_of_before_its_e
     assert!(why.contains("certificate.pem: the certificate expired on 2030-05-31"), "{why}");
     let early = authority.host(directory.path(), |_| {}).check(Side::Agent, today() - 200 * DAY);
     let why = early.unwrap_err().to_string();
-    assert!(why.contains("certificate.pem: the certificate is valid from 2030-01-01 on"), "{why}");
+    assert!(why.contains("certificate.pem: the certificate is valid only from 2030-01-01"), "{why}");
 }

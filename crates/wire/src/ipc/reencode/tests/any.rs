@@ -1,0 +1,148 @@
+//! Strategies for arbitrary messages, encoded as by their senders.
+
+use std::borrow::Cow;
+
+use proptest::collection::{btree_set, vec};
+use proptest::option;
+use proptest::prelude::*;
+
+use super::common::{candidate, origin, usable_structure};
+use super::encode_message;
+use crate::block::Candidate;
+use crate::ids::{CampaignId, Origin, WalkId};
+use crate::messages::{Assignment, DeclineReason, Outcome, Progress, Report, Verdict, WalkEnd};
+use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
+
+fn verdict() -> impl Strategy<Value = Verdict> {
+    prop_oneof![
+        Just(Verdict::Accepted),
+        prop::sample::select(DeclineReason::ALL.to_vec()).prop_map(Verdict::Declined)
+    ]
+}
+
+fn end() -> impl Strategy<Value = WalkEnd> {
+    prop_oneof![
+        Just(WalkEnd::Steps),
+        Just(WalkEnd::Collected),
+        ".{0,40}".prop_map(|guard| WalkEnd::Trapped { guard }),
+        ".{0,40}".prop_map(|reason| WalkEnd::BlewUp { reason }),
+        ".{0,40}".prop_map(|reason| WalkEnd::BadStart { reason }),
+    ]
+}
+
+fn progress() -> impl Strategy<Value = Progress> {
+    let numbers = [(); 4].map(|()| -1e3..1e9);
+    (any::<u64>(), any::<u32>(), numbers, any::<u64>(), any::<u32>(), any::<Option<(u64, u64)>>()).prop_map(
+        |(step, segment, [tau, temperature, relative_volume, gamma_max], refused, returns, last_return)| {
+            Progress {
+                step,
+                segment,
+                tau,
+                temperature,
+                relative_volume,
+                gamma_max,
+                refused,
+                returns,
+                last_return,
+            }
+        },
+    )
+}
+
+pub fn assignment() -> impl Strategy<Value = Assignment> {
+    let ids = (any::<[u8; 16]>(), any::<u32>(), any::<u32>(), any::<u64>(), any::<u64>());
+    let rest = (
+        option::of(vec(any::<u8>(), 0..300)),
+        option::of(verdict()),
+        btree_set(any::<u64>(), 0..6),
+        1.0..9.0,
+    );
+    (ids, origin(), usable_structure(), rest).prop_map(|(ids, origin, seed_structure, rest)| {
+        let (campaign, walk, random_walk, number, last_step) = ids;
+        let (checkpoint, verdict, frame_steps, threshold_factor) = rest;
+        let (campaign, walk, random_walk) = (CampaignId(campaign), WalkId(walk), WalkId(random_walk));
+        let frame_steps =
+            if origin == Origin::Control { frame_steps.into_iter().collect() } else { Vec::new() };
+        Assignment {
+            campaign,
+            walk,
+            number,
+            origin,
+            random_walk,
+            seed_structure,
+            checkpoint,
+            verdict,
+            last_step,
+            frame_steps,
+            threshold_factor,
+        }
+    })
+}
+
+pub fn report() -> impl Strategy<Value = Report<Candidate>> {
+    let outcome = prop_oneof![
+        candidate().prop_map(Outcome::Candidate),
+        Just(Outcome::StepsDone),
+        Just(Outcome::Interrupted),
+        end().prop_map(Outcome::Ended),
+    ];
+    (any::<u32>(), any::<u64>(), outcome, vec(any::<u8>(), 0..300), progress()).prop_map(
+        |(walk, assignment, outcome, checkpoint, progress)| {
+            let walk = match &outcome {
+                Outcome::Candidate(candidate) => candidate.id.walk,
+                _ => WalkId(walk),
+            };
+            Report { walk, assignment, outcome, checkpoint, progress }
+        },
+    )
+}
+
+pub fn sender() -> impl Strategy<Value = SenderId> {
+    (any::<u64>(), any::<u32>(), any::<u32>()).prop_map(|(session, walker, incarnation)| SenderId {
+        session,
+        walker,
+        incarnation,
+    })
+}
+
+/// An offer as a walker sends it.
+pub fn offered(sender: SenderId, sequence: u64, report: Option<&Report<Candidate>>) -> Vec<u8> {
+    let (payload, candidate) = Payload::offer(sequence, report);
+    encode_message(&Envelope { sender, payload }, candidate)
+}
+
+pub fn offer() -> impl Strategy<Value = Vec<u8>> {
+    (sender(), any::<u64>(), option::weighted(0.8, report()))
+        .prop_map(|(sender, sequence, report)| offered(sender, sequence, report.as_ref()))
+}
+
+pub fn request() -> impl Strategy<Value = Vec<u8>> {
+    let poll = (sender(), any::<u64>()).prop_map(|(sender, sequence)| {
+        encode_message(&Envelope { sender, payload: Payload::Poll { sequence } }, None)
+    });
+    let news = (sender(), any::<u32>(), progress()).prop_map(|(sender, walk, progress)| {
+        let payload = Payload::Progress(WalkId(walk), Cow::Owned(progress));
+        encode_message(&Envelope { sender, payload }, None)
+    });
+    prop_oneof![4 => offer(), 1 => poll, 1 => news]
+}
+
+/// An assignment as the server sends it.
+pub fn given(sequence: u64, mixture_version: u64, assignment: &Assignment) -> Vec<u8> {
+    let assignment = Cow::Borrowed(assignment);
+    encode_message(&Answer { sequence, body: AnswerBody::Assignment { mixture_version, assignment } }, None)
+}
+
+pub fn answer() -> impl Strategy<Value = Vec<u8>> {
+    let assigned = (any::<u64>(), any::<u64>(), assignment())
+        .prop_map(|(sequence, version, assignment)| given(sequence, version, &assignment));
+    let other = (any::<u64>(), 0..3).prop_map(|(sequence, which)| {
+        let body = match which {
+            0 => AnswerBody::Shutdown,
+            1 => AnswerBody::Pending,
+            _ => AnswerBody::Unknown,
+        };
+        encode_message(&Answer { sequence, body }, None)
+    });
+    prop_oneof![3 => assigned, 1 => other]
+}

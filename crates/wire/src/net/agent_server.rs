@@ -1,0 +1,176 @@
+//! The orchestrator's end: a task that receives requests of agents, answers them, and forwards reports to the reactor.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use calm::Mixture;
+use futures_util::StreamExt;
+use futures_util::stream::FuturesUnordered;
+use tokio::sync::mpsc;
+use tokio::time::MissedTickBehavior;
+use zenoh::Session;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::pubsub::Subscriber;
+use zenoh::query::{Query, Queryable};
+use zenoh::sample::{Sample, SampleKind};
+
+use super::certificates::Tls;
+use super::endpoint::{self, Endpoint, Side};
+use super::files::Files;
+use super::message::{AGENTS, Agent, ORCHESTRATOR};
+use super::session::ServerSession;
+use super::{AgentBootstrap, NetError};
+use crate::transport::Incoming;
+
+/// Number of queued requests before zenoh applies backpressure.
+const QUEUE_LENGTH: usize = 1024;
+/// Interval between checks for unresponsive agents.
+const EXPIRY_INTERVAL: Duration = Duration::from_millis(500);
+
+/// An event of an agent.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum AgentEvent {
+    /// It has joined.
+    Joined(Agent),
+    /// Its heartbeat is missing: the link is down, or the agent is dead.
+    Unresponsive(Agent),
+    /// Its heartbeat is back.
+    Recovered(Agent),
+    /// Its heartbeat was missing for too long: others get its assignments.
+    Lost(Agent),
+    /// It has left.
+    Left(Agent),
+    /// A message was rejected, with the reason.
+    MessageRejected(String),
+}
+
+/// The orchestrator's end of the transport. Agents can connect as soon as it is open; [`AgentServer::run`] handles
+/// their requests.
+pub struct AgentServer {
+    endpoint: Endpoint,
+    session: Session,
+    queries: Queryable<FifoChannelHandler<Query>>,
+    liveliness: Subscriber<FifoChannelHandler<Sample>>,
+    commands: mpsc::UnboundedReceiver<Close>,
+    handle: AgentServerHandle,
+    session_id: u64,
+    agent_timeout: Duration,
+    bootstrap: AgentBootstrap,
+}
+
+/// Controls the server's task.
+#[derive(Clone, Debug)]
+pub struct AgentServerHandle(mpsc::UnboundedSender<Close>);
+
+#[derive(Debug)]
+struct Close;
+
+impl AgentServerHandle {
+    /// There is no more work: [`AgentServer::run`] returns when the last agent has left.
+    pub fn close(&self) {
+        // Fails only if the server has already ended.
+        let _ = self.0.send(Close);
+    }
+}
+
+impl AgentServer {
+    /// Listens on an endpoint. `session` distinguishes this run of the orchestrator from others. Agents without
+    /// heartbeat for `agent_timeout` are considered lost.
+    ///
+    /// # Errors
+    /// An endpoint off loopback without certificates, unusable certificates, or an error of zenoh.
+    pub async fn open(
+        endpoint: &Endpoint,
+        tls: Option<&Tls>,
+        session: u64,
+        agent_timeout: Duration,
+        bootstrap: AgentBootstrap,
+    ) -> Result<Self, NetError> {
+        let endpoint = endpoint.with_free_port().map_err(|why| NetError::open(endpoint, why))?;
+        let (session_id, failed) = (session, |why| NetError::open(&endpoint, why));
+        let session = endpoint::open(Side::Orchestrator, &endpoint, tls).await?;
+        let channel = zenoh::handlers::FifoChannel::new(QUEUE_LENGTH);
+        let queries = session.declare_queryable(ORCHESTRATOR).complete(true).with(channel);
+        let queries = queries.await.map_err(failed)?;
+        let channel = zenoh::handlers::FifoChannel::new(QUEUE_LENGTH);
+        let liveliness = session.liveliness().declare_subscriber(format!("{AGENTS}/*")).with(channel);
+        let liveliness = liveliness.await.map_err(failed)?;
+        let (sender, commands) = mpsc::unbounded_channel();
+        let handle = AgentServerHandle(sender);
+        Ok(Self {
+            endpoint,
+            session,
+            queries,
+            liveliness,
+            commands,
+            handle,
+            session_id,
+            agent_timeout,
+            bootstrap,
+        })
+    }
+
+    /// The endpoint it listens on.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.endpoint
+    }
+
+    /// Handle for stopping the server.
+    pub fn handle(&self) -> AgentServerHandle {
+        self.handle.clone()
+    }
+
+    /// Handles requests of agents and forwards reports to the reactor until [`AgentServerHandle::close`], and then
+    /// until every agent has left or is lost. `mixture` is the current mixture. Setting `stopping` asks agents to stop.
+    /// `on_event` is called for every event of an agent.
+    ///
+    /// # Errors
+    /// The zenoh session was closed.
+    pub async fn run(
+        mut self,
+        mixture: Arc<Mixture>,
+        stopping: Arc<AtomicBool>,
+        to_reactor: mpsc::Sender<Incoming>,
+        mut on_event: impl FnMut(AgentEvent) + Send + 'static,
+    ) -> Result<(), NetError> {
+        let files = Files::new(self.bootstrap.files);
+        let mut state =
+            ServerSession::new(self.session_id, self.agent_timeout, self.bootstrap.setup, mixture, stopping);
+        let mut closing = false;
+        let mut decisions = FuturesUnordered::new();
+        let mut expiry = tokio::time::interval(EXPIRY_INTERVAL);
+        expiry.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                // Complete aborted decisions before the reactor learns of the reason.
+                biased;
+                _ = self.commands.recv(), if !closing => closing = true,
+                Some((slot, work)) = decisions.next() => state.handle_decision(slot, work),
+                permit = to_reactor.reserve(), if !state.outbox.is_empty() => match permit {
+                    Ok(permit) => if let Some(incoming) = state.outbox.pop_front() { permit.send(incoming) },
+                    // The reactor has ended: all waiting walkers shut down.
+                    Err(_) => state.outbox.clear(),
+                },
+                change = self.liveliness.recv_async() => {
+                    let change = change.map_err(|why| NetError::SessionClosed { why: why.to_string() })?;
+                    let id = change.key_expr().as_str().rsplit('/').next().unwrap_or_default();
+                    state.set_alive(id, change.kind() == SampleKind::Put, Instant::now());
+                }
+                query = self.queries.recv_async() => {
+                    let query = query.map_err(|why| NetError::SessionClosed { why: why.to_string() })?;
+                    if let Some(decision) = state.receive(query, &files) {
+                        decisions.push(decision);
+                    }
+                }
+                _ = expiry.tick() => state.expire(Instant::now()),
+            }
+            state.events.drain(..).for_each(&mut on_event);
+            if closing && state.has_no_agents() {
+                break;
+            }
+        }
+        state.finish().await;
+        self.session.close().await.map_err(|why| NetError::SessionClosed { why: why.to_string() })
+    }
+}

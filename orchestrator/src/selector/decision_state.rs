@@ -1,0 +1,170 @@
+//! The state that decisions depend on, and its restoration from the store.
+
+use std::collections::{BTreeMap, HashSet};
+use std::sync::Arc;
+
+use calm::{ChangedComponent, Component, Mixture};
+use serde::de::DeserializeOwned;
+use serde_json::json;
+use store::records::{Commit, ComponentRecord, Decision, WalkRecord};
+use wire::{ContentHash, WalkId};
+
+use super::backlog::Backlog;
+use super::rules::{ChangeableRules, RULES};
+use super::walk::Walk;
+use super::{
+    Regrader, STALENESS, SeedStructure, SelectorError, SelectorSnapshot, Settings, Staleness, TrainingFrames,
+};
+use crate::grader::Grader;
+
+/// Decides on candidates and walks.
+pub(super) struct DecisionState {
+    pub settings: Settings,
+    /// Minimum distance in candidates of each seed structure, Å.
+    pub min_distances: Vec<f64>,
+    pub regrader: Regrader,
+    pub mixture: Arc<Mixture>,
+    pub training: Option<TrainingFrames>,
+    pub walks: BTreeMap<WalkId, Walk>,
+    pub known: HashSet<ContentHash>,
+    /// Number of started rounds; always 0 in live mode.
+    pub round: u64,
+    pub accepted: u32,
+    pub declined_feature_bytes: u64,
+    pub staleness: Staleness,
+    /// Number of imported structures: now, and when the log last recorded it.
+    pub imported: (u64, u64),
+    /// The changeable rules when the log last recorded them.
+    pub rules: Option<ChangeableRules>,
+    pub backlog: Option<Backlog>,
+    /// Factor on the threshold of the collection rule.
+    pub threshold_factor: f64,
+}
+
+impl DecisionState {
+    /// Restores the state from a store.
+    pub fn restore(
+        settings: Settings,
+        seeds: &[SeedStructure],
+        grader: Grader,
+        original: Arc<Mixture>,
+        training: Option<TrainingFrames>,
+        snapshot: SelectorSnapshot,
+    ) -> Result<Self, SelectorError> {
+        let min_distances = min_distances(&settings, seeds, &grader)?;
+        let value = |name: &str| -> Result<u64, SelectorError> {
+            let stored = snapshot.values.iter().find(|(key, _)| key == name);
+            let Some((_, text)) = stored else { return Ok(0) };
+            text.parse().map_err(|_| SelectorError::Snapshot(format!("{name} is '{text}', not a number")))
+        };
+        let (round, version) = (value("round")?, value("mixture_version")?);
+        let (declined_feature_bytes, imported) = (value("declined_feature_bytes")?, value("imported")?);
+        let staleness = restored(STALENESS, &snapshot.values)?.unwrap_or_default();
+        let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
+        let walks = restored_walks(snapshot.walks, seeds.len())?;
+        let accepted = walks.values().filter(|walk| walk.is_biased()).map(|walk| walk.record.accepted).sum();
+        Ok(Self {
+            settings,
+            min_distances,
+            regrader: Regrader { grader: Arc::new(grader), original },
+            mixture,
+            training,
+            walks,
+            known: snapshot.known.into_iter().collect(),
+            round,
+            accepted,
+            declined_feature_bytes,
+            staleness,
+            imported: (snapshot.imported, imported),
+            rules: restored(RULES, &snapshot.values)?,
+            backlog: None,
+            threshold_factor: 1.0,
+        })
+    }
+
+    /// A walk that exists: walks are never removed from the table.
+    pub fn walk_mut(&mut self, id: WalkId) -> &mut Walk {
+        self.walks.get_mut(&id).expect("walks stay in the table")
+    }
+
+    /// Adds the current values to a commit.
+    pub fn add_values(&self, commit: &mut Commit) {
+        let values = [
+            ("round", self.round),
+            ("mixture_version", self.mixture.version()),
+            ("declined_feature_bytes", self.declined_feature_bytes),
+            ("imported", self.imported.0),
+        ];
+        commit.values.extend(values.map(|(name, value)| (name.to_owned(), value.to_string())));
+        if !commit.candidates.is_empty() {
+            commit.values.push((STALENESS.to_owned(), json!(self.staleness).to_string()));
+        }
+    }
+
+    pub fn decision(&self, kind: &'static str, walk: WalkId, detail: serde_json::Value) -> Decision {
+        let (round, mixture_version) = (self.round, self.mixture.version());
+        Decision { round, kind, walk: Some(walk), candidate: None, mixture_version, detail }
+    }
+}
+
+/// max(minimum distance, fraction × shortest distance) for each seed structure, Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
+fn min_distances(
+    settings: &Settings,
+    seeds: &[SeedStructure],
+    grader: &Grader,
+) -> Result<Vec<f64>, SelectorError> {
+    let (least, fraction) = settings.min_distance;
+    let of = |seed: &SeedStructure| match grader.bonds(&seed.structure) {
+        Ok(bonds) if bonds.shortest.is_finite() => Ok(least.max(fraction * bonds.shortest)),
+        Ok(_) => Ok(least),
+        Err(source) => Err(SelectorError::SeedStructure { name: seed.name.clone(), source }),
+    };
+    seeds.iter().map(of).collect()
+}
+
+/// The stored walks, which must be numbered from 0 and start from existing seed structures.
+fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<BTreeMap<WalkId, Walk>, SelectorError> {
+    let restored = records.into_iter().enumerate().map(|(number, record)| {
+        let (id, seed) = (record.walk, record.seed_structure);
+        if id.0 as usize != number {
+            return Err(SelectorError::Snapshot(format!("found walk {id} in place of walk {number}")));
+        }
+        if seed as usize >= seeds {
+            let problem = format!("walk {id} starts from seed structure {seed}, but there are only {seeds}");
+            return Err(SelectorError::Snapshot(problem));
+        }
+        Ok((id, Walk::restore(record)?))
+    });
+    restored.collect()
+}
+
+/// A value that databases of earlier versions do not have.
+fn restored<T: DeserializeOwned>(
+    name: &str,
+    values: &[(String, String)],
+) -> Result<Option<T>, SelectorError> {
+    let Some((_, text)) = values.iter().find(|(key, _)| key == name) else { return Ok(None) };
+    let read = serde_json::from_str(text);
+    read.map(Some).map_err(|error| SelectorError::Snapshot(format!("{name} is damaged: {error}")))
+}
+
+/// The mixture of a version: the original mixture with the stored components, which are all that ever changed.
+///
+/// # Errors
+/// Components that are damaged or do not match the original mixture.
+pub fn restored_mixture(
+    original: &Mixture,
+    version: u64,
+    components: &[ComponentRecord],
+) -> Result<Mixture, SelectorError> {
+    let changed = components.iter().map(|record| {
+        let component = Component::from_bytes(&record.bytes).map_err(|error| {
+            let place = format!("component {} of element {}", record.slot, record.element);
+            SelectorError::Snapshot(format!("{place}: {error}"))
+        })?;
+        let (element, slot) = (record.element as usize, record.slot as usize);
+        Ok(ChangedComponent { element, slot, component: Arc::new(component) })
+    });
+    let changed = changed.collect::<Result<Vec<_>, SelectorError>>()?;
+    Ok(original.with_changes(&changed)?.at_version(version))
+}

@@ -1,0 +1,83 @@
+//! Choice of the next walk.
+
+use wire::WalkId;
+use wire::messages::Assignment;
+
+use super::walk::Walk;
+use super::{Mode, Selector};
+
+/// What an idle walker does next.
+#[derive(Debug)]
+pub enum Scheduling {
+    /// Works on this assignment, with the mixture of [`Selector::mixture`].
+    Assign(Box<Assignment>),
+    /// Waits: reports that determine the next assignment are outstanding, or walks are paused.
+    Wait,
+    /// Exits: there is no more work.
+    Done,
+}
+
+impl Selector {
+    /// The next assignment for an idle walker.
+    pub fn next_assignment(&mut self) -> Scheduling {
+        if self.decisions.settings.mode == Mode::Reproducible && self.in_round.is_empty() {
+            self.start_round();
+        }
+        let ready = |(id, walk): (&WalkId, &Walk)| {
+            let in_turn = match self.decisions.settings.mode {
+                Mode::Live => !walk.has_ended(),
+                Mode::Reproducible => self.in_round.get(id).is_some_and(Option::is_none),
+            };
+            (in_turn && !walk.is_assigned && !self.paused.contains(id)).then_some(*id)
+        };
+        if let Some(id) = self.decisions.walks.iter().find_map(ready) {
+            return Scheduling::Assign(Box::new(self.assign(id)));
+        }
+        if self.is_done() { Scheduling::Done } else { Scheduling::Wait }
+    }
+
+    /// Whether every walk has ended.
+    pub fn is_done(&self) -> bool {
+        self.decisions.walks.values().all(Walk::has_ended)
+    }
+
+    /// Returns the assignment of a lost walker; it is assigned again.
+    pub fn assignment_lost(&mut self, id: WalkId) {
+        if let Some(walk) = self.decisions.walks.get_mut(&id) {
+            walk.is_assigned = false;
+        }
+    }
+
+    /// Starts a round with the first unfinished biased walks and as many control walks.
+    fn start_round(&mut self) {
+        for biased in [true, false] {
+            let unfinished =
+                self.decisions.walks.values().filter(|walk| !walk.has_ended() && walk.is_biased() == biased);
+            let taken =
+                unfinished.take(self.decisions.settings.walks_per_round).map(|walk| (walk.record.walk, None));
+            self.in_round.extend(taken);
+        }
+        if !self.in_round.is_empty() {
+            self.decisions.round += 1;
+        }
+    }
+
+    fn assign(&mut self, id: WalkId) -> Assignment {
+        let walk = self.decisions.walks.get_mut(&id).expect("the id comes from this table");
+        walk.is_assigned = true;
+        walk.record.state = "running".to_owned();
+        Assignment {
+            campaign: self.campaign,
+            walk: id,
+            number: walk.record.turn,
+            origin: walk.record.origin,
+            random_walk: walk.record.partner.unwrap_or(id),
+            seed_structure: self.seeds[walk.record.seed_structure as usize].structure.clone(),
+            checkpoint: walk.record.checkpoint.clone(),
+            verdict: walk.state.verdict.clone(),
+            last_step: walk.state.until,
+            frame_steps: walk.state.wanted.clone(),
+            threshold_factor: self.decisions.threshold_factor,
+        }
+    }
+}
