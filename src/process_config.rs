@@ -96,7 +96,7 @@ pub struct PoolConfig {
     /// Whether to exit when the queue is empty and no run is active, even if walks are unfinished.
     pub until_empty: bool,
     /// Time that a label in progress may take after a stop, s.
-    pub grace: f64,
+    pub grace_period: f64,
 }
 
 /// How labels are made.

@@ -346,12 +346,12 @@ fn shared_memory_is_the_users_alone() {
     wait_for_work(here);
     let held = pause_walkers(here, 2);
     let shm_dir = wire::shm_dir::ShmDir::for_campaign(here).unwrap();
-    assert_eq!(fs::metadata(place.directory()).unwrap().mode() & 0o777, 0o700);
+    assert_eq!(fs::metadata(shm_dir.directory()).unwrap().mode() & 0o777, 0o700);
     let mut segments = 0;
     for file in fs::read_dir("/dev/shm").unwrap().flatten() {
         // Those that nobody needs any more are removed at any time.
         let (name, Ok(data)) = (file.file_name(), file.metadata()) else { continue };
-        if name.to_string_lossy().starts_with(place.prefix()) {
+        if name.to_string_lossy().starts_with(shm_dir.prefix()) {
             segments += 1;
             assert_eq!(data.mode() & 0o077, 0, "{:?} {:o}", file.path(), data.mode());
         }

@@ -58,28 +58,28 @@ fn main() {
     let mut server = Running(command.spawn().expect("the program starts"));
     let [address] = said(&mut server.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');
-    let look = |page: &str| {
+    let fetch = |page: &str| {
         let answer = get(address, page);
         assert!(answer.status < 300, "{page}: {answer:?}");
     };
     for page in PAGES {
-        row(&format!("`{page}`"), || look(page));
+        row(&format!("`{page}`"), || fetch(page));
     }
     let page = get(address, "/api/candidates?limit=1&fate=accepted").json();
     let newest = page.pointer("/candidates/0/id").and_then(serde_json::Value::as_str).expect("a candidate");
     let story = format!("/api/candidates/{newest}");
-    row("one candidate", || look(&story));
+    row("one candidate", || fetch(&story));
     println!("\nmemory of the server: {}", memory(server.0.id()));
     let begun = Instant::now();
-    row("force errors, before they are there", || look("/api/errors"));
-    row("the table meanwhile", || look(PAGES[2]));
+    row("force errors, before they are there", || fetch("/api/errors"));
+    row("the table meanwhile", || fetch(PAGES[2]));
     let errors = get_computed(address, "/api/errors");
     println!(
         "force errors of {} labels after {:.1} s",
         errors["all"]["structures"],
         begun.elapsed().as_secs_f64()
     );
-    row("force errors", || look("/api/errors"));
+    row("force errors", || fetch("/api/errors"));
     println!("\nmemory of the server: {}", memory(server.0.id()));
     let listeners: Vec<_> = (0..LISTENERS).map(|_| listen(address, "/api/events")).collect();
     // Skip the initial messages, which differ from the periodic ones.

@@ -85,7 +85,7 @@ impl Label {
                 location,
                 label_setup,
                 until_empty: self.until_empty,
-                grace: self.grace_period.get(),
+                grace_period: self.grace_period.get(),
             };
             let ended = label_pool::run(&opened, slots, &stopping, &stop).await?;
             let is_in_force = opened.is_in_force(protocol.hash).await?;

@@ -66,7 +66,7 @@ async fn label(setup: LabellerConfig, method: Method, closing: &Arc<Shutdown>) -
         },
         timing: Timing {
             lease: setup.lease,
-            grace: slot.map(|slot| Duration::from_secs_f64(slot.grace)),
+            grace: slot.map(|slot| Duration::from_secs_f64(slot.grace_period)),
             ..Timing::default()
         },
     };

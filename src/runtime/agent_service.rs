@@ -29,7 +29,7 @@ pub struct AgentService {
 /// Closes the server.
 pub struct AgentServerHandle(Option<net::AgentServerHandle>);
 
-impl Handle {
+impl AgentServerHandle {
     /// Tells agents that there is no more work.
     pub fn close(&self) {
         self.0.iter().for_each(net::AgentServerHandle::close);
@@ -70,8 +70,8 @@ impl AgentService {
         Ok(Self { hub: Some(hub), store, mixture })
     }
 
-    pub fn handle(&self) -> Handle {
-        Handle(self.hub.as_ref().map(AgentServer::handle))
+    pub fn handle(&self) -> AgentServerHandle {
+        AgentServerHandle(self.hub.as_ref().map(AgentServer::handle))
     }
 
     /// Serves agents until there is no more work and the last agent has left.

@@ -37,7 +37,7 @@ pub struct LabelPool {
     /// Whether the labellers exit when the queue is empty and no run is active.
     pub until_empty: bool,
     /// Time that labels in progress may take after a stop.
-    pub grace: Duration,
+    pub grace_period: Duration,
 }
 
 /// Makes labels until there is nothing left to do or `stop` is notified.

@@ -68,9 +68,9 @@ impl Labellers {
             let since = before.map_or_else(Instant::now, |(_, since)| since);
             self.seen.insert(number, (record.last_seen, since));
             if since.elapsed() > proven {
-                signs.delivered(number);
+                heartbeats.delivered(number);
             } else {
-                signs.heartbeat(number);
+                heartbeats.heartbeat(number);
             }
         }
         Ok(())

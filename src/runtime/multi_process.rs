@@ -119,7 +119,7 @@ enum ManagerEvent {
 async fn supervise(
     mut manager: ProcessManager<'_>,
     mut reactor: ReactorTask,
-    agents: agent_service::Handle,
+    agents: agent_service::AgentServerHandle,
     mut serving: JoinHandle<Result<(), Failure>>,
     stop: &Notify,
 ) -> Result<reactor::RunOutcome, Failure> {

@@ -21,14 +21,14 @@ pub struct ProcessRecords<'a> {
     /// When the last message of each walker arrived, ms since 1970.
     heard: Arc<[AtomicI64]>,
     /// Number of rejected messages reported so far.
-    dropped: u64,
+    rejected: u64,
 }
 
 impl<'a> ProcessRecords<'a> {
     /// The records of the orchestrator `process` and of `walkers` walkers.
     pub fn new(store: &'a Store, process: ProcessRecord, walkers: usize) -> Self {
         let heard = (0..walkers).map(|_| AtomicI64::default()).collect();
-        Self { store, process, walkers: BTreeMap::new(), heard, dropped: 0 }
+        Self { store, process, walkers: BTreeMap::new(), heard, rejected: 0 }
     }
 
     /// A callback for the number of a walker that sent a message.
@@ -99,7 +99,7 @@ impl<'a> ProcessRecords<'a> {
             log_and_warn(&rejected);
             let detail = json!({ "rejected": traffic.rejected, "remark": rejected });
             self.store.log_operation(now, "messages_dropped", &detail).await?;
-            self.dropped = traffic.rejected;
+            self.rejected = traffic.rejected;
         }
         Ok(())
     }

@@ -106,7 +106,7 @@ fn a_split_assignment_gives_the_same_result() {
     let whole = run(&settings, &assignment(seed_structure("vacancy"), 120));
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 120));
     let mut turn = assignment(seed_structure("vacancy"), 0);
-    for until in [1, 19, 20, 21, 33, 90, 120] {
+    for last_step in [1, 19, 20, 21, 33, 90, 120] {
         turn.last_step = last_step;
         turn.checkpoint = Some(run(&settings, &turn).checkpoint);
     }
@@ -282,7 +282,7 @@ fn a_control_walk_gives_the_requested_frames_and_follows_the_biased_one_until_th
     let Outcome::Candidate(candidate) = &report.outcome else { panic!("{report:?}") };
     assert_eq!((candidate.id.step, candidate.origin), (25, Origin::Control));
     // The bias is zero for its first ten evaluations: up to step 30 both trajectories agree.
-    let same = |until: u64| {
+    let same = |last_step: u64| {
         let quiet = WalkSettings { collection: never(), ..settings.clone() };
         let biased = run(&quiet, &assignment(seed_structure("slab-111"), last_step));
         let mut control = Assignment { frame_steps: Vec::new(), ..control.clone() };

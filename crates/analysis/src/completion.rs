@@ -37,12 +37,12 @@ impl<T: Clone> Completion<T> {
 
     /// Counts a labelled structure.
     pub fn add_labelled(&mut self, value: Option<f64>) {
-        self.place(value).0 += 1;
+        self.bin_mut(value).0 += 1;
     }
 
     /// Counts the structure `name`, whose label finally failed.
     pub fn add_failed(&mut self, value: Option<f64>, name: T) {
-        self.place(value).1.push(name);
+        self.bin_mut(value).1.push(name);
     }
 
     /// The table, including empty bins. A last row holds structures without a finite value, if there are any.
@@ -55,7 +55,7 @@ impl<T: Clone> Completion<T> {
         bins
     }
 
-    fn place(&mut self, value: Option<f64>) -> &mut (u64, Vec<T>) {
+    fn bin_mut(&mut self, value: Option<f64>) -> &mut (u64, Vec<T>) {
         match value.filter(|value| value.is_finite()) {
             Some(value) => &mut self.counts[self.bins.index_of(value)],
             None => &mut self.unknown,

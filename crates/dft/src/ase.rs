@@ -71,7 +71,7 @@ impl Settings {
             expected: format!("a Python file that defines calculator(), but: {error}"),
         })?;
         let environment = version_query::environment(&self.environment);
-        let versions = Versions::ask(&self.command, &environment, passed, &calculator)?;
+        let versions = Versions::query(&self.command, &environment, passed, &calculator)?;
         Ok(Ase { settings: self.clone(), environment, calculator, versions })
     }
 }
@@ -84,7 +84,7 @@ struct Versions {
 }
 
 impl Versions {
-    fn ask(
+    fn query(
         command: &[String],
         environment: &BTreeMap<String, String>,
         passed: &PassedEnvironment,
@@ -136,7 +136,7 @@ impl DftBackend for Ase {
             "cell": structure.cell.0,
             "periodic": structure.periodic,
             "moments": (!table.is_empty()).then(|| moments::initial(structure, table, adjustments)),
-            "remedies": adjustments.iter().map(|remedy| remedy.name()).collect::<Vec<_>>(),
+            "remedies": adjustments.iter().map(|adjustment| adjustment.name()).collect::<Vec<_>>(),
         });
         let files = [
             (SCRIPT_FILE, SCRIPT.into()),

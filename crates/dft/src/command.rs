@@ -108,7 +108,7 @@ impl DftBackend for Command {
             .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let mut files = self.files.clone();
         files.insert(STRUCTURE.to_owned(), text);
-        let names: Vec<_> = adjustments.iter().map(|remedy| remedy.name()).collect();
+        let names: Vec<_> = adjustments.iter().map(|adjustment| adjustment.name()).collect();
         let environment = BTreeMap::from([("CALMWALK_REMEDIES".to_owned(), names.join(","))]);
         Ok(Input { files, command: self.command.clone(), environment, ..Input::default() })
     }

@@ -100,8 +100,8 @@ fn a_graph_of_another_kind_is_refused() {
     ];
     let three: &[(&str, Option<Vec<u8>>, &str)] = &[
         ("spbf_names", strings(&["A1", "A2"]), "'spbf_names' lists A1, A2"),
-        ("prod_names", strings(&["A1_2", "A1_3"]), "'prod_names' lists A1_2, A1_3, where"),
-        ("out1_origins", strings(&["rho1"]), "'out1_origins' lists rho1, where"),
+        ("prod_names", strings(&["A1_2", "A1_3"]), "'prod_names' lists A1_2, A1_3, but"),
+        ("out1_origins", strings(&["rho1"]), "'out1_origins' lists rho1, but"),
         ("energy_mlp_n_origins", array(&[1], &[2_i64]), "array 'energy_mlp_n_origins' is 2, expected 3"),
         ("A2_equivariant", array(&[1], &[0_i64]), "array 'A2_equivariant' is 0, expected 1"),
         (
@@ -114,7 +114,7 @@ fn a_graph_of_another_kind_is_refused() {
         ("A2_mlp_b2", array(&[1, 6], &[0.0; 6]), "may change its energy: A2_mlp_b2"),
         ("eq1_norm_eps", array(&[], &[0.0]), "array 'eq1_norm_eps' is 0, expected"),
         ("A1_2_nfunc", array(&[1], &[25_i64]), "array 'A1_2_nfunc' is 25, expected 24"),
-        ("rho2_instruction_names", strings(&["A2_red"]), "'rho2_instruction_names' lists A2_red, where"),
+        ("rho2_instruction_names", strings(&["A2_red"]), "'rho2_instruction_names' lists A2_red, but"),
     ];
     for (file, changes) in FILES.into_iter().zip([two, three]) {
         for (name, change, message) in changes {

@@ -63,7 +63,7 @@ fn the_input_is_the_one_that_the_output_is_of() {
 }
 
 #[test]
-fn remedies_change_nothing_that_the_accuracy_depends_on() {
+fn adjustments_change_nothing_that_the_accuracy_depends_on() {
     let (plain, changed) = (input(settings(), &[]), input(settings(), &RetryAdjustment::ALL));
     let added = ["diemix 0.25\n", "npulayit 15\n", "iscf 17\n", "nline 8\n", "nnsclo 2\n"];
     let mut restored = changed.replace("nstep 180\n", "nstep 60\n").replace("  0 0 0.5\n", "  0 0 1.0\n");

@@ -28,7 +28,7 @@ fn task(code: &Ase, adjustments: &[RetryAdjustment]) -> Value {
 }
 
 #[test]
-fn the_task_is_the_structure_with_its_moments_and_remedies() {
+fn the_task_is_the_structure_with_its_moments_and_adjustments() {
     let plain = json!({
         "species": ["Cu", "O"],
         "positions": [[0.1, 0.2, 0.3], [1.0 / 3.0, 2.0, 9.0]],

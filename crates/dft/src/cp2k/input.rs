@@ -103,7 +103,7 @@ fn k_points(mesh: [u32; 3]) -> String {
 }
 
 fn steps(settings: &Settings, spins: &Spins, adjustments: &BTreeSet<RetryAdjustment>) -> String {
-    let has = |remedy| adjustments.contains(&remedy);
+    let has = |adjustment| adjustments.contains(&adjustment);
     let steps = settings.steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 });
     // Broyden's method stagnates below 0.2. Pulay's oscillates or stops at a bad condition number even in
     // simple cases, and with Kerker's CP2K reports convergence far too early.

@@ -56,7 +56,7 @@ fn the_input_is_the_one_that_the_output_is_of() {
 }
 
 #[test]
-fn remedies_change_nothing_that_the_accuracy_depends_on() {
+fn adjustments_change_nothing_that_the_accuracy_depends_on() {
     let slower = input(settings(), &[RetryAdjustment::SlowerMixing]);
     assert_eq!(slower.replace("ALPHA 0.2", "ALPHA 0.4"), INPUT);
     let changed = input(settings(), &RetryAdjustment::ALL);

@@ -106,7 +106,7 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let environment = self.environment();
-        let versions = Versions::ask(&self.command, &environment, passed)?;
+        let versions = Versions::query(&self.command, &environment, passed)?;
         let setups = setups::find(&versions.setup_paths, &self.variants)?;
         Ok(Gpaw { settings: self.clone(), environment, versions, setups })
     }
@@ -129,7 +129,7 @@ struct Versions {
 }
 
 impl Versions {
-    fn ask(
+    fn query(
         command: &[String],
         environment: &BTreeMap<String, String>,
         passed: &PassedEnvironment,

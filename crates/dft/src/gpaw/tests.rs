@@ -64,7 +64,7 @@ fn the_protocol_of_the_paper_is_written() {
 }
 
 #[test]
-fn remedies_change_nothing_that_the_accuracy_depends_on() {
+fn adjustments_change_nothing_that_the_accuracy_depends_on() {
     let code = gpaw(Settings::default());
     let (plain, mut changed) = (task(&code, &[]), task(&code, &RetryAdjustment::ALL));
     assert_ne!(plain, changed);

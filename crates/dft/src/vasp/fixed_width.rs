@@ -2,8 +2,8 @@
 
 use atoms::Vec3;
 
-/// The numbers of a text; where columns run together, each number ends after `decimals` decimals. Overflowed
-/// columns (`*****`) give NaN. `None` for other text.
+/// The numbers of a text; where columns run together, each number ends after `decimals` decimals. An overflowed
+/// column (`*****`) makes all of them NaN. `None` for other text.
 pub(super) fn numbers(text: &str, decimals: usize) -> Option<Vec<f64>> {
     let mut numbers = Vec::new();
     for word in text.split_whitespace() {
@@ -32,7 +32,7 @@ fn run_together(word: &str, decimals: usize, numbers: &mut Vec<f64>) -> Option<(
     Some(())
 }
 
-/// Three numbers; `None` if a column overflowed.
+/// Three numbers; all NaN if a column overflowed.
 pub(super) fn vector(text: &str, decimals: usize) -> Option<Vec3> {
     if text.contains('*') {
         return Some([f64::NAN; 3]);

@@ -70,7 +70,7 @@ pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
 
 /// `INCAR` for these initial moments, in the order of POSCAR.
 pub(super) fn incar(settings: &Settings, moments: &[f64], adjustments: &BTreeSet<RetryAdjustment>) -> String {
-    let has = |remedy| adjustments.contains(&remedy);
+    let has = |adjustment| adjustments.contains(&adjustment);
     let mut lines = vec![
         ("PREC", "Accurate".to_owned()),
         ("ENCUT", format!("{:?}", settings.cutoff)),
@@ -165,14 +165,14 @@ mod tests {
     }
 
     #[test]
-    fn no_remedy_touches_accuracy() {
-        let (plain, remedied) = (lines(&[1.0], &[]), lines(&[1.0], &RetryAdjustment::ALL));
+    fn no_adjustment_touches_accuracy() {
+        let (plain, adjusted) = (lines(&[1.0], &[]), lines(&[1.0], &RetryAdjustment::ALL));
         let changed: BTreeSet<&str> =
-            plain.symmetric_difference(&remedied).map(|line| line.split(" = ").next().unwrap()).collect();
+            plain.symmetric_difference(&adjusted).map(|line| line.split(" = ").next().unwrap()).collect();
         let free = ["NELM", "ALGO", "AMIX", "BMIX", "AMIX_MAG", "BMIX_MAG", "KPAR"];
         assert_eq!(changed, BTreeSet::from(free));
         assert!(
-            remedied.is_superset(
+            adjusted.is_superset(
                 &["NELM = 300", "ALGO = All", "AMIX = 0.1", "KPAR = 1"].map(str::to_owned).into()
             )
         );

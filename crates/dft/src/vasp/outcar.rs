@@ -17,7 +17,7 @@ pub(super) struct Outcar {
     version: Option<String>,
     /// Elements in the order of POTCAR.
     elements: Vec<Option<Species>>,
-    /// The elements from a second list, for files in which the first is incomplete.
+    /// The elements from the lines `POTCAR:`, for files without `TITEL`. The list may have further entries.
     listed: Vec<Option<Species>>,
     /// Number of atoms of each element.
     counts: Vec<usize>,

@@ -192,7 +192,7 @@ fn what_goes_wrong_is_told() {
 }
 
 #[test]
-fn remedies_and_moments_reach_the_calculator() {
+fn adjustments_and_moments_reach_the_calculator() {
     let text = format!(
         "{EMT}def calculator(adjustments):\n    assert adjustments == {{'more_steps', 'other_moments'}}, adjustments\n    return C()\n\
          class C(EMT):\n    def calculate(self, atoms, *a):\n        super().calculate(atoms, *a)\n        \

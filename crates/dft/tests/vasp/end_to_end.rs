@@ -97,14 +97,14 @@ fn a_left_handed_cell_is_turned_and_its_numbers_are_the_same() {
 }
 
 #[test]
-fn remedies_leave_all_files_but_incar_alone() {
-    let (plain, mut remedied) = (input(&alumina(), &[]), input(&alumina(), &RetryAdjustment::ALL));
-    let incar = file(&remedied, "INCAR");
+fn adjustments_leave_all_files_but_incar_alone() {
+    let (plain, mut adjusted) = (input(&alumina(), &[]), input(&alumina(), &RetryAdjustment::ALL));
+    let incar = file(&adjusted, "INCAR");
     assert!(incar.contains("\nMAGMOM = 2*0.5 1*0.125\n"), "{incar}");
     assert!(incar.contains("\nNELM = 300\nALGO = All\n"), "{incar}");
-    assert_ne!(remedied.files["INCAR"], plain.files["INCAR"]);
-    remedied.files.insert("INCAR".to_owned(), plain.files["INCAR"].clone());
-    assert_eq!(remedied, plain);
+    assert_ne!(adjusted.files["INCAR"], plain.files["INCAR"]);
+    adjusted.files.insert("INCAR".to_owned(), plain.files["INCAR"].clone());
+    assert_eq!(adjusted, plain);
 }
 
 #[test]

@@ -99,7 +99,7 @@ fn report_cases(mut cases: Vec<Case>, mut peer: Option<Peer>, rates: Rates) {
 
 /// Times of the calls in each round, s.
 #[derive(Default)]
-struct Found {
+struct Timings {
     plain: Vec<f64>,
     gamma: Vec<f64>,
     graded: Vec<f64>,
@@ -109,8 +109,8 @@ struct Found {
 }
 
 /// In every round, measures our calls for a while, then one plain and one graded call of the peer.
-fn measure(case: &mut Case, mut peer: impl FnMut(Call) -> Option<f64>) -> Found {
-    let mut found = Found::default();
+fn measure(case: &mut Case, mut peer: impl FnMut(Call) -> Option<f64>) -> Timings {
+    let mut found = Timings::default();
     for _ in 0..2 {
         for call in [Call::Plain, Call::Gamma, Call::Graded] {
             case.seconds(call);

@@ -52,7 +52,7 @@ impl AnyNetwork {
         }
     }
 
-    /// Energy of an isolated atom by element, eV.
+    /// Constant energy shift of each element, eV.
     pub fn shifts(&self) -> &[f64] {
         match self {
             Self::Double(network) => &network.readout.shifts,

@@ -16,9 +16,9 @@ pub(super) fn depth_first<V: Vector>(operations: Vec<Operation<V>>) -> Vec<Opera
     let needs = needs(&pieces);
     let mut taken = vec![false; pieces.len()];
     needs.iter().flatten().for_each(|k| taken[*k] = true);
-    let (mut order, mut placed) = (Vec::new(), vec![false; pieces.len()]);
+    let (mut order, mut visited) = (Vec::new(), vec![false; pieces.len()]);
     for last in (0..pieces.len()).filter(|k| !taken[*k]) {
-        place(last, &needs, &mut placed, &mut order);
+        visit(last, &needs, &mut visited, &mut order);
     }
     let mut pieces: Vec<Option<Operation<V>>> = pieces.into_iter().map(Some).collect();
     order.into_iter().filter_map(|k| pieces[k].take()).collect()
@@ -37,11 +37,11 @@ fn needs<V: Vector>(pieces: &[Operation<V>]) -> Vec<Vec<usize>> {
     pieces.iter().map(needs).collect()
 }
 
-fn place(k: usize, needs: &[Vec<usize>], placed: &mut [bool], order: &mut Vec<usize>) {
-    if std::mem::replace(&mut placed[k], true) {
+fn visit(k: usize, needs: &[Vec<usize>], visited: &mut [bool], order: &mut Vec<usize>) {
+    if std::mem::replace(&mut visited[k], true) {
         return;
     }
-    needs[k].iter().for_each(|needed| place(*needed, needs, placed, order));
+    needs[k].iter().for_each(|needed| visit(*needed, needs, visited, order));
     order.push(k);
 }
 
