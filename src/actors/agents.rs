@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::Duration;
 
 use calm::Mixture;
 use serde_json::json;
@@ -51,11 +50,11 @@ impl Agents {
             precision: config.potential.precision,
             settings: run.campaign.walk_settings(),
             message_bytes: run.campaign.largest_message(),
-            silence_limit: config.run.silence_limit.get(),
+            silence_limit: config.run.silence_limit.seconds(),
             restarts: config.run.restarts,
         };
         let welcome = Welcome { setup: setup::bytes(&setup), files: BTreeMap::from([(model_hash, model)]) };
-        let patience = Duration::from_secs_f64(config.run.agent_silence_limit.get());
+        let patience = config.run.agent_silence_limit.get();
         let hub = Hub::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
         let hub = hub.map_err(|error| match error {
             NetError::Ended { .. } => Failure::failed(error),

@@ -47,12 +47,12 @@ impl<'a> Notifier<'a> {
         let Some(command) = settings.command.clone() else { return Ok(None) };
         let told = store.note(NOTE).await?;
         let told = told.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
-        let stall = Duration::from_secs_f64(60.0 * settings.stall.get());
+        let stall = settings.stall.get();
         Ok(Some(Self {
             store,
             location: location.to_string(),
             command,
-            limit: Duration::from_secs_f64(settings.time_limit.get()),
+            limit: settings.time_limit.get(),
             look: LOOK.min(stall / 4).max(Duration::from_millis(100)),
             watch: Watch::new(settings.clone(), told),
             forgetting: Forgetting::new(&config.calm),

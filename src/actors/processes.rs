@@ -62,7 +62,7 @@ async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reac
         asked.1.notify_one();
     });
     let limits = Limits {
-        silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
+        silence: campaign.config.run.silence_limit.get(),
         restarts: campaign.config.run.restarts,
         ..Limits::default()
     };

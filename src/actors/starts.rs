@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use orchestrator::launcher::{Children, Launch, ask_to_end};
 use orchestrator::supervisor::Limits;
@@ -56,7 +55,7 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
         protocol: campaign.protocol.clone(),
         attempts: label.attempts.get(),
         bounds: label.bounds(),
-        lease: Duration::from_secs(label.lease.get().into()),
+        lease: label.lease.get(),
     };
     let setup = LabellerSetup::new(location, labelling);
     let (hash, slots) = (setup.hash(), label.slots as u32);
