@@ -100,7 +100,7 @@ pub static RANGES: [Range; 79] = [
     range("label.largest_energy", "eV", [0.0, 1e12], [10.0, 1e7], "it is that of an atom, in eV"),
     range("label.largest_energy_difference", "eV", [0.0, 1e12], [0.1, 1e4], "it is that of an atom, in eV"),
     range("label.cores", "", [0.0, 4096.0], [1.0, 2048.0], ""),
-    range("label.time_limit", TIME, [0.0, 365.0 * DAY], [10.0, 30.0 * DAY], ""),
+    range("label.time_limit", TIME, [0.0, 30.0 * DAY], [10.0, 7.0 * DAY], ""),
     range("label.memory", "GB", [0.0, 1e6], [0.1, 1e4], "it is in GB"),
     range("label.queue_limit", "", [0.0, 1e9], [1.0, 1e6], ""),
     range("label.guard.least_height", "Å", [0.0, 1e3], [1.0, 50.0], "it is in Å"),
@@ -139,7 +139,7 @@ pub static RANGES: [Range; 79] = [
     range("run.agent_silence_limit", TIME, [0.0, 10.0 * DAY], [10.0, DAY], ""),
     range("run.restarts", "", [0.0, 1e9], [0.0, 100.0], ""),
     range("run.turn_steps", "", [0.0, STEPS], [1.0, 1e5], ""),
-    range("notify.stall", TIME, [0.0, 365.0 * DAY], [60.0, 60.0 * DAY], ""),
+    range("notify.stall", TIME, [0.0, 30.0 * DAY], [60.0, 14.0 * DAY], ""),
     range("notify.time_limit", TIME, [0.0, DAY], [1.0, 3600.0], ""),
 ];
 
