@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::Config;
 use super::changes::differences;
-use super::ranges::{RANGES, Range, shown};
+use super::ranges::{RANGES, Range};
 
 const CAMPAIGNS: [&str; 4] =
     ["aluminium.toml", "silicon.toml", "silicon-dft.toml", "foundation-expansion.toml"];
@@ -138,8 +138,9 @@ fn the_reference_has_every_range() {
     let rows: Vec<_> = chapter.lines().filter(|line| line.starts_with("| `")).collect();
     let expected: Vec<_> = RANGES
         .iter()
-        .map(|Range { key, unit, possible, usual, .. }| {
-            let [[least, most], [from, to]] = [possible, usual].map(|bounds| bounds.map(shown));
+        .map(|range @ Range { key, unit, possible, usual, .. }| {
+            let [[least, most], [from, to]] =
+                [possible, usual].map(|bounds| bounds.map(|bound| range.shown(bound)));
             let possible =
                 if possible[0] > 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
             format!("| `{key}` | {unit} | {possible} | {from} to {to} |").replace("|  |", "| |")

@@ -3,10 +3,10 @@
 use std::num::NonZeroU32;
 use std::path::Path;
 
-use calm::rules::Positive;
 use serde::{Deserialize, Serialize};
 
 use super::defaults;
+use crate::duration::Duration;
 
 /// A command of the user's that is run when something has happened to a campaign.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -16,12 +16,12 @@ pub struct NotifySection {
     pub command: Option<Vec<String>>,
     /// On what it is run.
     pub on: Vec<NotifyEvent>,
-    /// No candidate and no label for so long is a stall, min.
-    pub stall: Positive,
+    /// A campaign without a new candidate or label for this long has stalled.
+    pub stall: Duration,
     /// So many labels that finally failed, and so many again.
     pub failed_labels: NonZeroU32,
-    /// It is killed after so long, s.
-    pub time_limit: Positive,
+    /// The command is killed after this time.
+    pub time_limit: Duration,
 }
 
 /// What may happen to a campaign.
@@ -84,9 +84,9 @@ impl Default for NotifySection {
         Self {
             command: None,
             on: NotifyEvent::ALL.into(),
-            stall: defaults::positive(120.0),
+            stall: Duration::from_seconds(7200),
             failed_labels: defaults::nonzero(10),
-            time_limit: defaults::positive(60.0),
+            time_limit: Duration::from_seconds(60),
         }
     }
 }

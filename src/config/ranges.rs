@@ -6,6 +6,7 @@
 use toml::de::{DeTable, DeValue};
 
 use super::check::Wrong;
+use crate::duration::Duration;
 
 /// The values of a key.
 pub struct Range {
@@ -32,6 +33,10 @@ pub struct Found {
     /// Where it stands, bytes.
     pub offset: usize,
 }
+
+/// The unit of wall-clock times, which are text with a unit in a file and seconds here.
+const TIME: &str = "time";
+const DAY: f64 = 86_400.0;
 
 /// Steps, in the sense of time: larger numbers would exhaust it.
 const STEPS: f64 = 1e12;
@@ -88,14 +93,14 @@ pub static RANGES: [Range; 79] = [
     range("guard.most_returns", "", [0.0, 1e9], [0.0, 100.0], ""),
     range("guard.checkpoint_interval", "", [0.0, STEPS], [1.0, 1e5], ""),
     range("label.slots", "", [0.0, 1024.0], [0.0, 256.0], ""),
-    range("label.lease", "s", [0.0, 86_400.0], [10.0, 86_400.0], "it is in s"),
+    range("label.lease", TIME, [1.0, 86_400.0], [10.0, 86_400.0], ""),
     range("label.attempts", "", [0.0, 1e9], [1.0, 20.0], ""),
     range("label.largest_force", "eV/Å", [0.0, 1e9], [5.0, 1e5], ""),
     range("label.largest_stress", "eV/Å³", [0.0, 1e9], [0.01, 1e3], "it is in eV/Å³: 1 GPa is 0.00624 eV/Å³"),
     range("label.largest_energy", "eV", [0.0, 1e12], [10.0, 1e7], "it is that of an atom, in eV"),
     range("label.largest_energy_difference", "eV", [0.0, 1e12], [0.1, 1e4], "it is that of an atom, in eV"),
     range("label.cores", "", [0.0, 4096.0], [1.0, 2048.0], ""),
-    range("label.time_limit", "s", [0.0, 1e8], [10.0, 3e6], "it is in s: a day has 86400"),
+    range("label.time_limit", TIME, [0.0, 30.0 * DAY], [10.0, 7.0 * DAY], ""),
     range("label.memory", "GB", [0.0, 1e6], [0.1, 1e4], "it is in GB"),
     range("label.queue_limit", "", [0.0, 1e9], [1.0, 1e6], ""),
     range("label.guard.least_height", "Å", [0.0, 1e3], [1.0, 50.0], "it is in Å"),
@@ -130,12 +135,12 @@ pub static RANGES: [Range; 79] = [
     range("label.method.cp2k.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
     range("run.walkers", "", [0.0, 1024.0], [0.0, 512.0], ""),
     range("run.threads", "", [0.0, 256.0], [1.0, 128.0], ""),
-    range("run.silence_limit", "s", [5.0, 1e6], [10.0, 1e5], "it is in s"),
-    range("run.agent_silence_limit", "s", [0.0, 1e6], [10.0, 1e5], "it is in s"),
+    range("run.silence_limit", TIME, [5.0, 10.0 * DAY], [10.0, DAY], ""),
+    range("run.agent_silence_limit", TIME, [0.0, 10.0 * DAY], [10.0, DAY], ""),
     range("run.restarts", "", [0.0, 1e9], [0.0, 100.0], ""),
     range("run.turn_steps", "", [0.0, STEPS], [1.0, 1e5], ""),
-    range("notify.stall", "min", [0.0, 1e6], [1.0, 1e5], "it is in min"),
-    range("notify.time_limit", "s", [0.0, 86_400.0], [1.0, 3600.0], "it is in s"),
+    range("notify.stall", TIME, [0.0, 30.0 * DAY], [60.0, 14.0 * DAY], ""),
+    range("notify.time_limit", TIME, [0.0, DAY], [1.0, 3600.0], ""),
 ];
 
 impl Range {
@@ -151,30 +156,39 @@ impl Range {
 
     /// What is possible, in words.
     pub fn expected(&self) -> String {
-        let [least, most] = self.possible.map(shown);
+        let [least, most] = self.possible.map(|bound| self.shown(bound));
         let bounds =
             if self.possible[0] > 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
         match self.hint {
-            "" => with_unit(bounds, self.unit),
-            hint => format!("{}: {hint}", with_unit(bounds, self.unit)),
+            "" => self.with_unit(bounds),
+            hint => format!("{}: {hint}", self.with_unit(bounds)),
         }
     }
 
     /// That a value is unusual, in words.
     pub fn unusual(&self, value: f64) -> String {
-        let ([least, most], value) = (self.usual.map(shown), with_unit(shown(value), self.unit));
+        let [least, most] = self.usual.map(|bound| self.shown(bound));
+        let value = self.with_unit(self.shown(value));
         let hint = if self.hint.is_empty() { String::new() } else { format!("; {}", self.hint) };
-        format!("{value} is unusual ({} is usual){hint}", with_unit(format!("{least} to {most}"), self.unit))
+        format!("{value} is unusual ({} is usual){hint}", self.with_unit(format!("{least} to {most}")))
+    }
+
+    /// A value as people write it, without its unit; times have theirs.
+    pub fn shown(&self, value: f64) -> String {
+        match self.unit {
+            TIME => Duration::from_seconds(value as u64).to_string(),
+            _ => shown(value),
+        }
+    }
+
+    fn with_unit(&self, number: String) -> String {
+        if ["", TIME].contains(&self.unit) { number } else { format!("{number} {}", self.unit) }
     }
 }
 
 /// A number as people write it.
-pub fn shown(x: f64) -> String {
+fn shown(x: f64) -> String {
     if x != 0.0 && !(1e-3..1e5).contains(&x.abs()) { format!("{x:e}") } else { x.to_string() }
-}
-
-fn with_unit(number: String, unit: &str) -> String {
-    if unit.is_empty() { number } else { format!("{number} {unit}") }
 }
 
 /// The numbers of a file that have ranges. What the ranges call `walk` is the table `walk` of the file.
@@ -195,7 +209,7 @@ pub fn impossible(text: &str) -> Vec<Wrong> {
     let (table, _) = DeTable::parse_recoverable(text);
     let wrong =
         found(table.get_ref(), "walk").into_iter().filter(|found| !found.range.is_possible(found.value));
-    wrong.map(|found| (found.key, found.value.to_string(), found.range.expected())).collect()
+    wrong.map(|found| (found.key, found.range.shown(found.value), found.range.expected())).collect()
 }
 
 /// A number by its dotted key, and where it stands.
@@ -205,6 +219,7 @@ fn number(table: &DeTable<'_>, key: &str) -> Option<(f64, usize)> {
     let number = match value.get_ref() {
         DeValue::Table(inner) if !rest.is_empty() => return number(inner, rest),
         _ if !rest.is_empty() => return None,
+        DeValue::String(text) => text.parse::<Duration>().ok()?.seconds(),
         DeValue::Float(float) => float.as_str().replace('_', "").parse().ok()?,
         DeValue::Integer(integer) => {
             i128::from_str_radix(&integer.as_str().replace('_', ""), integer.radix()).ok()? as f64

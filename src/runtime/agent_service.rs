@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::Duration;
 
 use calm::Mixture;
 use serde_json::json;
@@ -52,14 +51,14 @@ impl AgentService {
             precision: config.potential.precision,
             settings: run.campaign.walk_settings(),
             message_bytes: run.campaign.largest_message(),
-            silence_limit: config.run.silence_limit.get(),
+            silence_limit: config.run.silence_limit.seconds(),
             restarts: config.run.restarts,
         };
         let welcome = AgentBootstrap {
             setup: process_config::to_bytes(&setup),
             files: BTreeMap::from([(model_hash, model)]),
         };
-        let patience = Duration::from_secs_f64(config.run.agent_silence_limit.get());
+        let patience = config.run.agent_silence_limit.get();
         let hub = AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
         let hub = hub.map_err(|error| match error {
             NetError::SessionClosed { .. } => Failure::failed(error),

@@ -68,7 +68,7 @@ async fn run_in(
         handles.1.notify_one();
     });
     let limits = Limits {
-        heartbeat_timeout: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
+        heartbeat_timeout: campaign.config.run.silence_limit.get(),
         max_restarts: campaign.config.run.restarts,
         ..Limits::default()
     };

@@ -47,12 +47,12 @@ impl<'a> Notifier<'a> {
         let Some(command) = settings.command.clone() else { return Ok(None) };
         let told = store.metadata(METADATA_KEY).await?;
         let told = told.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
-        let stall = Duration::from_secs_f64(60.0 * settings.stall.get());
+        let stall = settings.stall.get();
         Ok(Some(Self {
             store,
             location: location.to_string(),
             command,
-            limit: Duration::from_secs_f64(settings.time_limit.get()),
+            limit: settings.time_limit.get(),
             interval: MAX_CHECK_INTERVAL.min(stall / 4).max(Duration::from_millis(100)),
             tracker: NotificationTracker::new(settings.clone(), told),
             forgetting: ForgettingRule::new(&config.calm),

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
 
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
@@ -175,7 +174,7 @@ fn start_labellers(
             attempts: label.attempts.get(),
             bounds: label.bounds(),
             exit_policy: ExitPolicy::UntilEmpty,
-            timing: Timing { lease: Duration::from_secs(label.lease.get().into()), ..Timing::default() },
+            timing: Timing { lease: label.lease.get(), ..Timing::default() },
         };
         let (store, closing) = (store.clone(), Arc::clone(closing));
         labellers.spawn(async move {

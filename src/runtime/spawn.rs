@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use orchestrator::launcher::{Children, Launch, request_exit};
 use orchestrator::supervisor::Limits;
@@ -56,7 +55,7 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
         protocol: campaign.protocol.clone(),
         attempts: label.attempts.get(),
         bounds: label.bounds(),
-        lease: Duration::from_secs(label.lease.get().into()),
+        lease: label.lease.get(),
     };
     let setup = LabellerConfig::new(location, label_setup);
     let (hash, slots) = (setup.hash(), label.slots as u32);
