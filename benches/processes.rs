@@ -116,8 +116,9 @@ fn calmwalk(directory: &Path) -> Command {
 fn text() -> String {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
     let text = fs::read_to_string(configs.join("aluminium.toml")).expect("a file of the project");
-    let longer =
-        text.replace("\nsteps = 2000 ", "\nsteps = 6000 ").replace("# per_seed = 3 ", "per_seed = 9 ");
+    let longer = text
+        .replace("\nsteps = 2000 ", "\nsteps = 6000 ")
+        .replace("# max_per_seed_structure = 3 ", "max_per_seed_structure = 9 ");
     assert_ne!(longer, text, "the keys stand in the file as they are replaced here");
     longer.replace("\"data/", &format!("\"{}/", configs.join("data").display()))
 }

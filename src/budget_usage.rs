@@ -31,8 +31,8 @@ mod tests {
         let used = BudgetUse { labels: 7, under_way: 1, core_hours: 9.0, wall_hours: 0.25 };
         let mut budget = BudgetStatus { limits, used, used_up: None };
         assert_eq!(describe(&budget).unwrap(), "labels 7 of 10; wall_hours 0.250 of 2");
-        budget.used_up = Some("collect.total".into());
-        assert!(describe(&budget).unwrap().ends_with("; walks were ended by collect.total"));
+        budget.used_up = Some("collect.max_structures".into());
+        assert!(describe(&budget).unwrap().ends_with("; walks were ended by collect.max_structures"));
         assert_eq!(describe(&BudgetStatus::default()), None);
     }
 }

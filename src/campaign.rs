@@ -26,7 +26,7 @@ pub use load::check_sound;
 
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
 const FILE_KEYS: [&str; 4] =
-    ["/potential/model", "/calm/artifact", "/calm/training_frames", "/label/method/reference/file"];
+    ["/potential/model", "/calm/artifact", "/calm/training_frames", "/label/method/potential/file"];
 
 /// A campaign that is ready to run.
 pub struct Campaign {
@@ -118,7 +118,7 @@ impl Campaign {
     pub fn label_sizes(&self) -> Result<Vec<dft::Size>, Failure> {
         let structures = self.seed_structures.iter().map(|seed| &seed.seed.structure);
         Ok(match &self.config.label.method {
-            LabelMethod::Reference(_) => structures
+            LabelMethod::Potential(_) => structures
                 .map(|structure| dft::Size { atoms: structure.len(), electrons: 0.0, k_points: 1 })
                 .collect(),
             LabelMethod::Code(settings) => {
@@ -224,22 +224,22 @@ impl Campaign {
             temperature: walk.temperature.get(),
             thermostat: walk.thermostat,
             time_step: walk.time_step.map(|dt| dt.get()),
-            equilibration: walk.equilibration,
-            steps: walk.steps.get(),
+            equilibration: walk.equilibration_steps,
+            steps: walk.biased_steps.get(),
             tau: walk.tau.get(),
-            average_steps: walk.average_steps.get(),
+            bias_averaging_steps: walk.bias_averaging_steps.get(),
             volume_ramp: walk.volume_ramp.map(|ramp| (ramp.from.get(), ramp.to.get())),
             skin: walk.skin.get(),
-            collection: collect.when,
-            gap: collect.gap,
-            declined_gap: collect.declined_gap.get(),
+            collection: collect.criterion,
+            gap: collect.min_interval,
+            min_interval_after_decline: collect.min_interval_after_decline.get(),
             zbl: guard.zbl.map(|zbl| (zbl.inner.get(), zbl.outer.get())),
             guard: GuardSettings {
-                least_distance: guard.least_distance.get(),
-                least_distance_fraction: guard.least_distance_fraction.get(),
-                highest_temperature: guard.highest_temperature.get(),
-                refusals_in_a_row: guard.refusals_in_a_row.get(),
-                most_returns: guard.most_returns,
+                min_distance: guard.min_distance.get(),
+                min_distance_fraction: guard.min_distance_fraction.get(),
+                max_temperature: guard.max_temperature.get(),
+                max_consecutive_rejections: guard.max_consecutive_rejections.get(),
+                max_rollbacks: guard.max_rollbacks,
                 tau_factor: guard.tau_factor.get(),
                 checkpoint_interval: guard.checkpoint_interval.get(),
             },
@@ -291,15 +291,15 @@ pub fn selector_settings(config: &Config) -> selector::Settings {
     selector::Settings {
         mode: campaign.mode,
         walks_per_round: run.walks_per_round.get(),
-        steps_per_assignment: run.turn_steps.get(),
+        steps_per_assignment: run.steps_per_assignment.get(),
         update: calm.update,
         search: config.update_settings(),
         forgetting_alarm: ForgettingAlarm { share_above_one: calm.forgetting_alarm },
-        collection: collect.when,
-        max_per_seed_structure: collect.per_seed.get(),
+        collection: collect.criterion,
+        max_per_seed_structure: collect.max_per_seed_structure.get(),
         max_structures: config.most_structures(),
         control: campaign.control,
-        min_distance: (guard.least_distance.get(), guard.least_distance_fraction.get()),
+        min_distance: (guard.min_distance.get(), guard.min_distance_fraction.get()),
         declined_feature_bytes: collect.declined_features_mb * 1_000_000,
     }
 }

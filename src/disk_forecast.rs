@@ -40,9 +40,10 @@ impl DiskForecast {
         let features = campaign.artifact.mixture.dimension() as u64;
         let seeds = || campaign.seed_structures.iter().map(|named| named.seed.structure.len() as u64);
         let number = seeds().len() as u64;
-        let per_seed = u64::from(config.collect.per_seed.get());
-        let collected = per_seed.saturating_mul(number);
-        let collected = config.collect.total.map_or(collected, |total| collected.min(total.get().into()));
+        let max_per_seed_structure = u64::from(config.collect.max_per_seed_structure.get());
+        let collected = max_per_seed_structure.saturating_mul(number);
+        let collected =
+            config.collect.max_structures.map_or(collected, |total| collected.min(total.get().into()));
         let copies = if config.campaign.control { 2 } else { 1 };
         let mean = seeds().map(|atoms| structure_bytes(atoms, features)).sum::<u64>() / number.max(1);
         let checkpoints =

@@ -25,7 +25,7 @@ pub struct AlarmState {
 impl ForgettingRule {
     /// Reads the section `[calm]`.
     pub fn new(calm: &CalmSection) -> Self {
-        Self { limit: calm.forgetting_alarm.get(), combination: calm.combination }
+        Self { limit: calm.forgetting_alarm.get(), combination: calm.covariance_update }
     }
 
     /// Whether the alarm holds for this share of training atoms with γ > 1. `raised` is the selector's own check.
@@ -38,7 +38,7 @@ impl ForgettingRule {
     pub fn raised_message(&self, share: f64) -> String {
         let other = match self.combination {
             CovarianceUpdateKind::Convex => {
-                "combination = \"additive\", which forgets nothing, or with smaller values of ladder"
+                "covariance_update = \"additive\", which forgets nothing, or with smaller values of ladder"
             }
             CovarianceUpdateKind::Additive => "smaller values of ladder",
         };

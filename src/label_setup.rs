@@ -18,7 +18,7 @@ use crate::exit_status::Failure;
 use crate::process_config::MethodConfig;
 
 /// Configuration key of a reference potential's file.
-pub const REFERENCE_FILE: &str = "label.method.reference.file";
+pub const REFERENCE_FILE: &str = "label.method.potential.file";
 
 /// Metadata key under which the leader stores its [`MethodConfig`], with the paths of its host.
 pub const LABEL_METHOD_KEY: &str = "label_method";
@@ -82,15 +82,15 @@ pub fn code_identity(method: &str, code: &dyn DftBackend) -> Value {
 
 /// Protocol settings of a reference potential.
 pub fn reference_identity(kind: PotentialKind, file_hash: &str) -> Value {
-    json!({ "method": "reference", "kind": kind, "file_hash": file_hash })
+    json!({ "method": "potential", "kind": kind, "file_hash": file_hash })
 }
 
 /// The part of the label method that a campaign's configuration records: what determines the labels. The command and
 /// the paths of files may change.
 pub fn resolved_method(label: &LabelSection, protocol: &Protocol) -> Value {
     match &label.method {
-        LabelMethod::Reference(PotentialFile { kind, .. }) => {
-            json!({ "reference": { "kind": kind, "file": null } })
+        LabelMethod::Potential(PotentialFile { kind, .. }) => {
+            json!({ "potential": { "kind": kind, "file": null } })
         }
         LabelMethod::Code(settings) => json!({ settings.name(): protocol.settings }),
     }
@@ -103,7 +103,7 @@ pub fn with_protocol(configuration: &Value, label: &LabelSection, protocol: &Pro
     configuration["label"]["method"] = resolved_method(label, protocol);
     if let Some(files) = configuration["files"].as_object_mut() {
         files.remove(REFERENCE_FILE);
-        if let LabelMethod::Reference(_) = label.method {
+        if let LabelMethod::Potential(_) = label.method {
             files.insert(REFERENCE_FILE.to_owned(), protocol.settings["file_hash"].clone());
         }
     }
@@ -113,7 +113,7 @@ pub fn with_protocol(configuration: &Value, label: &LabelSection, protocol: &Pro
 /// Checks that labels can be made for these elements.
 pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(), String> {
     match &label.method {
-        LabelMethod::Reference(reference) => {
+        LabelMethod::Potential(reference) => {
             let potential = reference.load()?;
             match species.iter().find(|species| !potential.species().contains(species)) {
                 Some(missing) => Err(format!("the label potential does not know {missing}")),
@@ -176,7 +176,7 @@ impl MethodConfig {
     pub fn from_section(label: &LabelSection) -> Result<Self, Failure> {
         let absolute = |path: &Path| std::path::absolute(path).map_err(Failure::failed);
         match &label.method {
-            LabelMethod::Reference(PotentialFile { kind, file }) => {
+            LabelMethod::Potential(PotentialFile { kind, file }) => {
                 let file = file.get_ref();
                 let file_hash = hash(file)
                     .map_err(|error| Failure::Input(format!("cannot read {}: {error}", file.display())))?;
@@ -206,7 +206,7 @@ impl MethodConfig {
     /// Name of the method in the configuration.
     fn name(&self) -> &'static str {
         match self {
-            Self::Reference { .. } => "reference",
+            Self::Reference { .. } => "potential",
             Self::Code { settings, .. } => settings.name(),
         }
     }
@@ -239,7 +239,7 @@ impl MethodConfig {
                 check_protocol(&identity, protocol)?;
                 Ok(method)
             }
-            (Self::Reference { .. }, Some(given)) => Err(method_mismatch(given.name(), "reference")),
+            (Self::Reference { .. }, Some(given)) => Err(method_mismatch(given.name(), "potential")),
         }
     }
 }
@@ -258,7 +258,7 @@ pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), Failu
 
 fn method_mismatch(found: &str, expected: &str) -> Failure {
     Failure::Input(match (found, expected) {
-        ("reference", "reference") => {
+        ("potential", "potential") => {
             "--config: give the file of a reference potential with --file".to_owned()
         }
         _ => format!(

@@ -56,7 +56,7 @@ pub struct AgentConfig {
     /// Largest message of a walker, bytes.
     pub message_bytes: usize,
     /// Heartbeat timeout of a walker, s.
-    pub silence_limit: f64,
+    pub heartbeat_timeout: f64,
     /// Largest number of restarts.
     pub restarts: u32,
 }

@@ -78,7 +78,7 @@ impl Display {
                 self.waiting = false;
             }
             Notice::Committed(commit) => self.committed(commit),
-            Notice::QueueFull(jobs) => self.queue_full(*jobs),
+            Notice::QueueFull(jobs) => self.on_queue_full(*jobs),
         }
         self.draw();
     }
@@ -138,7 +138,7 @@ impl Display {
     }
 
     /// Reported once, until a walk advances.
-    fn queue_full(&mut self, jobs: u64) {
+    fn on_queue_full(&mut self, jobs: u64) {
         if !std::mem::replace(&mut self.waiting, true) {
             let line = format!("walkers wait: the label queue is full ({} in it)", count(jobs, "structure"));
             tracing::info!("{line}");

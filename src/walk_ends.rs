@@ -11,7 +11,7 @@ const MIN_EARLY_ENDS: u64 = 3;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EarlyEndCause {
-    /// The temperature exceeded `guard.highest_temperature`.
+    /// The temperature exceeded `guard.max_temperature`.
     TooHot,
     /// An energy or force is not finite.
     NotFinite,
@@ -93,7 +93,7 @@ impl EarlyEndCause {
             Self::Crashed => {
                 "nothing in the configuration: check the walkers' last output in the log, and the free memory"
             }
-            Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.least_distance says what is too close",
+            Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.min_distance says what is too close",
             Self::BadStart => "the seed structure: the reason says what is wrong with it",
             Self::Other => "a smaller walk.time_step or walk.tau, or guard.zbl",
         }
@@ -212,11 +212,11 @@ mod tests {
     #[test]
     fn reasons_of_the_guard_have_causes() {
         let settings = GuardSettings {
-            least_distance: 1.2,
-            least_distance_fraction: 0.75,
-            highest_temperature: 1000.0,
-            refusals_in_a_row: 10,
-            most_returns: 3,
+            min_distance: 1.2,
+            min_distance_fraction: 0.75,
+            max_temperature: 1000.0,
+            max_consecutive_rejections: 10,
+            max_rollbacks: 3,
             tau_factor: 0.5,
             checkpoint_interval: 100,
         };

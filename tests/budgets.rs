@@ -106,7 +106,7 @@ fn as_many_structures_are_collected_as_there_may_be_labels_for() {
 #[test]
 fn a_limit_of_time_stops_walks_where_they_stand() {
     // Seconds of work, so that the clock is looked at before it is done.
-    let small = Small { steps: 3000, per_seed: 1000, ..Small::default() };
+    let small = Small { steps: 3000, max_per_seed_structure: 1000, ..Small::default() };
     let expected = uninterrupted_outcome(&small);
     let directory = write(&small, "[budget]\nwall_hours = 1e-6\n");
     let here = directory.path();
@@ -187,8 +187,11 @@ fn wrong_budgets_and_queues_are_refused() {
     tester.refused_with("# wall_hours = 24.0", "wall_hours = -1.0", &["expected a finite number above 0"]);
     tester.refused_with("# core_hours = 100.0", "core_hour = 100.0", &["did you mean `core_hours`?"]);
     tester.refused_with(
-        "# queue_full = \"wait\"",
-        "queue_full = \"raise\"",
-        &["label.queue_full is \"raise\"; expected \"wait\", or mode = \"live\"", "how fast labels are made"],
+        "# on_queue_full = \"wait\"",
+        "on_queue_full = \"raise\"",
+        &[
+            "label.on_queue_full is \"raise\"; expected \"wait\", or mode = \"live\"",
+            "how fast labels are made",
+        ],
     );
 }

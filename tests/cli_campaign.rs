@@ -19,28 +19,28 @@ const CONFIGURATION: &str = r#"
 model = "CONFIGS/data/al_eam_1l/kokkos.npz"
 [calm]
 artifact = "CONFIGS/data/al_eam_1l/gmm_artifacts.npz"
-[seeds]
+[seed_structures]
 files = ["seeds.extxyz"]
 [walk]
 temperature = 900.0
-steps = 150
-equilibration = 50
+biased_steps = 150
+equilibration_steps = 50
 tau = 0.15
 volume_ramp = { from = 1.0, to = 1.2 }
 [collect]
-when = { rule = "maximum_grade", threshold = 1.5 }
-until = { rule = "maximum_grade", target = 1.25 }
-gap = 20
-declined_gap = 10
-per_seed = 2
+criterion = { rule = "maximum_grade", threshold = 1.5 }
+update_target = { rule = "maximum_grade", target = 1.25 }
+min_interval = 20
+min_interval_after_decline = 10
+max_per_seed_structure = 2
 [label]
-method = { reference = { kind = "eam_fs", file = "CONFIGS/data/Al_mm.eam.fs" } }
-attempts = 2
-largest_force = 1000
+method = { potential = { kind = "eam_fs", file = "CONFIGS/data/Al_mm.eam.fs" } }
+max_attempts = 2
+max_force = 1000
 [run]
 walkers = 2
 walks_per_round = 2
-turn_steps = 50
+steps_per_assignment = 50
 "#;
 
 /// Writes `small.toml` with its seed structures; the campaign goes to `small`.
@@ -147,7 +147,7 @@ fn an_export_holds_labels_and_grades_in_decision_order() {
         assert!(["fcc-100", "slab-111"].contains(&name) && text(frame, "origin") == "biased");
         assert!(number(frame, "mixture_version_seen") < number(frame, "mixture_version"));
         assert!((1.0..=1.2).contains(&number(frame, "relative_volume")));
-        assert_eq!((text(frame, "protocol"), text(frame, "protocol_hash").len()), ("reference", 16));
+        assert_eq!((text(frame, "protocol"), text(frame, "protocol_hash").len()), ("potential", 16));
     }
     check_grades(here, &frames);
 
@@ -219,7 +219,7 @@ fn check_grades(here: &Path, frames: &[Frame]) {
 fn failed_labels_are_shown_retried_and_dropped() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    write_campaign(here, &[("largest_force = 1000", "largest_force = 1e-3")]);
+    write_campaign(here, &[("max_force = 1000", "max_force = 1e-3")]);
     succeed(here, ["run", "small.toml"]);
     let failed = jobs(here);
     assert!(failed.iter().all(|job| job["state"] == "failed" && job["attempts"] == 2));
@@ -248,8 +248,7 @@ fn failed_labels_are_shown_retried_and_dropped() {
 
     // The same campaign goes on with a limit that lets labels pass.
     let before = fs::read_to_string(here.join("small.toml")).unwrap();
-    fs::write(here.join("small.toml"), before.replace("largest_force = 1e-3", "largest_force = 1000"))
-        .unwrap();
+    fs::write(here.join("small.toml"), before.replace("max_force = 1e-3", "max_force = 1000")).unwrap();
     succeed(here, ["run", "small.toml"]);
     let printed = succeed(here, ["export", "small", "--output", "out.extxyz"]);
     let expected = format!(
@@ -285,13 +284,13 @@ fn labelled_structures_are_imported_once() {
         let checks = if checks == 1 { "1 check".to_owned() } else { format!("{checks} checks") };
         format!("imported {labels} labels and {checks} of protocol '{protocol}'; {known} already known\n")
     };
-    assert_eq!(succeed(here, ["import", "small", "new.extxyz"]), counts(3, 0, 0, "reference"));
-    assert_eq!(succeed(here, ["import", "small", "new.extxyz", "own.extxyz"]), counts(0, 0, 7, "reference"));
+    assert_eq!(succeed(here, ["import", "small", "new.extxyz"]), counts(3, 0, 0, "potential"));
+    assert_eq!(succeed(here, ["import", "small", "new.extxyz", "own.extxyz"]), counts(0, 0, 7, "potential"));
     let mut other = seeds[..1].to_vec();
     let labels = Labels { energy: Some(-364.0), ..other[0].labels().unwrap() };
     other[0].set_labels(&labels, LabelKeys::Mace);
     write_frames(&here.join("other.extxyz"), &other);
-    assert_eq!(succeed(here, ["import", "small", "other.extxyz"]), counts(0, 1, 0, "reference"));
+    assert_eq!(succeed(here, ["import", "small", "other.extxyz"]), counts(0, 1, 0, "potential"));
     succeed(here, ["export", "small", "--output", "all.extxyz", "--imported"]);
     let all = read_extxyz(&here.join("all.extxyz")).unwrap();
     assert_eq!(all.len(), 7);
@@ -306,7 +305,7 @@ fn labelled_structures_are_imported_once() {
     );
     let message = refuse(here, ["export", "small", "--output", "both.extxyz", "--imported"]);
     assert!(
-        message.contains("several protocols") && message.contains("'reference', 'other code'"),
+        message.contains("several protocols") && message.contains("'potential', 'other code'"),
         "{message}"
     );
     assert!(!here.join("both.extxyz").exists());
@@ -316,17 +315,20 @@ fn labelled_structures_are_imported_once() {
     let other = ["export", "small", "--output", "both.extxyz", "--imported", "--protocol", "other code"];
     assert!(succeed(here, other).starts_with("3 structures"));
     let message = refuse(here, ["export", "small", "--output", "x.extxyz", "--protocol", "none"]);
-    assert!(message.contains("no protocol 'none'; it has 'reference', 'other code'"), "{message}");
+    assert!(message.contains("no protocol 'none'; it has 'potential', 'other code'"), "{message}");
     // The campaign still labels by its own protocol.
     succeed(here, ["run", "small.toml"]);
-    assert!(jobs(here).iter().all(|job| job["protocol"] == "reference"));
+    assert!(jobs(here).iter().all(|job| job["protocol"] == "potential"));
 }
 
 #[test]
 fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    write_campaign(here, &[("steps = 150", "steps = 100000000"), ("threshold = 1.5", "threshold = 1e6")]);
+    write_campaign(
+        here,
+        &[("biased_steps = 150", "biased_steps = 100000000"), ("threshold = 1.5", "threshold = 1e6")],
+    );
     let command = ["run", "small.toml"];
     let run = program(here).args(command).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
     let run = Running(run);

@@ -154,10 +154,13 @@ fn the_foundation_expansion_runs_once_its_files_are_there() {
         fs::copy(config(from), place).unwrap();
     }
     succeed(here, ["validate", "campaign.toml"]);
-    assert!(text.contains("\nsteps = 15000") && text.contains("\n# equilibration = 500"));
+    assert!(text.contains("\nsteps = 15000") && text.contains("\n# equilibration_steps = 500"));
     let short = text.replace("\nsteps = 15000", "\nsteps = 200");
-    fs::write(here.join("campaign.toml"), short.replace("\n# equilibration = 500", "\nequilibration = 20"))
-        .unwrap();
+    fs::write(
+        here.join("campaign.toml"),
+        short.replace("\n# equilibration_steps = 500", "\nequilibration = 20"),
+    )
+    .unwrap();
     let summary = succeed(here, ["run", "campaign.toml"]);
     assert!(summary.contains("walks            8 biased"), "{summary}");
     let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();

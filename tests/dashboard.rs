@@ -28,7 +28,7 @@ struct Live {
 impl Live {
     /// One that has collected all it may.
     fn begin() -> Self {
-        let live = Self::labelling("slots = 0");
+        let live = Self::labelling("concurrency = 0");
         wait_until("all is collected", || {
             let status = live.status();
             let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
@@ -320,7 +320,7 @@ fn the_table_and_exports_speak_one_language() {
 #[test]
 fn walks_are_paused_and_resumed_by_who_knows_the_token() {
     // Walkers wait for ever when that many structures wait for labels, and walks stay under way.
-    let live = Live::labelling("slots = 0\nqueue_limit = 4");
+    let live = Live::labelling("concurrency = 0\nqueue_limit = 4");
     wait_until("walkers wait", || live.status()["labels"]["queued"].as_u64() > Some(4));
     let paused = || {
         let status = live.status();

@@ -77,7 +77,8 @@ fn an_absurd_energy_is_a_failed_attempt() {
             continue;
         }
         let energy = format!("{:.3e}", 1e300 / atoms as f64);
-        let message = format!("an energy of {energy} eV/atom, beyond label.largest_energy = 2000000 eV/atom");
+        let message =
+            format!("an energy of {energy} eV/atom, beyond label.max_energy_per_atom = 2000000 eV/atom");
         assert!(state == "failed" && log.starts_with("implausible") && log.contains(&message), "{log}");
     }
 }
@@ -85,9 +86,9 @@ fn an_absurd_energy_is_a_failed_attempt() {
 /// The bounds are keys of the configuration, also where nothing runs.
 #[test]
 fn bounds_are_those_of_the_configuration() {
-    let directory = labelled_with("-56.5 * N", "largest_energy = 50.0");
+    let directory = labelled_with("-56.5 * N", "max_energy_per_atom = 50.0");
     for (state, _, log) in jobs(directory.path()) {
-        let message = "an energy of -56.5 eV/atom, beyond label.largest_energy = 50 eV/atom";
+        let message = "an energy of -56.5 eV/atom, beyond label.max_energy_per_atom = 50 eV/atom";
         assert!(state == "failed" && log.contains(message), "{log}");
     }
     let here = directory.path();
@@ -106,8 +107,9 @@ fn bounds_are_those_of_the_configuration() {
     fs::write(here.join("known.extxyz"), IMPORTED).unwrap();
     let message = common::refuse(here, ["import", "here", "known.extxyz"]);
     assert!(
-        message
-            .contains("known.extxyz:4: an energy of -60 eV/atom, beyond label.largest_energy = 50 eV/atom"),
+        message.contains(
+            "known.extxyz:4: an energy of -60 eV/atom, beyond label.max_energy_per_atom = 50 eV/atom"
+        ),
         "{message}"
     );
     assert_eq!(json(here, ["status", "here"])["imported"], 0);
@@ -115,7 +117,7 @@ fn bounds_are_those_of_the_configuration() {
     let output = common::calmwalk(here, arguments);
     assert_eq!(output.status.code(), Some(1));
     let said = common::stderr(&output);
-    assert!(said.contains("beyond label.largest_energy = 50 eV/atom"), "{said}");
+    assert!(said.contains("beyond label.max_energy_per_atom = 50 eV/atom"), "{said}");
 }
 
 /// Energies of every labelled candidate in eV an atom, by its name: of the potential and of the label; with the structure's hash.

@@ -27,7 +27,7 @@ fn labelled(directory: &Path) -> Vec<ExportRow> {
     })
 }
 
-fn largest_force(row: &ExportRow) -> f64 {
+fn max_force(row: &ExportRow) -> f64 {
     row.label.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max)
 }
 
@@ -71,7 +71,7 @@ fn atoms_in(bin: &Json, pairs: &[(f64, f64)]) -> usize {
 fn structures_of_both_walks_are_counted_and_not_compared() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let path = Small { per_seed: 2, ..Small::default() }.write(here);
+    let path = Small { max_per_seed_structure: 2, ..Small::default() }.write(here);
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text.replacen("threshold = 1.0, fraction = 0.1", "threshold = 0.01, fraction = 0.1", 1))
         .unwrap();
@@ -102,7 +102,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     let config = Small::default().write(here);
     succeed(here, ["run", "campaign.toml", "--directory", "whole"]);
     let rows = labelled(&here.join("whole"));
-    let mut forces: Vec<_> = rows.iter().map(largest_force).collect();
+    let mut forces: Vec<_> = rows.iter().map(max_force).collect();
     forces.sort_by(f64::total_cmp);
     // The same campaign, in which a third of the labels is not believed.
     let limit = forces[forces.len() * 2 / 3];
@@ -110,7 +110,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     let text = text.replace("[label]", &format!("[label]\nlargest_force = {limit}\nattempts = 1"));
     fs::write(here.join("strict.toml"), text).unwrap();
     let summary = succeed(here, ["run", "strict.toml", "--directory", "strict"]);
-    let (kept, lost): (Vec<_>, Vec<_>) = rows.iter().partition(|row| largest_force(row) <= limit);
+    let (kept, lost): (Vec<_>, Vec<_>) = rows.iter().partition(|row| max_force(row) <= limit);
     assert!(lost.len() > 1 && kept.len() > 1, "{forces:?}");
 
     let errors = json(here, ["force-errors", "strict"]);
@@ -158,7 +158,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     common::report::check(here, "strict", &status, &errors);
     // Another protocol than there is.
     let wrong = common::refuse(here, ["force-errors", "whole", "--protocol", "nothing"]);
-    assert!(wrong.contains("no protocol 'nothing'; it has 'reference'"), "{wrong}");
+    assert!(wrong.contains("no protocol 'nothing'; it has 'potential'"), "{wrong}");
 }
 
 #[test]

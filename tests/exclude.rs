@@ -38,11 +38,11 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     let short = bad.split_once('-').unwrap().1;
     let said = succeed(here, ["exclude", "here", short, "--reason", report]);
     assert!(
-        said.starts_with(&format!("{bad}: label of 'reference' excluded from exports and statistics")),
+        said.starts_with(&format!("{bad}: label of 'potential' excluded from exports and statistics")),
         "{said}"
     );
     let said = succeed(here, ["exclude", "here", bad, "--reason", "once more"]);
-    assert_eq!(said, format!("{bad}: label of 'reference' was already excluded: {report}\n"));
+    assert_eq!(said, format!("{bad}: label of 'potential' was already excluded: {report}\n"));
 
     let (left, said) = exported(here);
     assert!(!left.contains(&bad.to_owned()) && left.len() == before.len() - 1, "{left:?}");
@@ -80,7 +80,7 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     assert!(message.contains("use calmwalk exclude to take its label out of the data set"), "{message}");
 
     let said = succeed(here, ["exclude", "here", bad, "--undo"]);
-    assert_eq!(said, format!("{bad}: label of 'reference' included again\n"));
+    assert_eq!(said, format!("{bad}: label of 'potential' included again\n"));
     assert_eq!(exported(here).0, before);
     assert_eq!(json(here, ["force-errors", "here"]), errors);
     let story = succeed(here, ["explain", "here", bad]);

@@ -244,7 +244,7 @@ fn imported_structures_have_theirs_and_what_is_not_there_is_refused() {
     assert_eq!(story["labels"][0]["energy"].as_f64(), frames[0].labels().unwrap().energy);
     let forces = frames[0].labels().unwrap().forces.unwrap();
     let largest = forces.iter().map(|force| norm(sub(*force, [0.0; 3]))).fold(0.0, f64::max);
-    assert_eq!(story["labels"][0]["largest_force"].as_f64(), Some(largest));
+    assert_eq!(story["labels"][0]["max_force"].as_f64(), Some(largest));
     let known = explain(here, "import-2");
     assert_eq!(known["same_structure"][0]["candidate"].as_str(), frames[0].info["candidate_id"].text());
 

@@ -132,7 +132,7 @@ fn files_may_move_but_not_change() {
     fs::write(here.join("label.eam.fs"), format!("another comment{content}")).unwrap();
     let message = refuse(here, RUN);
     assert!(
-        message.contains("label.method.reference.file: the file has another content (BLAKE3 "),
+        message.contains("label.method.potential.file: the file has another content (BLAKE3 "),
         "{message}"
     );
     assert!(message.contains("Put the old file back"), "{message}");
@@ -144,20 +144,20 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
     let here = directory.path();
     let before = walks(here);
     assert!(before.iter().all(|walk| walk.0 == "control" || walk.2 == "steps"), "{before:?}");
-    replace(here, "per_seed = 4", "per_seed = 6\ntotal = 20");
+    replace(here, "max_per_seed_structure = 4", "max_per_seed_structure = 6\ntotal = 20");
     replace(here, "walkers = 2", "walkers = 1");
     replace(here, "[label]", "[label]\nslots = 2");
-    let shown = "configuration: collect.per_seed is now 6 (was 4)\n\
-                 configuration: collect.total is now 20 (was left out)\n\
-                 configuration: label.slots is now 2 (was 1)\n\
+    let shown = "configuration: collect.max_per_seed_structure is now 6 (was 4)\n\
+                 configuration: collect.max_structures is now 20 (was left out)\n\
+                 configuration: label.concurrency is now 2 (was 1)\n\
                  configuration: run.walkers is now 1 (was 2)";
     assert_eq!(resume_processes(here), shown);
     let change =
         |key: &str, before: Value, after: Value| json!({ "key": key, "before": before, "after": after });
     let expected = [
-        change("collect.per_seed", 4.into(), 6.into()),
-        change("collect.total", Value::Null, 20.into()),
-        change("label.slots", 1.into(), 2.into()),
+        change("collect.max_per_seed_structure", 4.into(), 6.into()),
+        change("collect.max_structures", Value::Null, 20.into()),
+        change("label.concurrency", 1.into(), 2.into()),
         change("run.walkers", 2.into(), 1.into()),
     ];
     assert_eq!(logged(here), expected);
@@ -170,7 +170,7 @@ fn a_larger_budget_lets_walks_go_on() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     Small::default().write(here);
-    replace(here, "per_seed = 4", "per_seed = 1");
+    replace(here, "max_per_seed_structure = 4", "max_per_seed_structure = 1");
     succeed(here, RUN);
     let accepted = || -> Vec<_> {
         let biased = walks(here).into_iter().filter(|walk| walk.0 == "biased");
@@ -179,11 +179,11 @@ fn a_larger_budget_lets_walks_go_on() {
     let collected =
         |accepted: u32| ["fcc-100", "vacancy"].map(|n| (n.to_owned(), "collected".to_owned(), accepted));
     assert_eq!(accepted(), collected(1));
-    replace(here, "per_seed = 1", "per_seed = 2");
-    assert_eq!(resume_processes(here), "configuration: collect.per_seed is now 2 (was 1)");
+    replace(here, "max_per_seed_structure = 1", "max_per_seed_structure = 2");
+    assert_eq!(resume_processes(here), "configuration: collect.max_per_seed_structure is now 2 (was 1)");
     assert_eq!(accepted(), collected(2));
     // One for all of them: whoever comes first takes what is left.
-    replace(here, "per_seed = 2", "per_seed = 4\ntotal = 5");
+    replace(here, "max_per_seed_structure = 2", "max_per_seed_structure = 4\ntotal = 5");
     resume_processes(here);
     assert_eq!(accepted().iter().map(|walk| walk.2).sum::<u32>(), 5);
 }
@@ -232,7 +232,7 @@ fn seed_structures_cannot_be_changed_moved_or_taken_away() {
     ] {
         other.write(here);
         let message = refuse(here, RUN);
-        assert!(message.contains("seeds.files: ") && message.contains(words), "{message}");
+        assert!(message.contains("seed_structures.files: ") && message.contains(words), "{message}");
         assert!(message.contains("can be added behind those that it has"), "{message}");
     }
     small().write(here);

@@ -14,7 +14,7 @@ fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
 
 /// A small campaign with these keys in `[label]`.
 fn write(here: &Path, keys: &str) {
-    let config = Small { seeds: &["fcc-100"], per_seed: 2, ..Small::default() }.write(here);
+    let config = Small { seeds: &["fcc-100"], max_per_seed_structure: 2, ..Small::default() }.write(here);
     let text = fs::read_to_string(&config).unwrap();
     fs::write(&config, text.replace("[label]", &format!("[label]\n{keys}"))).unwrap();
 }
@@ -28,7 +28,7 @@ fn names(jobs: &Json, state: &str) -> Vec<String> {
 fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    write(here, r#"guard = { shortest_bond = { "Al-Al" = 3.5 } }"#);
+    write(here, r#"guard = { min_bond_lengths = { "Al-Al" = 3.5 } }"#);
     let summary = succeed(here, ["run", "campaign.toml"]);
     let refused = names(&json(here, ["queue", "campaign", "list"]), "failed");
     assert!(refused.len() > 1 && summary.contains("structures failed"), "{summary}");
@@ -36,7 +36,7 @@ fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
     let attempt = &details["attempts_made"][0];
     assert_eq!(attempt["class"], "refused");
     let log = attempt["log"].as_str().unwrap();
-    assert!(log.contains("Å apart, where label.guard.shortest_bond of Al-Al is 3.5"), "{log}");
+    assert!(log.contains("Å apart, where label.guard.min_bond_lengths of Al-Al is 3.5"), "{log}");
     let status = json(here, ["status", "campaign"]);
     assert_eq!(status["failures"][0]["class"], "refused");
     assert_eq!(status["failures"][0]["given_up"], refused.len());
@@ -54,7 +54,7 @@ fn near_duplicates_of_labelled_structures_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     // Everything from one seed structure is as near as that.
-    write(here, "guard = { near_duplicate = 1.0 }");
+    write(here, "guard = { duplicate_tolerance = 1.0 }");
     succeed(here, ["run", "campaign.toml"]);
     let jobs = json(here, ["queue", "campaign", "list"]);
     let (labelled, refused) = (names(&jobs, "labelled"), names(&jobs, "failed"));
@@ -69,8 +69,8 @@ fn impossible_guards_are_wrong_input() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     for (guard, said) in [
-        ("{ least_angle = 120.0 }", "label.guard.least_angle"),
-        (r#"{ shortest_bond = { "Xx-Al" = 1.0 } }"#, "'Xx-Al' is not a pair of elements"),
+        ("{ min_angle = 120.0 }", "label.guard.min_angle"),
+        (r#"{ min_bond_lengths = { "Xx-Al" = 1.0 } }"#, "'Xx-Al' is not a pair of elements"),
         ("{ smallest_volume = 1.0 }", "smallest_volume"),
     ] {
         write(here, &format!("guard = {guard}"));
@@ -98,9 +98,13 @@ fn a_campaign_has_a_bill_before_it_begins() {
     assert!((hours(&priced) / expected - 1.0).abs() < 1e-9, "{priced}");
     // A key that limits structures limits the bill.
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
-    fs::write(here.join("less.toml"), text.replace("per_seed = 4", "per_seed = 4\ntotal = 2")).unwrap();
+    fs::write(
+        here.join("less.toml"),
+        text.replace("max_per_seed_structure = 4", "max_per_seed_structure = 4\ntotal = 2"),
+    )
+    .unwrap();
     let less = json(here, ["estimate", "less.toml", "--core-seconds", "3600"]);
-    assert_eq!((&less["labels"], &less["limited_by"]), (&4.into(), &"collect.total".into()));
+    assert_eq!((&less["labels"], &less["limited_by"]), (&4.into(), &"collect.max_structures".into()));
     assert!((hours(&less) / hours(&priced) - 0.25).abs() < 1e-9);
 
     assert!(refuse(here, ["estimate", "campaign.toml", "--cost-from", "less"]).contains("less"));

@@ -248,7 +248,7 @@ fn daemons_end_with_the_calculation() {
     let daemon = once.read("daemon");
     assert!(!Path::new("/proc").join(daemon.trim()).exists(), "{daemon} is left");
     // At its time limit as well.
-    let once = Once::new(&format!("{DAEMON}sleep 1000\n"), "time_limit = 1.0");
+    let once = Once::new(&format!("{DAEMON}sleep 1000\n"), "time_limit = \"1s\"");
     let output = once.command().output().unwrap();
     assert!(stderr(&output).contains("time limit"), "{}", stderr(&output));
     let daemon = once.read("daemon");
@@ -263,7 +263,7 @@ fn no_dead_process_is_left_while_a_calculation_goes_on() {
         "for times in 1 2 3 4 5; do (sleep 0 &); done\n\
          zombies() { cat /proc/[0-9]*/stat 2> /dev/null | awk -v parent=$PPID '$3 == \"Z\" && $4 == parent' | wc -l; }\n\
          while [ $(zombies) -gt 0 ]; do sleep 0.05; done; echo none > $HERE/zombies\n",
-        "time_limit = 60.0",
+        "time_limit = \"1m\"",
     );
     label(once.command().output().unwrap());
     assert_eq!(once.read("zombies"), "none\n");

@@ -13,7 +13,7 @@ use crate::common::{Running, kills, random};
 
 /// A silent agent is soon taken for dead.
 fn hosts(small: &Small, others: usize) -> Hosts {
-    Hosts::new(small, others, "agent_silence_limit = 0.5")
+    Hosts::new(small, others, "agent_heartbeat_timeout = \"500ms\"")
 }
 
 #[test]
@@ -72,7 +72,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
 #[test]
 fn a_slow_line_changes_nothing() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
-    let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
+    let mut hosts = Hosts::new(&small, 1, "agent_heartbeat_timeout = \"30s\"");
     let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
     hosts.endpoints[1] = format!("tcp/{}", proxy.address);
     hosts.options[1] = vec!["--prefetch=1".into()];

@@ -41,7 +41,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     let small = Small::default();
     let place = LabelCampaign::new(&small, &[NO_SLOTS]);
     // It may be there before the campaign.
-    let mut label = place.label(&["--concurrency", "2", "--method", "reference", "--wait-timeout", "2m"]);
+    let mut label = place.label(&["--concurrency", "2", "--method", "potential", "--wait-timeout", "2m"]);
     wait_until("it waits", || place.said().contains("waiting for the campaign: there is no campaign in"));
     let mut run = place.run();
     wait_until("both slots show in status", || {
@@ -54,7 +54,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     let said = place.said();
-    assert!(said.contains("label.slots = 0: start labellers with calmwalk label --store "), "{said}");
+    assert!(said.contains("label.concurrency = 0: start labellers with calmwalk label --store "), "{said}");
     let labels = place.jobs("labelled") as usize;
     assert!(labels > 0 && said.matches(": labelled ").count() == labels, "{labels} in {said}");
     assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
@@ -154,7 +154,7 @@ fn wrong_files_methods_and_stores_are_refused() {
     };
     let message = refuse(here, command(&[]));
     let hash = blake3::hash(content.as_bytes()).to_string();
-    for words in ["label.method.reference.file: ", &hash, "label.eam.fs cannot be read here", "--file"] {
+    for words in ["label.method.potential.file: ", &hash, "label.eam.fs cannot be read here", "--file"] {
         assert!(message.contains(words), "{message}");
     }
     for given in [&["--file", "other.eam.fs"][..], &["--file", "moved.eam.fs", "--file", "other.eam.fs"]] {
@@ -168,7 +168,7 @@ fn wrong_files_methods_and_stores_are_refused() {
     assert!(message.contains("label.eam.fs here has another content (BLAKE3 "), "{message}");
     let message = refuse(here, command(&["--method", "vasp"]));
     assert!(
-        message.contains("--method vasp, but the labels of this campaign are made by the method 'reference'")
+        message.contains("--method vasp, but the labels of this campaign are made by the method 'potential'")
     );
 
     let empty = tempfile::tempdir().unwrap();

@@ -92,7 +92,7 @@ fn a_stall_is_told_once_also_over_restarts() {
     let here = directory.path();
     let small = Small { steps: 1_000_000, ..Small::default() };
     let nothing_is_new = ("threshold = 1.0", "threshold = 1e6");
-    write(here, &small, "stall = 0.02", nothing_is_new, "exit 0");
+    write(here, &small, "stall_timeout = \"1200ms\"", nothing_is_new, "exit 0");
     for again in [false, true] {
         let run = program(here).args(RUN).stderr(Stdio::null()).stdout(Stdio::null()).spawn();
         let run = Running(run.unwrap());
@@ -125,7 +125,7 @@ fn a_mixture_that_forgets_is_spoken_of_once_a_run_and_told_once() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let small = Small { steps: 900, ..Small::default() };
-    let low = ("training_frames", "ladder = [1.0]\nforgetting_alarm = 0.02\ntraining_frames");
+    let low = ("training_frames", "alpha_values = [1.0]\nforgetting_alarm = 0.02\ntraining_frames");
     write(here, &small, "on = [\"forgetting\"]\nstall = 0.01", low, "exit 0");
     let said = here.join("said");
     let start = || {
@@ -140,7 +140,7 @@ fn a_mixture_that_forgets_is_spoken_of_once_a_run_and_told_once() {
     run.0.wait().unwrap();
     let text = fs::read_to_string(&said).unwrap();
     assert_eq!(spoken_of(), 1, "{text}");
-    assert!(text.contains("ALARM: ") && text.contains("combination = \"additive\""), "{text}");
+    assert!(text.contains("ALARM: ") && text.contains("covariance_update = \"additive\""), "{text}");
     let before = alarms(here);
     assert_eq!(start().0.wait().unwrap().code(), Some(0));
     assert!(spoken_of() <= 1 && alarms(here) >= before, "{}", fs::read_to_string(&said).unwrap());

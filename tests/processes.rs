@@ -112,7 +112,7 @@ fn wait_for_work(directory: &Path) {
 #[test]
 fn a_hung_walker_is_killed_and_replaced() {
     let mut hung = 0;
-    let directory = disturbed("silence_limit = 10.0", |here| {
+    let directory = disturbed("heartbeat_timeout = \"10s\"", |here| {
         hung = wait_for_process(here, "walker");
         signal(hung, "STOP");
     });

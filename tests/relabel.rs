@@ -74,9 +74,9 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
         "label.protocol is now \"fine\" (was \"reference\")".to_owned(),
         "protocol 'fine' would become the current label protocol".to_owned(),
         format!(
-            "{labels} structures would be queued again for protocol 'fine', to replace {labels} labels of 'reference'"
+            "{labels} structures would be queued again for protocol 'fine', to replace {labels} labels of 'potential'"
         ),
-        format!("estimated from {labels} labels by 'reference'"),
+        format!("estimated from {labels} labels by 'potential'"),
         "nothing was changed".to_owned(),
     ] {
         assert!(planned.contains(&words), "{words} in {planned}");
@@ -95,7 +95,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     assert_eq!((place.jobs("again"), place.jobs("queued")), (labels, labels));
     let before = exported(&place);
     // A structure that was found twice has one label.
-    assert!(before.len() as u64 >= labels && before.iter().all(|(protocol, _)| protocol == "reference"));
+    assert!(before.len() as u64 >= labels && before.iter().all(|(protocol, _)| protocol == "potential"));
     check(&place);
     assert!(refuse(here, ["run", "campaign.toml", "--directory", "."]).contains("labels of two protocols"));
 
@@ -112,7 +112,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     let words = format!("{labels} labelled, 0 failed, 0 dropped, {labels} superseded, 0 in work, 0 waiting");
     assert!(summary.contains(&words), "{summary}");
     let story = succeed(here, ["explain", campaign, &after[0].1]);
-    for words in ["superseded", "ago: a finer grid", "protocol 'fine'", "protocol 'reference'"] {
+    for words in ["superseded", "ago: a finer grid", "protocol 'fine'", "protocol 'potential'"] {
         assert!(story.contains(words), "{words} in {story}");
     }
     check(&place);
@@ -127,7 +127,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
 #[test]
 fn a_protocol_needs_a_name_of_its_own_and_a_campaign_that_nobody_runs() {
     let (place, _) = labelled();
-    another_protocol(&place, "reference");
+    another_protocol(&place, "potential");
     let with = ["relabel", place.argument(), "--config", "fine.toml", "--all"];
     let refused = refuse(place.path(), with);
     assert!(refused.contains("choose a new name"), "{refused}");
@@ -207,7 +207,7 @@ fn labellers_go_on_with_the_new_protocol() {
     relabel(&place, &["--config", "fine.toml", "--all"]);
     signal(slot, "CONT");
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
-    assert!(place.said().contains("the campaign replaced label protocol 'reference'"), "{}", place.said());
+    assert!(place.said().contains("the campaign replaced label protocol 'potential'"), "{}", place.said());
     let job = place.job(&name).job;
     assert_eq!((job.protocol.as_str(), job.state), ("fine", JobState::Labelled));
     assert_eq!((place.jobs("labelled"), place.jobs("again")), (labels + 1, 0));

@@ -90,7 +90,8 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
     assert!(shown.contains("all reproduced bit by bit"), "{shown}");
     assert!(shown.contains("is identical to the stored one"), "{shown}");
 
-    let strict = replayed(here, &["collect.when={ rule = \"atom_count\", threshold = 1.2, fraction = 0.1 }"]);
+    let strict =
+        replayed(here, &["collect.criterion={ rule = \"atom_count\", threshold = 1.2, fraction = 0.1 }"]);
     let accepted = |report: &Value, when: &str| report[when]["accepted"].as_u64().unwrap();
     assert_eq!(accepted(&strict, "before"), accepted(&report, "before"));
     assert!(accepted(&strict, "now") < accepted(&strict, "before"), "{strict}");
@@ -100,16 +101,19 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
     assert!(lost.iter().any(|change| change["reason"] == "covered"), "{lost:?}");
     assert!(lost.iter().all(|change| change["step"].as_u64() > Some(20)), "{lost:?}");
     // A value can be set as a whole or inside.
-    let inside = replayed(here, &["collect.when.threshold=1.2"]);
-    assert_eq!((&inside["now"], &inside["set"]["collect.when.threshold"]), (&strict["now"], &"1.2".into()));
+    let inside = replayed(here, &["collect.criterion.threshold=1.2"]);
+    assert_eq!(
+        (&inside["now"], &inside["set"]["collect.criterion.threshold"]),
+        (&strict["now"], &"1.2".into())
+    );
 
-    let one = replayed(here, &["collect.per_seed=1"]);
+    let one = replayed(here, &["collect.max_per_seed_structure=1"]);
     assert_eq!(accepted(&one, "now"), 4, "{one}");
     let over = one["no_longer_accepted"].as_array().unwrap();
     assert!(over.iter().all(|change| change["reason"] == "walk over"), "{over:?}");
-    let other = replayed(here, &["calm.update=never", "collect.per_seed=100"]);
+    let other = replayed(here, &["calm.update=never", "collect.max_per_seed_structure=100"]);
     assert_eq!(other["now"]["mixture_version"], 0);
-    let other = replayed(here, &["calm.combination=additive"]);
+    let other = replayed(here, &["calm.covariance_update=additive"]);
     assert_eq!(other["difference"], Value::Null);
     assert_eq!(fs::read(here.join("here/campaign.sqlite")).unwrap(), database, "nothing is written");
 }
@@ -117,14 +121,17 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
 #[test]
 fn a_live_campaign_that_went_on_by_other_limits_comes_out_as_it_was() {
     let live = Small { mode: "live", ..Small::default() };
-    let directory = finished(&live, &[("per_seed = 4", "per_seed = 1")]);
+    let directory = finished(&live, &[("max_per_seed_structure = 4", "max_per_seed_structure = 1")]);
     let here = directory.path();
     check_exact(here);
     // Structures that the walks will meet again when they go on would be duplicates; these are of another campaign.
     let other = finished(&Small { steps: 120, ..Small::default() }, &[]);
     let labelled = export(other.path());
     succeed(here, ["import", "here", labelled.to_str().unwrap()]);
-    change(&here.join("campaign.toml"), &[("per_seed = 1", "per_seed = 3\ntotal = 5")]);
+    change(
+        &here.join("campaign.toml"),
+        &[("max_per_seed_structure = 1", "max_per_seed_structure = 3\ntotal = 5")],
+    );
     succeed(here, RUN);
     check_exact(here);
     let kinds = kinds(here);
@@ -144,16 +151,20 @@ fn kinds(directory: &Path) -> Vec<String> {
 #[test]
 fn a_mixture_that_begins_anew_comes_out_as_it_was() {
     let small = Small { walks_per_round: 1, ..Small::default() };
-    let directory = finished(&small, &[("[seeds]", "update = \"restarted\"\n[seeds]")]);
+    let directory =
+        finished(&small, &[("[seed_structures]", "update = \"per_seed_structure\"\n[seed_structures]")]);
     let report = check_exact(directory.path());
-    let carried = replayed(directory.path(), &["calm.update=carried"]);
+    let carried = replayed(directory.path(), &["calm.update=cumulative"]);
     let versions = |report: &Value| report["now"]["mixture_version"].as_u64().unwrap();
     assert!(versions(&carried) < versions(&report), "no version for a new begin: {carried}");
 }
 
 #[test]
 fn it_says_from_where_on_features_are_missing() {
-    let directory = finished(&many(), &[("per_seed = 4", "per_seed = 4\ndeclined_features_mb = 0")]);
+    let directory = finished(
+        &many(),
+        &[("max_per_seed_structure = 4", "max_per_seed_structure = 4\ndeclined_features_mb = 0")],
+    );
     let here = directory.path();
     let report = replayed(here, &[]);
     let stopped = &report["stopped"];
@@ -171,8 +182,8 @@ fn what_cannot_be_set_is_refused() {
     let here = directory.path();
     for (setting, words) in [
         ("walk.tau=0.2", "walk.tau cannot be replayed: expected a key that acts on the selector alone"),
-        ("collect.per_seed=0", "expected a whole number above 0"),
-        ("collect.when.threshold=\"a\"", "--set collect.when.threshold=\"a\": "),
+        ("collect.max_per_seed_structure=0", "expected a whole number above 0"),
+        ("collect.criterion.threshold=\"a\"", "--set collect.criterion.threshold=\"a\": "),
         ("calm.update=restarted", "run.walks_per_round = 1"),
     ] {
         let message = refuse(here, ["replay", "here", "--set", setting]);

@@ -254,5 +254,5 @@ fn labels_that_fail_do_not_stop_a_campaign() {
     let jobs: serde_json::Value = serde_json::from_str(&jobs).unwrap();
     let candidate = jobs[0]["candidate"].as_str().unwrap();
     let details = succeed(directory.path(), ["queue", "here", "show", candidate]);
-    assert_eq!(details.matches("beyond label.largest_force").count(), 2, "{details}");
+    assert_eq!(details.matches("beyond label.max_force").count(), 2, "{details}");
 }

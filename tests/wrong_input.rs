@@ -26,13 +26,17 @@ fn every_wrong_key_is_named_with_its_line() {
         ("temperature = 600.0", "temperature = \"600\"", "string \"600\", expected a number"),
         ("temperature = 600.0", "temperature = = 600", "extra `=`"),
         ("temperature = 600.0", "temperature = 600.0\ntemperature = 600.0", "duplicate key"),
-        ("steps = 2000 ", "steps = 0 ", "integer `0`, expected a whole number above 0"),
-        ("steps = 2000 ", "steps = -1 ", "integer `-1`, expected a whole number above 0"),
-        ("steps = 2000 ", "steps = 20.5 ", "floating point `20.5`, expected a whole number above 0"),
+        ("biased_steps = 2000 ", "biased_steps = 0 ", "integer `0`, expected a whole number above 0"),
+        ("biased_steps = 2000 ", "biased_steps = -1 ", "integer `-1`, expected a whole number above 0"),
         (
-            "steps = 2000 ",
-            "steps = 9223372036854775807 ",
-            "walk.steps is 9223372036854776000; expected at most",
+            "biased_steps = 2000 ",
+            "biased_steps = 20.5 ",
+            "floating point `20.5`, expected a whole number above 0",
+        ),
+        (
+            "biased_steps = 2000 ",
+            "biased_steps = 9223372036854775807 ",
+            "walk.biased_steps is 9223372036854776000; expected at most",
         ),
         ("tau = 0.15", "tau = 0", "found 0, expected a finite number above 0"),
         ("# mode = \"reproducible\"", "mode = \"reproducable\"", "did you mean `reproducible`?"),
@@ -44,10 +48,14 @@ fn every_wrong_key_is_named_with_its_line() {
             "forgetting_alarm = 20",
             "found 20, expected a number above 0 and not above 1",
         ),
-        ("# ladder = [0.05, 0.1,", "ladder = [0.05, 0.01,", "expected at least one value, ascending"),
         (
-            "# ladder = [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]",
-            "ladder = []",
+            "# alpha_values = [0.05, 0.1,",
+            "alpha_values = [0.05, 0.01,",
+            "expected at least one value, ascending",
+        ),
+        (
+            "# alpha_values = [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]",
+            "alpha_values = []",
             "expected at least one value, ascending",
         ),
         (
@@ -74,18 +82,14 @@ fn every_wrong_key_is_named_with_its_line() {
             "expected at most the cutoff of the model, 6.5 Å",
         ),
         ("inner = 1.6, outer = 2.4", "inner = 1.6", "missing key `outer`"),
+        ("# max_temperature = 20000.0", "max_temperature = 500", "more than walk.temperature = 600 K"),
         (
-            "# highest_temperature = 20000.0",
-            "highest_temperature = 500",
-            "more than walk.temperature = 600 K",
-        ),
-        (
-            "# update = \"carried\"",
-            "update = \"restarted\"",
+            "# update = \"cumulative\"",
+            "update = \"per_seed_structure\"",
             "expected mode = \"reproducible\" and run.walks_per_round = 1",
         ),
-        ("files = [\"", "files = [] # [\"", "seeds.files is an empty list"),
-        ("# total = 100", "total = 0", "expected a whole number above 0"),
+        ("files = [\"", "files = [] # [\"", "seed_structures.files is an empty list"),
+        ("# max_structures = 100", "max_structures = 0", "expected a whole number above 0"),
         ("# walkers = 0", "walkers = -1", "integer `-1`, expected a whole number, 0 or more"),
         ("# walkers = 0", "walkers = 100000", "run.walkers is 100000; expected at most 1024"),
         (
@@ -94,9 +98,9 @@ fn every_wrong_key_is_named_with_its_line() {
             "expected one of `grace`, `eam_alloy`, `eam_fs`, `stillinger_weber`",
         ),
         (
-            "method = { reference",
+            "method = { potential",
             "method = { dft",
-            "unknown value `dft`, expected one of `reference`, `abinit`, ",
+            "unknown value `dft`, expected one of `potential`, `abinit`, ",
         ),
     ] {
         let message = tester.refused(changed(from, to));
@@ -112,7 +116,11 @@ fn whole_sections_and_files_that_are_none_are_told() {
     let tester = ConfigTester::new();
     tester.refused_with("[potential]\nmodel", "model", &["c.toml:", "`model`"]);
     tester.refused_with("tau = 0.15 ", "# ", &["missing key `tau`", "[walk]"]);
-    tester.refused_with("[seeds]", "[walk]", &[&format!("c.toml:{}:", line("[walk]")), "duplicate key"]);
+    tester.refused_with(
+        "[seed_structures]",
+        "[walk]",
+        &[&format!("c.toml:{}:", line("[walk]")), "duplicate key"],
+    );
     assert!(tester.refused("").contains("c.toml:1:1: missing key `potential`"));
     let binary: Vec<u8> = (0..=255).collect();
     assert!(
@@ -209,8 +217,9 @@ fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
     );
 
     // Without updates the export is enough.
-    let never = changed("artifact = ", "update = \"never\" # ").replace("steps = 2000 ", "steps = 60 ");
-    tester.write("c.toml", never.replace("# equilibration = 500", "equilibration = 10"));
+    let never =
+        changed("artifact = ", "update = \"never\" # ").replace("biased_steps = 2000 ", "biased_steps = 60 ");
+    tester.write("c.toml", never.replace("# equilibration_steps = 500", "equilibration_steps = 10"));
     let valid = succeed(tester.path(), ["validate", "c.toml"]);
     assert!(valid.contains("it can be scored with but not updated"), "{valid}");
     let summary = succeed(tester.path(), ["run", "c.toml"]);
@@ -237,16 +246,16 @@ fn training_frames_and_label_potentials_must_fit() {
     tester.refused_with(
         &label,
         "absent.eam",
-        &["label.method.reference.file: ", "absent.eam", "No such file"],
+        &["label.method.potential.file: ", "absent.eam", "No such file"],
     );
-    tester.refused_with(&label, &path("data/Si.sw"), &["label.method.reference.file: ", "Si.sw"]);
+    tester.refused_with(&label, &path("data/Si.sw"), &["label.method.potential.file: ", "Si.sw"]);
     tester.refused_with("\"eam_fs\"", "\"stillinger_weber\"", &["Al_mm.eam.fs, line 2: found 22 words"]);
     let of_silicon = format!("{{ kind = \"stillinger_weber\", file = \"{}\" }}", path("data/Si.sw"));
     let expected = ["Si.sw: the label potential knows Si, but seed structure 'fcc-100' (", "has Al"];
     tester.refused_with(&format!("{{ kind = \"eam_fs\", file = \"{label}\" }}"), &of_silicon, &expected);
     for size in [0, 20, 2000] {
         tester.write("cut.eam", &fs::read(&label).unwrap()[..size]);
-        tester.refused_with(&label, "cut.eam", &["label.method.reference.file: ", "cut.eam"]);
+        tester.refused_with(&label, "cut.eam", &["label.method.potential.file: ", "cut.eam"]);
     }
 }
 

@@ -31,7 +31,7 @@ struct Seeds {
 impl Seeds {
     fn new() -> Self {
         let files = config("data/aluminium_seeds.extxyz").display().to_string();
-        let at = format!("c.toml:{}: seeds.files: ", line(&files));
+        let at = format!("c.toml:{}: seed_structures.files: ", line(&files));
         Self { tester: ConfigTester::new(), files, at }
     }
 
@@ -89,7 +89,7 @@ fn structures_that_no_walk_can_start_from_are_refused() {
         ),
         (
             good.replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0.1"),
-            ":1: atoms 12 and 13 are 0.100 Å apart, closer than guard.least_distance = 1.2 Å",
+            ":1: atoms 12 and 13 are 0.100 Å apart, closer than guard.min_distance = 1.2 Å",
         ),
         (good.replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0"), ":1: atoms 12 and 13 are 0.000 Å apart"),
         (crowded, ":1: atoms 0 and 0 are 0.500 Å apart"),
@@ -137,8 +137,7 @@ fn structures_from_which_nothing_can_be_collected_are_refused() {
     let seeds = Seeds::new();
     let two =
         format!("2\n{} Properties=species:S:1:pos:R:3\nAl 0 0 0\nAl 2.8 0 0\n", CELL.replace("8.4", "5.6"));
-    let words =
-        ":1: the structure has 2 atoms, fewer than the 3 that must be new at once (collect.when.least)";
+    let words = ":1: the structure has 2 atoms, fewer than the 3 that must be new at once (collect.criterion.min_atoms)";
     seeds.refused("two.extxyz", two, &[words]);
     let cluster = good().replace(CELL, "pbc=\"F F F\"");
     let words =

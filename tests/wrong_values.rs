@@ -42,7 +42,7 @@ fn unusual_values_are_warned_of_at_their_own_lines() {
             "walk.temperature: 1 K is unusual (10 to 10000 K is usual)",
         ),
         ("from = 1.0, to = 1.4", "from = 1.0, to = 14", "walk.volume_ramp.to: 14 V/V₀ is unusual"),
-        ("# time_limit = 86400.0", "time_limit = 1", "label.time_limit: 1 s is unusual"),
+        ("# time_limit = \"1day\"", "time_limit = \"1s\"", "label.time_limit: 1 s is unusual"),
     ] {
         let found = warnings(&tester, &changed(from, to));
         let at = format!("WARNING: c.toml:{}: ", line(from));
@@ -55,7 +55,8 @@ fn unusual_values_are_warned_of_at_their_own_lines() {
 #[test]
 fn run_gives_the_same_warnings_and_goes_on() {
     let tester = ConfigTester::new();
-    let text = changed("steps = 2000 ", "steps = 5 ").replace("# equilibration = 500", "equilibration = 1");
+    let text = changed("biased_steps = 2000 ", "biased_steps = 5 ")
+        .replace("# equilibration_steps = 500", "equilibration_steps = 1");
     let expected = warnings(&tester, &text);
     assert_eq!(expected.len(), 1, "{expected:?}");
     let output = calmwalk(tester.path(), ["run", "c.toml"]);
@@ -74,13 +75,17 @@ fn values_that_nobody_can_mean_are_refused() {
         ),
         ("# time_step = 2.0", "time_step = 50", "walk.time_step is 50; expected at most 20 fs"),
         ("# skin = 0.5", "skin = 50", "walk.skin is 50; expected at most 10 Å"),
-        ("# silence_limit = 120.0", "silence_limit = 1", "run.silence_limit is 1; expected 5 to 1e6 s"),
+        (
+            "# heartbeat_timeout = \"2m\"",
+            "heartbeat_timeout = \"1s\"",
+            "run.heartbeat_timeout is 1; expected 5 to 1e6 s",
+        ),
     ] {
         tester.refused_with(from, to, &[&format!("c.toml:{}: ", line(from)), expected]);
     }
     // Of a table of its own, too.
     let abinit = "[label.method.abinit]\npseudopotentials = \"/\"\ncutoff = 10\nk_spacing = 6\n";
-    let text = changed("method = { reference", "# method = { reference")
+    let text = changed("method = { potential", "# method = { potential")
         .replace("\n[budget]", &format!("\n{abinit}\n[budget]"));
     let message = tester.refused(&text);
     let at = |words: &str| 1 + text.lines().position(|line| line == words).unwrap();
@@ -107,7 +112,7 @@ fn everything_that_is_wrong_is_told_at_once() {
         ("model = ", "modle = "),
         ("# rng_seed = 1 ", "rng_seed = -1 "),
         ("from = 1.0, to = 1.4", "from = 1.0, to = 140"),
-        ("# gap = 200", "gap = \"200\""),
+        ("# min_interval = 200", "gap = \"200\""),
         ("until = ", "# until = "),
         ("inner = 1.6, outer = 2.4", "inner = 1.6"),
         ("# walkers = 0", "walkers = 5000"),
@@ -125,7 +130,7 @@ fn everything_that_is_wrong_is_told_at_once() {
         ("temprature", "unknown key `temprature`, expected one of"),
         ("to = 140", "walk.volume_ramp.to is 140; expected"),
         ("[collect]", "missing key `until`"),
-        ("gap = \"200\"", "collect.gap: invalid type: string \"200\", expected a whole number"),
+        ("gap = \"200\"", "collect.min_interval: invalid type: string \"200\", expected a whole number"),
         ("zbl = {", "missing key `outer`"),
         ("walkers = 5000", "run.walkers is 5000; expected at most 1024"),
         ("[notifi]", "unknown key `notifi`, expected one of"),
@@ -169,10 +174,10 @@ fn names_that_are_nearly_right_get_a_hint() {
         ("temperature = 600.0", "temperature = 600.0\ngap = 100", "it belongs in [collect]"),
         ("temperature = 600.0", "temperature = 600.0\ntime_limit = 100", "it belongs in [label] or [notify]"),
         ("temperature = 600.0", "temperature = 600.0\ndt = 1", "did you mean `time_step`?"),
-        ("# gap = 200", "gaps = 200", "did you mean `gap`?"),
+        ("# min_interval = 200", "gaps = 200", "did you mean `gap`?"),
         ("[campaign]", "tau = 1\n[campaign]", "it belongs in [walk]"),
         (
-            "method = { reference",
+            "method = { potential",
             "method = { quantum_espresso",
             "makes labels through `ase`: see docs/dft-codes.md",
         ),
@@ -180,7 +185,7 @@ fn names_that_are_nearly_right_get_a_hint() {
         tester.refused_with(from, to, &[expected]);
     }
     let abinit = "\n[label.method.abinit]\necut = 400\n[budget]";
-    let text = changed("method = { reference", "# method = { reference").replacen("\n[budget]", abinit, 1);
+    let text = changed("method = { potential", "# method = { potential").replacen("\n[budget]", abinit, 1);
     let message = tester.refused(text);
     assert!(
         message.contains("unknown key `ecut`") && message.contains("did you mean `cutoff`?"),
@@ -202,7 +207,7 @@ fn other_things_in_the_place_of_files_are_told() {
             true => fs::create_dir(tester.path().join(name)).unwrap(),
             false => tester.write(name, "data_Al\n_cell_length_a 4.05\n"),
         }
-        tester.refused_with(&seeds, name, &["seeds.files: ", expected]);
+        tester.refused_with(&seeds, name, &["seed_structures.files: ", expected]);
     }
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
     let score = |input: &str| {

@@ -46,7 +46,7 @@ fn event() -> impl Strategy<Value = Event> {
 }
 
 fn any_settings() -> impl Strategy<Value = Settings> {
-    let update = prop::sample::select(vec![UpdateProtocol::Carried, UpdateProtocol::Restarted]);
+    let update = prop::sample::select(vec![UpdateProtocol::Cumulative, UpdateProtocol::PerSeedStructure]);
     (update, 1..5_u32, prop::option::of(1..9_u32), any::<bool>()).prop_map(
         |(update, max_per_seed_structure, total, control)| Settings {
             update,

@@ -306,8 +306,11 @@ fn updates_accumulate_over_seed_structures() {
 
 #[test]
 fn each_seed_structure_starts_from_the_original_mixture() {
-    let restarted =
-        Settings { update: UpdateProtocol::Restarted, walks_per_round: 1, ..settings(Mode::Reproducible) };
+    let restarted = Settings {
+        update: UpdateProtocol::PerSeedStructure,
+        walks_per_round: 1,
+        ..settings(Mode::Reproducible)
+    };
     let training = TrainingFrames::new(vec![0], vec![0.0, 0.0, 0.9], &mixture()).unwrap();
     let mut selector = try_restore(&restarted, 2, Some(training), SelectorSnapshot::default()).unwrap();
     selector.start_walks();

@@ -132,7 +132,7 @@ proptest! {
         let log = log(&campaign);
         let collection = CollectionRule::MaximumGrade { threshold: positive(threshold) };
         let strict = Settings { collection, ..settings.clone() };
-        let replayed = follow(&mut open(&campaign, &strict, scripts.len(), &["collect.when"]), &log);
+        let replayed = follow(&mut open(&campaign, &strict, scripts.len(), &["collect.criterion"]), &log);
         for ((recorded, candidate), now) in log.iter().zip(replayed) {
             let (Some(candidate), true) = (candidate, recorded.kind != "control") else { continue };
             let above = candidate.selector.gamma.iter().any(|gamma| *gamma > threshold);
@@ -157,7 +157,7 @@ fn the_campaigns_cover_the_intended_cases() {
     let mut seen = HashSet::new();
     for _ in 0..60 {
         let settings = any_settings().new_tree(&mut runner).unwrap().current();
-        let settings = Settings { mode: Mode::Live, update: UpdateProtocol::Carried, ..settings };
+        let settings = Settings { mode: Mode::Live, update: UpdateProtocol::Cumulative, ..settings };
         let scripts: Vec<Script> = scripts().new_tree(&mut runner).unwrap().current();
         let more = Settings {
             max_per_seed_structure: settings.max_per_seed_structure + 3,

@@ -75,8 +75,8 @@ proptest! {
         prop_assert!(versions.is_sorted(), "rounds and versions only go up");
         let steps = match settings.update {
             UpdateProtocol::Never => 0,
-            UpdateProtocol::Carried => count("accepted"),
-            UpdateProtocol::Restarted => count("accepted") + scripts.len(),
+            UpdateProtocol::Cumulative => count("accepted"),
+            UpdateProtocol::PerSeedStructure => count("accepted") + scripts.len(),
         };
         prop_assert_eq!(campaign.selector.mixture().version(), steps as u64, "one version an update");
     }

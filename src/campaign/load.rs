@@ -171,7 +171,7 @@ impl Loader<'_> {
         seeds: &[SourcedStructure],
     ) -> Result<(Protocol, Vec<(String, String)>), ConfigError> {
         let (settings, hashes) = match &self.config.label.method {
-            LabelMethod::Reference(reference) => self.reference(reference, seeds)?,
+            LabelMethod::Potential(reference) => self.reference(reference, seeds)?,
             LabelMethod::Code(settings) => (self.code(settings, seeds)?, Vec::new()),
         };
         Ok((label_setup::protocol(self.config.label.protocol_name(), settings), hashes))

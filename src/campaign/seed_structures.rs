@@ -12,7 +12,7 @@ use super::SourcedStructure;
 use super::load::Loader;
 use crate::config::{ConfigError, Warning, place};
 
-const FILES: &str = "seeds.files";
+const FILES: &str = "seed_structures.files";
 
 /// Nearest neighbours of solids and molecules are 0.79 to 1.48 times the sum of their radii (U, H₂) apart. Confusing
 /// Bohr and Å changes distances by a factor of 1.89.
@@ -22,7 +22,7 @@ impl Loader<'_> {
     /// Reads every frame of every file. Names must be unique.
     pub fn seed_structures(&self, model: &GraceModel) -> Result<Vec<SourcedStructure>, ConfigError> {
         let mut seeds: Vec<SourcedStructure> = Vec::new();
-        for file in &self.config.seeds.files {
+        for file in &self.config.seed_structures.files {
             let path = file.get_ref();
             let wrong = |message: String| self.file_error(FILES, file, message);
             let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -56,10 +56,12 @@ impl Loader<'_> {
         model.element_indices(&structure.species).map_err(|error| error.to_string())?;
         let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
         neighbours.update(structure).map_err(|error| error.to_string())?;
-        let least = self.config.guard.least_distance.get();
-        if let Some((i, j, d)) = shortest_distance(structure, &neighbours).filter(|(_, _, d)| *d < least) {
+        let min_distance = self.config.guard.min_distance.get();
+        if let Some((i, j, d)) =
+            shortest_distance(structure, &neighbours).filter(|(_, _, d)| *d < min_distance)
+        {
             return Err(format!(
-                "atoms {i} and {j} are {d:.3} Å apart, closer than guard.least_distance = {least} Å: no walk can start \
+                "atoms {i} and {j} are {d:.3} Å apart, closer than guard.min_distance = {min_distance} Å: no walk can start \
                  here"
             ));
         }
@@ -77,12 +79,12 @@ impl Loader<'_> {
 
     fn check_collectable(&self, structure: &Structure) -> Result<(), String> {
         let atoms = structure.len();
-        if let CollectionRule::AtomCount { least, .. } = self.config.collect.when
-            && least.get() > atoms
+        if let CollectionRule::AtomCount { min_atoms, .. } = self.config.collect.criterion
+            && min_atoms.get() > atoms
         {
             return Err(format!(
-                "the structure has {atoms} atoms, fewer than the {least} that must be new at once \
-                 (collect.when.least): nothing can ever be collected from it; give a larger cell or a smaller `least`"
+                "the structure has {atoms} atoms, fewer than the {min_atoms} that must be new at once \
+                 (collect.criterion.min_atoms): nothing can ever be collected from it; give a larger cell or a smaller `min_atoms`"
             ));
         }
         if self.config.walk.volume_ramp.is_some() && structure.periodic == [false; 3] {

@@ -124,8 +124,8 @@ impl Update {
         let symbol = |(element, _): &(u32, u32)| elements.get(*element as usize).cloned();
         let training_frames = detail.get("training_frames").cloned().map(serde_json::from_value);
         Ok(Some(Self {
-            rule: serde_json::from_value(rules["collect"]["until"].clone()).ok(),
-            combination: rules["calm"]["combination"].as_str().map(str::to_owned),
+            rule: serde_json::from_value(rules["collect"]["update_target"].clone()).ok(),
+            combination: rules["calm"]["covariance_update"].as_str().map(str::to_owned),
             component_elements: found.components.iter().map(symbol).collect(),
             found,
             training_frames: training_frames.transpose().map_err(damaged)?,

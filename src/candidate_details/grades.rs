@@ -82,7 +82,7 @@ impl CandidateGrades {
         // An accepted candidate is graded before it updates the mixture.
         let decided = &decision.detail["selector"]["mixture_version"];
         let decided = decided.as_u64().unwrap_or(decision.mixture_version);
-        let rule = serde_json::from_value::<CollectionRule>(rules["collect"]["when"].clone()).ok();
+        let rule = serde_json::from_value::<CollectionRule>(rules["collect"]["criterion"].clone()).ok();
         let rule = rule.filter(|_| view.origin() == Origin::Biased);
         let trigger = rule.map(|rule| Trigger::new(rule, view.gamma, &selector.gamma));
         let threshold = trigger.as_ref().map_or(f64::INFINITY, |trigger| trigger.threshold);
@@ -133,7 +133,9 @@ impl Trigger {
         let threshold = rule.threshold();
         let needed = match rule {
             CollectionRule::MaximumGrade { .. } => 1,
-            CollectionRule::AtomCount { fraction, least, .. } => atom_limit(walker.len(), fraction, least),
+            CollectionRule::AtomCount { fraction, min_atoms, .. } => {
+                atom_limit(walker.len(), fraction, min_atoms)
+            }
         };
         let (above_walker, above_selector) =
             (count_above(walker, threshold), count_above(selector, threshold));

@@ -61,7 +61,7 @@ pub struct CandidateLabel {
     /// Energy per atom, eV.
     pub energy_per_atom: f64,
     /// Largest force, eV/Å.
-    pub largest_force: f64,
+    pub max_force: f64,
     /// Pressure −tr(stress)/3, eV/Å³. `None` without a stress.
     pub pressure: Option<f64>,
     /// Further results of the calculation.
@@ -151,7 +151,7 @@ impl CandidateLabel {
             excluded,
             energy: label.energy,
             energy_per_atom: label.energy / atoms,
-            largest_force: label.max_force(),
+            max_force: label.max_force(),
             pressure: label.stress.map(|stress| -(stress[0][0] + stress[1][1] + stress[2][2]) / 3.0),
             model,
             details: label.details,

@@ -46,7 +46,7 @@ pub struct Distances {
     pub atoms: Option<[usize; 2]>,
     /// Shortest distance of the seed structure, Å.
     pub seed_structure: Option<f64>,
-    /// The selector declines below this distance, Å: max(`guard.least_distance`, `guard.least_distance_fraction` ×
+    /// The selector declines below this distance, Å: max(`guard.min_distance`, `guard.min_distance_fraction` ×
     /// that of the seed structure). Control frames are exempt.
     pub least: Option<f64>,
 }
@@ -88,7 +88,7 @@ impl Distances {
     fn new(structure: &Structure, seed_structure: Option<f64>, rules: &Value) -> Self {
         let found = shortest(structure);
         let number = |key: &str| rules["guard"][key].as_f64();
-        let limits = number("least_distance").zip(number("least_distance_fraction"));
+        let limits = number("min_distance").zip(number("min_distance_fraction"));
         Self {
             shortest: found.map(|(.., r)| r),
             atoms: found.map(|(i, j, _)| [i, j]),

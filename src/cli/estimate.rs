@@ -84,8 +84,9 @@ impl Estimate {
         let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
         let config = &campaign.config;
-        let (copies, per_seed) = (config.labels_of_each(), config.collect.per_seed.get());
-        let labels = u64::from(copies) * u64::from(per_seed);
+        let (copies, max_per_seed_structure) =
+            (config.labels_of_each(), config.collect.max_per_seed_structure.get());
+        let labels = u64::from(copies) * u64::from(max_per_seed_structure);
         let seed_structures: Vec<_> = campaign
             .seed_structures
             .iter()

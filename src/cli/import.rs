@@ -17,7 +17,7 @@ use crate::xyz_reader::XyzReader;
 /// Import labelled structures
 ///
 /// Each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one frame
-/// is invalid or exceeds label.largest_force, largest_stress or largest_energy, nothing is imported from any file. Importing
+/// is invalid or exceeds label.max_force, max_stress or max_energy_per_atom, nothing is imported from any file. Importing
 /// again is safe: known structures are not changed, and a different label for a labelled structure is stored as a check beside
 /// it.
 ///

@@ -121,8 +121,10 @@ impl Launch {
                 store::check_directory(directory)?;
             }
             let (names, wanted) = (job_names(&location), self.wanted(&location));
-            if wanted.labellers == 0 && campaign.config.label.slots == 0 {
-                log_and_print("label.slots = 0 and no labeller jobs: start labellers with calmwalk label");
+            if wanted.labellers == 0 && campaign.config.label.concurrency == 0 {
+                log_and_print(
+                    "label.concurrency = 0 and no labeller jobs: start labellers with calmwalk label",
+                );
             }
             let specs = JobSpecs::new(&self, &campaign, &directory, wanted)?;
             block_on(self.launch(&slurm, &names, &specs, wanted))??;
@@ -148,7 +150,7 @@ impl Launch {
         {
             log_and_print(
                 "--labellers is ignored: the SQLite store of the campaign is limited to one node, where the orchestrator starts \
-                 label.slots labellers; set run.store to a PostgreSQL database for labellers on other nodes",
+                 label.concurrency labellers; set run.store to a PostgreSQL database for labellers on other nodes",
             );
             labellers = 0;
         }

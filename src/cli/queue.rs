@@ -34,7 +34,7 @@ pub enum Action {
         /// Id of the candidate
         id: String,
     },
-    /// Write the archived calculation directories of a candidate to files (label.keep selects what is archived)
+    /// Write the archived calculation directories of a candidate to files (label.keep_directories selects what is archived)
     Files {
         /// Id of the candidate
         id: String,
@@ -252,7 +252,7 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
 
 fn write_files(out: &mut dyn Write, written: &[(PathBuf, String)]) -> io::Result<()> {
     if written.is_empty() {
-        writeln!(out, "no calculation directories are archived (see label.keep)")?;
+        writeln!(out, "no calculation directories are archived (see label.keep_directories)")?;
     }
     for (path, left_out) in written {
         writeln!(out, "{}", path.display())?;

@@ -23,7 +23,7 @@ const SHOWN: usize = 20;
 pub struct Replay {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Change a configuration key of the selector to a value (TOML), such as collect.when.threshold=2.0; may be repeated
+    /// Change a configuration key of the selector to a value (TOML), such as collect.criterion.threshold=2.0; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<RuleOverride>,
     #[command(flatten)]

@@ -163,9 +163,11 @@ async fn run(
     }
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
-    if campaign.config.label.slots == 0 {
+    if campaign.config.label.concurrency == 0 {
         let store = shell_argument(location);
-        log_and_print(format_args!("label.slots = 0: start labellers with calmwalk label --store {store}"));
+        log_and_print(format_args!(
+            "label.concurrency = 0: start labellers with calmwalk label --store {store}"
+        ));
     }
     let over = Arc::new(Notify::new());
     let run = runtime::RunContext {

@@ -8,7 +8,7 @@ use crate::output::print;
 
 /// Pause or resume walks
 ///
-/// A walk pauses at the end of its current assignment (run.turn_steps), and resumes from there. It stays paused when the
+/// A walk pauses at the end of its current assignment (run.steps_per_assignment), and resumes from there. It stays paused when the
 /// campaign is stopped and resumed. In reproducible mode, the other walks of the same round wait for it, because decisions must
 /// not depend on when a walk was paused.
 #[derive(Debug, clap::Args)]

@@ -6,55 +6,55 @@ use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
 pub(super) const CHANGEABLE: [&str; 46] = [
-    "seeds",
-    "collect.per_seed",
-    "collect.total",
+    "seed_structures",
+    "collect.max_per_seed_structure",
+    "collect.max_structures",
     "collect.declined_features_mb",
     "calm.forgetting_alarm",
-    "label.slots",
-    "label.lease",
-    "label.attempts",
-    "label.largest_force",
-    "label.largest_stress",
-    "label.largest_energy",
-    "label.largest_energy_difference",
+    "label.concurrency",
+    "label.lease_timeout",
+    "label.max_attempts",
+    "label.max_force",
+    "label.max_stress",
+    "label.max_energy_per_atom",
+    "label.max_energy_difference_per_atom",
     "label.cores",
     "label.time_limit",
     "label.memory",
     "label.scratch",
-    "label.keep",
+    "label.keep_directories",
     "label.pass_environment",
     "label.batch_system",
     "label.batch_options",
     "label.queue_limit",
-    "label.queue_full",
-    "label.guard.shortest_bond",
-    "label.guard.least_height",
-    "label.guard.largest_edge_ratio",
-    "label.guard.least_angle",
-    "label.guard.least_volume",
-    "label.guard.largest_volume",
-    "label.guard.most_atoms",
-    "label.guard.near_duplicate",
-    "label.guard.largest_cost",
+    "label.on_queue_full",
+    "label.guard.min_bond_lengths",
+    "label.guard.min_height",
+    "label.guard.max_edge_ratio",
+    "label.guard.min_angle",
+    "label.guard.min_volume_per_atom",
+    "label.guard.max_volume_per_atom",
+    "label.guard.max_atoms",
+    "label.guard.duplicate_tolerance",
+    "label.guard.max_cost",
     "budget.labels",
     "budget.core_hours",
     "budget.wall_hours",
     "run.walkers",
-    "run.threads",
-    "run.silence_limit",
-    "run.agent_silence_limit",
-    "run.restarts",
+    "run.threads_per_walker",
+    "run.heartbeat_timeout",
+    "run.agent_heartbeat_timeout",
+    "run.max_restarts",
     "run.store",
     "notify.command",
     "notify.on",
-    "notify.stall",
+    "notify.stall_timeout",
     "notify.failed_labels",
     "notify.time_limit",
-    "guard.highest_temperature",
+    "guard.max_temperature",
 ];
 
-const BONDS: &str = "label.guard.shortest_bond";
+const BONDS: &str = "label.guard.min_bond_lengths";
 
 /// Something that is not as the campaign has it, and that holds from now on.
 #[derive(Clone, Debug, PartialEq)]
@@ -112,7 +112,7 @@ pub enum Refused {
     },
     /// A seed structure that is gone or changed.
     #[error(
-        "seeds.files: seed structure {number} is {after}, but this campaign has {before} there: seed structures can be \
+        "seed_structures.files: seed structure {number} is {after}, but this campaign has {before} there: seed structures can be \
          added behind those that it has, but not changed, moved or taken away. Put it back"
     )]
     SeedStructure {
@@ -157,7 +157,7 @@ impl Refused {
     pub fn key(&self) -> &str {
         match self {
             Self::Key { key, .. } | Self::File { key, .. } => key,
-            Self::SeedStructure { .. } => "seeds.files",
+            Self::SeedStructure { .. } => "seed_structures.files",
         }
     }
 }
@@ -168,7 +168,7 @@ impl Change {
         match self {
             Self::Key { key, before, after } => json!({ "key": key, "before": before, "after": after }),
             Self::SeedStructures { before, added } => {
-                json!({ "key": "seeds", "before": before, "after": before + added.len(), "added": added })
+                json!({ "key": "seed_structures", "before": before, "after": before + added.len(), "added": added })
             }
         }
     }
@@ -195,7 +195,7 @@ pub fn compare(before: &Value, after: &Value) -> Result<Vec<Change>, Refused> {
 }
 
 fn judge(key: String, before: Value, after: Value) -> Result<Change, Refused> {
-    if key == "seeds" {
+    if key == "seed_structures" {
         return seed_structures(&before, &after);
     }
     if let Some(key) = key.strip_prefix("files.").map(str::to_owned) {
@@ -303,8 +303,8 @@ mod tests {
 
     #[test]
     fn budgets_and_new_seed_structures_are_applied() {
-        let before = json!({ "run": { "walkers": 1 }, "seeds": ["a 1"] });
-        let after = json!({ "run": { "walkers": 2 }, "seeds": ["a 1", "b 2"] });
+        let before = json!({ "run": { "walkers": 1 }, "seed_structures": ["a 1"] });
+        let after = json!({ "run": { "walkers": 2 }, "seed_structures": ["a 1", "b 2"] });
         let changes = compare(&before, &after).unwrap();
         let shown: Vec<_> = changes.iter().map(Change::to_string).collect();
         assert_eq!(
@@ -312,14 +312,16 @@ mod tests {
             ["run.walkers is now 2 (was 1)", "seed structures added to the 1 that it has: 'b' (content 2)"]
         );
         assert_eq!(changes[0].detail(), json!({ "key": "run.walkers", "before": 1, "after": 2 }));
-        assert_eq!(changes[1].detail(), json!({ "key": "seeds", "before": 1, "after": 2, "added": ["b 2"] }));
+        assert_eq!(
+            changes[1].detail(),
+            json!({ "key": "seed_structures", "before": 1, "after": 2, "added": ["b 2"] })
+        );
         assert_eq!(compare(&after, &after), Ok(Vec::new()));
     }
 
     #[test]
     fn physics_files_and_lost_seed_structures_are_refused() {
-        let before =
-            json!({ "walk": { "tau": 0.15 }, "files": { "potential.model": "ab" }, "seeds": ["a 1", "b 2"] });
+        let before = json!({ "walk": { "tau": 0.15 }, "files": { "potential.model": "ab" }, "seed_structures": ["a 1", "b 2"] });
         let refused = |pointer: &str, value: Value| {
             let mut after = before.clone();
             *after.pointer_mut(pointer).unwrap() = value;
@@ -329,9 +331,10 @@ mod tests {
         let (key, message) = refused("/walk/tau", json!(0.2));
         assert!(message.starts_with("walk.tau is 0.2, but this campaign began with 0.15"), "{message}");
         assert_eq!(key, "walk.tau");
-        let added = json!({ "walk": { "tau": 0.15, "volume_ramp": { "to": 1.1 } }, "seeds": [] });
-        let message =
-            compare(&json!({ "walk": { "tau": 0.15 }, "seeds": [] }), &added).unwrap_err().to_string();
+        let added = json!({ "walk": { "tau": 0.15, "volume_ramp": { "to": 1.1 } }, "seed_structures": [] });
+        let message = compare(&json!({ "walk": { "tau": 0.15 }, "seed_structures": [] }), &added)
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("{\"to\":1.1}, but this campaign began without it: "), "{message}");
         let (key, message) = refused("/files/potential.model", json!("cd"));
         assert!(message.contains("(BLAKE3 cd)") && message.contains("(ab)"), "{message}");
@@ -339,9 +342,9 @@ mod tests {
         for (seeds, found) in
             [(json!(["a 1"]), "1 is missing"), (json!(["a 3", "b 2"]), "0 is 'a' (content 3)")]
         {
-            let (key, message) = refused("/seeds", seeds);
+            let (key, message) = refused("/seed_structures", seeds);
             assert!(message.contains(&format!("seed structure {found}, but this campaign has")), "{message}");
-            assert_eq!(key, "seeds.files");
+            assert_eq!(key, "seed_structures.files");
         }
     }
 }

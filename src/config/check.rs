@@ -26,8 +26,8 @@ pub fn check(config: &Config) -> Vec<Wrong> {
 }
 
 fn check_seeds(config: &Config) -> Result<(), Wrong> {
-    if config.seeds.files.is_empty() {
-        return wrong("seeds.files", "an empty list", "at least one file with seed structures");
+    if config.seed_structures.files.is_empty() {
+        return wrong("seed_structures.files", "an empty list", "at least one file with seed structures");
     }
     Ok(())
 }
@@ -70,10 +70,10 @@ fn check_budget(config: &Config) -> Result<(), Wrong> {
 
 /// How long the queue is depends on how fast labels are made, which is not the same twice.
 fn check_queue(config: &Config) -> Result<(), Wrong> {
-    if config.label.queue_full == QueueFull::Raise && config.campaign.mode == Mode::Reproducible {
+    if config.label.on_queue_full == QueueFull::Raise && config.campaign.mode == Mode::Reproducible {
         let expected = "\"wait\", or mode = \"live\": what is collected would depend on how fast labels are made, and a \
                         reproducible campaign must not";
-        return wrong("label.queue_full", "\"raise\"", expected);
+        return wrong("label.on_queue_full", "\"raise\"", expected);
     }
     Ok(())
 }
@@ -128,10 +128,10 @@ fn is_option(text: &str) -> bool {
 fn check_mixture(config: &Config) -> Result<(), Wrong> {
     let Config { campaign, calm, run, .. } = config;
     let one_by_one = campaign.mode == Mode::Reproducible && run.walks_per_round.get() == 1;
-    if calm.update == UpdateProtocol::Restarted && !one_by_one {
+    if calm.update == UpdateProtocol::PerSeedStructure && !one_by_one {
         let expected = "mode = \"reproducible\" and run.walks_per_round = 1: the mixture can be restarted for each seed \
                         structure only if walks follow one another";
-        return wrong("calm.update", "\"restarted\"", expected);
+        return wrong("calm.update", "\"per_seed_structure\"", expected);
     }
     if calm.update != UpdateProtocol::Never && calm.artifact.is_none() {
         let expected = "the gmm_artifacts.npz of the model: an export alone has no scatter matrices and counts, so its \
@@ -166,10 +166,10 @@ fn check_zbl(config: &Config) -> Result<(), Wrong> {
 
 fn check_temperature(config: &Config) -> Result<(), Wrong> {
     let Config { walk, guard, .. } = config;
-    let (highest, temperature) = (guard.highest_temperature.get(), walk.temperature.get());
+    let (highest, temperature) = (guard.max_temperature.get(), walk.temperature.get());
     if highest <= temperature {
         let expected = format!("more than walk.temperature = {temperature} K: every walk would end at once");
-        return wrong("guard.highest_temperature", highest, expected);
+        return wrong("guard.max_temperature", highest, expected);
     }
     Ok(())
 }

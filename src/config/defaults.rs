@@ -26,10 +26,10 @@ pub fn forgetting_alarm() -> Fraction {
 }
 
 pub fn update() -> UpdateProtocol {
-    UpdateProtocol::Carried
+    UpdateProtocol::Cumulative
 }
 
-pub fn equilibration() -> u64 {
+pub fn equilibration_steps() -> u64 {
     500
 }
 
@@ -37,7 +37,7 @@ pub fn thermostat() -> ThermostatKind {
     ThermostatKind::Langevin { friction: 0.01 }
 }
 
-pub fn average_steps() -> NonZeroU64 {
+pub fn bias_averaging_steps() -> NonZeroU64 {
     nonzero(10).into()
 }
 
@@ -45,15 +45,15 @@ pub fn skin() -> Positive {
     positive(0.5)
 }
 
-pub fn gap() -> u64 {
+pub fn min_interval() -> u64 {
     200
 }
 
-pub fn declined_gap() -> NonZeroU64 {
+pub fn min_interval_after_decline() -> NonZeroU64 {
     nonzero(20).into()
 }
 
-pub fn per_seed() -> NonZeroU32 {
+pub fn max_per_seed_structure() -> NonZeroU32 {
     nonzero(3)
 }
 
@@ -61,16 +61,16 @@ pub fn declined_features() -> u64 {
     1000
 }
 
-pub fn slots() -> usize {
+pub fn concurrency() -> usize {
     1
 }
 
-pub fn lease() -> Duration {
+pub fn lease_timeout() -> Duration {
     Duration::from_seconds(600)
 }
 
 /// As many as the longest ladder of remedies has steps.
-pub fn attempts() -> NonZeroU32 {
+pub fn max_attempts() -> NonZeroU32 {
     nonzero(4)
 }
 
@@ -82,20 +82,20 @@ pub fn time_limit() -> Duration {
     Duration::from_seconds(86_400)
 }
 
-pub fn largest_force() -> Positive {
-    positive(LabelBounds::default().largest_force)
+pub fn max_force() -> Positive {
+    positive(LabelBounds::default().max_force)
 }
 
-pub fn largest_stress() -> Positive {
-    positive(LabelBounds::default().largest_stress)
+pub fn max_stress() -> Positive {
+    positive(LabelBounds::default().max_stress)
 }
 
-pub fn largest_energy() -> Positive {
-    positive(LabelBounds::default().largest_energy)
+pub fn max_energy_per_atom() -> Positive {
+    positive(LabelBounds::default().max_energy_per_atom)
 }
 
-pub fn largest_energy_difference() -> Positive {
-    positive(LabelBounds::default().largest_energy_difference)
+pub fn max_energy_difference_per_atom() -> Positive {
+    positive(LabelBounds::default().max_energy_difference_per_atom)
 }
 
 pub fn queue_limit() -> NonZeroU32 {

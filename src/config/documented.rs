@@ -24,7 +24,7 @@ fn resolved(text: &str) -> Value {
     let path = directory.path().join("c.toml");
     std::fs::write(&path, text).unwrap();
     let mut config = Config::load(&path).unwrap().config;
-    config.seeds.files.truncate(1);
+    config.seed_structures.files.truncate(1);
     let text = serde_json::to_string(&config).unwrap();
     serde_json::from_str(&text.replace(&directory.path().display().to_string(), "")).unwrap()
 }
@@ -80,7 +80,7 @@ fn keys_that_are_commented_out_show_their_defaults() {
         for (key, before, after) in differ {
             let expected = match key.as_str() {
                 // These have no default value: what holds without them is the same as this value here …
-                "calm.ladder" => json!(CovarianceUpdateKind::Convex.default_alphas()),
+                "calm.alpha_values" => json!(CovarianceUpdateKind::Convex.default_alphas()),
                 "walk.time_step" => json!(md::default_time_step(&["Al".parse::<Species>().unwrap()])),
                 // … or said in words.
                 _ => {
@@ -171,7 +171,7 @@ fn the_reference_says_which_keys_may_change() {
             changeable.insert(format!("{section}.{}", key.trim_matches('`')));
         }
     }
-    let expected =
-        super::changes::CHANGEABLE.map(|key| if key == "seeds" { "seeds.files" } else { key }.to_owned());
+    let expected = super::changes::CHANGEABLE
+        .map(|key| if key == "seed_structures" { "seed_structures.files" } else { key }.to_owned());
     assert_eq!(changeable, BTreeSet::from(expected));
 }

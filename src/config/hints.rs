@@ -24,10 +24,10 @@ const SYNONYMS: [(&str, &str); 22] = [
     ("dt", "time_step"),
     ("timestep", "time_step"),
     ("temp", "temperature"),
-    ("nsteps", "steps"),
+    ("nsteps", "biased_steps"),
     ("seed", "rng_seed"),
     ("gamma", "friction"),
-    ("nelm", "steps"),
+    ("nelm", "max_scf_steps"),
     ("ncores", "cores"),
 ];
 

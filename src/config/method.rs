@@ -45,7 +45,7 @@ const THROUGH_ASE: [&str; 27] = [
 #[serde(rename_all = "snake_case")]
 pub enum LabelMethod {
     /// Any potential that calmwalk evaluates.
-    Reference(PotentialFile),
+    Potential(PotentialFile),
     /// A program.
     #[serde(untagged)]
     Code(dft::Settings),
@@ -55,7 +55,7 @@ impl LabelMethod {
     /// Its key.
     pub fn name(&self) -> &'static str {
         match self {
-            Self::Reference(_) => "reference",
+            Self::Potential(_) => "potential",
             Self::Code(settings) => settings.name(),
         }
     }
@@ -63,7 +63,7 @@ impl LabelMethod {
     /// Every path in it.
     pub(super) fn paths(&mut self) -> Vec<&mut PathBuf> {
         match self {
-            Self::Reference(reference) => vec![Spanned::get_mut(&mut reference.file)],
+            Self::Potential(reference) => vec![Spanned::get_mut(&mut reference.file)],
             Self::Code(settings) => settings.paths().into_iter().collect(),
         }
     }
@@ -82,26 +82,26 @@ impl<'de> Visitor<'de> for Methods {
     type Value = LabelMethod;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("a table with one label method, as { reference = { … } }")
+        f.write_str("a table with one label method, as { potential = { … } }")
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<LabelMethod, A::Error> {
         let name: String = map.next_key()?.ok_or_else(|| A::Error::custom("found no label method"))?;
-        if name != "reference" && !dft::Settings::NAMES.contains(&name.as_str()) {
+        if name != "potential" && !dft::Settings::NAMES.contains(&name.as_str()) {
             let names = dft::Settings::NAMES.join("`, `");
-            let mut message = format!("unknown value `{name}`, expected one of `reference`, `{names}`");
+            let mut message = format!("unknown value `{name}`, expected one of `potential`, `{names}`");
             if THROUGH_ASE.contains(&name.to_ascii_lowercase().as_str()) {
                 message += &format!("; {name} makes labels through `ase`: see docs/dft-codes.md");
             }
             return Err(A::Error::custom(message));
         }
-        if name != "reference" {
+        if name != "potential" {
             let settings = MapAccessDeserializer::new(Again { name: Some(name), map });
             return dft::Settings::deserialize(settings).map(LabelMethod::Code);
         }
         let reference = map.next_value()?;
         match map.next_key::<String>()? {
-            None => Ok(LabelMethod::Reference(reference)),
+            None => Ok(LabelMethod::Potential(reference)),
             Some(second) => Err(A::Error::custom(format!("found a second label method, `{second}`"))),
         }
     }

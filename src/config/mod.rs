@@ -49,7 +49,7 @@ pub struct Config {
     /// Its CALM mixture.
     pub calm: CalmSection,
     /// Where walks start.
-    pub seeds: SeedsSection,
+    pub seed_structures: SeedStructuresSection,
     /// Dynamics and bias.
     pub walk: WalkSection,
     /// When a structure is collected.
@@ -74,10 +74,10 @@ pub struct Config {
 const STAND_INS: &str = r#"
 potential = { model = "-" }
 calm = {}
-seeds = { files = ["-"] }
-walk = { temperature = 300.0, steps = 1, tau = 1.0 }
-collect = { when = { rule = "maximum_grade" }, until = { rule = "maximum_grade" } }
-label = { method = { reference = { kind = "grace", file = "-" } } }
+seed_structures = { files = ["-"] }
+walk = { temperature = 300.0, biased_steps = 1, tau = 1.0 }
+collect = { criterion = { rule = "maximum_grade" }, update_target = { rule = "maximum_grade" } }
+label = { method = { potential = { kind = "grace", file = "-" } } }
 "#;
 
 /// A configuration as it was read.
@@ -133,7 +133,7 @@ impl Config {
             .with::<CampaignSection>("campaign")
             .with::<PotentialSection>("potential")
             .with::<CalmSection>("calm")
-            .with::<SeedsSection>("seeds")
+            .with::<SeedStructuresSection>("seed_structures")
             .with::<WalkSection>("walk")
             .with::<CollectSection>("collect")
             .with::<GuardSection>("guard")
@@ -160,7 +160,8 @@ impl Config {
     /// Every path in it.
     fn paths(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         let optional = self.calm.artifact.iter_mut().chain(&mut self.calm.training_frames);
-        let others = [&mut self.potential.model].into_iter().chain(optional).chain(&mut self.seeds.files);
+        let others =
+            [&mut self.potential.model].into_iter().chain(optional).chain(&mut self.seed_structures.files);
         others.map(Spanned::get_mut).chain(self.label.method.paths())
     }
 
@@ -189,7 +190,7 @@ impl Config {
     /// The same with the key that says so.
     fn limit_of_structures(&self) -> Option<(u32, &'static str)> {
         let by_labels = self.budget.labels.map(|labels| labels.get() / self.labels_of_each());
-        let total = self.collect.total.map(|total| (total.get(), "collect.total"));
+        let total = self.collect.max_structures.map(|total| (total.get(), "collect.max_structures"));
         by_labels.map(|labels| (labels, "budget.labels")).into_iter().chain(total).min()
     }
 
@@ -206,7 +207,7 @@ impl Config {
 
     /// What the update search needs.
     pub fn update_settings(&self) -> UpdateSettings {
-        let (combination, ladder) = (self.calm.combination, self.calm.ladder.clone());
-        UpdateSettings { combination, ladder, stop: self.collect.until }
+        let (combination, ladder) = (self.calm.covariance_update, self.calm.alpha_values.clone());
+        UpdateSettings { combination, ladder, stop: self.collect.update_target }
     }
 }

@@ -17,7 +17,7 @@ pub struct NotifySection {
     /// On what it is run.
     pub on: Vec<NotifyEvent>,
     /// A campaign without a new candidate or label for this long has stalled.
-    pub stall: Duration,
+    pub stall_timeout: Duration,
     /// So many labels that finally failed, and so many again.
     pub failed_labels: NonZeroU32,
     /// The command is killed after this time.
@@ -84,7 +84,7 @@ impl Default for NotifySection {
         Self {
             command: None,
             on: NotifyEvent::ALL.into(),
-            stall: Duration::from_seconds(7200),
+            stall_timeout: Duration::from_seconds(7200),
             failed_labels: defaults::nonzero(10),
             time_limit: Duration::from_seconds(60),
         }

@@ -58,16 +58,16 @@ pub struct CalmSection {
     pub update: UpdateProtocol,
     /// Convex or additive.
     #[serde(default)]
-    pub combination: CovarianceUpdateKind,
+    pub covariance_update: CovarianceUpdateKind,
     /// The α to try; left out, those of the paper.
     #[serde(default)]
-    pub ladder: Option<calm::rules::AlphaValues>,
+    pub alpha_values: Option<calm::rules::AlphaValues>,
 }
 
-/// `[seeds]`
+/// `[seed_structures]`
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
-pub struct SeedsSection {
+pub struct SeedStructuresSection {
     /// extended XYZ or POSCAR files; every frame is a seed structure.
     pub files: Vec<Spanned<PathBuf>>,
 }
@@ -79,10 +79,10 @@ pub struct WalkSection {
     /// K.
     pub temperature: Positive,
     /// Biased steps.
-    pub steps: NonZeroU64,
+    pub biased_steps: NonZeroU64,
     /// Unbiased steps before them.
-    #[serde(default = "defaults::equilibration")]
-    pub equilibration: u64,
+    #[serde(default = "defaults::equilibration_steps")]
+    pub equilibration_steps: u64,
     /// Uncertainty-force scale τ.
     pub tau: Positive,
     /// fs; left out, 2 fs, or 0.5 fs with H, He, Li or Be.
@@ -95,8 +95,8 @@ pub struct WalkSection {
     #[serde(default)]
     pub volume_ramp: Option<VolumeRampSection>,
     /// Steps over which the norms of τ_r are averaged.
-    #[serde(default = "defaults::average_steps")]
-    pub average_steps: NonZeroU64,
+    #[serde(default = "defaults::bias_averaging_steps")]
+    pub bias_averaging_steps: NonZeroU64,
     /// Skin of the neighbour list, Å.
     #[serde(default = "defaults::skin")]
     pub skin: Positive,
@@ -117,21 +117,21 @@ pub struct VolumeRampSection {
 #[serde(deny_unknown_fields)]
 pub struct CollectSection {
     /// When a structure is a candidate.
-    pub when: CollectionRule,
+    pub criterion: CollectionRule,
     /// When an update has done enough.
-    pub until: calm::UpdateRule,
+    pub update_target: calm::UpdateRule,
     /// Least steps between two collections of a walk.
-    #[serde(default = "defaults::gap")]
-    pub gap: u64,
+    #[serde(default = "defaults::min_interval")]
+    pub min_interval: u64,
     /// Least steps after a candidate that was declined or refused.
-    #[serde(default = "defaults::declined_gap")]
-    pub declined_gap: NonZeroU64,
+    #[serde(default = "defaults::min_interval_after_decline")]
+    pub min_interval_after_decline: NonZeroU64,
     /// Most structures from one seed structure.
-    #[serde(default = "defaults::per_seed")]
-    pub per_seed: NonZeroU32,
+    #[serde(default = "defaults::max_per_seed_structure")]
+    pub max_per_seed_structure: NonZeroU32,
     /// Most structures in the campaign.
     #[serde(default)]
-    pub total: Option<NonZeroU32>,
+    pub max_structures: Option<NonZeroU32>,
     /// MB of feature vectors of declined candidates that are kept.
     #[serde(default = "defaults::declined_features")]
     pub declined_features_mb: u64,
@@ -142,17 +142,17 @@ pub struct CollectSection {
 #[serde(deny_unknown_fields, default)]
 pub struct GuardSection {
     /// Å.
-    pub least_distance: Positive,
+    pub min_distance: Positive,
     /// Of the seed structure's shortest distance.
-    pub least_distance_fraction: Fraction,
+    pub min_distance_fraction: Fraction,
     /// Switched ZBL repulsion.
     pub zbl: Option<ZblSection>,
     /// K.
-    pub highest_temperature: Positive,
+    pub max_temperature: Positive,
     /// Refusals in a row after which a walk goes back.
-    pub refusals_in_a_row: NonZeroU32,
+    pub max_consecutive_rejections: NonZeroU32,
     /// Returns after which it ends.
-    pub most_returns: u32,
+    pub max_rollbacks: u32,
     /// Factor on τ at each return.
     pub tau_factor: Fraction,
     /// Steps between checkpoints to go back to.
@@ -179,26 +179,26 @@ pub struct LabelSection {
     #[serde(default)]
     pub protocol: Option<String>,
     /// Labels calculated side by side by `run`; 0: all come from `calmwalk label`.
-    #[serde(default = "defaults::slots")]
-    pub slots: usize,
+    #[serde(default = "defaults::concurrency")]
+    pub concurrency: usize,
     /// How long a label job is leased to a labeller.
-    #[serde(default = "defaults::lease")]
-    pub lease: Duration,
+    #[serde(default = "defaults::lease_timeout")]
+    pub lease_timeout: Duration,
     /// Attempts before a label counts as failed.
-    #[serde(default = "defaults::attempts")]
-    pub attempts: NonZeroU32,
+    #[serde(default = "defaults::max_attempts")]
+    pub max_attempts: NonZeroU32,
     /// Largest force that is believed, eV/Å.
-    #[serde(default = "defaults::largest_force")]
-    pub largest_force: Positive,
+    #[serde(default = "defaults::max_force")]
+    pub max_force: Positive,
     /// Largest component of a stress that is believed, eV/Å³.
-    #[serde(default = "defaults::largest_stress")]
-    pub largest_stress: Positive,
+    #[serde(default = "defaults::max_stress")]
+    pub max_stress: Positive,
     /// Largest energy that is believed, whatever its sign, eV an atom.
-    #[serde(default = "defaults::largest_energy")]
-    pub largest_energy: Positive,
+    #[serde(default = "defaults::max_energy_per_atom")]
+    pub max_energy_per_atom: Positive,
     /// Largest difference from the potential's energy that is believed, eV an atom.
-    #[serde(default = "defaults::largest_energy_difference")]
-    pub largest_energy_difference: Positive,
+    #[serde(default = "defaults::max_energy_difference_per_atom")]
+    pub max_energy_difference_per_atom: Positive,
     /// Cores of a calculation by another program.
     #[serde(default = "defaults::cores")]
     pub cores: NonZeroU32,
@@ -211,7 +211,7 @@ pub struct LabelSection {
     pub scratch: Option<PathBuf>,
     /// Which of these directories are kept in the store.
     #[serde(default)]
-    pub keep: KeepDirectories,
+    pub keep_directories: KeepDirectories,
     /// Variables of the labeller's environment that its program gets beside those that every program gets.
     #[serde(default)]
     pub pass_environment: PassedEnvironment,
@@ -225,7 +225,7 @@ pub struct LabelSection {
     pub queue_limit: NonZeroU32,
     /// Which of the two.
     #[serde(default)]
-    pub queue_full: QueueFull,
+    pub on_queue_full: QueueFull,
     /// What a structure must be before anything is spent on its label.
     #[serde(default)]
     pub guard: LabelGuard,
@@ -261,17 +261,17 @@ pub struct RunSection {
     /// Walkers side by side; 0 for as many as the processor cores allow.
     pub walkers: usize,
     /// Threads of each.
-    pub threads: NonZeroUsize,
+    pub threads_per_walker: NonZeroUsize,
     /// A process that sends no heartbeat for this long hangs, and is replaced.
-    pub silence_limit: Duration,
+    pub heartbeat_timeout: Duration,
     /// An agent on another host that sends no heartbeat for this long is dead: its walks go to others.
-    pub agent_silence_limit: Duration,
+    pub agent_heartbeat_timeout: Duration,
     /// Starts of a process in a row after failures, with nothing delivered between them; then it is given up.
-    pub restarts: u32,
+    pub max_restarts: u32,
     /// Biased walks that advance together (reproducible mode).
     pub walks_per_round: NonZeroUsize,
     /// Steps of a turn.
-    pub turn_steps: NonZeroU64,
+    pub steps_per_assignment: NonZeroU64,
     /// URL of a PostgreSQL database, without password; left out, SQLite in the campaign's directory.
     pub store: Option<String>,
 }
@@ -285,10 +285,10 @@ impl LabelSection {
     /// What is believed of a label.
     pub fn bounds(&self) -> LabelBounds {
         LabelBounds {
-            largest_force: self.largest_force.get(),
-            largest_stress: self.largest_stress.get(),
-            largest_energy: self.largest_energy.get(),
-            largest_energy_difference: self.largest_energy_difference.get(),
+            max_force: self.max_force.get(),
+            max_stress: self.max_stress.get(),
+            max_energy_per_atom: self.max_energy_per_atom.get(),
+            max_energy_difference_per_atom: self.max_energy_difference_per_atom.get(),
         }
     }
 
@@ -299,7 +299,7 @@ impl LabelSection {
             time_limit: self.time_limit.seconds(),
             memory: self.memory.map(Positive::get),
             scratch: self.scratch.clone(),
-            keep: self.keep,
+            keep: self.keep_directories,
             pass_environment: self.pass_environment.clone(),
             batch_system: self.batch_system,
             batch_options: self.batch_options.clone(),
@@ -316,12 +316,12 @@ impl Default for CampaignSection {
 impl Default for GuardSection {
     fn default() -> Self {
         Self {
-            least_distance: defaults::positive(1.2),
-            least_distance_fraction: defaults::fraction(0.75),
+            min_distance: defaults::positive(1.2),
+            min_distance_fraction: defaults::fraction(0.75),
             zbl: None,
-            highest_temperature: defaults::positive(20_000.0),
-            refusals_in_a_row: defaults::nonzero(10),
-            most_returns: 3,
+            max_temperature: defaults::positive(20_000.0),
+            max_consecutive_rejections: defaults::nonzero(10),
+            max_rollbacks: 3,
             tau_factor: defaults::fraction(0.5),
             checkpoint_interval: defaults::nonzero(100).into(),
         }
@@ -332,12 +332,12 @@ impl Default for RunSection {
     fn default() -> Self {
         Self {
             walkers: 0,
-            threads: NonZeroUsize::MIN,
-            silence_limit: Duration::from_seconds(120),
-            agent_silence_limit: Duration::from_seconds(60),
-            restarts: 5,
+            threads_per_walker: NonZeroUsize::MIN,
+            heartbeat_timeout: Duration::from_seconds(120),
+            agent_heartbeat_timeout: Duration::from_seconds(60),
+            max_restarts: 5,
             walks_per_round: NonZeroUsize::MIN,
-            turn_steps: defaults::nonzero(250).into(),
+            steps_per_assignment: defaults::nonzero(250).into(),
             store: None,
         }
     }

@@ -110,7 +110,7 @@ impl NotificationTracker {
             return None;
         }
         let minutes = (now - since) as f64 / MINUTE;
-        if minutes < self.settings.stall.seconds() / 60.0 {
+        if minutes < self.settings.stall_timeout.seconds() / 60.0 {
             return None;
         }
         let digits = if minutes < 10.0 { 1 } else { 0 };

@@ -10,16 +10,16 @@ use crate::exit_status::Failure;
 /// Keys that affect the selector's decisions. Their effect on walks is recorded and does not change.
 const KEYS: [&str; 11] = [
     "budget.labels",
-    "calm.combination",
+    "calm.covariance_update",
     "calm.forgetting_alarm",
-    "calm.ladder",
+    "calm.alpha_values",
     "calm.update",
-    "collect.per_seed",
-    "collect.total",
-    "collect.until",
-    "collect.when",
-    "guard.least_distance",
-    "guard.least_distance_fraction",
+    "collect.max_per_seed_structure",
+    "collect.max_structures",
+    "collect.update_target",
+    "collect.criterion",
+    "guard.min_distance",
+    "guard.min_distance_fraction",
 ];
 
 /// A key with another value, as `key=value`.
@@ -58,7 +58,7 @@ impl RuleOverride {
     /// Name of the key in the decision log.
     pub fn rule(&self) -> &'static str {
         // Both keys limit the number of structures, and the log records one limit.
-        if self.base_key() == "budget.labels" { "collect.total" } else { self.base_key() }
+        if self.base_key() == "budget.labels" { "collect.max_structures" } else { self.base_key() }
     }
 }
 
@@ -129,20 +129,20 @@ mod tests {
 
     #[test]
     fn keys_of_the_selector_are_taken_and_no_others() {
-        let words = setting("calm.combination=additive").unwrap();
-        assert_eq!((&words.value, words.base_key()), (&Value::from("additive"), "calm.combination"));
-        let inside = setting("collect.when.threshold = 1.75").unwrap();
-        assert_eq!((inside.value.as_float(), inside.base_key()), (Some(1.75), "collect.when"));
-        assert_eq!(setting("calm.ladder=[0.5,1]").unwrap().value.as_array().unwrap().len(), 2);
+        let words = setting("calm.covariance_update=additive").unwrap();
+        assert_eq!((&words.value, words.base_key()), (&Value::from("additive"), "calm.covariance_update"));
+        let inside = setting("collect.criterion.threshold = 1.75").unwrap();
+        assert_eq!((inside.value.as_float(), inside.base_key()), (Some(1.75), "collect.criterion"));
+        assert_eq!(setting("calm.alpha_values=[0.5,1]").unwrap().value.as_array().unwrap().len(), 2);
         for (text, words) in [
             (
                 "walk.tau=0.2",
                 "walk.tau cannot be replayed: expected a key that acts on the selector alone, budget.l",
             ),
             ("collect.whenever=1", "collect.whenever cannot be replayed"),
-            ("collect.total", "expected KEY=VALUE"),
-            ("collect.total=", "collect.total = : "),
-            ("calm.ladder=[0.5", "calm.ladder = [0.5: "),
+            ("collect.max_structures", "expected KEY=VALUE"),
+            ("collect.max_structures=", "collect.max_structures = : "),
+            ("calm.alpha_values=[0.5", "calm.alpha_values = [0.5: "),
         ] {
             let error = setting(text).unwrap_err();
             assert!(error.contains(words), "{error}");
@@ -156,18 +156,22 @@ mod tests {
             let settings: Vec<_> = texts.iter().map(|text| setting(text).unwrap()).collect();
             configuration(&text, &settings)
         };
-        assert_eq!(with(&["collect.per_seed=7"]).unwrap().collect.per_seed.get(), 7);
-        let rule = with(&["collect.when={ rule = \"maximum_grade\" }", "collect.when.threshold=2.5"]);
-        assert!(rule.unwrap().collect.when.is_met(&[2.6]));
+        assert_eq!(
+            with(&["collect.max_per_seed_structure=7"]).unwrap().collect.max_per_seed_structure.get(),
+            7
+        );
+        let rule =
+            with(&["collect.criterion={ rule = \"maximum_grade\" }", "collect.criterion.threshold=2.5"]);
+        assert!(rule.unwrap().collect.criterion.is_met(&[2.6]));
         for (texts, words) in [
             (
-                &["collect.per_seed=0"][..],
-                "--set collect.per_seed=0: invalid value: integer `0`, expected a whole",
+                &["collect.max_per_seed_structure=0"][..],
+                "--set collect.max_per_seed_structure=0: invalid value: integer `0`, expected a whole",
             ),
-            (&["collect.when.threshold=-1.0"], "expected a finite number above 0"),
-            (&["collect.when.treshold=1.0"], "unknown key `treshold`"),
-            (&["calm.combination=conves"], "did you mean `convex`?"),
-            (&["collect.per_seed.x=1"], "invalid type: map, expected a whole number"),
+            (&["collect.criterion.threshold=-1.0"], "expected a finite number above 0"),
+            (&["collect.criterion.treshold=1.0"], "unknown key `treshold`"),
+            (&["calm.covariance_update=conves"], "did you mean `convex`?"),
+            (&["collect.max_per_seed_structure.x=1"], "invalid type: map, expected a whole number"),
         ] {
             let Err(Failure::Input(error)) = with(texts) else { panic!("{texts:?} are taken") };
             assert!(error.contains(words), "{error}");

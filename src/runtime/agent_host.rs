@@ -161,7 +161,7 @@ async fn run_in(
     let server = Server::open(place, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
     let line = server.handle();
     let limits = Limits {
-        heartbeat_timeout: Duration::from_secs_f64(setup.silence_limit),
+        heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),
         max_restarts: setup.restarts,
         ..Limits::default()
     };

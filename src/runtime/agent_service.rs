@@ -51,14 +51,14 @@ impl AgentService {
             precision: config.potential.precision,
             settings: run.campaign.walk_settings(),
             message_bytes: run.campaign.largest_message(),
-            silence_limit: config.run.silence_limit.seconds(),
-            restarts: config.run.restarts,
+            heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
+            restarts: config.run.max_restarts,
         };
         let welcome = AgentBootstrap {
             setup: process_config::to_bytes(&setup),
             files: BTreeMap::from([(model_hash, model)]),
         };
-        let patience = config.run.agent_silence_limit.get();
+        let patience = config.run.agent_heartbeat_timeout.get();
         let hub = AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
         let hub = hub.map_err(|error| match error {
             NetError::SessionClosed { .. } => Failure::failed(error),

@@ -75,13 +75,13 @@ fn start_reactor(
     stopping: &Arc<AtomicBool>,
 ) -> ReactorTask {
     let config = &run.campaign.config;
-    let walk_steps = config.walk.equilibration + config.walk.steps.get();
+    let walk_steps = config.walk.equilibration_steps + config.walk.biased_steps.get();
     let mut ends = WalkEnds::default();
     selector.ended_walks().for_each(|(walk, end, reason)| ends.add(walk.0, end, reason));
     let mut display =
         Display::new(walk_steps, selector.walk_progress(walk_steps), ends, ForgettingRule::new(&config.calm));
     let queue_limit = u64::from(config.label.queue_limit.get());
-    if config.label.queue_full == QueueFull::Raise {
+    if config.label.on_queue_full == QueueFull::Raise {
         selector.raise_threshold_above(queue_limit);
     }
     let reactor = Reactor {
@@ -109,7 +109,7 @@ fn start_reactor(
 /// Number of walkers to run in parallel, from the configuration.
 fn wanted_walkers(campaign: &Campaign) -> u32 {
     match campaign.config.run.walkers {
-        0 => (cores() / campaign.config.run.threads.get() as u32).max(1),
+        0 => (cores() / campaign.config.run.threads_per_walker.get() as u32).max(1),
         wanted => wanted as u32,
     }
 }

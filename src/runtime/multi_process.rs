@@ -68,8 +68,8 @@ async fn run_in(
         handles.1.notify_one();
     });
     let limits = Limits {
-        heartbeat_timeout: campaign.config.run.silence_limit.get(),
-        max_restarts: campaign.config.run.restarts,
+        heartbeat_timeout: campaign.config.run.heartbeat_timeout.get(),
+        max_restarts: campaign.config.run.max_restarts,
         ..Limits::default()
     };
     let line = server.handle();

@@ -47,7 +47,7 @@ impl<'a> Notifier<'a> {
         let Some(command) = settings.command.clone() else { return Ok(None) };
         let told = store.metadata(METADATA_KEY).await?;
         let told = told.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
-        let stall = settings.stall.get();
+        let stall = settings.stall_timeout.get();
         Ok(Some(Self {
             store,
             location: location.to_string(),

@@ -149,7 +149,7 @@ fn start_walkers(
     let (model, settings) = (Arc::clone(&campaign.model), Arc::new(campaign.walk_settings()));
     let start = |number| {
         let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
-        let threads = Threads::new(campaign.config.run.threads.get()).map_err(Failure::failed)?;
+        let threads = Threads::new(campaign.config.run.threads_per_walker.get()).map_err(Failure::failed)?;
         let context = WalkContext { model: Arc::clone(&model), threads, settings: Arc::clone(&settings) };
         thread::Builder::new()
             .name(format!("walker-{number}"))
@@ -166,15 +166,15 @@ fn start_labellers(
     let RunContext { campaign, store, process, .. } = run;
     let label = &campaign.config.label;
     let mut labellers = JoinSet::new();
-    for slot in 0..label.slots {
+    for slot in 0..label.concurrency {
         let method = campaign.method()?.load(&campaign.protocol)?;
         let settings = LabellerSettings {
             holder: format!("{}/{slot}", process.id),
             protocol: campaign.protocol.clone(),
-            attempts: label.attempts.get(),
+            attempts: label.max_attempts.get(),
             bounds: label.bounds(),
             exit_policy: ExitPolicy::UntilEmpty,
-            timing: Timing { lease: label.lease.get(), ..Timing::default() },
+            timing: Timing { lease: label.lease_timeout.get(), ..Timing::default() },
         };
         let (store, closing) = (store.clone(), Arc::clone(closing));
         labellers.spawn(async move {

@@ -25,7 +25,7 @@ pub fn walker_launcher(
         (absolute(campaign.config.potential.model.get_ref())?, campaign.hash_of("potential.model"));
     let (parent, settings) = (std::process::id(), campaign.walk_settings());
     let precision = campaign.config.potential.precision;
-    let threads = campaign.config.run.threads.get();
+    let threads = campaign.config.run.threads_per_walker.get();
     Ok(move |number, incarnation| {
         line.expect(number, incarnation);
         let setup = WalkerConfig {
@@ -53,12 +53,12 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
     let label_setup = LabelSetup {
         method: campaign.method()?,
         protocol: campaign.protocol.clone(),
-        attempts: label.attempts.get(),
+        attempts: label.max_attempts.get(),
         bounds: label.bounds(),
-        lease: label.lease.get(),
+        lease: label.lease_timeout.get(),
     };
     let setup = LabellerConfig::new(location, label_setup);
-    let (hash, slots) = (setup.hash(), label.slots as u32);
+    let (hash, slots) = (setup.hash(), label.concurrency as u32);
     let mut labellers = Children::new(slots, limits, move |number, incarnation| {
         let restarts = incarnation.saturating_sub(1);
         let setup = LabellerConfig { number: Some(number), restarts, ..setup.clone() };
@@ -73,7 +73,7 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
             None => drop(request_exit(found.pid, &found.start_time)),
         }
     }
-    Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
+    Ok(Labellers::new(labellers, adopted, campaign.config.label.max_attempts.get()))
 }
 
 /// Asks the labellers of an earlier run to end, because this run makes labels itself.

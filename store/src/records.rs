@@ -214,7 +214,7 @@ pub struct Commit {
     pub candidates: Vec<CandidateRecord>,
     /// Components that changed, newest last.
     pub components: Vec<ComponentRecord>,
-    /// Restart the whole mixture (update protocol "restarted"): stored components are deleted first.
+    /// Restart the whole mixture (update protocol "per_seed_structure"): stored components are deleted first.
     pub restart_mixture: bool,
     /// Walks whose state changed.
     pub walks: Vec<WalkRecord>,

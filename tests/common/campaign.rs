@@ -15,21 +15,28 @@ pub struct Small {
     pub walkers: usize,
     pub walks_per_round: usize,
     pub steps: u64,
-    pub per_seed: u32,
+    pub max_per_seed_structure: u32,
     pub seeds: &'static [&'static str],
 }
 
 impl Default for Small {
     fn default() -> Self {
         let seeds = &["fcc-100", "vacancy"];
-        Self { mode: "reproducible", walkers: 2, walks_per_round: 2, steps: 240, per_seed: 4, seeds }
+        Self {
+            mode: "reproducible",
+            walkers: 2,
+            walks_per_round: 2,
+            steps: 240,
+            max_per_seed_structure: 4,
+            seeds,
+        }
     }
 }
 
 impl Small {
     /// Text of the configuration.
     pub fn text(&self) -> String {
-        let Self { mode, walkers, walks_per_round, steps, per_seed, .. } = self;
+        let Self { mode, walkers, walks_per_round, steps, max_per_seed_structure, .. } = self;
         let file = |path: &str| config(path).display().to_string();
         format!(
             r#"
@@ -41,28 +48,28 @@ model = "{model}"
 [calm]
 artifact = "{artifact}"
 training_frames = "{frames}"
-[seeds]
+[seed_structures]
 files = ["seeds.extxyz"]
 [walk]
 temperature = 700.0
-steps = {steps}
-equilibration = 20
+biased_steps = {steps}
+equilibration_steps = 20
 tau = 0.3
 volume_ramp = {{ from = 1.0, to = 1.25 }}
 [collect]
-when = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1 }}
-until = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1, target = 1.25 }}
-gap = 30
-declined_gap = 5
-per_seed = {per_seed}
+criterion = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1 }}
+update_target = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1, target = 1.25 }}
+min_interval = 30
+min_interval_after_decline = 5
+max_per_seed_structure = {max_per_seed_structure}
 [guard]
 zbl = {{ inner = 1.6, outer = 2.4 }}
 [label]
-method = {{ reference = {{ kind = "eam_fs", file = "{label}" }} }}
+method = {{ potential = {{ kind = "eam_fs", file = "{label}" }} }}
 [run]
 walkers = {walkers}
 walks_per_round = {walks_per_round}
-turn_steps = 40
+steps_per_assignment = 40
 "#,
             model = file("data/al_eam_1l/kokkos.npz"),
             artifact = file("data/al_eam_1l/gmm_artifacts.npz"),

@@ -66,7 +66,9 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
     fs::create_dir(&scratch).unwrap();
     let text = fs::read_to_string(config("silicon-dft.toml")).unwrap();
     let data = format!("\"{}/data/", config("").display()).replace("//", "/");
-    let text = text.replace("\"data/", &data).replace("# per_seed = 3 ", "per_seed = 1 ");
+    let text = text
+        .replace("\"data/", &data)
+        .replace("# max_per_seed_structure = 3 ", "max_per_seed_structure = 1 ");
     let label = format!("[label]\nscratch = \"{}\"\nattempts = 20", scratch.display());
     fs::write(here.join("campaign.toml"), text.replace("[label]", &label)).unwrap();
     let mut run = program(here)
@@ -137,12 +139,12 @@ fn is_refused(here: &Path, candidate: &str, reason: &str) {
 
 #[test]
 fn guards_stand_before_abinit() {
-    const GUARD: &str = "guard = { shortest_bond = { \"Si-Si\" = 1.8 }, least_height = 3.0, most_atoms = 8, near_duplicate = 0.01";
+    const GUARD: &str = "guard = { min_bond_lengths = { \"Si-Si\" = 1.8 }, min_height = 3.0, max_atoms = 8, duplicate_tolerance = 0.01";
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     // One label by the campaign itself.
     let text = demo("silicon-dft.toml").replace("# control = true", "control = false");
-    let text = text.replace("# total = 100 ", "total = 1 ");
+    let text = text.replace("# max_structures = 100 ", "max_structures = 1 ");
     let write = |guard: &str| {
         fs::write(here.join("campaign.toml"), text.replace("[label]\n", &format!("[label]\n{guard}\n")))
             .unwrap();
@@ -174,20 +176,20 @@ fn guards_stand_before_abinit() {
     let is_labelled = |candidate: &str| attempts(here, candidate).last().unwrap()["outcome"] == "labelled";
     // The same structure has one job.
     assert!(is_labelled(&good) && is_labelled(&other) && attempts(here, &again) == attempts(here, &good));
-    is_refused(here, &short, "label.guard.shortest_bond of Si-Si is 1.8");
-    is_refused(here, &flat, "label.guard.least_height is 3");
-    is_refused(here, &many, "9 atoms, where label.guard.most_atoms is 8");
+    is_refused(here, &short, "label.guard.min_bond_lengths of Si-Si is 1.8");
+    is_refused(here, &flat, "label.guard.min_height is 3");
+    is_refused(here, &many, "9 atoms, where label.guard.max_atoms is 8");
     is_refused(here, &near, &format!("from those of {good}, which has a label"));
     succeed(here, ["queue", "campaign", "retry", &near]);
     succeed(here, ["label", "--store", "campaign", "--until-empty"]);
     assert!(is_labelled(&near));
 
     // From now on nothing is cheap enough.
-    write(&format!("{GUARD}, largest_cost = 1e-6 }}"));
+    write(&format!("{GUARD}, max_cost = 1e-6 }}"));
     succeed(here, ["run", "campaign.toml"]);
     let dear = add(8, pair(1.5), 4.0);
     succeed(here, ["label", "--store", "campaign", "--until-empty"]);
-    is_refused(here, &dear, "core-seconds, judging by 4 labels, where label.guard.largest_cost is 0.000001");
+    is_refused(here, &dear, "core-seconds, judging by 4 labels, where label.guard.max_cost is 0.000001");
 }
 
 /// When ABINIT has made the first label, its pseudopotential becomes another, with which it would calculate as well.
@@ -211,7 +213,9 @@ fn a_pseudopotential_that_is_replaced_between_two_labels_makes_none() {
         here.display().to_string()
     );
     let text = demo("silicon-dft.toml").replace("# control = true", "control = false");
-    let text = text.replace("# total = 100 ", "total = 3 ").replace("[label.method.abinit]\n", &method);
+    let text = text
+        .replace("# max_structures = 100 ", "max_structures = 3 ")
+        .replace("[label.method.abinit]\n", &method);
     fs::write(here.join("campaign.toml"), text).unwrap();
     let output = program(&here).args(["run", "campaign.toml"]).output().unwrap();
     let said = stderr(&output);

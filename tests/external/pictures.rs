@@ -24,7 +24,9 @@ fn the_readme_shows_a_campaign() {
     let here = directory.path();
     let text = demo("aluminium.toml").replace("[campaign]", "[campaign]\nmode = \"live\"");
     // Long enough for lines over time.
-    let text = text.replace("steps = 2000", "steps = 12000").replace("# per_seed = 3", "per_seed = 20");
+    let text = text
+        .replace("biased_steps = 2000", "biased_steps = 12000")
+        .replace("# max_per_seed_structure = 3", "max_per_seed_structure = 20");
     fs::write(here.join("aluminium.toml"), text).unwrap();
     let mut command = program(here);
     command.args(["run", "aluminium.toml", "--dashboard", "127.0.0.1:0"]);

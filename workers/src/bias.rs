@@ -57,7 +57,7 @@ pub struct BiasedPotential {
     pub tau: f64,
     /// State of the running averages.
     pub state: BiasState,
-    average_steps: u64,
+    bias_averaging_steps: u64,
     pull_back: PullBack,
     /// With the bias on.
     parts: BatchedGrades,
@@ -75,7 +75,7 @@ impl BiasedPotential {
         grace: Grace,
         mixture: Arc<Mixture>,
         zbl: Option<Zbl>,
-        average_steps: u64,
+        bias_averaging_steps: u64,
         species: &[Species],
     ) -> Result<Self, PotentialError> {
         let elements = grace.model().element_indices(species)?;
@@ -86,7 +86,7 @@ impl BiasedPotential {
             mixture,
             tau: 0.0,
             state: BiasState::default(),
-            average_steps,
+            bias_averaging_steps,
             pull_back: PullBack::default(),
             parts: BatchedGrades::default(),
             grades: Grades::default(),
@@ -149,7 +149,7 @@ impl BiasedPotential {
     fn add_bias(&mut self, out: &mut Evaluation) {
         let norm = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
         let (force_norm, gradient_norm) = (norm(&out.forces), norm(&self.pull_back.gradient));
-        let scale = self.tau * self.state.advance(force_norm, gradient_norm, self.average_steps);
+        let scale = self.tau * self.state.advance(force_norm, gradient_norm, self.bias_averaging_steps);
         for (force, gradient) in out.forces.iter_mut().zip(&self.pull_back.gradient) {
             *force = cell::add(*force, cell::scale(*gradient, scale));
         }

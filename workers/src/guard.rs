@@ -8,12 +8,12 @@ use crate::settings::GuardSettings;
 pub const SHORTEST_BOND: &str = "shortest-bond";
 
 /// max(least, fraction × shortest distance of the seed structure), Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
-pub fn least_distance(settings: &GuardSettings, seed_shortest: Option<f64>) -> f64 {
-    let relative = seed_shortest.map_or(0.0, |d| settings.least_distance_fraction * d);
-    settings.least_distance.max(relative)
+pub fn min_distance(settings: &GuardSettings, seed_shortest: Option<f64>) -> f64 {
+    let relative = seed_shortest.map_or(0.0, |d| settings.min_distance_fraction * d);
+    settings.min_distance.max(relative)
 }
 
-/// Whether two atoms are closer than `least` Å.
+/// Whether two atoms are closer than `min_atoms` Å.
 pub fn too_close(structure: &Structure, neighbours: &NeighbourList, least: f64) -> bool {
     shortest_distance(structure, neighbours).is_some_and(|(_, _, d)| d < least)
 }
@@ -30,8 +30,8 @@ pub fn blown_up(
     if let Some(atom) = evaluation.forces.iter().position(|f| f.iter().any(|x| !x.is_finite())) {
         return Some(format!("the force on atom {atom} is not finite"));
     }
-    if temperature.is_nan() || temperature > settings.highest_temperature {
-        let highest = settings.highest_temperature;
+    if temperature.is_nan() || temperature > settings.max_temperature {
+        let highest = settings.max_temperature;
         return Some(format!("{temperature:.0} K is above the allowed {highest:.0} K"));
     }
     if structure.len() > 1 {

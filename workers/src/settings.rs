@@ -38,7 +38,7 @@ pub struct WalkSettings {
     /// Uncertainty-force scale τ.
     pub tau: f64,
     /// Steps over which the two norms of τ_r are exponentially averaged.
-    pub average_steps: u64,
+    pub bias_averaging_steps: u64,
     /// V/V₀ at the start and at the end of the biased steps; `None` for a fixed cell.
     pub volume_ramp: Option<(f64, f64)>,
     /// Neighbour-list skin, Å.
@@ -48,7 +48,7 @@ pub struct WalkSettings {
     /// Minimum number of steps between two accepted structures of a walk.
     pub gap: u64,
     /// Minimum number of steps between two candidates after one that was declined or refused.
-    pub declined_gap: u64,
+    pub min_interval_after_decline: u64,
     /// Switched ZBL repulsion: inner and outer radius of the switch, Å.
     pub zbl: Option<(f64, f64)>,
     /// Guards.
@@ -59,15 +59,15 @@ pub struct WalkSettings {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GuardSettings {
     /// A structure with a shorter distance is refused, Å.
-    pub least_distance: f64,
+    pub min_distance: f64,
     /// The same limit as a fraction of the seed structure's shortest distance; the larger of the two applies.
-    pub least_distance_fraction: f64,
+    pub min_distance_fraction: f64,
     /// Temperature above which a walk ends, K.
-    pub highest_temperature: f64,
+    pub max_temperature: f64,
     /// Consecutive refusals by the same guard after which the walk rolls back to a checkpoint.
-    pub refusals_in_a_row: u32,
+    pub max_consecutive_rejections: u32,
     /// Number of roll backs after which the walk ends instead.
-    pub most_returns: u32,
+    pub max_rollbacks: u32,
     /// Factor on τ at each roll back.
     pub tau_factor: f64,
     /// Steps between checkpoints for roll backs.

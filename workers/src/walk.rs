@@ -102,9 +102,9 @@ impl<'a> Walk<'a> {
         let species = &assignment.seed_structure.species;
         let zbl = settings.zbl.map(|(inner, outer)| Zbl::new(species, inner, outer)).transpose()?;
         let mixture_version = mixture.version();
-        let average_steps = settings.average_steps;
+        let bias_averaging_steps = settings.bias_averaging_steps;
         let grace = Grace::with(Arc::clone(model), Instructions::best(), threads.clone());
-        let mut potential = BiasedPotential::new(grace, mixture, zbl, average_steps, species)?;
+        let mut potential = BiasedPotential::new(grace, mixture, zbl, bias_averaging_steps, species)?;
         let (dynamics, state) = match &assignment.checkpoint {
             None => start(settings, assignment, &mut potential)?,
             Some(bytes) => {
@@ -131,7 +131,9 @@ impl<'a> Walk<'a> {
                 self.state.collected.push(CollectionPoint { branch: step, beyond: 0 });
                 self.state.next_offer = step + self.settings.gap;
             }
-            Some(Verdict::Declined(_)) => self.state.next_offer = step + self.settings.declined_gap,
+            Some(Verdict::Declined(_)) => {
+                self.state.next_offer = step + self.settings.min_interval_after_decline
+            }
         }
     }
 
@@ -206,14 +208,14 @@ impl<'a> Walk<'a> {
             (false, _) => Ok(None),
             (true, true) => self.record_refusal(),
             (true, false) => {
-                self.state.refusals_in_a_row = 0;
+                self.state.max_consecutive_rejections = 0;
                 Ok(Some(Outcome::Candidate(self.candidate()?)))
             }
         }
     }
 
     fn is_too_close(&self) -> bool {
-        let least = self.state.least_distance;
+        let least = self.state.min_distance;
         guard::too_close(self.dynamics.structure(), self.dynamics.neighbours(), least)
     }
 
@@ -225,12 +227,12 @@ impl<'a> Walk<'a> {
     fn record_refusal(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let guard = &self.settings.guard;
         self.state.refused += 1;
-        self.state.refusals_in_a_row += 1;
-        self.state.next_offer = self.step() + self.settings.declined_gap;
-        if self.state.refusals_in_a_row < guard.refusals_in_a_row {
+        self.state.max_consecutive_rejections += 1;
+        self.state.next_offer = self.step() + self.settings.min_interval_after_decline;
+        if self.state.max_consecutive_rejections < guard.max_consecutive_rejections {
             return Ok(None);
         }
-        if self.state.returns == guard.most_returns || self.state.good.is_empty() {
+        if self.state.returns == guard.max_rollbacks || self.state.good.is_empty() {
             return Ok(Some(Outcome::Ended(WalkEnd::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
         }
         self.roll_back()?;
@@ -243,7 +245,7 @@ impl<'a> Walk<'a> {
         self.state.good.clear();
         self.state.segment += 1;
         self.state.returns += 1;
-        self.state.refusals_in_a_row = 0;
+        self.state.max_consecutive_rejections = 0;
         self.state.tau *= self.settings.guard.tau_factor;
         checkpoint.stream = self.stream();
         let cutoff = self.dynamics.neighbours().cutoff();

@@ -224,7 +224,7 @@ async fn energies_out_of_bounds_fail_from_the_first_label_on() {
     let (class, log) = outcomes[0].as_ref().unwrap_err();
     assert_eq!(class, "implausible");
     assert!(
-        log.contains("an energy of 1.000e300 eV/atom, beyond label.largest_energy = 2000000 eV/atom"),
+        log.contains("an energy of 1.000e300 eV/atom, beyond label.max_energy_per_atom = 2000000 eV/atom"),
         "{log}"
     );
     assert_eq!(outcomes[1], Ok(-106.0));
@@ -244,7 +244,7 @@ async fn energies_are_compared_with_the_potential_once_offsets_are_known() {
     assert_eq!(class, "implausible");
     assert!(log.contains("differs by 10105.8 eV/atom") && log.contains("from 5 labels"), "{log}");
     let (_, log) = outcomes[8].as_ref().unwrap_err();
-    assert!(log.contains("beyond label.largest_energy_difference = 100 eV/atom"), "{log}");
+    assert!(log.contains("beyond label.max_energy_difference_per_atom = 100 eV/atom"), "{log}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

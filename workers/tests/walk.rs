@@ -41,19 +41,19 @@ fn settings() -> WalkSettings {
         equilibration: 20,
         steps: 600,
         tau: 0.15,
-        average_steps: 10,
+        bias_averaging_steps: 10,
         volume_ramp: Some((1.0, 1.4)),
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         gap: 200,
-        declined_gap: 20,
+        min_interval_after_decline: 20,
         zbl: Some((1.6, 2.4)),
         guard: GuardSettings {
-            least_distance: 1.2,
-            least_distance_fraction: 0.75,
-            highest_temperature: 20_000.0,
-            refusals_in_a_row: 5,
-            most_returns: 3,
+            min_distance: 1.2,
+            min_distance_fraction: 0.75,
+            max_temperature: 20_000.0,
+            max_consecutive_rejections: 5,
+            max_rollbacks: 3,
             tau_factor: 0.5,
             checkpoint_interval: 100,
         },
@@ -83,13 +83,17 @@ fn run(settings: &WalkSettings, assignment: &Assignment) -> Report<Candidate> {
 }
 
 /// Runs a walk, one assignment after the other, with every candidate accepted, until it ends.
-fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) -> Vec<Report<Candidate>> {
-    let mut turn = assignment(structure, turn_steps);
+fn whole_walk(
+    settings: &WalkSettings,
+    structure: Structure,
+    steps_per_assignment: u64,
+) -> Vec<Report<Candidate>> {
+    let mut turn = assignment(structure, steps_per_assignment);
     let mut reports = Vec::new();
     loop {
         let report = run(settings, &turn);
         turn.checkpoint = Some(report.checkpoint.clone());
-        turn.last_step = report.progress.step + turn_steps;
+        turn.last_step = report.progress.step + steps_per_assignment;
         turn.number += 1;
         turn.verdict = matches!(report.outcome, Outcome::Candidate(_)).then_some(Verdict::Accepted);
         let ended = matches!(report.outcome, Outcome::Ended(_));
@@ -205,7 +209,7 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
 /// Steps between two candidates along the path that joins them, across roll backs.
 #[test]
 fn the_interval_between_collections_holds_across_roll_backs() {
-    let guard = GuardSettings { tau_factor: 0.8, most_returns: 6, ..settings().guard };
+    let guard = GuardSettings { tau_factor: 0.8, max_rollbacks: 6, ..settings().guard };
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), gap: 120, guard, ..settings() };
     let reports = whole_walk(&settings, seed_structure("fcc-097"), 150);
     let candidate = |report: &Report<Candidate>| match &report.outcome {
@@ -249,7 +253,7 @@ fn the_skin_changes_nothing() {
 
 #[test]
 fn a_walk_that_cannot_leave_a_trap_ends() {
-    let guard = GuardSettings { least_distance: 3.0, ..settings().guard };
+    let guard = GuardSettings { min_distance: 3.0, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
     let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
     let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
@@ -258,13 +262,13 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
         matches!(&last.outcome, Outcome::Ended(WalkEnd::Trapped { guard }) if guard == "shortest-bond"),
         "{last:?}"
     );
-    assert_eq!(last.progress.returns, settings.guard.most_returns);
+    assert_eq!(last.progress.returns, settings.guard.max_rollbacks);
     assert!(last.progress.step < 600);
 }
 
 #[test]
 fn a_diverging_walk_ends_with_its_reason() {
-    let guard = GuardSettings { highest_temperature: 900.0, ..settings().guard };
+    let guard = GuardSettings { max_temperature: 900.0, ..settings().guard };
     let settings = WalkSettings { temperature: 2500.0, collection: never(), guard, ..settings() };
     let report = run(&settings, &assignment(seed_structure("fcc-100"), 600));
     let Outcome::Ended(WalkEnd::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };

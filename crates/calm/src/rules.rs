@@ -113,7 +113,7 @@ pub enum CollectionRule {
         #[serde(default = "collection_threshold")]
         threshold: Positive,
     },
-    /// At least max[`least`, ⌈`fraction` N⌉] of the N atoms above a threshold (paper, foundation model).
+    /// At min_atoms max[`min_atoms`, ⌈`fraction` N⌉] of the N atoms above a threshold (paper, foundation model).
     AtomCount {
         /// Grade above which an atom counts (paper: 1.3).
         #[serde(default = "atom_threshold")]
@@ -123,7 +123,7 @@ pub enum CollectionRule {
         fraction: Fraction,
         /// Minimum number of atoms (paper: 3).
         #[serde(default = "atom_least")]
-        least: NonZeroUsize,
+        min_atoms: NonZeroUsize,
     },
 }
 
@@ -138,7 +138,7 @@ pub enum UpdateRule {
         #[serde(default = "update_target")]
         target: Positive,
     },
-    /// The smallest α that leaves fewer than max[`least`, ⌈`fraction` N⌉] atoms above the threshold; if there
+    /// The smallest α that leaves fewer than max[`min_atoms`, ⌈`fraction` N⌉] atoms above the threshold; if there
     /// is none, the smallest with γ_max below the target; otherwise the last (paper, foundation model).
     AtomCount {
         /// Grade above which an atom counts (paper: 1.3).
@@ -149,7 +149,7 @@ pub enum UpdateRule {
         fraction: Fraction,
         /// Minimum number of atoms (paper: 3).
         #[serde(default = "atom_least")]
-        least: NonZeroUsize,
+        min_atoms: NonZeroUsize,
         /// Target of the fallback (paper: 1.25).
         #[serde(default = "update_target")]
         target: Positive,
@@ -229,8 +229,8 @@ impl CollectionRule {
     pub fn is_met(&self, gamma: &[f64]) -> bool {
         match *self {
             Self::MaximumGrade { threshold } => maximum(gamma) > threshold.0,
-            Self::AtomCount { threshold, fraction, least } => {
-                count_above(gamma, threshold.0) >= atom_limit(gamma.len(), fraction, least)
+            Self::AtomCount { threshold, fraction, min_atoms } => {
+                count_above(gamma, threshold.0) >= atom_limit(gamma.len(), fraction, min_atoms)
             }
         }
     }
@@ -241,10 +241,10 @@ pub fn count_above(gamma: &[f64], threshold: f64) -> usize {
     gamma.iter().filter(|&&grade| grade > threshold).count()
 }
 
-/// max[least, ⌈fraction · atoms⌉]; products that are integers up to rounding count as integers.
-pub fn atom_limit(atoms: usize, fraction: Fraction, least: NonZeroUsize) -> usize {
+/// max[min_atoms, ⌈fraction · atoms⌉]; products that are integers up to rounding count as integers.
+pub fn atom_limit(atoms: usize, fraction: Fraction, min_atoms: NonZeroUsize) -> usize {
     let share = (fraction.0 * atoms as f64 * (1.0 - 1e-12)).ceil() as usize;
-    share.max(least.get())
+    share.max(min_atoms.get())
 }
 
 fn collection_threshold() -> Positive {

@@ -137,8 +137,8 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
     let atoms = batch.gamma().len();
     let (threshold, limit, target) = match settings.stop {
         UpdateRule::MaximumGrade { target } => (target.get(), None, target.get()),
-        UpdateRule::AtomCount { threshold, fraction, least, target } => {
-            (threshold.get(), Some(atom_limit(atoms, fraction, least)), target.get())
+        UpdateRule::AtomCount { threshold, fraction, min_atoms, target } => {
+            (threshold.get(), Some(atom_limit(atoms, fraction, min_atoms)), target.get())
         }
     };
     let ladder = AlphaScan::new(batch, settings.combination);

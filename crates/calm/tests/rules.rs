@@ -19,14 +19,14 @@ fn collection(text: &str) -> CollectionRule {
 #[test]
 fn the_papers_values_are_the_defaults() {
     let positive = |value: f64| Positive::try_from(value).unwrap();
-    let (fraction, least) = (Fraction::try_from(0.15).unwrap(), NonZeroUsize::new(3).unwrap());
+    let (fraction, min_atoms) = (Fraction::try_from(0.15).unwrap(), NonZeroUsize::new(3).unwrap());
     let threshold = positive(1.5);
     assert_eq!(collection("rule = 'maximum_grade'"), CollectionRule::MaximumGrade { threshold });
     let threshold = positive(1.3);
-    let rule = CollectionRule::AtomCount { threshold, fraction, least };
+    let rule = CollectionRule::AtomCount { threshold, fraction, min_atoms };
     assert_eq!(collection("rule = 'atom_count'"), rule);
     let settings: UpdateSettings = toml::from_str("stop = { rule = 'atom_count' }").unwrap();
-    let stop = UpdateRule::AtomCount { threshold, fraction, least, target: positive(1.25) };
+    let stop = UpdateRule::AtomCount { threshold, fraction, min_atoms, target: positive(1.25) };
     assert_eq!(settings, UpdateSettings { combination: CovarianceUpdateKind::Convex, ladder: None, stop });
     assert_eq!(settings.alphas(), [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]);
     for combination in [CovarianceUpdateKind::Convex, CovarianceUpdateKind::Additive] {
@@ -152,7 +152,7 @@ fn the_count_rule_falls_back_twice() {
     // Three atoms at r in one direction: γ² = r² / (1 − α + α r²), as for a single one.
     let features = |radius: f64| [[radius, 0.0]; 3].concat();
     let run = |radius: f64, text: &str| {
-        let text = format!("ladder = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
+        let text = format!("alpha_values = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
         update(&round(), &[0; 3], &features(radius), &settings(&text)).unwrap()
     };
     // 2 / √(1 + 3·0.4) = 1.35; 1 at α = 1.

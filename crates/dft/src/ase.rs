@@ -45,6 +45,7 @@ pub struct Settings {
     pub calculator: PathBuf,
     /// Initial magnetic moment of each element, μ_B. Default: 1 for the elements not listed; without this table
     /// no atom has a moment.
+    #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
 }
 

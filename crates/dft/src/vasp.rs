@@ -56,7 +56,7 @@ pub struct Settings {
     /// Directory of the POTCAR files: `Al_pv/POTCAR`, `POTCAR.Al_pv` or `Al_pv`. Required.
     pub pseudopotentials: PathBuf,
     /// The potential of each element that may occur: `{ Al = "Al", Fe = "Fe_pv" }`. Required.
-    pub variants: BTreeMap<Species, String>,
+    pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV (`ENCUT`).
     pub cutoff: f64,
     /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
@@ -66,19 +66,22 @@ pub struct Settings {
     /// Width of the smearing, eV (`SIGMA`).
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised (`ISPIN`).
+    #[serde(rename = "spin_polarized")]
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B (`MAGMOM`). Default: 1.
+    #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// Tolerance of the energy in the last electronic step, eV (`EDIFF`).
     pub energy_tolerance: f64,
     /// Maximum number of electronic steps (`NELM`).
+    #[serde(rename = "max_scf_steps")]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
     /// Number of process groups that share the k-points (`KPAR`).
-    pub k_groups: u32,
+    pub kpar: u32,
     /// Number of processes that share a band (`NCORE`).
-    pub cores_per_band: u32,
+    pub ncore: u32,
     /// Further INCAR tags, part of the protocol: `{ LASPH = ".TRUE." }`.
     pub tags: BTreeMap<String, String>,
 }
@@ -90,7 +93,7 @@ impl Default for Settings {
             environment: BTreeMap::new(),
             version: String::new(),
             pseudopotentials: PathBuf::new(),
-            variants: BTreeMap::new(),
+            pseudopotential_variants: BTreeMap::new(),
             cutoff: 500.0,
             k_spacing: 0.125,
             smearing: Smearing::Gaussian,
@@ -100,8 +103,8 @@ impl Default for Settings {
             energy_tolerance: 1e-6,
             steps: 100,
             vacuum: 10.0,
-            k_groups: 1,
-            cores_per_band: 1,
+            kpar: 1,
+            ncore: 1,
             tags: BTreeMap::new(),
         }
     }
@@ -118,9 +121,9 @@ impl Settings {
         positive("smearing_width", self.smearing_width)?;
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("steps", self.steps, 1)?;
-        at_least("k_groups", self.k_groups, 1)?;
-        at_least("cores_per_band", self.cores_per_band, 1)?;
+        at_least("max_scf_steps", self.steps, 1)?;
+        at_least("kpar", self.kpar, 1)?;
+        at_least("ncore", self.ncore, 1)?;
         let needed = |key, missing: bool, expected: &str| match missing {
             true => {
                 Err(SetupError::Setting { key, found: "nothing".to_owned(), expected: expected.to_owned() })
@@ -134,8 +137,8 @@ impl Settings {
             "the directory of your POTCAR files",
         )?;
         needed(
-            "variants",
-            self.variants.is_empty(),
+            "pseudopotential_variants",
+            self.pseudopotential_variants.is_empty(),
             "the potential of each element, such as { Al = \"Al\" }",
         )?;
         needed(
@@ -145,7 +148,7 @@ impl Settings {
         )?;
         incar::check(self)?;
         executable::find(&self.command[0])?;
-        let potcars = self.variants.iter().map(|(species, variant)| {
+        let potcars = self.pseudopotential_variants.iter().map(|(species, variant)| {
             Ok((*species, Potcar::find(&self.pseudopotentials, *species, variant)?))
         });
         Ok(Vasp { potcars: potcars.collect::<Result<_, _>>()?, settings: self.clone() })
@@ -162,8 +165,9 @@ pub struct Vasp {
 impl Vasp {
     fn potcar(&self, species: Species) -> Result<&Potcar, SetupError> {
         self.potcars.get(&species).ok_or_else(|| {
-            let reason =
-                format!("none is selected; name one in `variants`, such as {species} = \"{species}\"");
+            let reason = format!(
+                "none is selected; name one in `pseudopotential_variants`, such as {species} = \"{species}\""
+            );
             SetupError::Pseudopotential { species, reason }
         })
     }
@@ -181,7 +185,7 @@ impl DftBackend for Vasp {
             environment: _,
             version,
             pseudopotentials: _,
-            variants: _,
+            pseudopotential_variants: _,
             cutoff,
             k_spacing,
             smearing,
@@ -191,8 +195,8 @@ impl DftBackend for Vasp {
             energy_tolerance,
             steps: _,
             vacuum,
-            k_groups: _,
-            cores_per_band: _,
+            kpar: _,
+            ncore: _,
             tags,
         } = &self.settings;
         json!({

@@ -28,7 +28,7 @@ pub fn settings(threshold: f64) -> Settings {
         mode: Mode::Live,
         walks_per_round: 1,
         steps_per_assignment: 1000,
-        update: UpdateProtocol::Carried,
+        update: UpdateProtocol::Cumulative,
         search: UpdateSettings {
             combination: CovarianceUpdateKind::Convex,
             ladder: None,

@@ -298,7 +298,7 @@ impl DecisionState {
             "end": end, "reason": walk.record.reason, "step": walk.record.progress.step,
             "accepted": walk.record.accepted,
         });
-        let restart = walk.is_biased() && self.settings.update == UpdateProtocol::Restarted;
+        let restart = walk.is_biased() && self.settings.update == UpdateProtocol::PerSeedStructure;
         if restart {
             let next_version = self.mixture.version() + 1;
             self.mixture = Arc::new(self.regrader.original.at_version(next_version));

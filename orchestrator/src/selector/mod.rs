@@ -70,9 +70,9 @@ impl Mode {
 #[serde(rename_all = "snake_case")]
 pub enum UpdateProtocol {
     /// Updates accumulate over all seed structures.
-    Carried,
+    Cumulative,
     /// Each seed structure starts from the original mixture.
-    Restarted,
+    PerSeedStructure,
     /// The mixture is never updated.
     Never,
 }

@@ -16,10 +16,10 @@ pub(super) const CONFIGURATION: &str = "configuration";
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ChangeableRules {
     /// See [`Settings::max_per_seed_structure`].
-    #[serde(rename = "collect.per_seed")]
+    #[serde(rename = "collect.max_per_seed_structure")]
     pub max_per_seed_structure: u32,
     /// See [`Settings::max_structures`]: the smallest of the configured limits.
-    #[serde(rename = "collect.total")]
+    #[serde(rename = "collect.max_structures")]
     pub max_structures: Option<u32>,
     /// See [`ForgettingAlarm`].
     #[serde(rename = "calm.forgetting_alarm")]

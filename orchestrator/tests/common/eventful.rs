@@ -78,11 +78,14 @@ pub fn scripts() -> impl Strategy<Value = Vec<Script>> {
 }
 
 pub fn any_settings() -> impl Strategy<Value = Settings> {
-    let update =
-        prop::sample::select(vec![UpdateProtocol::Carried, UpdateProtocol::Restarted, UpdateProtocol::Never]);
+    let update = prop::sample::select(vec![
+        UpdateProtocol::Cumulative,
+        UpdateProtocol::PerSeedStructure,
+        UpdateProtocol::Never,
+    ]);
     (1..5_usize, update, 1..6_u32, prop::option::of(1..12_u32), any::<bool>(), 0..300_u64).prop_map(
         |(walks, update, max_per_seed_structure, total, control, declined_feature_bytes)| Settings {
-            walks_per_round: if update == UpdateProtocol::Restarted { 1 } else { walks },
+            walks_per_round: if update == UpdateProtocol::PerSeedStructure { 1 } else { walks },
             update,
             max_per_seed_structure,
             max_structures: total,

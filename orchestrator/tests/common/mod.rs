@@ -74,7 +74,7 @@ pub fn settings(mode: Mode) -> Settings {
         mode,
         walks_per_round: 2,
         steps_per_assignment: 10,
-        update: UpdateProtocol::Carried,
+        update: UpdateProtocol::Cumulative,
         search: UpdateSettings {
             combination: CovarianceUpdateKind::Convex,
             ladder: None,

@@ -50,8 +50,8 @@ fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Resul
         Some(UpdateRule::MaximumGrade { target }) => {
             (format!("maximum_grade: γ_max below {}", target.get()), target.get())
         }
-        Some(UpdateRule::AtomCount { threshold, fraction, least, target }) => {
-            let (limit, threshold) = (atom_limit(atoms, fraction, least), threshold.get());
+        Some(UpdateRule::AtomCount { threshold, fraction, min_atoms, target }) => {
+            let (limit, threshold) = (atom_limit(atoms, fraction, min_atoms), threshold.get());
             let target = target.get();
             (
                 format!(

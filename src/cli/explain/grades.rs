@@ -37,8 +37,8 @@ fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &CandidateGrade
     let Trigger { rule, threshold, needed, above_walker, above_selector } = trigger;
     let rule = match rule {
         CollectionRule::MaximumGrade { .. } => format!("maximum_grade: γ_max > {threshold}"),
-        CollectionRule::AtomCount { fraction, least, .. } => format!(
-            "atom_count: at least {needed} atoms with γ > {threshold} (the larger of {least} and {} % of {})",
+        CollectionRule::AtomCount { fraction, min_atoms, .. } => format!(
+            "atom_count: at least {needed} atoms with γ > {threshold} (the larger of {min_atoms} and {} % of {})",
             100.0 * f64::from(*fraction),
             grades.atoms.len()
         ),

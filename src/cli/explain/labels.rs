@@ -79,7 +79,7 @@ fn write_label(out: &mut dyn Write, label: &CandidateLabel, atoms: usize) -> io:
         &status,
         &format!(
             "energy {energy:.6} eV ({energy_per_atom:.6} eV/atom), largest force {:.4} eV/Å",
-            label.largest_force
+            label.max_force
         ),
     )?;
     line(out, "", &format!("protocol '{protocol}' ({}), from {source}", &protocol_hash[..16]))?;

@@ -41,8 +41,8 @@ impl JobSpecs {
         let config = &campaign.config;
         // run.walkers = 0 is one walker per core, that is, as many as the job has cores.
         let cores = match config.run.walkers {
-            0 => config.run.threads.get().max(2),
-            walkers => walkers * config.run.threads.get() + config.label.slots,
+            0 => config.run.threads_per_walker.get().max(2),
+            walkers => walkers * config.run.threads_per_walker.get() + config.label.concurrency,
         };
         let values = |cpus: usize, command: String| {
             [

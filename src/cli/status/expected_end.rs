@@ -26,7 +26,7 @@ impl ExpectedEnd {
             return Self::default();
         }
         let steps = |key: &str| configuration["walk"][key].as_u64().unwrap_or_default();
-        let steps_per_walk = steps("equilibration") + steps("steps");
+        let steps_per_walk = steps("equilibration_steps") + steps("biased_steps");
         let under_way = status.walks.iter().filter(|walk| walk.is_active());
         let left: u64 = under_way.map(|walk| steps_per_walk.saturating_sub(walk.step)).sum();
         let speed = status.steps_per_second.filter(|speed| status.led && *speed > 0.0);
@@ -77,7 +77,11 @@ mod tests {
             led: true,
             ..Status::default()
         };
-        (status, json!({ "walk": { "equilibration": 1_000, "steps": 19_000 } }), QueueCost::default())
+        (
+            status,
+            json!({ "walk": { "equilibration_steps": 1_000, "biased_steps": 19_000 } }),
+            QueueCost::default(),
+        )
     }
 
     #[test]

@@ -62,13 +62,13 @@ pub fn summary(data: &ReportData) -> Table {
 
 /// The collection rule as text. `None` if the configuration has none.
 pub fn collection_rule(configuration: &Value) -> Option<String> {
-    let rule = serde_json::from_value(configuration["collect"]["when"].clone()).ok()?;
+    let rule = serde_json::from_value(configuration["collect"]["criterion"].clone()).ok()?;
     Some(match rule {
         CollectionRule::MaximumGrade { threshold } => {
             format!("the largest γ of its atoms is above {}", f64::from(threshold))
         }
-        CollectionRule::AtomCount { threshold, fraction, least } => format!(
-            "at least max({least}, ⌈{} N⌉) of its N atoms have γ above {}",
+        CollectionRule::AtomCount { threshold, fraction, min_atoms } => format!(
+            "at least max({min_atoms}, ⌈{} N⌉) of its N atoms have γ above {}",
             f64::from(fraction),
             f64::from(threshold)
         ),
@@ -148,8 +148,8 @@ mod tests {
 
     #[test]
     fn collection_rules_are_words() {
-        let rule = |when: Value| collection_rule(&json!({ "collect": { "when": when } }));
-        let count = json!({ "rule": "atom_count", "threshold": 1.3, "fraction": 0.15, "least": 3 });
+        let rule = |criterion: Value| collection_rule(&json!({ "collect": { "criterion": criterion } }));
+        let count = json!({ "rule": "atom_count", "threshold": 1.3, "fraction": 0.15, "min_atoms": 3 });
         assert_eq!(rule(count).unwrap(), "at least max(3, ⌈0.15 N⌉) of its N atoms have γ above 1.3");
         assert_eq!(rule(json!({})), None);
     }

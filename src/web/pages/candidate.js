@@ -168,7 +168,7 @@ function label(made) {
     [made.standing, `protocol ${made.protocol}; ${made.source}; ${time(made.received)}`],
     ["excluded", made.excluded && `${made.excluded.reason}; ${time(made.excluded.time)}`],
     ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} per atom)`],
-    ["largest force", decimals(made.largest_force, 4, "eV/Å")],
+    ["largest force", decimals(made.max_force, 4, "eV/Å")],
     ["pressure", made.pressure == null ? null : digits(made.pressure, "eV/Å³")],
     ["energy error of the potential", model && energyError(model)],
     ["force errors of the potential", model && `mean ${decimals(model.mean, 4)}, largest ${decimals(model.largest, 4, "eV/Å")} (atom ${model.atom})`],

@@ -13,7 +13,7 @@ const SHAPES = {
 const HOLLOW = new Set(["cross", "plus", "ring"]);
 
 /**
- * A plot: `title`, `x` and `y` (axes: title; `ticks` formats a number; `least`, `most`: values to include; `logarithmic`), and
+ * A plot: `title`, `x` and `y` (axes: title; `ticks` formats a number; `min_atoms`, `most`: values to include; `logarithmic`), and
  * `lines` ({name, colour, dash, points: [[x, y], …]}), `bands` ({colour, points: [[x, low, high], …]}) and `marks` ({name, colour, shape,
  * points: [[x, y, href, text], …]}). A y of null breaks a line.
  */

@@ -115,7 +115,7 @@ fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
 
 /// Sets the budget that ended walks. Running walks count as stopped while a time limit is reached.
 fn set_budget_reason(walks: &mut [WalkStatus], time: Option<&'static str>, limits: &Budget) {
-    let structures = limits.structures_by.as_deref().unwrap_or("collect.total");
+    let structures = limits.structures_by.as_deref().unwrap_or("collect.max_structures");
     for walk in walks {
         if walk.state == END_BY_BUDGET {
             structures.clone_into(&mut walk.reason);

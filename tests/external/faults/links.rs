@@ -18,7 +18,7 @@ fn small() -> Small {
         walks_per_round: 3,
         seeds: &["fcc-100", "vacancy", "fcc-097"],
         steps: 1600,
-        per_seed: 8,
+        max_per_seed_structure: 8,
         ..Small::default()
     }
 }
@@ -32,15 +32,15 @@ struct Linked {
 }
 
 impl Linked {
-    /// Both are at work. An agent is taken for dead after `silence_limit`, and gives up after `patience` (min).
-    fn new(silence_limit: f64, patience: f64) -> Self {
-        let linked = Self::with_cable(Cable::new(), silence_limit, patience);
+    /// Both are at work. An agent is taken for dead after `heartbeat_timeout`, and gives up after `patience` (min).
+    fn new(heartbeat_timeout: f64, patience: f64) -> Self {
+        let linked = Self::with_cable(Cable::new(), heartbeat_timeout, patience);
         linked.are_at_work();
         linked
     }
 
-    fn with_cable(cable: Cable, silence_limit: f64, patience: f64) -> Self {
-        let mut hosts = Hosts::new(&small(), 1, &format!("agent_silence_limit = {silence_limit}"));
+    fn with_cable(cable: Cable, heartbeat_timeout: f64, patience: f64) -> Self {
+        let mut hosts = Hosts::new(&small(), 1, &format!("agent_heartbeat_timeout = {heartbeat_timeout}"));
         hosts.through = cable.through();
         hosts.endpoints = ["0.0.0.0", HEAD].map(|address| format!("tcp/{address}:7447"));
         let certificates = hosts.home.path().join("certificates");

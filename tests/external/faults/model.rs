@@ -15,7 +15,7 @@ const DELAY: Duration = Duration::from_secs(1);
 #[test]
 fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let small = Small::default();
-    let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
+    let mut hosts = Hosts::new(&small, 1, "agent_heartbeat_timeout = \"30s\"");
     // The agent has another file system where the model is.
     let models = hosts.home.path().join("models");
     fs::create_dir(&models).unwrap();

@@ -18,7 +18,7 @@ struct Killed {
 
 impl Killed {
     fn new(small: &Small, name: &str) -> Self {
-        let campaign = Campaign::new(small, name, 2, "agent_silence_limit = 0.5");
+        let campaign = Campaign::new(small, name, 2, "agent_heartbeat_timeout = \"500ms\"");
         let orchestrator = campaign.hosts.start_orchestrator();
         let agents = [campaign.hosts.agent(0), campaign.hosts.agent(1)];
         Self { campaign, orchestrator, agents }

@@ -35,7 +35,7 @@ fn a_job_that_is_cancelled_is_lost_and_tried_again() {
 
 #[test]
 fn a_job_whose_time_is_over_gets_twice_as_much() {
-    let jobs = Jobs::with("time_limit = 600.0", "--comment=label");
+    let jobs = Jobs::with("time_limit = \"10m\"", "--comment=label");
     let run = jobs.place.run();
     let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);

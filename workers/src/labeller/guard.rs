@@ -32,41 +32,41 @@ const MAX_COST_LABELS: u32 = 1_000;
 #[serde(default, deny_unknown_fields)]
 pub struct LabelGuard {
     /// Minimum bond length for pairs of elements, Å.
-    pub shortest_bond: BTreeMap<Pair, f64>,
+    pub min_bond_lengths: BTreeMap<Pair, f64>,
     /// Minimum distance between opposite faces of the cell, Å.
-    pub least_height: Option<f64>,
+    pub min_height: Option<f64>,
     /// Maximum ratio of the longest to the shortest edge of the cell.
-    pub largest_edge_ratio: Option<f64>,
+    pub max_edge_ratio: Option<f64>,
     /// Minimum angle α between edges of the cell; angles must be between α and 180° − α, degrees.
-    pub least_angle: Option<f64>,
+    pub min_angle: Option<f64>,
     /// Minimum volume per atom, Å³.
-    pub least_volume: Option<f64>,
+    pub min_volume_per_atom: Option<f64>,
     /// Maximum volume per atom, Å³.
-    pub largest_volume: Option<f64>,
+    pub max_volume_per_atom: Option<f64>,
     /// Maximum number of atoms.
-    pub most_atoms: Option<u32>,
+    pub max_atoms: Option<u32>,
     /// Refuses a structure if the features of each atom differ from those of a labelled structure by less than this
     /// fraction of their norm.
-    pub near_duplicate: Option<f64>,
+    pub duplicate_tolerance: Option<f64>,
     /// Maximum expected cost of a label, core-seconds.
-    pub largest_cost: Option<f64>,
+    pub max_cost: Option<f64>,
 }
 
 impl LabelGuard {
     /// The first key with an invalid value, with that value and the expected one.
     pub fn fault(&self) -> Option<(&'static str, String, &'static str)> {
         let positive = |x: &f64| x.is_finite() && *x > 0.0;
-        if let Some((pair, bond)) = self.shortest_bond.iter().find(|(_, bond)| !positive(bond)) {
-            return Some(("label.guard.shortest_bond", format!("{pair} = {bond}"), "a length above 0, Å"));
+        if let Some((pair, bond)) = self.min_bond_lengths.iter().find(|(_, bond)| !positive(bond)) {
+            return Some(("label.guard.min_bond_lengths", format!("{pair} = {bond}"), "a length above 0, Å"));
         }
         let numbers = [
-            ("label.guard.least_height", self.least_height, f64::MAX),
-            ("label.guard.largest_edge_ratio", self.largest_edge_ratio, f64::MAX),
-            ("label.guard.least_angle", self.least_angle, 90.0),
-            ("label.guard.least_volume", self.least_volume, f64::MAX),
-            ("label.guard.largest_volume", self.largest_volume, f64::MAX),
-            ("label.guard.near_duplicate", self.near_duplicate, 1.0),
-            ("label.guard.largest_cost", self.largest_cost, f64::MAX),
+            ("label.guard.min_height", self.min_height, f64::MAX),
+            ("label.guard.max_edge_ratio", self.max_edge_ratio, f64::MAX),
+            ("label.guard.min_angle", self.min_angle, 90.0),
+            ("label.guard.min_volume_per_atom", self.min_volume_per_atom, f64::MAX),
+            ("label.guard.max_volume_per_atom", self.max_volume_per_atom, f64::MAX),
+            ("label.guard.duplicate_tolerance", self.duplicate_tolerance, 1.0),
+            ("label.guard.max_cost", self.max_cost, f64::MAX),
         ];
         let wrong = |(key, value, most): (&'static str, Option<f64>, f64)| {
             let value = value.filter(|value| !positive(value) || *value > most)?;
@@ -83,12 +83,12 @@ impl LabelGuard {
     /// Why the structure itself is refused; `None` if it may be labelled.
     pub fn refuses(&self, structure: &Structure) -> Option<String> {
         let atoms = structure.len();
-        if let Some(most) = self.most_atoms.filter(|most| atoms > *most as usize) {
-            return Some(format!("{atoms} atoms, where label.guard.most_atoms is {most}"));
+        if let Some(most) = self.max_atoms.filter(|most| atoms > *most as usize) {
+            return Some(format!("{atoms} atoms, where label.guard.max_atoms is {most}"));
         }
         self.refuses_shape(structure)
             .or_else(|| self.refuses_volume(structure))
-            .or_else(|| bonds::too_short(structure, &self.shortest_bond))
+            .or_else(|| bonds::too_short(structure, &self.min_bond_lengths))
     }
 
     fn refuses_shape(&self, structure: &Structure) -> Option<String> {
@@ -96,19 +96,19 @@ impl LabelGuard {
         let directions: Vec<_> = (0..3).filter(|k| structure.periodic[*k]).collect();
         let heights = cell.heights();
         let height = directions.iter().map(|k| heights[*k]).reduce(f64::min)?;
-        if let Some(least) = self.least_height.filter(|least| height < *least) {
+        if let Some(least) = self.min_height.filter(|least| height < *least) {
             return Some(format!(
-                "opposite faces of its cell are {height:.3} Å apart, where label.guard.least_height is {least}"
+                "opposite faces of its cell are {height:.3} Å apart, where label.guard.min_height is {least}"
             ));
         }
         let edges = || directions.iter().map(|k| norm(cell.0[*k]));
         let ratio = edges().reduce(f64::max)? / edges().reduce(f64::min)?;
-        if let Some(largest) = self.largest_edge_ratio.filter(|largest| ratio > *largest) {
+        if let Some(largest) = self.max_edge_ratio.filter(|largest| ratio > *largest) {
             return Some(format!(
-                "the longest edge of its cell is {ratio:.2} times the shortest, where label.guard.largest_edge_ratio is {largest}"
+                "the longest edge of its cell is {ratio:.2} times the shortest, where label.guard.max_edge_ratio is {largest}"
             ));
         }
-        let least = self.least_angle?;
+        let least = self.min_angle?;
         let pairs =
             directions.iter().flat_map(|i| directions.iter().filter(move |k| i < *k).map(move |k| (*i, *k)));
         let angle = |(i, k): (usize, usize)| {
@@ -116,7 +116,7 @@ impl LabelGuard {
             (dot(a, b) / (norm(a) * norm(b))).clamp(-1.0, 1.0).acos().to_degrees()
         };
         let sharp = pairs.map(angle).find(|angle| angle.min(180.0 - angle) < least)?;
-        Some(format!("its cell has an angle of {sharp:.1}°, where label.guard.least_angle is {least}"))
+        Some(format!("its cell has an angle of {sharp:.1}°, where label.guard.min_angle is {least}"))
     }
 
     /// Applies to cells that are periodic in all three directions.
@@ -127,9 +127,11 @@ impl LabelGuard {
         let volume = structure.cell.volume() / structure.len() as f64;
         let too =
             |key: &str, limit: f64| format!("{volume:.3} Å³ per atom, where label.guard.{key} is {limit}");
-        let small = self.least_volume.filter(|least| volume < *least);
-        let large = self.largest_volume.filter(|largest| volume > *largest);
-        small.map(|limit| too("least_volume", limit)).or(large.map(|limit| too("largest_volume", limit)))
+        let small = self.min_volume_per_atom.filter(|least| volume < *least);
+        let large = self.max_volume_per_atom.filter(|largest| volume > *largest);
+        small
+            .map(|limit| too("min_volume_per_atom", limit))
+            .or(large.map(|limit| too("max_volume_per_atom", limit)))
     }
 }
 
@@ -150,14 +152,14 @@ pub(super) async fn refusal(
     if let Some(reason) = too_costly(store, lease, size, &guard).await? {
         return Ok(Some(reason));
     }
-    let Some(bound) = guard.near_duplicate else { return Ok(None) };
+    let Some(bound) = guard.duplicate_tolerance else { return Ok(None) };
     let near = store.near_duplicates(lease, MAX_COMPARED).await?;
     let Some((own, others)) = near else { return Ok(None) };
     let like = others.iter().find(|other| is_near(&own, &other.features, lease.structure.len(), bound));
     Ok(like.map(|other| {
         format!(
             "its features differ by less than {bound} of their norm from those of {}, which has a label \
-             (label.guard.near_duplicate)",
+             (label.guard.duplicate_tolerance)",
             other.candidate
         )
     }))
@@ -173,7 +175,7 @@ async fn too_costly(
     size: dft::Size,
     guard: &LabelGuard,
 ) -> Result<Option<String>, StoreError> {
-    let Some(largest) = guard.largest_cost else { return Ok(None) };
+    let Some(largest) = guard.max_cost else { return Ok(None) };
     let costs = store.label_costs(lease.protocol, MAX_COST_LABELS).await?;
     let measured: Vec<_> = costs
         .iter()
@@ -193,7 +195,7 @@ async fn too_costly(
     let too_much = expected.map(|expected| expected.core_seconds).filter(|seconds| *seconds > largest);
     Ok(too_much.map(|seconds| {
         format!(
-            "its label is expected to take {seconds:.0} core-seconds, judging by {} labels, where label.guard.largest_cost \
+            "its label is expected to take {seconds:.0} core-seconds, judging by {} labels, where label.guard.max_cost \
              is {largest}",
             measured.len()
         )

@@ -18,23 +18,23 @@ const GPA: f64 = 160.217_663_4;
 #[serde(default)]
 pub struct LabelBounds {
     /// Force, eV/Å.
-    pub largest_force: f64,
+    pub max_force: f64,
     /// Stress component, eV/Å³.
-    pub largest_stress: f64,
+    pub max_stress: f64,
     /// Absolute energy per atom, eV.
-    pub largest_energy: f64,
+    pub max_energy_per_atom: f64,
     /// Difference per atom from the potential's energy after removing the elements' offsets, eV.
-    pub largest_energy_difference: f64,
+    pub max_energy_difference_per_atom: f64,
 }
 
 impl Default for LabelBounds {
     fn default() -> Self {
         Self {
-            largest_force: 1000.0,
-            largest_stress: 10.0,
+            max_force: 1000.0,
+            max_stress: 10.0,
             // No element has a larger all-electron energy.
-            largest_energy: 2e6,
-            largest_energy_difference: 100.0,
+            max_energy_per_atom: 2e6,
+            max_energy_difference_per_atom: 100.0,
         }
     }
 }
@@ -51,24 +51,27 @@ impl LabelBounds {
     }
 
     fn refuses_energy(&self, energy: f64, atoms: usize) -> Option<String> {
-        let (energy, bound) = (energy / atoms.max(1) as f64, self.largest_energy);
+        let (energy, bound) = (energy / atoms.max(1) as f64, self.max_energy_per_atom);
         let (found, largest) = (number(energy), number(bound));
-        (energy.abs() > bound)
-            .then(|| format!("an energy of {found} eV/atom, beyond label.largest_energy = {largest} eV/atom"))
+        (energy.abs() > bound).then(|| {
+            format!("an energy of {found} eV/atom, beyond label.max_energy_per_atom = {largest} eV/atom")
+        })
     }
 
     fn refuses_stress(&self, stress: f64) -> Option<String> {
-        let bound = self.largest_stress;
+        let bound = self.max_stress;
         let (gpa, found, largest) = (number(stress * GPA), number(stress), number(bound));
         (stress.abs() > bound).then(|| {
-            format!("a stress component of {found} eV/Å³ ({gpa} GPa), beyond label.largest_stress = {largest} eV/Å³")
+            format!(
+                "a stress component of {found} eV/Å³ ({gpa} GPa), beyond label.max_stress = {largest} eV/Å³"
+            )
         })
     }
 
     fn refuses_force(&self, force: f64) -> Option<String> {
-        let (found, largest) = (number(force), number(self.largest_force));
-        (force > self.largest_force)
-            .then(|| format!("a force of {found} eV/Å, beyond label.largest_force = {largest} eV/Å"))
+        let (found, largest) = (number(force), number(self.max_force));
+        (force > self.max_force)
+            .then(|| format!("a force of {found} eV/Å, beyond label.max_force = {largest} eV/Å"))
     }
 }
 
@@ -132,11 +135,11 @@ fn energy_mismatch(
     let EnergyReference { model, offsets } = expected;
     let label = labelled_energy(structure, model, results.energy);
     let difference = -offsets.error_per_atom(&label, MIN_SUPPORT)?;
-    let bound = bounds.largest_energy_difference;
+    let bound = bounds.max_energy_difference_per_atom;
     (difference.abs() > bound).then(|| {
         format!(
             "an energy that differs by {} eV/atom from the potential's (offsets of the elements, from {} labels, taken out), beyond \
-             label.largest_energy_difference = {} eV/atom",
+             label.max_energy_difference_per_atom = {} eV/atom",
             number(difference),
             offsets.structures(),
             number(bound)

@@ -25,13 +25,13 @@ pub(super) struct WalkState {
     /// Steps from which and to which the walk last rolled back.
     pub last_return: Option<(u64, u64)>,
     pub refused: u64,
-    pub refusals_in_a_row: u32,
+    pub max_consecutive_rejections: u32,
     /// First step at which a candidate may be offered.
     pub next_offer: u64,
     /// Points at which structures were collected.
     pub collected: Vec<CollectionPoint>,
     /// The guard's minimum distance, Å.
-    pub least_distance: f64,
+    pub min_distance: f64,
     /// Targets of roll backs, oldest first.
     pub good: Vec<(Checkpoint, BiasState)>,
     pub gamma_max: f64,
@@ -63,7 +63,7 @@ impl WalkState {
             collected.branch = step;
         }
         let offers = self.collected.iter().map(|c| c.branch + settings.gap.saturating_sub(c.beyond));
-        offers.max().unwrap_or(0).max(step + settings.declined_gap)
+        offers.max().unwrap_or(0).max(step + settings.min_interval_after_decline)
     }
 }
 
@@ -93,10 +93,10 @@ pub(super) fn start(
         returns: 0,
         last_return: None,
         refused: 0,
-        refusals_in_a_row: 0,
+        max_consecutive_rejections: 0,
         next_offer: 0,
         collected: Vec::new(),
-        least_distance: guard::least_distance(&settings.guard, shortest),
+        min_distance: guard::min_distance(&settings.guard, shortest),
         good: vec![(dynamics.checkpoint().clone(), BiasState::default())],
         gamma_max: 0.0,
     };

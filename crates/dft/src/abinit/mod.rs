@@ -51,7 +51,7 @@ pub struct Settings {
     /// Directory of the pseudopotentials, `Si.psp8` or `Si.xml`.
     pub pseudopotentials: PathBuf,
     /// File names that differ from that pattern: `{ Zn = "Zn-sp.psp8" }`.
-    pub variants: BTreeMap<Species, String>,
+    pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV.
     pub cutoff: f64,
     /// Cutoff of the fine PAW grid, eV. Default: twice `cutoff`.
@@ -63,12 +63,15 @@ pub struct Settings {
     /// Width of the smearing, eV.
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
+    #[serde(rename = "spin_polarized")]
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
+    #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// Tolerance of the energy between electronic steps, met twice in a row, eV.
     pub energy_tolerance: f64,
     /// Maximum number of electronic steps.
+    #[serde(rename = "max_scf_steps")]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
@@ -80,7 +83,7 @@ impl Default for Settings {
             command: vec!["abinit".into()],
             environment: BTreeMap::new(),
             pseudopotentials: "/usr/share/abinit/psp/Pseudodojo_nc_sr_04_pbe_standard_psp8".into(),
-            variants: BTreeMap::new(),
+            pseudopotential_variants: BTreeMap::new(),
             cutoff: 1000.0,
             fine_cutoff: None,
             k_spacing: 0.125,
@@ -107,10 +110,11 @@ impl Settings {
         positive("smearing_width", self.smearing_width)?;
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("steps", self.steps, 1)?;
+        at_least("max_scf_steps", self.steps, 1)?;
         let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
-        let pseudopotentials = pseudopotentials::find(&self.pseudopotentials, &self.variants)?;
+        let pseudopotentials =
+            pseudopotentials::find(&self.pseudopotentials, &self.pseudopotential_variants)?;
         Ok(Abinit { settings: self.clone(), environment, version, pseudopotentials })
     }
 }
@@ -148,11 +152,12 @@ impl Abinit {
         &self,
         species: &BTreeSet<Species>,
     ) -> Result<BTreeMap<Species, &Pseudopotential>, SetupError> {
-        let Settings { pseudopotentials: directory, variants, .. } = &self.settings;
+        let Settings { pseudopotentials: directory, pseudopotential_variants, .. } = &self.settings;
         let mut chosen: BTreeMap<Species, &Pseudopotential> = BTreeMap::new();
         for species in species {
             let one = self.pseudopotentials.get(species);
-            let one = one.ok_or_else(|| pseudopotentials::missing(*species, directory, variants))?;
+            let one =
+                one.ok_or_else(|| pseudopotentials::missing(*species, directory, pseudopotential_variants))?;
             if let Some((other, before)) = chosen.iter().find(|(_, before)| before.paw != one.paw) {
                 let [file, before] = [one, before].map(|one| one.pinned.path().display());
                 let reason = format!(
@@ -175,7 +180,7 @@ impl DftBackend for Abinit {
             command: _,
             environment: _,
             pseudopotentials: _,
-            variants: _,
+            pseudopotential_variants: _,
             cutoff,
             fine_cutoff,
             k_spacing,

@@ -28,17 +28,17 @@ impl Pseudopotential {
 /// All pseudopotentials in the directory.
 pub(super) fn find(
     directory: &Path,
-    variants: &BTreeMap<Species, String>,
+    pseudopotential_variants: &BTreeMap<Species, String>,
 ) -> Result<BTreeMap<Species, Pseudopotential>, SetupError> {
     let mut found = BTreeMap::new();
     for species in (1..=118).filter_map(|number| Species::from_atomic_number(number).ok()) {
-        let names = match variants.get(&species) {
+        let names = match pseudopotential_variants.get(&species) {
             Some(name) => vec![name.clone()],
             None => vec![format!("{species}.psp8"), format!("{species}.xml")],
         };
         let Some(file) = names.into_iter().find(|name| directory.join(name).is_file()) else {
-            if variants.contains_key(&species) {
-                return Err(missing(species, directory, variants));
+            if pseudopotential_variants.contains_key(&species) {
+                return Err(missing(species, directory, pseudopotential_variants));
             }
             continue;
         };
@@ -51,13 +51,15 @@ pub(super) fn find(
 pub(super) fn missing(
     species: Species,
     directory: &Path,
-    variants: &BTreeMap<Species, String>,
+    pseudopotential_variants: &BTreeMap<Species, String>,
 ) -> SetupError {
-    let sought =
-        variants.get(&species).cloned().unwrap_or_else(|| format!("{species}.psp8 or {species}.xml"));
+    let sought = pseudopotential_variants
+        .get(&species)
+        .cloned()
+        .unwrap_or_else(|| format!("{species}.psp8 or {species}.xml"));
     let reason = format!(
         "no {sought} in {}: get one for PBE and set `pseudopotentials` to its directory; if its \
-         name differs, set its file in `variants`",
+         name differs, set its file in `pseudopotential_variants`",
         directory.display()
     );
     SetupError::Pseudopotential { species, reason }
@@ -129,8 +131,8 @@ mod tests {
         std::fs::write(directory.path().join("Si.psp8"), SILICON).unwrap();
         let found = find(directory.path(), &BTreeMap::new()).unwrap();
         assert_eq!(found.len(), 1);
-        let variants = BTreeMap::from([("Zn".parse().unwrap(), "Zn-sp.psp8".to_owned())]);
-        let error = find(directory.path(), &variants).unwrap_err().to_string();
+        let pseudopotential_variants = BTreeMap::from([("Zn".parse().unwrap(), "Zn-sp.psp8".to_owned())]);
+        let error = find(directory.path(), &pseudopotential_variants).unwrap_err().to_string();
         let expected = format!("pseudopotential of Zn: no Zn-sp.psp8 in {}", directory.path().display());
         assert!(error.starts_with(&expected), "{error}");
     }

@@ -97,9 +97,10 @@ fn calculations_read_copies_of_what_was_hashed() {
     let file = directory.path().join("mine.psp8");
     let before = "Si\n14.0 4.0 170510 zatom\n8 11 2 4\n";
     std::fs::write(&file, before).unwrap();
-    let variants = BTreeMap::from([("Si".parse().unwrap(), "mine.psp8".to_owned())]);
-    let pseudopotentials = pseudopotentials::find(directory.path(), &variants).unwrap();
-    let settings = Settings { pseudopotentials: directory.path().to_owned(), variants, ..settings() };
+    let pseudopotential_variants = BTreeMap::from([("Si".parse().unwrap(), "mine.psp8".to_owned())]);
+    let pseudopotentials = pseudopotentials::find(directory.path(), &pseudopotential_variants).unwrap();
+    let settings =
+        Settings { pseudopotentials: directory.path().to_owned(), pseudopotential_variants, ..settings() };
     let code = Abinit { pseudopotentials, ..abinit(settings) };
     let input = code.input(&silicon(), &BTreeSet::new()).unwrap();
     let text = String::from_utf8(input.files["run.abi"].clone()).unwrap();

@@ -47,7 +47,9 @@ pub(super) fn find(settings: &Settings) -> Result<BTreeMap<Species, Kind>, Setup
         let wrong = |reason: String| SetupError::Pseudopotential { species, reason };
         match kind(&potentials, &bases, species, settings) {
             Ok(Some(kind)) => drop(kinds.insert(species, kind)),
-            Ok(None) if settings.variants.contains_key(&species) => return Err(missing(species, settings)),
+            Ok(None) if settings.pseudopotential_variants.contains_key(&species) => {
+                return Err(missing(species, settings));
+            }
             Ok(None) => {}
             Err(reason) => return Err(wrong(reason)),
         }
@@ -60,7 +62,7 @@ pub(super) fn missing(species: Species, settings: &Settings) -> SetupError {
     let directory = settings.pseudopotentials.display();
     let reason = format!(
         "no pseudopotential {} in {directory}/{POTENTIALS} with a basis set {} in {directory}/{BASES}: name another \
-         directory in `pseudopotentials`, another pseudopotential in `variants`, or another `basis`",
+         directory in `pseudopotentials`, another pseudopotential in `pseudopotential_variants`, or another `basis`",
         potential(species, settings),
         settings.basis
     );
@@ -77,7 +79,7 @@ fn text(settings: &Settings, name: &str) -> Result<String, SetupError> {
 }
 
 fn potential(species: Species, settings: &Settings) -> &str {
-    settings.variants.get(&species).map_or(FUNCTIONAL, String::as_str)
+    settings.pseudopotential_variants.get(&species).map_or(FUNCTIONAL, String::as_str)
 }
 
 fn kind(
@@ -89,7 +91,7 @@ fn kind(
     let name = potential(species, settings);
     if name != FUNCTIONAL && !name.starts_with("GTH-PBE-") {
         return Err(format!(
-            "{name} in `variants` is not of PBE: expected {FUNCTIONAL} or {FUNCTIONAL}-q<electrons>"
+            "{name} in `pseudopotential_variants` is not of PBE: expected {FUNCTIONAL} or {FUNCTIONAL}-q<electrons>"
         ));
     }
     let Some(potential) = entry(potentials, species, |names| names.contains(&name)) else { return Ok(None) };
@@ -159,11 +161,11 @@ mod tests {
         let error = missing(nickel, &settings).to_string();
         assert!(error.starts_with("pseudopotential of Ni: no pseudopotential GTH-PBE in "), "{error}");
 
-        let variants = BTreeMap::from([(silicon, "GTH-BLYP".to_owned())]);
-        let error = find(&Settings { variants, ..settings.clone() }).unwrap_err().to_string();
-        assert!(error.contains("GTH-BLYP in `variants` is not of PBE"), "{error}");
-        let variants = BTreeMap::from([(nickel, "GTH-PBE-q18".to_owned())]);
-        assert!(find(&Settings { variants, ..settings }).is_err());
+        let pseudopotential_variants = BTreeMap::from([(silicon, "GTH-BLYP".to_owned())]);
+        let error = find(&Settings { pseudopotential_variants, ..settings.clone() }).unwrap_err().to_string();
+        assert!(error.contains("GTH-BLYP in `pseudopotential_variants` is not of PBE"), "{error}");
+        let pseudopotential_variants = BTreeMap::from([(nickel, "GTH-PBE-q18".to_owned())]);
+        assert!(find(&Settings { pseudopotential_variants, ..settings }).is_err());
     }
 
     #[test]

@@ -58,7 +58,7 @@ pub struct Settings {
     /// Directory with `BASIS_MOLOPT` and `GTH_POTENTIALS`.
     pub pseudopotentials: PathBuf,
     /// Pseudopotentials other than `GTH-PBE`: `{ W = "GTH-PBE-q6" }`.
-    pub variants: BTreeMap<Species, String>,
+    pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Basis set of all elements.
     pub basis: String,
     /// Cutoff of the finest grid, eV (8163 eV are 600 Ry).
@@ -70,12 +70,15 @@ pub struct Settings {
     /// k_B T of the Fermi–Dirac occupation, eV.
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
+    #[serde(rename = "spin_polarized")]
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
+    #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// CP2K's `EPS_SCF`: tolerance of the density between electronic steps.
     pub density_tolerance: f64,
     /// Maximum number of electronic steps.
+    #[serde(rename = "max_scf_steps")]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
@@ -87,7 +90,7 @@ impl Default for Settings {
             command: vec!["cp2k".into()],
             environment: BTreeMap::new(),
             pseudopotentials: "/usr/share/cp2k".into(),
-            variants: BTreeMap::new(),
+            pseudopotential_variants: BTreeMap::new(),
             basis: "DZVP-MOLOPT-SR-GTH".into(),
             cutoff: 8163.0,
             relative_cutoff: 816.0,
@@ -115,7 +118,7 @@ impl Settings {
         positive("smearing_width", self.smearing_width)?;
         positive("density_tolerance", self.density_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("steps", self.steps, 1)?;
+        at_least("max_scf_steps", self.steps, 1)?;
         let kinds = data::find(self)?;
         let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
@@ -165,7 +168,7 @@ impl DftBackend for Cp2k {
             command: _,
             environment: _,
             pseudopotentials: _,
-            variants: _,
+            pseudopotential_variants: _,
             basis,
             cutoff,
             relative_cutoff,

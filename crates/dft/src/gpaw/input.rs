@@ -40,7 +40,7 @@ pub(super) fn write(
     for species in BTreeSet::from_iter(structure.species.iter().copied()) {
         let setup =
             gpaw.setup(species).map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
-        data.insert(setups::name(species, &settings.variants), setup.pinned.clone());
+        data.insert(setups::name(species, &settings.pseudopotential_variants), setup.pinned.clone());
     }
     let task = Task {
         species: &structure.species,
@@ -74,7 +74,7 @@ fn parameters(
 ) -> Value {
     let mut parameters = json!({
         "xc": "PBE",
-        "setups": settings.variants,
+        "setups": settings.pseudopotential_variants,
         "kpts": { "size": mesh, "gamma": true },
         "symmetry": { "point_group": false },
         "spinpol": settings.spin,

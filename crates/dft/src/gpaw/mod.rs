@@ -48,7 +48,7 @@ pub struct Settings {
     /// Directory of the setups. Default: GPAW's own search path.
     pub pseudopotentials: Option<PathBuf>,
     /// Setups other than the default one of an element: `{ Ni = "10" }`.
-    pub variants: BTreeMap<Species, String>,
+    pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV.
     pub cutoff: f64,
     /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
@@ -58,14 +58,17 @@ pub struct Settings {
     /// Width of the smearing, eV.
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
+    #[serde(rename = "spin_polarized")]
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
+    #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// Tolerance of the energy over the last three electronic steps, eV.
     pub energy_tolerance: f64,
     /// Tolerance of the forces in the last electronic step, eV/Å.
     pub force_tolerance: f64,
     /// Maximum number of electronic steps.
+    #[serde(rename = "max_scf_steps")]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
@@ -77,7 +80,7 @@ impl Default for Settings {
             command: vec!["/usr/bin/python3".into()],
             environment: BTreeMap::new(),
             pseudopotentials: None,
-            variants: BTreeMap::new(),
+            pseudopotential_variants: BTreeMap::new(),
             cutoff: 500.0,
             k_spacing: 0.125,
             smearing: Smearing::Gaussian,
@@ -104,10 +107,10 @@ impl Settings {
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("force_tolerance", self.force_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("steps", self.steps, 1)?;
+        at_least("max_scf_steps", self.steps, 1)?;
         let environment = self.environment();
         let versions = Versions::query(&self.command, &environment, passed)?;
-        let setups = setups::find(&versions.setup_paths, &self.variants)?;
+        let setups = setups::find(&versions.setup_paths, &self.pseudopotential_variants)?;
         Ok(Gpaw { settings: self.clone(), environment, versions, setups })
     }
 
@@ -154,9 +157,9 @@ pub struct Gpaw {
 
 impl Gpaw {
     fn setup(&self, species: Species) -> Result<&Setup, SetupError> {
-        self.setups
-            .get(&species)
-            .ok_or_else(|| setups::missing(species, &self.versions.setup_paths, &self.settings.variants))
+        self.setups.get(&species).ok_or_else(|| {
+            setups::missing(species, &self.versions.setup_paths, &self.settings.pseudopotential_variants)
+        })
     }
 
     /// Valence electrons of a structure; elements without a setup count none.
@@ -179,7 +182,7 @@ impl DftBackend for Gpaw {
             command: _,
             environment: _,
             pseudopotentials: _,
-            variants: _,
+            pseudopotential_variants: _,
             cutoff,
             k_spacing,
             smearing,
@@ -205,7 +208,7 @@ impl DftBackend for Gpaw {
             let moment = self.settings.moments.get(species).copied().unwrap_or_default();
             if self.settings.spin && moment.abs() > valence {
                 return Err(SetupError::Setting {
-                    key: "moments",
+                    key: "initial_magnetic_moments",
                     found: format!("{species} = {moment}"),
                     expected: format!("at most its {valence} valence electrons"),
                 });

@@ -19,16 +19,16 @@ pub(super) struct Setup {
 /// All available setups.
 pub(super) fn find(
     directories: &[PathBuf],
-    variants: &BTreeMap<Species, String>,
+    pseudopotential_variants: &BTreeMap<Species, String>,
 ) -> Result<BTreeMap<Species, Setup>, SetupError> {
     let mut setups = BTreeMap::new();
     for species in (1..=118).filter_map(|number| Species::from_atomic_number(number).ok()) {
-        let name = name(species, variants);
+        let name = name(species, pseudopotential_variants);
         // Of the candidates in a directory GPAW takes the last by name.
         let candidates = |directory: &PathBuf| [directory.join(format!("{name}.gz")), directory.join(&name)];
         let Some(path) = directories.iter().flat_map(candidates).find(|path| path.is_file()) else {
-            if variants.contains_key(&species) {
-                return Err(missing(species, directories, variants));
+            if pseudopotential_variants.contains_key(&species) {
+                return Err(missing(species, directories, pseudopotential_variants));
             }
             continue;
         };
@@ -46,20 +46,20 @@ pub(super) fn find(
 pub(super) fn missing(
     species: Species,
     directories: &[PathBuf],
-    variants: &BTreeMap<Species, String>,
+    pseudopotential_variants: &BTreeMap<Species, String>,
 ) -> SetupError {
     let looked: Vec<String> = directories.iter().map(|path| path.display().to_string()).collect();
     let reason = format!(
         "no setup {} (or .gz) in {}: install GPAW's setups, or name their directory in `pseudopotentials`",
-        name(species, variants),
+        name(species, pseudopotential_variants),
         looked.join(", ")
     );
     SetupError::Pseudopotential { species, reason }
 }
 
 /// `Si.PBE`, or with a variant `Ni.10.PBE`.
-pub(super) fn name(species: Species, variants: &BTreeMap<Species, String>) -> String {
-    match variants.get(&species) {
+pub(super) fn name(species: Species, pseudopotential_variants: &BTreeMap<Species, String>) -> String {
+    match pseudopotential_variants.get(&species) {
         Some(variant) => format!("{species}.{variant}.PBE"),
         None => format!("{species}.PBE"),
     }

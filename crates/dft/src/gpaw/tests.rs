@@ -84,9 +84,9 @@ fn calculations_read_copies_of_what_was_hashed() {
     let before =
         "<atom symbol=\"Si\" valence=\"4\"/>\n<xc_functional type=\"GGA\" name=\"PBE\"/>\n<!-- 1 -->";
     std::fs::write(&file, before).unwrap();
-    let variants = BTreeMap::from([("Si".parse().unwrap(), "mine".to_owned())]);
-    let setups = setups::find(&[directory.path().to_owned()], &variants).unwrap();
-    let code = Gpaw { setups, ..gpaw(Settings { variants, ..Settings::default() }) };
+    let pseudopotential_variants = BTreeMap::from([("Si".parse().unwrap(), "mine".to_owned())]);
+    let setups = setups::find(&[directory.path().to_owned()], &pseudopotential_variants).unwrap();
+    let code = Gpaw { setups, ..gpaw(Settings { pseudopotential_variants, ..Settings::default() }) };
     assert_eq!(task(&code, &[])["setups"], json!("../data"));
     let data = code.input(&silicon(), &BTreeSet::new()).unwrap().data;
     // Under the name that GPAW looks for.

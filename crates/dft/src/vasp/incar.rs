@@ -102,8 +102,8 @@ pub(super) fn incar(settings: &Settings, moments: &[f64], adjustments: &BTreeSet
         }
     }
     // Each group of processes with its own k-points holds a copy of all data not distributed by k-points.
-    let k_groups = if has(RetryAdjustment::MoreMemory) { 1 } else { settings.k_groups };
-    lines.extend([("KPAR", k_groups.to_string()), ("NCORE", settings.cores_per_band.to_string())]);
+    let kpar = if has(RetryAdjustment::MoreMemory) { 1 } else { settings.kpar };
+    lines.extend([("KPAR", kpar.to_string()), ("NCORE", settings.ncore.to_string())]);
     let further = settings.tags.iter().map(|(tag, value)| (tag.as_str(), value.clone()));
     lines.into_iter().chain(further).fold(String::new(), |mut text, (tag, value)| {
         // Writing to a string does not fail.
@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     fn lines(moments: &[f64], adjustments: &[RetryAdjustment]) -> BTreeSet<String> {
-        let settings = Settings { k_groups: 4, ..Settings::default() };
+        let settings = Settings { kpar: 4, ..Settings::default() };
         incar(&settings, moments, &adjustments.iter().copied().collect()).lines().map(str::to_owned).collect()
     }
 

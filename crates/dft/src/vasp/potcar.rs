@@ -88,7 +88,11 @@ fn missing(directory: &Path, candidates: &[PathBuf], species: Species) -> String
     there.sort();
     let there = match there.is_empty() {
         true => format!("{} has no POTCAR of {species}", directory.display()),
-        false => format!("{} has {}; choose one in `variants`", directory.display(), there.join(", ")),
+        false => format!(
+            "{} has {}; choose one in `pseudopotential_variants`",
+            directory.display(),
+            there.join(", ")
+        ),
     };
     format!("none of {} exists; {there}", sought.join(", "))
 }
@@ -131,7 +135,7 @@ mod tests {
         }
         let message = Potcar::find(directory.path(), aluminium(), "Al").unwrap_err().to_string();
         assert!(message.contains("/Al/POTCAR"), "{message}");
-        assert!(message.ends_with("has Al_GW, Al_pv; choose one in `variants`"), "{message}");
+        assert!(message.ends_with("has Al_GW, Al_pv; choose one in `pseudopotential_variants`"), "{message}");
         let nowhere = Potcar::find(Path::new("/no/such/place"), aluminium(), "Al").unwrap_err().to_string();
         assert!(nowhere.ends_with("/no/such/place has no POTCAR of Al"), "{nowhere}");
     }

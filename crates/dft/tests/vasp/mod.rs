@@ -84,7 +84,10 @@ fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
         command: vec!["sh".to_owned()],
         version: version.to_owned(),
         pseudopotentials: directory.to_owned(),
-        variants: elements.iter().map(|element| (element.parse().unwrap(), (*element).to_owned())).collect(),
+        pseudopotential_variants: elements
+            .iter()
+            .map(|element| (element.parse().unwrap(), (*element).to_owned()))
+            .collect(),
         ..Settings::default()
     }
 }

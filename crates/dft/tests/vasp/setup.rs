@@ -32,7 +32,7 @@ fn the_identity_holds_what_changes_a_label() {
         identity(&settings) == identity(&first)
     };
     assert!(same(&|settings| settings.steps = 7));
-    assert!(same(&|settings| settings.k_groups = 4));
+    assert!(same(&|settings| settings.kpar = 4));
     assert!(same(&|settings| settings.command.push("-x".to_owned())));
     assert!(!same(&|settings| settings.version = "5.4".to_owned()));
     assert!(!same(&|settings| settings.cutoff = 520.0));
@@ -84,7 +84,7 @@ fn what_is_missing_is_named() {
         other => panic!("{other}"),
     };
     assert_eq!(key(fault(&|settings| settings.version.clear())), "version");
-    assert_eq!(key(fault(&|settings| settings.variants.clear())), "variants");
+    assert_eq!(key(fault(&|settings| settings.pseudopotential_variants.clear())), "pseudopotential_variants");
     assert_eq!(key(fault(&|settings| settings.pseudopotentials = "".into())), "pseudopotentials");
     assert_eq!(key(fault(&|settings| settings.command.clear())), "command");
     assert_eq!(key(fault(&|settings| settings.cutoff = f64::NAN)), "cutoff");
@@ -92,8 +92,10 @@ fn what_is_missing_is_named() {
     assert_eq!(key(fault(&|settings| drop(settings.tags.insert("NSW".into(), "1".into())))), "tags");
     let program = fault(&|settings| settings.command = vec!["no-such-vasp".to_owned()]);
     assert!(matches!(program, SetupError::Program { .. }), "{program}");
-    let missing =
-        fault(&|settings| drop(settings.variants.insert("Fe".parse().unwrap(), "Fe_pv".into()))).to_string();
+    let missing = fault(&|settings| {
+        drop(settings.pseudopotential_variants.insert("Fe".parse().unwrap(), "Fe_pv".into()))
+    })
+    .to_string();
     assert!(missing.contains(home.path().join("Fe_pv/POTCAR").to_str().unwrap()), "{missing}");
     let elsewhere =
         fault(&|settings| settings.pseudopotentials = Path::new("/no/such/place").into()).to_string();

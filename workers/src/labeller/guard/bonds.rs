@@ -54,7 +54,7 @@ pub(super) fn too_short(structure: &Structure, shortest: &BTreeMap<Pair, f64>) -
             let length = norm(neighbour.displacement(structure, i));
             if let Some(least) = shortest.get(&pair).filter(|least| length < **least) {
                 return Some(format!(
-                    "atoms {i} and {} are {length:.3} Å apart, where label.guard.shortest_bond of {pair} is {least}",
+                    "atoms {i} and {} are {length:.3} Å apart, where label.guard.min_bond_lengths of {pair} is {least}",
                     neighbour.atom
                 ));
             }

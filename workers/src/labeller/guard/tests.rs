@@ -38,33 +38,33 @@ fn unset_limits_refuse_nothing() {
 #[test]
 fn bond_limits_apply_per_pair_and_across_the_boundary() {
     let apart = box_of(9.0, 9.0, 9.0);
-    assert!(refused(r#"{ "shortest_bond": { "O-Si": 2.01 } }"#, &apart));
-    assert!(refused(r#"{ "shortest_bond": { "Si-O": 2.01 } }"#, &apart));
-    assert!(!refused(r#"{ "shortest_bond": { "Si-O": 1.99, "Si-Si": 8.0, "O-O": 8.9 } }"#, &apart));
+    assert!(refused(r#"{ "min_bond_lengths": { "O-Si": 2.01 } }"#, &apart));
+    assert!(refused(r#"{ "min_bond_lengths": { "Si-O": 2.01 } }"#, &apart));
+    assert!(!refused(r#"{ "min_bond_lengths": { "Si-O": 1.99, "Si-Si": 8.0, "O-O": 8.9 } }"#, &apart));
     // 1.5 Å through the boundary, and an atom to its own image.
-    assert!(refused(r#"{ "shortest_bond": { "Si-O": 1.6 } }"#, &box_of(3.5, 9.0, 9.0)));
-    assert!(refused(r#"{ "shortest_bond": { "O-O": 3.6 } }"#, &box_of(3.5, 9.0, 9.0)));
-    let reason = guard(r#"{ "shortest_bond": { "Si-O": 2.5 } }"#).refuses(&apart).unwrap();
+    assert!(refused(r#"{ "min_bond_lengths": { "Si-O": 1.6 } }"#, &box_of(3.5, 9.0, 9.0)));
+    assert!(refused(r#"{ "min_bond_lengths": { "O-O": 3.6 } }"#, &box_of(3.5, 9.0, 9.0)));
+    let reason = guard(r#"{ "min_bond_lengths": { "Si-O": 2.5 } }"#).refuses(&apart).unwrap();
     assert!(reason.contains("2.000 Å") && reason.contains("O-Si is 2.5"), "{reason}");
-    assert!(serde_json::from_str::<LabelGuard>(r#"{ "shortest_bond": { "Si": 2.0 } }"#).is_err());
+    assert!(serde_json::from_str::<LabelGuard>(r#"{ "min_bond_lengths": { "Si": 2.0 } }"#).is_err());
 }
 
 #[test]
 fn cell_shapes_have_limits() {
     let long = box_of(4.0, 5.0, 12.0);
-    assert!(refused(r#"{ "least_height": 4.1 }"#, &long) && !refused(r#"{ "least_height": 3.9 }"#, &long));
-    assert!(refused(r#"{ "largest_edge_ratio": 2.9 }"#, &long));
-    assert!(!refused(r#"{ "largest_edge_ratio": 3.1 }"#, &long));
+    assert!(refused(r#"{ "min_height": 4.1 }"#, &long) && !refused(r#"{ "min_height": 3.9 }"#, &long));
+    assert!(refused(r#"{ "max_edge_ratio": 2.9 }"#, &long));
+    assert!(!refused(r#"{ "max_edge_ratio": 3.1 }"#, &long));
     // 45° and 135° are equivalent.
     for x in [5.0, -5.0] {
         let sheared = structure([[6.0, 0.0, 0.0], [x, 5.0, 0.0], [0.0, 0.0, 6.0]]);
-        assert!(refused(r#"{ "least_angle": 46 }"#, &sheared), "{x}");
-        assert!(!refused(r#"{ "least_angle": 44 }"#, &sheared), "{x}");
-        assert!(refused(r#"{ "least_height": 4.3 }"#, &sheared), "6 sin 45° = 4.24 Å");
+        assert!(refused(r#"{ "min_angle": 46 }"#, &sheared), "{x}");
+        assert!(!refused(r#"{ "min_angle": 44 }"#, &sheared), "{x}");
+        assert!(refused(r#"{ "min_height": 4.3 }"#, &sheared), "6 sin 45° = 4.24 Å");
     }
     // Non-periodic directions have no shape.
     let slab = Structure { periodic: [true, true, false], ..long };
-    assert!(!refused(r#"{ "largest_edge_ratio": 2.9, "least_volume": 1e6 }"#, &slab));
+    assert!(!refused(r#"{ "max_edge_ratio": 2.9, "min_volume_per_atom": 1e6 }"#, &slab));
 }
 
 #[test]
@@ -72,12 +72,12 @@ fn volumes_and_atom_counts_have_limits() {
     // 60 Å³ for two atoms.
     let structure = box_of(3.0, 4.0, 5.0);
     for (text, expected) in [
-        (r#"{ "least_volume": 30.1 }"#, true),
-        (r#"{ "least_volume": 29.9 }"#, false),
-        (r#"{ "largest_volume": 29.9 }"#, true),
-        (r#"{ "largest_volume": 30.1 }"#, false),
-        (r#"{ "most_atoms": 1 }"#, true),
-        (r#"{ "most_atoms": 2 }"#, false),
+        (r#"{ "min_volume_per_atom": 30.1 }"#, true),
+        (r#"{ "min_volume_per_atom": 29.9 }"#, false),
+        (r#"{ "max_volume_per_atom": 29.9 }"#, true),
+        (r#"{ "max_volume_per_atom": 30.1 }"#, false),
+        (r#"{ "max_atoms": 1 }"#, true),
+        (r#"{ "max_atoms": 2 }"#, false),
     ] {
         assert_eq!(refused(text, &structure), expected, "{text}");
     }
@@ -86,10 +86,10 @@ fn volumes_and_atom_counts_have_limits() {
 #[test]
 fn impossible_limits_are_rejected() {
     for (text, key) in [
-        (r#"{ "shortest_bond": { "Si-O": -1.0 } }"#, "label.guard.shortest_bond"),
-        (r#"{ "least_angle": 91 }"#, "label.guard.least_angle"),
-        (r#"{ "near_duplicate": 1.5 }"#, "label.guard.near_duplicate"),
-        (r#"{ "largest_cost": 0 }"#, "label.guard.largest_cost"),
+        (r#"{ "min_bond_lengths": { "Si-O": -1.0 } }"#, "label.guard.min_bond_lengths"),
+        (r#"{ "min_angle": 91 }"#, "label.guard.min_angle"),
+        (r#"{ "duplicate_tolerance": 1.5 }"#, "label.guard.duplicate_tolerance"),
+        (r#"{ "max_cost": 0 }"#, "label.guard.max_cost"),
     ] {
         assert_eq!(guard(text).fault().unwrap().0, key);
     }

@@ -66,7 +66,7 @@ fn non_finite_numbers_and_wrong_counts_are_rejected() {
 fn results_out_of_bounds_are_rejected() {
     for energy in [1e300, -1e300] {
         let expected = format!(
-            "an energy of {:.3e} eV/atom, beyond label.largest_energy = 2000000 eV/atom",
+            "an energy of {:.3e} eV/atom, beyond label.max_energy_per_atom = 2000000 eV/atom",
             energy / 2.0
         );
         assert_eq!(said(|made| made.energy = energy, None), expected);
@@ -77,10 +77,10 @@ fn results_out_of_bounds_are_rejected() {
     let stress = said(|made| made.stress.as_mut().unwrap()[1][2] = -15.5, None);
     assert_eq!(
         stress,
-        "a stress component of -15.5 eV/Å³ (-2483.37 GPa), beyond label.largest_stress = 10 eV/Å³"
+        "a stress component of -15.5 eV/Å³ (-2483.37 GPa), beyond label.max_stress = 10 eV/Å³"
     );
     let force = said(|made| made.forces[1] = [0.0, -1200.0, 1600.0], None);
-    assert_eq!(force, "a force of 2000 eV/Å, beyond label.largest_force = 1000 eV/Å");
+    assert_eq!(force, "a force of 2000 eV/Å, beyond label.max_force = 1000 eV/Å");
 }
 
 #[test]
@@ -95,7 +95,7 @@ fn an_energy_is_compared_once_enough_labels_support_it() {
         message.starts_with("an energy that differs by 49999.99 eV/atom from the potential's"),
         "{message}"
     );
-    let end = "from 5 labels, taken out), beyond label.largest_energy_difference = 100 eV/atom";
+    let end = "from 5 labels, taken out), beyond label.max_energy_difference_per_atom = 100 eV/atom";
     assert!(message.ends_with(end), "{message}");
     // Bad labels that were accepted do not move the offsets.
     let spoilt = offsets(5, &[1e5, -1e300]);
