@@ -160,7 +160,7 @@ fn with_setup(home: &Path) -> LabelCampaign {
     let command = ["sh".to_owned(), home.join("gpaw.sh").display().to_string()];
     let keys = format!(
         "[label]\nslots = 0\nscratch = {scratch:?}\nkeep = \"all\"\nmethod = {{ gpaw = {{ command = {command:?}, \
-         pseudopotentials = {scratch:?}, spin = false }} }} # ",
+         pseudopotentials = {scratch:?}, spin_polarized = false }} }} # ",
         scratch = home.display().to_string()
     );
     LabelCampaign::new(&Small { walkers: 1, steps: 120, ..Small::default() }, &[("[label]\nmethod", &keys)])
