@@ -100,7 +100,7 @@ fn processor_time() -> Duration {
 }
 
 fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
-    let rule = "rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nleast = 3\n";
+    let rule = "rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3\n";
     let settings = Settings {
         mode,
         walks_per_round: seeds().len(),
@@ -139,7 +139,7 @@ fn walk_settings() -> WalkSettings {
         bias_averaging_steps: 10,
         volume_ramp: Some((1.0, 1.4)),
         skin: 0.5,
-        collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nleast = 3")
+        collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),
         gap: 200,
         min_interval_after_decline: 20,

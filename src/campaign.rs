@@ -181,7 +181,7 @@ impl Campaign {
         let seed = |named: &SourcedStructure| {
             format!("{} {}", named.seed.name, ContentHash::from_structure(&named.seed.structure))
         };
-        value["seeds"] = self.seed_structures.iter().map(seed).collect();
+        value["seed_structures"] = self.seed_structures.iter().map(seed).collect();
         value
     }
 

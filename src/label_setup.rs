@@ -57,16 +57,10 @@ struct EffectiveConfig {
 
 #[derive(Deserialize)]
 struct LabelLimits {
-    attempts: u32,
+    max_attempts: u32,
     #[serde(flatten)]
     bounds: LabelBounds,
-    /// Campaigns of earlier versions have no lease.
-    #[serde(default = "default_lease")]
-    lease: u32,
-}
-
-fn default_lease() -> u32 {
-    600
+    lease_timeout: crate::duration::Duration,
 }
 
 /// The protocol with these settings. Its hash is that of the settings.
@@ -131,7 +125,7 @@ impl LabelSetup {
     /// Reads the setup of `protocol`, which is in force, and locates on this host what the method needs.
     pub async fn read(store: &Store, protocol: Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
         let text = store.campaign().await?.configuration_in_force;
-        let EffectiveConfig { label: LabelLimits { attempts, bounds, lease } } =
+        let EffectiveConfig { label: LabelLimits { max_attempts: attempts, bounds, lease_timeout } } =
             serde_json::from_str(&text).map_err(unreadable)?;
         let noted = store.metadata(LABEL_METHOD_KEY).await?.ok_or_else(|| {
             Failure::Failed(
@@ -149,7 +143,7 @@ impl LabelSetup {
             )));
         }
         let method = noted.for_this_host(&protocol, here)?;
-        let lease = Duration::from_secs(lease.into());
+        let lease = lease_timeout.get();
         Ok(Self { method, protocol, attempts, bounds, lease })
     }
 }

@@ -86,7 +86,7 @@ fn as_many_structures_are_collected_as_there_may_be_labels_for() {
     let by_budget = ("budget".to_owned(), "budget.labels".to_owned());
     assert!(walks(&ended).contains(&by_budget), "{ended}");
     let shown = succeed(here, ["status", "here"]);
-    assert!(shown.contains("state       finished, since budget.labels is used up"), "{shown}");
+    assert!(shown.contains("state       finished: budget.labels is used up"), "{shown}");
     // The same for another number of walkers.
     let other = write(&Small { walkers: 1, ..small.clone() }, "[budget]\nlabels = 5\n");
     succeed(other.path(), RUN);
@@ -159,7 +159,7 @@ fn labels_beyond_the_core_hours_are_not_begun() {
 fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
     let directory = write(&Small { mode: "live", steps: 2000, ..Small::default() }, "");
     let here = directory.path();
-    change(here, "[run]", "queue_limit = 4\nqueue_full = \"raise\"\n[run]");
+    change(here, "[run]", "queue_limit = 4\non_queue_full = \"raise\"\n[run]");
     let run = program(here).args(RUN).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let mut run = Running(run);
     // While nobody makes labels the queue only grows.

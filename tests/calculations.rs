@@ -46,7 +46,7 @@ impl Random {
 fn place(scratch: &Path) -> LabelCampaign {
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
     let keys = format!(
-        "[label]\nslots = 0\nattempts = 20\nscratch = {:?}\nmethod = {command} # ",
+        "[label]\nconcurrency = 0\nmax_attempts = 20\nscratch = {:?}\nmethod = {command} # ",
         scratch.display().to_string()
     );
     let small = Small { walkers: 1, steps: 120, ..Small::default() };
@@ -159,7 +159,7 @@ fn with_setup(home: &Path) -> LabelCampaign {
     fs::write(home.join("gpaw.sh"), GPAW).unwrap();
     let command = ["sh".to_owned(), home.join("gpaw.sh").display().to_string()];
     let keys = format!(
-        "[label]\nslots = 0\nscratch = {scratch:?}\nkeep = \"all\"\nmethod = {{ gpaw = {{ command = {command:?}, \
+        "[label]\nconcurrency = 0\nscratch = {scratch:?}\nkeep_directories = \"all\"\nmethod = {{ gpaw = {{ command = {command:?}, \
          pseudopotentials = {scratch:?}, spin_polarized = false }} }} # ",
         scratch = home.display().to_string()
     );

@@ -75,7 +75,7 @@ fn score_golden(model: &str, artifact: bool) {
         arguments.extend(["--artifact", gmm.to_str().unwrap()]);
     }
     let printed = succeed(here, arguments);
-    assert_eq!(printed, format!("graded {} structures into out.extxyz\n", frames.len()));
+    assert_eq!(printed, format!("wrote {} structures with grades to out.extxyz\n", frames.len()));
 
     let scored = read_extxyz(&here.join("out.extxyz")).unwrap();
     assert_eq!(scored.len(), frames.len());

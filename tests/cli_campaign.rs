@@ -121,7 +121,7 @@ fn a_finished_campaign_is_shown() {
 
     assert!(
         refuse(here, ["queue", "small", "show", "zzz"])
-            .contains("no label job belongs to 'zzz'; near it are")
+            .contains("no label job belongs to 'zzz'; similar names: ")
     );
     assert!(refuse(here, ["queue", "small", "drop", id]).contains("its label job is labelled"));
     assert!(refuse(here, ["queue", "small", "show", "0."]).contains("give a longer prefix"));

@@ -154,11 +154,11 @@ fn the_foundation_expansion_runs_once_its_files_are_there() {
         fs::copy(config(from), place).unwrap();
     }
     succeed(here, ["validate", "campaign.toml"]);
-    assert!(text.contains("\nsteps = 15000") && text.contains("\n# equilibration_steps = 500"));
+    assert!(text.contains("\nbiased_steps = 15000") && text.contains("\n# equilibration_steps = 500"));
     let short = text.replace("\nsteps = 15000", "\nsteps = 200");
     fs::write(
         here.join("campaign.toml"),
-        short.replace("\n# equilibration_steps = 500", "\nequilibration = 20"),
+        short.replace("\n# equilibration_steps = 500", "\nequilibration_steps = 20"),
     )
     .unwrap();
     let summary = succeed(here, ["run", "campaign.toml"]);

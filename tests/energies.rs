@@ -41,7 +41,7 @@ fn labelled_with(energy: &str, keys: &str) -> TempDir {
     let text = fs::read_to_string(&path).unwrap();
     let method =
         "{ command = { command = [\"sh\", \"label.sh\"], files = [\"label.sh\"], version = \"1\" } }";
-    let label = format!("[label]\nattempts = 1\n{keys}\nmethod = {method} # ");
+    let label = format!("[label]\nmax_attempts = 1\n{keys}\nmethod = {method} # ");
     fs::write(path, text.replacen("[label]\nmethod = ", &label, 1)).unwrap();
     fs::write(directory.path().join("label.sh"), SCRIPT.replace("ENERGY", energy)).unwrap();
     succeed(directory.path(), ["run", "campaign.toml", "--directory", "here"]);

@@ -107,7 +107,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     // The same campaign, in which a third of the labels is not believed.
     let limit = forces[forces.len() * 2 / 3];
     let text = fs::read_to_string(&config).unwrap();
-    let text = text.replace("[label]", &format!("[label]\nlargest_force = {limit}\nattempts = 1"));
+    let text = text.replace("[label]", &format!("[label]\nmax_force = {limit}\nmax_attempts = 1"));
     fs::write(here.join("strict.toml"), text).unwrap();
     let summary = succeed(here, ["run", "strict.toml", "--directory", "strict"]);
     let (kept, lost): (Vec<_>, Vec<_>) = rows.iter().partition(|row| max_force(row) <= limit);
@@ -167,7 +167,7 @@ fn labels_that_wait_have_a_price_as_soon_as_one_was_made() {
     let here = directory.path();
     let config = Small::default().write(here);
     let text = fs::read_to_string(&config).unwrap();
-    fs::write(&config, text.replace("[label]", "[label]\nslots = 0")).unwrap();
+    fs::write(&config, text.replace("[label]", "[label]\nconcurrency = 0")).unwrap();
     let _run = common::Running(common::program(here).args(["run", "campaign.toml"]).spawn().unwrap());
     let queued = || json(here, ["status", "campaign"])["labels"]["queued"].as_u64().unwrap_or(0);
     common::processes::wait_until("all is collected", || {

@@ -68,7 +68,8 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     let line = listed.lines().find(|line| line.starts_with(bad)).unwrap();
     assert!(line.contains("labelled, excluded") && listed.matches("excluded").count() == 1, "{listed}");
     let story = succeed(here, ["explain", "here", bad]);
-    for part in ["excluded from exports and statistics", "by hand: exclude (the SCF loop had two solutions)"]
+    for part in
+        ["excluded from exports and statistics", "by the user: exclude (the SCF loop had two solutions)"]
     {
         assert!(story.contains(part), "{story}");
     }

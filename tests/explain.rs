@@ -184,7 +184,7 @@ fn check_declined(
 
 #[test]
 fn a_story_is_told_in_words_also_of_a_copy_and_of_what_failed() {
-    let directory = campaign(&[("[label]\n", "[label]\nlargest_force = 1e-6\nattempts = 1\n")]);
+    let directory = campaign(&[("[label]\n", "[label]\nmax_force = 1e-6\nmax_attempts = 1\n")]);
     let here = directory.path();
     let contents = contents(here);
     let of_kind = |kind: &str| {

@@ -100,11 +100,8 @@ fn whole_seed_structures_go_to_one_part() {
             let frames = read_extxyz(&path).unwrap();
             let seeds: BTreeSet<_> =
                 frames.iter().map(|frame| text(frame, "seed_structure").to_owned()).collect();
-            let line = format!(
-                "{} structures in out-{part}.extxyz, found from {} of the",
-                frames.len(),
-                seeds.len()
-            );
+            let line =
+                format!("{} structures in out-{part}.extxyz, from {} of the", frames.len(), seeds.len());
             assert!(printed.contains(&line), "{printed}");
             (frames, seeds, fs::read(path).unwrap())
         })

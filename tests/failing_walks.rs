@@ -20,7 +20,7 @@ fn write(here: &Path, all_fail: bool) {
     if all_fail {
         // What a displaced atom lets go is more than such walks may have.
         text = text.replace("temperature = 700.0", "temperature = 1.0");
-        text = text.replace("[guard]", "[guard]\nhighest_temperature = 2.0");
+        text = text.replace("[guard]", "[guard]\nmax_temperature = 2.0");
         let mut frames = atoms::read_extxyz(&here.join("seeds.extxyz")).unwrap();
         frames.iter_mut().for_each(|frame| frame.structure.positions[0][0] += 0.3);
         common::write_frames(&here.join("seeds.extxyz"), &frames);
@@ -51,7 +51,7 @@ fn a_campaign_whose_walks_all_diverge_has_failed() {
     assert!(summary.contains("what to change: a smaller walk.time_step"), "{summary}");
     // Of three walks or four: they may end together.
     assert!(said.contains("WARNING: ") && said.contains(" finished walks ended early ("), "{said}");
-    assert!(said.contains("the campaign has failed: 4 of 4 walks"), "{said}");
+    assert!(said.contains("the campaign has failed: 4 of 4 finished walks"), "{said}");
 
     let shown = succeed(here, ["status", "campaign"]);
     assert!(shown.contains("4 ended (4 blew up)") && shown.contains("too hot: try a smaller"), "{shown}");

@@ -91,7 +91,7 @@ fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let path = small.write(here);
-    let text = fs::read_to_string(&path).unwrap().replace("[run]", "[run]\nrestarts = 1");
+    let text = fs::read_to_string(&path).unwrap().replace("[run]", "[run]\nmax_restarts = 1");
     fs::write(&path, text).unwrap();
     let script = format!(
         "ulimit -n {LIMIT}; exec {} run campaign.toml --directory . --dashboard 127.0.0.1:0",
@@ -131,7 +131,7 @@ fn who_says_nothing_is_not_listened_to_for_ever() {
     let path = Small::default().write(here);
     let text = fs::read_to_string(&path).unwrap();
     // It waits for labels from elsewhere.
-    fs::write(&path, text.replace("[label]", "[label]\nslots = 0")).unwrap();
+    fs::write(&path, text.replace("[label]", "[label]\nconcurrency = 0")).unwrap();
     let mut command = common::program(here);
     command.args(["run", "campaign.toml", "--dashboard", "127.0.0.1:0"]);
     let mut run = Running(command.stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap());

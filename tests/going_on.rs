@@ -144,9 +144,9 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
     let here = directory.path();
     let before = walks(here);
     assert!(before.iter().all(|walk| walk.0 == "control" || walk.2 == "steps"), "{before:?}");
-    replace(here, "max_per_seed_structure = 4", "max_per_seed_structure = 6\ntotal = 20");
+    replace(here, "max_per_seed_structure = 4", "max_per_seed_structure = 6\nmax_structures = 20");
     replace(here, "walkers = 2", "walkers = 1");
-    replace(here, "[label]", "[label]\nslots = 2");
+    replace(here, "[label]", "[label]\nconcurrency = 2");
     let shown = "configuration: collect.max_per_seed_structure is now 6 (was 4)\n\
                  configuration: collect.max_structures is now 20 (was left out)\n\
                  configuration: label.concurrency is now 2 (was 1)\n\
@@ -183,7 +183,7 @@ fn a_larger_budget_lets_walks_go_on() {
     assert_eq!(resume_processes(here), "configuration: collect.max_per_seed_structure is now 2 (was 1)");
     assert_eq!(accepted(), collected(2));
     // One for all of them: whoever comes first takes what is left.
-    replace(here, "max_per_seed_structure = 2", "max_per_seed_structure = 4\ntotal = 5");
+    replace(here, "max_per_seed_structure = 2", "max_per_seed_structure = 4\nmax_structures = 5");
     resume_processes(here);
     assert_eq!(accepted().iter().map(|walk| walk.2).sum::<u32>(), 5);
 }

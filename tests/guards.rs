@@ -100,7 +100,7 @@ fn a_campaign_has_a_bill_before_it_begins() {
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
     fs::write(
         here.join("less.toml"),
-        text.replace("max_per_seed_structure = 4", "max_per_seed_structure = 4\ntotal = 2"),
+        text.replace("max_per_seed_structure = 4", "max_per_seed_structure = 4\nmax_structures = 2"),
     )
     .unwrap();
     let less = json(here, ["estimate", "less.toml", "--core-seconds", "3600"]);

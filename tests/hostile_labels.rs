@@ -81,8 +81,10 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     // As /tmp is.
     fs::set_permissions(&scratch, Permissions::from_mode(0o1777)).unwrap();
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
-    let keys =
-        format!("[label]\nslots = 0\nscratch = {:?}\nmethod = {command} # ", scratch.display().to_string());
+    let keys = format!(
+        "[label]\nconcurrency = 0\nscratch = {:?}\nmethod = {command} # ",
+        scratch.display().to_string()
+    );
     let small = Small { walkers: 1, steps: 60, ..Small::default() };
     let place = LabelCampaign::new(&small, &[("[label]\nmethod", &keys)]);
     fs::write(place.path().join("label.sh"), script(&home)).unwrap();

@@ -35,7 +35,7 @@ fn with_program(small: &Small, directory: &Path) {
     std::fs::create_dir_all(&scratch).unwrap();
     std::fs::write(directory.join("label.sh"), format!("sleep 0.05\n{WRITE_FIXED_LABEL}")).unwrap();
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
-    let keys = format!("[label]\nattempts = 20\nscratch = {scratch:?}\nmethod = {command} # ");
+    let keys = format!("[label]\nmax_attempts = 20\nscratch = {scratch:?}\nmethod = {command} # ");
     std::fs::write(small.write(directory), small.text().replace("[label]\nmethod", &keys)).unwrap();
 }
 
@@ -175,7 +175,7 @@ fn live_mode_loses_and_doubles_nothing() {
 fn a_stop_while_labels_are_still_made_is_no_end() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let text = Small::default().text().replace("[label]", "[label]\nlargest_force = 1e-6\nattempts = 1");
+    let text = Small::default().text().replace("[label]", "[label]\nmax_force = 1e-6\nmax_attempts = 1");
     std::fs::write(Small::default().write(here), text).unwrap();
     assert_eq!(start(here, &[]).0.wait().unwrap().code(), Some(0));
     let runtime = tokio::runtime::Runtime::new().unwrap();

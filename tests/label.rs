@@ -14,7 +14,7 @@ use crate::common::processes::{
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
 /// `run` starts no labellers of its own.
-const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nslots = 0");
+const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nconcurrency = 0");
 
 fn ended(running: &mut Running) -> Option<i32> {
     running.0.wait().expect("a child").code()
@@ -210,7 +210,7 @@ fn elsewhere(place: &LabelCampaign) -> Option<Command> {
 /// A labeller elsewhere is stopped in mid-label for longer than its lease, and goes on when another has made the label.
 #[test]
 fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
-    let (place, name) = with_large_structure(&[("[label]", "[label]\nlease = 2")]);
+    let (place, name) = with_large_structure(&[("[label]", "[label]\nlease_timeout = \"2s\"")]);
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut late = place.spawn(command, &arguments);
@@ -243,7 +243,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
 /// What this host cannot see it does not take for gone: neither `run` nor another labeller takes the job away.
 #[test]
 fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
-    let (place, name) = with_large_structure(&[("[label]", "[label]\nlease = 60")]);
+    let (place, name) = with_large_structure(&[("[label]", "[label]\nlease_timeout = \"1m\"")]);
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut label = place.spawn(command, &arguments);

@@ -58,7 +58,7 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
     let path = Small::default().write(here);
     let text = fs::read_to_string(&path).unwrap();
     // All is collected, and then it waits for labels from elsewhere.
-    fs::write(&path, text.replace("[label]", "[label]\nslots = 0")).unwrap();
+    fs::write(&path, text.replace("[label]", "[label]\nconcurrency = 0")).unwrap();
     let arguments = ["run", "campaign.toml", "--metrics", "127.0.0.1:0"];
     let run = program(here).args(arguments).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
     let mut run = Running(run);

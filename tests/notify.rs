@@ -76,7 +76,7 @@ fn a_command_that_fails_or_hangs_is_a_line_in_the_log() {
     {
         let directory = tempfile::tempdir().unwrap();
         let here = directory.path();
-        let notify = format!("on = [\"end\"]\ntime_limit = {limit}");
+        let notify = format!("on = [\"end\"]\ntime_limit = \"{limit}s\"");
         write(here, &Small::default(), &notify, ("", ""), last);
         succeed(here, RUN);
         assert_eq!(events(here), ["end"]);
@@ -126,7 +126,7 @@ fn a_mixture_that_forgets_is_spoken_of_once_a_run_and_told_once() {
     let here = directory.path();
     let small = Small { steps: 900, ..Small::default() };
     let low = ("training_frames", "alpha_values = [1.0]\nforgetting_alarm = 0.02\ntraining_frames");
-    write(here, &small, "on = [\"forgetting\"]\nstall = 0.01", low, "exit 0");
+    write(here, &small, "on = [\"forgetting\"]\nstall_timeout = \"600ms\"", low, "exit 0");
     let said = here.join("said");
     let start = || {
         let said = fs::File::create(&said).unwrap();

@@ -149,7 +149,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     with_own_model(&small, here);
-    with_keys(&here.join("campaign.toml"), "restarts = 1");
+    with_keys(&here.join("campaign.toml"), "max_restarts = 1");
     let running = start(here);
     wait_for_work(here);
     // The other does not end the campaign before this one was given up.
@@ -202,7 +202,7 @@ fn without_any_walker_the_campaign_fails_and_can_go_on() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     with_own_model(&small, here);
-    with_keys(&here.join("campaign.toml"), "restarts = 1");
+    with_keys(&here.join("campaign.toml"), "max_restarts = 1");
     let mut running = start(here);
     wait_for_work(here);
     let held = pause_walkers(here, 2);

@@ -130,7 +130,7 @@ fn a_live_campaign_that_went_on_by_other_limits_comes_out_as_it_was() {
     succeed(here, ["import", "here", labelled.to_str().unwrap()]);
     change(
         &here.join("campaign.toml"),
-        &[("max_per_seed_structure = 1", "max_per_seed_structure = 3\ntotal = 5")],
+        &[("max_per_seed_structure = 1", "max_per_seed_structure = 3\nmax_structures = 5")],
     );
     succeed(here, RUN);
     check_exact(here);

@@ -241,7 +241,7 @@ fn a_second_run_of_a_campaign_names_the_first() {
 fn labels_that_fail_do_not_stop_a_campaign() {
     let small = small();
     let directory = written(&small);
-    let text = small.text().replace("[label]", "[label]\nlargest_force = 1e-6\nattempts = 2");
+    let text = small.text().replace("[label]", "[label]\nmax_force = 1e-6\nmax_attempts = 2");
     fs::write(directory.path().join("campaign.toml"), text).unwrap();
     let summary = succeed(directory.path(), RUN);
     assert!(summary.contains("labels           0 biased and 0 control structures labelled"), "{summary}");

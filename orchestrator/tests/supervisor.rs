@@ -223,10 +223,7 @@ fn a_child_that_cannot_be_started_counts_as_failed() {
     let mut supervisor = started(1);
     let reason = ExitReason::StartFailed { reason: "no such program".to_owned(), is_shortage: false };
     let ended = supervisor.ended(0, reason.clone(), s(0)).unwrap();
-    assert_eq!(
-        ended,
-        ChildExit { incarnation: 1, reason: reason, then: ChildState::BackingOff { left: s(1) } }
-    );
+    assert_eq!(ended, ChildExit { incarnation: 1, reason, then: ChildState::BackingOff { left: s(1) } });
     assert_eq!(supervisor.due_actions(s(1)), [start(0, 2)]);
 }
 

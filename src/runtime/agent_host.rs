@@ -48,7 +48,7 @@ pub async fn run(
         joined = join(address, tls, agent, directory) => joined?,
         () = stop.notified() => return Ok(ExitStatus::Interrupted),
         () = address.wait_until_over() => {
-            log_and_print("the campaign is wait_until_over");
+            log_and_print("the campaign is over");
             return Ok(ExitStatus::Done);
         }
         () = tokio::time::sleep(patience) => {

@@ -10,7 +10,7 @@ use super::succeed;
 /// Writes the report of the campaign in `campaign` twice, and compares it with the output of other commands.
 pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     let said = succeed(here, ["report", campaign, "-o", "one/report"]);
-    assert!(said.starts_with("one/report/report.html and "), "{said}");
+    assert!(said.starts_with("wrote one/report/report.html and "), "{said}");
     succeed(here, ["store", "backup", campaign, "copy-for-report"]);
     succeed(here, ["report", "copy-for-report", "-o", "two"]);
     let read = |path: &str| fs::read(here.join("one/report").join(path)).expect("a file of the report");

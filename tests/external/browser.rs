@@ -25,7 +25,7 @@ fn campaign(here: &Path) -> (Running, String, String) {
     let path = Small::default().write(here);
     let text = fs::read_to_string(&path).unwrap();
     // Walkers wait then for ever, and walks stay under way.
-    fs::write(&path, text.replace("[label]", "[label]\nslots = 0\nqueue_limit = 4")).unwrap();
+    fs::write(&path, text.replace("[label]", "[label]\nconcurrency = 0\nqueue_limit = 4")).unwrap();
     // What a campaign says is text, whatever it looks like.
     let seeds = fs::read_to_string(here.join("seeds.extxyz")).unwrap();
     fs::write(here.join("seeds.extxyz"), seeds.replace("name=vacancy", "name=\"<b>vacancy</b>\"")).unwrap();

@@ -69,7 +69,7 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
     let text = text
         .replace("\"data/", &data)
         .replace("# max_per_seed_structure = 3 ", "max_per_seed_structure = 1 ");
-    let label = format!("[label]\nscratch = \"{}\"\nattempts = 20", scratch.display());
+    let label = format!("[label]\nscratch = \"{}\"\nmax_attempts = 20", scratch.display());
     fs::write(here.join("campaign.toml"), text.replace("[label]", &label)).unwrap();
     let mut run = program(here)
         .args(["run", "campaign.toml"])

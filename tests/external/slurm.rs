@@ -57,7 +57,7 @@ impl OnSlurm {
         small.write(home.path());
         let options = vec![format!("--agents={agents}"), "--".into(), format!("--nodelist={}", this_node())];
         let campaign = Self { home, location: ".".into(), options, _node };
-        campaign.changed("[run]\n", "[run]\nagent_silence_limit = 2\n");
+        campaign.changed("[run]\n", "[run]\nagent_heartbeat_timeout = \"2s\"\n");
         campaign
     }
 
@@ -69,7 +69,7 @@ impl OnSlurm {
         campaign.location =
             format!("{server}?schema=slurm_{}_{}", std::process::id(), store::unix_milliseconds());
         campaign.changed("[run]\n", &format!("[run]\nstore = \"{}\"\n", campaign.location));
-        campaign.changed("[label]\n", "[label]\nslots = 0\n");
+        campaign.changed("[label]\n", "[label]\nconcurrency = 0\n");
         campaign.options.insert(1, format!("--labellers={labellers}"));
         campaign
     }
@@ -78,7 +78,7 @@ impl OnSlurm {
     /// and nobody makes any.
     fn unlabelled(small: &Small, agents: u32) -> Self {
         let campaign = Self::new(small, agents);
-        campaign.changed("[label]\n", "[label]\nslots = 0\nqueue_limit = 4\n");
+        campaign.changed("[label]\n", "[label]\nconcurrency = 0\nqueue_limit = 4\n");
         campaign
     }
 

@@ -116,7 +116,7 @@ fn endless() -> (LabelCampaign, Running) {
 
 /// A campaign whose walks are over and whose structures wait for labels that nobody makes.
 fn waiting() -> LabelCampaign {
-    let place = LabelCampaign::new(&Small::default(), &[("[label]", "[label]\nslots = 0")]);
+    let place = LabelCampaign::new(&Small::default(), &[("[label]", "[label]\nconcurrency = 0")]);
     let mut run = place.run();
     let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
     wait_until("every walk is over", || {

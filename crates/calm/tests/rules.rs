@@ -37,7 +37,8 @@ fn the_papers_values_are_the_defaults() {
 
 #[test]
 fn configurations_survive_a_round_trip() {
-    for text in ["rule = 'maximum_grade'\nthreshold = 2.0", "rule = 'atom_count'\nfraction = 1.0\nleast = 7"]
+    for text in
+        ["rule = 'maximum_grade'\nthreshold = 2.0", "rule = 'atom_count'\nfraction = 1.0\nmin_atoms = 7"]
     {
         let rule = collection(text);
         assert_eq!(collection(&toml::to_string(&rule).unwrap()), rule);
@@ -56,7 +57,7 @@ fn nonsense_is_refused() {
         ("rule = 'maximum_grade'\nthreshold = nan", "finite"),
         ("rule = 'maximum_grade'\nfraction = 0.5", "unknown field `fraction`"),
         ("rule = 'atom_count'\nfraction = 1.5", "not above 1"),
-        ("rule = 'atom_count'\nleast = 0", "nonzero"),
+        ("rule = 'atom_count'\nmin_atoms = 0", "nonzero"),
         ("rule = 'most'", "unknown variant"),
     ] {
         let error = toml::from_str::<CollectionRule>(text).unwrap_err().to_string();
@@ -152,7 +153,7 @@ fn the_count_rule_falls_back_twice() {
     // Three atoms at r in one direction: γ² = r² / (1 − α + α r²), as for a single one.
     let features = |radius: f64| [[radius, 0.0]; 3].concat();
     let run = |radius: f64, text: &str| {
-        let text = format!("alpha_values = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
+        let text = format!("ladder = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
         update(&round(), &[0; 3], &features(radius), &settings(&text)).unwrap()
     };
     // 2 / √(1 + 3·0.4) = 1.35; 1 at α = 1.

@@ -48,7 +48,7 @@ async fn waiting_for_a_lock_is_not_reported_as_an_unreachable_server() {
     let commits: Vec<_> = commits.collect();
     tokio::time::sleep(Duration::from_secs(1)).await;
     let error = store.add_running_time(1).await.unwrap_err();
-    assert!(error.is_transient() && error.to_string().contains("locked"), "{error}");
+    assert!(error.is_transient() && error.to_string().contains("for locks"), "{error}");
     other.execute("ROLLBACK").await.unwrap();
     for commit in commits {
         commit.await.unwrap().unwrap();

@@ -40,7 +40,8 @@ impl Linked {
     }
 
     fn with_cable(cable: Cable, heartbeat_timeout: f64, patience: f64) -> Self {
-        let mut hosts = Hosts::new(&small(), 1, &format!("agent_heartbeat_timeout = {heartbeat_timeout}"));
+        let mut hosts =
+            Hosts::new(&small(), 1, &format!("agent_heartbeat_timeout = \"{heartbeat_timeout}s\""));
         hosts.through = cable.through();
         hosts.endpoints = ["0.0.0.0", HEAD].map(|address| format!("tcp/{address}:7447"));
         let certificates = hosts.home.path().join("certificates");
@@ -166,9 +167,9 @@ fn one_way() {
     for (comes_in, leaves) in [(Some(all), None), (None, Some(all))] {
         let said = |words| linked.hosts.said(0).matches(words).count();
         let back = said("the orchestrator answers again");
-        let waits = said("1 of 1 walkers wait");
+        let waits = said("1 of 1 walkers idle");
         linked.cable.drop_where(comes_in, leaves);
-        wait_until("the walker waits", || said("1 of 1 walkers wait") > waits);
+        wait_until("the walker waits", || said("1 of 1 walkers idle") > waits);
         linked.cable.drop_where(None, None);
         wait_until("the orchestrator is heard again", || said("the orchestrator answers again") > back);
     }

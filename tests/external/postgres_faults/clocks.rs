@@ -36,7 +36,8 @@ fn clocks(place: &LabelCampaign) -> [Clock; 2] {
 #[test]
 fn labellers_with_wrong_clocks_label_everything_once() {
     let small = Small { steps: 1600, max_per_seed_structure: 12, ..Small::default() };
-    let place = LabelCampaign::on_server(&small, &[("[label]", "[label]\nslots = 0\nlease = 2")]);
+    let place =
+        LabelCampaign::on_server(&small, &[("[label]", "[label]\nconcurrency = 0\nlease_timeout = \"2s\"")]);
     let mut run = place.run();
     wait_until("there is a campaign", || place.jobs("queued") > 0);
     let clocks = clocks(&place);
@@ -65,7 +66,7 @@ fn labellers_with_wrong_clocks_label_everything_once() {
 #[test]
 fn a_lease_lasts_however_late_others_think_it_is() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = LabelCampaign::on_server(&small, &[("[label]", "[label]\nlease = 60")]);
+    let place = LabelCampaign::on_server(&small, &[("[label]", "[label]\nlease_timeout = \"1m\"")]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
     let name = place.queue_large();
     let [ahead, behind] = clocks(&place);

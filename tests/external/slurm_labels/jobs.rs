@@ -50,7 +50,7 @@ impl Jobs {
         let command =
             format!(r#"{{ command = {{ command = {command}, files = ["label.sh"], version = "1" }} }}"#);
         let keys = format!(
-            "[label]\n{keys}\nslots = 0\nscratch = {:?}\nmethod = {command} # ",
+            "[label]\n{keys}\nconcurrency = 0\nscratch = {:?}\nmethod = {command} # ",
             scratch.display().to_string()
         );
         let small = Small { walkers: 1, steps: 120, ..Small::default() };

@@ -110,7 +110,7 @@ fn a_command_that_uses_ase_gives_the_same_but_for_the_digits_of_its_file() {
         files: vec![path],
         version: "EMT".to_owned(),
     };
-    let found = run(&settings.prepare(&PassedEnvironment::default()).unwrap(), &alloy(), &[]).unwrap();
+    let found = run(&settings.prepare().unwrap(), &alloy(), &[]).unwrap();
     let expected = run(&prepared(EMT), &alloy(), &[]).unwrap();
     let numbers = |label: &Results| {
         let energies = [label.energy, label.energy_without_smearing.unwrap()];
