@@ -128,7 +128,7 @@ fn whole_seed_structures_go_to_one_part() {
     assert!(high_seeds.is_subset(&train_seeds));
     let many = "a=0.2,b=0.2,c=0.2,d=0.2,e=0.1,f=0.1";
     let message = refuse(here, ["export", "here", "--output", "out.extxyz", "--split", many]);
-    assert!(message.contains("6 parts and 5 seed structures"), "{message}");
+    assert!(message.contains("5 seed structures into 6 parts"), "{message}");
     let message = refuse(here, ["export", "here", "--output", "out.extxyz", "--split", "train=0.9,test=0.2"]);
     assert!(message.contains("the shares add up to 1.1"), "{message}");
 }

@@ -124,7 +124,7 @@ fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
     assert_eq!(ended(&mut label), Some(130), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Queued);
     assert_eq!(place.job(&name).attempts_made[0].outcome.as_deref(), Some("released"));
-    assert!(place.said().contains("is given back"), "{}", place.said());
+    assert!(place.said().contains("there is no time to finish it"), "{}", place.said());
     let mut label = place.label(&["--grace-period", "100s"]);
     place.wait_for_lease();
     signal(label.0.id(), "INT");

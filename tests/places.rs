@@ -96,7 +96,7 @@ fn a_campaign_refuses_the_configuration_of_another() {
     let text = fs::read_to_string(here.join("second/campaign.toml")).unwrap();
     fs::write(here.join("second/campaign.toml"), text.replace("tau = 0.3", "tau = 0.4")).unwrap();
     let message = refuse(here, both("second/campaign.toml"));
-    assert!(message.contains("walk.tau") && message.contains("is 'first', by "), "{message}");
+    assert!(message.contains("walk.tau") && message.contains("is 'first', configured by "), "{message}");
     fs::write(here.join("second/campaign.toml"), text).unwrap();
     assert_eq!(fs::read(here.join("shared/campaign.sqlite")).unwrap(), database);
 
@@ -150,7 +150,10 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     // It has become that of this file, and is in nobody else's way.
     write(&here.join("second"));
     run(here, &["second/campaign.toml"]);
-    assert!(refuse(here, ["run", "first/campaign.toml"]).contains("is in campaign, and"));
+    assert!(
+        refuse(here, ["run", "first/campaign.toml"])
+            .contains("campaign already contains a campaign of this configuration")
+    );
     // Nor one that is beside its configuration.
     run(here, &["second/campaign.toml", "--directory", "second"]);
     fs::remove_dir_all(here.join("second/campaign")).unwrap();

@@ -54,7 +54,7 @@ fn exported(place: &LabelCampaign) -> Vec<(String, String)> {
 
 fn check(place: &LabelCampaign) {
     let found = succeed(place.path(), ["store", "check", place.argument()]);
-    assert!(found.starts_with("nothing found"), "{found}");
+    assert!(found.starts_with("no problems found"), "{found}");
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     let with = ["--config", "fine.toml", "--all", "--reason", "a finer grid"];
     let planned = relabel(&place, &[&with[..], &["--dry-run"]].concat());
     for words in [
-        "label.protocol is now \"fine\" (was \"reference\")".to_owned(),
+        "label.protocol is now \"fine\" (was \"potential\")".to_owned(),
         "protocol 'fine' would become the current label protocol".to_owned(),
         format!(
             "{labels} structures would be queued again for protocol 'fine', to replace {labels} labels of 'potential'"
@@ -109,7 +109,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     assert!(succeed(here, ["status", campaign]).contains(&format!(", {labels} superseded; ")));
     succeed(here, ["report", campaign, "-o", "report"]);
     let summary = fs::read_to_string(here.join("report/tables/summary.csv")).unwrap();
-    let words = format!("{labels} labelled, 0 failed, 0 dropped, {labels} superseded, 0 in work, 0 waiting");
+    let words = format!("{labels} labelled, 0 failed, 0 dropped, {labels} superseded, 0 leased, 0 queued");
     assert!(summary.contains(&words), "{summary}");
     let story = succeed(here, ["explain", campaign, &after[0].1]);
     for words in ["superseded", "ago: a finer grid", "protocol 'fine'", "protocol 'potential'"] {

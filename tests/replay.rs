@@ -184,7 +184,7 @@ fn what_cannot_be_set_is_refused() {
         ("walk.tau=0.2", "walk.tau cannot be replayed: expected a key that acts on the selector alone"),
         ("collect.max_per_seed_structure=0", "expected a whole number above 0"),
         ("collect.criterion.threshold=\"a\"", "--set collect.criterion.threshold=\"a\": "),
-        ("calm.update=restarted", "run.walks_per_round = 1"),
+        ("calm.update=per_seed_structure", "run.walks_per_round = 1"),
     ] {
         let message = refuse(here, ["replay", "here", "--set", setting]);
         assert!(message.contains(words), "{message}");

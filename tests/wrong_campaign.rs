@@ -114,7 +114,7 @@ fn names_need_not_be_text_but_for_sqlite() {
         [OsStr::new("run"), config.as_os_str(), OsStr::new("--directory"), place].map(OsString::from)
     };
     let message = refuse(above.path(), run(directory.as_os_str()));
-    assert!(message.contains("(its name is not UTF-8, which SQLite needs it)"), "{message}");
+    assert!(message.contains("(its name is not UTF-8, which SQLite requires)"), "{message}");
     assert!(succeed(above.path(), run(OsStr::new("here"))).contains("; next:"));
 }
 

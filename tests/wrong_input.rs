@@ -197,7 +197,7 @@ fn an_artifact_must_belong_to_the_model() {
     let tester = ConfigTester::new();
     let silicon = path("data/si_sw_1l/gmm_artifacts.npz");
     let expected =
-        ["calm.artifact: ", &silicon, "another model: its list of elements is Si, that of the model Al"];
+        ["calm.artifact: ", &silicon, "another model: its list of elements is Si, the model's is Al"];
     tester.refused_with(&path(ARTIFACT), &silicon, &expected);
 }
 
@@ -221,7 +221,7 @@ fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
         changed("artifact = ", "update = \"never\" # ").replace("biased_steps = 2000 ", "biased_steps = 60 ");
     tester.write("c.toml", never.replace("# equilibration_steps = 500", "equilibration_steps = 10"));
     let valid = succeed(tester.path(), ["validate", "c.toml"]);
-    assert!(valid.contains("it can be scored with but not updated"), "{valid}");
+    assert!(valid.contains("it can grade structures but not be updated"), "{valid}");
     let summary = succeed(tester.path(), ["run", "c.toml"]);
     assert!(summary.contains("mixture          version 0"), "{summary}");
 }
@@ -242,7 +242,7 @@ fn training_frames_and_label_potentials_must_fit() {
     let (frames, label) = (path("data/al_eam_1l/seed_frames.extxyz"), path("data/Al_mm.eam.fs"));
     tester.refused_with(&frames, "absent.extxyz", &["calm.training_frames: absent.extxyz"]);
     let silicon = path("data/si_sw_1l/seed_frames.extxyz");
-    tester.refused_with(&frames, &silicon, &[&format!("{silicon}:1: atom 0 is Si"), "knows Al"]);
+    tester.refused_with(&frames, &silicon, &[&format!("{silicon}:1: atom 0 is Si"), "(it supports Al)"]);
     tester.refused_with(
         &label,
         "absent.eam",

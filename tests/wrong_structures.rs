@@ -206,5 +206,5 @@ fn the_good_structure_is_good() {
     seeds.tester.write("good.extxyz", good());
     seeds.tester.write("c.toml", changed(&seeds.files, "good.extxyz"));
     let valid = succeed(seeds.tester.path(), ["validate", "c.toml"]);
-    assert!(valid.contains("seed structures  1, of 27 to 27 atoms"), "{valid}");
+    assert!(valid.contains("seed structures  1, with 27 to 27 atoms"), "{valid}");
 }

@@ -153,7 +153,8 @@ fn everything_that_is_wrong_is_told_at_once() {
 fn missing_keys_are_told_together() {
     let tester = ConfigTester::new();
     let message = tester.refused("[walk]\n[potential]\n");
-    for key in ["temperature", "steps", "tau", "model", "calm", "seeds", "collect", "label"] {
+    for key in ["temperature", "biased_steps", "tau", "model", "calm", "seed_structures", "collect", "label"]
+    {
         assert!(message.contains(&format!("missing key `{key}`")), "{key}: {message}");
     }
     let md = fs::read_to_string(config("md-aluminium.toml")).unwrap();
@@ -181,7 +182,7 @@ fn names_that_are_nearly_right_get_a_hint() {
             "it belongs in [label] or [notify]",
         ),
         ("temperature = 600.0", "temperature = 600.0\ndt = 1", "did you mean `time_step`?"),
-        ("# min_interval = 200", "gaps = 200", "did you mean `gap`?"),
+        ("# min_interval = 200", "min_intervall = 200", "did you mean `min_interval`?"),
         ("[campaign]", "tau = 1\n[campaign]", "it belongs in [walk]"),
         (
             "method = { potential",

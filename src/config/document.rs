@@ -138,7 +138,7 @@ impl<'a> Document<'a> {
                 continue;
             }
             if !range.is_possible(value) {
-                self.push(offset, (key, range.shown(value), range.expected()));
+                self.push(offset, (key, range.written(value), range.expected()));
             } else if !range.is_usual(value) {
                 warnings.push(Warning { at: self.at(offset), key, message: range.unusual(value) });
             }

@@ -187,6 +187,11 @@ impl Range {
         }
     }
 
+    /// A value as it may stand in a file.
+    pub fn written(&self, value: f64) -> String {
+        if self.unit == TIME { self.shown(value) } else { value.to_string() }
+    }
+
     fn with_unit(&self, number: String) -> String {
         if ["", TIME].contains(&self.unit) { number } else { format!("{number} {}", self.unit) }
     }
@@ -217,7 +222,7 @@ pub fn impossible(text: &str) -> Vec<Wrong> {
     let (table, _) = DeTable::parse_recoverable(text);
     let wrong =
         found(table.get_ref(), "walk").into_iter().filter(|found| !found.range.is_possible(found.value));
-    wrong.map(|found| (found.key, found.range.shown(found.value), found.range.expected())).collect()
+    wrong.map(|found| (found.key, found.range.written(found.value), found.range.expected())).collect()
 }
 
 /// A number by its dotted key, and where it stands.

@@ -75,7 +75,7 @@ async fn each_kind_of_damage_is_found_and_described() {
         ),
         ("DELETE FROM label", "1 jobs labelled without a label, or not labelled despite one"),
         ("DELETE FROM archive; DELETE FROM attempt", "1 labels that do not belong to their job"),
-        ("UPDATE job SET max_attempts = 5 WHERE state = 'queued'", "1 jobs with a wrong count of attempts"),
+        ("UPDATE job SET attempts = 5 WHERE state = 'queued'", "1 jobs with a wrong count of attempts"),
         ("UPDATE attempt SET ended = NULL, outcome = NULL", "1 running attempts at jobs that are not leased"),
         (
             "UPDATE structure SET data = substr(data, 1, 80) WHERE number = 2",
