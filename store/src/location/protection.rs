@@ -116,12 +116,12 @@ mod tests {
         let url = |parameters: &str| unprotected(&format!("postgres://anna@head/lab?{parameters}"));
         assert_eq!(url(&format!("sslmode=verify-full&sslrootcert={root}")), Ok(false));
         for (parameters, expected) in [
-            (format!("sslmode=require&sslrootcert={root}"), "say sslmode=verify-full"),
+            (format!("sslmode=require&sslrootcert={root}"), "use sslmode=verify-full"),
             (format!("sslmode=verify-ca&sslrootcert={root}"), "any server with a certificate"),
             (format!("sslmode=verify-full&sslrootcert={root}.old"), "an authority.pem.old' (No such file"),
             ("sslmode=verify-full&sslkey=/nowhere/key.pem".into(), "its sslkey '/nowhere/key.pem'"),
-            ("sslmode=verify_full".into(), "not known"),
-            ("ssl-mode=disable".into(), "as libpq does"),
+            ("sslmode=verify_full".into(), "unknown sslmode=verify_full"),
+            ("ssl-mode=disable".into(), "use the names of libpq"),
         ] {
             let message = url(&parameters).unwrap_err();
             assert!(message.contains(expected), "{message}");

@@ -183,5 +183,5 @@ fn elements_without_a_setup_are_refused_by_name() {
     let magnetic =
         Settings { moments: BTreeMap::from([("Si".parse().unwrap(), 5.0)]), ..Settings::default() };
     let error = gpaw(magnetic).supports(&BTreeSet::from(["Si".parse().unwrap()])).unwrap_err().to_string();
-    assert_eq!(error, "moments: found Si = 5, expected at most its 4 valence electrons");
+    assert_eq!(error, "initial_magnetic_moments: found Si = 5, expected at most its 4 valence electrons");
 }
