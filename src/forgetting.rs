@@ -38,7 +38,7 @@ impl ForgettingRule {
     pub fn raised_message(&self, share: f64) -> String {
         let other = match self.combination {
             CovarianceUpdateKind::Convex => {
-                "covariance_update = \"additive\", which forgets nothing, or with smaller values of ladder"
+                "covariance_update = \"additive\", which forgets nothing, or with smaller values in calm.alpha_values"
             }
             CovarianceUpdateKind::Additive => "smaller values of ladder",
         };

@@ -113,7 +113,7 @@ pub enum CollectionRule {
         #[serde(default = "collection_threshold")]
         threshold: Positive,
     },
-    /// At min_atoms max[`min_atoms`, ⌈`fraction` N⌉] of the N atoms above a threshold (paper, foundation model).
+    /// At least max[`min_atoms`, ⌈`fraction` N⌉] of the N atoms above a threshold (paper, foundation model).
     AtomCount {
         /// Grade above which an atom counts (paper: 1.3).
         #[serde(default = "atom_threshold")]

@@ -117,7 +117,7 @@ impl Job {
         }))
     }
 
-    /// JobPhase from_state the job.
+    /// Phase of the job.
     pub fn phase(&self) -> JobPhase {
         JobPhase::from_state(&self.state)
     }

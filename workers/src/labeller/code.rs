@@ -399,7 +399,7 @@ impl CodeMethod {
     }
 }
 
-/// The failure_classes of the failures of a job so far.
+/// The classes of the failures of a job so far.
 pub(super) fn failure_classes(lease: &Lease) -> Vec<FailureClass> {
     lease.failures.iter().filter_map(|name| FailureClass::from_name(name)).collect()
 }
