@@ -40,7 +40,7 @@ impl ForgettingRule {
             CovarianceUpdateKind::Convex => {
                 "covariance_update = \"additive\", which forgets nothing, or with smaller values in calm.alpha_values"
             }
-            CovarianceUpdateKind::Additive => "smaller values of ladder",
+            CovarianceUpdateKind::Additive => "smaller values in calm.alpha_values",
         };
         format!(
             "the mixture forgets its training data: {:.1} % of the training atoms have γ > 1 (calm.forgetting_alarm: {:.1} %), \
