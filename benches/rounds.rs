@@ -31,7 +31,7 @@ const STEPS_PER_ASSIGNMENT: u64 = 250;
 fn main() {
     let assignment_steps =
         std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(STEPS_PER_ASSIGNMENT);
-    println!("turns of {assignment_steps} steps");
+    println!("assignments of {assignment_steps} steps");
     println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
     let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| Campaign::run(mode, assignment_steps));
     let rate = |campaign: &Campaign| f64::from(campaign.candidates) / campaign.time.as_secs_f64();
@@ -62,7 +62,7 @@ impl Campaign {
         };
         let mut selector = selector(mode, assignment_steps, &model);
         selector.start_walks();
-        let (mut campaign, mut turns, mut begun) = (Self::default(), BinaryHeap::new(), 0);
+        let (mut campaign, mut running, mut begun) = (Self::default(), BinaryHeap::new(), 0);
         loop {
             // There are as many walkers as walks, so every assignment starts at once.
             while let Scheduling::Assign(assignment) = selector.next_assignment() {
@@ -72,9 +72,9 @@ impl Campaign {
                 campaign.work += taken;
                 begun += 1;
                 let report = report.map_candidate(|candidate| CandidateBlock::encode(&candidate));
-                turns.push(Reverse(RunningAssignment(campaign.time + taken, begun, report)));
+                running.push(Reverse(RunningAssignment(campaign.time + taken, begun, report)));
             }
-            let Some(Reverse(RunningAssignment(ended, _, report))) = turns.pop() else { break };
+            let Some(Reverse(RunningAssignment(ended, _, report))) = running.pop() else { break };
             campaign.time = ended;
             campaign.candidates += u32::from(matches!(report.outcome, Outcome::Candidate(_)));
             let commit = selector.report(report).unwrap().unwrap_or_default();
@@ -107,8 +107,8 @@ fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
         steps_per_assignment: assignment_steps,
         update: UpdateProtocol::Cumulative,
         search: UpdateSettings {
-            combination: calm::CovarianceUpdateKind::Convex,
-            ladder: None,
+            covariance_update: calm::CovarianceUpdateKind::Convex,
+            alpha_values: None,
             stop: toml::from_str(&format!("{rule}target = 1.25")).unwrap(),
         },
         forgetting_alarm: ForgettingAlarm::default(),

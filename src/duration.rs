@@ -19,6 +19,11 @@ impl Duration {
         Self(std::time::Duration::from_secs(seconds))
     }
 
+    /// The same with a fraction; a negative number is none.
+    pub fn from_fractional_seconds(seconds: f64) -> Self {
+        Self(std::time::Duration::try_from_secs_f64(seconds).unwrap_or_default())
+    }
+
     /// As the standard library has it.
     pub const fn get(self) -> std::time::Duration {
         self.0

@@ -181,7 +181,7 @@ impl MethodConfig {
                 for path in settings.paths() {
                     *path = absolute(path)?;
                 }
-                Ok(Self::Code { settings, running: label.running() })
+                Ok(Self::Code { settings, running: label.execution_settings() })
             }
         }
     }

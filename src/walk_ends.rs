@@ -245,7 +245,7 @@ mod tests {
             );
         }
         assert_eq!(
-            early_end_cause("blew_up", "4 walkers crashed in this turn"),
+            early_end_cause("blew_up", "4 walkers crashed in this assignment"),
             Some(EarlyEndCause::Crashed)
         );
         assert_eq!(

@@ -1,4 +1,4 @@
-//! `calmwalk label`: labellers that nobody's run starts. The same tests on PostgreSQL are in `postgres_whole.rs`.
+//! `calmwalk label`: labellers that no `run` starts. With `CALMWALK_POSTGRES` the same tests use a server.
 
 use std::fs;
 use std::process::Command;
@@ -9,7 +9,7 @@ use store::{JobState, LabelStatus};
 use crate::common::campaign::{Outcome, Small, outcome, outcome_at};
 use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::{
-    assert_no_leftovers, processes_in, processes_running, resume_processes, signal, wait_until,
+    assert_no_leftovers, pause_walkers, processes_in, processes_running, resume_processes, signal, wait_until,
 };
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
@@ -44,6 +44,8 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     let mut label = place.label(&["--concurrency", "2", "--method", "potential", "--wait-timeout", "2m"]);
     wait_until("it waits", || place.said().contains("waiting for the campaign: there is no campaign in"));
     let mut run = place.run();
+    // The campaign cannot end before both slots have been seen.
+    let held = pause_walkers(place.path(), small.walkers);
     wait_until("both slots show in status", || {
         let status = place.status();
         let processes = status["processes"].as_array().cloned().unwrap_or_default();
@@ -51,6 +53,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
             processes.iter().filter(|process| process["kind"] == "labeller" && process["state"] == "running");
         slots.count() == 2
     });
+    resume_processes(&held);
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     let said = place.said();

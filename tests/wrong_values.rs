@@ -80,6 +80,12 @@ fn values_that_nobody_can_mean_are_refused() {
             "heartbeat_timeout = \"1s\"",
             "run.heartbeat_timeout is 1s; expected 5s to 10days",
         ),
+        ("# time_limit = \"1day\"", "time_limit = \"0s\"", "label.time_limit is 0s; expected 1s to 30days"),
+        (
+            "# agent_heartbeat_timeout = \"1m\"",
+            "agent_heartbeat_timeout = \"0s\"",
+            "run.agent_heartbeat_timeout is 0s; expected 100ms to 10days",
+        ),
     ] {
         tester.refused_with(from, to, &[&format!("c.toml:{}: ", line(from)), expected]);
     }

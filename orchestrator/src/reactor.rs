@@ -261,7 +261,7 @@ impl ReactorState {
             *crashes += 1;
             if *crashes == MAX_CRASHES {
                 // Without the details: the last output of a process is not reproducible.
-                let reason = format!("{MAX_CRASHES} walkers crashed in this turn");
+                let reason = format!("{MAX_CRASHES} walkers crashed in this assignment");
                 return Ok(self.selector.abandon_walk(walk, reason)?);
             }
         }

@@ -31,7 +31,7 @@ fn live_settings() -> Settings {
 enum Event {
     /// A structure with this number, whose second atom is at this distance along one direction.
     Candidate(u64, usize, f64),
-    Turn,
+    StepsDone,
     Paused,
     Ended,
 }
@@ -39,7 +39,7 @@ enum Event {
 fn event() -> impl Strategy<Value = Event> {
     prop_oneof![
         8 => (0..30_u64, 0..DIMENSION, 1.0..9.0).prop_map(|(number, k, far)| Event::Candidate(number, k, far)),
-        2 => Just(Event::Turn),
+        2 => Just(Event::StepsDone),
         1 => Just(Event::Paused),
         1 => Just(Event::Ended),
     ]
@@ -69,7 +69,7 @@ fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Report>
             let structure = structure(structure_number, SHORTEST);
             Outcome::Candidate(block(&assignment, selector.mixture(), &progress, structure, z))
         }
-        Event::Turn => Outcome::StepsDone,
+        Event::StepsDone => Outcome::StepsDone,
         Event::Paused => Outcome::Interrupted,
         Event::Ended => Outcome::Ended(WalkEnd::Steps),
     };

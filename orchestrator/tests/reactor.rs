@@ -346,7 +346,7 @@ async fn assignments_that_crash_walkers_end_their_walk() {
         assert_eq!(running.await.unwrap(), RunOutcome::Finished);
         threads.into_iter().for_each(|thread| thread.join().unwrap());
         let walk = store.load_walks().await.unwrap().remove(0);
-        let expected = "3 walkers crashed in this turn";
+        let expected = "3 walkers crashed in this assignment";
         assert_eq!((walk.state == "blew_up", walk.reason == expected), (fault, fault));
         let log = store.decision_log_text().await.unwrap();
         assert_eq!(log.contains(expected), fault, "{log}");
@@ -366,12 +366,12 @@ async fn pausing_a_walk_does_not_change_decisions() {
     let threads = start_walkers(2, to_reactor, &stopping);
     store.pause_walks(&[WalkId(1)], true, 0).await.unwrap();
     let running = tokio::spawn(end_of(reactor, |_| {}));
-    let turns = async || {
+    let assignments = async || {
         let walks = store.load_walks().await.unwrap();
         walks.iter().map(|walk| walk.turn).collect::<Vec<_>>()
     };
     tokio::time::sleep(Duration::from_millis(700)).await;
-    assert_eq!((turns().await, running.is_finished()), (vec![0; 3], false), "the first round waits");
+    assert_eq!((assignments().await, running.is_finished()), (vec![0; 3], false), "the first round waits");
     store.pause_walks(&[WalkId(1)], false, 0).await.unwrap();
     assert_eq!(running.await.unwrap(), RunOutcome::Finished);
     threads.into_iter().for_each(|thread| thread.join().unwrap());

@@ -207,7 +207,7 @@ impl Config {
 
     /// What the update search needs.
     pub fn update_settings(&self) -> UpdateSettings {
-        let (combination, ladder) = (self.calm.covariance_update, self.calm.alpha_values.clone());
-        UpdateSettings { combination, ladder, stop: self.collect.update_target }
+        let CalmSection { covariance_update, alpha_values, .. } = self.calm.clone();
+        UpdateSettings { covariance_update, alpha_values, stop: self.collect.update_target }
     }
 }

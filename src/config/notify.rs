@@ -8,19 +8,19 @@ use serde::{Deserialize, Serialize};
 use super::defaults;
 use crate::duration::Duration;
 
-/// A command of the user's that is run when something has happened to a campaign.
+/// The user's command that calmwalk runs at events of a campaign.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct NotifySection {
-    /// It and its arguments; left out, nobody is told.
+    /// The command and its arguments. Default: none, and no notification is sent.
     pub command: Option<Vec<String>>,
-    /// On what it is run.
+    /// Events for which the command is run.
     pub on: Vec<NotifyEvent>,
-    /// A campaign without a new candidate or label for this long has stalled.
+    /// Time without a new candidate or label after which a campaign has stalled.
     pub stall_timeout: Duration,
-    /// So many labels that finally failed, and so many again.
+    /// Number of failed labels after which the command is run, and again after as many more.
     pub failed_labels: NonZeroU32,
-    /// The command is killed after this time.
+    /// Time after which the command is killed.
     pub time_limit: Duration,
 }
 

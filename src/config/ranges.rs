@@ -106,7 +106,7 @@ pub static RANGES: [Range; 79] = [
         "it is that of an atom, in eV",
     ),
     range("label.cores", "", [0.0, 4096.0], [1.0, 2048.0], ""),
-    range("label.time_limit", TIME, [0.0, 30.0 * DAY], [10.0, 7.0 * DAY], ""),
+    range("label.time_limit", TIME, [1.0, 30.0 * DAY], [10.0, 7.0 * DAY], ""),
     range("label.memory", "GB", [0.0, 1e6], [0.1, 1e4], "it is in GB"),
     range("label.queue_limit", "", [0.0, 1e9], [1.0, 1e6], ""),
     range("label.guard.min_height", "Å", [0.0, 1e3], [1.0, 50.0], "it is in Å"),
@@ -142,11 +142,11 @@ pub static RANGES: [Range; 79] = [
     range("run.walkers", "", [0.0, 1024.0], [0.0, 512.0], ""),
     range("run.threads_per_walker", "", [0.0, 256.0], [1.0, 128.0], ""),
     range("run.heartbeat_timeout", TIME, [5.0, 10.0 * DAY], [10.0, DAY], ""),
-    range("run.agent_heartbeat_timeout", TIME, [0.0, 10.0 * DAY], [10.0, DAY], ""),
+    range("run.agent_heartbeat_timeout", TIME, [0.1, 10.0 * DAY], [10.0, DAY], ""),
     range("run.max_restarts", "", [0.0, 1e9], [0.0, 100.0], ""),
     range("run.steps_per_assignment", "", [0.0, STEPS], [1.0, 1e5], ""),
-    range("notify.stall_timeout", TIME, [0.0, 30.0 * DAY], [60.0, 14.0 * DAY], ""),
-    range("notify.time_limit", TIME, [0.0, DAY], [1.0, 3600.0], ""),
+    range("notify.stall_timeout", TIME, [0.1, 30.0 * DAY], [60.0, 14.0 * DAY], ""),
+    range("notify.time_limit", TIME, [1.0, DAY], [1.0, 3600.0], ""),
 ];
 
 impl Range {
@@ -182,7 +182,7 @@ impl Range {
     /// A value as people write it, without its unit; times have theirs.
     pub fn shown(&self, value: f64) -> String {
         match self.unit {
-            TIME => Duration::from_seconds(value as u64).to_string(),
+            TIME => Duration::from_fractional_seconds(value).to_string(),
             _ => shown(value),
         }
     }

@@ -20,11 +20,11 @@ use crate::duration::Duration;
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CampaignSection {
-    /// Reproducible or live.
+    /// `reproducible`: rounds of a fixed number of walks. `live`: every walk goes on as soon as it can.
     pub mode: Mode,
-    /// Random seed of all walks.
+    /// Seed of all random numbers of the campaign.
     pub rng_seed: u64,
-    /// Whether biased walks that collected something are followed by their unbiased control.
+    /// Whether each biased walk that collected a structure is followed by its unbiased control walk.
     pub control: bool,
 }
 
@@ -32,9 +32,9 @@ pub struct CampaignSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct PotentialSection {
-    /// The exported model, `kokkos.npz`.
+    /// File of the exported GRACE model (`kokkos.npz`).
     pub model: Spanned<PathBuf>,
-    /// In which walkers evaluate it.
+    /// Floating-point precision in which walkers evaluate the model.
     #[serde(default)]
     pub precision: Precision,
 }
@@ -43,23 +43,23 @@ pub struct PotentialSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct CalmSection {
-    /// `gmm_artifacts.npz` with scatter and counts; left out, the mixture that the model was exported with, which
-    /// cannot be updated.
+    /// File of the mixture with scatter matrices and counts (`gmm_artifacts.npz`). Default: the mixture in the
+    /// model's file, which cannot be updated.
     #[serde(default)]
     pub artifact: Option<Spanned<PathBuf>>,
-    /// The frames the mixture was built from, whose grades are watched under the live mixture.
+    /// File of the frames that the mixture was built from. calmwalk grades them again with each mixture.
     #[serde(default)]
     pub training_frames: Option<Spanned<PathBuf>>,
-    /// Alarm when more than this share of the training atoms has γ > 1 under the live mixture.
+    /// Share of training atoms with γ > 1 under the current mixture above which calmwalk warns.
     #[serde(default = "defaults::forgetting_alarm")]
     pub forgetting_alarm: Fraction,
-    /// Carried, restarted or never.
+    /// What happens to the mixture between seed structures.
     #[serde(default = "defaults::update")]
     pub update: UpdateProtocol,
-    /// Convex or additive.
+    /// How a collected feature changes a component's covariance: `convex` or `additive`.
     #[serde(default)]
     pub covariance_update: CovarianceUpdateKind,
-    /// The α to try; left out, those of the paper.
+    /// Values of α that an update tries. Default: the paper's.
     #[serde(default)]
     pub alpha_values: Option<calm::rules::AlphaValues>,
 }
@@ -68,7 +68,7 @@ pub struct CalmSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct SeedStructuresSection {
-    /// extended XYZ or POSCAR files; every frame is a seed structure.
+    /// Extended XYZ or POSCAR files; each frame is a seed structure.
     pub files: Vec<Spanned<PathBuf>>,
 }
 
@@ -76,25 +76,25 @@ pub struct SeedStructuresSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct WalkSection {
-    /// K.
+    /// Temperature of the thermostat, K.
     pub temperature: Positive,
-    /// Biased steps.
+    /// Number of biased steps.
     pub biased_steps: NonZeroU64,
-    /// Unbiased steps before them.
+    /// Number of unbiased steps before the biased ones.
     #[serde(default = "defaults::equilibration_steps")]
     pub equilibration_steps: u64,
-    /// Uncertainty-force scale τ.
+    /// Scale τ of the uncertainty force.
     pub tau: Positive,
-    /// fs; left out, 2 fs, or 0.5 fs with H, He, Li or Be.
+    /// Time step, fs. Default: 2 fs, or 0.5 fs with H, He, Li or Be.
     #[serde(default)]
     pub time_step: Option<Positive>,
-    /// Langevin or Nosé–Hoover.
+    /// Thermostat: Langevin or Nosé–Hoover.
     #[serde(default = "defaults::thermostat")]
     pub thermostat: ThermostatKind,
-    /// Linear volume ramp over the biased steps; left out, the cell is fixed.
+    /// Linear change of the volume over the biased steps. Default: the cell is fixed.
     #[serde(default)]
     pub volume_ramp: Option<VolumeRampSection>,
-    /// Steps over which the norms of τ_r are averaged.
+    /// Number of steps over which the norms in τ_r are averaged.
     #[serde(default = "defaults::bias_averaging_steps")]
     pub bias_averaging_steps: NonZeroU64,
     /// Skin of the neighbour list, Å.
@@ -102,13 +102,13 @@ pub struct WalkSection {
     pub skin: Positive,
 }
 
-/// `volume_ramp = { from, to }`, V/V₀.
+/// `volume_ramp = { from, to }`
 #[derive(Clone, Copy, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct VolumeRampSection {
-    /// At the first biased step.
+    /// V/V₀ at the first biased step.
     pub from: Positive,
-    /// At the last.
+    /// V/V₀ at the last biased step.
     pub to: Positive,
 }
 
@@ -116,23 +116,23 @@ pub struct VolumeRampSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct CollectSection {
-    /// When a structure is a candidate.
+    /// Rule by which a walker sends a structure as a candidate.
     pub criterion: CollectionRule,
-    /// When an update has done enough.
+    /// Grade at which an update of the mixture is strong enough.
     pub update_target: calm::UpdateRule,
-    /// Least steps between two collections of a walk.
+    /// Least number of steps between two collected structures of a walk.
     #[serde(default = "defaults::min_interval")]
     pub min_interval: u64,
-    /// Least steps after a candidate that was declined or refused.
+    /// Least number of steps after a candidate that was declined or refused.
     #[serde(default = "defaults::min_interval_after_decline")]
     pub min_interval_after_decline: NonZeroU64,
-    /// Most structures from one seed structure.
+    /// Largest number of structures collected from one seed structure.
     #[serde(default = "defaults::max_per_seed_structure")]
     pub max_per_seed_structure: NonZeroU32,
-    /// Most structures in the campaign.
+    /// Largest number of structures collected by the campaign.
     #[serde(default)]
     pub max_structures: Option<NonZeroU32>,
-    /// MB of feature vectors of declined candidates that are kept.
+    /// Space in the store for feature vectors of declined candidates, MB.
     #[serde(default = "defaults::declined_features")]
     pub declined_features_mb: u64,
 }
@@ -141,31 +141,31 @@ pub struct CollectSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GuardSection {
-    /// Å.
+    /// Shortest allowed distance of two atoms, Å.
     pub min_distance: Positive,
-    /// Of the seed structure's shortest distance.
+    /// Shortest allowed distance as a fraction of the seed structure's shortest distance.
     pub min_distance_fraction: Fraction,
-    /// Switched ZBL repulsion.
+    /// Switched ZBL repulsion at short range. Default: none.
     pub zbl: Option<ZblSection>,
-    /// K.
+    /// Highest allowed kinetic temperature, K.
     pub max_temperature: Positive,
-    /// Refusals in a row after which a walk goes back.
+    /// Number of refused configurations in a row after which a walk goes back to a checkpoint.
     pub max_consecutive_rejections: NonZeroU32,
-    /// Returns after which it ends.
+    /// Number of returns to a checkpoint after which the walk ends.
     pub max_rollbacks: u32,
-    /// Factor on τ at each return.
+    /// Factor on τ at each return to a checkpoint.
     pub tau_factor: Fraction,
-    /// Steps between checkpoints to go back to.
+    /// Number of steps between checkpoints.
     pub checkpoint_interval: NonZeroU64,
 }
 
-/// `zbl = { inner, outer }`, Å.
+/// `zbl = { inner, outer }`
 #[derive(Clone, Copy, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct ZblSection {
-    /// Full strength below.
+    /// Distance below which the repulsion has its full strength, Å.
     pub inner: Positive,
-    /// Nothing beyond.
+    /// Distance above which the repulsion is zero, Å.
     pub outer: Positive,
 }
 
@@ -173,65 +173,65 @@ pub struct ZblSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct LabelSection {
-    /// The method.
+    /// What calculates the labels.
     pub method: LabelMethod,
-    /// Name of the protocol, as exports and imports call it; left out, that of the method.
+    /// Name of the protocol, by which exports and imports select labels. Default: the name of the method.
     #[serde(default)]
     pub protocol: Option<String>,
-    /// Labels calculated side by side by `run`; 0: all come from `calmwalk label`.
+    /// Number of labels that `run` calculates at the same time. 0: all labels come from `calmwalk label`.
     #[serde(default = "defaults::concurrency")]
     pub concurrency: usize,
-    /// How long a label job is leased to a labeller.
+    /// Time for which a label job is leased to a labeller.
     #[serde(default = "defaults::lease_timeout")]
     pub lease_timeout: Duration,
-    /// Attempts before a label counts as failed.
+    /// Number of attempts after which a label has failed.
     #[serde(default = "defaults::max_attempts")]
     pub max_attempts: NonZeroU32,
-    /// Largest force that is believed, eV/Å.
+    /// Largest force that a label may have, eV/Å.
     #[serde(default = "defaults::max_force")]
     pub max_force: Positive,
-    /// Largest component of a stress that is believed, eV/Å³.
+    /// Largest component of the stress that a label may have, eV/Å³.
     #[serde(default = "defaults::max_stress")]
     pub max_stress: Positive,
-    /// Largest energy that is believed, whatever its sign, eV an atom.
+    /// Largest magnitude of the energy that a label may have, eV/atom.
     #[serde(default = "defaults::max_energy_per_atom")]
     pub max_energy_per_atom: Positive,
-    /// Largest difference from the potential's energy that is believed, eV an atom.
+    /// Largest difference from the potential's energy that a label may have, eV/atom.
     #[serde(default = "defaults::max_energy_difference_per_atom")]
     pub max_energy_difference_per_atom: Positive,
-    /// Cores of a calculation by another program.
+    /// Number of cores of one calculation.
     #[serde(default = "defaults::cores")]
     pub cores: NonZeroU32,
-    /// Longest time of a calculation.
+    /// Time after which a calculation is ended.
     #[serde(default = "defaults::time_limit")]
     pub time_limit: Duration,
-    /// Most memory of a calculation, GB.
+    /// Memory limit of one calculation, GB.
     pub memory: Option<Positive>,
-    /// Where calculations have their directories, if not where temporary files are.
+    /// Directory in which calculations get directories of their own. Default: that of temporary files.
     pub scratch: Option<PathBuf>,
-    /// Which of these directories are kept in the store.
+    /// Of which calculations the store keeps the directory.
     #[serde(default)]
     pub keep_directories: KeepDirectories,
-    /// Variables of the labeller's environment that its program gets beside those that every program gets.
+    /// Environment variables that the program gets beside those that every program gets.
     #[serde(default)]
     pub pass_environment: PassedEnvironment,
-    /// The batch system that each calculation is a job of; left out, they run beside the labeller.
+    /// Batch system that runs each calculation as a job. Default: none; calculations run beside the labeller.
     pub batch_system: Option<BatchSystem>,
-    /// Further options of its jobs.
+    /// Further options for the batch system.
     #[serde(default)]
     pub batch_options: Vec<String>,
-    /// Walkers wait while more jobs than this are unfinished, or the threshold is raised.
+    /// Number of unfinished label jobs above which `on_queue_full` applies.
     #[serde(default = "defaults::queue_limit")]
     pub queue_limit: NonZeroU32,
-    /// Which of the two.
+    /// What to do then: walkers wait, or the selector raises the threshold.
     #[serde(default)]
     pub on_queue_full: QueueFull,
-    /// What a structure must be before anything is spent on its label.
+    /// Checks of a structure before it is labelled.
     #[serde(default)]
     pub guard: LabelGuard,
 }
 
-/// What happens while the label queue is longer than it should be.
+/// What happens while the label queue is longer than `queue_limit`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum QueueFull {
@@ -246,11 +246,11 @@ pub enum QueueFull {
 #[derive(Clone, Debug, Default, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BudgetSection {
-    /// Most labels that are made.
+    /// Largest number of labels.
     pub labels: Option<NonZeroU32>,
-    /// Most hours of label attempts.
+    /// Largest sum of core-hours of all attempts to label.
     pub core_hours: Option<Positive>,
-    /// Most hours for which it is under way.
+    /// Longest time that the campaign runs, h.
     pub wall_hours: Option<Positive>,
 }
 
@@ -258,21 +258,21 @@ pub struct BudgetSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunSection {
-    /// Walkers side by side; 0 for as many as the processor cores allow.
+    /// Number of walkers. 0: as many as the processor cores allow.
     pub walkers: usize,
-    /// Threads of each.
+    /// Number of threads of each walker.
     pub threads_per_walker: NonZeroUsize,
-    /// A process that sends no heartbeat for this long hangs, and is replaced.
+    /// Time without heartbeat after which a process is killed and replaced.
     pub heartbeat_timeout: Duration,
-    /// An agent on another host that sends no heartbeat for this long is dead: its walks go to others.
+    /// Time without heartbeat after which an agent's walks go to other hosts.
     pub agent_heartbeat_timeout: Duration,
-    /// Starts of a process in a row after failures, with nothing delivered between them; then it is given up.
+    /// Number of restarts without a result between them after which a process is not started again.
     pub max_restarts: u32,
-    /// Biased walks that advance together (reproducible mode).
+    /// Number of biased walks that advance together (reproducible mode).
     pub walks_per_round: NonZeroUsize,
-    /// Steps of a turn.
+    /// Number of steps that a walker makes before it reports to the selector.
     pub steps_per_assignment: NonZeroU64,
-    /// URL of a PostgreSQL database, without password; left out, SQLite in the campaign's directory.
+    /// URL of a PostgreSQL database, without password. Default: SQLite in the campaign's directory.
     pub store: Option<String>,
 }
 
@@ -282,7 +282,7 @@ impl LabelSection {
         self.protocol.as_deref().unwrap_or(self.method.name())
     }
 
-    /// What is believed of a label.
+    /// Bounds beyond which a label is refused.
     pub fn bounds(&self) -> LabelBounds {
         LabelBounds {
             max_force: self.max_force.get(),
@@ -292,8 +292,8 @@ impl LabelSection {
         }
     }
 
-    /// How the calculations of a program run.
-    pub fn running(&self) -> ExecutionSettings {
+    /// How programs that calculate labels are run.
+    pub fn execution_settings(&self) -> ExecutionSettings {
         ExecutionSettings {
             cores: self.cores.get(),
             time_limit: self.time_limit.seconds(),

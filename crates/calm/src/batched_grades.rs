@@ -99,7 +99,7 @@ impl Collected {
     }
 }
 
-/// Poisoning is harmless: nobody reads what a panicked thread left here.
+/// A poisoned lock is harmless: what a panicked thread left here is never read.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

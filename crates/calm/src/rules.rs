@@ -98,8 +98,8 @@ impl From<Fraction> for f64 {
 }
 
 impl From<AlphaValues> for Vec<f64> {
-    fn from(ladder: AlphaValues) -> Vec<f64> {
-        ladder.0
+    fn from(values: AlphaValues) -> Vec<f64> {
+        values.0
     }
 }
 
@@ -194,10 +194,10 @@ impl CovarianceUpdateKind {
 pub struct UpdateSettings {
     /// Convex or additive.
     #[serde(default)]
-    pub combination: CovarianceUpdateKind,
+    pub covariance_update: CovarianceUpdateKind,
     /// The α to try. Default: [`CovarianceUpdateKind::default_alphas`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub ladder: Option<AlphaValues>,
+    pub alpha_values: Option<AlphaValues>,
     /// How α is chosen.
     pub stop: UpdateRule,
 }
@@ -205,7 +205,7 @@ pub struct UpdateSettings {
 impl UpdateSettings {
     /// The values of α to try, ascending.
     pub fn alphas(&self) -> Vec<f64> {
-        self.ladder.clone().unwrap_or_else(|| self.combination.default_alphas()).into()
+        self.alpha_values.clone().unwrap_or_else(|| self.covariance_update.default_alphas()).into()
     }
 }
 

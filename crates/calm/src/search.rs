@@ -86,7 +86,7 @@ pub fn update(
 ) -> Result<UpdateOutcome, UpdateError> {
     let batch = Batch::new(mixture, elements, features)?;
     let (trials, alpha, mut end) = choose(&batch, settings)?;
-    let mut changed = batch.updated(settings.combination.with_alpha(alpha))?;
+    let mut changed = batch.updated(settings.covariance_update.with_alpha(alpha))?;
     let mut inflations = Vec::new();
     if let (UpdateEnd::InflationExhausted, UpdateRule::MaximumGrade { target }) = (end, settings.stop) {
         (changed, inflations) = inflate(&batch, changed, target.get())?;
@@ -96,7 +96,7 @@ pub fn update(
     }
     Ok(UpdateOutcome {
         base_version: mixture.version(),
-        combination: settings.combination,
+        combination: settings.covariance_update,
         alpha,
         trials,
         end,
@@ -141,11 +141,11 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
             (threshold.get(), Some(atom_limit(atoms, fraction, min_atoms)), target.get())
         }
     };
-    let ladder = AlphaScan::new(batch, settings.combination);
+    let scan = AlphaScan::new(batch, settings.covariance_update);
     let mut trials = Vec::new();
     for alpha in settings.alphas() {
         let gamma =
-            trial(batch, &ladder, settings.combination.with_alpha(alpha), alpha, [threshold, target])?;
+            trial(batch, &scan, settings.covariance_update.with_alpha(alpha), alpha, [threshold, target])?;
         let trial = Trial { alpha, gamma_max: maximum(&gamma), above: count_above(&gamma, threshold) };
         trials.push(trial);
         match limit {
@@ -167,13 +167,13 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
 /// γ of the batch for one α. Uses the scan, unless it is inaccurate or a grade is too close to a threshold.
 fn trial(
     batch: &Batch,
-    ladder: &AlphaScan<'_>,
+    scan: &AlphaScan<'_>,
     update: CovarianceUpdate,
     alpha: f64,
     thresholds: [f64; 2],
 ) -> Result<Vec<f64>, UpdateError> {
     let near = |grade: f64| thresholds.iter().any(|limit| (grade - limit).abs() <= DECISION_MARGIN * limit);
-    match ladder.gamma(alpha) {
+    match scan.gamma(alpha) {
         Some(gamma) if !gamma.iter().any(|&grade| near(grade)) => Ok(gamma),
         _ => Ok(batch.gamma_under(&batch.updated(update)?)),
     }

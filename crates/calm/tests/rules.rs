@@ -27,7 +27,10 @@ fn the_papers_values_are_the_defaults() {
     assert_eq!(collection("rule = 'atom_count'"), rule);
     let settings: UpdateSettings = toml::from_str("stop = { rule = 'atom_count' }").unwrap();
     let stop = UpdateRule::AtomCount { threshold, fraction, min_atoms, target: positive(1.25) };
-    assert_eq!(settings, UpdateSettings { combination: CovarianceUpdateKind::Convex, ladder: None, stop });
+    assert_eq!(
+        settings,
+        UpdateSettings { covariance_update: CovarianceUpdateKind::Convex, alpha_values: None, stop }
+    );
     assert_eq!(settings.alphas(), [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]);
     for combination in [CovarianceUpdateKind::Convex, CovarianceUpdateKind::Additive] {
         let ladder = combination.default_alphas();
@@ -43,8 +46,7 @@ fn configurations_survive_a_round_trip() {
         let rule = collection(text);
         assert_eq!(collection(&toml::to_string(&rule).unwrap()), rule);
     }
-    let text =
-        "combination = 'additive'\nladder = [0.01, 1.0]\nstop = { rule = 'maximum_grade', target = 1.1 }";
+    let text = "covariance_update = 'additive'\nalpha_values = [0.01, 1.0]\nstop = { rule = 'maximum_grade', target = 1.1 }";
     let settings: UpdateSettings = toml::from_str(text).unwrap();
     assert_eq!(toml::from_str::<UpdateSettings>(&toml::to_string(&settings).unwrap()).unwrap(), settings);
 }
@@ -63,8 +65,8 @@ fn nonsense_is_refused() {
         let error = toml::from_str::<CollectionRule>(text).unwrap_err().to_string();
         assert!(error.contains(message), "{error}");
     }
-    for ladder in ["[]", "[0.2, 0.1]", "[0.1, 0.1]", "[0.0, 1.0]", "[1.5]", "[nan]"] {
-        let text = format!("ladder = {ladder}\nstop = {{ rule = 'maximum_grade' }}");
+    for values in ["[]", "[0.2, 0.1]", "[0.1, 0.1]", "[0.0, 1.0]", "[1.5]", "[nan]"] {
+        let text = format!("alpha_values = {values}\nstop = {{ rule = 'maximum_grade' }}");
         assert!(toml::from_str::<UpdateSettings>(&text).unwrap_err().to_string().contains("ascending"));
     }
     assert!(toml::from_str::<UpdateSettings>("stop = { rule = 'atom_count' }\nalpha = 1").is_err());

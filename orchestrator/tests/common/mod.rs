@@ -76,8 +76,8 @@ pub fn settings(mode: Mode) -> Settings {
         steps_per_assignment: 10,
         update: UpdateProtocol::Cumulative,
         search: UpdateSettings {
-            combination: CovarianceUpdateKind::Convex,
-            ladder: None,
+            covariance_update: CovarianceUpdateKind::Convex,
+            alpha_values: None,
             stop: UpdateRule::MaximumGrade { target: positive(1.25) },
         },
         forgetting_alarm: ForgettingAlarm::default(),

@@ -10,7 +10,7 @@ const SECTIONS: [&str; 11] = [
     "campaign",
     "potential",
     "calm",
-    "seeds",
+    "seed_structures",
     "walk",
     "collect",
     "guard",
@@ -20,7 +20,7 @@ const SECTIONS: [&str; 11] = [
     "notify",
 ];
 /// Hashes of files and the list of seed structures have their own tables.
-const EXCLUDED_SECTIONS: [&str; 2] = ["files", "seeds"];
+const EXCLUDED_SECTIONS: [&str; 2] = ["files", "seed_structures"];
 
 /// The table: a heading for each section, then its keys. A key without a value is shown as not set.
 pub fn settings(data: &ReportData) -> Table {
@@ -92,7 +92,7 @@ mod tests {
     fn every_key_stands_below_its_section_in_the_order_of_the_file() {
         let configuration = json!({
             "walk": { "temperature": 300.0, "thermostat": { "kind": "langevin" }, "volume_ramp": null },
-            "instructions": "avx2", "seeds": ["a 12ab"], "files": { "potential.model": "ff00" },
+            "instructions": "avx2", "seed_structures": ["a 12ab"], "files": { "potential.model": "ff00" },
             "potential": { "model": null }, "later": { "key": [1, 2] }, "collect": {},
         });
         let found: Vec<_> = sections(&configuration)

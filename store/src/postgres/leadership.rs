@@ -3,7 +3,7 @@
 //! A connection may break while its process lives, and another process may then take the lock. Each new holder
 //! therefore increments the generation in the table `leader`, a fencing token under which it writes
 //! ([`Server::begin_as_leader`]): holders of an earlier generation can no longer write. A process that loses the
-//! connection takes the lock again if nobody had it meanwhile.
+//! connection takes the lock again if no other process had it meanwhile.
 
 use std::time::{Duration, Instant};
 

@@ -85,7 +85,7 @@ impl Store {
 
     /// Tries once; `again` is set if an earlier try may have succeeded.
     async fn commit_once(&self, commit: &Commit, mark: i64, again: bool) -> Result<Range<i64>> {
-        // Copies everything before the transaction begins, so that nobody waits for the copying.
+        // Copies everything before the transaction begins, so that no other writer waits for the copying.
         let mut rows = Rows::from_commit(commit)?;
         let (mut transaction, made) = self.database.begin_commit(mark, again).await?;
         let last = query("SELECT coalesce(max(sequence), 0) FROM decision");

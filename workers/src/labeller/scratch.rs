@@ -70,7 +70,7 @@ impl ScratchRoot {
         }
     }
 
-    /// Removes directories that killed labellers left and nobody needs: those of calculations whose runner has
+    /// Removes directories that killed labellers left and that are not needed: those of calculations whose runner has
     /// ended and whose result is not wanted.
     pub async fn cleanup(
         &self,

@@ -45,7 +45,7 @@ impl<V: Vector> Scratch<V> {
     }
 }
 
-/// Poisoning is harmless: nobody reads what a panicked thread left in its arrays.
+/// A poisoned lock is harmless: what a panicked thread left in its arrays is never read.
 pub(super) fn lock_scratch<V>(scratch: &[Mutex<Scratch<V>>], thread: usize) -> MutexGuard<'_, Scratch<V>> {
     scratch[thread].lock().unwrap_or_else(PoisonError::into_inner)
 }

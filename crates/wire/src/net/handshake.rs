@@ -66,7 +66,7 @@ pub(super) fn probe(endpoint: &Endpoint, tls: &Tls) -> Result<(), HandshakeError
     result.map_or_else(|error| classify(&error, endpoint, tls), |_| Ok(()))
 }
 
-/// A connection before the handshake; `None` if nobody listens.
+/// A connection before the handshake; `None` if no process listens.
 fn connect(endpoint: &Endpoint, tls: &Tls) -> Option<(ClientConnection, TcpStream)> {
     let credentials = tls.load().ok()?;
     let config = ClientConfig::builder_with_provider(Arc::new(provider()))

@@ -203,7 +203,7 @@ impl Slurm {
     }
 
     /// Cancels a job and waits briefly for its end. If Slurm does not respond, this fails: the job continues, and
-    /// whoever looks for it later finds it.
+    /// a later labeller finds it.
     pub async fn cancel(&self, job: &Job) -> Result<(), StoreError> {
         let started = Instant::now();
         loop {

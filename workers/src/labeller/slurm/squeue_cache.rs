@@ -14,7 +14,7 @@ use super::{Job, SQUEUE_INTERVAL};
 /// File beside the directories of calculations.
 const CACHE_FILE: &str = "calmwalk-squeue";
 
-/// Whether the job was recently reported as read_recent, or nobody answers.
+/// Whether Slurm recently reported the job as alive, or does not answer.
 pub(super) async fn is_alive(commands: &SlurmClient, job: &Job) -> bool {
     let path = job.directory.with_file_name(CACHE_FILE);
     let names = match read_recent(&path) {
