@@ -3,35 +3,28 @@
 //! them.
 
 mod atomic_file;
-mod budget_usage;
 mod campaign;
-mod candidate_details;
 mod cli;
 mod config;
 mod disk_forecast;
 mod duration;
-mod energy_errors;
 mod exit_status;
 mod filter;
 mod forgetting;
-mod label_cost;
+mod initial_mixture;
 mod label_setup;
-mod label_statistics;
 mod log;
-mod mixture_status;
 mod notify;
 mod output;
 mod process_config;
 mod progress;
-mod provenance;
 mod replay;
 mod report;
 mod runtime;
 mod signals;
 mod summary;
-mod unlabelled;
-mod walk_ends;
 mod web;
+mod wording;
 mod xyz_reader;
 
 use std::process::ExitCode;

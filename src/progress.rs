@@ -5,13 +5,14 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use monitor::walk_ends::WalkEnds;
 use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
 use crate::forgetting::{AlarmState, ForgettingRule};
 use crate::output::{count, print_stderr};
-use crate::walk_ends::WalkEnds;
+use crate::wording::walk_ends;
 
 /// Interval between plain lines that only report steps.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
@@ -131,7 +132,7 @@ impl Display {
         }
         if !self.warned && self.ends.is_alarming() {
             self.warned = true;
-            let warning = format!("WARNING: {}", self.ends.warning());
+            let warning = format!("WARNING: {}", walk_ends::warning(&self.ends));
             tracing::warn!("{warning}");
             self.show(&warning);
         }

@@ -3,14 +3,13 @@
 use std::fmt;
 
 use calm::forgetting::GradeDistribution;
+use monitor::label_statistics::{self, ErrorsByGrade, LabelStatistics};
+use monitor::walk_ends::WalkEnds;
 use store::{Status, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
-use crate::budget_usage;
-use crate::label_statistics::{self, ErrorsByGrade, LabelStatistics};
 use crate::output::{count, decimals};
-use crate::unlabelled;
-use crate::walk_ends::WalkEnds;
+use crate::wording::{budget, energies, unlabelled, walk_ends};
 
 /// Largest number of seed structures with failed labels to show.
 const MAX_SHOWN: usize = 8;
@@ -43,8 +42,8 @@ impl fmt::Display for Summary {
         let of = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
         writeln!(f, "walks            {} biased, {} control", of("biased"), of("control"))?;
         let ends = WalkEnds::from_walks(walks);
-        writeln!(f, "                 ended: {}", ends.in_words())?;
-        ends.lines().iter().try_for_each(|line| writeln!(f, "                 {line}"))?;
+        writeln!(f, "                 ended: {}", walk_ends::all(&ends))?;
+        walk_ends::early_ends(&ends).iter().try_for_each(|line| writeln!(f, "                 {line}"))?;
         let declined = &candidates.declined;
         let all = declined.covered + declined.duplicate + declined.guard + declined.budget + declined.backlog;
         writeln!(
@@ -77,7 +76,7 @@ impl fmt::Display for Summary {
             labels.dropped
         )?;
         write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, MAX_SHOWN))?;
-        if let Some(budget) = budget_usage::describe(&self.status.budget) {
+        if let Some(budget) = budget::describe(&self.status.budget) {
             writeln!(f, "budget           {budget}")?;
         }
         writeln!(f, "mixture          version {mixture_version}")?;
@@ -95,11 +94,11 @@ impl fmt::Display for Summary {
         )?;
         writeln!(f, "  biased   {}", line(&self.statistics.biased))?;
         writeln!(f, "  control  {}", line(&self.statistics.control))?;
-        let energies = self.statistics.energies.summary();
-        if let Some(line) = energies.line() {
+        let energy = self.statistics.energies.summary();
+        if let Some(line) = energies::errors(&energy) {
             writeln!(f, "energy error of the potential: {line}")?;
         }
-        writeln!(f, "{}", energies.offsets.note)
+        writeln!(f, "{}", energy.offsets.note)
     }
 }
 

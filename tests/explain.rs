@@ -97,7 +97,7 @@ fn check_label(story: &Value, stored: &StoredCandidate) {
 }
 
 #[test]
-fn every_candidate_has_its_story() {
+fn every_candidate_has_its_history() {
     let directory = campaign(&[]);
     let here = directory.path();
     let contents = contents(here);

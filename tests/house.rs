@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Every package, where it lives, and the packages that it may depend on.
-const HOUSE: [(&str, &str, &[&str]); 14] = [
+const HOUSE: [(&str, &str, &[&str]); 15] = [
     ("atoms", "crates/atoms", &[]),
     ("npz", "crates/npz", &[]),
     ("calm", "crates/calm", &["npz"]),
@@ -18,10 +18,11 @@ const HOUSE: [(&str, &str, &[&str]); 14] = [
     ("slurm", "crates/slurm", &[]),
     ("wire", "crates/wire", &["atoms", "calm"]),
     ("store", "store", &["atoms", "wire"]),
+    ("monitor", "crates/monitor", &["analysis", "atoms", "calm", "store", "wire"]),
     (
         "workers",
         "workers",
-        &["atoms", "calm", "potentials", "md", "dft", "analysis", "slurm", "wire", "store"],
+        &["atoms", "calm", "potentials", "md", "dft", "analysis", "slurm", "wire", "store", "monitor"],
     ),
     ("orchestrator", "orchestrator", &["atoms", "calm", "slurm", "wire", "store"]),
     (
@@ -38,6 +39,7 @@ const HOUSE: [(&str, &str, &[&str]); 14] = [
             "figures",
             "wire",
             "store",
+            "monitor",
             "workers",
             "orchestrator",
         ],
@@ -172,6 +174,100 @@ fn walkers_do_not_open_the_store() {
         read += 1;
     }
     assert!(read > 1);
+}
+
+/// The Rust files at these paths, which are files or folders, with their text. Unit tests at the end of a file do not
+/// count.
+fn sources(paths: &[&str]) -> BTreeMap<PathBuf, String> {
+    let mut open: Vec<_> = paths.iter().map(|path| root().join(path)).collect();
+    let mut found = BTreeMap::new();
+    while let Some(path) = open.pop() {
+        if path.is_dir() {
+            open.extend(std::fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
+        } else if path.extension().is_some_and(|kind| kind == "rs") {
+            let text = std::fs::read_to_string(&path).unwrap();
+            let text = text.split("#[cfg(test)]\nmod tests {").next().unwrap_or_default().to_owned();
+            found.insert(path, text);
+        }
+    }
+    assert!(
+        paths.iter().all(|path| found.keys().any(|file| file.starts_with(root().join(path)))),
+        "{paths:?}"
+    );
+    found
+}
+
+/// Functions of the store that begin a transaction which writes, or call one that does.
+fn writing_functions() -> BTreeSet<String> {
+    let mut bodies = BTreeMap::new();
+    for text in sources(&["store/src/tables"]).values() {
+        for function in text.split("async fn ").skip(1) {
+            let (name, body) = function.split_once('(').unwrap();
+            let body = body.split("\n    }\n").next().unwrap().to_owned();
+            bodies.insert(name.split('<').next().unwrap().to_owned(), body);
+        }
+    }
+    let begins = |body: &String| {
+        [".begin()", "begin_as_leader()", "begin_commit("].iter().any(|begin| body.contains(begin))
+    };
+    let mut names: BTreeSet<_> =
+        bodies.iter().filter(|(_, body)| begins(body)).map(|(name, _)| name.clone()).collect();
+    loop {
+        let calls = |body: &String| names.iter().any(|name| body.contains(&format!("self.{name}(")));
+        let more: BTreeSet<_> =
+            bodies.iter().filter(|(_, body)| calls(body)).map(|(name, _)| name.clone()).collect();
+        if more.is_subset(&names) {
+            return names;
+        }
+        names.extend(more);
+    }
+}
+
+/// The read side and the views take everything from the store and put nothing into it. The dashboard's `actions` are
+/// no view.
+#[test]
+fn views_never_write() {
+    let views = [
+        "crates/monitor/src",
+        "src/cli/status.rs",
+        "src/cli/status",
+        "src/cli/explain",
+        "src/cli/force_errors.rs",
+        "src/cli/watch/reader.rs",
+        "src/report",
+        "src/web",
+        "src/wording",
+        "src/summary.rs",
+    ];
+    let writing = writing_functions();
+    for known in ["lease", "complete", "commit", "pause_walks", "retry_job", "exclude"] {
+        assert!(writing.contains(known), "{known} is not among the functions that write: {writing:?}");
+    }
+    for (path, text) in
+        sources(&views).into_iter().filter(|(path, _)| !path.ends_with("dashboard/actions.rs"))
+    {
+        let found: Vec<_> = writing.iter().filter(|name| text.contains(&format!("store.{name}("))).collect();
+        assert!(found.is_empty(), "{} writes into the store: {found:?}", path.display());
+    }
+}
+
+/// What the read side computes, views put into words, tables and pages.
+#[test]
+fn the_read_side_renders_nothing() {
+    for (path, text) in sources(&["crates/monitor/src"]) {
+        for means in ["println!", "writeln!", "write!(", "io::Write", "fmt::Display", "fmt::Write", "Table"] {
+            assert!(!text.contains(means), "{} uses {means}", path.display());
+        }
+    }
+}
+
+/// Commands stand above everything else of the program.
+#[test]
+fn commands_are_used_by_the_program_alone() {
+    for (path, text) in sources(&["src"]) {
+        let is_above = path.starts_with(root().join("src/cli")) || path == root().join("src/main.rs");
+        assert!(is_above || !text.contains("cli::"), "{} uses a command", path.display());
+    }
 }
 
 #[test]

@@ -3,13 +3,13 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use monitor::provenance::Provenance;
 use serde_json::Value;
 use store::{DATABASE, Location, Store};
 
 use super::Failure;
 use crate::campaign::Campaign;
 use crate::config::compare;
-use crate::provenance::Provenance;
 
 /// The default directory of a campaign: the path of its configuration without the extension.
 pub fn default_directory(config: &Path) -> PathBuf {

@@ -4,14 +4,17 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use analysis::{CostModel, Measured, Size};
+use monitor::disk::DiskForecast;
+use monitor::label_cost::{CoreHours, CostEstimator};
 use serde_json::json;
 use store::{Location, Store};
 
 use super::{ExitStatus, Failure, block_on, campaign_location};
 use crate::campaign::Campaign;
-use crate::disk_forecast::DiskForecast;
-use crate::label_cost::{CoreHours, CostEstimator, cost_size, two_digits};
+use crate::disk_forecast;
 use crate::output::{Table, count, print, print_json};
+use crate::wording;
+use crate::wording::cost::{core_hours, two_digits};
 
 /// Seed structures shown without --all.
 const SHOWN: usize = 20;
@@ -111,7 +114,7 @@ impl Estimate {
             limited_by: limit.and(config.budget().structures_by),
             cost: cost.map(|cost| cost.scaled(fraction)),
             cost_source,
-            disk: DiskForecast::from_campaign(campaign),
+            disk: disk_forecast::estimate(campaign),
         })
     }
 
@@ -130,6 +133,12 @@ impl Estimate {
         let source = format!("the {} of {location}", newest_labels(costs.measured()));
         Ok((Some(costs), source))
     }
+}
+
+/// The quantities that the cost of a label depends on, from its method.
+fn cost_size(size: &dft::Size) -> Size {
+    let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
+    Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 }
 }
 
 fn newest_labels(count: usize) -> String {
@@ -151,7 +160,11 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
     writeln!(out, "{}: at most {}{limit}", path.display(), count(*labels, "label"))?;
     match cost {
         Some(hours) => {
-            writeln!(out, "  labels   about {hours} for all of them, estimated from {cost_source}")?;
+            writeln!(
+                out,
+                "  labels   about {} for all of them, estimated from {cost_source}",
+                core_hours(hours)
+            )?;
         }
         None => writeln!(
             out,
@@ -159,7 +172,7 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
              and pass its cost with --core-seconds"
         )?,
     }
-    writeln!(out, "  disk     {disk}")?;
+    writeln!(out, "  disk     {}", wording::disk::forecast(disk))?;
     let mut table = Table::new(&[
         "seed structure",
         ">labels",

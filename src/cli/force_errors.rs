@@ -3,12 +3,12 @@
 use std::io::{self, Write};
 
 use analysis::{CompletionBin, ErrorBin};
-use serde_json::{Value, json};
+use monitor::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use store::{Protocol, Store};
 
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
-use crate::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use crate::output::{Table, count, decimals, print, print_json, range};
+use crate::wording;
 
 /// Failed structures listed per line.
 const NAMES: usize = 3;
@@ -34,11 +34,11 @@ pub struct ForceErrors {
 
 impl ForceErrors {
     pub fn run(self) -> Result<ExitStatus, Failure> {
-        let (protocol, learned) = block_on(self.read())??;
+        let (protocol, statistics) = block_on(self.read())??;
         if self.json {
-            print_json(&as_json(&protocol, &learned))?;
+            print_json(&statistics.to_json(&protocol))?;
         } else {
-            print(|out| write(out, &protocol, &learned))?;
+            print(|out| write(out, &protocol, &statistics))?;
         }
         Ok(ExitStatus::Done)
     }
@@ -46,9 +46,9 @@ impl ForceErrors {
     async fn read(&self) -> Result<(Protocol, LabelStatistics), Failure> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let protocol = self.select_protocol(&store).await?;
-        let learned = label_statistics::read(&store, protocol.hash).await?;
+        let statistics = label_statistics::read(&store, protocol.hash).await?;
         store.close().await;
-        Ok((protocol, learned))
+        Ok((protocol, statistics))
     }
 
     async fn select_protocol(&self, store: &Store) -> Result<Protocol, Failure> {
@@ -65,20 +65,20 @@ impl ForceErrors {
     }
 }
 
-fn write(out: &mut dyn Write, protocol: &Protocol, learned: &LabelStatistics) -> io::Result<()> {
-    let LabelStatistics { all, .. } = learned;
+fn write(out: &mut dyn Write, protocol: &Protocol, statistics: &LabelStatistics) -> io::Result<()> {
+    let LabelStatistics { all, .. } = statistics;
     writeln!(
         out,
         "force error |F_model − F_label| by grade under the original mixture, protocol '{}'",
         protocol.name
     )?;
-    write_correlations(out, learned)?;
+    write_correlations(out, statistics)?;
     if (all.gamma.sampled() as u64) < all.gamma.atoms() {
         let (sampled, atoms) = (all.gamma.sampled(), all.gamma.atoms());
         writeln!(out, "ρ, ROC-AUC and percentiles are from a sample of {sampled} of {atoms} atoms")?;
     }
-    if learned.shared > 0 {
-        let structures = count(learned.shared, "structure");
+    if statistics.shared > 0 {
+        let structures = count(statistics.shared, "structure");
         writeln!(
             out,
             "{structures} found by both biased and control walks: counted once in 'all', and not in 'biased' or 'control'"
@@ -88,15 +88,15 @@ fn write(out: &mut dyn Write, protocol: &Protocol, learned: &LabelStatistics) ->
         let (gamma, gamma_nbr) = (all.gamma.left_out(), all.gamma_nbr.left_out());
         writeln!(out, "excluded: {gamma} atoms without a finite γ, {gamma_nbr} without a finite γ_nbr")?;
     }
-    write_energies(out, learned)?;
+    write_energies(out, statistics)?;
     for (name, errors) in [("γ", &all.gamma), ("γ_nbr", &all.gamma_nbr)] {
         write_bins(out, name, &errors.bins())?;
     }
-    write_completion(out, "γ_max", &learned.by_gamma.bins())?;
-    write_completion(out, "V/V₀", &learned.by_expansion.bins())
+    write_completion(out, "γ_max", &statistics.by_gamma.bins())?;
+    write_completion(out, "V/V₀", &statistics.by_expansion.bins())
 }
 
-fn write_correlations(out: &mut dyn Write, learned: &LabelStatistics) -> io::Result<()> {
+fn write_correlations(out: &mut dyn Write, statistics: &LabelStatistics) -> io::Result<()> {
     let mut table = Table::new(&[
         "",
         ">structures",
@@ -107,7 +107,8 @@ fn write_correlations(out: &mut dyn Write, learned: &LabelStatistics) -> io::Res
         ">ROC-AUC(γ)",
         ">ROC-AUC(γ_nbr)",
     ]);
-    for (name, grades) in [("all", &learned.all), ("biased", &learned.biased), ("control", &learned.control)]
+    for (name, grades) in
+        [("all", &statistics.all), ("biased", &statistics.biased), ("control", &statistics.control)]
     {
         let ErrorsByGrade { structures, gamma, gamma_nbr } = grades;
         table.push(vec![
@@ -124,10 +125,10 @@ fn write_correlations(out: &mut dyn Write, learned: &LabelStatistics) -> io::Res
     table.write(out)
 }
 
-fn write_energies(out: &mut dyn Write, learned: &LabelStatistics) -> io::Result<()> {
-    let energies = learned.energies.summary();
+fn write_energies(out: &mut dyn Write, statistics: &LabelStatistics) -> io::Result<()> {
+    let energies = statistics.energies.summary();
     writeln!(out)?;
-    if let Some(line) = energies.line() {
+    if let Some(line) = wording::energies::errors(&energies) {
         writeln!(out, "energy error |E_model − E_label|: {line}")?;
     }
     writeln!(out, "{}", energies.offsets.note)
@@ -188,52 +189,4 @@ fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<Strin
     }
     writeln!(out)?;
     table.write(out)
-}
-
-/// The output of `--json`.
-pub fn as_json(protocol: &Protocol, learned: &LabelStatistics) -> Value {
-    json!({
-        "protocol": protocol.name,
-        "protocol_hash": protocol.hash.to_string(),
-        "large": LARGE_FORCE_ERROR,
-        "all": grades_as_json(&learned.all),
-        "biased": grades_as_json(&learned.biased),
-        "control": grades_as_json(&learned.control),
-        "energy": learned.energies.summary(),
-        "shared_structures": learned.shared,
-        "completion_by_gamma": completion_as_json(&learned.by_gamma.bins()),
-        "completion_by_relative_volume": completion_as_json(&learned.by_expansion.bins()),
-    })
-}
-
-fn grades_as_json(grades: &ErrorsByGrade) -> Value {
-    let one = |errors: &analysis::ForceErrors| {
-        json!({
-            "spearman": errors.spearman(), "roc_auc": errors.roc_auc(), "left_out": errors.left_out(),
-            "sampled_atoms": errors.sampled(), "share_above_one": errors.fraction_above(1.0),
-            "bins": errors.bins().iter().map(bin_as_json).collect::<Vec<_>>(),
-        })
-    };
-    json!({
-        "structures": grades.structures, "atoms": grades.gamma.atoms(), "mean_error": grades.gamma.mean(),
-        "gamma": one(&grades.gamma), "gamma_nbr": one(&grades.gamma_nbr),
-    })
-}
-
-fn bin_as_json(bin: &ErrorBin) -> Value {
-    let ErrorBin { above, up_to, atoms, share, unlabelled, median, p90, p99, large, large_between } = bin;
-    json!({
-        "above": above, "up_to": up_to, "atoms": atoms, "share": share, "median": median, "p90": p90, "p99": p99,
-        "share_large": large, "atoms_without_label": unlabelled, "share_large_between": large_between,
-    })
-}
-
-fn completion_as_json(bins: &[CompletionBin<String>]) -> Value {
-    let one = |bin: &CompletionBin<String>| {
-        json!({
-            "above": bin.above, "up_to": bin.up_to, "labelled": bin.labelled, "failed": bin.failed,
-            "share": bin.share, "share_between": bin.interval,
-        })
-    };
-    bins.iter().map(one).collect()
 }

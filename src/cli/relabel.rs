@@ -6,6 +6,8 @@ mod selection;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
+use monitor::label_cost::{self, RelabelCost};
+use monitor::provenance::Provenance;
 use serde_json::{Value, json};
 use store::{CampaignLock, Location, NewProtocol, Protocol, RelabelCounts, Store, unix_milliseconds};
 
@@ -14,9 +16,8 @@ use self::selection::Selection;
 use super::campaign_location::shell_argument;
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::filter::Filter;
-use crate::label_cost::{self, RelabelCost};
 use crate::output::{count, print, print_json, warn_if_unencrypted};
-use crate::provenance::Provenance;
+use crate::wording;
 
 /// Compute labels again, or switch the campaign to another label protocol
 ///
@@ -190,7 +191,7 @@ impl RelabelReport {
         writeln!(out, "{structures} {are} queued again for protocol '{name}'{}", selection.replaced())?;
         selection.skipped(name).iter().try_for_each(|line| writeln!(out, "{line}"))?;
         if requeued.again > 0 {
-            writeln!(out, "cost: {cost}")?;
+            writeln!(out, "cost: {}", wording::cost::relabel_cost(cost))?;
         }
         match dry_run {
             true => writeln!(out, "dry run: nothing was changed"),

@@ -9,6 +9,10 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use monitor::candidate_details;
+use monitor::disk;
+use monitor::provenance::Provenance;
+use monitor::walk_ends::WalkEnds;
 use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, SelectorSnapshot};
@@ -23,15 +27,15 @@ use workers::labeller::GUARD;
 use super::campaign_location::{self, shell_argument};
 use super::{ExitStatus, Failure, block_on, duration_between};
 use crate::campaign::Campaign;
-use crate::disk_forecast::{self, DiskForecast, megabytes};
+use crate::disk_forecast;
 use crate::duration::Duration;
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
-use crate::provenance::Provenance;
 use crate::runtime::notify::{self, Notifier};
 use crate::runtime::{self, multi_process, single_process, time_budget};
-use crate::walk_ends::WalkEnds;
-use crate::{candidate_details, log, summary, web};
+use crate::wording::disk::megabytes;
+use crate::wording::{self, walk_ends};
+use crate::{log, summary, web};
 
 /// Run a campaign until it is finished, or resume it
 ///
@@ -233,7 +237,7 @@ async fn run(
     })?;
     store.close().await;
     if ends.all_early() {
-        log_and_warn(format_args!("calmwalk: the campaign has failed: {}", ends.warning()));
+        log_and_warn(format_args!("calmwalk: the campaign has failed: {}", walk_ends::warning(&ends)));
         return Ok(ExitStatus::NoWalkCompleted);
     }
     Ok(ExitStatus::Done)
@@ -285,10 +289,7 @@ async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), Failur
     let elements: Vec<_> = campaign.model.elements().iter().map(|species| species.symbol()).collect();
     store.set_metadata(candidate_details::ELEMENTS_KEY, &text(serde_json::to_string(&elements))?).await?;
     store
-        .set_metadata(
-            disk_forecast::METADATA_KEY,
-            &text(serde_json::to_string(&DiskForecast::from_campaign(campaign)))?,
-        )
+        .set_metadata(disk::METADATA_KEY, &text(serde_json::to_string(&disk_forecast::estimate(campaign)))?)
         .await?;
     Ok(())
 }
@@ -299,15 +300,16 @@ async fn warn_if_disk_is_too_small(
     directory: &Path,
     store: &Store,
 ) -> Result<(), Failure> {
-    let forecast = DiskForecast::from_campaign(campaign);
+    let forecast = disk_forecast::estimate(campaign);
     let needed = (forecast.bytes() + disk_forecast::WAL_BYTES).saturating_sub(store.size().await?);
     let free = store::free_space(directory)?;
     if free < needed {
         log_and_warn(format_args!(
-            "WARNING: the campaign needs {} more on the disk of {}, but only {} are free (forecast: {forecast})",
+            "WARNING: the campaign needs {} more on the disk of {}, but only {} are free (forecast: {})",
             megabytes(needed),
             directory.display(),
-            megabytes(free)
+            megabytes(free),
+            wording::disk::forecast(&forecast)
         ));
     }
     Ok(())

@@ -1,10 +1,8 @@
 //! `calmwalk status`
 
 mod batch_jobs;
-mod expected_end;
-mod json;
-mod label_summary;
-mod mixture_summary;
+mod labels;
+mod mixture;
 pub mod page;
 mod processes;
 #[cfg(test)]
@@ -13,20 +11,21 @@ pub mod walks;
 
 use std::io::{self, Write};
 
-use serde_json::Value;
-use store::{Candidates, Location, Status as CampaignStatus, Store};
+use monitor::Snapshot;
+use monitor::disk::DiskUse;
+use monitor::expected_end::ExpectedEnd;
+use monitor::label_cost::SECONDS_PER_HOUR;
+use monitor::walk_ends::WalkEnds;
+use store::{Candidates, Location, Status as CampaignStatus, Store, unix_milliseconds};
 
 use self::batch_jobs::BatchJobs;
-pub use self::expected_end::ExpectedEnd;
-use self::label_summary::LabelSummary;
-pub use self::mixture_summary::MixtureSummary;
 use self::page::Page;
+pub use self::processes::state;
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
-use crate::budget_usage;
-use crate::disk_forecast::{self, DiskForecast, megabytes};
 use crate::output::{count, decimals, print, print_json};
-use crate::provenance::Provenance;
-use crate::walk_ends::WalkEnds;
+use crate::wording::cost::two_digits;
+use crate::wording::disk::megabytes;
+use crate::wording::{budget, walk_ends};
 
 /// Show the progress of a campaign
 ///
@@ -50,190 +49,113 @@ pub struct Status {
 impl Status {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
-        let snapshot = block_on(Snapshot::read_location(&location))??;
+        let snapshot = block_on(read(&location))??;
         let jobs = block_on(BatchJobs::query(&location))?;
         if self.json {
-            print_json(&json::to_json(&snapshot, &jobs).map_err(Failure::failed)?)?;
+            let mut json = snapshot.to_json().map_err(Failure::failed)?;
+            jobs.add_to(&mut json);
+            print_json(&json)?;
         } else {
             let page = if self.all { Page::unlimited() } else { Page::unlimited().screen() };
-            print(|out| snapshot.write(out, &jobs, page, self.walks))?;
+            print(|out| write(out, &snapshot, &jobs, page, self.walks))?;
         }
         Ok(ExitStatus::Done)
     }
 }
 
-/// The state of a campaign, read within a short time.
-#[derive(Debug)]
-pub struct Snapshot {
-    campaign: store::Campaign,
-    /// `None` for campaigns of early versions.
-    origin: Option<Provenance>,
-    status: CampaignStatus,
-    mixture: MixtureSummary,
-    disk: Disk,
-    labels: LabelSummary,
-    end: ExpectedEnd,
+async fn read(location: &Location) -> Result<Snapshot, Failure> {
+    let store = Store::open_read_only(location).await?;
+    let snapshot = Snapshot::read(&store).await?;
+    store.close().await;
+    Ok(snapshot)
 }
 
-impl Snapshot {
-    async fn read_location(location: &Location) -> Result<Self, Failure> {
-        let store = Store::open_read_only(location).await?;
-        let snapshot = Self::read(&store).await?;
-        store.close().await;
-        Ok(snapshot)
-    }
+/// The output of `--all` in lines of at most `width` columns, without the jobs of a batch system.
+pub fn text(snapshot: &Snapshot, width: usize) -> String {
+    let (mut text, page) = (Vec::new(), Page { width, ..Page::unlimited() });
+    // Writing to memory cannot fail.
+    let _ = write(&mut text, snapshot, &BatchJobs::None, page, None);
+    String::from_utf8_lossy(&text).into_owned()
+}
 
-    /// Reads the state of a campaign.
-    pub async fn read(store: &Store) -> Result<Self, Failure> {
-        let forecast = store.metadata(disk_forecast::METADATA_KEY).await?;
-        let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
-        let (campaign, status) = (store.campaign().await?, store.status().await?);
-        let labels = LabelSummary::read(store, &status).await?;
-        let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
-        Ok(Self {
-            end: ExpectedEnd::extrapolate(&status, &configuration, labels.bill()),
-            origin: Provenance::read(store).await?,
-            mixture: MixtureSummary(store.values().await?),
-            disk: Disk { bytes: store.size().await?, forecast },
-            campaign,
-            status,
-            labels,
-        })
-    }
+fn write(
+    out: &mut dyn Write,
+    snapshot: &Snapshot,
+    jobs: &BatchJobs,
+    page: Page,
+    walks: Option<usize>,
+) -> io::Result<()> {
+    let mut head = Vec::new();
+    write_head(&mut head, snapshot, &page)?;
+    out.write_all(&head)?;
+    let lines = head.iter().filter(|byte| **byte == b'\n').count();
+    let page = page.fitted(lines, if matches!(jobs, BatchJobs::Known(_)) { 3 } else { 2 }, walks);
+    let status = &snapshot.status;
+    walks::write(out, &status.walks, status.led, &page)?;
+    processes::write(out, &status.processes, &page)?;
+    jobs.write(out, &page)
+}
 
-    /// A description of what the campaign does.
-    pub fn state(&self) -> String {
-        processes::state(&self.status)
+fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Result<()> {
+    let Snapshot { campaign, origin, status, mixture, disk, labels, end } = snapshot;
+    let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
+    let id = campaign.id.to_string();
+    // Ids of candidates start with the same eight characters.
+    let id = if page.is_unlimited() || name.is_empty() { &id[..] } else { &id[..8] };
+    let separator = if name.is_empty() { "" } else { ", " };
+    let round = if status.round == 0 { String::new() } else { format!(", round {}", status.round) };
+    page.titled(out, "campaign", &format!("{name}{separator}{id}, {mode} mode{round}"))?;
+    if let Some(origin) = origin.as_ref().filter(|_| page.is_unlimited()) {
+        page.titled(out, "", &format!("configured by {}", origin.file.path))?;
     }
-
-    /// The output of `--all` in lines of at most `width` columns, without the jobs of a batch system.
-    pub fn text(&self, width: usize) -> String {
-        let (mut text, page) = (Vec::new(), Page { width, ..Page::unlimited() });
-        // Writing to memory cannot fail.
-        let _ = self.write(&mut text, &BatchJobs::None, page, None);
-        String::from_utf8_lossy(&text).into_owned()
+    page.titled(out, "state", &state(status))?;
+    let ends = WalkEnds::from_walks(&status.walks);
+    page.titled(out, "walks", &describe_walks(status, &ends))?;
+    if page.is_unlimited() {
+        walk_ends::early_ends(&ends).iter().try_for_each(|line| page.titled(out, "", line))?;
+    } else {
+        let advice =
+            ends.causes().map(|(cause, _)| format!("{}: try {}", walk_ends::cause(cause), cause.advice()));
+        advice.take(page.few).try_for_each(|line| page.titled(out, "", &line))?;
     }
-
-    /// The JSON output (docs/status.md), without the jobs of a batch system.
-    pub fn to_json(&self) -> serde_json::Result<Value> {
-        json::to_json(self, &BatchJobs::None)
+    page.titled(out, "mixture", &format!("version {}", status.mixture_version))?;
+    mixture::write(out, mixture, page, &campaign.mode)?;
+    write_candidates(out, page, &status.candidates, labels.shared)?;
+    labels::write(out, labels, page, status)?;
+    if let Some(budget) = budget::describe(&status.budget) {
+        page.titled(out, "budget", &budget)?;
     }
-
-    /// Identity and configuration.
-    pub fn campaign(&self) -> &store::Campaign {
-        &self.campaign
-    }
-
-    /// Counts, walks and processes.
-    pub fn status(&self) -> &CampaignStatus {
-        &self.status
-    }
-
-    /// Label failures by class.
-    pub fn failures(&self) -> &[store::FailureCount] {
-        &self.labels.failures
-    }
-
-    /// Fraction of the training atoms with γ > 1 under the newest mixture, if they are monitored.
-    pub fn share_above_one(&self) -> Option<f64> {
-        self.mixture.training_frames()["share_above_one"].as_f64()
-    }
-
-    /// Size of the store, bytes.
-    pub fn bytes(&self) -> u64 {
-        self.disk.bytes
-    }
-
-    /// The expected end.
-    pub fn end(&self) -> &ExpectedEnd {
-        &self.end
-    }
-
-    fn write(
-        &self,
-        out: &mut dyn Write,
-        jobs: &BatchJobs,
-        page: Page,
-        walks: Option<usize>,
-    ) -> io::Result<()> {
-        let mut head = Vec::new();
-        self.write_head(&mut head, &page)?;
-        out.write_all(&head)?;
-        let lines = head.iter().filter(|byte| **byte == b'\n').count();
-        let page = page.fitted(lines, if matches!(jobs, BatchJobs::Known(_)) { 3 } else { 2 }, walks);
-        walks::write(out, &self.status.walks, self.status.led, &page)?;
-        processes::write(out, &self.status.processes, &page)?;
-        jobs.write(out, &page)
-    }
-
-    fn write_head(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
-        let Self { campaign, origin, status, mixture, disk, labels, end } = self;
-        let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
-        let id = campaign.id.to_string();
-        // Ids of candidates start with the same eight characters.
-        let id = if page.is_unlimited() || name.is_empty() { &id[..] } else { &id[..8] };
-        let separator = if name.is_empty() { "" } else { ", " };
-        let round = if status.round == 0 { String::new() } else { format!(", round {}", status.round) };
-        page.titled(out, "campaign", &format!("{name}{separator}{id}, {mode} mode{round}"))?;
-        if let Some(origin) = origin.as_ref().filter(|_| page.is_unlimited()) {
-            page.titled(out, "", &format!("configured by {}", origin.file.path))?;
-        }
-        page.titled(out, "state", &processes::state(status))?;
-        let ends = WalkEnds::from_walks(&status.walks);
-        page.titled(out, "walks", &describe_walks(status, &ends))?;
-        if page.is_unlimited() {
-            ends.lines().iter().try_for_each(|line| page.titled(out, "", line))?;
-        } else {
-            let advice =
-                ends.causes().map(|(cause, _)| format!("{}: try {}", cause.in_words(), cause.advice()));
-            advice.take(page.few).try_for_each(|line| page.titled(out, "", &line))?;
-        }
-        page.titled(out, "mixture", &format!("version {}", status.mixture_version))?;
-        mixture.write(out, page, &campaign.mode)?;
-        write_candidates(out, page, &status.candidates, labels.shared)?;
-        labels.write(out, page, status)?;
-        if let Some(budget) = budget_usage::describe(&status.budget) {
-            page.titled(out, "budget", &budget)?;
-        }
-        page.titled(out, "disk", &disk.describe(page, status))?;
-        match end.describe() {
-            Some(end) => page.titled(out, "end", &end),
-            None => Ok(()),
-        }
+    page.titled(out, "disk", &describe_disk(disk, page, status))?;
+    match expected_end(end) {
+        Some(end) => page.titled(out, "end", &end),
+        None => Ok(()),
     }
 }
 
-/// Disk use of the store.
-#[derive(Debug, serde::Serialize)]
-struct Disk {
-    /// Current size.
-    bytes: u64,
-    /// Last forecast of the orchestrator for the end of the campaign.
-    forecast: Option<DiskForecast>,
+fn describe_disk(disk: &DiskUse, page: &Page, status: &CampaignStatus) -> String {
+    let now = megabytes(disk.bytes);
+    let Some((forecast, end)) = disk.forecast.zip(disk.at_the_end(status)) else {
+        return format!("{now} now");
+    };
+    let end = format!("{now} now; about {} at the end", megabytes(end));
+    match page.is_unlimited() {
+        true => {
+            let declined = megabytes(forecast.declined);
+            format!("{end}, plus up to {declined} for features of declined candidates")
+        }
+        false => end,
+    }
 }
 
-impl Disk {
-    /// Expected size at the end, bytes. `None` if it is unknown or the campaign is finished.
-    fn at_the_end(&self, status: &CampaignStatus) -> Option<u64> {
-        let Candidates { accepted, control, .. } = status.candidates;
-        let forecast = self.forecast.filter(|_| !status.finished)?;
-        Some(self.bytes + forecast.remaining_bytes(accepted + control, self.bytes))
-    }
-
-    fn describe(&self, page: &Page, status: &CampaignStatus) -> String {
-        let now = megabytes(self.bytes);
-        let Some((forecast, end)) = self.forecast.zip(self.at_the_end(status)) else {
-            return format!("{now} now");
-        };
-        let end = format!("{now} now; about {} at the end", megabytes(end));
-        match page.is_unlimited() {
-            true => {
-                let declined = megabytes(forecast.declined);
-                format!("{end}, plus up to {declined} for features of declined candidates")
-            }
-            false => end,
-        }
-    }
+/// The expected end as text; `None` if it is unknown.
+pub fn expected_end(end: &ExpectedEnd) -> Option<String> {
+    let milliseconds = end.time? - unix_milliseconds();
+    let hours = two_digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
+    let part = |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", two_digits(hours)));
+    let parts =
+        [part("walks", end.walks_hours), part("labels", end.labels_hours), part("budget", end.budget_hours)];
+    let parts: Vec<_> = parts.into_iter().flatten().collect();
+    Some(format!("expected within {hours} h at the current rate ({})", parts.join(", ")))
 }
 
 fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
@@ -241,7 +163,7 @@ fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     let state = if status.led { "active" } else { "not finished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),
-        ended => format!("{ended} ended ({})", ends.counts_by_end()),
+        ended => format!("{ended} ended ({})", walk_ends::without_causes(ends)),
     };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {} steps/s", decimals(Some(speed), 1)));

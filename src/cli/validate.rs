@@ -7,8 +7,9 @@ use calm::Artifact;
 
 use super::{ExitStatus, Failure};
 use crate::campaign::Campaign;
-use crate::disk_forecast::DiskForecast;
+use crate::disk_forecast;
 use crate::output::{count, print};
+use crate::wording;
 
 /// Check a configuration and all files that it refers to
 ///
@@ -49,7 +50,7 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
     }
     writeln!(out, "  seed structures  {}, with {min} to {max} atoms", seed_structures.len())?;
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
-    writeln!(out, "  disk             {}", DiskForecast::from_campaign(campaign))?;
+    writeln!(out, "  disk             {}", wording::disk::forecast(&disk_forecast::estimate(campaign)))?;
     match campaign.warnings.len() {
         0 => writeln!(out, "  warnings         none"),
         count => writeln!(out, "  warnings         {count}, see above"),

@@ -131,7 +131,7 @@ const OTHER_PHYSICS: &str =
 fn reason(key: &str) -> &'static str {
     match key {
         "instructions" => {
-            "this machine's processor gives other last two_digits than the one on which it began, which mode = \
+            "this machine's processor gives other last digits than the one on which it began, which mode = \
              \"reproducible\" promises not to happen"
         }
         key if is_label(key) => "labels of two protocols do not belong in one data set",

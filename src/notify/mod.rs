@@ -3,13 +3,14 @@
 
 use std::collections::BTreeMap;
 
+use monitor::walk_ends::WalkEnds;
 use serde::{Deserialize, Serialize};
 use store::Status;
 
 use crate::config::{NotifyEvent, NotifySection};
 use crate::forgetting::ForgettingRule;
 use crate::output::count;
-use crate::walk_ends::WalkEnds;
+use crate::wording::walk_ends;
 
 const MINUTE: f64 = 60_000.0;
 /// Stored for the event `forgetting` while the alarm is raised.
@@ -138,7 +139,7 @@ impl NotificationTracker {
         if !ends.is_alarming() {
             return None;
         }
-        self.due(NotifyEvent::FailingWalks, "yes".into(), ends.warning())
+        self.due(NotifyEvent::FailingWalks, "yes".into(), walk_ends::warning(ends))
     }
 
     fn is_wanted(&self, event: NotifyEvent) -> bool {

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use monitor::label_statistics::{self, LabelStatistics};
 use serde_json::Value;
 use store::{
     Campaign, FailureCount, FateCount, LabelCost, Protocol, SeedStructure, Status, Store, StoreError,
@@ -9,7 +10,6 @@ use store::{
 };
 
 use super::collections::Collections;
-use crate::label_statistics::{self, LabelStatistics};
 
 /// Largest number of labels in the cost figure: the newest.
 const MAX_COSTS: u32 = 100_000;

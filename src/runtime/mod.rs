@@ -23,6 +23,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use monitor::walk_ends::WalkEnds;
 use orchestrator::reactor::{self, Notice, Reactor};
 use orchestrator::selector::Selector;
 use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, unix_milliseconds};
@@ -31,15 +32,13 @@ use tokio::sync::{Notify, mpsc};
 use wire::transport::Incoming;
 
 use self::throughput::Throughput;
-pub use listen::Listen;
-
 use crate::campaign::Campaign;
 use crate::config::QueueFull;
 use crate::exit_status::Failure;
 use crate::forgetting::ForgettingRule;
 use crate::output::log_and_print;
 use crate::progress::Display;
-use crate::walk_ends::WalkEnds;
+pub use listen::Listen;
 
 /// Capacity of the channel of reports from walkers to the reactor.
 const CHANNEL: usize = 64;

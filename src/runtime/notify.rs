@@ -5,6 +5,8 @@ use std::convert::Infallible;
 use std::process::Stdio;
 use std::time::Duration;
 
+use monitor::Snapshot;
+use monitor::mixture_values::MixtureValues;
 use serde_json::{Value, json};
 use store::{Location, Store, StoreError, unix_milliseconds};
 use tokio::io::AsyncWriteExt;
@@ -12,7 +14,6 @@ use tokio::process::Command;
 use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
-use crate::cli::status;
 use crate::config::{Config, NotifyEvent};
 use crate::exit_status::Failure;
 use crate::forgetting::ForgettingRule;
@@ -77,7 +78,7 @@ impl<'a> Notifier<'a> {
 
     async fn check(&mut self) -> Result<(), Failure> {
         let mut due = self.tracker.check(&self.store.status().await?, unix_milliseconds());
-        let values = status::MixtureSummary(self.store.values().await?);
+        let values = MixtureValues(self.store.values().await?);
         if let Some((share, raised)) = values.forgetting() {
             due.extend(self.tracker.check_training(&self.forgetting, share, raised));
         }
@@ -87,7 +88,7 @@ impl<'a> Notifier<'a> {
         // Store this first, so that no event is reported twice.
         let told = serde_json::to_string(self.tracker.sent()).map_err(Failure::failed)?;
         self.store.set_metadata(METADATA_KEY, &told).await?;
-        let snapshot = status::Snapshot::read(self.store).await?;
+        let snapshot = Snapshot::read(self.store).await?;
         let state = snapshot.to_json().map_err(Failure::failed)?;
         due.into_iter().for_each(|due| self.notify(due, &state));
         Ok(())

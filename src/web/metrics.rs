@@ -7,10 +7,10 @@ use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use monitor::Snapshot;
 use store::{Status, Store, unix_milliseconds};
 
 use super::exposition::{CONTENT_TYPE, Text};
-use crate::cli::status::Snapshot;
 
 const SECONDS_PER_HOUR: f64 = 3600.0;
 
@@ -28,7 +28,7 @@ async fn metrics(State(store): State<Store>) -> Response {
 
 /// All metrics. Labels have few values: kinds, states, reasons and classes, never walks or structures.
 pub fn text(snapshot: &Snapshot) -> String {
-    let (campaign, status) = (snapshot.campaign(), snapshot.status());
+    let (campaign, status) = (&snapshot.campaign, &snapshot.status);
     let mut text = Text::default();
     let id = campaign.id.to_string();
     let labels =
@@ -43,23 +43,23 @@ pub fn text(snapshot: &Snapshot) -> String {
     walks(&mut text, status);
     label_queue(&mut text, status);
     let failures: Vec<_> =
-        snapshot.failures().iter().map(|failure| [("class", failure.class.as_str())]).collect();
+        snapshot.labels.failures.iter().map(|failure| [("class", failure.class.as_str())]).collect();
     let samples: Vec<_> = failures
         .iter()
-        .zip(snapshot.failures())
+        .zip(&snapshot.labels.failures)
         .map(|(labels, found)| (&labels[..], (found.labelled + found.given_up + found.unfinished) as f64))
         .collect();
     text.gauge("calmwalk_failed_label_jobs", "Label jobs with a failure of this class.", &samples);
     processes(&mut text, status);
-    if let Some(share) = snapshot.share_above_one() {
+    if let Some(share) = snapshot.mixture.share_above_one() {
         text.gauge(
             "calmwalk_training_atoms_above_one_ratio",
             "Share of the training atoms with an extrapolation grade above 1 under the newest mixture.",
             &[(&[], share)],
         );
     }
-    text.gauge("calmwalk_store_bytes", "Size of the database.", &[(&[], snapshot.bytes() as f64)]);
-    if let Some(end) = snapshot.end().time {
+    text.gauge("calmwalk_store_bytes", "Size of the database.", &[(&[], snapshot.disk.bytes as f64)]);
+    if let Some(end) = snapshot.end.time {
         text.gauge(
             "calmwalk_expected_end_timestamp_seconds",
             "Expected end of the campaign, if nothing changes.",

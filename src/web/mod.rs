@@ -12,13 +12,13 @@ use std::net::SocketAddr;
 
 use axum::Router;
 use calm::Artifact;
+use monitor::mixture_status::InitialMixture;
 use store::{Location, Store};
 use tokio::net::TcpListener;
 
 use self::dashboard::{Dashboard, Mutations};
 pub use self::server::Server;
 use crate::exit_status::Failure;
-use crate::mixture_status::InitialMixture;
 use crate::output::{log_and_print, print_stderr};
 
 /// Options for the addresses to serve on.

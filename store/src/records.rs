@@ -8,6 +8,12 @@ use serde::{Deserialize, Serialize};
 use wire::messages::{DeclineReason, Progress};
 use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
+/// Name of the value with the grades of the training frames under the newest mixture (JSON of
+/// `calm::forgetting::GradeDistribution`, with `alarm`).
+pub const TRAINING_FRAMES: &str = "training_frames";
+/// Name of the value with the histogram of mixture ages at decisions (JSON of `calm::Staleness`).
+pub const STALENESS: &str = "staleness";
+
 /// Properties of a campaign, written when it is created.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Campaign {
@@ -218,7 +224,7 @@ pub struct Commit {
     pub restart_mixture: bool,
     /// Walks whose state changed.
     pub walks: Vec<WalkRecord>,
-    /// Small named values of the selector (round, mixture version, used byte budget …).
+    /// Small named values of the selector (round, mixture version, used byte budget, [`TRAINING_FRAMES`] …).
     pub values: Vec<(String, String)>,
 }
 

@@ -23,6 +23,7 @@ pub mod neighbourhood;
 pub mod rules;
 pub mod search;
 pub mod soundness;
+pub mod staleness;
 mod storage;
 pub mod update;
 
@@ -38,5 +39,6 @@ pub use neighbourhood::{Pair, neighbourhood_average};
 pub use rules::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 pub use search::{Trial, UpdateEnd, UpdateOutcome, update};
 pub use soundness::{ComponentFault, UnsoundComponent};
+pub use staleness::Staleness;
 pub use storage::SharedNumbers;
 pub use update::{Batch, CovarianceUpdate, UpdateError};

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use crate::bytes::ComponentBytesError;
 use crate::component::Component;
 
 /// The components of every element of a model. A clone copies one reference per element, not matrices.
@@ -49,6 +50,16 @@ pub enum MixtureError {
         found: usize,
         /// The dimension of the mixture.
         expected: usize,
+    },
+    /// Stored bytes that are not a component.
+    #[error("component {slot} of element {element}: {source}")]
+    Bytes {
+        /// Element index.
+        element: usize,
+        /// Component index.
+        slot: usize,
+        /// What is wrong with the bytes.
+        source: ComponentBytesError,
     },
     /// An index that the mixture does not have.
     #[error("the mixture has no component {slot} of element {element}")]
@@ -106,6 +117,24 @@ impl Mixture {
     /// The same components under another version number.
     pub fn at_version(&self, version: u64) -> Self {
         Self { version, ..self.clone() }
+    }
+
+    /// The mixture of a version: this one, the original, with the stored components (element index, component index,
+    /// [`Component::to_bytes`]), which are all that ever changed.
+    ///
+    /// # Errors
+    /// Bytes that are no component, and components that do not match the mixture.
+    pub fn restored<'a>(
+        &self,
+        version: u64,
+        stored: impl IntoIterator<Item = (usize, usize, &'a [u8])>,
+    ) -> Result<Self, MixtureError> {
+        let component = |(element, slot, bytes)| match Component::from_bytes(bytes) {
+            Ok(component) => Ok(ChangedComponent { element, slot, component: Arc::new(component) }),
+            Err(source) => Err(MixtureError::Bytes { element, slot, source }),
+        };
+        let changed = stored.into_iter().map(component).collect::<Result<Vec<_>, _>>()?;
+        Ok(self.with_changes(&changed)?.at_version(version))
     }
 
     /// Version number; the artifact as loaded is version 0.

@@ -155,7 +155,7 @@ fn the_count_rule_falls_back_twice() {
     // Three atoms at r in one direction: γ² = r² / (1 − α + α r²), as for a single one.
     let features = |radius: f64| [[radius, 0.0]; 3].concat();
     let run = |radius: f64, text: &str| {
-        let text = format!("ladder = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
+        let text = format!("alpha_values = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
         update(&round(), &[0; 3], &features(radius), &settings(&text)).unwrap()
     };
     // 2 / √(1 + 3·0.4) = 1.35; 1 at α = 1.

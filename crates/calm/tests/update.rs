@@ -110,7 +110,7 @@ fn the_reference_search_is_reproduced() {
     for combination in ["convex", "additive"] {
         let settings = |target: f64| {
             let text = format!(
-                "combination = '{combination}'\nladder = [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]\n\
+                "covariance_update = '{combination}'\nalpha_values = [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]\n\
                  stop = {{ rule = 'maximum_grade', target = {target:?} }}"
             );
             toml::from_str(&text).unwrap()

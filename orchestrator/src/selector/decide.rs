@@ -9,7 +9,7 @@ use calm::forgetting::{GradeDistribution, grade_distribution};
 use calm::grade::maximum;
 use calm::{GradeError, Grades, Mixture, UpdateOutcome};
 use serde_json::json;
-use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
+use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate, TRAINING_FRAMES};
 use wire::messages::{DeclineReason, Outcome, Verdict, WalkEnd};
 use wire::{CandidateBlock, ContentHash, WalkId};
 
@@ -362,7 +362,7 @@ fn describe_end(end: &WalkEnd) -> String {
 fn training_frames(grades: &GradeDistribution, alarm: bool) -> (String, String) {
     let mut value = json!(grades);
     value["alarm"] = json!(alarm);
-    ("training_frames".to_owned(), value.to_string())
+    (TRAINING_FRAMES.to_owned(), value.to_string())
 }
 
 fn grade_summary(gamma: &[f64], mixture_version: u64) -> serde_json::Value {

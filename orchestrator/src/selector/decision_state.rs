@@ -3,18 +3,16 @@
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
-use calm::{ChangedComponent, Component, Mixture};
+use calm::{Mixture, MixtureError, Staleness};
 use serde::de::DeserializeOwned;
 use serde_json::json;
-use store::records::{Commit, ComponentRecord, Decision, WalkRecord};
+use store::records::{Commit, ComponentRecord, Decision, STALENESS, WalkRecord};
 use wire::{ContentHash, WalkId};
 
 use super::backlog::Backlog;
 use super::rules::{ChangeableRules, RULES};
 use super::walk::Walk;
-use super::{
-    Regrader, STALENESS, SeedStructure, SelectorError, SelectorSnapshot, Settings, Staleness, TrainingFrames,
-};
+use super::{Regrader, SeedStructure, SelectorError, SelectorSnapshot, Settings, TrainingFrames};
 use crate::grader::Grader;
 
 /// Decides on candidates and walks.
@@ -148,23 +146,19 @@ fn restored<T: DeserializeOwned>(
     read.map(Some).map_err(|error| SelectorError::Snapshot(format!("{name} is damaged: {error}")))
 }
 
-/// The mixture of a version: the original mixture with the stored components, which are all that ever changed.
+/// The mixture of a version, from the original mixture and the stored components.
 ///
 /// # Errors
 /// Components that are damaged or do not match the original mixture.
-pub fn restored_mixture(
+pub(super) fn restored_mixture(
     original: &Mixture,
     version: u64,
     components: &[ComponentRecord],
 ) -> Result<Mixture, SelectorError> {
-    let changed = components.iter().map(|record| {
-        let component = Component::from_bytes(&record.bytes).map_err(|error| {
-            let place = format!("component {} of element {}", record.slot, record.element);
-            SelectorError::Snapshot(format!("{place}: {error}"))
-        })?;
-        let (element, slot) = (record.element as usize, record.slot as usize);
-        Ok(ChangedComponent { element, slot, component: Arc::new(component) })
-    });
-    let changed = changed.collect::<Result<Vec<_>, SelectorError>>()?;
-    Ok(original.with_changes(&changed)?.at_version(version))
+    let stored =
+        components.iter().map(|record| (record.element as usize, record.slot as usize, &record.bytes[..]));
+    original.restored(version, stored).map_err(|error| match error {
+        MixtureError::Bytes { .. } => SelectorError::Snapshot(error.to_string()),
+        other => other.into(),
+    })
 }

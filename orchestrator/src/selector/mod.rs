@@ -16,7 +16,6 @@ mod regrade;
 mod replay;
 mod rules;
 mod scheduling;
-mod staleness;
 mod start_walks;
 mod walk;
 
@@ -35,15 +34,10 @@ use crate::grader::{Grader, GraderError};
 use backlog::Backlog;
 pub use decide::TrainingFrames;
 use decision_state::DecisionState;
-pub use decision_state::restored_mixture;
 pub use regrade::{RegradedCandidate, RegradedReport, Regrader};
 pub use replay::{Replay, ReplayError, ReplayedDecision};
 pub use scheduling::Scheduling;
-pub use staleness::Staleness;
 use walk::Walk;
-
-/// Key under which the histogram of mixture ages ([`Staleness`], JSON) is committed.
-pub const STALENESS: &str = "staleness";
 
 /// Whether a campaign is reproducible bit by bit, or walks never wait for each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -4,10 +4,10 @@ use std::io::{self, Write};
 
 use calm::rules::atom_limit;
 use calm::{UpdateEnd, UpdateRule};
+use monitor::candidate_details::{Coverage, DecisionDetails, Update};
 
 use super::grades::block;
 use super::{SHOWN, line, shortened_list};
-use crate::candidate_details::{Coverage, DecisionDetails, Update};
 use crate::output::{self, Table, decimals};
 
 pub fn write(out: &mut dyn Write, decision: &DecisionDetails, atoms: usize) -> io::Result<()> {

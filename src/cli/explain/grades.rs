@@ -3,9 +3,9 @@
 use std::io::{self, Write};
 
 use calm::CollectionRule;
+use monitor::candidate_details::{Atom, CandidateGrades, Trigger};
 
 use super::{INDENT, SHOWN, line};
-use crate::candidate_details::{Atom, CandidateGrades, Trigger};
 use crate::output::{Table, count, decimals};
 
 pub fn write(out: &mut dyn Write, grades: &CandidateGrades) -> io::Result<()> {

@@ -2,21 +2,21 @@
 
 use std::io::{self, Write};
 
+use monitor::candidate_details::{CandidateDetails, CandidateLabel, ForceError, LabelJob};
 use store::{Attempt, Exclusion, Job, Supersession, unix_milliseconds};
 
 use super::line;
-use crate::candidate_details::{CandidateDetails, CandidateLabel, ForceError, LabelJob};
 use crate::output::count;
 
 /// Lines printed from the end of a log.
 const LOG_LINES: usize = 10;
 
-pub fn write(out: &mut dyn Write, story: &CandidateDetails) -> io::Result<()> {
-    if story.jobs.is_empty() && story.labels.is_empty() {
+pub fn write(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {
+    if details.jobs.is_empty() && details.labels.is_empty() {
         return line(out, "label", "no label job: only accepted candidates and control frames get one");
     }
-    story.jobs.iter().try_for_each(|job| write_job(out, job))?;
-    story.labels.iter().try_for_each(|label| write_label(out, label, story.structure.atoms))
+    details.jobs.iter().try_for_each(|job| write_job(out, job))?;
+    details.labels.iter().try_for_each(|label| write_label(out, label, details.structure.atoms))
 }
 
 fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {

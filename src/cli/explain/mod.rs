@@ -6,10 +6,10 @@ mod labels;
 
 use std::io::{self, Write};
 
+use monitor::candidate_details::{self, CandidateDetails, Discovery, Distances, StructureSummary};
 use store::{Location, Store};
 
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
-use crate::candidate_details::{self, CandidateDetails, Discovery, Distances, StructureSummary};
 use crate::output::{count, decimals, print, print_json};
 
 /// Indent of lines without a title.
@@ -37,11 +37,11 @@ pub struct Explain {
 
 impl Explain {
     pub fn run(self) -> Result<ExitStatus, Failure> {
-        let story = block_on(read(self.location.get()?, &self.id))??;
+        let details = block_on(read(self.location.get()?, &self.id))??;
         if self.json {
-            print_json(&story)?
+            print_json(&details)?
         } else {
-            print(|out| write(out, &story))?
+            print(|out| write(out, &details))?
         }
         Ok(ExitStatus::Done)
     }
@@ -49,37 +49,37 @@ impl Explain {
 
 /// The output of the command.
 pub async fn text(location: Location, id: &str) -> Result<String, Failure> {
-    let (mut text, story) = (Vec::new(), read(location, id).await?);
-    write(&mut text, &story).map_err(Failure::failed)?;
+    let (mut text, details) = (Vec::new(), read(location, id).await?);
+    write(&mut text, &details).map_err(Failure::failed)?;
     Ok(String::from_utf8_lossy(&text).into_owned())
 }
 
 async fn read(location: Location, id: &str) -> Result<CandidateDetails, Failure> {
     let store = Store::open_read_only(&location).await?;
-    let story = candidate_details::read(&store, id).await?;
+    let details = candidate_details::read(&store, id).await?;
     store.close().await;
-    Ok(story)
+    Ok(details)
 }
 
-fn write(out: &mut dyn Write, story: &CandidateDetails) -> io::Result<()> {
-    writeln!(out, "{}", story.id)?;
-    write_structure(out, &story.structure)?;
-    if let (Some(file), Some(frame)) = (&story.file, story.frame) {
+fn write(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {
+    writeln!(out, "{}", details.id)?;
+    write_structure(out, &details.structure)?;
+    if let (Some(file), Some(frame)) = (&details.file, details.frame) {
         line(out, "from", &format!("{file}, frame {frame}: imported with its label"))?;
     }
-    if let Some(found) = &story.found {
+    if let Some(found) = &details.found {
         write_found(out, found)?;
     }
-    if let Some(grades) = &story.grades {
+    if let Some(grades) = &details.grades {
         grades::write(out, grades)?;
     }
-    if let (Some(found), Some(decision)) = (&story.found, &story.decision) {
+    if let (Some(found), Some(decision)) = (&details.found, &details.decision) {
         write_distances(out, &found.distances, decision.kind == "control")?;
-        decision::write(out, decision, story.structure.atoms)?;
+        decision::write(out, decision, details.structure.atoms)?;
     }
-    write_same(out, story)?;
-    labels::write(out, story)?;
-    for (k, what) in story.not_recorded.iter().enumerate() {
+    write_same(out, details)?;
+    labels::write(out, details)?;
+    for (k, what) in details.not_recorded.iter().enumerate() {
         line(out, if k == 0 { "not recorded" } else { "" }, what)?;
     }
     Ok(())
@@ -163,12 +163,12 @@ fn write_distances(out: &mut dyn Write, distances: &Distances, control: bool) ->
     line(out, "guard", &(found + &limit))
 }
 
-fn write_same(out: &mut dyn Write, story: &CandidateDetails) -> io::Result<()> {
-    if !story.same_structure.is_empty() {
-        let names = story.same_structure.iter().map(|named| &named.candidate);
+fn write_same(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {
+    if !details.same_structure.is_empty() {
+        let names = details.same_structure.iter().map(|named| &named.candidate);
         line(out, "the same as", &shortened_list(names))?;
     }
-    match story.same_import {
+    match details.same_import {
         Some(import) => line(out, "the same as", &format!("import-{import}")),
         None => Ok(()),
     }

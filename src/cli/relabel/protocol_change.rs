@@ -4,13 +4,13 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use atoms::Species;
+use monitor::provenance::{self, Provenance};
 use store::{Protocol, Store, StoreError};
 
 use super::Failure;
 use crate::config::{Change, Config, LabelSection, changed_keys};
 use crate::label_setup::{self, LABEL_METHOD_KEY};
 use crate::process_config::MethodConfig;
-use crate::provenance::{self, Provenance};
 
 /// The new label protocol, and what changes with it.
 pub struct ProtocolChange {

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use monitor::provenance::{self, ConfigMatch, Provenance};
 use serde_json::Value;
 use store::{Location, Store, unix_milliseconds};
 
@@ -9,7 +10,6 @@ use crate::campaign::Campaign;
 use crate::config::{Change, Refused, compare, place};
 use crate::exit_status::Failure;
 use crate::output::{count, log_and_print};
-use crate::provenance::{self, ConfigMatch, Provenance};
 
 /// Records the configuration of a new campaign.
 pub async fn record_start(store: &Store, origin: &Provenance, location: &Location) -> Result<(), Failure> {

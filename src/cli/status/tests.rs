@@ -3,8 +3,15 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use monitor::disk::DiskForecast;
+use monitor::label_cost::{CoreHours, QueueCost};
+use monitor::label_queue::LabelQueue;
+use monitor::mixture_values::MixtureValues;
+use monitor::provenance::Provenance;
+use monitor::snapshot::FORMAT;
 use orchestrator::slurm::{Job, Role};
-use serde_json::json;
+use serde_json::{Value, json};
+use store::records::{STALENESS, TRAINING_FRAMES};
 use store::{
     Budget, BudgetStatus, BudgetUse, Declined, FailureCount, Labels, OldestLease, ProcessRecord, Unlabelled,
     ValueRange, WalkStatus, unix_milliseconds,
@@ -12,7 +19,6 @@ use store::{
 use wire::CampaignId;
 
 use super::*;
-use crate::label_cost::{CoreHours, QueueCost};
 
 /// A large campaign with a value for every field.
 pub fn large() -> Snapshot {
@@ -20,9 +26,9 @@ pub fn large() -> Snapshot {
     let training = json!({
         "atoms": 20_000, "median": 0.51, "percentile_95": 1.2, "maximum": 7.0, "share_above_one": 0.25, "alarm": true,
     });
-    let values = [(orchestrator::selector::STALENESS, staleness), ("training_frames", training)];
+    let values = [(STALENESS, staleness), (TRAINING_FRAMES, training)];
     let hours = CoreHours { expected: 123_456.0, low: 98_765.0, high: 234_567.0 };
-    let bill = QueueCost {
+    let cost = QueueCost {
         unfinished: 12_345,
         measured: 5000,
         overhead: 1.25,
@@ -58,8 +64,8 @@ pub fn large() -> Snapshot {
             Path::new("/scratch"),
         )),
         status: status(),
-        mixture: MixtureSummary(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
-        disk: Disk {
+        mixture: MixtureValues(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
+        disk: DiskUse {
             bytes: 123_456_789_012,
             forecast: Some(DiskForecast {
                 structures: 9 << 33,
@@ -68,8 +74,8 @@ pub fn large() -> Snapshot {
                 most_structures: 200_000,
             }),
         },
-        labels: LabelSummary {
-            bill,
+        labels: LabelQueue {
+            cost,
             failures: ["not_converged", "out_of_memory", "implausible"].map(failure).into(),
             unlabelled: vec![unlabelled],
             by_protocol: Vec::new(),
@@ -171,7 +177,7 @@ fn the_status_of_a_large_campaign_fits_a_screen() {
     for (jobs, lines) in [(BatchJobs::None, 40), (BatchJobs::Known(vec![job(); 100]), 45)] {
         let page = Page { width: 80, ..Page::unlimited().screen() };
         let mut text = Vec::new();
-        large().write(&mut text, &jobs, page, None).unwrap();
+        write(&mut text, &large(), &jobs, page, None).unwrap();
         let text = String::from_utf8(text).unwrap();
         let widest = text.lines().map(|line| line.chars().count()).max();
         assert!(text.lines().count() <= lines && widest <= Some(80), "{text}");
@@ -186,7 +192,7 @@ fn the_status_of_a_large_campaign_fits_a_screen() {
 #[test]
 fn all_walks_are_shown_on_request() {
     let mut text = Vec::new();
-    large().write(&mut text, &BatchJobs::None, Page::unlimited().screen(), Some(usize::MAX)).unwrap();
+    write(&mut text, &large(), &BatchJobs::None, Page::unlimited().screen(), Some(usize::MAX)).unwrap();
     let text = String::from_utf8(text).unwrap();
     assert!(text.contains("a-long-name-of-a-seed-structure-999") && !text.contains("more walks"));
     assert!(text.contains("more processes"));
@@ -211,13 +217,14 @@ fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
 fn every_key_is_documented_and_every_documented_key_is_there() {
     let mut found = BTreeSet::new();
     for jobs in [BatchJobs::Known(vec![job()]), BatchJobs::Unknown("no answer".into())] {
-        let json = json::to_json(&large(), &jobs).unwrap();
-        assert_eq!(json["version"], json::VERSION);
+        let mut json = large().to_json().unwrap();
+        jobs.add_to(&mut json);
+        assert_eq!(json["version"], FORMAT);
         keys(&json, "", &mut found);
     }
     let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/status.md")).unwrap();
     let rows = text.lines().filter_map(|line| line.strip_prefix("| `")?.split_once("` | "));
     let documented: BTreeSet<_> = rows.map(|(key, _)| key.to_owned()).collect();
     assert_eq!(found, documented);
-    assert!(text.contains(&format!("of this description: {}", json::VERSION)));
+    assert!(text.contains(&format!("of this description: {}", FORMAT)));
 }

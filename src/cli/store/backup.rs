@@ -6,8 +6,8 @@ use store::{DATABASE, Store, unix_milliseconds};
 
 use super::{CampaignLocation, ExitStatus, Failure};
 use crate::cli::block_on;
-use crate::disk_forecast::megabytes;
 use crate::output::{Bar, print};
+use crate::wording::disk::megabytes;
 
 const BAR: &str = "copying {bar:32} {percent} %  {eta} left";
 

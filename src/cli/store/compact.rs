@@ -4,8 +4,8 @@ use store::{CampaignLock, Store, unix_milliseconds};
 
 use super::{CampaignLocation, ExitStatus, Failure};
 use crate::cli::block_on;
-use crate::disk_forecast::megabytes;
 use crate::output::{log_and_print, print};
+use crate::wording::disk::megabytes;
 
 /// Free unused space in a campaign's store
 ///

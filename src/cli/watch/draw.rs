@@ -12,6 +12,7 @@ use store::{Candidates, Labels};
 use super::entries;
 use super::pane::{Pane, Tone};
 use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, State, Text, WALKS, WINDOW};
+use crate::cli::status as cli_status;
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
 use crate::output::{Table, count, decimals};
@@ -97,7 +98,7 @@ fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut State, theme: &Them
 }
 
 fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
-    let (campaign, status) = (state.snapshot.campaign(), state.snapshot.status());
+    let (campaign, status) = (&state.snapshot.campaign, &state.snapshot.status);
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let paused = status.walks.iter().filter(|walk| walk.paused).count();
     let paused = if paused == 0 { String::new() } else { format!(" ({paused} paused)") };
@@ -108,7 +109,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
     let Candidates { seen, accepted, control, .. } = &status.candidates;
     let Labels { queued, leased, labelled, failed, .. } = &status.labels;
     let lines = [
-        ("campaign", format!("{}, {} mode: {}", campaign.id, campaign.mode, state.snapshot.state())),
+        ("campaign", format!("{}, {} mode: {}", campaign.id, campaign.mode, cli_status::state(status))),
         (
             "walks",
             format!(
@@ -131,7 +132,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
                 status.labels_last_hour
             ),
         ),
-        ("end", state.snapshot.end().describe().unwrap_or_else(|| "–".into())),
+        ("end", cli_status::expected_end(&state.snapshot.end).unwrap_or_else(|| "–".into())),
     ];
     let bold = Modifier::BOLD;
     let lines = lines.map(|(title, text)| {

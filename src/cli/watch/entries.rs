@@ -89,8 +89,8 @@ pub fn decision_entries<'a>(
 fn decision_entry(decision: &RecentDecision) -> Entry {
     let RecentDecision { sequence, kind, walk, detail, candidate, .. } = decision;
     let found = candidate.as_ref();
-    let number = |of: fn(&DecidedCandidate) -> Option<f64>, two_digits| match found {
-        Some(found) => decimals(of(found), two_digits),
+    let number = |of: fn(&DecidedCandidate) -> Option<f64>, digits| match found {
+        Some(found) => decimals(of(found), digits),
         None => String::new(),
     };
     let what = match (found.and_then(|found| found.reason.as_deref()), detail["end"].as_str()) {

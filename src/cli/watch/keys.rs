@@ -7,6 +7,7 @@ use super::super::ExitStatus;
 use super::entries::{UNKNOWN_QUANTITIES, without_campaign};
 use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, State, Text, WALKS};
 use crate::cli::queue::Action as QueueAction;
+use crate::cli::status;
 use crate::cli::walks::{Action as WalksAction, WalkSelection};
 use crate::filter::Filter;
 
@@ -78,7 +79,9 @@ impl State {
             KeyCode::Char('2') => self.focus = QUEUE,
             KeyCode::Char('3') => self.focus = DECISIONS,
             KeyCode::Char('?') | KeyCode::F(1) => self.show("keys", HELP.to_owned()),
-            KeyCode::Char('i') => self.show("calmwalk status --all", self.snapshot.text(usize::MAX)),
+            KeyCode::Char('i') => {
+                self.show("calmwalk status --all", status::text(&self.snapshot, usize::MAX))
+            }
             KeyCode::Char('/') => {
                 let text = self.pane().filter.as_ref().map_or(String::new(), ToString::to_string);
                 self.mode = Mode::Prompt(Prompt { kind: PromptKind::Filter, text });

@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
+use monitor::Snapshot;
 use store::{Job, JobState, Location, RecentDecision, Store};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 
 use super::state::{JobView, WINDOW};
-use crate::cli::status::Snapshot;
 use crate::exit_status::Failure;
 
 /// Maximum number of jobs read per state.

@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use monitor::Snapshot;
 use store::{Job, RecentDecision};
 
 use super::Completed;
@@ -10,7 +11,6 @@ use super::entries;
 use super::keys::Request;
 use super::pane::Pane;
 use super::reader::Reading;
-use crate::cli::status::Snapshot;
 use crate::exit_status::Failure;
 
 /// Number of newest decisions kept, for charts and filters.
@@ -181,7 +181,7 @@ impl State {
 
     /// Updates the panes and charts.
     pub fn update_panes(&mut self) {
-        let store::Status { walks, led, .. } = self.snapshot.status();
+        let store::Status { walks, led, .. } = &self.snapshot.status;
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
         of_walks.set_entries(entries::walk_entries(walks, *led, of_walks.filter.as_ref()), walks.len());
         of_queue.set_entries(entries::job_entries(&self.jobs, of_queue.filter.as_ref()), self.jobs.len());

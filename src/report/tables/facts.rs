@@ -9,6 +9,7 @@ use super::super::report_data::ReportData;
 use super::super::style::grouped;
 use super::settings::flatten;
 use super::{Table, text};
+use crate::wording;
 
 /// The campaign in a few lines.
 pub fn summary(data: &ReportData) -> Table {
@@ -42,7 +43,10 @@ pub fn summary(data: &ReportData) -> Table {
     );
     if let Some(found) = &data.labels {
         let energies = found.statistics.energies.summary();
-        row("energy error", energies.line().unwrap_or_else(|| energies.offsets.note.clone()));
+        row(
+            "energy error",
+            wording::energies::errors(&energies).unwrap_or_else(|| energies.offsets.note.clone()),
+        );
     }
     row("imported structures", grouped(status.imported));
     row("cost of labels", format!("{:.4} core-hours", status.budget.used.core_hours));

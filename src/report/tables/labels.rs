@@ -1,10 +1,10 @@
 //! Force errors by grade, failures, and unlabelled structures.
 
 use analysis::ForceErrors;
+use monitor::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use store::{FailureCount, Unlabelled, ValueRange};
 
 use super::{Cell, Table, count, percent, real, text};
-use crate::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use crate::output::range;
 
 /// Correlation of grades and errors.

@@ -6,13 +6,13 @@ use atoms::poscar::write_poscar;
 use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
+use monitor::candidate_details;
 use serde_json::json;
 use store::{LabelStatus, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult, json};
-use crate::candidate_details;
 
 /// A structure with its candidate.
 struct StructureRecord {

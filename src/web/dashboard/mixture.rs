@@ -2,11 +2,12 @@
 
 use axum::extract::State;
 use axum::http::StatusCode;
+use monitor::mixture_status::{self, InitialMixture};
 use store::Store;
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult};
-use crate::mixture_status::{self, InitialMixture};
+use crate::initial_mixture;
 
 /// `GET /api/mixture`: each component, and how far its covariance has moved since the campaign began.
 pub async fn mixture(State(dashboard): State<Dashboard>) -> ApiResult {
@@ -18,7 +19,7 @@ async fn compute(store: Store, initial: Option<InitialMixture>) -> Result<String
     let not_found = |why: &dyn ToString| ApiError::new(StatusCode::NOT_FOUND, why.to_string());
     let initial = match initial {
         Some(initial) => initial,
-        None => InitialMixture::read(&store).await.map_err(|failure| not_found(&failure))?,
+        None => initial_mixture::read(&store).await.map_err(|failure| not_found(&failure))?,
     };
     let newest = store.newest_mixture().await?;
     // Computing the eigenvalues of every component may take seconds.

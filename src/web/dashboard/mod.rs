@@ -15,6 +15,7 @@ use axum::Router;
 use axum::extract::{Path, State};
 use axum::middleware;
 use axum::routing::{get, post};
+use monitor::mixture_status::InitialMixture;
 use store::Store;
 
 pub use self::actions::Mutations;
@@ -22,7 +23,6 @@ use self::cache::CachedResponse;
 use self::response::{ApiResult, json};
 use self::sse::StatusFeed;
 use super::security;
-use crate::mixture_status::InitialMixture;
 
 /// Largest number of candidates in the trace of a walk.
 const MAX_TRACE_POINTS: u32 = 2000;

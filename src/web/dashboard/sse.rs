@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use axum::extract::State;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::stream::{self, Stream};
+use monitor::Snapshot;
 use serde_json::json;
 use store::{Store, unix_milliseconds};
 use tokio::sync::watch;
@@ -15,7 +16,6 @@ use tokio::task::JoinHandle;
 use super::Dashboard;
 use super::response::{self, ApiResult};
 use super::time_series::{Sample, TimeSeries};
-use crate::cli::status::Snapshot;
 
 /// Shortest interval between polls while a client listens.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
@@ -60,7 +60,7 @@ async fn poll(store: Store, publish: watch::Sender<Option<Arc<str>>>, samples: A
         let begun = Instant::now();
         let text = match Snapshot::read(&store).await {
             Ok(snapshot) => {
-                let sample = Sample::new(snapshot.status(), unix_milliseconds());
+                let sample = Sample::new(&snapshot.status, unix_milliseconds());
                 let status = snapshot.to_json().unwrap_or_default();
                 let text = json!({ "status": status, "sample": sample }).to_string();
                 samples.lock().unwrap_or_else(PoisonError::into_inner).add(sample);

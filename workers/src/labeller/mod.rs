@@ -36,22 +36,20 @@ use store::records::{Label, LabelDetails, Lease, Protocol};
 use store::{LeaseStatus, Store, StoreError};
 use tracing::{debug, info, warn};
 
-use code::EndedCalculation;
-use energies::Offsets;
-use method::LabelAttempt;
-use report_line::DeliveryOutcome;
-use shutdown::ShutdownState;
-
 pub use calculation_runner::{RunnerCommand, run_calculation};
 pub use code::CodeMethod;
-pub use energies::{energy_offsets, labelled_energy};
+use code::EndedCalculation;
+use energies::Offsets;
 pub use execution::{BatchSystem, ExecutionSettings, KeepDirectories};
 pub use guard::{GUARD, LabelGuard, Pair};
 pub use heartbeat::{ExitPolicy, serve};
+use method::LabelAttempt;
 pub use method::Method;
 pub use reference::ReferenceMethod;
+use report_line::DeliveryOutcome;
 pub use retry::retry_until_written;
 pub use shutdown::Shutdown;
+use shutdown::ShutdownState;
 pub use single_label::{SingleLabel, label_structure};
 pub use validate::LabelBounds;
 

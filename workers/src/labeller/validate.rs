@@ -4,9 +4,8 @@ use analysis::EnergyOffsets;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use dft::{Failure, FailureClass, Results};
+use monitor::energy_offsets::labelled_energy;
 use serde::{Deserialize, Serialize};
-
-use super::energies::labelled_energy;
 
 /// Minimum number of labelled structures that must support a composition before energies are compared for it.
 const MIN_SUPPORT: f64 = 5.0;

@@ -1,16 +1,11 @@
 //! State of the mixture's components, compared with those at the start of the campaign.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use calm::drift::{self, Drift};
-use calm::{Artifact, Component, LinearError, Mixture};
+use calm::{Component, LinearError, Mixture, MixtureError};
 use serde::Serialize;
-use serde_json::Value;
-use store::{NewestMixture, Store};
-
-use crate::exit_status::Failure;
-use crate::process_config::verify_hash;
+use store::NewestMixture;
 
 /// The mixture at the start of a campaign.
 #[derive(Clone, Debug)]
@@ -32,6 +27,17 @@ pub struct MixtureStatus {
     feature_dimension: usize,
     /// By element and slot.
     components: Vec<ComponentStatus>,
+}
+
+/// A stored mixture that cannot be compared.
+#[derive(Debug, thiserror::Error)]
+pub enum MixtureStatusError {
+    /// Damaged components, or those of another mixture.
+    #[error("the mixture: {0}")]
+    Mixture(#[from] MixtureError),
+    /// A covariance that is not positive definite.
+    #[error("the mixture: {0}")]
+    Covariance(#[from] LinearError),
 }
 
 /// One component of the mixture.
@@ -57,43 +63,22 @@ struct ComponentStatus {
     distance: Option<f64>,
 }
 
-impl InitialMixture {
-    /// Reads the artifact from the path that the campaign last used.
-    ///
-    /// # Errors
-    /// Fails if the file is missing or has another content.
-    pub async fn read(store: &Store) -> Result<Self, Failure> {
-        let campaign = store.campaign().await?;
-        let resolved: Value = serde_json::from_str(&campaign.resolved_configuration)
-            .map_err(|error| Failure::Failed(format!("damaged database: the configuration: {error}")))?;
-        let files = store.grade_files().await?;
-        let (key, load): (_, fn(&Path) -> _) = match &files["calm.artifact"] {
-            Value::String(_) => ("calm.artifact", |path| Artifact::load(path)),
-            _ => ("potential.model", |path| Artifact::load_export(path)),
-        };
-        let path = files[key].as_str().ok_or_else(|| {
-            Failure::Input(format!("the store has no path of {key}, with which the campaign began"))
-        })?;
-        let path = Path::new(path);
-        verify_hash(path, resolved["files"][key].as_str().unwrap_or_default())?;
-        let Artifact { symbols, mixture, .. } = load(path).map_err(Failure::input)?;
-        Ok(Self { symbols, mixture })
-    }
-}
-
 /// Compares each component with its start.
 ///
 /// # Errors
 /// Fails on a damaged database, or if the mixture did not grow from `original`.
-pub fn mixture_status(original: &InitialMixture, newest: &NewestMixture) -> Result<MixtureStatus, Failure> {
-    let damaged = |error: &dyn ToString| Failure::Failed(format!("the mixture: {}", error.to_string()));
-    let now = orchestrator::selector::restored_mixture(&original.mixture, newest.version, &newest.components)
-        .map_err(|error| damaged(&error))?;
+pub fn mixture_status(
+    original: &InitialMixture,
+    newest: &NewestMixture,
+) -> Result<MixtureStatus, MixtureStatusError> {
+    let stored = newest.components.iter();
+    let stored = stored.map(|record| (record.element as usize, record.slot as usize, &record.bytes[..]));
+    let now = original.mixture.restored(newest.version, stored)?;
     let component = |(element, slot, now): (usize, usize, &Arc<Component>)| {
         let symbol = original.symbols.get(element).cloned().unwrap_or_default();
         ComponentStatus::compare(symbol, slot, original.mixture.component(element, slot), now)
     };
-    let components = now.iter().map(component).collect::<Result<_, _>>().map_err(|error| damaged(&error))?;
+    let components = now.iter().map(component).collect::<Result<_, _>>()?;
     let NewestMixture { version, decision, .. } = *newest;
     Ok(MixtureStatus { version, decision, feature_dimension: now.dimension(), components })
 }

@@ -1,10 +1,10 @@
-//! The expected end of a campaign in `calmwalk status`.
+//! The expected end of a campaign.
 
 use serde::Serialize;
 use serde_json::Value;
 use store::{Status, unix_milliseconds};
 
-use crate::label_cost::{QueueCost, SECONDS_PER_HOUR, two_digits};
+use crate::label_cost::{QueueCost, SECONDS_PER_HOUR};
 
 /// An extrapolation from the current state: existing walks at their current speed, and queued labels on the cores in use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -21,7 +21,7 @@ pub struct ExpectedEnd {
 
 impl ExpectedEnd {
     /// Extrapolates from the status of a campaign with this configuration.
-    pub fn extrapolate(status: &Status, configuration: &Value, bill: &QueueCost) -> Self {
+    pub fn extrapolate(status: &Status, configuration: &Value, queue: &QueueCost) -> Self {
         if status.finished {
             return Self::default();
         }
@@ -34,7 +34,7 @@ impl ExpectedEnd {
             0 => Some(0.0),
             left => speed.map(|speed| left as f64 / speed / SECONDS_PER_HOUR),
         };
-        let labels_hours = if bill.unfinished == 0 { Some(0.0) } else { bill.hours_left };
+        let labels_hours = if queue.unfinished == 0 { Some(0.0) } else { queue.hours_left };
         let budget = &status.budget;
         let budget_hours = budget.limits.wall_hours.map(|limit| (limit - budget.used.wall_hours).max(0.0));
         let hours = walks_hours.zip(labels_hours).map(|(walks, labels)| walks.max(labels));
@@ -44,21 +44,6 @@ impl ExpectedEnd {
         };
         let time = hours.map(|hours| unix_milliseconds() + (1000.0 * SECONDS_PER_HOUR * hours) as i64);
         Self { walks_hours, labels_hours, budget_hours, time }
-    }
-
-    /// A description; `None` if the end is unknown.
-    pub fn describe(&self) -> Option<String> {
-        let milliseconds = self.time? - unix_milliseconds();
-        let hours = two_digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
-        let part =
-            |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", two_digits(hours)));
-        let parts = [
-            part("walks", self.walks_hours),
-            part("labels", self.labels_hours),
-            part("budget", self.budget_hours),
-        ];
-        let parts: Vec<_> = parts.into_iter().flatten().collect();
-        Some(format!("expected within {hours} h at the current rate ({})", parts.join(", ")))
     }
 }
 
@@ -86,18 +71,18 @@ mod tests {
 
     #[test]
     fn the_slowest_part_determines_the_end() {
-        let (mut status, configuration, mut bill) = campaign();
-        let end = ExpectedEnd::extrapolate(&status, &configuration, &bill);
+        let (mut status, configuration, mut queue) = campaign();
+        let end = ExpectedEnd::extrapolate(&status, &configuration, &queue);
         assert_eq!((end.walks_hours, end.labels_hours, end.budget_hours), (Some(1.0), Some(0.0), None));
         let hours = |end: &ExpectedEnd| (end.time.unwrap() - unix_milliseconds()) as f64 / 3.6e6;
         assert!((hours(&end) - 1.0).abs() < 0.01);
-        (bill.unfinished, bill.hours_left) = (3, Some(2.5));
-        assert!((hours(&ExpectedEnd::extrapolate(&status, &configuration, &bill)) - 2.5).abs() < 0.01);
-        bill.hours_left = None;
-        assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &bill).time, None, "no labellers");
+        (queue.unfinished, queue.hours_left) = (3, Some(2.5));
+        assert!((hours(&ExpectedEnd::extrapolate(&status, &configuration, &queue)) - 2.5).abs() < 0.01);
+        queue.hours_left = None;
+        assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &queue).time, None, "no labellers");
         status.budget.limits = Budget { wall_hours: Some(0.5), ..Budget::default() };
-        assert!((hours(&ExpectedEnd::extrapolate(&status, &configuration, &bill)) - 0.5).abs() < 0.01);
+        assert!((hours(&ExpectedEnd::extrapolate(&status, &configuration, &queue)) - 0.5).abs() < 0.01);
         status.led = false;
-        assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &bill).time, None, "no orchestrator");
+        assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &queue).time, None, "no orchestrator");
     }
 }

@@ -1,5 +1,4 @@
-//! Counts how walks ended and why, and gives advice on early ends. Pure functions, shared by everything that shows
-//! them.
+//! Counts how walks ended and why, and gives advice on early ends.
 
 use serde::Serialize;
 use store::WalkStatus;
@@ -71,19 +70,6 @@ fn is_pattern(ended: u64, early: u64) -> bool {
 }
 
 impl EarlyEndCause {
-    /// Short description.
-    pub fn in_words(self) -> &'static str {
-        match self {
-            Self::TooHot => "too hot",
-            Self::NotFinite => "forces not finite",
-            Self::LostAtom => "an atom left the structure",
-            Self::Crashed => "walkers crashed",
-            Self::Trapped => "atoms repeatedly too close",
-            Self::BadStart => "invalid start",
-            Self::Other => "diverged",
-        }
-    }
-
     /// What to change.
     pub fn advice(self) -> &'static str {
         match self {
@@ -122,6 +108,11 @@ impl WalkEnds {
         self.0.sort_by(|a, b| (a.cause, &a.end).cmp(&(b.cause, &b.end)));
     }
 
+    /// All ends, by cause.
+    pub fn counts(&self) -> &[EndCount] {
+        &self.0
+    }
+
     /// Number of walks that have ended.
     pub fn ended(&self) -> u64 {
         self.0.iter().map(|count| count.walks).sum()
@@ -142,117 +133,18 @@ impl WalkEnds {
         self.0.iter().filter_map(|count| Some((count.cause?, count)))
     }
 
-    /// All ends in one line: `12 collected, 3 blew up (too hot)`.
-    pub fn in_words(&self) -> String {
-        let one = |EndCount { end, cause, walks, .. }: &EndCount| {
-            let end = end.replace('_', " ");
-            match cause {
-                Some(cause) if *cause != EarlyEndCause::Trapped => {
-                    format!("{walks} {end} ({})", cause.in_words())
-                }
-                _ => format!("{walks} {end}"),
-            }
-        };
-        self.0.iter().map(one).collect::<Vec<_>>().join(", ")
-    }
-
-    /// All ends in one line without causes: `12 collected, 3 blew up`.
-    pub fn counts_by_end(&self) -> String {
-        let mut numbers: Vec<(&str, u64)> = Vec::new();
-        for EndCount { end, walks, .. } in &self.0 {
-            match numbers.iter_mut().find(|(known, _)| known == end) {
-                Some((_, number)) => *number += walks,
-                None => numbers.push((end, *walks)),
-            }
-        }
-        let one = |(end, number): (&str, u64)| format!("{number} {}", end.replace('_', " "));
-        numbers.into_iter().map(one).collect::<Vec<_>>().join(", ")
-    }
-
     /// Whether many walks ended early.
     pub fn is_alarming(&self) -> bool {
         is_pattern(self.ended(), self.early())
-    }
-
-    /// The early ends and what to change, two lines for each cause.
-    pub fn lines(&self) -> Vec<String> {
-        let two = |(cause, EndCount { walks, walk, reason, .. }): (EarlyEndCause, &EndCount)| {
-            let what = format!("{walks} {}, such as walk {walk}: {reason}", cause.in_words());
-            [what, format!("  what to change: {}", cause.advice())]
-        };
-        self.causes().flat_map(two).collect()
-    }
-
-    /// Text of the warning about early ends.
-    pub fn warning(&self) -> String {
-        let causes: Vec<_> =
-            self.causes().map(|(cause, count)| format!("{} {}", count.walks, cause.in_words())).collect();
-        let advice =
-            self.causes().max_by_key(|(_, count)| count.walks).map_or("", |(cause, _)| cause.advice());
-        let (early, ended) = (self.early(), self.ended());
-        format!(
-            "{early} of {ended} finished walks ended early ({}); what to change: {advice}",
-            causes.join(", ")
-        )
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use atoms::{Cell, Evaluation, NeighbourList, Structure};
-    use workers::guard::blown_up;
-    use workers::settings::GuardSettings;
-
     use super::*;
 
     fn walk(number: u32, state: &str, reason: &str) -> WalkStatus {
         WalkStatus { walk: number, state: state.into(), reason: reason.into(), ..WalkStatus::default() }
-    }
-
-    #[test]
-    fn reasons_of_the_guard_have_causes() {
-        let settings = GuardSettings {
-            min_distance: 1.2,
-            min_distance_fraction: 0.75,
-            max_temperature: 1000.0,
-            max_consecutive_rejections: 10,
-            max_rollbacks: 3,
-            tau_factor: 0.5,
-            checkpoint_interval: 100,
-        };
-        let pair = |distance: f64| Structure {
-            species: vec!["Al".parse().unwrap(); 2],
-            positions: vec![[0.0; 3], [distance, 0.0, 0.0]],
-            cell: Cell::orthorhombic(50.0, 50.0, 50.0),
-            periodic: [true; 3],
-        };
-        let said = |distance, force, temperature| {
-            let structure = pair(distance);
-            let mut neighbours = NeighbourList::new(5.0, 0.0);
-            neighbours.update(&structure).unwrap();
-            let evaluation = Evaluation { forces: vec![[force; 3]; 2], ..Evaluation::default() };
-            blown_up(&settings, &structure, &neighbours, &evaluation, temperature).unwrap()
-        };
-        for (reason, expected) in [
-            (said(2.0, 0.0, 2000.0), EarlyEndCause::TooHot),
-            (said(2.0, f64::NAN, 300.0), EarlyEndCause::NotFinite),
-            (said(20.0, 0.0, 300.0), EarlyEndCause::LostAtom),
-        ] {
-            assert_eq!(
-                early_end_cause("blew_up", &format!("at step 3: {reason}")),
-                Some(expected),
-                "{reason}"
-            );
-        }
-        assert_eq!(
-            early_end_cause("blew_up", "4 walkers crashed in this assignment"),
-            Some(EarlyEndCause::Crashed)
-        );
-        assert_eq!(
-            early_end_cause("bad_start", "an element that the model does not know"),
-            Some(EarlyEndCause::BadStart)
-        );
-        assert_eq!(early_end_cause("running", ""), None);
     }
 
     #[test]
@@ -267,14 +159,20 @@ mod tests {
         ];
         let ends = WalkEnds::from_walks(&walks);
         assert_eq!((ends.ended(), ends.early(), ends.all_early()), (5, 3, false));
-        assert_eq!(ends.in_words(), "2 collected, 2 blew up (too hot), 1 trapped");
-        assert_eq!(ends.counts_by_end(), "2 collected, 2 blew up, 1 trapped");
         let (_, hot) = ends.causes().next().unwrap();
         assert_eq!((hot.walk, hot.reason.as_str()), (2, "at step 5: 9000 K is above the allowed 800 K"));
-        assert!(ends.warning().starts_with("3 of 5 finished walks ended early (2 too hot, 1 atoms"));
         assert!(
             WalkEnds::from_walks(&walks[2..5]).all_early() && !WalkEnds::from_walks(&walks[1..2]).all_early()
         );
+    }
+
+    #[test]
+    fn causes_other_than_reasons_of_the_guard() {
+        let crashed = early_end_cause("blew_up", "4 walkers crashed in this assignment");
+        assert_eq!(crashed, Some(EarlyEndCause::Crashed));
+        let start = early_end_cause("bad_start", "an element that the model does not know");
+        assert_eq!(start, Some(EarlyEndCause::BadStart));
+        assert_eq!(early_end_cause("running", ""), None);
     }
 
     #[test]

@@ -101,15 +101,15 @@ async fn read_import(store: &Store, id: &str, number: &str) -> Result<CandidateD
         let imported = store.imported_structures().await?;
         return Err(StoreError::UnknownImport { id: id.to_owned(), imported });
     };
-    let mut story = CandidateDetails::new(store, id, "imported", &found.structure, found.content).await?;
-    story.file = Some(found.file);
-    story.frame = Some(found.frame);
-    story.same_import = None;
-    story.labels = labels::labels(store, found.content, None).await?;
-    story
+    let mut details = CandidateDetails::new(store, id, "imported", &found.structure, found.content).await?;
+    details.file = Some(found.file);
+    details.frame = Some(found.frame);
+    details.same_import = None;
+    details.labels = labels::labels(store, found.content, None).await?;
+    details
         .not_recorded
         .push("grades: the store has none of imported structures (calmwalk calm score computes them)");
-    Ok(story)
+    Ok(details)
 }
 
 async fn read_candidate(store: &Store, named: CandidateRef) -> Result<CandidateDetails, StoreError> {
@@ -121,14 +121,14 @@ async fn read_candidate(store: &Store, named: CandidateRef) -> Result<CandidateD
     let view = stored.block.view();
     let (structure, content) = (view.structure(), view.id().content);
     let kind = view.origin().name();
-    let mut story = CandidateDetails::new(store, &named.candidate, kind, &structure, content).await?;
-    story.same_structure.retain(|other| *other != named);
-    story.found = Some(Discovery::read(store, &stored, &rules).await?);
-    story.grades = Some(CandidateGrades::new(&stored, &rules, &logged));
-    story.decision = Some(DecisionDetails::read(store, &logged, &stored, &rules).await?);
-    story.labels = labels::labels(store, content, Some(&view)).await?;
-    story.not_recorded = not_recorded(&stored);
-    Ok(story)
+    let mut details = CandidateDetails::new(store, &named.candidate, kind, &structure, content).await?;
+    details.same_structure.retain(|other| *other != named);
+    details.found = Some(Discovery::read(store, &stored, &rules).await?);
+    details.grades = Some(CandidateGrades::new(&stored, &rules, &logged));
+    details.decision = Some(DecisionDetails::read(store, &logged, &stored, &rules).await?);
+    details.labels = labels::labels(store, content, Some(&view)).await?;
+    details.not_recorded = not_recorded(&stored);
+    Ok(details)
 }
 
 impl CandidateDetails {

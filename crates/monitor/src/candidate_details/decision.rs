@@ -1,10 +1,10 @@
 //! The decision about a candidate: its numbers and its consequences for other candidates.
 
 use calm::forgetting::GradeDistribution;
-use calm::{Trial, UpdateEnd, UpdateRule};
-use orchestrator::selector::{STALENESS, Staleness};
+use calm::{Staleness, Trial, UpdateEnd, UpdateRule};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use store::records::STALENESS;
 use store::{LoggedDecision, Store, StoreError, StoredCandidate};
 
 use super::{CandidateRef, CoveredCandidate};

@@ -5,7 +5,8 @@ use atoms::{Species, Structure};
 use serde::Serialize;
 use store::{Store, StoreError};
 use wire::ContentHash;
-use workers::labeller::{energy_offsets, labelled_energy};
+
+use crate::energy_offsets::{energy_offsets, labelled_energy};
 
 /// Least number of labelled structures that must support a composition before its energy error is shown. One alone
 /// would have no error.
@@ -177,25 +178,5 @@ impl EnergyErrors {
             largest: any(self.largest),
             offsets: self.reference.summary(),
         }
-    }
-}
-
-impl EnergySummary {
-    /// One line of text in meV/atom, without the note. `None` without errors.
-    pub fn line(&self) -> Option<String> {
-        let milli = |x: Option<f64>| crate::output::decimals(x.map(|x| 1000.0 * x), 1);
-        self.mean?;
-        let mut line = format!(
-            "mean {}, median {}, 90 % below {}, largest {} meV/atom, over {} structures",
-            milli(self.mean),
-            milli(self.median),
-            milli(self.p90),
-            milli(self.largest),
-            self.structures
-        );
-        if self.left_out > 0 {
-            line += &format!(" ({} more have compositions with too few labels)", self.left_out);
-        }
-        Some(line)
     }
 }

@@ -7,11 +7,10 @@ use serde::Serialize;
 use store::{LabelCost, PendingJobs, Protocol, Store, StoreError};
 use wire::ContentHash;
 
-use crate::output::count;
-
 /// Number of labels that the cost model is fitted to: the newest.
 const MAX_SAMPLES: u32 = 1_000;
 
+/// Seconds in an hour.
 pub const SECONDS_PER_HOUR: f64 = 3600.0;
 
 /// Core-hours: the expected value and a 90 % interval.
@@ -142,19 +141,6 @@ pub async fn relabel_cost(
     Ok(RelabelCost { hours, measured: costs.measured(), protocol: protocol.name })
 }
 
-impl std::fmt::Display for RelabelCost {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { hours, measured, protocol } = self;
-        match hours {
-            Some(hours) => {
-                let measured = count(*measured, "label");
-                write!(f, "about {hours}, estimated from {measured} by '{protocol}'")
-            }
-            None => write!(f, "unknown: no label has a measured cost"),
-        }
-    }
-}
-
 impl CoreHours {
     /// The cost times a factor.
     pub fn scaled(self, factor: f64) -> Self {
@@ -170,28 +156,6 @@ impl CoreHours {
             high: hours(predicted.high),
         }
     }
-}
-
-impl std::fmt::Display for CoreHours {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let [expected, low, high] = [self.expected, self.low, self.high].map(two_digits);
-        write!(f, "{expected} core-hours (90 % interval: {low} to {high})")
-    }
-}
-
-/// Formats with two significant digits, and as a whole number from ten on.
-pub fn two_digits(x: f64) -> String {
-    if !(x.is_finite() && x > 0.0) {
-        return format!("{x}");
-    }
-    let decimals = (1.0 - x.log10().floor()).clamp(0.0, 6.0) as usize;
-    format!("{x:.decimals$}")
-}
-
-/// The quantities that the cost of a label depends on, from its method.
-pub fn cost_size(size: &dft::Size) -> Size {
-    let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
-    Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 }
 }
 
 fn size(cost: &LabelCost) -> Size {
@@ -211,19 +175,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn hours_have_two_digits() {
-        for (x, text) in [
-            (0.0, "0"),
-            (0.001_234, "0.0012"),
-            (0.5, "0.50"),
-            (3.26, "3.3"),
-            (42.7, "43"),
-            (12_345.6, "12346"),
-        ] {
-            assert_eq!(two_digits(x), text);
-        }
-        let hours =
-            CoreHours::from_core_seconds(Predicted { core_seconds: 3600.0, low: 1800.0, high: 9000.0 }, 2.0);
-        assert_eq!(hours.to_string(), "2.0 core-hours (90 % interval: 1.0 to 5.0)");
+    fn core_seconds_become_hours() {
+        let predicted = Predicted { core_seconds: 3600.0, low: 1800.0, high: 9000.0 };
+        let expected = CoreHours { expected: 2.0, low: 1.0, high: 5.0 };
+        assert_eq!(CoreHours::from_core_seconds(predicted, 2.0), expected);
     }
 }

@@ -1,9 +1,12 @@
 //! Statistics of the labels of a campaign: the potential's errors, whether the grade predicted them, and which
 //! structures have no label.
 
+mod json;
+
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
-use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Store, StoreError};
+use serde_json::Value;
+use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Protocol, Store, StoreError};
 use wire::{ContentHash, Origin};
 
 use crate::energy_errors::{EnergyErrors, EnergyReference};
@@ -93,6 +96,11 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
 }
 
 impl LabelStatistics {
+    /// The JSON of `calmwalk force-errors`, for labels of this protocol.
+    pub fn to_json(&self, protocol: &Protocol) -> Value {
+        json::to_json(protocol, self)
+    }
+
     fn for_origin(&mut self, origin: Origin, mut change: impl FnMut(&mut ErrorsByGrade)) {
         let of_origin = if origin == Origin::Biased { &mut self.biased } else { &mut self.control };
         [&mut self.all, of_origin].into_iter().for_each(&mut change);

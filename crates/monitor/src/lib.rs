@@ -1,0 +1,22 @@
+//! The read side: what all views show of a campaign, read from its store and computed from it.
+//!
+//! [`Snapshot`] is the state of a campaign; [`candidate_details`] the history of one candidate; [`label_statistics`]
+//! the potential's errors against labels; [`label_cost`] what labels cost; [`mixture_status`] how far the mixture has
+//! moved. Nothing here writes to the store, and nothing renders: values leave as numbers, or as the JSON that the
+//! documents describe.
+
+pub mod candidate_details;
+pub mod disk;
+pub mod energy_errors;
+pub mod energy_offsets;
+pub mod expected_end;
+pub mod label_cost;
+pub mod label_queue;
+pub mod label_statistics;
+pub mod mixture_status;
+pub mod mixture_values;
+pub mod provenance;
+pub mod snapshot;
+pub mod walk_ends;
+
+pub use snapshot::Snapshot;

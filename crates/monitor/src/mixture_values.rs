@@ -1,0 +1,66 @@
+//! What the selector stores about the mixture: forgetting and staleness.
+
+use calm::Staleness;
+use serde_json::{Value, json};
+use store::records::{STALENESS, TRAINING_FRAMES};
+
+/// Values that the selector stores with its commits, by name.
+#[derive(Debug)]
+pub struct MixtureValues(pub Vec<(String, String)>);
+
+impl MixtureValues {
+    /// The grades of the training frames under the newest mixture; null if they are not monitored.
+    pub fn training_frames(&self) -> Value {
+        self.read(TRAINING_FRAMES).unwrap_or_default()
+    }
+
+    /// The fraction of the training atoms with γ > 1, if they are monitored.
+    pub fn share_above_one(&self) -> Option<f64> {
+        self.training_frames()["share_above_one"].as_f64()
+    }
+
+    /// The fraction of the training atoms with γ > 1, and whether it raises an alarm. `None` before the first update.
+    pub fn forgetting(&self) -> Option<(f64, bool)> {
+        let training = self.training_frames();
+        training["share_above_one"].as_f64().zip(training["alarm"].as_bool())
+    }
+
+    /// By how many versions walkers' mixtures were behind the newest at decisions; null before the first decision.
+    pub fn staleness_json(&self) -> Value {
+        let Some(staleness) = self.staleness() else { return Value::Null };
+        let mut json = json!(staleness);
+        json["decisions"] = json!(staleness.decisions());
+        json["share_of_newest"] = json!(staleness.share_of_newest());
+        json["median"] = json!(staleness.quantile(0.5));
+        json["quantile_90"] = json!(staleness.quantile(0.9));
+        json
+    }
+
+    /// The same as a histogram.
+    pub fn staleness(&self) -> Option<Staleness> {
+        self.read(STALENESS)
+    }
+
+    fn read<T: serde::de::DeserializeOwned>(&self, name: &str) -> Option<T> {
+        let (_, text) = self.0.iter().find(|(key, _)| key == name)?;
+        serde_json::from_str(text).ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn staleness_has_its_quantiles() {
+        let mut staleness = Staleness::default();
+        [0, 0, 0, 1, 2, 7].iter().for_each(|age| staleness.add(*age));
+        let values = MixtureValues(vec![(STALENESS.into(), json!(staleness).to_string())]);
+        let expected = json!({
+            "counts": { "0": 3, "1": 1, "2": 1, "7": 1 }, "largest": 7, "decisions": 6, "share_of_newest": 0.5,
+            "median": 0, "quantile_90": 7,
+        });
+        assert_eq!(values.staleness_json(), expected);
+        assert_eq!(MixtureValues(Vec::new()).staleness_json(), Value::Null);
+    }
+}

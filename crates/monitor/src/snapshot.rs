@@ -1,0 +1,74 @@
+//! The state of a campaign, which `status`, the dashboard, metrics and notifications show.
+
+use serde_json::{Value, json};
+use store::{Campaign, Status, Store, StoreError};
+
+use crate::disk::{self, DiskUse};
+use crate::expected_end::ExpectedEnd;
+use crate::label_queue::LabelQueue;
+use crate::mixture_values::MixtureValues;
+use crate::provenance::Provenance;
+use crate::walk_ends::WalkEnds;
+
+/// Version of the JSON format; incremented when a key is removed or changes its meaning.
+pub const FORMAT: u32 = 1;
+
+/// The state of a campaign, read within a short time.
+#[derive(Debug)]
+pub struct Snapshot {
+    /// Identity and configuration.
+    pub campaign: Campaign,
+    /// Its name and configuration files. `None` for campaigns of early versions.
+    pub origin: Option<Provenance>,
+    /// Counts, walks and processes.
+    pub status: Status,
+    /// Forgetting and staleness.
+    pub mixture: MixtureValues,
+    /// Size of the store and its forecast.
+    pub disk: DiskUse,
+    /// Costs and failures of labels.
+    pub labels: LabelQueue,
+    /// The expected end.
+    pub end: ExpectedEnd,
+}
+
+impl Snapshot {
+    /// Reads the state of a campaign.
+    pub async fn read(store: &Store) -> Result<Self, StoreError> {
+        let forecast = store.metadata(disk::METADATA_KEY).await?;
+        let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
+        let (campaign, status) = (store.campaign().await?, store.status().await?);
+        let labels = LabelQueue::read(store, &status).await?;
+        let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
+        Ok(Self {
+            end: ExpectedEnd::extrapolate(&status, &configuration, &labels.cost),
+            origin: Provenance::read(store).await?,
+            mixture: MixtureValues(store.values().await?),
+            disk: DiskUse { bytes: store.size().await?, forecast },
+            campaign,
+            status,
+            labels,
+        })
+    }
+
+    /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
+    pub fn to_json(&self) -> serde_json::Result<Value> {
+        let Self { campaign, origin, status, mixture, disk, labels, end } = self;
+        let mut json = serde_json::to_value(status)?;
+        json["version"] = FORMAT.into();
+        json["campaign"] = campaign.id.to_string().into();
+        json["name"] = json!(origin.as_ref().map(|origin| &origin.name));
+        json["configuration"] = json!(origin.as_ref().map(|origin| {
+            json!({ "path": origin.file.path, "blake3": origin.file.blake3, "began_with": origin.began_with })
+        }));
+        json["mode"] = campaign.mode.clone().into();
+        json["training_frames"] = mixture.training_frames();
+        json["staleness"] = mixture.staleness_json();
+        json["disk"] = serde_json::to_value(disk)?;
+        json["disk"]["at_the_end"] = json!(disk.at_the_end(status));
+        json["ends"] = json!(WalkEnds::from_walks(&status.walks));
+        json["expected_end"] = json!(end);
+        labels.add_to(&mut json, status);
+        Ok(json)
+    }
+}

@@ -1,0 +1,108 @@
+//! The label queue, costs and failures in `calmwalk status`.
+
+use std::io::{self, Write};
+
+use monitor::label_cost::QueueCost;
+use monitor::label_queue::{LabelQueue, ProtocolJobs, labels_per_hour};
+use store::{FailureCount, Labels, Status};
+
+use super::page::{Page, cut};
+use super::processes::since;
+use crate::output::count;
+use crate::wording::cost::{core_hours, two_digits};
+use crate::wording::unlabelled;
+
+/// Writes the state of the queue, costs, failures and the structures without labels.
+pub fn write(out: &mut dyn Write, queue: &LabelQueue, page: &Page, status: &Status) -> io::Result<()> {
+    page.titled(out, "labels", &describe_queue(status))?;
+    if let Some(relabelling) = describe_relabelling(&status.labels) {
+        page.titled(out, "", &relabelling)?;
+    }
+    if queue.by_protocol.len() > 1 {
+        let protocols: Vec<_> = queue.by_protocol.iter().map(describe_protocol).collect();
+        page.titled(out, "protocols", &protocols.join("; "))?;
+    }
+    page.titled(out, "", &describe_rate(status))?;
+    page.titled(out, "cost", &describe_cost(&queue.cost, status.budget.used.core_hours))?;
+    for (k, failure) in queue.failures.iter().take(page.few).enumerate() {
+        page.titled(out, if k == 0 { "failures" } else { "" }, &describe_failure(failure))?;
+    }
+    if queue.failures.len() > page.few {
+        page.titled(out, "", &format!("… and {} more classes", queue.failures.len() - page.few))?;
+    }
+    unlabelled::describe(&queue.unlabelled, 12, page.few)
+        .lines()
+        .try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
+}
+
+fn describe_cost(cost: &QueueCost, used: f64) -> String {
+    let QueueCost { unfinished, remaining, hours_left, cores, measured, overhead } = cost;
+    let used = format!("{} core-hours so far", two_digits(used));
+    let Some(remaining) = remaining else {
+        return match unfinished {
+            0 => used,
+            _ => format!(
+                "{used}; cost of {} to come unknown before the first one",
+                count(*unfinished, "label")
+            ),
+        };
+    };
+    let failures = match *overhead > 1.005 {
+        true => format!(", failed attempts add {:.0} %", 100.0 * (overhead - 1.0)),
+        false => String::new(),
+    };
+    let done = match hours_left {
+        Some(hours) => format!("done in {} h on {}", two_digits(*hours), count(*cores, "core")),
+        None => "no active labellers".to_owned(),
+    };
+    format!(
+        "{used}; {} to come: about {}, from {} so far{failures}; {done}",
+        count(*unfinished, "label"),
+        core_hours(remaining),
+        count(*measured, "label")
+    )
+}
+
+fn describe_queue(status: &Status) -> String {
+    let Labels { queued, leased, labelled, failed, dropped, superseded, excluded, .. } = &status.labels;
+    let oldest = status.oldest_lease.as_ref();
+    let oldest = oldest.map_or(String::new(), |lease| format!(" (oldest for {})", since(lease.started)));
+    let superseded = if *superseded > 0 { format!(", {superseded} superseded") } else { String::new() };
+    let excluded = if *excluded > 0 { format!(", {excluded} labels excluded") } else { String::new() };
+    let imported = status.imported;
+    format!(
+        "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped{superseded}{excluded}; \
+         {} imported",
+        count(imported, "structure")
+    )
+}
+
+/// Structures that are relabelled, and failed attempts at it.
+fn describe_relabelling(labels: &Labels) -> Option<String> {
+    let parts = [
+        (labels.again, "being relabelled keep their labels until then"),
+        (labels.again_in_vain, "failed to be relabelled and keep their labels"),
+    ];
+    let parts = parts.iter().filter(|(count, _)| *count > 0);
+    let parts: Vec<_> = parts.map(|(count, what)| format!("{count} {what}")).collect();
+    (!parts.is_empty()).then(|| parts.join("; "))
+}
+
+fn describe_protocol(jobs: &ProtocolJobs) -> String {
+    let ProtocolJobs { protocol, in_force, counts } = jobs;
+    let counts: Vec<_> = counts.iter().map(|(state, count)| format!("{count} {state}")).collect();
+    let current = if *in_force { " (current)" } else { "" };
+    format!("'{protocol}'{current}: {}", counts.join(", "))
+}
+
+fn describe_rate(status: &Status) -> String {
+    let average = labels_per_hour(status)
+        .map_or(String::new(), |average| format!("; {} per hour on average", two_digits(average)));
+    format!("{} computed in the last hour{average}", status.labels_last_hour)
+}
+
+fn describe_failure(failure: &FailureCount) -> String {
+    let FailureCount { class, labelled, given_up, unfinished } = failure;
+    let (class, jobs) = (class.replace('_', " "), labelled + given_up + unfinished);
+    format!("{class} in {jobs}: {labelled} labelled later, {given_up} failed, {unfinished} open")
+}

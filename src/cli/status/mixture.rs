@@ -1,0 +1,72 @@
+//! The state of the mixture in `calmwalk status`: forgetting and staleness.
+
+use std::io::{self, Write};
+
+use monitor::mixture_values::MixtureValues;
+
+use super::page::Page;
+
+/// Writes the lines below the version of the mixture.
+pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &Page, mode: &str) -> io::Result<()> {
+    let training = values.training_frames();
+    let number = |key: &str| training[key].as_f64();
+    if let (Some(median), Some(share)) = (number("median"), number("share_above_one")) {
+        let alarm = if training["alarm"] == true { "; ALARM: the mixture forgets them" } else { "" };
+        let share = 100.0 * share;
+        page.titled(
+            out,
+            "",
+            &format!("training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"),
+        )?;
+    }
+    // Walks that run one after the other have the newest version by construction.
+    match values.staleness().filter(|staleness| mode == "live" || staleness.largest() > 0) {
+        Some(staleness) => page.titled(
+            out,
+            "",
+            &format!(
+                "walkers had the newest version at {:.1} % of decisions; versions behind: median {}, 90 % {}, \
+                 largest {}",
+                100.0 * staleness.share_of_newest(),
+                staleness.quantile(0.5),
+                staleness.quantile(0.9),
+                staleness.largest()
+            ),
+        ),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use calm::Staleness;
+    use serde_json::json;
+    use store::records::STALENESS;
+
+    use super::*;
+
+    fn text(values: &MixtureValues, mode: &str) -> String {
+        let mut out = Vec::new();
+        let page = Page { walks: 8, others: 8, few: 8, width: 120 };
+        write(&mut out, values, &page, mode).unwrap();
+        String::from_utf8(out).unwrap()
+    }
+
+    #[test]
+    fn staleness_is_shown_where_it_matters() {
+        let mut staleness = Staleness::default();
+        [0, 0, 0].iter().for_each(|age| staleness.add(*age));
+        let of =
+            |staleness: &Staleness| MixtureValues(vec![(STALENESS.into(), json!(staleness).to_string())]);
+        assert_eq!(text(&of(&staleness), "reproducible"), "");
+        assert!(text(&of(&staleness), "live").contains("at 100.0 % of decisions"));
+        [1, 2, 7].iter().for_each(|age| staleness.add(*age));
+        let shown = text(&of(&staleness), "reproducible");
+        assert!(
+            shown.contains("50.0 % of decisions; versions behind: median 0, 90 % 7, largest 7"),
+            "{shown}"
+        );
+        let none = MixtureValues(Vec::new());
+        assert_eq!(text(&none, "live"), "");
+    }
+}

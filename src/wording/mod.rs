@@ -1,0 +1,8 @@
+//! What `monitor` reads, in words: texts that several views share.
+
+pub mod budget;
+pub mod cost;
+pub mod disk;
+pub mod energies;
+pub mod unlabelled;
+pub mod walk_ends;
