@@ -1,4 +1,4 @@
-//! `calmwalk explain`: the story of a candidate is what the store holds, for whatever became of it.
+//! `calmwalk explain`: the history of a candidate is what the store holds, whatever became of it.
 
 use std::fs;
 use std::path::Path;
@@ -59,8 +59,8 @@ fn names(list: &Value) -> Vec<&str> {
 }
 
 /// The grades are those of the store, and the atoms that triggered are those above the threshold.
-fn check_grades(story: &Value, stored: &StoredCandidate) {
-    let (view, grades) = (stored.block.view(), &story["grades"]);
+fn check_grades(details: &Value, stored: &StoredCandidate) {
+    let (view, grades) = (stored.block.view(), &details["grades"]);
     let atoms = grades["atoms"].as_array().unwrap();
     assert_eq!(atoms.len(), view.gamma.len());
     for (k, atom) in atoms.iter().enumerate() {
@@ -70,7 +70,7 @@ fn check_grades(story: &Value, stored: &StoredCandidate) {
         assert_eq!(atom["gamma_selector"], stored.selector.gamma[k]);
         assert_eq!(atom["gamma_original"], stored.original.gamma[k]);
         assert_eq!(atom["gamma_nbr_original"], stored.original.gamma_nbr[k]);
-        let biased = story["kind"] == "biased";
+        let biased = details["kind"] == "biased";
         assert_eq!(atom["triggered"], biased && view.gamma[k] > 1.0);
     }
     assert_eq!(grades["walker"]["mixture_version"], view.mixture_version());
@@ -79,11 +79,11 @@ fn check_grades(story: &Value, stored: &StoredCandidate) {
 }
 
 /// The label's errors are those of the potential's forces.
-fn check_label(story: &Value, stored: &StoredCandidate) {
-    let labels = story["labels"].as_array().unwrap();
+fn check_label(details: &Value, stored: &StoredCandidate) {
+    let labels = details["labels"].as_array().unwrap();
     assert_eq!((labels.len(), &labels[0]["standing"]), (1, &"label".into()));
-    assert_eq!(story["jobs"][0]["state"], "labelled");
-    assert_eq!(story["jobs"][0]["attempts_made"][0]["outcome"], "labelled");
+    assert_eq!(details["jobs"][0]["state"], "labelled");
+    assert_eq!(details["jobs"][0]["attempts_made"][0]["outcome"], "labelled");
     let model = &labels[0]["model"];
     let errors: Vec<f64> = serde_json::from_value(model["atoms"].clone()).unwrap();
     let largest = errors.iter().copied().fold(0.0, f64::max);
@@ -107,11 +107,11 @@ fn every_candidate_has_its_history() {
     {
         kinds.insert(decision.kind.clone());
         let name = decision.candidate.as_deref().unwrap();
-        let story = explain(here, name);
-        assert_eq!((&story["format"], &story["id"]), (&1.into(), &name.into()));
-        assert_eq!(story, explain(here, &decision.sequence.to_string()), "by the decision's number");
-        check_grades(&story, stored);
-        let decided = &story["decision"];
+        let details = explain(here, name);
+        assert_eq!((&details["format"], &details["id"]), (&1.into(), &name.into()));
+        assert_eq!(details, explain(here, &decision.sequence.to_string()), "by the decision's number");
+        check_grades(&details, stored);
+        let decided = &details["decision"];
         assert_eq!(
             (&decided["number"], &decided["kind"], &decided["mixture_version"]),
             (&decision.sequence.into(), &decision.kind.clone().into(), &decision.mixture_version.into())
@@ -125,14 +125,15 @@ fn every_candidate_has_its_history() {
             assert!(text.contains("components changed: component 0 of Al"), "{text}");
         }
         match decision.kind.as_str() {
-            "accepted" => check_accepted(&story, decision, stored, &contents),
-            "declined" => check_declined(&story, decision, stored, &contents),
+            "accepted" => check_accepted(&details, decision, stored, &contents),
+            "declined" => check_declined(&details, decision, stored, &contents),
             _ => {
-                check_label(&story, stored);
+                check_label(&details, stored);
                 let text = succeed(here, ["explain", "here", name]);
                 assert!(text.contains("a control walk: unbiased") && !text.contains("its guard"), "{text}");
-                let partner = story["found"]["partner"]["candidate"].as_str().unwrap();
-                let place = format!("-{}.0.{}-", story["found"]["control_of"], stored.block.view().id().step);
+                let partner = details["found"]["partner"]["candidate"].as_str().unwrap();
+                let place =
+                    format!("-{}.0.{}-", details["found"]["control_of"], stored.block.view().id().step);
                 assert!(partner.contains(&place), "{partner} {place}");
             }
         }
@@ -141,13 +142,13 @@ fn every_candidate_has_its_history() {
 }
 
 fn check_accepted(
-    story: &Value,
+    details: &Value,
     decision: &LoggedDecision,
     stored: &StoredCandidate,
     contents: &[(LoggedDecision, Option<StoredCandidate>)],
 ) {
-    check_label(story, stored);
-    let trigger = &story["grades"]["trigger"];
+    check_label(details, stored);
+    let trigger = &details["grades"]["trigger"];
     assert!(trigger["above_walker"].as_u64() >= trigger["needed"].as_u64(), "{trigger}");
     // Whoever was declined as covered later without having seen this version, from the whole log.
     let later = contents.iter().filter(|(later, candidate)| {
@@ -157,17 +158,20 @@ fn check_accepted(
             && seen.is_some_and(|seen| seen < decision.mixture_version)
     });
     let later: Vec<_> = later.map(|(later, _)| later.candidate.as_deref().unwrap()).collect();
-    assert_eq!(names(&story["decision"]["coverage"]["later"]), later);
+    assert_eq!(names(&details["decision"]["coverage"]["later"]), later);
 }
 
 fn check_declined(
-    story: &Value,
+    details: &Value,
     decision: &LoggedDecision,
     stored: &StoredCandidate,
     contents: &[(LoggedDecision, Option<StoredCandidate>)],
 ) {
-    assert_eq!(story["decision"]["reason"], decision.detail["reason"]);
-    assert_eq!((&story["jobs"], &story["labels"]), (&Value::Array(Vec::new()), &Value::Array(Vec::new())));
+    assert_eq!(details["decision"]["reason"], decision.detail["reason"]);
+    assert_eq!(
+        (&details["jobs"], &details["labels"]),
+        (&Value::Array(Vec::new()), &Value::Array(Vec::new()))
+    );
     if decision.detail["reason"] == "covered" {
         let seen = stored.block.view().mixture_version();
         let earlier = contents.iter().filter(|(earlier, _)| {
@@ -178,7 +182,7 @@ fn check_declined(
         let mut by: Vec<_> = earlier.map(|(earlier, _)| earlier.candidate.as_deref().unwrap()).collect();
         by.reverse();
         assert!(!by.is_empty());
-        assert_eq!(names(&story["decision"]["coverage"]["by"]), by);
+        assert_eq!(names(&details["decision"]["coverage"]["by"]), by);
     }
 }
 
@@ -236,15 +240,15 @@ fn imported_structures_have_theirs_and_what_is_not_there_is_refused() {
     moved.structure.positions[0][0] += 0.01;
     common::write_frames(&here.join("moved.extxyz"), &[moved, frames[0].clone()]);
     succeed(here, ["import", "here", "moved.extxyz"]);
-    let story = explain(here, "import-1");
+    let details = explain(here, "import-1");
     assert_eq!(
-        (&story["kind"], &story["frame"], &story["decision"]),
+        (&details["kind"], &details["frame"], &details["decision"]),
         (&"imported".into(), &0.into(), &Value::Null)
     );
-    assert_eq!(story["labels"][0]["energy"].as_f64(), frames[0].labels().unwrap().energy);
+    assert_eq!(details["labels"][0]["energy"].as_f64(), frames[0].labels().unwrap().energy);
     let forces = frames[0].labels().unwrap().forces.unwrap();
     let largest = forces.iter().map(|force| norm(sub(*force, [0.0; 3]))).fold(0.0, f64::max);
-    assert_eq!(story["labels"][0]["max_force"].as_f64(), Some(largest));
+    assert_eq!(details["labels"][0]["max_force"].as_f64(), Some(largest));
     let known = explain(here, "import-2");
     assert_eq!(known["same_structure"][0]["candidate"].as_str(), frames[0].info["candidate_id"].text());
 
