@@ -9,7 +9,7 @@ use std::sync::Arc;
 use calm::Artifact;
 use calm::forgetting::ForgettingAlarm;
 use orchestrator::grader::Grader;
-use orchestrator::selector::{self, Mode, SeedStructure, TrainingFrames};
+use orchestrator::selector::{self, Mode, TrainingFrames};
 use potentials::grace::{GraceModel, Precision};
 use serde_json::{Value, json};
 use store::Protocol;
@@ -18,11 +18,11 @@ use workers::settings::{GuardSettings, WalkSettings};
 
 use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_changeable};
 use crate::exit_status::Failure;
-use crate::label_setup::resolved_method;
+use crate::label_method::MethodConfig;
+use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
-use crate::process_config::MethodConfig;
 use load::Loader;
-pub use load::check_sound;
+pub use load::{SourcedStructure, check_sound};
 
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
 const FILE_KEYS: [&str; 4] =
@@ -50,14 +50,6 @@ pub struct Campaign {
     pub file_hashes: Vec<(String, String)>,
     /// Settings that are valid but likely mistakes.
     pub warnings: Vec<Warning>,
-}
-
-/// A seed structure and its source.
-pub struct SourcedStructure {
-    /// Name and structure.
-    pub seed: SeedStructure,
-    /// `file:line`
-    pub source: String,
 }
 
 impl Campaign {

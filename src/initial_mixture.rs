@@ -8,7 +8,7 @@ use serde_json::Value;
 use store::Store;
 
 use crate::exit_status::Failure;
-use crate::process_config::verify_hash;
+use crate::file_hash::verify_hash;
 
 /// Reads the artifact from the path that the campaign last used.
 ///

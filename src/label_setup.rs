@@ -1,24 +1,17 @@
 //! How the labels of a campaign are made, as read from its store. Labellers without the configuration file use it.
 
-use std::collections::BTreeSet;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use atoms::Species;
-use dft::DftBackend;
 use serde::Deserialize;
-use serde_json::{Value, json};
+use serde_json::Value;
 use store::{Protocol, Store};
-use wire::ContentHash;
 use workers::labeller::LabelBounds;
 
-use crate::config::{LabelMethod, LabelSection, PotentialFile, PotentialKind, changed_keys};
+use crate::config::LabelSection;
 use crate::exit_status::Failure;
-use crate::process_config::MethodConfig;
-
-/// Configuration key of a reference potential's file.
-pub const REFERENCE_FILE: &str = "label.method.potential.file";
+use crate::file_hash::hash;
+use crate::label_method::{MethodConfig, REFERENCE_FILE, check_protocol};
 
 /// Metadata key under which the leader stores its [`MethodConfig`], with the paths of its host.
 pub const LABEL_METHOD_KEY: &str = "label_method";
@@ -63,64 +56,6 @@ struct LabelLimits {
     lease_timeout: crate::duration::Duration,
 }
 
-/// The protocol with these settings. Its hash is that of the settings.
-pub fn protocol(name: &str, settings: Value) -> Protocol {
-    let hash = ContentHash(*blake3::hash(settings.to_string().as_bytes()).as_bytes());
-    Protocol { hash, name: name.to_owned(), settings }
-}
-
-/// Protocol settings of a program's labels.
-pub fn code_identity(method: &str, code: &dyn DftBackend) -> Value {
-    json!({ "method": method, "settings": code.identity() })
-}
-
-/// Protocol settings of a reference potential.
-pub fn reference_identity(kind: PotentialKind, file_hash: &str) -> Value {
-    json!({ "method": "potential", "kind": kind, "file_hash": file_hash })
-}
-
-/// The part of the label method that a campaign's configuration records: what determines the labels. The command and
-/// the paths of files may change.
-pub fn resolved_method(label: &LabelSection, protocol: &Protocol) -> Value {
-    match &label.method {
-        LabelMethod::Potential(PotentialFile { kind, .. }) => {
-            json!({ "potential": { "kind": kind, "file": null } })
-        }
-        LabelMethod::Code(settings) => json!({ settings.name(): protocol.settings }),
-    }
-}
-
-/// The configuration of a campaign with another label protocol.
-pub fn with_protocol(configuration: &Value, label: &LabelSection, protocol: &Protocol) -> Value {
-    let mut configuration = configuration.clone();
-    configuration["label"]["protocol"] = json!(protocol.name);
-    configuration["label"]["method"] = resolved_method(label, protocol);
-    if let Some(files) = configuration["files"].as_object_mut() {
-        files.remove(REFERENCE_FILE);
-        if let LabelMethod::Potential(_) = label.method {
-            files.insert(REFERENCE_FILE.to_owned(), protocol.settings["file_hash"].clone());
-        }
-    }
-    configuration
-}
-
-/// Checks that labels can be made for these elements.
-pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(), String> {
-    match &label.method {
-        LabelMethod::Potential(reference) => {
-            let potential = reference.load()?;
-            match species.iter().find(|species| !potential.species().contains(species)) {
-                Some(missing) => Err(format!("the label potential does not know {missing}")),
-                None => Ok(()),
-            }
-        }
-        LabelMethod::Code(settings) => {
-            let code = settings.prepare(&label.pass_environment).map_err(|error| error.to_string())?;
-            code.supports(species).map_err(|error| error.to_string())
-        }
-    }
-}
-
 impl LabelSetup {
     /// Reads the setup of `protocol`, which is in force, and locates on this host what the method needs.
     pub async fn read(store: &Store, protocol: Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
@@ -142,7 +77,7 @@ impl LabelSetup {
                  or name the intended campaign"
             )));
         }
-        let method = noted.for_this_host(&protocol, here)?;
+        let method = method_for_this_host(noted, &protocol, here)?;
         let lease = lease_timeout.get();
         Ok(Self { method, protocol, attempts, bounds, lease })
     }
@@ -165,88 +100,39 @@ fn unreadable(error: serde_json::Error) -> Failure {
     ))
 }
 
-impl MethodConfig {
-    /// The method of a configuration, with absolute paths.
-    pub fn from_section(label: &LabelSection) -> Result<Self, Failure> {
-        let absolute = |path: &Path| std::path::absolute(path).map_err(Failure::failed);
-        match &label.method {
-            LabelMethod::Potential(PotentialFile { kind, file }) => {
-                let file = file.get_ref();
-                let file_hash = hash(file)
-                    .map_err(|error| Failure::Input(format!("cannot read {}: {error}", file.display())))?;
-                Ok(Self::Reference { kind: *kind, file: absolute(file)?, file_hash })
-            }
-            LabelMethod::Code(settings) => {
-                let mut settings = Box::new(settings.clone());
-                for path in settings.paths() {
-                    *path = absolute(path)?;
-                }
-                Ok(Self::Code { settings, running: label.execution_settings() })
-            }
+/// Replaces files and commands by those of this host. Fails if they would make labels of another protocol.
+fn method_for_this_host(
+    noted: MethodConfig,
+    protocol: &Protocol,
+    here: HostOptions<'_>,
+) -> Result<MethodConfig, Failure> {
+    let given = here.label.as_ref().map(MethodConfig::from_section).transpose()?;
+    match (noted, given) {
+        (MethodConfig::Potential { kind, file, .. }, None) => {
+            let (file, file_hash) = find_file(&file, protocol, here.files)?;
+            Ok(MethodConfig::Potential { kind, file, file_hash })
         }
-    }
-
-    /// Protocol settings of the labels. A program must be installed.
-    pub fn identity(&self) -> Result<Value, Failure> {
-        match self {
-            Self::Reference { kind, file_hash, .. } => Ok(reference_identity(*kind, file_hash)),
-            Self::Code { settings, running } => {
-                let code = settings.prepare(&running.pass_environment).map_err(Failure::input)?;
-                Ok(code_identity(settings.name(), &*code))
+        (noted @ MethodConfig::Code { .. }, given) => {
+            let (name, method) = (noted.name(), given.unwrap_or(noted));
+            if let Some(file) = here.files.first() {
+                return Err(Failure::Input(format!(
+                    "--file {}: give the files of the method '{name}' in a --config",
+                    file.display()
+                )));
             }
-        }
-    }
-
-    /// Name of the method in the configuration.
-    fn name(&self) -> &'static str {
-        match self {
-            Self::Reference { .. } => "potential",
-            Self::Code { settings, .. } => settings.name(),
-        }
-    }
-
-    /// Replaces files and commands by those of this host. Fails if they would make labels of another protocol.
-    fn for_this_host(self, protocol: &Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
-        let given = here.label.as_ref().map(Self::from_section).transpose()?;
-        match (self, given) {
-            (Self::Reference { kind, file, .. }, None) => {
-                let (file, file_hash) = find_file(&file, protocol, here.files)?;
-                Ok(Self::Reference { kind, file, file_hash })
+            if method.name() != name {
+                return Err(method_mismatch(method.name(), name));
             }
-            (noted @ Self::Code { .. }, given) => {
-                let (name, method) = (noted.name(), given.unwrap_or(noted));
-                if let Some(file) = here.files.first() {
-                    return Err(Failure::Input(format!(
-                        "--file {}: give the files of the method '{name}' in a --config",
-                        file.display()
-                    )));
-                }
-                if method.name() != name {
-                    return Err(method_mismatch(method.name(), name));
-                }
-                let identity = method.identity().map_err(|failure| {
-                    Failure::Input(format!(
-                        "cannot make labels on this host: {failure}; if the missing file or program has another path here, \
-                         give it in a --config"
-                    ))
-                })?;
-                check_protocol(&identity, protocol)?;
-                Ok(method)
-            }
-            (Self::Reference { .. }, Some(given)) => Err(method_mismatch(given.name(), "potential")),
+            let identity = method.identity().map_err(|failure| {
+                Failure::Input(format!(
+                    "cannot make labels on this host: {failure}; if the missing file or program has another path here, \
+                     give it in a --config"
+                ))
+            })?;
+            check_protocol(&identity, protocol)?;
+            Ok(method)
         }
-    }
-}
-
-/// Checks that labels with these settings belong to the protocol.
-pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), Failure> {
-    match changed_keys(&protocol.settings, identity).first() {
-        None => Ok(()),
-        Some((key, before, after)) => Err(Failure::Input(format!(
-            "labels made here would not belong to the campaign's protocol '{}': {key} is {after} here, but {before} \
-             in the protocol",
-            protocol.name
-        ))),
+        (MethodConfig::Potential { .. }, Some(given)) => Err(method_mismatch(given.name(), "potential")),
     }
 }
 
@@ -291,8 +177,4 @@ fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(Pa
         "{REFERENCE_FILE}: this campaign's labels need the file with BLAKE3 {expected}, but {why}; copy it to this \
          host and pass it with --file"
     )))
-}
-
-fn hash(path: &Path) -> std::io::Result<String> {
-    Ok(blake3::hash(&fs::read(path)?).to_string())
 }

@@ -11,12 +11,13 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
 use wire::ipc::ConnectInfo;
-use workers::labeller::{ExecutionSettings, LabelBounds, Method};
+use workers::labeller::LabelBounds;
 use workers::settings::WalkSettings;
 
-use crate::config::PotentialKind;
 use crate::exit_status::Failure;
-use crate::label_setup::{self, LabelSetup};
+use crate::file_hash::verify_hash;
+use crate::label_method::MethodConfig;
+use crate::label_setup::LabelSetup;
 use crate::log;
 
 /// Configuration of a walker process.
@@ -99,48 +100,6 @@ pub struct PoolConfig {
     pub grace_period: f64,
 }
 
-/// How labels are made.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-#[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum MethodConfig {
-    /// With a potential that calmwalk evaluates.
-    Reference {
-        /// Format of the potential's file.
-        kind: PotentialKind,
-        /// The potential.
-        file: PathBuf,
-        /// BLAKE3 hash of that file.
-        file_hash: String,
-    },
-    /// With an external program.
-    Code {
-        /// The program and the protocol.
-        settings: Box<dft::Settings>,
-        /// How its calculations run.
-        running: ExecutionSettings,
-    },
-}
-
-impl MethodConfig {
-    /// Prepares the method to label by `protocol`. Fails if a file or program has been replaced.
-    pub fn load(&self, protocol: &Protocol) -> Result<Method, Failure> {
-        match self {
-            Self::Reference { kind, file, file_hash } => {
-                verify_hash(file, file_hash)?;
-                let potential = kind.load(file).map_err(Failure::Input)?;
-                // Detects a file that was replaced while it was read.
-                verify_hash(file, file_hash)?;
-                Ok(Method::reference(potential))
-            }
-            Self::Code { settings, running } => {
-                let code = settings.prepare(&running.pass_environment).map_err(Failure::input)?;
-                label_setup::check_protocol(&label_setup::code_identity(settings.name(), &*code), protocol)?;
-                Ok(Method::code(code, running.clone()))
-            }
-        }
-    }
-}
-
 /// Reads the configuration of this process.
 pub fn from_stdin<T: DeserializeOwned>() -> Result<T, Failure> {
     let mut text = String::new();
@@ -175,47 +134,5 @@ impl WalkerConfig {
         verify_hash(&self.model, &self.model_hash)?;
         let model = GraceModel::load_in(&self.model, self.precision, RadialPath::default());
         Ok(Arc::new(model.map_err(Failure::input)?))
-    }
-}
-
-/// Checks that a file has this BLAKE3 hash.
-pub fn verify_hash(path: &std::path::Path, expected: &str) -> Result<(), Failure> {
-    let bytes = std::fs::read(path)
-        .map_err(|error| Failure::Input(format!("cannot read {}: {error}", path.display())))?;
-    let found = blake3::hash(&bytes).to_string();
-    if found == expected {
-        return Ok(());
-    }
-    Err(Failure::Input(format!(
-        "{}: the file has another content (BLAKE3 {found}) than when this run began ({expected}); restore the old file",
-        path.display()
-    )))
-}
-
-#[cfg(test)]
-mod tests {
-    use std::fs;
-
-    use super::*;
-
-    #[test]
-    fn a_replaced_program_is_refused() {
-        let directory = tempfile::tempdir().unwrap();
-        let script = directory.path().join("label.sh");
-        fs::write(&script, "exit 0").unwrap();
-        let settings = serde_json::json!({ "command": {
-            "command": ["sh", "label.sh"], "files": [script], "version": "1"
-        } });
-        let settings = Box::new(serde_json::from_value(settings).unwrap());
-        let method = MethodConfig::Code { settings, running: ExecutionSettings::default() };
-        let protocol = label_setup::protocol("script", method.identity().unwrap());
-        assert!(method.load(&protocol).is_ok());
-        fs::write(&script, "exit 1").unwrap();
-        let message = method.load(&protocol).map(drop).unwrap_err().to_string();
-        assert!(
-            message.contains("not belong to the campaign's protocol 'script'")
-                && message.contains("label.sh"),
-            "{message}"
-        );
     }
 }

@@ -6,15 +6,22 @@ use std::sync::Arc;
 use atoms::{NeighbourList, Structure, read_structures};
 use calm::forgetting::grade_distribution;
 use calm::{Artifact, ArtifactError, Mixture};
-use orchestrator::selector::TrainingFrames;
+use orchestrator::selector::{SeedStructure, TrainingFrames};
 use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
-use super::SourcedStructure;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
-use crate::label_setup::{self, REFERENCE_FILE};
+use crate::label_method::{self, REFERENCE_FILE};
+
+/// A seed structure and its source.
+pub struct SourcedStructure {
+    /// Name and structure.
+    pub seed: SeedStructure,
+    /// `file:line`
+    pub source: String,
+}
 
 /// Largest number of training atoms whose grades are monitored: enough for the share above 1 to a percent.
 const MAX_MONITORED_ATOMS: usize = 4000;
@@ -174,7 +181,7 @@ impl Loader<'_> {
             LabelMethod::Potential(reference) => self.reference(reference, seeds)?,
             LabelMethod::Code(settings) => (self.code(settings, seeds)?, Vec::new()),
         };
-        Ok((label_setup::protocol(self.config.label.protocol_name(), settings), hashes))
+        Ok((label_method::protocol(self.config.label.protocol_name(), settings), hashes))
     }
 
     fn reference(
@@ -198,7 +205,7 @@ impl Loader<'_> {
             }
         }
         let hash = self.hash(REFERENCE_FILE, &reference.file)?;
-        Ok((label_setup::reference_identity(reference.kind, &hash.1), vec![hash]))
+        Ok((label_method::potential_identity(reference.kind, &hash.1), vec![hash]))
     }
 
     /// Protocol settings of a program, which must be installed with all it needs for every seed structure.
@@ -214,7 +221,7 @@ impl Loader<'_> {
             let of_seed = |error| format!("{error} (seed structure '{}', {})", named.seed.name, named.source);
             supported.map_err(|error| wrong(of_seed(error)))?;
         }
-        Ok(label_setup::code_identity(settings.name(), &*code))
+        Ok(label_method::code_identity(settings.name(), &*code))
     }
 
     /// A key and the hash of the file that it names.

@@ -8,8 +8,7 @@ use orchestrator::selector::SeedStructure;
 use potentials::grace::GraceModel;
 use wire::ContentHash;
 
-use super::SourcedStructure;
-use super::load::Loader;
+use super::load::{Loader, SourcedStructure};
 use crate::config::{ConfigError, Warning, place};
 
 const FILES: &str = "seed_structures.files";

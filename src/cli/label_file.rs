@@ -14,10 +14,9 @@ use workers::labeller::{SingleLabel, label_structure};
 use super::{ExitStatus, Failure, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::Config;
-use crate::label_setup;
+use crate::label_method::{self, MethodConfig};
 use crate::log::Options;
 use crate::output::{print, print_json};
-use crate::process_config::MethodConfig;
 use crate::runtime::stop_signal;
 
 /// Label the structures of a file, to test a label protocol without a campaign
@@ -83,7 +82,7 @@ impl LabelFile {
         let section = Config::load_label(&self.config)?;
         let frames = read_structures(&self.structures).map_err(Failure::input)?;
         let setup = MethodConfig::from_section(&section)?;
-        let protocol = label_setup::protocol(section.protocol_name(), setup.identity()?);
+        let protocol = label_method::protocol(section.protocol_name(), setup.identity()?);
         let method = setup.load(&protocol)?;
         let bounds = section.bounds();
         let mut output = self.output.as_deref().map(AtomicFile::create).transpose()?;

@@ -4,10 +4,8 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use store::ServerUrl;
 use workers::settings::ThermostatKind;
 
+use super::error::Wrong;
 use super::{Config, LabelSection, NotifySection, QueueFull};
-
-/// A value that does not go: its key, what was found, what was expected.
-pub type Wrong = (String, String, String);
 
 /// Checks a configuration as a whole; everything that is wrong.
 pub fn check(config: &Config) -> Vec<Wrong> {

@@ -9,8 +9,7 @@ use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue, Deserializer, Error};
 
-use super::check::Wrong;
-use super::error::{ConfigError, line_and_column, translated};
+use super::error::{ConfigError, Wrong, line_and_column, nearest, translated};
 use super::hints::{self, KnownKeys};
 use super::ranges::{self, Found};
 use super::warning::Warning;
@@ -177,17 +176,6 @@ impl<'a> Document<'a> {
         self.problems.sort_by_key(|(offset, _)| *offset);
         ConfigError::all(self.path, self.problems).map_or(Ok(()), Err)
     }
-}
-
-/// Where a dotted key stands, or the innermost of the tables that should have it.
-pub fn nearest(table: &DeTable<'_>, key: &str) -> Option<usize> {
-    let (name, rest) = key.split_once('.').unwrap_or((key, ""));
-    let (found, value) = table.get_key_value(name)?;
-    let inside = match value.get_ref() {
-        DeValue::Table(inner) if !rest.is_empty() => nearest(inner, rest),
-        _ => None,
-    };
-    Some(inside.unwrap_or(found.span().start))
 }
 
 fn offset(error: &Error) -> usize {

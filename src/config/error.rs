@@ -3,10 +3,12 @@
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use toml::de::DeTable;
+use toml::de::{DeTable, DeValue};
 
-use super::document;
 use super::hints::Unknown;
+
+/// A value that a rule refuses: its key, what was found, what was expected.
+pub type Wrong = (String, String, String);
 
 /// Why a configuration cannot be used: exit code 2.
 #[derive(Debug, thiserror::Error)]
@@ -171,10 +173,21 @@ pub(super) fn translated(message: &str) -> String {
 /// `file:line` of a dotted key; that of the table that should have it where it is not written out, or the file alone.
 pub fn place(path: &Path, text: &str, key: &str) -> String {
     let (table, _) = DeTable::parse_recoverable(text);
-    match document::nearest(table.get_ref(), key) {
+    match nearest(table.get_ref(), key) {
         Some(offset) => place_of_offset(path, text, offset),
         None => path.display().to_string(),
     }
+}
+
+/// Where a dotted key stands, or the innermost of the tables that should have it.
+pub(super) fn nearest(table: &DeTable<'_>, key: &str) -> Option<usize> {
+    let (name, rest) = key.split_once('.').unwrap_or((key, ""));
+    let (found, value) = table.get_key_value(name)?;
+    let inside = match value.get_ref() {
+        DeValue::Table(inner) if !rest.is_empty() => nearest(inner, rest),
+        _ => None,
+    };
+    Some(inside.unwrap_or(found.span().start))
 }
 
 /// `file:line` of a byte offset.

@@ -153,7 +153,7 @@ impl Config {
     }
 
     /// Checks it as a whole; everything that is wrong.
-    pub fn check(&self) -> Vec<check::Wrong> {
+    pub fn check(&self) -> Vec<error::Wrong> {
         check::check(self)
     }
 

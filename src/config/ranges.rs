@@ -5,7 +5,7 @@
 
 use toml::de::{DeTable, DeValue};
 
-use super::check::Wrong;
+use super::error::Wrong;
 use crate::duration::Duration;
 
 /// The values of a key.

@@ -22,6 +22,7 @@ use workers::agent::{self, Agent, AgentEvent};
 use super::process_manager::all_failed_message;
 use super::{CHANNEL, STOP_MESSAGE, stop_signal};
 use crate::exit_status::{ExitStatus, Failure};
+use crate::file_hash::verify_hash;
 use crate::log;
 use crate::output::{count, log_and_print, log_and_warn};
 use crate::process_config::{self, AgentConfig, WalkerConfig};
@@ -116,7 +117,7 @@ async fn model(
     directory: &Path,
 ) -> Result<Option<PathBuf>, Failure> {
     let hash = &setup.model_hash;
-    if process_config::verify_hash(&setup.model, hash).is_ok() {
+    if verify_hash(&setup.model, hash).is_ok() {
         return Ok(Some(setup.model.clone()));
     }
     log_and_print("the orchestrator's model file is not on this host: downloading the model …");
@@ -127,7 +128,7 @@ async fn model(
     };
     fs::write(&path, bytes)
         .map_err(|error| Failure::Failed(format!("cannot write {}: {error}", path.display())))?;
-    process_config::verify_hash(&path, hash).map_err(Failure::failed)?;
+    verify_hash(&path, hash).map_err(Failure::failed)?;
     Ok(Some(path))
 }
 

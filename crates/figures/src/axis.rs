@@ -1,15 +1,6 @@
 //! The axes of a panel.
 
-use crate::ticks::{self, Tick};
-
-/// The mapping of values to positions.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Scale {
-    /// Linear.
-    Linear,
-    /// Logarithmic.
-    Logarithmic,
-}
+use crate::ticks::{self, Scale, Tick};
 
 /// An axis with its range and ticks.
 #[derive(Clone, Debug, PartialEq)]

@@ -13,7 +13,7 @@ mod rich_text;
 mod svg;
 mod ticks;
 
-pub use axis::{Axis, Scale};
+pub use axis::Axis;
 pub use colours::{Colour, Paint, Stroke};
 pub use figure::{Figure, Item, Marker, Rectangle, Text};
 pub use font::{BOLD, FAMILY, REGULAR};
@@ -22,6 +22,7 @@ pub use panel::{Panel, Side};
 pub use png::{PngError, to_png};
 pub use rich_text::{Anchor, escape, plain, to_html, width};
 pub use svg::to_svg;
+pub use ticks::Scale;
 
 /// A point on a sheet or in data coordinates: x, y.
 pub type Point = [f64; 2];

@@ -1,6 +1,13 @@
 //! Positions and labels of ticks.
 
-use crate::Scale;
+/// The mapping of values to positions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scale {
+    /// Linear.
+    Linear,
+    /// Logarithmic.
+    Logarithmic,
+}
 
 /// A tick; minor ticks have no label.
 #[derive(Clone, Debug, PartialEq)]

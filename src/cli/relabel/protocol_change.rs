@@ -9,8 +9,8 @@ use store::{Protocol, Store, StoreError};
 
 use super::Failure;
 use crate::config::{Change, Config, LabelSection, changed_keys};
-use crate::label_setup::{self, LABEL_METHOD_KEY};
-use crate::process_config::MethodConfig;
+use crate::label_method::{self, MethodConfig};
+use crate::label_setup::LABEL_METHOD_KEY;
 
 /// The new label protocol, and what changes with it.
 pub struct ProtocolChange {
@@ -29,7 +29,7 @@ impl ProtocolChange {
     pub async fn read(store: &Store, path: &Path, in_force: &Protocol) -> Result<Option<Self>, Failure> {
         let section = Config::load_label(path)?;
         let method = MethodConfig::from_section(&section)?;
-        let protocol = label_setup::protocol(section.protocol_name(), method.identity()?);
+        let protocol = label_method::protocol(section.protocol_name(), method.identity()?);
         if protocol.hash == in_force.hash {
             return Ok(None);
         }
@@ -38,7 +38,7 @@ impl ProtocolChange {
         let before = store.campaign().await?.configuration_in_force;
         let before = serde_json::from_str(&before)
             .map_err(|error| StoreError::damaged("the configuration in force", error))?;
-        let after = label_setup::with_protocol(&before, &section, &protocol);
+        let after = label_method::with_protocol(&before, &section, &protocol);
         let changed = changed_keys(&before, &after).into_iter();
         let changes = changed.map(|(key, before, after)| Change::Key { key, before, after }).collect();
         let note = serde_json::to_string(&method).map_err(Failure::failed)?;
@@ -87,6 +87,6 @@ async fn check_elements(store: &Store, section: &LabelSection, path: &Path) -> R
     let seeds = store.seed_structures().await?;
     let species: BTreeSet<Species> =
         seeds.iter().flat_map(|seed| seed.structure.species.iter().copied()).collect();
-    label_setup::supports(section, &species)
+    label_method::supports(section, &species)
         .map_err(|error| Failure::Input(format!("{}: label.method: {error}", path.display())))
 }

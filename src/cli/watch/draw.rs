@@ -10,8 +10,9 @@ use ratatui::widgets::{Paragraph, Sparkline};
 use store::{Candidates, Labels};
 
 use super::entries;
+use super::messages::WINDOW;
 use super::pane::{Pane, Tone};
-use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, State, Text, WALKS, WINDOW};
+use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, State, Text, WALKS};
 use crate::cli::status as cli_status;
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;

@@ -5,26 +5,12 @@ use store::JobState;
 
 use super::super::ExitStatus;
 use super::entries::{UNKNOWN_QUANTITIES, without_campaign};
+use super::messages::Request;
 use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, State, Text, WALKS};
 use crate::cli::queue::Action as QueueAction;
 use crate::cli::status;
 use crate::cli::walks::{Action as WalksAction, WalkSelection};
 use crate::filter::Filter;
-
-/// An action outside the state.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Request {
-    /// Exit.
-    Quit(ExitStatus),
-    /// Poll at once, because another view was selected.
-    Refresh,
-    /// Read the history of a candidate.
-    Explain(String),
-    /// Change label jobs.
-    Queue(QueueAction),
-    /// Pause or resume walks.
-    Walks(WalksAction),
-}
 
 /// The text of F1.
 pub const HELP: &str = "\

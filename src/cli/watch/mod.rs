@@ -4,6 +4,7 @@ mod charts;
 mod draw;
 mod entries;
 mod keys;
+mod messages;
 mod pane;
 mod reader;
 mod screen;
@@ -21,7 +22,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use self::draw::Theme;
-use self::keys::Request;
+use self::messages::{Completed, JobView, Request};
 use self::reader::{Poller, Reader};
 use self::screen::Screen;
 use self::state::State;
@@ -60,7 +61,7 @@ impl Watch {
 async fn watch(location: Location, interval: std::time::Duration) -> Result<ExitStatus, Failure> {
     let mut reader = Reader::new(location.clone());
     // Before the screen opens, so that an error is printed normally.
-    let mut state = State::new(reader.poll(state::JobView::default()).await?);
+    let mut state = State::new(reader.poll(JobView::default()).await?);
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
     let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
@@ -99,15 +100,6 @@ async fn watch(location: Location, interval: std::time::Duration) -> Result<Exit
             Some(request) => drop(requests.spawn(perform(location.clone(), request))),
         }
     }
-}
-
-/// The result of a request, as text.
-#[derive(Debug, PartialEq)]
-pub enum Completed {
-    /// The id of a candidate, and its history or an error.
-    Explain(String, Result<String, String>),
-    /// What was changed, or an error.
-    Change(Result<String, String>),
 }
 
 /// Does what the commands of the same names do.

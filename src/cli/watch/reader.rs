@@ -3,28 +3,15 @@
 use std::time::Duration;
 
 use monitor::Snapshot;
-use store::{Job, JobState, Location, RecentDecision, Store};
+use store::{Location, Store};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 
-use super::state::{JobView, WINDOW};
+use super::messages::{JobView, Reading, WINDOW};
 use crate::exit_status::Failure;
 
 /// Maximum number of jobs read per state.
 const MAX_JOBS: u32 = 300;
-
-/// The result of a poll.
-#[derive(Debug)]
-pub struct Reading {
-    /// The campaign, as in `calmwalk status`.
-    pub snapshot: Snapshot,
-    /// The requested view of jobs.
-    pub view: JobView,
-    /// The first jobs of the view, in the order in which labellers take them.
-    pub jobs: Vec<Job>,
-    /// Decisions since the last poll, newest first.
-    pub decisions: Vec<RecentDecision>,
-}
 
 /// Reads a campaign.
 pub struct Reader {
@@ -64,18 +51,6 @@ impl Reader {
         let decisions = store.newest_decisions(self.last, WINDOW as u32).await?;
         self.last = decisions.first().map_or(self.last, |newest| newest.sequence);
         Ok(Reading { snapshot, view, jobs, decisions })
-    }
-}
-
-impl JobView {
-    /// The states of the jobs in a view.
-    fn states(self) -> &'static [JobState] {
-        match self {
-            Self::Waiting => &[JobState::Leased, JobState::Queued],
-            Self::Failed => &[JobState::Failed],
-            Self::Dropped => &[JobState::Dropped],
-            Self::Labelled => &[JobState::Labelled],
-        }
     }
 }
 

@@ -5,16 +5,11 @@ use std::collections::VecDeque;
 use monitor::Snapshot;
 use store::{Job, RecentDecision};
 
-use super::Completed;
 use super::charts::Charts;
 use super::entries;
-use super::keys::Request;
+use super::messages::{Completed, JobView, Reading, Request, WINDOW};
 use super::pane::Pane;
-use super::reader::Reading;
 use crate::exit_status::Failure;
-
-/// Number of newest decisions kept, for charts and filters.
-pub const WINDOW: usize = 2000;
 
 /// Index of the pane of walks.
 pub const WALKS: usize = 0;
@@ -22,20 +17,6 @@ pub const WALKS: usize = 0;
 pub const QUEUE: usize = 1;
 /// Index of the pane of decisions.
 pub const DECISIONS: usize = 2;
-
-/// Which label jobs are shown.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum JobView {
-    /// Leased, then queued jobs.
-    #[default]
-    Waiting,
-    /// Failed jobs.
-    Failed,
-    /// Jobs dropped by the user.
-    Dropped,
-    /// Jobs with a label.
-    Labelled,
-}
 
 /// What receives the keys.
 #[derive(Debug, Default)]

@@ -6,9 +6,8 @@ use store::{DecidedCandidate, Job, JobState, RecentDecision};
 use wire::Origin;
 
 use super::draw::{Theme, draw};
-use super::keys::Request;
-use super::reader::Reading;
-use super::state::{DECISIONS, JobView, Message, Mode, QUEUE, State, WALKS};
+use super::messages::{Completed, JobView, Reading, Request};
+use super::state::{DECISIONS, Message, Mode, QUEUE, State, WALKS};
 use super::*;
 use crate::cli::queue::Action;
 use crate::cli::status;
