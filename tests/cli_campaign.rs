@@ -361,7 +361,7 @@ fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
     drop(run);
     assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("imported 1 label and "));
     let killed = json(here, ["status", "small"]);
-    assert_eq!(killed["processes"][0]["state"], "gone");
+    assert_eq!(killed["processes"][0]["state"], "dead");
     let not_running = "not running (resume with calmwalk run)";
     wait_until("the labeller has left", || succeed(here, ["status", "small"]).contains(not_running));
     assert!(succeed(here, ["clean", "small"]).contains("files from shared memory"));

@@ -146,7 +146,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     let status = json(here, ["status", "strict"]);
     assert_eq!(status["labels"]["failed"], lost.len());
     assert_eq!(status["failures"][0]["class"], "implausible");
-    assert_eq!(status["failures"][0]["given_up"], lost.len());
+    assert_eq!(status["failures"][0]["failed"], lost.len());
     let unlabelled = status["unlabelled"].as_array().unwrap();
     let failed: u64 = unlabelled.iter().map(|part| part["failed"].as_u64().unwrap()).sum();
     assert_eq!(failed as usize, lost.len());

@@ -39,7 +39,7 @@ fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
     assert!(log.contains("Å apart, where label.guard.min_bond_lengths of Al-Al is 3.5"), "{log}");
     let status = json(here, ["status", "campaign"]);
     assert_eq!(status["failures"][0]["class"], "refused");
-    assert_eq!(status["failures"][0]["given_up"], refused.len());
+    assert_eq!(status["failures"][0]["failed"], refused.len());
 
     // Overruled, one is labelled by the same labellers; the others stay refused.
     succeed(here, ["queue", "campaign", "retry", &refused[0]]);

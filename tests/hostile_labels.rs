@@ -119,7 +119,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
         assert!(told, "{kind}: {logs:#?}");
     }
     // Nobody has had to be started again, nothing is left, and nothing was done where others can write.
-    assert!(!place.said().contains("pausing"), "{}", place.said());
+    assert!(!place.said().contains("backing off"), "{}", place.said());
     assert_eq!(calculation_processes(&scratch), []);
     let left: Vec<_> = fs::read_dir(&scratch).unwrap().map(|entry| entry.unwrap().path()).collect();
     assert_eq!(left.as_slice(), std::slice::from_ref(&trap));

@@ -113,7 +113,7 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
     signal(pid, "KILL");
     resume_processes(&slots);
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
-    assert!(place.said().contains("killed by signal 9 (SIGKILL); pausing"), "{}", place.said());
+    assert!(place.said().contains("killed by signal 9 (SIGKILL); backing off"), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Labelled);
     assert_eq!(place.status()["processes"], serde_json::json!([]));
 }

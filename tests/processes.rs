@@ -157,13 +157,14 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
     signal(held[0], "KILL");
-    let given_up = |process: &Value| {
+    let failed = |process: &Value| {
         let remark = process["remark"].as_str().unwrap_or_default();
-        process["kind"] == "walker" && process["state"] == "given up" && remark.contains("another content")
+        process["kind"] == "walker" && process["state"] == "failed" && remark.contains("another content")
     };
-    wait_until("status shows it", || shown(here).iter().any(given_up));
+    wait_until("status shows it", || shown(here).iter().any(failed));
     let table = succeed(here, ["status", "."]);
-    assert!(table.contains("given up") && table.contains("another content"), "{table}");
+    let failed = |line: &str| line.starts_with("walker") && line.contains("  failed  ");
+    assert!(table.lines().any(failed) && table.contains("another content"), "{table}");
     fs::write(here.join("model.npz"), model).unwrap();
     resume_processes(&held);
     ends_as_undisturbed(running, here, &small);

@@ -95,9 +95,9 @@ fn backoff_doubles_up_to_the_maximum_until_the_child_fails() {
     }
     let last = supervisor.ended(0, signal(11), now);
     assert_eq!(last, Some(ChildExit { incarnation: 6, reason: signal(11), then: ChildState::Failed }));
-    let given_up = status(&supervisor, 0, now);
-    assert_eq!((given_up.incarnation, given_up.restarts), (6, 5));
-    assert_eq!(given_up.last_failure, Some(signal(11)));
+    let failed = status(&supervisor, 0, now);
+    assert_eq!((failed.incarnation, failed.restarts), (6, 5));
+    assert_eq!(failed.last_failure, Some(signal(11)));
     // The others continue.
     assert!(!supervisor.is_over());
     assert_eq!(status(&supervisor, 1, now).state, ChildState::Running);

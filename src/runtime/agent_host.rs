@@ -140,7 +140,7 @@ struct AgentHost {
     dispatching: DispatchTask,
     serving: JoinHandle<Result<(), IpcError>>,
     /// How the last walker failed, if all have failed for good.
-    given_up: Option<String>,
+    failed: Option<String>,
 }
 
 type DispatchTask = JoinHandle<Result<agent::AgentExit, LinkError>>;
@@ -172,7 +172,7 @@ async fn run_in(
     let heard = move |walker, useful| if useful { signs.delivered(walker) } else { signs.heartbeat(walker) };
     let serving = tokio::spawn(server.run(shared, to_agent, heard));
     let dispatching = dispatch(incoming);
-    AgentHost { walkers, state: state.clone(), line, dispatching, serving, given_up: None }
+    AgentHost { walkers, state: state.clone(), line, dispatching, serving, failed: None }
         .supervise(stop)
         .await
 }
@@ -227,7 +227,7 @@ impl AgentHost {
         self.serving.await.map_err(Failure::failed)?.map_err(Failure::failed)?;
         match dispatched.transpose()? {
             Some(agent::AgentExit::Done) => Ok(ExitStatus::Done),
-            _ => match self.given_up {
+            _ => match self.failed {
                 Some(how) => Err(Failure::Failed(format!("no walker is left: {how}"))),
                 None => Ok(ExitStatus::Interrupted),
             },
@@ -251,7 +251,7 @@ impl AgentHost {
             }
             launcher::ChildEvent::AllExited => {
                 self.line.close();
-                self.given_up = all_failed_message(&mut self.walkers);
+                self.failed = all_failed_message(&mut self.walkers);
                 return true;
             }
         }

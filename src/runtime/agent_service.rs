@@ -132,7 +132,7 @@ async fn record_event(
     let now = unix_milliseconds();
     let (agent, what, state) = match event {
         AgentEvent::Joined(agent) => (agent, "joined", "running"),
-        AgentEvent::Unresponsive(agent) => (agent, "sends no heartbeat", "silent"),
+        AgentEvent::Unresponsive(agent) => (agent, "sends no heartbeat", "unresponsive"),
         AgentEvent::Recovered(agent) => (agent, "is back", "running"),
         AgentEvent::Lost(agent) => (agent, "timed out: its walks go to other walkers", "lost"),
         AgentEvent::Left(agent) => (agent, "left", "left"),

@@ -179,8 +179,8 @@ impl<'a> ProcessManager<'a> {
             launcher::ChildEvent::AllExited => {
                 self.ended[0] = true;
                 self.line.close();
-                let given_up = all_failed_message(&mut self.walkers);
-                self.fail_if_none_left("walker", given_up);
+                let failed = all_failed_message(&mut self.walkers);
+                self.fail_if_none_left("walker", failed);
             }
         }
         Ok(())
@@ -198,17 +198,17 @@ impl<'a> ProcessManager<'a> {
             }
             launcher::ChildEvent::AllExited => {
                 self.ended[1] = true;
-                let given_up = all_failed_message(&mut self.labellers.children);
-                self.fail_if_none_left("labeller", given_up);
+                let failed = all_failed_message(&mut self.labellers.children);
+                self.fail_if_none_left("labeller", failed);
             }
         }
         Ok(())
     }
 
     /// Fails the run if no process of this kind is left to do the work.
-    fn fail_if_none_left(&mut self, kind: &str, given_up: Option<String>) {
-        if let Some(given_up) = given_up.filter(|_| !self.is_stopping()) {
-            self.fail(format!("no {kind} is left: {given_up}"));
+    fn fail_if_none_left(&mut self, kind: &str, failed: Option<String>) {
+        if let Some(failed) = failed.filter(|_| !self.is_stopping()) {
+            self.fail(format!("no {kind} is left: {failed}"));
         }
     }
 
@@ -232,8 +232,8 @@ impl<'a> ProcessManager<'a> {
 /// How the last process failed, if all of them have failed for good.
 pub fn all_failed_message(children: &mut Children) -> Option<String> {
     let status = children.status();
-    let given_up = status.iter().all(|child| child.state == ChildState::Failed);
-    let last = status.last().filter(|_| given_up)?;
+    let failed = status.iter().all(|child| child.state == ChildState::Failed);
+    let last = status.last().filter(|_| failed)?;
     let how = last.last_failure.as_ref().map(ToString::to_string).unwrap_or_default();
     Some(format!("each failed after {} restarts, number {} with {how}", last.restarts, last.number))
 }

@@ -138,9 +138,9 @@ fn state_name(standing: ChildState) -> &'static str {
     match standing {
         ChildState::Starting => "starting",
         ChildState::Running => "running",
-        ChildState::BackingOff { .. } => "pausing",
-        ChildState::Stopping => "ending",
-        ChildState::Exited => "gone_home",
-        ChildState::Failed => "given_up",
+        ChildState::BackingOff { .. } => "backing_off",
+        ChildState::Stopping => "stopping",
+        ChildState::Exited => "exited",
+        ChildState::Failed => "failed",
     }
 }

@@ -47,7 +47,7 @@ pub fn text(snapshot: &Snapshot) -> String {
     let samples: Vec<_> = failures
         .iter()
         .zip(&snapshot.labels.failures)
-        .map(|(labels, found)| (&labels[..], (found.labelled + found.given_up + found.unfinished) as f64))
+        .map(|(labels, found)| (&labels[..], (found.labelled + found.failed + found.unfinished) as f64))
         .collect();
     text.gauge("calmwalk_failed_label_jobs", "Label jobs with a failure of this class.", &samples);
     processes(&mut text, status);
@@ -156,8 +156,8 @@ fn processes(text: &mut Text, status: &Status) {
     let mut kinds: BTreeMap<(&str, &str), u64> = BTreeMap::new();
     for process in &status.processes {
         // Other states contain free text.
-        let known = ["running", "stopping", "pausing", "silent", "gone"];
-        let state = known.into_iter().find(|state| process.state == *state).unwrap_or("given_up");
+        let known = ["running", "stopping", "backing off", "unresponsive", "dead"];
+        let state = known.into_iter().find(|state| process.state == *state).unwrap_or("failed");
         *kinds.entry((&process.kind, state)).or_default() += 1;
     }
     let labels: Vec<_> = kinds.keys().map(|(kind, state)| [("kind", *kind), ("state", *state)]).collect();

@@ -67,7 +67,7 @@ pub struct FailureCount {
     /// Jobs that met it and were labelled later.
     pub labelled: u64,
     /// Jobs that met it and failed in the end, for this or another reason.
-    pub given_up: u64,
+    pub failed: u64,
     /// Jobs that met it and are unfinished.
     pub unfinished: u64,
 }

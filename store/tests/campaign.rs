@@ -188,7 +188,7 @@ async fn status_counts_everything_once() {
     assert_eq!(status["walks"][1]["seed_structure"], "diamond");
     assert_eq!(status["walks"][1]["step"], 100);
     assert_eq!(status["processes"][0]["state"], "running");
-    assert_eq!(status["processes"][1]["state"], "gone");
+    assert_eq!(status["processes"][1]["state"], "dead");
     assert_eq!(status["finished"], false);
     assert!(matches!(reader.commit(&Commit::default()).await, Err(StoreError::ReadOnly)));
 

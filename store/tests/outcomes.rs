@@ -77,12 +77,8 @@ async fn failures_are_counted_by_class_and_outcome() {
     let home = Home::new();
     let (store, _) = filled(&home).await;
     let found = store.failures(protocol("dft").hash).await.unwrap();
-    let count = |class: &str, labelled, given_up| FailureCount {
-        class: class.into(),
-        labelled,
-        given_up,
-        unfinished: 0,
-    };
+    let count =
+        |class: &str, labelled, failed| FailureCount { class: class.into(), labelled, failed, unfinished: 0 };
     assert_eq!(found, [count("crashed", 0, 1), count("not_converged", 1, 1)]);
 }
 

@@ -97,10 +97,10 @@ impl std::fmt::Display for ChildState {
         match self {
             Self::Starting => f.write_str("starting"),
             Self::Running => f.write_str("running"),
-            Self::BackingOff { left } => write!(f, "pausing for {} s", left.as_secs_f64().ceil()),
-            Self::Stopping => f.write_str("ending"),
-            Self::Exited => f.write_str("gone home"),
-            Self::Failed => f.write_str("given up"),
+            Self::BackingOff { left } => write!(f, "backing off for {} s", left.as_secs_f64().ceil()),
+            Self::Stopping => f.write_str("stopping"),
+            Self::Exited => f.write_str("exited"),
+            Self::Failed => f.write_str("failed"),
         }
     }
 }

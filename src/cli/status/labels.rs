@@ -102,7 +102,7 @@ fn describe_rate(status: &Status) -> String {
 }
 
 fn describe_failure(failure: &FailureCount) -> String {
-    let FailureCount { class, labelled, given_up, unfinished } = failure;
-    let (class, jobs) = (class.replace('_', " "), labelled + given_up + unfinished);
-    format!("{class} in {jobs}: {labelled} labelled later, {given_up} failed, {unfinished} open")
+    let FailureCount { class, labelled, failed, unfinished } = failure;
+    let (class, jobs) = (class.replace('_', " "), labelled + failed + unfinished);
+    format!("{class} in {jobs}: {labelled} labelled later, {failed} failed, {unfinished} open")
 }

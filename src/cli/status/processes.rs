@@ -13,8 +13,8 @@ pub fn state(status: &Status) -> String {
         let processes = status.processes.iter().filter(|process| process.kind == kind);
         processes.filter(|process| holds(&process.state)).count()
     };
-    let alive = |kind| number(kind, |state| state != "gone" && !is_given_up(state));
-    let given_up = number(ProcessRecord::WALKER, is_given_up);
+    let alive = |kind| number(kind, |state| state != "dead" && !is_failed(state));
+    let failed = number(ProcessRecord::WALKER, is_failed);
     match (status.finished, alive(ProcessRecord::ORCHESTRATOR), alive(ProcessRecord::LABELLER)) {
         (true, ..) => match &status.budget.used_up {
             Some(key) => format!("finished: {key} is used up (raise it and resume with calmwalk run)"),
@@ -27,16 +27,16 @@ pub fn state(status: &Status) -> String {
                 count(labellers, "labeller")
             )
         }
-        _ if given_up > 0 => {
+        _ if failed > 0 => {
             let all = number(ProcessRecord::WALKER, |_| true);
-            format!("running, but {given_up} of {all} walkers failed")
+            format!("running, but {failed} of {all} walkers failed")
         }
         _ => "running".to_owned(),
     }
 }
 
-fn is_given_up(state: &str) -> bool {
-    state.starts_with("given up")
+fn is_failed(state: &str) -> bool {
+    state.starts_with("failed")
 }
 
 /// Writes a table of the processes; if they do not fit, those that are not running have priority.
@@ -135,14 +135,14 @@ mod tests {
 
     #[test]
     fn remarks_are_shown_beside_processes() {
-        let mut failed = process("walker", 3, "given up");
+        let mut failed = process("walker", 3, "failed");
         failed.restarts = 5;
         failed.remark = "exit code 2: cannot read\x1b[2J the mixture\n\nsecond line\n".into();
         let text = text(&[process("orchestrator", None, "running"), failed], false);
         let expected = [
             "process        pid  state     restarts      last seen  remark",
             "orchestrator  4711  running          0  1 min 1 s ago",
-            "walker 3      4711  given up         5  1 min 1 s ago  exit code 2: cannot read[2J the mixture …",
+            "walker 3      4711  failed          5  1 min 1 s ago  exit code 2: cannot read[2J the mixture …",
         ];
         assert_eq!(text.trim().lines().collect::<Vec<_>>(), expected);
     }
@@ -151,7 +151,7 @@ mod tests {
     fn processes_in_trouble_have_priority() {
         let mut processes = vec![process("orchestrator", None, "running")];
         processes.extend((0..100).map(|number| process("walker", number, "running")));
-        processes[90].state = "pausing".into();
+        processes[90].state = "backing off".into();
         let short = text(&processes, false);
         assert!(
             short.contains("walker 89  ") && short.contains("walker 17 ") && !short.contains("walker 18 ")
@@ -167,16 +167,16 @@ mod tests {
             state(&Status { processes: processes.to_vec(), finished, ..Status::default() })
         };
         let run = process("orchestrator", None, "running");
-        let lost = process("orchestrator", None, "gone");
+        let lost = process("orchestrator", None, "dead");
         let (walker, labeller) = (process("walker", 0, "running"), process("labeller", 0, "running"));
-        let given_up = process("walker", 1, "given up");
+        let failed_walker = process("walker", 1, "failed");
         assert_eq!(describe(&[run.clone(), walker.clone(), labeller.clone()], false), "running");
-        let some = describe(&[run.clone(), walker, given_up.clone()], false);
+        let some = describe(&[run.clone(), walker, failed_walker.clone()], false);
         assert_eq!(some, "running, but 1 of 2 walkers failed");
-        assert_eq!(describe(&[lost.clone(), given_up.clone()], false), describe(&[], false));
+        assert_eq!(describe(&[lost.clone(), failed_walker.clone()], false), describe(&[], false));
         assert_eq!(describe(&[], false), "not running (resume with calmwalk run)");
         assert!(
-            describe(&[lost, given_up, labeller], false)
+            describe(&[lost, failed_walker, labeller], false)
                 .starts_with("not running, but 1 labeller at work on the queue")
         );
         assert_eq!(describe(&[run], true), "finished");

@@ -37,7 +37,7 @@ pub fn large() -> Snapshot {
         hours_left: Some(30.1),
     };
     let failure =
-        |class: &str| FailureCount { class: class.into(), labelled: 1000, given_up: 2000, unfinished: 300 };
+        |class: &str| FailureCount { class: class.into(), labelled: 1000, failed: 2000, unfinished: 300 };
     let range = |low, high| ValueRange { low: Some(low), high: Some(high) };
     let unlabelled = Unlabelled {
         seed_structure: "bcc-100".into(),

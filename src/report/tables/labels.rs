@@ -112,9 +112,9 @@ pub fn failures(failures: &[FailureCount]) -> Table {
                    unfinished.";
     let mut table =
         Table::new("failures", caption, &["class", "jobs", "labelled later", "failed", "unfinished"]);
-    for FailureCount { class, labelled, given_up, unfinished } in failures {
-        let all = labelled + given_up + unfinished;
-        let counts = [all, *labelled, *given_up, *unfinished].map(count);
+    for FailureCount { class, labelled, failed, unfinished } in failures {
+        let all = labelled + failed + unfinished;
+        let counts = [all, *labelled, *failed, *unfinished].map(count);
         table.rows.push([&[text(class.replace('_', " "))][..], &counts].concat());
     }
     table

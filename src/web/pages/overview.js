@@ -100,7 +100,7 @@ function queue(status) {
   ]);
   if (failures.length === 0) return list;
   const columns = [["class of failure"], ["failed", true], ["labelled later", true], ["unfinished", true]];
-  const rows = failures.map((failure) => [failure.class, whole(failure.given_up), whole(failure.labelled), whole(failure.unfinished)]);
+  const rows = failures.map((failure) => [failure.class, whole(failure.failed), whole(failure.labelled), whole(failure.unfinished)]);
   return element("div", {}, list, table("Label failures by class", columns, rows));
 }
 

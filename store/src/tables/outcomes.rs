@@ -124,7 +124,7 @@ impl Store {
             query(FAILURE_CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let count =
-            |(class, labelled, given_up, unfinished)| FailureCount { class, labelled, given_up, unfinished };
+            |(class, labelled, failed, unfinished)| FailureCount { class, labelled, failed, unfinished };
         Ok(rows.into_iter().map(count).collect())
     }
 

@@ -372,7 +372,7 @@ pub(crate) async fn end_without_label(
     now: i64,
 ) -> Result<JobState> {
     let JobRow { structure, protocol, attempts, mut failures, .. } = job_row(transaction, job).await?;
-    let given_up = match how {
+    let failed = match how {
         AttemptEnd::Failed { class, log, limit } => {
             end_attempt(transaction, job, "failed", now).await?;
             record_failure(transaction, job, attempts, class, log).await?;
@@ -390,7 +390,7 @@ pub(crate) async fn end_without_label(
             losses >= LOSS_LIMIT
         }
     };
-    let state = match given_up {
+    let state = match failed {
         false => JobState::Queued,
         // The requested new label could not be made; the existing one stays.
         true if has_label(transaction, structure, protocol).await? => JobState::Labelled,

@@ -73,12 +73,12 @@ fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
         for process in status["processes"].as_array().unwrap() {
             // One that was sent home is gone for a moment before its record is.
             let state = process["state"].as_str().unwrap();
-            assert!(["running", "stopping", "gone"].contains(&state), "{process}");
+            assert!(["running", "stopping", "dead"].contains(&state), "{process}");
             assert_eq!(process["restarts"], 0, "{process}");
         }
     });
     let said = fs::read_to_string(directory.path().join("said")).unwrap();
-    assert!(!said.contains("silent") && !said.contains("restart"), "{said}");
+    assert!(!said.contains("unresponsive") && !said.contains("restart"), "{said}");
 }
 
 /// What a labeller held that is killed comes back, whatever its clock said.
