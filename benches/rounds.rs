@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use calm::forgetting::ForgettingAlarm;
 use calm::{Artifact, UpdateSettings};
+use md::{LangevinSettings, ThermostatSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
     Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
@@ -22,7 +23,7 @@ use potentials::grace::{GraceModel, Threads};
 use rustix::time::{ClockId, clock_gettime};
 use wire::messages::{Outcome, Report};
 use wire::{CampaignId, CandidateBlock};
-use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
+use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
 /// Default steps per assignment, as in `configs/`.
@@ -131,7 +132,7 @@ fn walk_settings() -> WalkSettings {
     WalkSettings {
         rng_seed: 1,
         temperature: 600.0,
-        thermostat: ThermostatKind::Langevin { friction: 0.01 },
+        thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
         equilibration: 500,
         steps: 2000,

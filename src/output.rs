@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use store::Location;
+use textwrap::{WordSeparator, WordSplitter, WrapAlgorithm};
 
 use crate::exit_status::Failure;
 
@@ -78,6 +79,14 @@ pub fn range(above: Option<f64>, up_to: Option<f64>) -> String {
         (Some(above), None) => format!("> {above}"),
         (None, None) => "unknown".into(),
     }
+}
+
+/// How text is wrapped at `width` columns: between words, each line as full as possible.
+pub fn wrapped<'a>(width: usize) -> textwrap::Options<'a> {
+    textwrap::Options::new(width)
+        .word_separator(WordSeparator::AsciiSpace)
+        .word_splitter(WordSplitter::NoHyphenation)
+        .wrap_algorithm(WrapAlgorithm::FirstFit)
 }
 
 /// Rows with aligned columns.

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
+use calm::UpdateRule;
 use calm::grade::maximum;
+use calm::rules::MaximumGradeUpdate;
 use orchestrator::selector::{Mode, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol};
 use store::records::{Commit, Fate};
 use wire::messages::{DeclineReason, Verdict, WalkEnd};
@@ -354,7 +356,7 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
     let share = training.original.share_above_one;
     assert_eq!(share, 0.0);
     let mut patient = Settings { max_per_seed_structure: 50, ..live() };
-    patient.search.stop = calm::UpdateRule::MaximumGrade { target: positive(2.9) };
+    patient.search.stop = UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(2.9) });
     let mut selector = try_restore(&patient, 1, Some(training), SelectorSnapshot::default()).unwrap();
     selector.start_walks();
     let mut alarms = Vec::new();
@@ -395,7 +397,7 @@ fn candidates_below_a_raised_threshold_are_declined() {
 #[test]
 fn the_update_target_comes_from_the_settings() {
     let mut strict = live();
-    strict.search.stop = calm::UpdateRule::MaximumGrade { target: positive(0.8) };
+    strict.search.stop = UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(0.8) });
     let mut selector = begin(&strict, 1);
     let commit = next_candidate(&mut selector, 5, 1, NEW);
     let after = commit.decisions[0].detail["update"]["gamma_max_after"].as_f64().unwrap();

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 
 use calm::CollectionRule;
+use calm::rules::MaximumGrade;
 use orchestrator::selector::{Mode, Replay, ReplayedDecision, Settings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
@@ -130,7 +131,7 @@ proptest! {
         let settings = Settings { update: UpdateProtocol::Never, max_per_seed_structure: 100, max_structures: None, ..settings };
         let campaign = Campaign::begin(&settings, &scripts, 1).finish(false);
         let log = log(&campaign);
-        let collection = CollectionRule::MaximumGrade { threshold: positive(threshold) };
+        let collection = CollectionRule::MaximumGrade(MaximumGrade { threshold: positive(threshold) });
         let strict = Settings { collection, ..settings.clone() };
         let replayed = follow(&mut open(&campaign, &strict, scripts.len(), &["collect.criterion"]), &log);
         for ((recorded, candidate), now) in log.iter().zip(replayed) {

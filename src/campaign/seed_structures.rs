@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 
 use atoms::{NeighbourList, Structure, extxyz, read_structures, shortest_distance};
-use calm::CollectionRule;
 use orchestrator::selector::SeedStructure;
 use potentials::grace::GraceModel;
 use wire::ContentHash;
@@ -78,12 +77,10 @@ impl Loader<'_> {
 
     fn check_collectable(&self, structure: &Structure) -> Result<(), String> {
         let atoms = structure.len();
-        if let CollectionRule::AtomCount { min_atoms, .. } = self.config.collect.criterion
-            && min_atoms.get() > atoms
-        {
+        if let Some((needed, key)) = self.config.collect.criterion.too_small(atoms) {
             return Err(format!(
-                "the structure has {atoms} atoms, fewer than the {min_atoms} that must be new at once \
-                 (collect.criterion.min_atoms): nothing can ever be collected from it; give a larger cell or a smaller `min_atoms`"
+                "the structure has {atoms} atoms, fewer than the {needed} that must be new at once \
+                 (collect.criterion.{key}): nothing can ever be collected from it; give a larger cell or a smaller `{key}`"
             ));
         }
         if self.config.walk.volume_ramp.is_some() && structure.periodic == [false; 3] {

@@ -1,8 +1,8 @@
 //! The rules of a configuration that no single value can check.
 
+use md::{ThermostatSettings, WrongSetting};
 use orchestrator::selector::{Mode, UpdateProtocol};
 use store::ServerUrl;
-use workers::settings::ThermostatKind;
 
 use super::error::Wrong;
 use super::{Config, LabelSection, NotifySection, QueueFull};
@@ -140,16 +140,18 @@ fn check_mixture(config: &Config) -> Result<(), Wrong> {
 }
 
 fn check_thermostat(config: &Config) -> Result<(), Wrong> {
-    let (key, number) = match config.walk.thermostat {
-        ThermostatKind::Langevin { friction } => ("walk.thermostat.langevin.friction", friction),
-        ThermostatKind::NoseHoover { relaxation_time, .. } => {
-            ("walk.thermostat.nose_hoover.relaxation_time", relaxation_time)
-        }
-    };
-    if number.is_finite() && number > 0.0 {
-        return Ok(());
+    let thermostat = &config.walk.thermostat;
+    if *thermostat == (ThermostatSettings::None {}) {
+        let expected = "a thermostat: the bias heats a walk at constant energy";
+        return wrong("walk.thermostat", "`none`", expected);
     }
-    wrong(key, number, "a finite number above 0")
+    wrong_thermostat(thermostat, "walk").map_or(Ok(()), Err)
+}
+
+/// The first impossible setting of a thermostat in the table `section`.
+pub fn wrong_thermostat(thermostat: &ThermostatSettings, section: &str) -> Option<Wrong> {
+    let WrongSetting { key, found, expected } = thermostat.wrong()?;
+    Some((format!("{section}.thermostat.{key}"), found.to_string(), expected.to_owned()))
 }
 
 fn check_zbl(config: &Config) -> Result<(), Wrong> {

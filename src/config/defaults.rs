@@ -3,9 +3,9 @@
 use std::num::{NonZeroU32, NonZeroU64};
 
 use calm::rules::{Fraction, Positive};
+use md::{LangevinSettings, ThermostatSettings};
 use orchestrator::selector::UpdateProtocol;
 use workers::labeller::LabelBounds;
-use workers::settings::ThermostatKind;
 
 use crate::duration::Duration;
 
@@ -33,8 +33,8 @@ pub fn equilibration_steps() -> u64 {
     500
 }
 
-pub fn thermostat() -> ThermostatKind {
-    ThermostatKind::Langevin { friction: 0.01 }
+pub fn thermostat() -> ThermostatSettings {
+    ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 })
 }
 
 pub fn bias_averaging_steps() -> NonZeroU64 {

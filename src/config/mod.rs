@@ -27,6 +27,7 @@ use toml::Spanned;
 use workers::labeller::LabelGuard;
 
 pub use changes::{Change, Refused, changed_keys, compare, without_changeable};
+pub use check::wrong_thermostat;
 pub use document::Document;
 pub use error::{ConfigError, in_plain_words, place, place_of_offset, read_text};
 pub use files::{PotentialFile, PotentialKind};

@@ -6,12 +6,12 @@ use std::path::PathBuf;
 use calm::CollectionRule;
 use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use dft::PassedEnvironment;
+use md::ThermostatSettings;
 use orchestrator::selector::{Mode, UpdateProtocol};
 use potentials::grace::Precision;
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use workers::labeller::{BatchSystem, ExecutionSettings, KeepDirectories, LabelBounds, LabelGuard};
-use workers::settings::ThermostatKind;
 
 use super::{LabelMethod, defaults};
 use crate::duration::Duration;
@@ -90,7 +90,7 @@ pub struct WalkSection {
     pub time_step: Option<Positive>,
     /// Thermostat: Langevin or Nosé–Hoover.
     #[serde(default = "defaults::thermostat")]
-    pub thermostat: ThermostatKind,
+    pub thermostat: ThermostatSettings,
     /// Linear change of the volume over the biased steps. Default: the cell is fixed.
     #[serde(default)]
     pub volume_ramp: Option<VolumeRampSection>,

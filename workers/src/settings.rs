@@ -2,24 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The thermostat of a walk.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ThermostatKind {
-    /// Langevin dynamics, BAOAB.
-    Langevin {
-        /// Friction, 1/fs.
-        friction: f64,
-    },
-    /// Nosé–Hoover chain.
-    NoseHoover {
-        /// Relaxation time, fs.
-        relaxation_time: f64,
-        /// Thermostats in the chain.
-        chain_length: usize,
-    },
-}
-
 /// Dynamics, bias and guards of every walk of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct WalkSettings {
@@ -28,7 +10,7 @@ pub struct WalkSettings {
     /// Temperature, K.
     pub temperature: f64,
     /// Thermostat.
-    pub thermostat: ThermostatKind,
+    pub thermostat: md::ThermostatSettings,
     /// Time step, fs; `None` for the paper's rule (2 fs; 0.5 fs with H, He, Li or Be).
     pub time_step: Option<f64>,
     /// Unbiased steps at the start, at V₀.

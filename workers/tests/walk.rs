@@ -6,11 +6,12 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, Potential, Structure, Vec3, cell, read_extxyz};
 use calm::{Artifact, CollectionRule, Grades, Mixture};
+use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
 use wire::messages::{Assignment, Outcome, Report, Verdict, WalkEnd};
 use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::bias::BiasedPotential;
-use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
+use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
 use crate::mutate;
@@ -36,7 +37,7 @@ fn settings() -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
         temperature: 600.0,
-        thermostat: ThermostatKind::Langevin { friction: 0.01 },
+        thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
         equilibration: 20,
         steps: 600,

@@ -1,159 +1,122 @@
-//! Rules for collecting a structure and for ending an update of the mixture.
+//! Rules for collecting a structure and for ending an update of the mixture. Each kind of rule has its own file.
 
-use std::num::NonZeroUsize;
+mod atom_count;
+mod maximum_grade;
+mod numbers;
 
 use serde::{Deserialize, Serialize};
 
-use crate::grade::maximum;
+pub use self::atom_count::{AtomCount, AtomCountUpdate, atom_limit};
+pub use self::maximum_grade::{MaximumGrade, MaximumGradeUpdate};
+pub use self::numbers::{AlphaValues, Fraction, Positive, RuleError};
 use crate::update::CovarianceUpdate;
 
-/// A finite number above zero.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
-#[serde(try_from = "f64", into = "f64")]
-pub struct Positive(f64);
-
-/// A number above 0 and at most 1.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
-#[serde(try_from = "f64", into = "f64")]
-pub struct Fraction(f64);
-
-/// The values of α to try: ascending, each above 0 and at most 1.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Vec<f64>", into = "Vec<f64>")]
-pub struct AlphaValues(Vec<f64>);
-
-/// A setting out of range.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum RuleError {
-    /// Not a positive number.
-    #[error("found {0}, expected a finite number above 0")]
-    NotPositive(f64),
-    /// Not a fraction.
-    #[error("found {0}, expected a number above 0 and not above 1")]
-    NotFraction(f64),
-    /// Not a valid list of α.
-    #[error("found α = {0:?}, expected at least one value, ascending, each above 0 and not above 1")]
-    NotLadder(Vec<f64>),
-}
-
-impl Positive {
-    /// The number itself.
-    pub fn get(self) -> f64 {
-        self.0
-    }
-}
-
-impl Fraction {
-    pub(crate) const FIFTH: Self = Self(0.2);
-
-    /// The number itself.
-    pub fn get(self) -> f64 {
-        self.0
-    }
-}
-
-impl AlphaValues {
-    /// The values, ascending.
-    pub fn values(&self) -> &[f64] {
-        &self.0
-    }
-}
-
-impl TryFrom<f64> for Positive {
-    type Error = RuleError;
-    fn try_from(found: f64) -> Result<Self, RuleError> {
-        if found.is_finite() && found > 0.0 { Ok(Self(found)) } else { Err(RuleError::NotPositive(found)) }
-    }
-}
-
-impl TryFrom<f64> for Fraction {
-    type Error = RuleError;
-    fn try_from(found: f64) -> Result<Self, RuleError> {
-        if found > 0.0 && found <= 1.0 { Ok(Self(found)) } else { Err(RuleError::NotFraction(found)) }
-    }
-}
-
-impl TryFrom<Vec<f64>> for AlphaValues {
-    type Error = RuleError;
-    fn try_from(found: Vec<f64>) -> Result<Self, RuleError> {
-        let within = found.iter().all(|&alpha| alpha > 0.0 && alpha <= 1.0);
-        if !found.is_empty() && within && found.is_sorted_by(|a, b| a < b) {
-            Ok(Self(found))
-        } else {
-            Err(RuleError::NotLadder(found))
-        }
-    }
-}
-
-impl From<Positive> for f64 {
-    fn from(number: Positive) -> f64 {
-        number.0
-    }
-}
-
-impl From<Fraction> for f64 {
-    fn from(number: Fraction) -> f64 {
-        number.0
-    }
-}
-
-impl From<AlphaValues> for Vec<f64> {
-    fn from(values: AlphaValues) -> Vec<f64> {
-        values.0
-    }
-}
-
-/// When a structure becomes a candidate.
+/// When a structure becomes a candidate: enough of its atoms have a grade above a threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "rule", rename_all = "snake_case", deny_unknown_fields)]
+#[serde(tag = "rule", rename_all = "snake_case")]
 pub enum CollectionRule {
-    /// γ_max above a threshold (paper, aluminium and silicon: 1.5).
-    MaximumGrade {
-        /// The threshold.
-        #[serde(default = "collection_threshold")]
-        threshold: Positive,
-    },
-    /// At least max[`min_atoms`, ⌈`fraction` N⌉] of the N atoms above a threshold (paper, foundation model).
-    AtomCount {
-        /// Grade above which an atom counts (paper: 1.3).
-        #[serde(default = "atom_threshold")]
-        threshold: Positive,
-        /// Fraction of the atoms (paper: 0.15).
-        #[serde(default = "atom_fraction")]
-        fraction: Fraction,
-        /// Minimum number of atoms (paper: 3).
-        #[serde(default = "atom_least")]
-        min_atoms: NonZeroUsize,
-    },
+    /// γ_max above a threshold.
+    MaximumGrade(MaximumGrade),
+    /// Enough atoms above a threshold.
+    AtomCount(AtomCount),
 }
 
 /// How α is chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "rule", rename_all = "snake_case", deny_unknown_fields)]
+#[serde(tag = "rule", rename_all = "snake_case")]
 pub enum UpdateRule {
-    /// The smallest α with γ_max below the target. If there is none: the last α, followed by a bounded
-    /// inflation (paper, aluminium and silicon).
-    MaximumGrade {
-        /// Update target (paper: 1.25).
-        #[serde(default = "update_target")]
-        target: Positive,
-    },
-    /// The smallest α that leaves fewer than max[`min_atoms`, ⌈`fraction` N⌉] atoms above the threshold; if there
-    /// is none, the smallest with γ_max below the target; otherwise the last (paper, foundation model).
-    AtomCount {
-        /// Grade above which an atom counts (paper: 1.3).
-        #[serde(default = "atom_threshold")]
-        threshold: Positive,
-        /// Fraction of the atoms (paper: 0.15).
-        #[serde(default = "atom_fraction")]
-        fraction: Fraction,
-        /// Minimum number of atoms (paper: 3).
-        #[serde(default = "atom_least")]
-        min_atoms: NonZeroUsize,
-        /// Target of the fallback (paper: 1.25).
-        #[serde(default = "update_target")]
-        target: Positive,
-    },
+    /// γ_max below a target.
+    MaximumGrade(MaximumGradeUpdate),
+    /// Few enough atoms above a threshold.
+    AtomCount(AtomCountUpdate),
+}
+
+/// What the search for α aims at in one structure.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UpdateGoal {
+    /// Grade above which an atom counts.
+    pub threshold: f64,
+    /// Number of counted atoms below which the search ends. `None`: it ends when γ_max is below `target`, if need be
+    /// after an inflation.
+    pub limit: Option<usize>,
+    /// Target of γ_max.
+    pub target: f64,
+}
+
+impl CollectionRule {
+    /// The grade above which a structure, or an atom of it, counts.
+    pub fn threshold(&self) -> f64 {
+        match self {
+            Self::MaximumGrade(rule) => rule.threshold.0,
+            Self::AtomCount(rule) => rule.threshold.0,
+        }
+    }
+
+    /// The same rule with its threshold multiplied by `factor`, which must be finite and positive.
+    pub fn with_threshold_factor(mut self, factor: f64) -> Self {
+        let threshold = match &mut self {
+            Self::MaximumGrade(rule) => &mut rule.threshold,
+            Self::AtomCount(rule) => &mut rule.threshold,
+        };
+        threshold.0 *= factor;
+        self
+    }
+
+    /// Number of atoms that must be above the threshold in a structure of `atoms` atoms.
+    pub fn needed_atoms(&self, atoms: usize) -> usize {
+        match self {
+            Self::MaximumGrade(_) => 1,
+            Self::AtomCount(rule) => rule.needed_atoms(atoms),
+        }
+    }
+
+    /// If a structure of `atoms` atoms is too small to ever meet the rule: the number of atoms that the rule requires, and
+    /// the key of that setting.
+    pub fn too_small(&self, atoms: usize) -> Option<(usize, &'static str)> {
+        match self {
+            Self::MaximumGrade(_) => None,
+            Self::AtomCount(rule) => rule.too_small(atoms),
+        }
+    }
+
+    /// Whether a structure with these grades, `[atoms]`, meets the rule.
+    pub fn is_met(&self, gamma: &[f64]) -> bool {
+        count_above(gamma, self.threshold()) >= self.needed_atoms(gamma.len())
+    }
+
+    /// The rule as the end of a sentence about a structure.
+    pub fn description(&self) -> String {
+        match self {
+            Self::MaximumGrade(rule) => rule.description(),
+            Self::AtomCount(rule) => rule.description(),
+        }
+    }
+
+    /// Name and condition of the rule for a structure of `atoms` atoms, in short.
+    pub fn condition(&self, atoms: usize) -> String {
+        match self {
+            Self::MaximumGrade(rule) => rule.condition(),
+            Self::AtomCount(rule) => rule.condition(atoms),
+        }
+    }
+}
+
+impl UpdateRule {
+    /// What the search aims at in a structure of `atoms` atoms.
+    pub fn goal(&self, atoms: usize) -> UpdateGoal {
+        match self {
+            Self::MaximumGrade(rule) => rule.goal(),
+            Self::AtomCount(rule) => rule.goal(atoms),
+        }
+    }
+
+    /// Name and condition of the rule for a structure of `atoms` atoms, in short.
+    pub fn condition(&self, atoms: usize) -> String {
+        match self {
+            Self::MaximumGrade(rule) => rule.condition(),
+            Self::AtomCount(rule) => rule.condition(atoms),
+        }
+    }
 }
 
 /// How the old covariance and that of the batch are combined.
@@ -209,58 +172,9 @@ impl UpdateSettings {
     }
 }
 
-impl CollectionRule {
-    /// The grade above which a structure, or an atom of it, counts.
-    pub fn threshold(&self) -> f64 {
-        match *self {
-            Self::MaximumGrade { threshold } | Self::AtomCount { threshold, .. } => threshold.0,
-        }
-    }
-
-    /// The same rule with its threshold multiplied by `factor`, which must be finite and positive.
-    pub fn with_threshold_factor(mut self, factor: f64) -> Self {
-        match &mut self {
-            Self::MaximumGrade { threshold } | Self::AtomCount { threshold, .. } => threshold.0 *= factor,
-        }
-        self
-    }
-
-    /// Whether a structure with these grades, `[atoms]`, meets the rule.
-    pub fn is_met(&self, gamma: &[f64]) -> bool {
-        match *self {
-            Self::MaximumGrade { threshold } => maximum(gamma) > threshold.0,
-            Self::AtomCount { threshold, fraction, min_atoms } => {
-                count_above(gamma, threshold.0) >= atom_limit(gamma.len(), fraction, min_atoms)
-            }
-        }
-    }
-}
-
 /// Number of atoms with γ above a threshold.
 pub fn count_above(gamma: &[f64], threshold: f64) -> usize {
     gamma.iter().filter(|&&grade| grade > threshold).count()
-}
-
-/// max[min_atoms, ⌈fraction · atoms⌉]; products that are integers up to rounding count as integers.
-pub fn atom_limit(atoms: usize, fraction: Fraction, min_atoms: NonZeroUsize) -> usize {
-    let share = (fraction.0 * atoms as f64 * (1.0 - 1e-12)).ceil() as usize;
-    share.max(min_atoms.get())
-}
-
-fn collection_threshold() -> Positive {
-    Positive(1.5)
-}
-
-fn atom_threshold() -> Positive {
-    Positive(1.3)
-}
-
-fn atom_fraction() -> Fraction {
-    Fraction(0.15)
-}
-
-fn atom_least() -> NonZeroUsize {
-    NonZeroUsize::MIN.saturating_add(2)
 }
 
 fn update_target() -> Positive {

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::alpha_scan::AlphaScan;
 use crate::grade::maximum;
 use crate::mixture::{ChangedComponent, Mixture};
-use crate::rules::{CovarianceUpdateKind, UpdateRule, UpdateSettings, atom_limit, count_above};
+use crate::rules::{CovarianceUpdateKind, UpdateGoal, UpdateSettings, count_above};
 use crate::update::{Batch, CovarianceUpdate, UpdateError};
 
 /// Maximum factor of a scatter in one round of inflation.
@@ -25,7 +25,7 @@ pub struct Trial {
     pub alpha: f64,
     /// Largest grade.
     pub gamma_max: f64,
-    /// Number of atoms above the rule's threshold (for the maximum rule: its target).
+    /// Number of atoms above the threshold of the [`UpdateGoal`].
     pub above: usize,
 }
 
@@ -85,12 +85,13 @@ pub fn update(
     settings: &UpdateSettings,
 ) -> Result<UpdateOutcome, UpdateError> {
     let batch = Batch::new(mixture, elements, features)?;
-    let (trials, alpha, mut end) = choose(&batch, settings)?;
+    let goal = settings.stop.goal(batch.gamma().len());
+    let (trials, alpha, mut end) = choose(&batch, settings, goal)?;
     let mut changed = batch.updated(settings.covariance_update.with_alpha(alpha))?;
     let mut inflations = Vec::new();
-    if let (UpdateEnd::InflationExhausted, UpdateRule::MaximumGrade { target }) = (end, settings.stop) {
-        (changed, inflations) = inflate(&batch, changed, target.get())?;
-        if maximum(&batch.gamma_under(&changed)) < target.get() {
+    if end == UpdateEnd::InflationExhausted {
+        (changed, inflations) = inflate(&batch, changed, goal.target)?;
+        if maximum(&batch.gamma_under(&changed)) < goal.target {
             end = UpdateEnd::Inflated;
         }
     }
@@ -132,15 +133,13 @@ pub fn inflate(
     Ok((changed, factors))
 }
 
-/// Tries α in order until the rule is met. If none meets it, the maximum rule gives `InflationExhausted`.
-fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, UpdateEnd), UpdateError> {
-    let atoms = batch.gamma().len();
-    let (threshold, limit, target) = match settings.stop {
-        UpdateRule::MaximumGrade { target } => (target.get(), None, target.get()),
-        UpdateRule::AtomCount { threshold, fraction, min_atoms, target } => {
-            (threshold.get(), Some(atom_limit(atoms, fraction, min_atoms)), target.get())
-        }
-    };
+/// Tries α in order until the goal is met. If none meets it, a goal without a limit gives `InflationExhausted`.
+fn choose(
+    batch: &Batch,
+    settings: &UpdateSettings,
+    goal: UpdateGoal,
+) -> Result<(Vec<Trial>, f64, UpdateEnd), UpdateError> {
+    let UpdateGoal { threshold, limit, target } = goal;
     let scan = AlphaScan::new(batch, settings.covariance_update);
     let mut trials = Vec::new();
     for alpha in settings.alphas() {

@@ -3,7 +3,9 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use calm::rules::{AlphaValues, Fraction, Positive, atom_limit};
+use calm::rules::{
+    AlphaValues, AtomCount, AtomCountUpdate, Fraction, MaximumGrade, Positive, atom_limit,
+};
 use calm::{
     CollectionRule, Component, CovarianceUpdateKind, Mixture, Statistics, UpdateEnd, UpdateRule,
     UpdateSettings, update,
@@ -21,12 +23,12 @@ fn the_papers_values_are_the_defaults() {
     let positive = |value: f64| Positive::try_from(value).unwrap();
     let (fraction, min_atoms) = (Fraction::try_from(0.15).unwrap(), NonZeroUsize::new(3).unwrap());
     let threshold = positive(1.5);
-    assert_eq!(collection("rule = 'maximum_grade'"), CollectionRule::MaximumGrade { threshold });
+    assert_eq!(collection("rule = 'maximum_grade'"), CollectionRule::MaximumGrade(MaximumGrade { threshold }));
     let threshold = positive(1.3);
-    let rule = CollectionRule::AtomCount { threshold, fraction, min_atoms };
+    let rule = CollectionRule::AtomCount(AtomCount { threshold, fraction, min_atoms });
     assert_eq!(collection("rule = 'atom_count'"), rule);
     let settings: UpdateSettings = toml::from_str("stop = { rule = 'atom_count' }").unwrap();
-    let stop = UpdateRule::AtomCount { threshold, fraction, min_atoms, target: positive(1.25) };
+    let stop = UpdateRule::AtomCount(AtomCountUpdate { threshold, fraction, min_atoms, target: positive(1.25) });
     assert_eq!(
         settings,
         UpdateSettings { covariance_update: CovarianceUpdateKind::Convex, alpha_values: None, stop }
@@ -86,6 +88,25 @@ fn a_structure_is_collected_when_the_rule_says_so() {
             assert!(!count.is_met(&graded(atoms, atoms)), "{atoms} atoms");
         }
     }
+}
+
+#[test]
+fn rules_describe_themselves() {
+    let (maximum, count) = (collection("rule = 'maximum_grade'"), collection("rule = 'atom_count'"));
+    assert_eq!(maximum.description(), "the largest γ of its atoms is above 1.5");
+    assert_eq!(count.description(), "at least max(3, ⌈0.15 N⌉) of its N atoms have γ above 1.3");
+    assert_eq!(maximum.condition(108), "maximum_grade: γ_max > 1.5");
+    assert_eq!(
+        count.condition(108),
+        "atom_count: at least 17 atoms with γ > 1.3 (the larger of 3 and 15 % of 108)"
+    );
+    assert_eq!([maximum.too_small(1), count.too_small(3), count.too_small(2)], [None, None, Some((3, "min_atoms"))]);
+    let update = |text: &str| toml::from_str::<UpdateRule>(text).unwrap().condition(108);
+    assert_eq!(update("rule = 'maximum_grade'"), "maximum_grade: γ_max below 1.25");
+    assert_eq!(
+        update("rule = 'atom_count'"),
+        "atom_count: fewer than 17 atoms with γ > 1.3, else γ_max below 1.25"
+    );
 }
 
 #[test]

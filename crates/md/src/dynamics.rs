@@ -119,10 +119,8 @@ impl Dynamics {
         self.thermostat_half_step();
         self.kick(half);
         self.drift(half);
-        if let Thermostat::Langevin(langevin) = self.now.thermostat {
-            let Checkpoint { state, stream, time_step, .. } = &mut self.now;
-            langevin.exchange(&mut state.velocities, &self.masses, *time_step, stream, state.step);
-        }
+        let Checkpoint { state, stream, time_step, thermostat, .. } = &mut self.now;
+        thermostat.exchange(&mut state.velocities, &self.masses, *time_step, stream, state.step);
         self.drift(half);
         if let Some(ramp) = self.now.ramp {
             ramp.apply(&mut self.now.state.structure, self.now.state.step + 1);
@@ -192,11 +190,8 @@ impl Dynamics {
     }
 
     fn thermostat_half_step(&mut self) {
-        if let Thermostat::NoseHooverChain(_) = self.now.thermostat {
-            let (energy, freedom) = (self.kinetic_energy(), self.degrees_of_freedom());
-            let factor = self.now.thermostat.half_step(energy, freedom, self.now.time_step);
-            self.scale_velocities(factor);
-        }
+        let Checkpoint { state, thermostat, time_step, .. } = &mut self.now;
+        thermostat.half_step(&mut state.velocities, &self.masses, *time_step);
     }
 
     /// v += F / m · time

@@ -9,6 +9,7 @@
 
 mod checkpoint;
 mod dynamics;
+mod langevin;
 mod nose_hoover;
 mod random;
 mod state;
@@ -17,8 +18,9 @@ mod volume_ramp;
 
 pub use checkpoint::Checkpoint;
 pub use dynamics::{Dynamics, DynamicsError, Settings, default_time_step};
-pub use nose_hoover::NoseHooverChain;
+pub use langevin::{Langevin, LangevinSettings};
+pub use nose_hoover::{NoseHooverChain, NoseHooverSettings};
 pub use random::{Stream, StreamId, philox};
 pub use state::{State, kinetic_energy, masses, maxwell_boltzmann, momentum, temperature};
-pub use thermostat::{Langevin, Thermostat};
+pub use thermostat::{Thermostat, ThermostatSettings, WrongSetting};
 pub use volume_ramp::{VolumeRamp, scale_volume};

@@ -3,8 +3,35 @@
 use atoms::units::BOLTZMANN;
 use serde::{Deserialize, Serialize};
 
+use crate::thermostat::{WrongSetting, is_positive};
+
 /// Weights of the fourth-order Suzuki–Yoshida factorisation, w = 1 / (2 − 2^(1/3)).
 const SUZUKI_YOSHIDA: [f64; 3] = [1.351_207_191_959_657_8, -1.702_414_383_919_315_3, 1.351_207_191_959_657_8];
+
+/// Settings of a Nosé–Hoover chain.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoseHooverSettings {
+    /// Relaxation time, fs.
+    pub relaxation_time: f64,
+    /// Number of thermostats in the chain.
+    #[serde(default = "usual_length")]
+    pub chain_length: usize,
+}
+
+fn usual_length() -> usize {
+    NoseHooverChain::LENGTH
+}
+
+impl NoseHooverSettings {
+    pub(crate) fn start(self, temperature: f64) -> NoseHooverChain {
+        NoseHooverChain::new(temperature, self.relaxation_time, self.chain_length)
+    }
+
+    pub(crate) fn wrong(&self) -> Option<WrongSetting> {
+        WrongSetting::unless_positive("nose_hoover.relaxation_time", self.relaxation_time)
+    }
+}
 
 /// A chain of thermostats: the first acts on the atoms, each other on its predecessor.
 ///
@@ -60,6 +87,18 @@ impl NoseHooverChain {
                 0.5 * self.mass(k, degrees_of_freedom) * velocity * velocity + freedom * thermal * position
             })
             .sum()
+    }
+
+    pub(crate) fn invalid_setting(&self, atoms: usize) -> Option<&'static str> {
+        if atoms < 2 {
+            return Some("a Nosé–Hoover chain needs at least two atoms: a single one has no thermal motion");
+        }
+        if !is_positive(self.temperature) || !is_positive(self.damping_time) {
+            return Some("temperature and damping time of the Nosé–Hoover chain must be positive and finite");
+        }
+        let valid = !self.velocities.is_empty() && self.positions.len() == self.velocities.len();
+        (!valid)
+            .then_some("a Nosé–Hoover chain needs one or more links, each with a position and a velocity")
     }
 
     fn kick_from_the_end(&mut self, kinetic_energy: f64, degrees_of_freedom: usize, time: f64) {

@@ -1,11 +1,61 @@
-//! Thermostats.
+//! The choice of a thermostat. Each thermostat has its own file, with its settings and its dynamics.
 
-use atoms::units::{ACCELERATION, BOLTZMANN};
 use atoms::{Vec3, cell};
 use serde::{Deserialize, Serialize};
 
-use crate::nose_hoover::NoseHooverChain;
-use crate::random::{Stream, StreamId};
+use crate::langevin::{Langevin, LangevinSettings};
+use crate::nose_hoover::{NoseHooverChain, NoseHooverSettings};
+use crate::random::Stream;
+use crate::state;
+
+/// A thermostat as a configuration names it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum ThermostatSettings {
+    /// Langevin dynamics, integrated by BAOAB.
+    Langevin(LangevinSettings),
+    /// Nosé–Hoover chain.
+    NoseHoover(NoseHooverSettings),
+    /// Constant energy.
+    None {},
+}
+
+/// A setting of a thermostat that has an impossible value.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WrongSetting {
+    /// Dotted key below that of the thermostat.
+    pub key: &'static str,
+    /// Its value.
+    pub found: f64,
+    /// What is possible.
+    pub expected: &'static str,
+}
+
+impl ThermostatSettings {
+    /// The thermostat in its initial state. `temperature` in K.
+    pub fn start(&self, temperature: f64) -> Thermostat {
+        match self {
+            Self::Langevin(settings) => Thermostat::Langevin(settings.start(temperature)),
+            Self::NoseHoover(settings) => Thermostat::NoseHooverChain(settings.start(temperature)),
+            Self::None {} => Thermostat::None,
+        }
+    }
+
+    /// The first setting with an impossible value.
+    pub fn wrong(&self) -> Option<WrongSetting> {
+        match self {
+            Self::Langevin(settings) => settings.wrong(),
+            Self::NoseHoover(settings) => settings.wrong(),
+            Self::None {} => None,
+        }
+    }
+}
+
+impl WrongSetting {
+    pub(crate) fn unless_positive(key: &'static str, found: f64) -> Option<Self> {
+        (!is_positive(found)).then_some(Self { key, found, expected: "a finite number above 0" })
+    }
+}
 
 /// The thermostat with its dynamical variables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -28,11 +78,31 @@ impl Thermostat {
         }
     }
 
-    /// Propagates a Nosé–Hoover chain by half of `time_step` (fs). Returns the factor for the velocities.
-    pub fn half_step(&mut self, kinetic_energy: f64, degrees_of_freedom: usize, time_step: f64) -> f64 {
+    /// Acts on the velocities (Å/fs) before the first and after the last kick of a step of `time_step` fs. `masses`
+    /// in u.
+    pub fn half_step(&mut self, velocities: &mut [Vec3], masses: &[f64], time_step: f64) {
+        let freedom = self.degrees_of_freedom(masses.len());
         match self {
-            Self::NoseHooverChain(chain) => chain.half_step(kinetic_energy, degrees_of_freedom, time_step),
-            Self::None | Self::Langevin(_) => 1.0,
+            Self::NoseHooverChain(chain) => {
+                let factor = chain.half_step(state::kinetic_energy(velocities, masses), freedom, time_step);
+                velocities.iter_mut().for_each(|v| *v = cell::scale(*v, factor));
+            }
+            Self::None | Self::Langevin(_) => {}
+        }
+    }
+
+    /// Acts on the velocities (Å/fs) between the two drifts of a step of `time_step` fs. `masses` in u.
+    pub fn exchange(
+        &mut self,
+        velocities: &mut [Vec3],
+        masses: &[f64],
+        time_step: f64,
+        stream: &Stream,
+        step: u64,
+    ) {
+        match self {
+            Self::Langevin(langevin) => langevin.exchange(velocities, masses, time_step, stream, step),
+            Self::None | Self::NoseHooverChain(_) => {}
         }
     }
 
@@ -47,57 +117,14 @@ impl Thermostat {
 
     /// The first invalid setting for `atoms` atoms.
     pub(crate) fn invalid_setting(&self, atoms: usize) -> Option<&'static str> {
-        let positive = |x: f64| x.is_finite() && x > 0.0;
         match self {
             Self::None => None,
-            Self::Langevin(langevin) if !positive(langevin.friction) => {
-                Some("the friction must be positive and finite")
-            }
-            Self::Langevin(langevin) if !(langevin.temperature == 0.0 || positive(langevin.temperature)) => {
-                Some("the temperature must be finite and not negative")
-            }
-            Self::Langevin(_) => None,
-            Self::NoseHooverChain(_) if atoms < 2 => {
-                Some("a Nosé–Hoover chain needs at least two atoms: a single one has no thermal motion")
-            }
-            Self::NoseHooverChain(chain) if !positive(chain.temperature) || !positive(chain.damping_time) => {
-                Some("temperature and damping time of the Nosé–Hoover chain must be positive and finite")
-            }
-            Self::NoseHooverChain(chain)
-                if chain.velocities.is_empty() || chain.positions.len() != chain.velocities.len() =>
-            {
-                Some("a Nosé–Hoover chain needs one or more links, each with a position and a velocity")
-            }
-            Self::NoseHooverChain(_) => None,
+            Self::Langevin(langevin) => langevin.invalid_setting(),
+            Self::NoseHooverChain(chain) => chain.invalid_setting(atoms),
         }
     }
 }
 
-/// m dv = F dt − m Γ v dt + √(2 m Γ k_B T) dW.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Langevin {
-    /// Temperature, K.
-    pub temperature: f64,
-    /// Γ, 1/fs.
-    pub friction: f64,
-}
-
-impl Langevin {
-    /// The exact Ornstein–Uhlenbeck step over `time_step` (fs), the O of BAOAB (Leimkuhler & Matthews, Appl.
-    /// Math. Res. Express 2013, 34): v ← e^(−Γt) v + √((1 − e^(−2Γt)) k_B T / m) ξ.
-    pub fn exchange(
-        &self,
-        velocities: &mut [Vec3],
-        masses: &[f64],
-        time_step: f64,
-        stream: &Stream,
-        step: u64,
-    ) {
-        let kept = (-self.friction * time_step).exp();
-        let heat = -(-2.0 * self.friction * time_step).exp_m1() * BOLTZMANN * self.temperature * ACCELERATION;
-        for (atom, (v, mass)) in velocities.iter_mut().zip(masses).enumerate() {
-            let noise = stream.normals(step, atom as u32, StreamId::Langevin);
-            *v = cell::add(cell::scale(*v, kept), cell::scale(noise, (heat / mass).sqrt()));
-        }
-    }
+pub(crate) fn is_positive(x: f64) -> bool {
+    x.is_finite() && x > 0.0
 }

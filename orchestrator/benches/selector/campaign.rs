@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use calm::forgetting::ForgettingAlarm;
-use calm::rules::Positive;
+use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{Mode, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol};
@@ -32,10 +32,10 @@ pub fn settings(threshold: f64) -> Settings {
         search: UpdateSettings {
             covariance_update: CovarianceUpdateKind::Convex,
             alpha_values: None,
-            stop: UpdateRule::MaximumGrade { target: positive(1.25) },
+            stop: UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(1.25) }),
         },
         forgetting_alarm: ForgettingAlarm::default(),
-        collection: CollectionRule::MaximumGrade { threshold: positive(threshold) },
+        collection: CollectionRule::MaximumGrade(MaximumGrade { threshold: positive(threshold) }),
         max_per_seed_structure: u32::MAX,
         max_structures: None,
         control: false,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::thread;
 
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Structure, cell, read_extxyz};
-use calm::rules::Positive;
+use calm::rules::{MaximumGrade, Positive};
 use calm::{Artifact, CollectionRule, Mixture};
 use orchestrator::grader::Grader;
 use orchestrator::selector::TrainingFrames;
@@ -93,7 +93,8 @@ impl Model {
     pub fn at_rest(&self, number: u64) -> Candidate {
         let mut structure = crystal();
         displace(&mut structure, LIKENESS, &mut Random::new(number));
-        let any = CollectionRule::MaximumGrade { threshold: Positive::try_from(f64::MIN_POSITIVE).unwrap() };
+        let threshold = Positive::try_from(f64::MIN_POSITIVE).unwrap();
+        let any = CollectionRule::MaximumGrade(MaximumGrade { threshold });
         let plan = Plan { walks: 1, kinds: 1, of_kind: 1, collection: any, min_distance: 1.0 };
         let candidate = self.candidate(plan, number, structure, &mut Evaluator::new(&self.grace));
         candidate.expect("any structure is collected")

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use atoms::{Cell, Species, Structure};
 use calm::forgetting::ForgettingAlarm;
-use calm::rules::Positive;
+use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{
     CollectionRule, Component, CovarianceUpdateKind, Mixture, Statistics, UpdateRule, UpdateSettings,
 };
@@ -78,10 +78,10 @@ pub fn settings(mode: Mode) -> Settings {
         search: UpdateSettings {
             covariance_update: CovarianceUpdateKind::Convex,
             alpha_values: None,
-            stop: UpdateRule::MaximumGrade { target: positive(1.25) },
+            stop: UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(1.25) }),
         },
         forgetting_alarm: ForgettingAlarm::default(),
-        collection: CollectionRule::MaximumGrade { threshold: positive(1.5) },
+        collection: CollectionRule::MaximumGrade(MaximumGrade { threshold: positive(1.5) }),
         max_per_seed_structure: 3,
         max_structures: None,
         control: false,

@@ -2,8 +2,7 @@
 
 use std::io::{self, Write};
 
-use calm::rules::atom_limit;
-use calm::{UpdateEnd, UpdateRule};
+use calm::UpdateEnd;
 use monitor::candidate_details::{Coverage, DecisionDetails, Update};
 
 use super::grades::block;
@@ -47,19 +46,7 @@ fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Resul
     let found = &update.found;
     let combination = update.combination.as_deref().unwrap_or_default();
     let (rule, counted) = match update.rule {
-        Some(UpdateRule::MaximumGrade { target }) => {
-            (format!("maximum_grade: γ_max below {}", target.get()), target.get())
-        }
-        Some(UpdateRule::AtomCount { threshold, fraction, min_atoms, target }) => {
-            let (limit, threshold) = (atom_limit(atoms, fraction, min_atoms), threshold.get());
-            let target = target.get();
-            (
-                format!(
-                    "atom_count: fewer than {limit} atoms with γ > {threshold}, else γ_max below {target}"
-                ),
-                threshold,
-            )
-        }
+        Some(rule) => (rule.condition(atoms), rule.goal(atoms).threshold),
         None => ("rule not recorded".to_owned(), f64::NAN),
     };
     line(out, "update", &format!("{combination}, until {rule}"))?;

@@ -2,7 +2,6 @@
 
 use std::io::{self, Write};
 
-use calm::CollectionRule;
 use monitor::candidate_details::{Atom, CandidateGrades, Trigger};
 
 use super::{INDENT, SHOWN, line};
@@ -34,16 +33,8 @@ pub fn write(out: &mut dyn Write, grades: &CandidateGrades) -> io::Result<()> {
 }
 
 fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &CandidateGrades) -> io::Result<()> {
-    let Trigger { rule, threshold, needed, above_walker, above_selector } = trigger;
-    let rule = match rule {
-        CollectionRule::MaximumGrade { .. } => format!("maximum_grade: γ_max > {threshold}"),
-        CollectionRule::AtomCount { fraction, min_atoms, .. } => format!(
-            "atom_count: at least {needed} atoms with γ > {threshold} (the larger of {min_atoms} and {} % of {})",
-            100.0 * f64::from(*fraction),
-            grades.atoms.len()
-        ),
-    };
-    line(out, "trigger", &rule)?;
+    let Trigger { rule, above_walker, above_selector, .. } = trigger;
+    line(out, "trigger", &rule.condition(grades.atoms.len()))?;
     line(
         out,
         "",

@@ -1,15 +1,17 @@
 //! The configuration of `calmwalk md`: a TOML file; unknown keys are errors.
 
-use std::num::{NonZeroU64, NonZeroUsize};
+use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
 
 use atoms::{Potential, extxyz::Frame, read_structures};
 use calm::rules::Positive;
-use md::{Langevin, NoseHooverChain, Thermostat};
+use md::ThermostatSettings;
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::{ConfigError, Document, KnownKeys, PotentialFile, place_of_offset, read_text};
+use crate::config::{
+    ConfigError, Document, KnownKeys, PotentialFile, place_of_offset, read_text, wrong_thermostat,
+};
 use crate::output::log_and_warn;
 
 /// Placeholder values for invalid required keys, so that the other keys can be checked too.
@@ -47,32 +49,11 @@ pub struct DynamicsSection {
     /// Random seed of the initial velocities and Langevin forces.
     #[serde(default = "one")]
     pub rng_seed: u64,
-    /// Thermostat.
-    pub thermostat: ThermostatSection,
+    /// `{ none = {} }` for constant energy, or a thermostat.
+    pub thermostat: ThermostatSettings,
     /// Skin of the neighbour list, Å; does not affect results.
     #[serde(default = "skin")]
     pub skin: Positive,
-}
-
-/// `thermostat = { none = {} }`, `{ langevin = { … } }` or `{ nose_hoover = { … } }`
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum ThermostatSection {
-    /// Constant energy.
-    None {},
-    /// Langevin dynamics, BAOAB.
-    Langevin {
-        /// Friction coefficient, 1/fs.
-        friction: Positive,
-    },
-    /// Nosé–Hoover chain.
-    NoseHoover {
-        /// Relaxation time, fs.
-        relaxation_time: Positive,
-        /// Number of thermostats in the chain.
-        #[serde(default = "chain_length")]
-        chain_length: NonZeroUsize,
-    },
 }
 
 /// `[output]`
@@ -94,11 +75,15 @@ impl MdConfig {
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
         let known = KnownKeys::new().with::<DynamicsSection>("dynamics").with::<OutputSection>("output");
-        let config = document.read(PLACEHOLDERS, &known);
+        let config: Option<Self> = document.read(PLACEHOLDERS, &known);
         let warnings = document.check_ranges("dynamics");
+        document.check_rules(|| {
+            let thermostat = config.as_ref().map(|config| config.dynamics.thermostat);
+            thermostat.and_then(|it| wrong_thermostat(&it, "dynamics")).into_iter().collect()
+        });
         document.finish()?;
         warnings.iter().for_each(log_and_warn);
-        let mut config: Self = config.ok_or_else(|| ConfigError::unreadable(path))?;
+        let mut config = config.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         for file in [&mut config.structure, &mut config.potential.file] {
             *file.get_mut() = directory.join(file.get_ref());
@@ -137,33 +122,12 @@ impl MdConfig {
     }
 }
 
-impl DynamicsSection {
-    /// The thermostat in its initial state.
-    pub fn thermostat(&self) -> Thermostat {
-        let temperature = self.temperature.get();
-        match self.thermostat {
-            ThermostatSection::None {} => Thermostat::None,
-            ThermostatSection::Langevin { friction } => {
-                Thermostat::Langevin(Langevin { temperature, friction: friction.get() })
-            }
-            ThermostatSection::NoseHoover { relaxation_time, chain_length } => {
-                let chain = NoseHooverChain::new(temperature, relaxation_time.get(), chain_length.get());
-                Thermostat::NoseHooverChain(chain)
-            }
-        }
-    }
-}
-
 fn one() -> u64 {
     1
 }
 
 fn skin() -> Positive {
     Positive::try_from(0.5).expect("a number above 0")
-}
-
-fn chain_length() -> NonZeroUsize {
-    NonZeroUsize::new(NoseHooverChain::LENGTH).expect("a number above 0")
 }
 
 fn hundred() -> NonZeroU64 {

@@ -88,7 +88,7 @@ fn settings(dynamics: &DynamicsSection, state: &State) -> Settings {
     let default = default_time_step(&state.structure.species);
     Settings {
         time_step: dynamics.time_step.map_or(default, |time_step| time_step.get()),
-        thermostat: dynamics.thermostat(),
+        thermostat: dynamics.thermostat.start(dynamics.temperature.get()),
         ramp: None,
         stream: Stream::new(dynamics.rng_seed, 0, 0),
         skin: dynamics.skin.get(),

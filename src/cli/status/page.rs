@@ -2,7 +2,7 @@
 
 use std::io::{self, IsTerminal, Write};
 
-use crate::output::Table;
+use crate::output::{self, Table};
 
 /// Width of titles, columns.
 const TITLE: usize = 12;
@@ -54,19 +54,12 @@ impl Page {
 
     /// Writes a title and a text, wrapped to the width.
     pub fn titled(&self, out: &mut dyn Write, title: &str, text: &str) -> io::Result<()> {
-        let mut line = format!("{title:<TITLE$}");
-        let mut is_empty = true;
-        for word in text.split(' ') {
-            if !is_empty && line.chars().count() + 1 + word.chars().count() > self.width {
-                writeln!(out, "{}", line.trim_end())?;
-                (line, is_empty) = (" ".repeat(TITLE), true);
-            }
-            if !std::mem::take(&mut is_empty) {
-                line.push(' ');
-            }
-            line.push_str(word);
+        let (title, indent) = (format!("{title:<TITLE$}"), " ".repeat(TITLE));
+        let options = output::wrapped(self.width).initial_indent(&title).subsequent_indent(&indent);
+        for line in textwrap::wrap(text, options.break_words(false)) {
+            writeln!(out, "{}", line.trim_end())?;
         }
-        writeln!(out, "{}", line.trim_end())
+        Ok(())
     }
 
     /// Writes a table with `shown` of `of` rows, after an empty line.

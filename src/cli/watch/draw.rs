@@ -1,5 +1,6 @@
 //! Draws the state on a terminal of any size.
 
+use std::borrow::Cow;
 use std::env;
 
 use ratatui::Frame;
@@ -16,7 +17,7 @@ use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, State, Text, WAL
 use crate::cli::status as cli_status;
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
-use crate::output::{Table, count, decimals};
+use crate::output::{self, Table, count, decimals};
 
 /// Height of the header with the line below it.
 const HEADER_HEIGHT: u16 = 5;
@@ -244,9 +245,9 @@ fn axis(width: u16, end: f64) -> String {
 fn draw_text(frame: &mut Frame<'_>, area: Rect, text: &mut Text) {
     let [title, rows] = Layout::vertical([Constraint::Length(1), Constraint::Fill(1)]).areas(area);
     let width = usize::from(area.width);
-    let lines: Vec<String> = match &text.text {
+    let lines: Vec<Cow<'_, str>> = match &text.text {
         Some(text) => text.lines().flat_map(|line| wrap(line, width)).collect(),
-        None => vec!["reading …".to_owned()],
+        None => vec!["reading …".into()],
     };
     text.rows = rows.height.into();
     text.top = text.top.min(lines.len().saturating_sub(text.rows));
@@ -254,28 +255,19 @@ fn draw_text(frame: &mut Frame<'_>, area: Rect, text: &mut Text) {
     let position = format!(" {}: lines {} to {last} of {}", text.title, text.top + 1, lines.len());
     let position = format!("{:<width$}", cut(&position, width));
     frame.render_widget(Paragraph::new(Line::styled(position, Modifier::REVERSED)), title);
-    let seen = lines[text.top..last].iter().map(|line| Line::raw(line.as_str()));
+    let seen = lines[text.top..last].iter().map(|line| Line::raw(&**line));
     frame.render_widget(Paragraph::new(seen.collect::<Vec<_>>()), rows);
 }
 
 /// Wraps a line at `width` columns, between words if possible. Continuation lines are indented like the line, or like the text
 /// after its title.
-fn wrap(line: &str, width: usize) -> Vec<String> {
-    let mut rest: Vec<char> = line.chars().collect();
-    let blanks = |from: usize| rest[from..].iter().take_while(|c| **c == ' ').count();
-    let title = rest.windows(2).take(TITLE).position(|pair| *pair == [' ', ' ']).unwrap_or(0);
-    let indent = Some(title + blanks(title)).filter(|indent| *indent <= width / 2).unwrap_or(0);
-    let mut pieces = Vec::new();
-    while rest.len() > width.max(1) {
-        let blank = rest[indent..=width.max(1)].iter().rposition(|c| *c == ' ').map(|at| indent + at);
-        let end = blank.filter(|at| *at > indent).unwrap_or(width.max(1));
-        let behind = rest.split_off(end);
-        pieces.push(std::mem::take(&mut rest).into_iter().collect());
-        rest = vec![' '; indent];
-        rest.extend(behind.into_iter().skip_while(|c| *c == ' '));
-    }
-    pieces.push(rest.into_iter().collect());
-    pieces
+fn wrap(line: &str, width: usize) -> Vec<Cow<'_, str>> {
+    let title = line.char_indices().take(TITLE).find(|(at, _)| line[*at..].starts_with("  "));
+    let (title, text) = line.split_at(title.map_or(0, |(at, _)| at));
+    let blanks = text.chars().take_while(|c| *c == ' ').count();
+    let indent = title.chars().count() + blanks;
+    let indent = " ".repeat(if indent <= width / 2 { indent } else { 0 });
+    textwrap::wrap(line, output::wrapped(width.max(1)).subsequent_indent(&indent))
 }
 
 fn draw_message(frame: &mut Frame<'_>, area: Rect, state: &State, theme: &Theme) {

@@ -66,17 +66,9 @@ pub fn summary(data: &ReportData) -> Table {
 
 /// The collection rule as text. `None` if the configuration has none.
 pub fn collection_rule(configuration: &Value) -> Option<String> {
-    let rule = serde_json::from_value(configuration["collect"]["criterion"].clone()).ok()?;
-    Some(match rule {
-        CollectionRule::MaximumGrade { threshold } => {
-            format!("the largest γ of its atoms is above {}", f64::from(threshold))
-        }
-        CollectionRule::AtomCount { threshold, fraction, min_atoms } => format!(
-            "at least max({min_atoms}, ⌈{} N⌉) of its N atoms have γ above {}",
-            f64::from(fraction),
-            f64::from(threshold)
-        ),
-    })
+    let rule: CollectionRule =
+        serde_json::from_value(configuration["collect"]["criterion"].clone()).ok()?;
+    Some(rule.description())
 }
 
 /// Versions, hashes and sources.

@@ -5,10 +5,11 @@ use std::time::Instant;
 
 use atoms::{Cell, Species, Structure};
 use calm::Mixture;
+use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{GraceModel, Threads};
 use wire::messages::{Assignment, Outcome, Report};
 use wire::{CampaignId, Candidate, Origin, WalkId};
-use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
+use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
 /// An assignment of a walk with active bias, which starts at the same checkpoint each time.
@@ -66,7 +67,7 @@ fn settings(threshold: f64) -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
         temperature: 600.0,
-        thermostat: ThermostatKind::Langevin { friction: 0.01 },
+        thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
         equilibration: EQUILIBRATION,
         steps: 10_000_000,

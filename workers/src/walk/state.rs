@@ -1,7 +1,7 @@
 //! The state of a walk between assignments, and its initial state.
 
 use atoms::shortest_distance;
-use md::{Checkpoint, Dynamics, Langevin, NoseHooverChain, State, Stream, Thermostat, VolumeRamp};
+use md::{Checkpoint, Dynamics, State, Stream, VolumeRamp};
 use serde::{Deserialize, Serialize};
 use wire::Origin;
 use wire::messages::Assignment;
@@ -9,7 +9,7 @@ use wire::messages::Assignment;
 use super::WalkError;
 use crate::bias::{BiasState, BiasedPotential};
 use crate::guard;
-use crate::settings::{ThermostatKind, WalkSettings};
+use crate::settings::WalkSettings;
 
 /// Number of checkpoints kept for roll backs. The oldest one is used, so that a roll back leads out of the trap.
 const MAX_CHECKPOINTS: usize = 2;
@@ -81,7 +81,7 @@ pub(super) fn start(
         let ramp = VolumeRamp::new(&start, from, to, settings.steps);
         VolumeRamp { start: settings.equilibration, ..ramp }
     });
-    let thermostat = thermostat(settings);
+    let thermostat = settings.thermostat.start(settings.temperature);
     let run = md::Settings { time_step, thermostat, ramp, stream, skin: settings.skin };
     let dynamics = Dynamics::new(start, run, potential)?;
     let shortest = shortest_distance(dynamics.structure(), dynamics.neighbours()).map(|(_, _, d)| d);
@@ -101,14 +101,4 @@ pub(super) fn start(
         gamma_max: 0.0,
     };
     Ok((dynamics, state))
-}
-
-fn thermostat(settings: &WalkSettings) -> Thermostat {
-    let temperature = settings.temperature;
-    match settings.thermostat {
-        ThermostatKind::Langevin { friction } => Thermostat::Langevin(Langevin { temperature, friction }),
-        ThermostatKind::NoseHoover { relaxation_time, chain_length } => {
-            Thermostat::NoseHooverChain(NoseHooverChain::new(temperature, relaxation_time, chain_length))
-        }
-    }
 }

@@ -1,7 +1,7 @@
 //! Grades of a candidate under three mixtures, and the atoms that triggered it.
 
 use calm::CollectionRule;
-use calm::rules::{atom_limit, count_above};
+use calm::rules::count_above;
 use serde::Serialize;
 use serde_json::Value;
 use store::{LoggedDecision, StoredCandidate};
@@ -131,12 +131,7 @@ impl Grade {
 impl Trigger {
     fn new(rule: CollectionRule, walker: &[f64], selector: &[f64]) -> Self {
         let threshold = rule.threshold();
-        let needed = match rule {
-            CollectionRule::MaximumGrade { .. } => 1,
-            CollectionRule::AtomCount { fraction, min_atoms, .. } => {
-                atom_limit(walker.len(), fraction, min_atoms)
-            }
-        };
+        let needed = rule.needed_atoms(walker.len());
         let (above_walker, above_selector) =
             (count_above(walker, threshold), count_above(selector, threshold));
         Self { rule, threshold, needed, above_walker, above_selector }
