@@ -3,9 +3,7 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use calm::rules::{
-    AlphaValues, AtomCount, AtomCountUpdate, Fraction, MaximumGrade, Positive, atom_limit,
-};
+use calm::rules::{AlphaValues, AtomCount, AtomCountUpdate, Fraction, MaximumGrade, Positive, atom_limit};
 use calm::{
     CollectionRule, Component, CovarianceUpdateKind, Mixture, Statistics, UpdateEnd, UpdateRule,
     UpdateSettings, update,
@@ -23,12 +21,16 @@ fn the_papers_values_are_the_defaults() {
     let positive = |value: f64| Positive::try_from(value).unwrap();
     let (fraction, min_atoms) = (Fraction::try_from(0.15).unwrap(), NonZeroUsize::new(3).unwrap());
     let threshold = positive(1.5);
-    assert_eq!(collection("rule = 'maximum_grade'"), CollectionRule::MaximumGrade(MaximumGrade { threshold }));
+    assert_eq!(
+        collection("rule = 'maximum_grade'"),
+        CollectionRule::MaximumGrade(MaximumGrade { threshold })
+    );
     let threshold = positive(1.3);
     let rule = CollectionRule::AtomCount(AtomCount { threshold, fraction, min_atoms });
     assert_eq!(collection("rule = 'atom_count'"), rule);
     let settings: UpdateSettings = toml::from_str("stop = { rule = 'atom_count' }").unwrap();
-    let stop = UpdateRule::AtomCount(AtomCountUpdate { threshold, fraction, min_atoms, target: positive(1.25) });
+    let stop =
+        UpdateRule::AtomCount(AtomCountUpdate { threshold, fraction, min_atoms, target: positive(1.25) });
     assert_eq!(
         settings,
         UpdateSettings { covariance_update: CovarianceUpdateKind::Convex, alpha_values: None, stop }
@@ -100,7 +102,10 @@ fn rules_describe_themselves() {
         count.condition(108),
         "atom_count: at least 17 atoms with γ > 1.3 (the larger of 3 and 15 % of 108)"
     );
-    assert_eq!([maximum.too_small(1), count.too_small(3), count.too_small(2)], [None, None, Some((3, "min_atoms"))]);
+    assert_eq!(
+        [maximum.too_small(1), count.too_small(3), count.too_small(2)],
+        [None, None, Some((3, "min_atoms"))]
+    );
     let update = |text: &str| toml::from_str::<UpdateRule>(text).unwrap().condition(108);
     assert_eq!(update("rule = 'maximum_grade'"), "maximum_grade: γ_max below 1.25");
     assert_eq!(

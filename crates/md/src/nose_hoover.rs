@@ -97,8 +97,7 @@ impl NoseHooverChain {
             return Some("temperature and damping time of the Nosé–Hoover chain must be positive and finite");
         }
         let valid = !self.velocities.is_empty() && self.positions.len() == self.velocities.len();
-        (!valid)
-            .then_some("a Nosé–Hoover chain needs one or more links, each with a position and a velocity")
+        (!valid).then_some("a Nosé–Hoover chain needs one or more links, each with a position and a velocity")
     }
 
     fn kick_from_the_end(&mut self, kinetic_energy: f64, degrees_of_freedom: usize, time: f64) {

@@ -66,8 +66,7 @@ pub fn summary(data: &ReportData) -> Table {
 
 /// The collection rule as text. `None` if the configuration has none.
 pub fn collection_rule(configuration: &Value) -> Option<String> {
-    let rule: CollectionRule =
-        serde_json::from_value(configuration["collect"]["criterion"].clone()).ok()?;
+    let rule: CollectionRule = serde_json::from_value(configuration["collect"]["criterion"].clone()).ok()?;
     Some(rule.description())
 }
 
