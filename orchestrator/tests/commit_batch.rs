@@ -175,12 +175,8 @@ impl Live {
 
     /// The walks of the stored candidates, in decision order.
     async fn stored(&self) -> Vec<usize> {
-        let mut walks = Vec::new();
-        for (_, id) in self.store.candidate_ids(0, 100).await.unwrap() {
-            let candidate = self.store.candidate(&id).await.unwrap();
-            walks.push(candidate.unwrap().block.view().id().walk.0 as usize);
-        }
-        walks
+        let candidates = self.store.candidates(0, true, 100).await.unwrap();
+        candidates.iter().map(|candidate| candidate.block.view().id().walk.0 as usize).collect()
     }
 }
 

@@ -190,7 +190,7 @@ async fn names(store: &Store) -> Vec<String> {
 
 async fn history(store: &Store) -> Vec<LabelRecord> {
     let structure = store.known_hashes().await.unwrap()[0];
-    store.label_history(structure, protocol("dft").hash).await.unwrap()
+    store.labels_of(structure).await.unwrap().into_iter().map(|label| label.record).collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
