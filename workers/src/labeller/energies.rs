@@ -7,10 +7,11 @@ use atoms::Structure;
 use dft::Results;
 use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
+use tokio_util::sync::CancellationToken;
 use wire::ContentHash;
 
+use super::retry_until_written;
 use super::validate::EnergyReference;
-use super::{Shutdown, retry_until_written};
 
 /// Number of labels in the fit: the newest ones.
 const MAX_FIT_LABELS: u32 = 2_000;
@@ -59,11 +60,11 @@ impl Offsets {
         protocol: &Protocol,
         lease: &Lease,
         result: &Result<Results, dft::Failure>,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
     ) -> Result<Option<EnergyReference<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };
         if self.until_refit == 0 {
-            self.fitted = retry_until_written(shutdown, || energy_offsets(store, protocol.hash)).await?.ok();
+            self.fitted = retry_until_written(stop, || energy_offsets(store, protocol.hash)).await?.ok();
             self.until_refit =
                 self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT_DIVISOR).max(1);
         }
