@@ -1,33 +1,67 @@
-//! Handles Ctrl-C and SIGTERM in single-threaded commands.
+//! Turns Ctrl-C and SIGTERM into the cancellation of a token.
 
 use std::process;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
+use std::time::{Duration, Instant};
 
 use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
 
 use crate::exit_status::Failure;
+use crate::output::log_and_print;
 
-/// Returns a flag that the first signal sets, so that work can stop in order. The second signal exits at once.
-pub fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
+/// A batch system signals every process of a job, and the job script forwards the signal it receives. Signals within
+/// this time count as one request.
+const SIGNAL_MERGE_WINDOW: Duration = Duration::from_secs(5);
+
+/// Cancels `stop` and prints `message` on the first Ctrl-C, SIGTERM or hang-up. A second signal exits at once, which is
+/// safe too, unless it is a SIGTERM within [`SIGNAL_MERGE_WINDOW`] of the first.
+pub fn cancel_on_signal(stop: CancellationToken, message: &'static str) -> Result<(), Failure> {
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
+    tokio::spawn(async move {
+        let mut asked: Option<Instant> = None;
+        loop {
+            let again = tokio::select! {
+                _ = interrupt.recv() => false,
+                _ = hangup.recv() => false,
+                _ = terminate.recv() => asked.is_some_and(|asked| asked.elapsed() < SIGNAL_MERGE_WINDOW),
+            };
+            if again {
+                continue;
+            }
+            if asked.replace(Instant::now()).is_some() {
+                process::exit(130);
+            }
+            stop.cancel();
+            log_and_print(message);
+        }
+    });
+    Ok(())
+}
+
+/// For commands without a runtime: returns a token that the first Ctrl-C or SIGTERM cancels, so that work can stop in
+/// order. The second signal exits at once.
+pub fn stop_token() -> Result<CancellationToken, Failure> {
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Failure::failed)?;
     let guard = runtime.enter();
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
     drop(guard);
-    let flag = Arc::new(AtomicBool::new(false));
-    let set = Arc::clone(&flag);
+    let stop = CancellationToken::new();
+    let asked = stop.clone();
     thread::spawn(move || {
         runtime.block_on(async {
             loop {
                 tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => () };
-                if set.swap(true, Ordering::Relaxed) {
+                if asked.is_cancelled() {
                     process::exit(130);
                 }
+                asked.cancel();
             }
         });
     });
-    Ok(flag)
+    Ok(stop)
 }

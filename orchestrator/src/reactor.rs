@@ -10,15 +10,17 @@ mod log;
 
 use std::collections::{HashMap, VecDeque};
 use std::panic::resume_unwind;
+use std::pin::pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use futures_util::FutureExt;
 use store::records::{Commit, Fate};
 use store::{Store, StoreError};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
+use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
 use wire::WalkId;
 use wire::messages::Progress;
@@ -71,8 +73,8 @@ pub struct Reactor {
     pub store: Store,
     /// Messages of walkers.
     pub incoming: mpsc::Receiver<Incoming>,
-    /// Set to stop, for example by Ctrl-C: walkers are shut down and their walks can be continued later.
-    pub stopping: Arc<AtomicBool>,
+    /// Cancelled to stop, for example by Ctrl-C: walkers are shut down and their walks can be continued later.
+    pub stopping: CancellationToken,
     /// Walkers wait while more label jobs than this are unfinished, unless the selector raises its threshold first.
     pub queue_limit: u64,
 }
@@ -81,7 +83,7 @@ pub struct Reactor {
 struct ReactorState {
     selector: Selector,
     store: Store,
-    stopping: Arc<AtomicBool>,
+    stopping: CancellationToken,
     queue_limit: u64,
     /// Decisions that are not being written yet.
     decided: Option<Commit>,
@@ -114,6 +116,8 @@ impl Reactor {
     pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<RunOutcome, ReactorError> {
         let mut events =
             EventStream::new(self.incoming, self.selector.regrader().clone(), self.selector.mixture());
+        let stopping = self.stopping.clone();
+        let mut stop = pin!(stopping.cancelled().fuse());
         let mut state = ReactorState::new(self.selector, self.store, self.stopping, self.queue_limit);
         // An interval, not a timeout since the last message: busy walkers may report progress continuously.
         let mut poll = tokio::time::interval(POLL_INTERVAL);
@@ -139,13 +143,8 @@ impl Reactor {
                     }
                     events.set_mixture(state.selector.mixture());
                 }
-                _ = poll.tick(), if !state.waiting.is_empty() || state.assigned.is_empty() => {
-                    // A stop before the first walker is idle is not followed by any message, but agents wait for the
-                    // reactor to end.
-                    if state.waiting.is_empty() && !state.stopping.load(Ordering::Relaxed) {
-                        continue;
-                    }
-                }
+                _ = poll.tick(), if !state.waiting.is_empty() => {}
+                () = &mut stop => {}
             }
             if !writing.is_empty() {
                 continue;
@@ -181,7 +180,7 @@ fn accepted(commit: &Commit) -> u64 {
 }
 
 impl ReactorState {
-    fn new(selector: Selector, store: Store, stopping: Arc<AtomicBool>, queue_limit: u64) -> Self {
+    fn new(selector: Selector, store: Store, stopping: CancellationToken, queue_limit: u64) -> Self {
         Self {
             selector,
             store,
@@ -242,7 +241,7 @@ impl ReactorState {
 
     /// Whether no walker is busy, waiting, or will get an assignment.
     fn is_over(&self) -> bool {
-        let no_more = self.selector.is_done() || self.stopping.load(Ordering::Relaxed);
+        let no_more = self.selector.is_done() || self.stopping.is_cancelled();
         no_more && self.waiting.is_empty() && self.assigned.is_empty()
     }
 
@@ -274,7 +273,7 @@ impl ReactorState {
         if self.waiting.is_empty() {
             return Ok(());
         }
-        if self.stopping.load(Ordering::Relaxed) {
+        if self.stopping.is_cancelled() {
             self.dismiss_waiting();
             return Ok(());
         }

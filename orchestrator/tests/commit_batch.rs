@@ -1,7 +1,6 @@
 //! Reports that arrive together are decided one after the other, committed together, and answered afterwards.
 
 use std::path::Path;
-use std::sync::Arc;
 use std::time::Duration;
 
 use orchestrator::reactor::{Reactor, ReactorError, RunOutcome, commit_batch};
@@ -14,6 +13,7 @@ use store::records::Commit;
 use store::{Campaign, Store, StoreError};
 use tempfile::TempDir;
 use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
 use wire::messages::{Outcome, Report, WalkEnd};
 use wire::transport::{Incoming, WorkItem};
 
@@ -175,12 +175,8 @@ impl Live {
 
     /// The walks of the stored candidates, in decision order.
     async fn stored(&self) -> Vec<usize> {
-        let mut walks = Vec::new();
-        for (_, id) in self.store.candidate_ids(0, 100).await.unwrap() {
-            let candidate = self.store.candidate(&id).await.unwrap();
-            walks.push(candidate.unwrap().block.view().id().walk.0 as usize);
-        }
-        walks
+        let candidates = self.store.candidates(0, true, 100).await.unwrap();
+        candidates.iter().map(|candidate| candidate.block.view().id().walk.0 as usize).collect()
     }
 }
 
@@ -215,7 +211,7 @@ impl Arrived {
 }
 
 fn reactor(store: &Store, selector: Selector, incoming: mpsc::Receiver<Incoming>) -> Reactor {
-    Reactor { selector, store: store.clone(), incoming, stopping: Arc::default(), queue_limit: 100 }
+    Reactor { selector, store: store.clone(), incoming, stopping: CancellationToken::new(), queue_limit: 100 }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
@@ -10,6 +10,7 @@ use orchestrator::reactor::{Notice, Reactor, RunOutcome};
 use orchestrator::selector::{Mode, SelectorSnapshot, Settings};
 use store::{Campaign, JobState, Protocol, SeedStructure, Store};
 use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
 use wire::messages::{Progress, Report};
 use wire::transport::{InProcess, Incoming, Transport, WorkItem};
 use wire::{ContentHash, WalkId};
@@ -37,12 +38,12 @@ fn scripts() -> Vec<Script> {
 async fn a_stop_before_the_first_message_ends_the_reactor() {
     let directory = tempfile::tempdir().unwrap();
     let store = open(directory.path()).await;
-    let stopping = Arc::new(AtomicBool::new(false));
+    let stopping = CancellationToken::new();
     // Transports from other hosts keep the channel open until the reactor has ended.
     let (reactor, _to_reactor) = reactor(&store, &stopping).await;
     let running = tokio::spawn(reactor.run(|_| {}));
     tokio::time::sleep(Duration::from_millis(50)).await;
-    stopping.store(true, Ordering::Relaxed);
+    stopping.cancel();
     let ended = tokio::time::timeout(Duration::from_secs(60), running).await.expect("it ends");
     assert_eq!(ended.unwrap().unwrap(), RunOutcome::Stopped);
 }
@@ -79,7 +80,7 @@ async fn open(directory: &Path) -> Store {
 }
 
 /// A reactor that continues from the database, and the channel to it.
-async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::Sender<Incoming>) {
+async fn reactor(store: &Store, stopping: &CancellationToken) -> (Reactor, mpsc::Sender<Incoming>) {
     let snapshot = SelectorSnapshot {
         imported: 0,
         walks: store.load_walks().await.unwrap(),
@@ -93,7 +94,7 @@ async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::S
         store.commit(&begun).await.unwrap();
     }
     let (to_reactor, incoming) = mpsc::channel(2);
-    let (store, stopping, queue_limit) = (store.clone(), Arc::clone(stopping), 1000);
+    let (store, stopping, queue_limit) = (store.clone(), stopping.clone(), 1000);
     (Reactor { selector, store, incoming, stopping, queue_limit }, to_reactor)
 }
 
@@ -111,10 +112,10 @@ fn work_on(work: &WorkItem, transport: &InProcess) -> Report {
 fn start_walkers(
     number: u32,
     to_reactor: mpsc::Sender<Incoming>,
-    stopping: &Arc<AtomicBool>,
+    stopping: &CancellationToken,
 ) -> Vec<thread::JoinHandle<()>> {
     let start = |walker| {
-        let mut transport = InProcess::new(walker, to_reactor.clone(), Arc::clone(stopping));
+        let mut transport = InProcess::new(walker, to_reactor.clone(), stopping.clone());
         thread::spawn(move || {
             let mut report = None;
             while let Some(work) = transport.exchange(report.take()) {
@@ -133,14 +134,14 @@ async fn end_of(reactor: Reactor, watch: impl FnMut(Notice<'_>)) -> RunOutcome {
 
 /// Runs until it ends, or until `stop_after` commits.
 async fn run(store: &Store, walkers: u32, stop_after: usize) -> RunOutcome {
-    let stopping = Arc::new(AtomicBool::new(false));
+    let stopping = CancellationToken::new();
     let (reactor, to_reactor) = reactor(store, &stopping).await;
     let threads = start_walkers(walkers, to_reactor, &stopping);
     let mut commits = 0;
     let watch = |notice: Notice<'_>| {
         commits += usize::from(matches!(notice, Notice::Committed(_)));
         if commits >= stop_after {
-            stopping.store(true, Ordering::Relaxed);
+            stopping.cancel();
         }
     };
     let ended = end_of(reactor, watch).await;
@@ -150,16 +151,13 @@ async fn run(store: &Store, walkers: u32, stop_after: usize) -> RunOutcome {
 
 /// Everything in a database that must be equal in two runs of a campaign.
 async fn content(store: &Store) -> (String, String) {
-    let mut candidates = String::new();
-    for (_, id) in store.candidate_ids(0, 1000).await.unwrap() {
-        candidates += &format!("{:?}\n", store.candidate(&id).await.unwrap());
-    }
     let rest = (
+        store.candidates(0, true, 1000).await.unwrap(),
         store.load_walks().await.unwrap(),
         store.load_components().await.unwrap(),
         store.values().await.unwrap(),
     );
-    (store.decision_log_text().await.unwrap(), format!("{candidates}{rest:?}"))
+    (store.decision_log_text().await.unwrap(), format!("{rest:?}"))
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -194,7 +192,7 @@ async fn walkers_wait_while_the_label_queue_is_full() {
     const LIMIT: u64 = 2;
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
-    let stopping = Arc::new(AtomicBool::new(false));
+    let stopping = CancellationToken::new();
     let (reactor, to_reactor) = reactor(&store, &stopping).await;
     let reactor = Reactor { queue_limit: LIMIT, ..reactor };
     let threads = start_walkers(2, to_reactor, &stopping);
@@ -232,7 +230,7 @@ async fn walkers_continue_with_a_raised_threshold_up_to_twice_the_limit() {
     const LIMIT: u64 = 2;
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
-    let stopping = Arc::new(AtomicBool::new(false));
+    let stopping = CancellationToken::new();
     let (mut reactor, to_reactor) = reactor(&store, &stopping).await;
     reactor.selector.raise_threshold_above(LIMIT);
     let reactor = Reactor { queue_limit: LIMIT, ..reactor };
@@ -244,7 +242,7 @@ async fn walkers_continue_with_a_raised_threshold_up_to_twice_the_limit() {
     }));
     // Simulated walkers record the threshold factor of each assignment.
     let raised = Arc::new(std::sync::Mutex::new(Vec::new()));
-    let (seen, mut transport) = (Arc::clone(&raised), InProcess::new(0, to_reactor, Arc::clone(&stopping)));
+    let (seen, mut transport) = (Arc::clone(&raised), InProcess::new(0, to_reactor, stopping.clone()));
     let walker = thread::spawn(move || {
         let mut report = None;
         while let Some(work) = transport.exchange(report.take()) {
@@ -279,10 +277,10 @@ async fn walkers_continue_with_a_raised_threshold_up_to_twice_the_limit() {
 async fn waiting_walkers_are_shut_down_when_the_campaign_stops() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
-    let stopping = Arc::new(AtomicBool::new(false));
+    let stopping = CancellationToken::new();
     let (reactor, to_reactor) = reactor(&store, &stopping).await;
     let reactor = Reactor { queue_limit: 0, ..reactor };
-    let talker = InProcess::new(9, to_reactor.clone(), Arc::clone(&stopping));
+    let talker = InProcess::new(9, to_reactor.clone(), stopping.clone());
     let walker = start_walkers(1, to_reactor, &stopping).remove(0);
     let talking = thread::spawn(move || {
         while !walker.is_finished() {
@@ -292,7 +290,7 @@ async fn waiting_walkers_are_shut_down_when_the_campaign_stops() {
     });
     let watch = move |notice: Notice<'_>| {
         if matches!(notice, Notice::QueueFull(_)) {
-            stopping.store(true, Ordering::Relaxed);
+            stopping.cancel();
         }
     };
     assert_eq!(end_of(reactor, watch).await, RunOutcome::Stopped);
@@ -304,9 +302,9 @@ async fn waiting_walkers_are_shut_down_when_the_campaign_stops() {
 async fn assignments_of_dead_walkers_are_completed_by_others() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
-    let stopping = Arc::new(AtomicBool::new(false));
+    let stopping = CancellationToken::new();
     let (reactor, to_reactor) = reactor(&store, &stopping).await;
-    let mut mortal = InProcess::new(9, to_reactor.clone(), Arc::clone(&stopping));
+    let mut mortal = InProcess::new(9, to_reactor.clone(), stopping.clone());
     let dying = thread::spawn(move || {
         let work = mortal.exchange(None).expect("the first idle walker gets an assignment");
         drop(work);
@@ -322,7 +320,7 @@ async fn assignments_of_dead_walkers_are_completed_by_others() {
 async fn a_campaign_without_walkers_is_not_finished() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(folder.path()).await;
-    let (reactor, to_reactor) = reactor(&store, &Arc::default()).await;
+    let (reactor, to_reactor) = reactor(&store, &CancellationToken::new()).await;
     drop(to_reactor);
     assert_eq!(end_of(reactor, |_| ()).await, RunOutcome::Stopped);
 }
@@ -333,7 +331,7 @@ async fn assignments_that_crash_walkers_end_their_walk() {
     for (fault, walkers) in [(true, 3), (false, 5)] {
         let directory = tempfile::tempdir().unwrap();
         let store = open(directory.path()).await;
-        let stopping = Arc::new(AtomicBool::new(false));
+        let stopping = CancellationToken::new();
         let (reactor, to_reactor) = reactor(&store, &stopping).await;
         let running = tokio::spawn(end_of(reactor, |_| {}));
         for walker in 0..walkers {
@@ -361,7 +359,7 @@ async fn pausing_a_walk_does_not_change_decisions() {
     assert_eq!(run(&whole, 2, usize::MAX).await, RunOutcome::Finished);
 
     let store = open(folders[1].path()).await;
-    let stopping = Arc::new(AtomicBool::new(false));
+    let stopping = CancellationToken::new();
     let (reactor, to_reactor) = reactor(&store, &stopping).await;
     let threads = start_walkers(2, to_reactor, &stopping);
     store.pause_walks(&[WalkId(1)], true, 0).await.unwrap();

@@ -1,12 +1,10 @@
 //! `calmwalk label`
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use store::{Location, Store, StoreError};
-use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
 
 use super::{ExitStatus, Failure, block_on, campaign_location, duration_between};
 use crate::config::Config;
@@ -15,7 +13,7 @@ use crate::label_setup::{HostOptions, LabelSetup};
 use crate::log::Options;
 use crate::output::{log_and_print, warn_if_unencrypted};
 use crate::runtime::label_pool::{self, LabelPool};
-use crate::runtime::stop_signal;
+use crate::signals::cancel_on_signal;
 
 /// Between two attempts to open a campaign that does not exist yet.
 const RETRY_INTERVAL: std::time::Duration = std::time::Duration::from_secs(2);
@@ -65,10 +63,11 @@ impl Label {
     }
 
     async fn label(self) -> Result<ExitStatus, Failure> {
-        let (stopping, stop) = stop_signal("stopping: labels in progress finish or return to the queue …")?;
+        let stop = CancellationToken::new();
+        cancel_on_signal(stop.clone(), "stopping: labels in progress finish or return to the queue …")?;
         warn_if_unencrypted(&campaign_location::parse(&self.store)?);
         loop {
-            let Some((opened, label_setup)) = self.wait_for_campaign(&stopping, &stop).await? else {
+            let Some((opened, label_setup)) = self.wait_for_campaign(&stop).await? else {
                 return Ok(ExitStatus::Interrupted);
             };
             let location = match campaign_location::parse(&self.store)? {
@@ -87,7 +86,7 @@ impl Label {
                 until_empty: self.until_empty,
                 grace_period: self.grace_period.get(),
             };
-            let ended = label_pool::run(&opened, slots, &stopping, &stop).await?;
+            let ended = label_pool::run(&opened, slots, &stop).await?;
             let is_in_force = opened.is_in_force(protocol.hash).await?;
             opened.close().await;
             if ended == ExitStatus::Interrupted || is_in_force {
@@ -103,11 +102,10 @@ impl Label {
     /// Opens the store once it contains a campaign. `None` if this process was asked to stop first.
     async fn wait_for_campaign(
         &self,
-        stopping: &Arc<AtomicBool>,
-        stop: &Notify,
+        stop: &CancellationToken,
     ) -> Result<Option<(Store, LabelSetup)>, Failure> {
         let (started, mut reported) = (Instant::now(), false);
-        while !stopping.load(Ordering::Relaxed) {
+        while !stop.is_cancelled() {
             // Parsed at each attempt: the campaign may appear in a subdirectory.
             let error = match self.open(&campaign_location::parse(&self.store)?).await {
                 Ok(opened) => return Ok(Some(opened)),
@@ -118,7 +116,7 @@ impl Label {
             if !std::mem::replace(&mut reported, true) {
                 log_and_print(format_args!("waiting for the campaign: {error}"));
             }
-            tokio::select! { () = tokio::time::sleep(RETRY_INTERVAL) => {}, () = stop.notified() => {} }
+            stop.run_until_cancelled(tokio::time::sleep(RETRY_INTERVAL)).await;
         }
         Ok(None)
     }

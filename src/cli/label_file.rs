@@ -8,7 +8,7 @@ use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, write_frame};
 use atoms::{Structure, read_structures};
 use serde::Serialize;
 use store::Protocol;
-use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
 use workers::labeller::{SingleLabel, label_structure};
 
 use super::{ExitStatus, Failure, block_on};
@@ -17,7 +17,7 @@ use crate::config::Config;
 use crate::label_method::{self, MethodConfig};
 use crate::log::Options;
 use crate::output::{print, print_json};
-use crate::runtime::stop_signal;
+use crate::signals::cancel_on_signal;
 
 /// Label the structures of a file, to test a label protocol without a campaign
 ///
@@ -72,13 +72,14 @@ impl LabelFile {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         self.log.init("label-file")?;
         block_on(async {
-            let (_, stop) = stop_signal("stopping …")?;
+            let stop = CancellationToken::new();
+            cancel_on_signal(stop.clone(), "stopping …")?;
             self.label(&stop).await
         })?
     }
 
     /// Labels the structures one after the other, up to the first failure.
-    async fn label(&self, stop: &Notify) -> Result<ExitStatus, Failure> {
+    async fn label(&self, stop: &CancellationToken) -> Result<ExitStatus, Failure> {
         let section = Config::load_label(&self.config)?;
         let frames = read_structures(&self.structures).map_err(Failure::input)?;
         let setup = MethodConfig::from_section(&section)?;
@@ -92,7 +93,7 @@ impl LabelFile {
             structure.validate().map_err(|error| Failure::Input(format!("{source}: {error}")))?;
             let attempt = tokio::select! {
                 attempt = label_structure(&method, &structure, &bounds) => attempt?,
-                () = stop.notified() => {
+                () = stop.cancelled() => {
                     method.stop().await?;
                     return Ok(ExitStatus::Interrupted);
                 }

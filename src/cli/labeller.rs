@@ -1,6 +1,5 @@
 //! `calmwalk labeller`
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use orchestrator::launcher;
@@ -31,23 +30,22 @@ impl Labeller {
             None => launcher::start_own_session().map_err(Failure::failed)?,
         }
         let method = setup.method.load(&setup.protocol)?;
-        let closing = Arc::new(Shutdown::default());
+        let closing = Shutdown::default();
         block_on(label(setup, method, &closing))??;
-        Ok(if closing.is_stopping() { ExitStatus::Interrupted } else { ExitStatus::Done })
+        Ok(if closing.stop.is_cancelled() { ExitStatus::Interrupted } else { ExitStatus::Done })
     }
 }
 
-async fn label(setup: LabellerConfig, method: Method, closing: &Arc<Shutdown>) -> Result<(), Failure> {
-    let (mut terminate, asked) =
-        (signal(SignalKind::terminate()).map_err(Failure::failed)?, Arc::clone(closing));
+async fn label(setup: LabellerConfig, method: Method, closing: &Shutdown) -> Result<(), Failure> {
+    let (mut terminate, stop) =
+        (signal(SignalKind::terminate()).map_err(Failure::failed)?, closing.stop.clone());
     tokio::spawn(async move {
-        while terminate.recv().await.is_some() {
-            asked.stop();
-        }
+        terminate.recv().await;
+        stop.cancel();
     });
     let location: Location =
         setup.location.to_str().map_or_else(|| Ok(Location::from(&setup.location)), str::parse)?;
-    let store = retry_until_written(closing, || Store::open(&location)).await?;
+    let store = retry_until_written(&closing.stop, || Store::open(&location)).await?;
     let (pid, now) = (std::process::id(), unix_milliseconds());
     let record = ProcessRecord::new(ProcessRecord::LABELLER, setup.number, pid, now);
     // Only labellers of `calmwalk run` are taken over by the next run.

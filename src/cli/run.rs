@@ -20,7 +20,7 @@ use serde_json::json;
 use store::{
     DATABASE, Location, ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds,
 };
-use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
 use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
 
@@ -173,15 +173,9 @@ async fn run(
             "label.concurrency = 0: start labellers with calmwalk label --store {store}"
         ));
     }
-    let over = Arc::new(Notify::new());
-    let run = runtime::RunContext {
-        campaign,
-        store: &store,
-        process: &process,
-        directory,
-        listen,
-        limit_reached: &over,
-    };
+    let stop = CancellationToken::new();
+    let run =
+        runtime::RunContext { campaign, store: &store, process: &process, directory, listen, stop: &stop };
     let (limits, used_up) = (campaign.config.budget(), time_budget::exhausted_time_limit(&store).await?);
     let work = async {
         if used_up.is_some() {
@@ -198,7 +192,7 @@ async fn run(
     let mut notifier = Notifier::new(&campaign.config, &store, location).await?;
     let worked = tokio::select! {
         ended = work => ended,
-        error = time_budget::track(&store, &limits, &over) => Err(error.into()),
+        error = time_budget::track(&store, &limits, &stop) => Err(error.into()),
         error = lock::lost(lock.as_ref()) => Err(error.into()),
         never = notify::run(&mut notifier) => match never {},
     };

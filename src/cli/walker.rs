@@ -24,7 +24,7 @@ impl Walker {
         log::init(setup.log.clone(), "walker", Some(setup.door.walker()))?;
         launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
         launcher::end_with_parent(setup.parent).map_err(Failure::failed)?;
-        let stopping = signals::stop_flag()?;
+        let stopping = signals::stop_token()?;
         let threads = Threads::new(setup.threads).map_err(Failure::failed)?;
         let context = WalkContext { model: setup.load_model()?, threads, settings: Arc::new(setup.settings) };
         let mut transport = IpcWalker::connect(&setup.door, stopping).map_err(Failure::failed)?;

@@ -2,16 +2,18 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
+use std::pin::pin;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use calm::Mixture;
+use futures_util::FutureExt;
 use orchestrator::launcher::{self, Children, Launch};
 use orchestrator::supervisor::{ChildState, Limits};
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
+use tokio_util::sync::CancellationToken;
 use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
 use wire::net::{self, Address, AgentClient, LinkError, Membership, NetError, Tls};
@@ -20,12 +22,13 @@ use wire::transport::Incoming;
 use workers::agent::{self, Agent, AgentEvent};
 
 use super::process_manager::all_failed_message;
-use super::{CHANNEL, STOP_MESSAGE, stop_signal};
+use super::{CHANNEL, STOP_MESSAGE};
 use crate::exit_status::{ExitStatus, Failure};
 use crate::file_hash::verify_hash;
 use crate::log;
 use crate::output::{count, log_and_print, log_and_warn};
 use crate::process_config::{self, AgentConfig, WalkerConfig};
+use crate::signals::cancel_on_signal;
 use crate::web::agent_metrics::AgentState;
 
 /// Interval at which the walkers' states are published for the agent's metrics.
@@ -43,11 +46,12 @@ pub async fn run(
     directory: &Path,
     state: &AgentState,
 ) -> Result<ExitStatus, Failure> {
-    let (stopping, stop) = stop_signal(STOP_MESSAGE)?;
+    let stop = CancellationToken::new();
+    cancel_on_signal(stop.clone(), STOP_MESSAGE)?;
     let walkers = agent.walkers;
     let (uplink, joined, setup) = tokio::select! {
         joined = join(address, tls, agent, directory) => joined?,
-        () = stop.notified() => return Ok(ExitStatus::Interrupted),
+        () = stop.cancelled() => return Ok(ExitStatus::Interrupted),
         () = address.wait_until_over() => {
             log_and_print("the campaign is over");
             return Ok(ExitStatus::Done);
@@ -64,14 +68,11 @@ pub async fn run(
     ));
     let place = ShmDir::for_campaign(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
-    let (flag, wake) = (Arc::clone(&stopping), Arc::clone(&stop));
+    let (stopping, asked) = (stop.clone(), stop.clone());
     let numbers = Arc::clone(&state.numbers);
     let dispatch = |incoming| {
         tokio::spawn(Agent { uplink, joined, incoming, stopping, orchestrator_timeout: patience, metrics: numbers }.run(move |news| match news {
-            AgentEvent::Stop => {
-                flag.store(true, Ordering::Relaxed);
-                wake.notify_one();
-            }
+            AgentEvent::Stop => asked.cancel(),
             AgentEvent::Unresponsive { unsent, idle } => log_and_warn(format_args!(
                 "the orchestrator does not answer: {unsent} unsent reports, {idle} of {walkers} walkers idle"
             )),
@@ -151,7 +152,7 @@ async fn run_in(
     (walkers, threads): (u32, usize),
     mixture: &Mixture,
     dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
-    stop: &Notify,
+    stop: &CancellationToken,
     state: &AgentState,
 ) -> Result<ExitStatus, Failure> {
     let sizes = Sizes { walkers, message_bytes: setup.message_bytes };
@@ -202,8 +203,9 @@ fn launch(
 
 impl AgentHost {
     /// Runs until every walker has ended and every report is delivered.
-    async fn supervise(mut self, stop: &Notify) -> Result<ExitStatus, Failure> {
+    async fn supervise(mut self, stop: &CancellationToken) -> Result<ExitStatus, Failure> {
         let (mut dispatched, mut gone) = (None, false);
+        let mut stop_requested = pin!(stop.cancelled().fuse());
         let mut ticks = interval(STATUS_INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         while dispatched.is_none() || !gone {
@@ -213,7 +215,7 @@ impl AgentHost {
                     let walkers = self.walkers.status();
                     *self.state.walkers.lock().unwrap_or_else(PoisonError::into_inner) = walkers;
                 }
-                () = stop.notified() => self.walkers.stop(),
+                () = &mut stop_requested => self.walkers.stop(),
                 ended = &mut self.dispatching, if dispatched.is_none() => {
                     let ended = ended.map_err(Failure::failed)?;
                     match ended {

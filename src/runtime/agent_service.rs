@@ -2,14 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use calm::Mixture;
 use serde_json::json;
 use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval};
-use wire::net::{self, AgentBootstrap, AgentEvent, AgentServer, NetError};
+use wire::net::{AgentBootstrap, AgentEvent, AgentServer, NetError, StopTokens};
 use wire::transport::Incoming;
 use workers::labeller::HEARTBEAT_INTERVAL;
 
@@ -23,16 +22,6 @@ pub struct AgentService {
     hub: Option<AgentServer>,
     store: Store,
     mixture: Arc<Mixture>,
-}
-
-/// Closes the server.
-pub struct AgentServerHandle(Option<net::AgentServerHandle>);
-
-impl AgentServerHandle {
-    /// Tells agents that there is no more work.
-    pub fn close(&self) {
-        self.0.iter().for_each(net::AgentServerHandle::close);
-    }
 }
 
 impl AgentService {
@@ -69,21 +58,13 @@ impl AgentService {
         Ok(Self { hub: Some(hub), store, mixture })
     }
 
-    pub fn handle(&self) -> AgentServerHandle {
-        AgentServerHandle(self.hub.as_ref().map(AgentServer::handle))
-    }
-
     /// Serves agents until there is no more work and the last agent has left.
-    pub async fn run(
-        self,
-        stopping: Arc<AtomicBool>,
-        to_reactor: mpsc::Sender<Incoming>,
-    ) -> Result<(), Failure> {
+    pub async fn run(self, stop: StopTokens, to_reactor: mpsc::Sender<Incoming>) -> Result<(), Failure> {
         let Some(hub) = self.hub else { return Ok(()) };
         let (sender, events) = mpsc::unbounded_channel();
         let on_event = move |event| drop(sender.send(event));
         let (ended, ()) = tokio::join!(
-            hub.run(self.mixture, stopping, to_reactor, on_event),
+            hub.run(self.mixture, stop, to_reactor, on_event),
             record_events(&self.store, events)
         );
         ended.map_err(Failure::failed)

@@ -1,15 +1,15 @@
 //! The labellers of `calmwalk label`. They end with the command, and no run of the campaign adopts them.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::pin::pin;
 use std::time::Duration;
 
+use futures_util::FutureExt;
 use orchestrator::launcher::{ChildEvent, Children, Launch};
 use orchestrator::supervisor::{ChildState, Limits};
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
-use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval};
+use tokio_util::sync::CancellationToken;
 use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::labellers::Labellers;
@@ -40,15 +40,10 @@ pub struct LabelPool {
     pub grace_period: Duration,
 }
 
-/// Makes labels until there is nothing left to do or `stop` is notified.
+/// Makes labels until there is nothing left to do or `stop` is cancelled.
 ///
 /// Await this on the main thread: the labellers end with the thread that starts them.
-pub async fn run(
-    store: &Store,
-    pool: LabelPool,
-    stopping: &Arc<AtomicBool>,
-    stop: &Notify,
-) -> Result<ExitStatus, Failure> {
+pub async fn run(store: &Store, pool: LabelPool, stop: &CancellationToken) -> Result<ExitStatus, Failure> {
     let attempts = pool.label_setup.attempts;
     let mut manager = PoolManager {
         store,
@@ -58,7 +53,7 @@ pub async fn run(
     };
     let mut ticks = interval(HEARTBEAT_INTERVAL);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut failure = None;
+    let (mut stop_requested, mut failure) = (pin!(stop.cancelled().fuse()), None);
     loop {
         let done = tokio::select! {
             event = manager.labellers.children.next() => match event {
@@ -66,7 +61,7 @@ pub async fn run(
                 event => manager.handle(event).await,
             },
             _ = ticks.tick() => manager.update().await,
-            () = stop.notified() => {
+            () = &mut stop_requested => {
                 manager.labellers.children.stop();
                 Ok(())
             }
@@ -77,9 +72,9 @@ pub async fn run(
         }
     }
     let failure = failure.or_else(|| all_failed_message(&mut manager.labellers.children));
-    match failure.filter(|_| !stopping.load(Ordering::Relaxed)) {
+    match failure.filter(|_| !stop.is_cancelled()) {
         Some(why) => Err(Failure::Failed(format!("no slot is left: {why}"))),
-        None if stopping.load(Ordering::Relaxed) => Ok(ExitStatus::Interrupted),
+        None if stop.is_cancelled() => Ok(ExitStatus::Interrupted),
         None => Ok(ExitStatus::Done),
     }
 }

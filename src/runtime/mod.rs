@@ -17,26 +17,21 @@ mod throughput;
 pub mod time_budget;
 
 use std::path::Path;
-use std::process;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
 
 use monitor::walk_ends::WalkEnds;
 use orchestrator::reactor::{self, Notice, Reactor};
 use orchestrator::selector::Selector;
 use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, unix_milliseconds};
-use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
 use wire::transport::Incoming;
 
 use self::throughput::Throughput;
 use crate::campaign::Campaign;
 use crate::config::QueueFull;
-use crate::exit_status::Failure;
 use crate::forgetting::ForgettingRule;
-use crate::output::log_and_print;
 use crate::progress::Display;
 pub use listen::Listen;
 
@@ -56,8 +51,8 @@ pub struct RunContext<'a> {
     pub directory: &'a Path,
     /// Where agents of other hosts may join.
     pub listen: Option<&'a Listen>,
-    /// Notified when a time limit is reached.
-    pub limit_reached: &'a Arc<Notify>,
+    /// Cancelled to stop the run: by a signal, or when a time limit is reached.
+    pub stop: &'a CancellationToken,
 }
 
 /// Printed when a campaign is asked to stop.
@@ -71,7 +66,7 @@ fn start_reactor(
     run: RunContext<'_>,
     mut selector: Selector,
     incoming: mpsc::Receiver<Incoming>,
-    stopping: &Arc<AtomicBool>,
+    stopping: CancellationToken,
 ) -> ReactorTask {
     let config = &run.campaign.config;
     let walk_steps = config.walk.equilibration_steps + config.walk.biased_steps.get();
@@ -87,7 +82,7 @@ fn start_reactor(
         selector,
         store: run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT),
         incoming,
-        stopping: Arc::clone(stopping),
+        stopping,
         queue_limit,
     };
     let (store, throughput) = (run.store.clone(), Mutex::new(Throughput::default()));
@@ -119,55 +114,4 @@ pub fn cores() -> u32 {
     // Not every batch system confines a job to its allocated cores.
     let given = std::env::var("SLURM_CPUS_PER_TASK").ok().and_then(|text| text.parse().ok());
     given.map_or(there, |given: u32| given.clamp(1, there))
-}
-
-/// Returns a flag that the first stop signal sets and a notification that it sends. Prints `message` then.
-pub fn stop_signal(message: &'static str) -> Result<(Arc<AtomicBool>, Arc<Notify>), Failure> {
-    let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
-    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
-    on_stop_signal(message, move || {
-        asked.0.store(true, Ordering::Relaxed);
-        asked.1.notify_one();
-    })?;
-    Ok((stopping, stop))
-}
-
-/// Calls `stop` when a time limit is reached, as a stop signal would.
-fn stop_at_limit(limit_reached: &Arc<Notify>, stop: impl FnOnce() + Send + 'static) {
-    let limit_reached = Arc::clone(limit_reached);
-    tokio::spawn(async move {
-        limit_reached.notified().await;
-        stop();
-    });
-}
-
-/// A batch system signals every process of a job, and the job script forwards the signal it receives. Signals within
-/// this time count as one request.
-const SIGNAL_MERGE_WINDOW: Duration = Duration::from_secs(5);
-
-/// Calls `stop` on the first Ctrl-C, SIGTERM or hang-up. A second signal exits at once, which is safe too, unless it
-/// is a SIGTERM within [`SIGNAL_MERGE_WINDOW`] of the first.
-fn on_stop_signal(message: &'static str, stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
-    let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
-    tokio::spawn(async move {
-        let mut asked: Option<Instant> = None;
-        loop {
-            let again = tokio::select! {
-                _ = interrupt.recv() => false,
-                _ = hangup.recv() => false,
-                _ = terminate.recv() => asked.is_some_and(|asked| asked.elapsed() < SIGNAL_MERGE_WINDOW),
-            };
-            if again {
-                continue;
-            }
-            if asked.replace(Instant::now()).is_some() {
-                process::exit(130);
-            }
-            stop();
-            log_and_print(message);
-        }
-    });
-    Ok(())
 }

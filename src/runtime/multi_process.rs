@@ -4,7 +4,6 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use orchestrator::launcher::Children;
@@ -12,20 +11,20 @@ use orchestrator::reactor;
 use orchestrator::selector::Selector;
 use orchestrator::supervisor::Limits;
 use store::ProcessRecord;
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Sleep, sleep};
+use tokio_util::sync::CancellationToken;
 use wire::ipc::{Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
+use wire::net::StopTokens;
 use wire::shm_dir::ShmDir;
 
-use super::agent_service::{self, AgentService};
+use super::agent_service::AgentService;
 use super::process_manager::{self, ProcessManager};
-use super::{
-    CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, spawn, start_reactor, stop_at_limit, stop_signal,
-    wanted_walkers,
-};
+use super::{CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, spawn, start_reactor, wanted_walkers};
 use crate::exit_status::Failure;
+use crate::signals::cancel_on_signal;
 
 /// Time that the last writes to the database may take after all processes have ended.
 const DATABASE_TIMEOUT: Duration = Duration::from_secs(60);
@@ -61,12 +60,9 @@ async fn run_in(
     let shared = shared.map_err(Failure::failed)?;
     let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
 
-    let (stopping, stop) = stop_signal(STOP_MESSAGE)?;
-    let handles = (Arc::clone(&stopping), Arc::clone(&stop));
-    stop_at_limit(run.limit_reached, move || {
-        handles.0.store(true, Ordering::Relaxed);
-        handles.1.notify_one();
-    });
+    cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
+    // The manager cancels it too, when the run cannot go on.
+    let stopping = run.stop.child_token();
     let limits = Limits {
         heartbeat_timeout: campaign.config.run.heartbeat_timeout.get(),
         max_restarts: campaign.config.run.max_restarts,
@@ -80,19 +76,19 @@ async fn run_in(
         ..limits
     };
     let labellers = spawn::start_labellers(run, limits).await?;
-    let manager =
-        ProcessManager::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
+    let manager = ProcessManager::new(store, process.clone(), line, walkers, labellers, stopping.clone());
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let local = server.run(shared, to_reactor.clone(), manager.listener());
     let agents = AgentService::open(run, session(process), &mixture).await?;
-    let agents_line = agents.handle();
-    let remote = agents.run(Arc::clone(&stopping), to_reactor);
+    let no_more_work = CancellationToken::new();
+    let tokens = StopTokens { stopping: stopping.clone(), closing: no_more_work.clone() };
+    let remote = agents.run(tokens, to_reactor);
     let serving = tokio::spawn(async {
         tokio::try_join!(async { local.await.map_err(Failure::failed) }, remote).map(|_| ())
     });
-    let reactor = start_reactor(run, selector, incoming, &stopping);
-    supervise(manager, reactor, agents_line, serving, &stop).await
+    let reactor = start_reactor(run, selector, incoming, stopping);
+    supervise(manager, reactor, no_more_work, serving, run.stop).await
 }
 
 /// Distinguishes the walkers of this run from those of any other.
@@ -119,9 +115,9 @@ enum ManagerEvent {
 async fn supervise(
     mut manager: ProcessManager<'_>,
     mut reactor: ReactorTask,
-    agents: agent_service::AgentServerHandle,
+    no_more_work: CancellationToken,
     mut serving: JoinHandle<Result<(), Failure>>,
-    stop: &Notify,
+    stop: &CancellationToken,
 ) -> Result<reactor::RunOutcome, Failure> {
     let (mut reactor_result, mut transport_result, mut stop_requested) = (None, None, false);
     let mut database_deadline = None;
@@ -132,7 +128,7 @@ async fn supervise(
         let event = tokio::select! {
             () = expired(&mut database_deadline) => return Err(database_unreachable()),
             event = manager.next_event() => ManagerEvent::Process(event),
-            () = stop.notified() => ManagerEvent::StopRequested,
+            () = stop.cancelled(), if !stop_requested => ManagerEvent::StopRequested,
             ended = &mut reactor, if reactor_result.is_none() => ManagerEvent::ReactorEnded(flatten(ended)),
             ended = &mut serving, if transport_result.is_none() => ManagerEvent::TransportEnded(flatten(ended)),
         };
@@ -143,7 +139,7 @@ async fn supervise(
                 manager.stop();
             }
             ManagerEvent::ReactorEnded(ended) => {
-                agents.close();
+                no_more_work.cancel();
                 match ended {
                     Ok(reactor::RunOutcome::Finished) => manager.wait_for_labels(),
                     _ => manager.stop(),

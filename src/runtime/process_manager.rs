@@ -1,13 +1,12 @@
 //! Manages the walker and labeller processes of a run.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use orchestrator::launcher::{self, Children};
 use orchestrator::supervisor::ChildState;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
+use tokio_util::sync::CancellationToken;
 use wire::ipc::ServerHandle;
 use workers::labeller::HEARTBEAT_INTERVAL;
 
@@ -33,8 +32,8 @@ pub struct ProcessManager<'a> {
     label_checks: Option<Interval>,
     /// Whether all walkers, and all labellers, have ended.
     ended: [bool; 2],
-    /// Tells the reactor to dismiss the walkers.
-    stopping: Arc<AtomicBool>,
+    /// Cancelled to make the reactor dismiss the walkers.
+    stopping: CancellationToken,
     failure: Option<String>,
     /// Whether the database is reachable.
     db_status: DbStatus,
@@ -60,7 +59,7 @@ impl<'a> ProcessManager<'a> {
         line: ServerHandle,
         mut walkers: Children,
         labellers: Labellers,
-        stopping: Arc<AtomicBool>,
+        stopping: CancellationToken,
     ) -> Self {
         let mut heartbeats = interval(HEARTBEAT_INTERVAL);
         heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -129,7 +128,7 @@ impl<'a> ProcessManager<'a> {
     /// Asks all processes to end in order.
     pub fn stop(&mut self) {
         self.label_checks = None;
-        self.stopping.store(true, Ordering::Relaxed);
+        self.stopping.cancel();
         self.walkers.stop();
         self.labellers.children.stop();
     }
@@ -152,7 +151,7 @@ impl<'a> ProcessManager<'a> {
     }
 
     fn is_stopping(&self) -> bool {
-        self.stopping.load(Ordering::Relaxed)
+        self.stopping.is_cancelled()
     }
 
     fn fail(&mut self, why: String) {

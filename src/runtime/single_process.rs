@@ -1,7 +1,6 @@
 //! Runs a campaign in one process: walkers as threads, reactor and labellers as tasks.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 
 use orchestrator::reactor;
@@ -10,6 +9,7 @@ use potentials::grace::Threads;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
+use tokio_util::sync::CancellationToken;
 use wire::shm_dir::ShmDir;
 use wire::transport::{InProcess, Incoming};
 use workers::labeller::{self, ExitPolicy, HEARTBEAT_INTERVAL, LabellerSettings, Shutdown, Timing};
@@ -19,12 +19,10 @@ use workers::walker;
 use super::db_status::DbStatus;
 use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
-use super::{
-    CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, on_stop_signal, start_reactor, stop_at_limit,
-    wanted_walkers,
-};
+use super::{CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, start_reactor, wanted_walkers};
 use crate::campaign::Campaign;
 use crate::exit_status::Failure;
+use crate::signals::cancel_on_signal;
 
 /// Runs the campaign until it is finished or stopped.
 pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
@@ -59,25 +57,20 @@ struct Tasks {
     /// The store to poll for labels that other processes make, if this one makes none.
     external_labels: Option<Store>,
     closing: Arc<Shutdown>,
-    stopping: Arc<AtomicBool>,
+    /// Stops walkers and reactor, but not the labellers.
+    stopping: CancellationToken,
 }
 
 impl Tasks {
     /// Starts all of them.
     fn start(run: RunContext<'_>, selector: Selector) -> Result<Self, Failure> {
-        let stopping = Arc::new(AtomicBool::new(false));
-        let closing = Arc::new(Shutdown::default());
-        let asked = (Arc::clone(&stopping), Arc::clone(&closing));
-        let stop = move || {
-            asked.0.store(true, Ordering::Relaxed);
-            asked.1.stop();
-        };
-        stop_at_limit(run.limit_reached, stop.clone());
-        on_stop_signal(STOP_MESSAGE, stop)?;
+        cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
+        let stopping = run.stop.child_token();
+        let closing = Arc::new(Shutdown::new(run.stop.child_token()));
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
         let walkers = start_walkers(run.campaign, &to_reactor, &stopping)?;
         let labellers = start_labellers(run, &closing)?;
-        let reactor = start_reactor(run, selector, incoming, &stopping);
+        let reactor = start_reactor(run, selector, incoming, stopping.clone());
         let external_labels = labellers.is_empty().then(|| run.store.clone());
         Ok(Self { walkers, labellers, reactor, external_labels, closing, stopping })
     }
@@ -90,19 +83,19 @@ impl Tasks {
                 ended = &mut self.reactor => break ended.map_err(Failure::failed)?,
                 Some(labeller) = self.labellers.join_next() => {
                     failure = failure_of(labeller).or(failure);
-                    self.stopping.store(true, Ordering::Relaxed);
+                    self.stopping.cancel();
                 }
             }
         };
         self.closing.set_no_more_jobs(true);
         if ended.is_err() || failure.is_some() {
-            self.stopping.store(true, Ordering::Relaxed);
-            self.closing.stop();
+            self.stopping.cancel();
+            self.closing.stop.cancel();
         }
         if let Some(store) =
             self.external_labels.filter(|_| matches!(ended, Ok(reactor::RunOutcome::Finished)))
         {
-            wait_for_labels(&store, &self.closing).await?;
+            self.closing.stop.run_until_cancelled(wait_for_labels(&store)).await.transpose()?;
         }
         let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
         while let Some(labeller) = self.labellers.join_next().await {
@@ -115,22 +108,21 @@ impl Tasks {
         match failure {
             Some(failure) => Err(failure),
             // Every walk is over, but the labellers were asked to stop and may have left jobs.
-            None if self.closing.is_stopping() => Ok(reactor::RunOutcome::Stopped),
+            None if self.closing.stop.is_cancelled() => Ok(reactor::RunOutcome::Stopped),
             None => Ok(ended),
         }
     }
 }
 
-/// Waits until no structure lacks a label or a stop is requested.
-async fn wait_for_labels(store: &Store, closing: &Shutdown) -> Result<(), StoreError> {
-    while !closing.is_stopping() {
+/// Waits until no structure lacks a label.
+async fn wait_for_labels(store: &Store) -> Result<(), StoreError> {
+    loop {
         match store.has_pending_labels(unix_milliseconds()).await {
-            Ok(false) => break,
+            Ok(false) => return Ok(()),
             Err(error) if !error.is_transient() => return Err(error),
             _ => tokio::time::sleep(LABEL_CHECK_INTERVAL).await,
         }
     }
-    Ok(())
 }
 
 /// Why a labeller failed, if it did.
@@ -144,11 +136,11 @@ fn failure_of(labeller: Result<Result<(), StoreError>, JoinError>) -> Option<Fai
 fn start_walkers(
     campaign: &Campaign,
     to_reactor: &mpsc::Sender<Incoming>,
-    stopping: &Arc<AtomicBool>,
+    stopping: &CancellationToken,
 ) -> Result<Vec<JoinHandle<walker::WalkerExit>>, Failure> {
     let (model, settings) = (Arc::clone(&campaign.model), Arc::new(campaign.walk_settings()));
     let start = |number| {
-        let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
+        let mut transport = InProcess::new(number, to_reactor.clone(), stopping.clone());
         let threads = Threads::new(campaign.config.run.threads_per_walker.get()).map_err(Failure::failed)?;
         let context = WalkContext { model: Arc::clone(&model), threads, settings: Arc::clone(&settings) };
         thread::Builder::new()

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use store::{Budget, Store, StoreError, unix_milliseconds};
-use tokio::sync::Notify;
 use tokio::time::{Instant, MissedTickBehavior, interval};
+use tokio_util::sync::CancellationToken;
 
 use crate::output::log_and_print;
 
@@ -17,9 +17,9 @@ pub async fn exhausted_time_limit(store: &Store) -> Result<Option<&'static str>,
     Ok(limits.time_used_up(&used))
 }
 
-/// Counts the time until the future is dropped. Notifies `limit_reached` once when a limit is reached, which stops
-/// the run in order. Retries while the database is busy.
-pub async fn track(store: &Store, limits: &Budget, limit_reached: &Notify) -> StoreError {
+/// Counts the time until the future is dropped. Cancels `stop` when a limit is reached, which stops the run in order.
+/// Retries while the database is busy.
+pub async fn track(store: &Store, limits: &Budget, stop: &CancellationToken) -> StoreError {
     let limited = limits.wall_hours.is_some() || limits.core_hours.is_some();
     let mut ticks = interval(POLL_INTERVAL);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -33,7 +33,7 @@ pub async fn track(store: &Store, limits: &Budget, limit_reached: &Notify) -> St
                 if let Some(key) = used_up.filter(|_| !reported) {
                     log_and_print(format_args!("{key} is used up"));
                     reported = true;
-                    limit_reached.notify_one();
+                    stop.cancel();
                 }
             }
             Err(error) if error.is_transient() => {}

@@ -62,7 +62,7 @@ async fn a_backup_is_an_independent_campaign() {
     assert_eq!(contents(&copy).await, contents(&store).await);
     assert_eq!(copy.campaign().await.unwrap(), store.campaign().await.unwrap());
     assert_eq!(copy.seed_structures().await.unwrap(), store.seed_structures().await.unwrap());
-    assert_eq!(copy.candidate_ids(0, 500).await.unwrap().len(), 400);
+    assert_eq!(copy.candidates(0, true, 500).await.unwrap().len(), 400);
     assert_eq!(copy.check(|_, _| ()).await.unwrap(), []);
     // The original's processes stay registered.
     assert_eq!(copy.processes(None).await.unwrap(), []);
@@ -162,8 +162,7 @@ async fn compacting_frees_space_and_changes_nothing() {
         tokio::time::sleep(Duration::from_millis(200)).await;
     }
     assert_eq!(contents(&store).await, before);
-    let ids = store.candidate_ids(0, 9).await.unwrap();
-    let features = async |k: usize| store.candidate(&ids[k].1).await.unwrap().unwrap().features;
+    let features = async |k: usize| store.candidates(0, true, 9).await.unwrap().swap_remove(k).features;
     assert!(features(0).await.is_some() && features(1).await.is_some());
     assert_eq!(store.drop_declined_features(3).await.unwrap(), 1);
     assert!(features(0).await.is_some() && features(1).await.is_none());

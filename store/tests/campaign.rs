@@ -76,7 +76,8 @@ async fn committed_data_is_read_back() {
         assert_eq!(stored.features, features);
     }
     assert!(store.candidate("9f").await.unwrap().is_none());
-    assert_eq!(store.candidate_ids(2, 1).await.unwrap(), [(3, name_of(&commit.candidates[2]))]);
+    let third = store.candidates(2, true, 1).await.unwrap();
+    assert_eq!(third, [store.candidate(&name_of(&commit.candidates[2])).await.unwrap().unwrap()]);
 
     let jobs = store.queue_list(None, 10, 0).await.unwrap();
     let names: Vec<_> = jobs.iter().map(|job| job.candidate.clone()).collect();

@@ -66,13 +66,11 @@ async fn the_first_result_becomes_the_label() {
     assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), FailOutcome::LeaseLost);
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
 
-    let history = store
-        .label_history(ContentHash::from_structure(&holds.structure), protocol("dft").hash)
-        .await
-        .unwrap();
-    let lines: Vec<_> = history.iter().map(|record| (record.status, record.label.energy)).collect();
+    let history = store.labels_of(ContentHash::from_structure(&holds.structure)).await.unwrap();
+    let lines: Vec<_> =
+        history.iter().map(|label| (label.record.status, label.record.label.energy)).collect();
     assert_eq!(lines, [(LabelStatus::Label, -1.0), (LabelStatus::Check, -2.0)]);
-    assert_eq!(history[0].source, LabelSource::Attempt { job: lost.job, attempt: lost.attempt });
+    assert_eq!(history[0].record.source, LabelSource::Attempt { job: lost.job, attempt: lost.attempt });
 }
 
 #[tokio::test]
@@ -429,7 +427,7 @@ async fn the_cost_of_a_calculation_is_counted_once() {
     assert_eq!(shown.attempts_made[1].made, made);
     assert_eq!(shown.attempts_made[1].log.as_deref(), Some("the end"));
     let hash = ContentHash::from_structure(&second.structure);
-    assert_eq!(store.label_history(hash, protocol("dft").hash).await.unwrap()[0].label, label);
+    assert_eq!(store.labels_of(hash).await.unwrap()[0].record.label, label);
 
     // A corrected time of a finished calculation changes the total by the difference.
     store.record_cost(&second, 18.0, "the end").await.unwrap();

@@ -101,7 +101,7 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     );
     let expected = [(LabelStatus::Superseded, -1.0, "dft".into()), (LabelStatus::Label, -1.5, "dft".into())];
     assert_eq!(history(&store, structures[0]).await, expected);
-    let old = store.label_history(structures[0], dft.hash).await.unwrap().remove(0);
+    let old = store.labels_of(structures[0]).await.unwrap().remove(0).record;
     assert_eq!(old.superseded.map(|s| (s.time, s.reason)), Some((400, "a sick node".into())));
     assert_eq!(old.label, label(-1.0));
     assert_eq!(exported(&store, &dft).await, [-1.5]);
@@ -286,8 +286,9 @@ async fn an_imported_label_may_be_superseded_or_satisfy_a_request() {
     assert_eq!(import(&fine, 2.0, -2.5).await.labels, 1);
     assert!(lease(&store, &fine, 400).await.is_none());
     assert_eq!((exported(&store, &dft).await, exported(&store, &fine).await), (vec![], vec![-1.5, -2.5]));
-    let source = store.label_history(structures[0], dft.hash).await.unwrap().remove(0).source;
-    assert!(matches!(source, LabelSource::Import { .. }));
+    let first = store.labels_of(structures[0]).await.unwrap().remove(0);
+    assert_eq!(first.protocol, dft);
+    assert!(matches!(first.record.source, LabelSource::Import { .. }));
     whole(&store).await;
 }
 

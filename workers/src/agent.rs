@@ -5,15 +5,15 @@ mod pool;
 
 use std::collections::BTreeMap;
 use std::pin::pin;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use futures_util::StreamExt;
 use futures_util::future::BoxFuture;
 use futures_util::stream::FuturesUnordered;
+use futures_util::{FutureExt, StreamExt};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio_util::sync::CancellationToken;
 use wire::WalkId;
 use wire::messages::{Progress, Report};
 use wire::net::{AgentClient, LinkError, Membership, Slot, SlotReport};
@@ -64,8 +64,8 @@ pub struct Agent {
     pub joined: Membership,
     /// Messages from the walkers of this host.
     pub incoming: mpsc::Receiver<Incoming>,
-    /// Set from outside to stop: walkers are dismissed, with their assignments as they are.
-    pub stopping: Arc<AtomicBool>,
+    /// Cancelled to stop: walkers are dismissed, with their assignments as they are.
+    pub stopping: CancellationToken,
     /// How long the orchestrator may be unresponsive before the agent gives up.
     pub orchestrator_timeout: Duration,
     /// Updated for monitoring.
@@ -110,6 +110,7 @@ impl Agent {
         let slots = self.joined.slots();
         let uplink = Arc::clone(&self.uplink);
         let mut over = pin!(uplink.address().wait_until_over());
+        let mut stop = pin!(self.stopping.cancelled().fuse());
         let mut state = AgentState::new(self.uplink, self.joined, self.metrics);
         state.metrics().mixture_version = Some(state.joined.newest().await.version());
         state.start(slots);
@@ -125,13 +126,14 @@ impl Agent {
                 joined = answer_to(&mut state.joining) => state.has_joined(joined?),
                 (told, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(told, took)? { watch(AgentEvent::Stop) },
                 _ = ticks.tick() => state.poll(self.orchestrator_timeout)?.into_iter().for_each(&mut watch),
+                () = &mut stop => {}
                 // The orchestrator no longer knew of this agent, or it would have waited.
                 () = &mut over => {
                     state.pool.dismiss_idle();
                     return Ok(AgentExit::Done);
                 }
             }
-            if self.stopping.load(Ordering::Relaxed) {
+            if self.stopping.is_cancelled() {
                 state.pool.dismiss_idle();
                 if state.pool.is_idle() {
                     break;

@@ -190,7 +190,7 @@ async fn names(store: &Store) -> Vec<String> {
 
 async fn history(store: &Store) -> Vec<LabelRecord> {
     let structure = store.known_hashes().await.unwrap()[0];
-    store.label_history(structure, protocol("dft").hash).await.unwrap()
+    store.labels_of(structure).await.unwrap().into_iter().map(|label| label.record).collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -281,7 +281,7 @@ async fn a_label_is_not_lost_while_the_database_is_locked() {
     let mut other = other.connect().await.unwrap();
     sqlx::query("BEGIN IMMEDIATE").execute(&mut other).await.unwrap();
     gate.open.store(true, Ordering::Relaxed);
-    labeller.shutdown.stop();
+    labeller.shutdown.stop.cancel();
     tokio::time::sleep(Duration::from_secs(35)).await;
     assert!(!labeller.task.is_finished());
     assert_eq!(number(&store, JobState::Labelled).await, 0);
@@ -333,7 +333,7 @@ async fn a_stop_waits_for_the_current_label_while_heartbeats_continue() {
     let gate = Gate::default();
     let labeller = Labeller::serving(directory.path(), &gate).await;
     gate.wait_for_labels(1).await;
-    labeller.shutdown.stop();
+    labeller.shutdown.stop.cancel();
     let own = async || store.processes(Some("labeller")).await.unwrap().remove(0);
     until("nobody can see that it stops", async || own().await.state == "stopping").await;
     let first = own().await.last_seen;
@@ -356,7 +356,7 @@ async fn a_label_that_outlasts_the_grace_period_is_released() {
     let labeller = Labeller::with(directory.path(), &gate, settings).await;
     gate.wait_for_labels(1).await;
     let started = Instant::now();
-    labeller.shutdown.stop();
+    labeller.shutdown.stop.cancel();
     labeller.ended().await.unwrap();
     assert!(started.elapsed() >= Duration::from_millis(300));
     assert_eq!((number(&store, JobState::Queued).await, names(&store).await), (1, vec![]));

@@ -121,13 +121,8 @@ impl NeighbourList {
         &self.neighbours[self.later[i]..self.offsets[i + 1]]
     }
 
-    /// The index of each [neighbour](Self::neighbours_of) of atom `i` in [`NeighbourList::site_positions`].
-    #[inline]
-    pub fn sites_of(&self, i: usize) -> &[u32] {
-        &self.sites.of_neighbour[self.offsets[i]..self.offsets[i + 1]]
-    }
-
-    /// The indices of its [later neighbours](Self::later_neighbours_of).
+    /// The index of each [later neighbour](Self::later_neighbours_of) of atom `i` in
+    /// [`NeighbourList::site_positions`].
     #[inline]
     pub fn later_sites_of(&self, i: usize) -> &[u32] {
         &self.sites.of_neighbour[self.later[i]..self.offsets[i + 1]]

@@ -96,17 +96,16 @@ fn each_pair_comes_once_and_stands_at_its_site(
     prop_assert_eq!(&sites[..structure.len()], &structure.positions[..]);
     let mut pairs = 0;
     for i in 0..structure.len() {
-        for (neighbour, site) in list.neighbours_of(i).iter().zip(list.sites_of(i)) {
-            let d = atoms::cell::sub(sites[*site as usize], structure.positions[i]);
-            let off = atoms::cell::norm(atoms::cell::sub(d, neighbour.displacement(structure, i)));
-            prop_assert!(off < 1e-10, "site {} of atom {} is off by {} Å", site, i, off);
-        }
         let own = Neighbour { atom: i as u32, image: [0; 3] };
         let later: Vec<Neighbour> =
             list.neighbours_of(i).iter().copied().filter(|neighbour| *neighbour > own).collect();
         prop_assert_eq!(list.later_neighbours_of(i), later.as_slice());
-        prop_assert!(list.sites_of(i).ends_with(list.later_sites_of(i)));
         prop_assert_eq!(list.later_sites_of(i).len(), later.len());
+        for (neighbour, site) in later.iter().zip(list.later_sites_of(i)) {
+            let d = atoms::cell::sub(sites[*site as usize], structure.positions[i]);
+            let off = atoms::cell::norm(atoms::cell::sub(d, neighbour.displacement(structure, i)));
+            prop_assert!(off < 1e-10, "site {} of atom {} is off by {} Å", site, i, off);
+        }
         pairs += later.len();
     }
     let directed: usize = (0..structure.len()).map(|i| list.neighbours_of(i).len()).sum();

@@ -14,7 +14,6 @@ pub struct Axis {
     /// Upper end.
     pub high: f64,
     ticks: Vec<Tick>,
-    has_labels: bool,
 }
 
 /// Approximate number of labelled ticks.
@@ -26,7 +25,7 @@ impl Axis {
     pub fn new(title: &str, scale: Scale, low: f64, high: f64) -> Self {
         let (low, high) = range(scale, low, high);
         let ticks = ticks::choose(scale, low, high, DEFAULT_TICKS);
-        Self { title: title.into(), scale, low, high, ticks, has_labels: true }
+        Self { title: title.into(), scale, low, high, ticks }
     }
 
     /// A categorical axis: the first category is centred at ½, the next at 1½, and so on.
@@ -34,14 +33,14 @@ impl Axis {
         let tick = |(k, name): (usize, &String)| Tick { position: k as f64 + 0.5, label: name.clone() };
         let ticks = names.iter().enumerate().map(tick).collect();
         let high = names.len().max(1) as f64;
-        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks }
     }
 
     /// An axis of equally wide bins with labels at these positions; 1 is the end of the first bin.
     pub fn binned(title: &str, bins: usize, words: impl IntoIterator<Item = (f64, String)>) -> Self {
         let ticks = words.into_iter().map(|(position, label)| Tick { position, label }).collect();
         let high = bins.max(1) as f64;
-        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks }
     }
 
     /// Sets the approximate number of ticks.
@@ -62,12 +61,6 @@ impl Axis {
         self
     }
 
-    /// Removes title and tick labels, for an axis shared with another panel.
-    pub fn without_labels(mut self) -> Self {
-        self.has_labels = false;
-        self
-    }
-
     /// Relative position of a value: 0 at the start, 1 at the end. Values without a position are far before the
     /// start.
     pub fn position(&self, value: f64) -> f64 {
@@ -79,11 +72,6 @@ impl Axis {
     /// The ticks.
     pub(crate) fn ticks(&self) -> &[Tick] {
         &self.ticks
-    }
-
-    /// Whether title and tick labels are drawn.
-    pub(crate) fn has_labels(&self) -> bool {
-        self.has_labels
     }
 }
 

@@ -82,12 +82,6 @@ impl Panel {
         self.line([[x, low], [x, high]], Colour::GREY.dashed(0.7));
     }
 
-    /// Draws a dashed horizontal line at y.
-    pub fn horizontal_line(&mut self, y: f64) {
-        let (low, high) = (self.x.low, self.x.high);
-        self.line([[low, y], [high, y]], Colour::GREY.dashed(0.7));
-    }
-
     /// Draws text at data coordinates with an offset in points.
     pub fn text(&mut self, at: Point, [right, down]: Point, words: &str, anchor: Anchor) -> &mut Text {
         let [x, y] = self.to_sheet(at);
@@ -148,15 +142,13 @@ impl Panel {
             let x = self.area.x + self.area.width * self.x.position(tick.position);
             let length = if tick.label.is_empty() { SMALL_TICK } else { TICK };
             figure.line(vec![[x, bottom], [x, bottom + length]], Colour::INK.line(AXIS));
-            if self.x.has_labels() && !tick.label.is_empty() {
+            if !tick.label.is_empty() {
                 figure.text([x, bottom + 11.0], &tick.label, Anchor::Middle);
             }
         }
-        if self.x.has_labels() {
-            let middle = self.area.x + 0.5 * self.area.width;
-            let below = if self.x.ticks().is_empty() { 12.0 } else { 23.0 };
-            figure.text([middle, bottom + below], &self.x.title, Anchor::Middle);
-        }
+        let middle = self.area.x + 0.5 * self.area.width;
+        let below = if self.x.ticks().is_empty() { 12.0 } else { 23.0 };
+        figure.text([middle, bottom + below], &self.x.title, Anchor::Middle);
     }
 
     fn draw_vertical(&self, figure: &mut Figure) {
@@ -165,15 +157,13 @@ impl Panel {
             let y = self.area.bottom() - self.area.height * self.y.position(tick.position);
             let length = if tick.label.is_empty() { SMALL_TICK } else { TICK };
             figure.line(vec![[left, y], [left - length, y]], Colour::INK.line(AXIS));
-            if self.y.has_labels() && !tick.label.is_empty() {
+            if !tick.label.is_empty() {
                 figure.text([left - 5.0, y + 0.35 * Text::SIZE], &tick.label, Anchor::End);
                 widest = widest.max(Text::SIZE * crate::width(&tick.label, false));
             }
         }
-        if self.y.has_labels() {
-            let middle = self.area.y + 0.5 * self.area.height;
-            figure.text([left - widest - 10.0, middle], &self.y.title, Anchor::Middle).rotated = true;
-        }
+        let middle = self.area.y + 0.5 * self.area.height;
+        figure.text([left - widest - 10.0, middle], &self.y.title, Anchor::Middle).rotated = true;
     }
 
     fn shape<L: IntoIterator<Item = Point>>(

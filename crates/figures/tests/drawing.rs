@@ -16,13 +16,13 @@ fn figure() -> Figure {
     panel.line([[0.1, 0.5], [10.0, 1.5]], Colour::VERMILLION.line(1.0));
     panel.dots([[1.0, 1.0], [2.0, 1.2]], Marker::Disc, 2.0, Colour::VERMILLION, None);
     panel.dots([[3.0, 1.0]], Marker::Square, 2.0, Colour::BLUE, Some(Colour::WHITE.line(0.5)));
-    panel.bar([0.2, 0.0], [0.3, 1.0], Colour::GREEN.into());
+    panel.bar([0.2, 0.0], [0.3, 1.0], Colour::GREY.into());
     panel.vertical_line(1.0);
     panel.text([1.0, 1.0], [2.0, -2.0], "γ = 1", Anchor::Start);
     panel.panel_letter('a');
     panel.draw(&mut figure);
     let margin = Rectangle { x: 50.0, y: 20.0, width: 120.0, height: 18.0 };
-    let bare = Axis::new("", Scale::Linear, 0.0, 1.0).without_ticks().without_labels();
+    let bare = Axis::new("", Scale::Linear, 0.0, 1.0).without_ticks();
     Panel::new(margin, bare.clone(), bare).draw_as_margin(&mut figure, Side::Below);
     legend(&mut figure, [170.0, 12.0], &[(LegendKey::Line(Colour::BLUE.dashed(1.0)), "control & more")]);
     figure

@@ -10,13 +10,13 @@
 use std::io::{Read, Write};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
 use atoms::{Cell, Species, Structure};
 use calm::{Component, Mixture};
 use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
 use wire::ipc::{ConnectInfo, IpcWalker, Server, Sizes, space_needed};
 use wire::messages::{Assignment, Outcome, Progress, Report};
 use wire::mixture::SharedMixture;
@@ -91,7 +91,7 @@ fn bare_wake_ups() {
 
 /// The walker's process: all sizes in sequence.
 fn walk(door: &ConnectInfo) {
-    let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
+    let mut walker = IpcWalker::connect(door, CancellationToken::new()).expect("an orchestrator");
     let mut checked = walker.exchange(None).expect("an assignment").assignment.number;
     println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
     for (atoms, features) in SIZES {

@@ -2,11 +2,11 @@
 //! [`Incoming`], and a walker uses a [`Transport`].
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use calm::Mixture;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
 
 use crate::block::{Candidate, CandidateBlock};
 use crate::ids::WalkId;
@@ -63,12 +63,12 @@ pub enum Incoming {
 pub struct InProcess {
     walker: u32,
     to_reactor: mpsc::Sender<Incoming>,
-    stopping: Arc<AtomicBool>,
+    stopping: CancellationToken,
 }
 
 impl InProcess {
-    /// The end of walker number `walker`. Setting `stopping` asks the walker to stop.
-    pub fn new(walker: u32, to_reactor: mpsc::Sender<Incoming>, stopping: Arc<AtomicBool>) -> Self {
+    /// The end of walker number `walker`. Cancelling `stopping` asks the walker to stop.
+    pub fn new(walker: u32, to_reactor: mpsc::Sender<Incoming>, stopping: CancellationToken) -> Self {
         Self { walker, to_reactor, stopping }
     }
 }
@@ -89,7 +89,7 @@ impl Transport for InProcess {
     }
 
     fn stopping(&self) -> bool {
-        self.stopping.load(Ordering::Relaxed)
+        self.stopping.is_cancelled()
     }
 }
 

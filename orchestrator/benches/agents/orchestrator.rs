@@ -1,7 +1,6 @@
 //! The orchestrator.
 
 use std::process::{Command, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -10,7 +9,7 @@ use orchestrator::selector::Settings;
 use store::Fate;
 use tokio::sync::mpsc;
 use tokio::time::{interval, sleep};
-use wire::net::{AgentBootstrap, AgentServer};
+use wire::net::{AgentBootstrap, AgentServer, StopTokens};
 
 use crate::database::Database;
 use crate::recording::Model;
@@ -39,11 +38,10 @@ pub async fn lead(plan: Plan) {
     store.commit(&selector.start_walks()).await.unwrap();
     let server =
         AgentServer::open(&endpoint(plan), None, 1, AGENT_TIMEOUT, AgentBootstrap::default()).await.unwrap();
-    let (handle, stopping) = (server.handle(), Arc::new(AtomicBool::new(false)));
+    let tokens = StopTokens::default();
     // The same capacity as in `calmwalk run`.
     let (to_reactor, incoming) = mpsc::channel(64);
-    let server =
-        tokio::spawn(server.run(Arc::clone(selector.mixture()), Arc::clone(&stopping), to_reactor, |_| {}));
+    let server = tokio::spawn(server.run(Arc::clone(selector.mixture()), tokens.clone(), to_reactor, |_| {}));
     let program = std::env::current_exe().unwrap();
     let arguments = [plan.rate, plan.duration.as_secs_f64(), f64::from(plan.port), plan.begun];
     let arguments = arguments.map(|number| number.to_string());
@@ -51,15 +49,16 @@ pub async fn lead(plan: Plan) {
 
     let log = Arc::new(Mutex::new(Log::default()));
     let memory = tokio::spawn(watch_memory(plan));
-    let stop = Arc::clone(&stopping);
+    let stop = tokens.stopping.clone();
     tokio::spawn(async move {
         sleep(Duration::from_secs_f64((plan.begun - now()).max(0.0)) + plan.duration).await;
-        stop.store(true, Ordering::Relaxed);
+        stop.cancel();
     });
+    let stopping = tokens.stopping;
     let reactor = Reactor { selector, store: store.clone(), incoming, stopping, queue_limit: u64::MAX };
     let writing = Arc::clone(&log);
     reactor.run(move |notice| writing.lock().unwrap().record(&notice, plan)).await.unwrap();
-    handle.close();
+    tokens.closing.cancel();
     server.await.unwrap().unwrap();
     let agents = agents.wait_with_output().unwrap();
     assert!(agents.status.success());

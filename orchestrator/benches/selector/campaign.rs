@@ -10,6 +10,7 @@ use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{Mode, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use store::{Campaign, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
 use wire::messages::{Assignment, Outcome, Report, WalkEnd};
 use wire::transport::Incoming;
 use wire::{CandidateBlock, ContentHash};
@@ -127,8 +128,13 @@ pub async fn run(
     let mut selector = selector(model, walks, settings);
     store.commit(&selector.start_walks()).await.unwrap();
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
-    let reactor =
-        Reactor { selector, store: store.clone(), incoming, stopping: Arc::default(), queue_limit: u64::MAX };
+    let reactor = Reactor {
+        selector,
+        store: store.clone(),
+        incoming,
+        stopping: CancellationToken::new(),
+        queue_limit: u64::MAX,
+    };
     let offers: Arc<Vec<_>> =
         Arc::new(recording.iter().map(|blocks| Mutex::new(blocks.clone().into_iter())).collect());
     let (begun, used) = (Instant::now(), processor_time());

@@ -5,7 +5,6 @@ mod trajectory;
 
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use atoms::Potential;
@@ -50,7 +49,7 @@ impl Md {
         let mut dynamics = Dynamics::new(state, settings, &mut *potential).map_err(|error| {
             Failure::Input(format!("{}:{}: {error}", config.structure.get_ref().display(), start.line))
         })?;
-        let stopping = signals::stop_flag()?;
+        let stopping = signals::stop_token()?;
         let mut trajectory = Trajectory::create(&path)?;
         let started = Instant::now();
         let progress = Progress::new(&config);
@@ -59,7 +58,7 @@ impl Md {
             if dynamics.state().step.is_multiple_of(config.output.every.get()) {
                 trajectory.push(dynamics)?;
             }
-            Ok(!stopping.load(Ordering::Relaxed))
+            Ok(!stopping.is_cancelled())
         });
         drop(progress);
         let (frames, file) = (trajectory.frames, path.display());

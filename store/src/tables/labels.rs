@@ -2,7 +2,6 @@
 //! old one. Nothing is overwritten. An excluded label still makes later results checks.
 
 use atoms::Vec3;
-use wire::ContentHash;
 
 use super::queue::{end_attempt, job_row};
 use super::relabel::status_of_result;
@@ -95,21 +94,6 @@ impl Store {
         finish_job(&mut transaction, job.structure, job.protocol, now).await?;
         transaction.commit().await?;
         Ok(if status == LabelStatus::Label { CompleteOutcome::Label } else { CompleteOutcome::KeptAsCheck })
-    }
-
-    /// Every label and check of a structure under a protocol, oldest first.
-    pub async fn label_history(
-        &self,
-        structure: ContentHash,
-        protocol: ContentHash,
-    ) -> Result<Vec<LabelRecord>> {
-        let sql = "SELECT label.* FROM label
-                   JOIN structure ON structure.number = label.structure
-                   JOIN protocol ON protocol.number = label.protocol
-                   WHERE structure.hash = $1 AND protocol.hash = $2 ORDER BY label.number";
-        let query = query(sql).bind(structure.0.to_vec()).bind(protocol.0.to_vec());
-        let rows: Vec<LabelRow> = query.fetch_all(&self.database).await?;
-        rows.into_iter().map(LabelRow::into_record).collect()
     }
 }
 

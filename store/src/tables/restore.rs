@@ -164,12 +164,6 @@ impl Store {
     pub async fn candidate(&self, id: &str) -> Result<Option<StoredCandidate>> {
         query(CANDIDATE_OF_NAME).bind(id).fetch_optional(&self.database).await
     }
-
-    /// Names of all candidates in decision order, at most `limit` after decision `after`.
-    pub async fn candidate_ids(&self, after: i64, limit: u32) -> Result<Vec<(i64, String)>> {
-        let sql = "SELECT decision, id FROM candidate WHERE decision > $1 ORDER BY decision LIMIT $2";
-        query(sql).bind(after).bind(limit).fetch_all(&self.database).await
-    }
 }
 
 async fn components(from: impl Into<Target<'_>>) -> Result<Vec<ComponentRecord>> {

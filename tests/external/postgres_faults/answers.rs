@@ -144,9 +144,8 @@ fn answers_to_commits_get_lost_and_no_job_does() {
             let left = store.queue_list(Some(state), 9, 0).await.unwrap();
             assert!(left.is_empty(), "{left:#?} {}", place.said());
         }
-        let protocol = store.protocols().await.unwrap()[0].hash;
         for structure in &structures {
-            let labels = store.label_history(ContentHash::from_structure(structure), protocol).await.unwrap();
+            let labels = store.labels_of(ContentHash::from_structure(structure)).await.unwrap();
             assert_eq!(labels.len(), 1, "{labels:?}");
         }
     });

@@ -13,6 +13,7 @@ use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::sync::OnceCell;
 use tokio::task::spawn_blocking;
+use tokio_util::sync::CancellationToken;
 
 use super::calculation_handle::{CalculationHandle, CalculationState};
 use super::calculation_runner::{Calculation, CalculationEnd, EndReason, WORK};
@@ -22,13 +23,12 @@ use super::prepare::{PreparedInput, prepare, read, write};
 use super::scratch::{self, ScratchRoot};
 use super::slurm::{self, Slurm};
 use super::{
-    BatchSystem, ExecutionSettings, RunnerCommand, Shutdown, SingleLabel, log, private_directory,
-    retry_until_written,
+    BatchSystem, ExecutionSettings, RunnerCommand, SingleLabel, log, private_directory, retry_until_written,
 };
 
 /// Minimum time allowed for reading results, even if the calculation used up its time limit.
 const MIN_READ_TIME: Duration = Duration::from_secs(60);
-/// Time allowed for reading results after a shutdown request.
+/// Time allowed for reading results after a stop request.
 const READ_GRACE: Duration = Duration::from_secs(5);
 
 /// Labels by another program, and how to run it.
@@ -81,7 +81,7 @@ impl CodeMethod {
     }
 
     /// Finds the calculation that an earlier attempt started here, or starts one, and waits for its end. `None` if
-    /// its results could not be read within seconds after a shutdown request.
+    /// its results could not be read within seconds after a stop request.
     ///
     /// # Errors
     /// Errors of the database, and if no calculation can be started on this host, whatever the structure.
@@ -89,7 +89,7 @@ impl CodeMethod {
         &self,
         store: &Store,
         lease: &Lease,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
     ) -> Result<Option<LabelAttempt>, StoreError> {
         let prepared = match self.prepare(lease.structure.clone(), failure_classes(lease)).await {
             Ok(prepared) => prepared,
@@ -97,8 +97,7 @@ impl CodeMethod {
         };
         let record = async |handle: &CalculationHandle| {
             let identity = handle.identity();
-            retry_until_written(shutdown, || store.record_calculation(lease, &identity, &prepared.record))
-                .await
+            retry_until_written(stop, || store.record_calculation(lease, &identity, &prepared.record)).await
         };
         let handle = match self.find(&lease.earlier_calculations).await? {
             Some((handle, found)) => {
@@ -110,13 +109,13 @@ impl CodeMethod {
                 handle
             }
             None => {
-                let directory = self.scratch_root(store, shutdown).await?.make(lease.job, lease.attempt)?;
+                let directory = self.scratch_root(store, stop).await?.make(lease.job, lease.attempt)?;
                 let ready = self.prepare_directory(&directory, &prepared, &failed_nodes(lease)).await?;
                 record(&ready.handle()).await?;
                 self.start(ready).await?
             }
         };
-        let outcome = self.outcome(lease.structure.clone(), handle, prepared.time_limit, shutdown).await?;
+        let outcome = self.outcome(lease.structure.clone(), handle, prepared.time_limit, stop).await?;
         let Some(attempt) = outcome else { return Ok(None) };
         if let Some(failed) = failed_on_node(&attempt) {
             record(&failed).await?;
@@ -151,7 +150,7 @@ impl CodeMethod {
         let directory = private_directory::make_inside(root, &scratch::name(1, 1))
             .map_err(|error| file_error(root, error))?;
         let handle = self.start(self.prepare_directory(&directory, prepared, &[]).await?).await?;
-        let never = Shutdown::default();
+        let never = CancellationToken::new();
         let attempt = self.outcome(structure.clone(), handle, prepared.time_limit, &never).await?;
         Ok(attempt.expect("nobody asks to stop"))
     }
@@ -174,13 +173,13 @@ impl CodeMethod {
     pub(super) async fn scratch_root(
         &self,
         store: &Store,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
     ) -> Result<&ScratchRoot, StoreError> {
         let make = async || {
-            let campaign = retry_until_written(shutdown, || store.campaign()).await?.id;
+            let campaign = retry_until_written(stop, || store.campaign()).await?.id;
             let root = ScratchRoot::for_campaign(&self.execution.scratch(), campaign);
             root.prepare()?;
-            root.cleanup(store, self.execution.keep, &self.slurm, shutdown).await?;
+            root.cleanup(store, self.execution.keep, &self.slurm, stop).await?;
             Ok(root)
         };
         self.root.get_or_try_init(make).await
@@ -272,13 +271,13 @@ impl CodeMethod {
     }
 
     /// Waits for the end of a calculation of at most `time_limit` s and reads its results; `None` if that takes too
-    /// long after a shutdown request.
+    /// long after a stop request.
     async fn outcome(
         &self,
         structure: Structure,
         handle: CalculationHandle,
         time_limit: f64,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
     ) -> Result<Option<LabelAttempt>, StoreError> {
         let Some(end) = handle.wait(&self.slurm).await? else {
             return self.lost_calculation(handle).await.map(Some);
@@ -287,7 +286,7 @@ impl CodeMethod {
         tokio::select! {
             attempt = self.read(structure, handle, end, left.max(MIN_READ_TIME)) => attempt.map(Some),
             () = async {
-                shutdown.stop_requested().await;
+                stop.cancelled().await;
                 tokio::time::sleep(READ_GRACE).await;
             } => Ok(None),
         }
@@ -382,12 +381,12 @@ impl CodeMethod {
         &self,
         store: &Store,
         lease: &Lease,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
         ended: EndedCalculation,
         failed: bool,
     ) -> Result<(), StoreError> {
         if self.execution.keep.keeps(failed) {
-            scratch::pack(store, lease.job, lease.attempt, shutdown, ended.handle.directory()).await?;
+            scratch::pack(store, lease.job, lease.attempt, stop, ended.handle.directory()).await?;
         }
         ended.handle.remove().await?;
         self.reap();

@@ -5,9 +5,10 @@ use dft::Results;
 use monitor::energy_offsets::energy_offsets;
 use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
+use tokio_util::sync::CancellationToken;
 
+use super::retry_until_written;
 use super::validate::EnergyReference;
-use super::{Shutdown, retry_until_written};
 
 /// The fit is repeated when this labeller has made 1/8 as many new labels as the last fit used.
 const REFIT_DIVISOR: usize = 8;
@@ -28,11 +29,11 @@ impl Offsets {
         protocol: &Protocol,
         lease: &Lease,
         result: &Result<Results, dft::Failure>,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
     ) -> Result<Option<EnergyReference<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };
         if self.until_refit == 0 {
-            self.fitted = retry_until_written(shutdown, || energy_offsets(store, protocol.hash)).await?.ok();
+            self.fitted = retry_until_written(stop, || energy_offsets(store, protocol.hash)).await?.ok();
             self.until_refit =
                 self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT_DIVISOR).max(1);
         }

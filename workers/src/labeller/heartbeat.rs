@@ -35,7 +35,7 @@ pub async fn serve(
 ) -> Result<(), StoreError> {
     let (interval, exit_policy) = (settings.timing.heartbeat_interval, settings.exit_policy);
     // A lease whose holder has no record would be released.
-    retry_until_written(shutdown, || store.upsert_process(&process)).await?;
+    retry_until_written(&shutdown.stop, || store.upsert_process(&process)).await?;
     let holder = settings.holder.clone();
     let ended = tokio::select! {
         ended = run(store.clone(), method, settings, shutdown, &now, tell) => ended,
@@ -44,8 +44,8 @@ pub async fn serve(
     match ended {
         Ok(()) => {
             // A lease without a holder would stay until another process looks for such leases.
-            retry_until_written(shutdown, || store.state_leases(&holder, &[], now())).await?;
-            retry_until_written(shutdown, || store.remove_process(&process.id)).await
+            retry_until_written(&shutdown.stop, || store.state_leases(&holder, &[], now())).await?;
+            retry_until_written(&shutdown.stop, || store.remove_process(&process.id)).await
         }
         Err(error) => match record_failure(&store, process, &error, now()).await {
             // This explains why everything else fails.
@@ -82,7 +82,7 @@ async fn send_heartbeat(
 ) -> Result<(), StoreError> {
     let others = store.processes(None).await?;
     if others.iter().any(|other| other.replaces(process)) {
-        shutdown.stop();
+        shutdown.stop.cancel();
     }
     let led = others.iter().any(ProcessRecord::is_leading);
     let is_over = match exit_policy {
@@ -96,7 +96,7 @@ async fn send_heartbeat(
         store.release_leases_of_dead_processes(now).await?;
     }
     process.last_seen = now;
-    if shutdown.is_stopping() {
+    if shutdown.stop.is_cancelled() {
         process.state = "stopping".to_owned();
     }
     store.upsert_process(process).await

@@ -8,10 +8,11 @@ use dft::{DftBackend, Failure, Results, Size};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
+use tokio_util::sync::CancellationToken;
 
 use super::code::{CodeMethod, EndedCalculation, failure_classes};
 use super::validate::{EnergyReference, LabelBounds, validate};
-use super::{ExecutionSettings, ReferenceMethod, RunnerCommand, Shutdown};
+use super::{ExecutionSettings, ReferenceMethod, RunnerCommand};
 
 /// A way to make labels.
 pub enum Method {
@@ -78,10 +79,10 @@ impl Method {
     }
 
     /// Prepares the scratch directory, and removes what killed labellers left.
-    pub(super) async fn start(&self, store: &Store, shutdown: &Shutdown) -> Result<(), StoreError> {
+    pub(super) async fn start(&self, store: &Store, stop: &CancellationToken) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.scratch_root(store, shutdown).await.map(drop),
+            Self::Code(method) => method.scratch_root(store, stop).await.map(drop),
         }
     }
 
@@ -104,30 +105,30 @@ impl Method {
         &self,
         store: &Store,
         lease: &Lease,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
         ended: EndedCalculation,
         failed: bool,
     ) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.archive(store, lease, shutdown, ended, failed).await,
+            Self::Code(method) => method.archive(store, lease, stop, ended, failed).await,
         }
     }
 
-    /// Makes the result of a job. A potential runs on a thread of its own. `None` if a shutdown was requested and
+    /// Makes the result of a job. A potential runs on a thread of its own. `None` if a stop was requested and
     /// reading the result would take longer.
     pub(super) async fn make(
         &self,
         store: &Store,
         lease: &Lease,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
     ) -> Result<Option<LabelAttempt>, StoreError> {
         match self {
             Self::Reference(method) => {
                 let result = evaluate(Arc::clone(method), lease.structure.clone()).await;
                 Ok(Some(LabelAttempt { result, ended: None }))
             }
-            Self::Code(method) => method.make(store, lease, shutdown).await,
+            Self::Code(method) => method.make(store, lease, stop).await,
         }
     }
 

@@ -34,22 +34,23 @@ use std::time::{Duration, Instant};
 use dft::{Failure, FailureClass, Results};
 use store::records::{Label, LabelDetails, Lease, Protocol};
 use store::{LeaseStatus, Store, StoreError};
+use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
+
+use code::EndedCalculation;
+use energies::Offsets;
+use method::LabelAttempt;
+use report_line::DeliveryOutcome;
 
 pub use calculation_runner::{RunnerCommand, run_calculation};
 pub use code::CodeMethod;
-use code::EndedCalculation;
-use energies::Offsets;
 pub use execution::{BatchSystem, ExecutionSettings, KeepDirectories};
 pub use guard::{GUARD, LabelGuard, Pair};
 pub use heartbeat::{ExitPolicy, serve};
-use method::LabelAttempt;
 pub use method::Method;
 pub use reference::ReferenceMethod;
-use report_line::DeliveryOutcome;
 pub use retry::retry_until_written;
 pub use shutdown::Shutdown;
-use shutdown::ShutdownState;
 pub use single_label::{SingleLabel, label_structure};
 pub use validate::LabelBounds;
 
@@ -158,18 +159,19 @@ async fn label_jobs(
         tell(line);
     };
     let (mut idle, mut offsets) = (Duration::ZERO, Offsets::default());
-    method.start(store, shutdown).await?;
+    let stop = &shutdown.stop;
+    method.start(store, stop).await?;
     loop {
-        let requested = shutdown.state();
-        if requested.stop {
+        if stop.is_cancelled() {
             return Ok(());
         }
-        let lease = match poll_queue(store, settings, requested.no_more_jobs, now()).await {
+        let no_more_jobs = shutdown.no_more_jobs();
+        let lease = match poll_queue(store, settings, no_more_jobs, now()).await {
             Ok(QueuePoll::Job(lease)) => lease,
             Ok(QueuePoll::Finished) => return Ok(()),
             Err(error) if !error.is_transient() => return Err(error),
             polled => {
-                idle += wait(store, idle, settings.timing.idle, polled.is_ok(), shutdown, requested).await;
+                idle += wait(store, idle, settings.timing.idle, polled.is_ok(), shutdown, no_more_jobs).await;
                 continue;
             }
         };
@@ -177,13 +179,13 @@ async fn label_jobs(
         debug!(candidate = lease.candidate, job = lease.job, attempt = lease.attempt, "leased");
         let started = Instant::now();
         let size = method.size(&lease.structure);
-        if let Some(reason) = retry_until_written(shutdown, || guard::refusal(store, &lease, size)).await? {
+        if let Some(reason) = retry_until_written(stop, || guard::refusal(store, &lease, size)).await? {
             // Another attempt would be refused as well, whatever was tried before.
-            retry_until_written(shutdown, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
+            retry_until_written(stop, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
             announce(&format!("refused {}: {reason}", lease.candidate));
             continue;
         }
-        let attempt = match make_label(store, method, &lease, &settings.timing, shutdown, &now).await? {
+        let attempt = match make_label(store, method, &lease, &settings.timing, stop, &now).await? {
             LeaseOutcome::Done(attempt) => *attempt,
             LeaseOutcome::NotWanted => {
                 method.stop().await?;
@@ -201,23 +203,23 @@ async fn label_jobs(
                     "{} continues and is left to the next labeller on this host",
                     lease.candidate
                 ));
-                return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
+                return retry_until_written(stop, || store.release_all(&settings.holder, now()))
                     .await
                     .map(drop);
             }
             LeaseOutcome::GraceExpired => {
                 method.stop().await?;
                 announce(&format!("released {}: there is no time to finish it", lease.candidate));
-                return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
+                return retry_until_written(stop, || store.release_all(&settings.holder, now()))
                     .await
                     .map(drop);
             }
         };
         let reference =
-            offsets.energy_reference(store, &settings.protocol, &lease, &attempt.result, shutdown).await?;
+            offsets.energy_reference(store, &settings.protocol, &lease, &attempt.result, stop).await?;
         let attempt = attempt.validated(&lease, &settings.bounds, reference);
         let Delivered { validated, outcome, ended } =
-            deliver_attempt(store, method, &lease, settings, attempt, shutdown, &now).await?;
+            deliver_attempt(store, method, &lease, settings, attempt, stop, &now).await?;
         let line = report_line::format_report(&lease, &validated, &outcome, started.elapsed().as_secs_f64());
         match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
@@ -227,7 +229,7 @@ async fn label_jobs(
         }
         tell(&line);
         if let Some(ended) = ended {
-            method.archive(store, &lease, shutdown, ended, validated.is_err()).await?;
+            method.archive(store, &lease, stop, ended, validated.is_err()).await?;
         }
     }
 }
@@ -246,19 +248,19 @@ async fn deliver_attempt(
     lease: &Lease,
     settings: &LabellerSettings,
     attempt: LabelAttempt,
-    shutdown: &Shutdown,
+    stop: &CancellationToken,
     now: impl Fn() -> i64,
 ) -> Result<Delivered, StoreError> {
     let LabelAttempt { result: validated, ended } = attempt;
     let log = ended.as_ref().map_or("", |ended| &ended.log);
     if let Some(ended) = &ended {
-        retry_until_written(shutdown, || store.record_cost(lease, ended.core_seconds, log)).await?;
+        retry_until_written(stop, || store.record_cost(lease, ended.core_seconds, log)).await?;
     }
     // A failure without a remedy is not tried again.
     let no_remedy = validated.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
     let attempts = if no_remedy { 1 } else { settings.attempts };
     let outcome =
-        retry_until_written(shutdown, || deliver(store, lease, &validated, log, attempts, now())).await?;
+        retry_until_written(stop, || deliver(store, lease, &validated, log, attempts, now())).await?;
     Ok(Delivered { validated, outcome, ended })
 }
 
@@ -297,7 +299,7 @@ async fn release_unknown_leases(
     Ok(())
 }
 
-/// Waits until there may be work, or until the shutdown state differs from `requested`. `idle` is the time without
+/// Waits until there may be work, or until a stop is requested or `no_more_jobs` is no longer so. `idle` is the time without
 /// work so far. Returns the longest time that it may have waited.
 async fn wait(
     store: &Store,
@@ -305,7 +307,7 @@ async fn wait(
     least: Duration,
     answers: bool,
     shutdown: &Shutdown,
-    requested: ShutdownState,
+    no_more_jobs: bool,
 ) -> Duration {
     let wait = match answers && store.has_job_notifications() {
         true => NOTIFIED_POLL_INTERVAL,
@@ -313,7 +315,7 @@ async fn wait(
     };
     tokio::select! {
         () = store.wait_for_jobs(wait) => {}
-        () = shutdown.changed_from(requested) => {}
+        () = shutdown.changed_from(no_more_jobs) => {}
     }
     wait
 }
@@ -339,15 +341,15 @@ async fn make_label(
     method: &Method,
     lease: &Lease,
     timing: &Timing,
-    shutdown: &Shutdown,
+    stop: &CancellationToken,
     now: impl Fn() -> i64,
 ) -> Result<LeaseOutcome, StoreError> {
-    let mut labelling = pin!(method.make(store, lease, shutdown));
-    let mut too_late = pin!(end_of_grace(timing.grace, shutdown));
+    let mut labelling = pin!(method.make(store, lease, stop));
+    let mut too_late = pin!(end_of_grace(timing.grace, stop));
     // Labellers without a grace period are followed by others, which find the calculation.
     let leaves = timing.grace.is_none() && method.outlives_labeller();
     let mut leave = pin!(async {
-        end_of_grace(leaves.then_some(DETACH_DELAY), shutdown).await;
+        end_of_grace(leaves.then_some(DETACH_DELAY), stop).await;
         while method.calculation().is_none() {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
@@ -388,10 +390,10 @@ async fn make_label(
     }
 }
 
-async fn end_of_grace(grace: Option<Duration>, shutdown: &Shutdown) {
+async fn end_of_grace(grace: Option<Duration>, stop: &CancellationToken) {
     match grace {
         Some(grace) => {
-            shutdown.stop_requested().await;
+            stop.cancelled().await;
             tokio::time::sleep(grace).await;
         }
         None => std::future::pending().await,

@@ -3,29 +3,28 @@
 use std::time::{Duration, Instant};
 
 use store::StoreError;
-
-use super::Shutdown;
+use tokio_util::sync::CancellationToken;
 
 /// Time between two tries.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
-/// How long to retry after a shutdown request.
-const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(60);
+/// How long to retry after a stop request.
+const STOP_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Calls `write` until it succeeds, fails permanently, or a minute has passed since `shutdown` was requested.
+/// Calls `write` until it succeeds, fails permanently, or a minute has passed since `stop` was cancelled.
 ///
 /// # Errors
 /// The last error of `write`.
 pub async fn retry_until_written<T, F: Future<Output = Result<T, StoreError>>>(
-    shutdown: &Shutdown,
+    stop: &CancellationToken,
     write: impl FnMut() -> F,
 ) -> Result<T, StoreError> {
-    retry_for(RETRY_INTERVAL, SHUTDOWN_TIMEOUT, shutdown, write).await
+    retry_for(RETRY_INTERVAL, STOP_TIMEOUT, stop, write).await
 }
 
 async fn retry_for<T, F: Future<Output = Result<T, StoreError>>>(
     interval: Duration,
     timeout: Duration,
-    shutdown: &Shutdown,
+    stop: &CancellationToken,
     mut write: impl FnMut() -> F,
 ) -> Result<T, StoreError> {
     let mut asked_to_stop = None;
@@ -34,7 +33,7 @@ async fn retry_for<T, F: Future<Output = Result<T, StoreError>>>(
             Err(error) if error.is_transient() => error,
             done => return done,
         };
-        if shutdown.is_stopping() && asked_to_stop.get_or_insert_with(Instant::now).elapsed() >= timeout {
+        if stop.is_cancelled() && asked_to_stop.get_or_insert_with(Instant::now).elapsed() >= timeout {
             return Err(error);
         }
         tokio::time::sleep(interval).await;
@@ -51,9 +50,9 @@ mod tests {
 
     #[tokio::test]
     async fn writes_are_retried_until_success_or_a_permanent_error() {
-        let shutdown = Shutdown::default();
+        let stop = CancellationToken::new();
         let mut tries = 0;
-        let written = retry_for(SHORT, Duration::ZERO, &shutdown, || {
+        let written = retry_for(SHORT, Duration::ZERO, &stop, || {
             tries += 1;
             ready(match tries {
                 1..20 => Err(StoreError::Busy),
@@ -63,7 +62,7 @@ mod tests {
         });
         assert_eq!(written.await.unwrap(), 40);
         let mut tries = 0;
-        let refused = retry_for(SHORT, Duration::ZERO, &shutdown, || {
+        let refused = retry_for(SHORT, Duration::ZERO, &stop, || {
             tries += 1;
             ready(Err::<(), _>(if tries < 3 { StoreError::Busy } else { StoreError::ReadOnly }))
         });
@@ -73,12 +72,12 @@ mod tests {
 
     #[tokio::test]
     async fn retries_continue_for_a_while_after_a_stop_request() {
-        let (shutdown, mut tries, mut asked) = (Shutdown::default(), 0, None);
+        let (stop, mut tries, mut asked) = (CancellationToken::new(), 0, None);
         let timeout = Duration::from_millis(50);
-        let full = retry_for(SHORT, timeout, &shutdown, || {
+        let full = retry_for(SHORT, timeout, &stop, || {
             tries += 1;
             if tries == 20 {
-                shutdown.stop();
+                stop.cancel();
                 asked = Some(Instant::now());
             }
             ready(Err::<(), _>(StoreError::DiskFull))

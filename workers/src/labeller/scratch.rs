@@ -11,13 +11,14 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use store::{Store, StoreError};
+use tokio_util::sync::CancellationToken;
 use wire::CampaignId;
 
 use super::calculation_handle::{CalculationHandle, CalculationState};
 use super::code::{blocking, file_error};
 use super::execution::KeepDirectories;
 use super::slurm::{self, Slurm};
-use super::{Shutdown, local, pack, private_directory, retry_until_written};
+use super::{local, pack, private_directory, retry_until_written};
 
 /// Directories younger than this may still be in use and are not removed.
 const MIN_AGE: Duration = Duration::from_secs(60);
@@ -77,12 +78,12 @@ impl ScratchRoot {
         store: &Store,
         keep: KeepDirectories,
         slurm: &Slurm,
-        shutdown: &Shutdown,
+        stop: &CancellationToken,
     ) -> Result<(), StoreError> {
         for root in self.all()? {
             let entries = fs::read_dir(&root).map_err(|error| file_error(&root, error))?;
             for directory in entries.flatten().map(|entry| entry.path()).filter(|path| is_old(path)) {
-                cleanup_one(store, &directory, keep, slurm, shutdown).await?;
+                cleanup_one(store, &directory, keep, slurm, stop).await?;
             }
         }
         Ok(())
@@ -124,12 +125,12 @@ pub(super) async fn pack(
     store: &Store,
     job: i64,
     attempt: u32,
-    shutdown: &Shutdown,
+    stop: &CancellationToken,
     directory: &Path,
 ) -> Result<(), StoreError> {
     let from = directory.to_owned();
     let packed = blocking(move || pack::pack(&from)).await.map_err(|error| file_error(directory, error))?;
-    retry_until_written(shutdown, || store.keep_archive(job, attempt, &packed.bytes, &packed.left_out)).await
+    retry_until_written(stop, || store.keep_archive(job, attempt, &packed.bytes, &packed.left_out)).await
 }
 
 async fn cleanup_one(
@@ -137,10 +138,10 @@ async fn cleanup_one(
     directory: &Path,
     keep: KeepDirectories,
     slurm: &Slurm,
-    shutdown: &Shutdown,
+    stop: &CancellationToken,
 ) -> Result<(), StoreError> {
     let Some((job, attempt)) = job_and_attempt(directory) else { return Ok(()) };
-    let past = retry_until_written(shutdown, || store.past_calculation(job, attempt)).await?;
+    let past = retry_until_written(stop, || store.past_calculation(job, attempt)).await?;
     // It belongs to a copy of this campaign.
     let Some(past) = past.filter(|past| !past.wanted) else { return Ok(()) };
     let handle = past.calculation.as_deref().and_then(CalculationHandle::parse);
@@ -150,7 +151,7 @@ async fn cleanup_one(
         None => true,
     };
     if is_over && keep.keeps(past.failed) {
-        pack(store, job, attempt, shutdown, directory).await?;
+        pack(store, job, attempt, stop, directory).await?;
     }
     if is_over {
         let cleared = directory.to_owned();

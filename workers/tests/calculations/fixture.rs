@@ -200,7 +200,7 @@ impl Fixture {
 
     pub async fn labels(&self) -> Vec<LabelRecord> {
         let structure = self.store.known_hashes().await.unwrap()[0];
-        self.store.label_history(structure, protocol("dft").hash).await.unwrap()
+        self.store.labels_of(structure).await.unwrap().into_iter().map(|label| label.record).collect()
     }
 
     /// Ids of running processes started by calculations of this fixture.

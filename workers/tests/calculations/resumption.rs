@@ -96,7 +96,7 @@ async fn a_stopped_labeller_ends_the_calculation_after_the_grace_period_and_rele
     let grace = Some(Duration::from_millis(300));
     let labeller = fixture.labeller_with(|settings| settings.timing.grace = grace).await;
     fixture.wait_until_begun(1).await;
-    labeller.shutdown.stop();
+    labeller.shutdown.stop.cancel();
     labeller.ended().await.unwrap();
     assert_eq!(outcomes(&fixture.attempts().await), [("released", None)]);
     fixture.nothing_is_left();
@@ -105,7 +105,7 @@ async fn a_stopped_labeller_ends_the_calculation_after_the_grace_period_and_rele
     let labeller =
         fixture.labeller_with(|settings| settings.timing.grace = Some(Duration::from_secs(60))).await;
     fixture.wait_until_begun(2).await;
-    labeller.shutdown.stop();
+    labeller.shutdown.stop.cancel();
     labeller.ended().await.unwrap();
     assert_eq!((fixture.job().await.job.state, fixture.labels().await.len()), (JobState::Labelled, 1));
     fixture.nothing_is_left();
@@ -117,7 +117,7 @@ async fn a_stopped_labeller_without_a_grace_period_leaves_the_calculation_to_the
     let fixture = Fixture::new(1, WITH_CHILDREN).await;
     let labeller = fixture.labeller().await;
     fixture.wait_until_begun(1).await;
-    labeller.shutdown.stop();
+    labeller.shutdown.stop.cancel();
     labeller.ended().await.unwrap();
     assert_eq!(outcomes(&fixture.attempts().await), [("released", None)]);
     assert!(!fixture.processes().is_empty());
@@ -136,7 +136,7 @@ async fn a_stopped_labeller_ends_even_if_results_cannot_be_read() {
         let labeller = fixture.labeller_with(|settings| settings.timing.grace = grace).await;
         fixture.wait_until_begun(1).await;
         until("it does not end", async || fixture.processes().is_empty()).await;
-        labeller.shutdown.stop();
+        labeller.shutdown.stop.cancel();
         labeller.ended().await.unwrap();
         assert_eq!(outcomes(&fixture.attempts().await), [("released", None)]);
         // The next labeller reads the results.

@@ -114,16 +114,6 @@ impl Projection {
         1 + self.blocks.len()
     }
 
-    /// The bytes that identify this map: a mixture can grade the features of all models with equal bytes.
-    pub fn fingerprint(&self) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(4 * self.matrix.len() + 24);
-        bytes.extend((self.dimension as u64).to_le_bytes());
-        bytes.extend([self.normalize, self.density_channels, self.asinh].map(u8::from));
-        bytes.extend(self.density_scale.to_le_bytes());
-        bytes.extend(self.matrix.iter().flat_map(|x| x.to_le_bytes()));
-        bytes
-    }
-
     /// Replaces ‖B_k‖ with the factor of layer k's basis in its cotangent.
     #[inline(always)]
     fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {

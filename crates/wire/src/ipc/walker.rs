@@ -4,14 +4,13 @@ use std::borrow::Cow;
 use std::cell::Cell;
 use std::fmt::Display;
 use std::mem::MaybeUninit;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
+use tokio_util::sync::CancellationToken;
 use zerocopy::IntoBytes;
 
 use super::config::{self, ClientPort, Pending, Service};
@@ -44,7 +43,7 @@ pub struct IpcWalker {
     wakeup: Listener<Service>,
     server_wakeup: Notifier<Service>,
     mixtures: MixtureReader,
-    stopping: Arc<AtomicBool>,
+    stopping: CancellationToken,
     sequence: u64,
     failure: Option<IpcError>,
     encoding: Cell<Duration>,
@@ -63,11 +62,11 @@ impl Drop for PendingAnswer {
 }
 
 impl IpcWalker {
-    /// Connects to the orchestrator. Setting `stopping` asks the walker to stop.
+    /// Connects to the orchestrator. Cancelling `stopping` asks the walker to stop.
     ///
     /// # Errors
     /// The orchestrator is not running, or an error of iceoryx2.
-    pub fn connect(connect_info: &ConnectInfo, stopping: Arc<AtomicBool>) -> Result<Self, IpcError> {
+    pub fn connect(connect_info: &ConnectInfo, stopping: CancellationToken) -> Result<Self, IpcError> {
         let ConnectInfo { sender, .. } = *connect_info;
         let node = config::node(&connect_info.directory, &connect_info.prefix)?;
         let wakeup = config::create_walker_wakeup(&node, sender)?;
@@ -218,7 +217,7 @@ impl Transport for IpcWalker {
     }
 
     fn stopping(&self) -> bool {
-        self.stopping.load(Ordering::Relaxed)
+        self.stopping.is_cancelled()
     }
 }
 

@@ -1,7 +1,6 @@
 //! The orchestrator's end: a task that receives requests of agents, answers them, and forwards reports to the reactor.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use calm::Mixture;
@@ -9,6 +8,7 @@ use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
+use tokio_util::sync::CancellationToken;
 use zenoh::Session;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::pubsub::Subscriber;
@@ -52,26 +52,18 @@ pub struct AgentServer {
     session: Session,
     queries: Queryable<FifoChannelHandler<Query>>,
     liveliness: Subscriber<FifoChannelHandler<Sample>>,
-    commands: mpsc::UnboundedReceiver<Close>,
-    handle: AgentServerHandle,
     session_id: u64,
     agent_timeout: Duration,
     bootstrap: AgentBootstrap,
 }
 
-/// Controls the server's task.
-#[derive(Clone, Debug)]
-pub struct AgentServerHandle(mpsc::UnboundedSender<Close>);
-
-#[derive(Debug)]
-struct Close;
-
-impl AgentServerHandle {
-    /// There is no more work: [`AgentServer::run`] returns when the last agent has left.
-    pub fn close(&self) {
-        // Fails only if the server has already ended.
-        let _ = self.0.send(Close);
-    }
+/// Tell an [`AgentServer`] to stop.
+#[derive(Clone, Debug, Default)]
+pub struct StopTokens {
+    /// Cancelled to ask the agents to stop.
+    pub stopping: CancellationToken,
+    /// Cancelled when there is no more work: [`AgentServer::run`] returns when the last agent has left.
+    pub closing: CancellationToken,
 }
 
 impl AgentServer {
@@ -96,19 +88,7 @@ impl AgentServer {
         let channel = zenoh::handlers::FifoChannel::new(QUEUE_LENGTH);
         let liveliness = session.liveliness().declare_subscriber(format!("{AGENTS}/*")).with(channel);
         let liveliness = liveliness.await.map_err(failed)?;
-        let (sender, commands) = mpsc::unbounded_channel();
-        let handle = AgentServerHandle(sender);
-        Ok(Self {
-            endpoint,
-            session,
-            queries,
-            liveliness,
-            commands,
-            handle,
-            session_id,
-            agent_timeout,
-            bootstrap,
-        })
+        Ok(Self { endpoint, session, queries, liveliness, session_id, agent_timeout, bootstrap })
     }
 
     /// The endpoint it listens on.
@@ -116,28 +96,23 @@ impl AgentServer {
         &self.endpoint
     }
 
-    /// Handle for stopping the server.
-    pub fn handle(&self) -> AgentServerHandle {
-        self.handle.clone()
-    }
-
-    /// Handles requests of agents and forwards reports to the reactor until [`AgentServerHandle::close`], and then
-    /// until every agent has left or is lost. `mixture` is the current mixture. Setting `stopping` asks agents to stop.
-    /// `on_event` is called for every event of an agent.
+    /// Handles requests of agents and forwards reports to the reactor until [`StopTokens::closing`], and then
+    /// until every agent has left or is lost. `mixture` is the current mixture. `on_event` is called for every event
+    /// of an agent.
     ///
     /// # Errors
     /// The zenoh session was closed.
     pub async fn run(
-        mut self,
+        self,
         mixture: Arc<Mixture>,
-        stopping: Arc<AtomicBool>,
+        StopTokens { stopping, closing }: StopTokens,
         to_reactor: mpsc::Sender<Incoming>,
         mut on_event: impl FnMut(AgentEvent) + Send + 'static,
     ) -> Result<(), NetError> {
         let files = Files::new(self.bootstrap.files);
         let mut state =
             ServerSession::new(self.session_id, self.agent_timeout, self.bootstrap.setup, mixture, stopping);
-        let mut closing = false;
+        let mut is_closing = false;
         let mut decisions = FuturesUnordered::new();
         let mut expiry = tokio::time::interval(EXPIRY_INTERVAL);
         expiry.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -145,7 +120,7 @@ impl AgentServer {
             tokio::select! {
                 // Complete aborted decisions before the reactor learns of the reason.
                 biased;
-                _ = self.commands.recv(), if !closing => closing = true,
+                () = closing.cancelled(), if !is_closing => is_closing = true,
                 Some((slot, work)) = decisions.next() => state.handle_decision(slot, work),
                 permit = to_reactor.reserve(), if !state.outbox.is_empty() => match permit {
                     Ok(permit) => if let Some(incoming) = state.outbox.pop_front() { permit.send(incoming) },
@@ -166,7 +141,7 @@ impl AgentServer {
                 _ = expiry.tick() => state.expire(Instant::now()),
             }
             state.events.drain(..).for_each(&mut on_event);
-            if closing && state.has_no_agents() {
+            if is_closing && state.has_no_agents() {
                 break;
             }
         }

@@ -34,7 +34,7 @@ use std::path::PathBuf;
 
 pub use address::{Address, Announcement};
 pub use agent_client::{AgentClient, LinkError, Membership};
-pub use agent_server::{AgentEvent, AgentServer, AgentServerHandle};
+pub use agent_server::{AgentEvent, AgentServer, StopTokens};
 pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
 pub use delta::DeltaError;
 pub use endpoint::{Endpoint, EndpointError};

@@ -5,13 +5,13 @@ use std::collections::{BTreeMap, VecDeque};
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use calm::Mixture;
 use futures_util::future::{AbortHandle, abortable};
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
@@ -48,7 +48,7 @@ pub(super) struct ServerSession {
     session: u64,
     setup: Vec<u8>,
     /// Whether agents should stop.
-    stopping: Arc<AtomicBool>,
+    stopping: CancellationToken,
     registry: AgentRegistry,
     sequences: SequenceTracker,
     /// Routes of answers, and the mixture of each assignment, kept until its report.
@@ -73,7 +73,7 @@ impl ServerSession {
         agent_timeout: Duration,
         setup: Vec<u8>,
         mixture: Arc<Mixture>,
-        stopping: Arc<AtomicBool>,
+        stopping: CancellationToken,
     ) -> Self {
         Self {
             outbox: VecDeque::new(),
@@ -140,7 +140,7 @@ impl ServerSession {
             }
             Request::Ping { session } => {
                 self.check_session(session)?;
-                let stopping = self.stopping.load(Ordering::Relaxed);
+                let stopping = self.stopping.is_cancelled();
                 self.send(query.clone(), &Reply::Pong { stopping });
             }
             Request::Leave { session, id } => {

@@ -2,14 +2,13 @@
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::thread::sleep;
 use std::time::Duration;
 
 use atoms::{Cell, Species, Structure};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
+use tokio_util::sync::CancellationToken;
 use wire::ipc::{ConnectInfo, IpcWalker};
 use wire::messages::{Assignment, Outcome, Report};
 use wire::transport::Transport;
@@ -56,7 +55,7 @@ fn child() {
 }
 
 fn walk(door: &ConnectInfo, stuck: bool) {
-    let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).unwrap();
+    let mut walker = IpcWalker::connect(door, CancellationToken::new()).unwrap();
     let mut report = None;
     while let Some(work) = walker.exchange(report.take()) {
         let Assignment { walk, number, .. } = work.assignment;

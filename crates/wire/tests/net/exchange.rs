@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
 use wire::WalkId;
 use wire::messages::Progress;
@@ -116,7 +115,7 @@ async fn agents_fetch_files_by_hash_and_learn_of_a_stop() {
         "{refused}"
     );
     assert_eq!(membership.is_stopping().await.unwrap(), Some(false));
-    server.stopping.store(true, Ordering::Relaxed);
+    server.tokens.stopping.cancel();
     assert_eq!(membership.is_stopping().await.unwrap(), Some(true));
     membership.leave().await;
     server.close().await;

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -14,8 +13,8 @@ use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
 use wire::messages::{Assignment, Outcome, Progress, Report};
 use wire::net::{
-    Agent, AgentBootstrap, AgentClient, AgentEvent, AgentServer, AgentServerHandle, Endpoint, Membership,
-    NetError, Tls,
+    Agent, AgentBootstrap, AgentClient, AgentEvent, AgentServer, Endpoint, Membership, NetError, StopTokens,
+    Tls,
 };
 use wire::transport::{Incoming, WorkItem};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
@@ -28,10 +27,9 @@ pub const AGENT_TIMEOUT: Duration = Duration::from_secs(40);
 /// An orchestrator in this process.
 pub struct TestServer {
     pub port: u16,
-    pub handle: AgentServerHandle,
     pub incoming: mpsc::Receiver<Incoming>,
     pub events: Arc<Mutex<Vec<AgentEvent>>>,
-    pub stopping: Arc<AtomicBool>,
+    pub tokens: StopTokens,
     pub task: JoinHandle<Result<(), NetError>>,
 }
 
@@ -65,13 +63,13 @@ impl TestServer {
         let welcome = AgentBootstrap { setup: b"the setup".to_vec(), files };
         let hub =
             AgentServer::open(&endpoint(port), tls.as_ref(), session, agent_timeout, welcome).await.unwrap();
-        let (handle, stopping) = (hub.handle(), Arc::new(AtomicBool::new(false)));
+        let tokens = StopTokens::default();
         let (to_reactor, incoming) = mpsc::channel(4);
         let events = Arc::new(Mutex::new(Vec::new()));
         let note = Arc::clone(&events);
         let note = move |event| note.lock().unwrap().push(event);
-        let task = tokio::spawn(hub.run(mixture, Arc::clone(&stopping), to_reactor, note));
-        Self { port, handle, incoming, events, stopping, task }
+        let task = tokio::spawn(hub.run(mixture, tokens.clone(), to_reactor, note));
+        Self { port, incoming, events, tokens, task }
     }
 
     pub async fn next(&mut self) -> Incoming {
@@ -100,7 +98,7 @@ impl TestServer {
 
     /// Closes the server; returns when every agent has left.
     pub async fn close(self) {
-        self.handle.close();
+        self.tokens.closing.cancel();
         timeout(LIMIT, self.task).await.expect("in time").unwrap().unwrap();
     }
 
