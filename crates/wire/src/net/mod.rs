@@ -17,6 +17,7 @@
 
 mod address;
 mod agent_client;
+mod agent_event;
 mod agent_server;
 mod certificates;
 mod delta;
@@ -25,6 +26,7 @@ mod files;
 mod handshake;
 mod message;
 mod registry;
+mod replies;
 mod session;
 mod slot;
 
@@ -34,7 +36,8 @@ use std::path::PathBuf;
 
 pub use address::{Address, Announcement};
 pub use agent_client::{AgentClient, LinkError, Membership};
-pub use agent_server::{AgentEvent, AgentServer, AgentServerHandle};
+pub use agent_event::AgentEvent;
+pub use agent_server::{AgentServer, AgentServerHandle};
 pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
 pub use delta::DeltaError;
 pub use endpoint::{Endpoint, EndpointError};
