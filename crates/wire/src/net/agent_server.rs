@@ -16,9 +16,10 @@ use zenoh::sample::{Sample, SampleKind};
 
 use super::agent_event::AgentEvent;
 use super::certificates::Tls;
-use super::endpoint::{self, Endpoint, Side};
+use super::endpoint::{self, Endpoint};
 use super::message::{AGENTS, ORCHESTRATOR};
 use super::session::AgentSession;
+use super::side::Side;
 use super::{AgentBootstrap, NetError};
 use crate::transport::Incoming;
 

@@ -28,6 +28,7 @@ mod message;
 mod registry;
 mod replies;
 mod session;
+mod side;
 mod slot;
 
 use std::collections::BTreeMap;
