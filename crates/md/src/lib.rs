@@ -9,6 +9,7 @@
 
 mod checkpoint;
 mod dynamics;
+mod error;
 mod nose_hoover;
 mod random;
 mod state;
@@ -16,7 +17,8 @@ mod thermostat;
 mod volume_ramp;
 
 pub use checkpoint::Checkpoint;
-pub use dynamics::{Dynamics, DynamicsError, Settings, default_time_step};
+pub use dynamics::{Dynamics, Settings, default_time_step};
+pub use error::DynamicsError;
 pub use nose_hoover::NoseHooverChain;
 pub use random::{Stream, StreamId, philox};
 pub use state::{State, kinetic_energy, masses, maxwell_boltzmann, momentum, temperature};
