@@ -9,7 +9,6 @@ use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
 use wire::ContentHash;
 
-use super::validate::EnergyReference;
 use super::{Shutdown, retry_until_written};
 
 /// Number of labels in the fit: the newest ones.
@@ -41,6 +40,15 @@ pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> Labelle
         *counts.entry(species.atomic_number()).or_default() += 1;
     }
     LabelledEnergy { composition: counts.into_iter().collect(), model, label }
+}
+
+/// The reference for the energy of a label.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct EnergyReference<'a> {
+    /// Energy by the potential, eV.
+    pub model: f64,
+    /// Offsets of the elements, fitted to the labels so far.
+    pub offsets: &'a EnergyOffsets,
 }
 
 /// A labeller's current offsets.

@@ -13,9 +13,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use store::{Store, StoreError};
 use wire::CampaignId;
 
-use super::calculation_handle::{CalculationHandle, CalculationState};
-use super::code::{blocking, file_error};
+use super::blocking::blocking;
+use super::calculation_handle::CalculationHandle;
+use super::calculation_state::CalculationState;
 use super::execution::KeepDirectories;
+use super::file_error::file_error;
 use super::slurm::{self, Slurm};
 use super::{Shutdown, local, pack, private_directory, retry_until_written};
 
