@@ -10,11 +10,13 @@ use store::records::{Commit, ComponentRecord, Decision, WalkRecord};
 use wire::{ContentHash, WalkId};
 
 use super::backlog::Backlog;
+use super::error::SelectorError;
+use super::regrade::Regrader;
 use super::rules::{ChangeableRules, RULES};
+use super::settings::{SeedStructure, SelectorSnapshot, Settings};
+use super::staleness::{STALENESS, Staleness};
+use super::training_frames::TrainingFrames;
 use super::walk::Walk;
-use super::{
-    Regrader, STALENESS, SeedStructure, SelectorError, SelectorSnapshot, Settings, Staleness, TrainingFrames,
-};
 use crate::grader::Grader;
 
 /// Decides on candidates and walks.
