@@ -12,9 +12,9 @@ use crate::Store;
 use crate::database::{Database, query};
 use crate::error::Result;
 use crate::sqlite::DatabaseFile;
+use crate::tables::attempt_end::{AttemptEnd, end_without_label};
 use crate::tables::logs::insert_operation;
 use crate::tables::processes::LEASED;
-use crate::tables::queue::{AttemptEnd, end_without_label};
 
 impl Store {
     /// Copies a snapshot of the campaign into a new directory `target`, which appears once it is complete and on

@@ -5,16 +5,7 @@ use serde::Serialize;
 use wire::ContentHash;
 
 use crate::jobs::LabelRecord;
-use crate::records::Protocol;
-
-/// A candidate, by decision and name.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub struct CandidateRef {
-    /// Sequence number of the decision on it.
-    pub decision: i64,
-    /// Its name.
-    pub candidate: String,
-}
+use crate::records::{CandidateRef, Protocol};
 
 /// A structure imported with its label.
 #[derive(Clone, Debug, PartialEq)]

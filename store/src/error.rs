@@ -7,8 +7,9 @@ use sqlx::postgres::PgDatabaseError;
 use wire::{BlockError, WalkId};
 
 use crate::JobState;
-use crate::candidate_history::CandidateRef;
+use crate::file_names::DATABASE;
 use crate::numbers::NumbersError;
+use crate::records::CandidateRef;
 
 /// The result type of this crate.
 pub type Result<T> = std::result::Result<T, StoreError>;
@@ -335,7 +336,7 @@ fn from_sqlite(code: i32, error: sqlx::Error) -> StoreError {
     match if code == IOERR_SHMSIZE { FULL } else { code & 0xff } {
         5 | 6 => StoreError::Busy,
         8 => StoreError::ReadOnly,
-        11 | 26 => StoreError::damaged(crate::DATABASE, error),
+        11 | 26 => StoreError::damaged(DATABASE, error),
         FULL => StoreError::DiskFull,
         _ => StoreError::Database(error),
     }

@@ -16,6 +16,7 @@ mod encoding;
 mod error;
 mod exclude;
 mod export;
+mod file_names;
 mod filesystem;
 mod jobs;
 mod listing;
@@ -41,12 +42,13 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 pub use budget::{Budget, BudgetStatus, BudgetUse};
 pub use candidate_history::{
-    CandidateRef, CoveredCandidate, ImportedStructure, LaterCoveredCandidates, SameStructure, StructureLabel,
+    CoveredCandidate, ImportedStructure, LaterCoveredCandidates, SameStructure, StructureLabel,
 };
 pub use check::Finding;
 pub use error::{Result, StoreError};
 pub use exclude::{ExcludedLabel, Exclusion, ExclusionChange};
 pub use export::{ExportCursor, ExportFilter, ExportRow, ExportSource};
+pub use file_names::{DATABASE, LOCK};
 pub use filesystem::{check_directory, free_space, network_file_system};
 pub use jobs::{
     Archive, Attempt, CalculationRecord, CompleteOutcome, FailOutcome, ImportCounts, Job, JobDetails,
@@ -54,21 +56,21 @@ pub use jobs::{
 };
 pub use listing::{ListCursor, ListOrder, ListedCandidate};
 pub use location::{Location, ServerUrl};
-pub use lock::{CampaignLock, LOCK};
+pub use lock::CampaignLock;
 pub use numbers::NumbersError;
 pub use outcomes::{
     FailureCount, FinishedCandidate, LabelCost, LabelUsage, LabelledEnergies, NearDuplicate, PendingJobs,
     Unlabelled, ValueRange,
 };
+pub use postgres::SERVER_RECONNECT_TIMEOUT;
 pub use process_start::{is_local, is_running, process_start_time};
 pub use processes::{ProcessRecord, this_host};
 pub use recent::{DecidedCandidate, RecentDecision};
 pub use records::*;
 pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 pub use report::{CollectedStructure, FateCount};
-pub use sqlite::DATABASE;
 pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
-pub use store::{SERVER_RECONNECT_TIMEOUT, Store};
+pub use store::Store;
 pub use walk_progress::WalkProgress;
 
 /// The current time, ms since 1970.

@@ -10,11 +10,9 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
 use crate::error::{Result, StoreError};
+use crate::file_names::LOCK;
 use crate::location::Location;
 use crate::postgres::leadership::Leadership;
-
-/// Name of the lock file in the campaign's directory.
-pub const LOCK: &str = "campaign.lock";
 
 /// The right to run a campaign. Released on drop.
 #[derive(Debug)]

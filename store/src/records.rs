@@ -32,6 +32,15 @@ pub struct Campaign {
     pub configuration_in_force: String,
 }
 
+/// A candidate, by decision and name.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub struct CandidateRef {
+    /// Sequence number of the decision on it.
+    pub decision: i64,
+    /// Its name.
+    pub candidate: String,
+}
+
 /// A structure where walks start.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SeedStructure {

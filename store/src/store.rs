@@ -1,4 +1,4 @@
-//! Creating and opening a campaign.
+//! The store of a campaign, and how it is opened.
 
 use std::time::Duration;
 
@@ -7,13 +7,7 @@ use crate::error::Result;
 use crate::location::Location;
 use crate::lock::CampaignLock;
 use crate::postgres::Server;
-use crate::records::{Campaign, SeedStructure};
 use crate::sqlite::DatabaseFile;
-use crate::tables::protocols;
-
-/// How long a run and every commit wait for a server that cannot be reached. A run has nothing else to do
-/// meanwhile; a run that gives up continues later from the same state, but somebody has to start it.
-pub const SERVER_RECONNECT_TIMEOUT: Duration = Duration::from_secs(3600);
 
 /// The database of one campaign. Clones share its connections.
 #[derive(Clone, Debug)]
@@ -22,28 +16,6 @@ pub struct Store {
 }
 
 impl Store {
-    /// Creates a campaign on a server or in an existing directory. The caller holds its [`crate::CampaignLock`].
-    /// The campaign is created as a whole or not at all.
-    pub async fn create(
-        location: impl Into<Location>,
-        campaign: &Campaign,
-        seed_structures: &[SeedStructure],
-        now: i64,
-    ) -> Result<Self> {
-        let fill = async |database: &Database| {
-            protocols::write_campaign(database, campaign, seed_structures, now).await
-        };
-        let database = match location.into() {
-            Location::Directory(directory) => Database::Sqlite(DatabaseFile::create(&directory, fill).await?),
-            Location::Server(url) => {
-                let database = Database::Postgres(Server::create(&url, campaign.id).await?);
-                fill(&database).await?;
-                database
-            }
-        };
-        Ok(Self { database })
-    }
-
     /// Opens a campaign and migrates its tables to the newest version.
     pub async fn open(location: impl Into<Location>) -> Result<Self> {
         let database = match location.into() {

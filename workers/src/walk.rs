@@ -4,21 +4,22 @@
 //! report, on any walker and any number of times.
 
 mod candidate;
+mod error;
 mod state;
 
 use std::sync::Arc;
 
-use atoms::PotentialError;
 use calm::{CollectionRule, Mixture};
-use md::{Dynamics, DynamicsError, Stream};
+use md::{Dynamics, Stream};
+use potentials::Zbl;
 use potentials::grace::{Grace, GraceModel, Instructions, Threads};
-use potentials::{Zbl, ZblRangeError};
 use wire::messages::{Assignment, Outcome, Progress, Report, Verdict, WalkEnd};
 use wire::{Candidate, Origin};
 
 use crate::bias::{BiasedPotential, UngradedError};
 use crate::guard;
 use crate::settings::WalkSettings;
+use error::WalkError;
 use state::{CollectionPoint, WalkState, start};
 
 /// Data shared by every walk of a campaign.
@@ -30,23 +31,6 @@ pub struct WalkContext {
     pub threads: Threads,
     /// The settings.
     pub settings: Arc<WalkSettings>,
-}
-
-/// Why a walk cannot go on.
-#[derive(Debug, thiserror::Error)]
-enum WalkError {
-    #[error(transparent)]
-    Dynamics(#[from] DynamicsError),
-    #[error(transparent)]
-    Potential(#[from] PotentialError),
-    #[error(transparent)]
-    Ungraded(#[from] UngradedError),
-    #[error(transparent)]
-    Zbl(#[from] ZblRangeError),
-    #[error("the walk's checkpoint cannot be read: {0}")]
-    Checkpoint(#[from] postcard::Error),
-    #[error("{0}")]
-    BlewUp(String),
 }
 
 /// Runs an assignment until it ends: with a candidate, at its last step, with the end of the walk, or when

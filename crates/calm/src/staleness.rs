@@ -4,6 +4,9 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+/// Key under which the histogram of mixture ages ([`Staleness`], JSON) is committed.
+pub const STALENESS: &str = "staleness";
+
 /// Ages up to this value are counted exactly; larger ones are binned by their leading binary digits. The histogram
 /// stays small, and the error is at most 1/30.
 const EXACT: u64 = 1 << 6;

@@ -3,7 +3,7 @@
 use atoms::Evaluation;
 use serde::{Deserialize, Serialize};
 
-use crate::dynamics::DynamicsError;
+use crate::error::DynamicsError;
 use crate::random::Stream;
 use crate::state::State;
 use crate::thermostat::Thermostat;

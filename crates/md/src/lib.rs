@@ -9,6 +9,7 @@
 
 mod checkpoint;
 mod dynamics;
+mod error;
 mod langevin;
 mod nose_hoover;
 mod random;
@@ -17,7 +18,8 @@ mod thermostat;
 mod volume_ramp;
 
 pub use checkpoint::Checkpoint;
-pub use dynamics::{Dynamics, DynamicsError, Settings, default_time_step};
+pub use dynamics::{Dynamics, Settings, default_time_step};
+pub use error::DynamicsError;
 pub use langevin::{Langevin, LangevinSettings};
 pub use nose_hoover::{NoseHooverChain, NoseHooverSettings};
 pub use random::{Stream, StreamId, philox};

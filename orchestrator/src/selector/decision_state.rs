@@ -10,9 +10,12 @@ use store::records::{Commit, ComponentRecord, Decision, STALENESS, WalkRecord};
 use wire::{ContentHash, WalkId};
 
 use super::backlog::Backlog;
+use super::error::SelectorError;
+use super::regrade::Regrader;
 use super::rules::{ChangeableRules, RULES};
+use super::settings::{SeedStructure, SelectorSnapshot, Settings};
+use super::training_frames::TrainingFrames;
 use super::walk::Walk;
-use super::{Regrader, SeedStructure, SelectorError, SelectorSnapshot, Settings, TrainingFrames};
 use crate::grader::Grader;
 
 /// Decides on candidates and walks.

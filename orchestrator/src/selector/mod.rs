@@ -12,159 +12,34 @@
 mod backlog;
 mod decide;
 mod decision_state;
+mod error;
 mod regrade;
 mod replay;
 mod rules;
 mod scheduling;
+mod settings;
 mod start_walks;
+mod training_frames;
 mod walk;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use atoms::Structure;
-use calm::forgetting::ForgettingAlarm;
-use calm::{Mixture, MixtureError};
-use serde::{Deserialize, Serialize};
-use store::records::{Commit, ComponentRecord, WalkRecord};
+use calm::Mixture;
+use store::records::{Commit, WalkRecord};
 use wire::messages::{Outcome, Report, WalkEnd};
-use wire::{CampaignId, CandidateId, ContentHash, WalkId};
+use wire::{CampaignId, WalkId};
 
-use crate::grader::{Grader, GraderError};
+use crate::grader::Grader;
 use backlog::Backlog;
-pub use decide::TrainingFrames;
 use decision_state::DecisionState;
+pub use error::SelectorError;
 pub use regrade::{RegradedCandidate, RegradedReport, Regrader};
 pub use replay::{Replay, ReplayError, ReplayedDecision};
 pub use scheduling::Scheduling;
+pub use settings::{Mode, SeedStructure, SelectorSnapshot, Settings, UpdateProtocol};
+pub use training_frames::TrainingFrames;
 use walk::Walk;
-
-/// Whether a campaign is reproducible bit by bit, or walks never wait for each other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Mode {
-    /// Walks advance in rounds. Decisions do not depend on the number of walkers or on their speed.
-    Reproducible,
-    /// The mixture is updated as candidates arrive.
-    Live,
-}
-
-impl Mode {
-    /// The serialized name: `"reproducible"` or `"live"`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Reproducible => "reproducible",
-            Self::Live => "live",
-        }
-    }
-}
-
-/// What happens to the mixture between seed structures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum UpdateProtocol {
-    /// Updates accumulate over all seed structures.
-    Cumulative,
-    /// Each seed structure starts from the original mixture.
-    PerSeedStructure,
-    /// The mixture is never updated.
-    Never,
-}
-
-/// The settings of the selector.
-#[derive(Clone, Debug)]
-pub struct Settings {
-    /// Reproducible or live.
-    pub mode: Mode,
-    /// Number of biased walks that advance together in a round.
-    pub walks_per_round: usize,
-    /// Number of steps in an assignment.
-    pub steps_per_assignment: u64,
-    /// Carried, restarted or never.
-    pub update: UpdateProtocol,
-    /// How the covariance is updated, and when the search for α stops.
-    pub search: calm::UpdateSettings,
-    /// When the grades of the training frames raise an alarm.
-    pub forgetting_alarm: ForgettingAlarm,
-    /// When a structure is a candidate.
-    pub collection: calm::CollectionRule,
-    /// Maximum number of structures accepted from one seed structure.
-    pub max_per_seed_structure: u32,
-    /// Maximum number of structures accepted in the campaign.
-    pub max_structures: Option<u32>,
-    /// Whether each biased walk that collected structures is followed by its unbiased control walk.
-    pub control: bool,
-    /// Minimum distance between atoms, Å, and as a fraction of the shortest distance in the seed structure. Structures
-    /// with shorter distances are declined.
-    pub min_distance: (f64, f64),
-    /// Maximum size of the stored feature vectors of declined candidates, bytes.
-    pub declined_feature_bytes: u64,
-}
-
-/// The start of a walk.
-#[derive(Clone, Debug)]
-pub struct SeedStructure {
-    /// Name.
-    pub name: String,
-    /// Structure.
-    pub structure: Structure,
-}
-
-/// The state of a selector, as restored from a store.
-#[derive(Clone, Debug, Default)]
-pub struct SelectorSnapshot {
-    /// Every walk.
-    pub walks: Vec<WalkRecord>,
-    /// Components that differ from the original mixture.
-    pub components: Vec<ComponentRecord>,
-    /// Hashes of the known structures.
-    pub known: Vec<ContentHash>,
-    /// Number of known structures that were imported.
-    pub imported: u64,
-    /// Values of past commits.
-    pub values: Vec<(String, String)>,
-}
-
-/// Why the selector failed.
-#[derive(Debug, thiserror::Error)]
-pub enum SelectorError {
-    /// A candidate that cannot be graded.
-    #[error("candidate {candidate}: {source}")]
-    Grade {
-        /// The candidate.
-        candidate: CandidateId,
-        /// The error.
-        source: GraderError,
-    },
-    /// The mixture update failed.
-    #[error("updating the mixture for candidate {candidate}: {source}")]
-    Update {
-        /// The candidate.
-        candidate: CandidateId,
-        /// The error.
-        source: calm::UpdateError,
-    },
-    /// Components that do not form a mixture.
-    #[error(transparent)]
-    Mixture(#[from] MixtureError),
-    /// An unusable seed structure.
-    #[error("seed structure '{name}': {source}")]
-    SeedStructure {
-        /// Name of the seed structure.
-        name: String,
-        /// The error.
-        source: GraderError,
-    },
-    /// A database that does not match the campaign.
-    #[error("cannot continue the campaign's database: {0}")]
-    Snapshot(String),
-    /// Training frames that do not match the mixture.
-    #[error("grading the training frames: {source}")]
-    Training {
-        /// The error.
-        source: calm::GradeError,
-    },
-}
 
 /// The selector. See the [module](self).
 pub struct Selector {

@@ -7,7 +7,7 @@ use store::records::AtomGrades;
 use wire::CandidateBlock;
 use wire::messages::Report;
 
-use super::SelectorError;
+use super::error::SelectorError;
 use crate::grader::{Bonds, Grader};
 
 /// Grades candidates ahead of the decisions about them. Cheap to clone.

@@ -6,7 +6,7 @@ use calm::rules::Fraction;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::Settings;
+use super::settings::Settings;
 
 /// Key under which the rules are committed, and kind of the decision that records a change.
 pub(super) const RULES: &str = "rules";

@@ -5,7 +5,7 @@ use store::records::WalkRecord;
 use wire::messages::{Progress, Report, Verdict, WalkEnd};
 use wire::{Origin, WalkId};
 
-use super::SelectorError;
+use super::error::SelectorError;
 
 /// A walk: its stored record, and whether it is assigned.
 pub(super) struct Walk {

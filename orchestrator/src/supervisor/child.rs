@@ -2,7 +2,10 @@
 
 use std::time::Duration;
 
-use super::{Action, ChildState, ChildStatus, ExitReason, Limits};
+use super::action::Action;
+use super::child_status::{ChildState, ChildStatus};
+use super::exit_reason::ExitReason;
+use super::limits::Limits;
 
 /// State of a child, with the times that determine its next action.
 #[derive(Clone, Copy, Debug)]

@@ -10,115 +10,19 @@
 //! If a start fails because the host lacks file descriptors, processes or memory, this says nothing about the child:
 //! the start is repeated with the same doubling backoff, without limit.
 
+mod action;
 mod child;
+mod child_status;
 mod exit_reason;
+mod limits;
 
 use std::time::Duration;
 
+pub use action::Action;
 use child::{Child, State};
+pub use child_status::{ChildState, ChildStatus};
 pub use exit_reason::ExitReason;
-
-/// Timeouts and limits of a supervisor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
-    /// A child without heartbeat for this time is considered hung and killed.
-    pub heartbeat_timeout: Duration,
-    /// Delay before the restart after the first failure; doubles with each consecutive failure.
-    pub initial_backoff: Duration,
-    /// Maximum delay before a restart.
-    pub max_backoff: Duration,
-    /// Maximum number of consecutive restarts without a delivery; the child fails after that.
-    pub max_restarts: u32,
-    /// Time between asking a process to exit and killing it. Detached processes are left running instead.
-    pub grace_period: Duration,
-    /// Whether the children work for the campaign and not for the parent: they may continue without it, and exiting
-    /// while there is work is a failure, whatever the exit code.
-    pub detached: bool,
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        let seconds = Duration::from_secs;
-        Self {
-            heartbeat_timeout: seconds(120),
-            initial_backoff: seconds(1),
-            max_backoff: seconds(60),
-            max_restarts: 5,
-            grace_period: seconds(30),
-            detached: false,
-        }
-    }
-}
-
-/// What to do with a process.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Action {
-    /// Start it. It counts as started from now on; if the start fails, it has exited with [`ExitReason::StartFailed`].
-    Start {
-        /// Number of the child.
-        number: u32,
-        /// Start count of this child, from 1.
-        incarnation: u32,
-    },
-    /// Ask it to exit (SIGTERM).
-    Terminate {
-        /// Number of the child.
-        number: u32,
-    },
-    /// Kill it (SIGKILL).
-    Kill {
-        /// Number of the child.
-        number: u32,
-    },
-}
-
-/// State of a child.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ChildState {
-    /// Started, without a heartbeat so far.
-    Starting,
-    /// Running.
-    Running,
-    /// Waiting for a restart.
-    BackingOff {
-        /// Remaining time.
-        left: Duration,
-    },
-    /// Asked to exit, or killed, and still running.
-    Stopping,
-    /// Exited normally; it is not restarted.
-    Exited,
-    /// Failed too often; it is not restarted.
-    Failed,
-}
-
-impl std::fmt::Display for ChildState {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Starting => f.write_str("starting"),
-            Self::Running => f.write_str("running"),
-            Self::BackingOff { left } => write!(f, "backing off for {} s", left.as_secs_f64().ceil()),
-            Self::Stopping => f.write_str("stopping"),
-            Self::Exited => f.write_str("exited"),
-            Self::Failed => f.write_str("failed"),
-        }
-    }
-}
-
-/// Status of a child.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ChildStatus {
-    /// Number of the child.
-    pub number: u32,
-    /// Start count; 0 for an adopted process.
-    pub incarnation: u32,
-    /// State.
-    pub state: ChildState,
-    /// Number of restarts after a failure.
-    pub restarts: u32,
-    /// The last failure.
-    pub last_failure: Option<ExitReason>,
-}
+pub use limits::Limits;
 
 /// The exit of a process, as the supervisor interprets it.
 #[derive(Clone, Debug, PartialEq, Eq)]

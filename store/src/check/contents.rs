@@ -2,8 +2,8 @@
 
 use wire::{CandidateBlock, ContentHash};
 
-use super::Finding;
 use super::archives::Packed;
+use super::finding::Finding;
 use crate::checksum::{
     CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG_COLUMNS, Names, PROTOCOL, STRUCTURE,
 };

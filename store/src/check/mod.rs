@@ -5,29 +5,16 @@
 mod archives;
 mod contents;
 pub(crate) mod export;
+mod finding;
 mod rules;
-
-use std::fmt;
 
 use self::contents::Contents;
 use crate::Store;
 use crate::database::{Transaction, query};
 use crate::error::{Result, StoreError};
+use crate::tables::checksums;
 
-/// A violation found by a check.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Finding {
-    /// The finding, with an example.
-    pub what: String,
-    /// Its consequence, and what to do.
-    pub then: &'static str,
-}
-
-impl fmt::Display for Finding {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.what, self.then)
-    }
-}
+pub use self::finding::Finding;
 
 const RESTORE: &str = "the file is damaged; restore the campaign from a backup";
 
@@ -46,6 +33,14 @@ impl Store {
             checked => checked?,
         }
         Ok(findings)
+    }
+
+    /// Recomputes the checksum of every row, after rows were written without this program.
+    #[doc(hidden)]
+    pub async fn write_checksums(&self) -> Result<()> {
+        let mut transaction = self.database.begin_as_leader().await?;
+        checksums::fill(&mut transaction).await?;
+        transaction.commit().await
     }
 }
 

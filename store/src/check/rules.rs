@@ -1,6 +1,6 @@
 //! Invariants between rows.
 
-use super::Finding;
+use super::finding::Finding;
 use crate::database::{Transaction, query};
 use crate::error::Result;
 use crate::processes::ProcessRecord;

@@ -22,12 +22,11 @@ use sqlx::{ConnectOptions, Connection, Executor};
 use self::file_identity::FileIdentity;
 use crate::database::{Database, Transaction};
 use crate::error::{Result, StoreError};
+use crate::file_names::DATABASE;
 use crate::filesystem::check_directory;
 use crate::migrations::{Step, migrator};
 use crate::tables::checksums;
 
-/// File name of the database in the campaign's directory.
-pub const DATABASE: &str = "campaign.sqlite";
 /// Temporary name of the database while it is created.
 const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".

@@ -8,8 +8,8 @@ use crate::Store;
 use crate::check;
 use crate::records::{Campaign, Commit, ComponentRecord};
 use crate::tables::{
-    candidate_history, exclude, export, job_counts, labels, listing, outcomes, queue, queue_admin, recent,
-    status,
+    attempt_end, candidate_history, exclude, export, job_counts, listing, outcomes, queue, queue_admin,
+    recent, status, structures,
 };
 
 /// The store in a directory, and its file.
@@ -44,7 +44,7 @@ async fn frequent_queries_use_indexes() {
         queue::UNFINISHED,
         queue::HELD,
         queue::HELD_BY,
-        queue::LOSSES,
+        attempt_end::LOSSES,
         queue_admin::FIND,
         export::CANDIDATES,
         export::IMPORTS,
@@ -58,7 +58,7 @@ async fn frequent_queries_use_indexes() {
         candidate_history::AT_STEP,
         candidate_history::BEFORE,
         candidate_history::AFTER,
-        labels::CURRENT,
+        structures::CURRENT,
         exclude::LABEL_STATUS,
         listing::NEWEST,
         listing::OLDEST,

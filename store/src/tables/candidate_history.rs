@@ -7,14 +7,14 @@ use super::labels::LabelRow;
 use super::status::walks;
 use crate::Store;
 use crate::candidate_history::{
-    CandidateRef, CoveredCandidate, ImportedStructure, LaterCoveredCandidates, SameStructure, StructureLabel,
+    CoveredCandidate, ImportedStructure, LaterCoveredCandidates, SameStructure, StructureLabel,
 };
 use crate::checksum::{IMPORT, Names, joined};
 use crate::database::{FromRow, Row, from_columns, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::jobs::JobDetails;
-use crate::records::{Operation, Protocol};
+use crate::records::{CandidateRef, Operation, Protocol};
 use crate::status::WalkStatus;
 
 /// Number of candidates shown if a name fits none or several.

@@ -1,6 +1,5 @@
 //! Computes missing checksums, and verifies every row of tables that no other check reads.
 
-use crate::Store;
 use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
     LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK,
@@ -228,14 +227,4 @@ pub(crate) fn views(schema: &str) -> String {
         format!("CREATE TEMP VIEW \"{table}\" AS SELECT *{columns} FROM \"{schema}\".\"{table}\"; ")
     };
     WITHOUT.iter().map(view).collect()
-}
-
-impl Store {
-    /// Recomputes the checksum of every row, after rows were written without this program.
-    #[doc(hidden)]
-    pub async fn write_checksums(&self) -> Result<()> {
-        let mut transaction = self.database.begin_as_leader().await?;
-        fill(&mut transaction).await?;
-        transaction.commit().await
-    }
 }

@@ -2,25 +2,21 @@
 
 mod rows;
 
-use std::collections::HashSet;
 use std::hash::{BuildHasher, RandomState};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-use atoms::Structure;
-use wire::ContentHash;
-
 use self::rows::{
-    CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, COMPONENT, DECISION, JOB, Rows, STRUCTURE, VALUE, WALK,
+    CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, COMPONENT, DECISION, Rows, STRUCTURE, VALUE, WALK,
 };
+use super::new_jobs::insert_jobs;
 use super::protocols;
 use crate::Store;
-use crate::checksum;
 use crate::database::{Transaction, execute_rows, query};
-use crate::encoding::{encode_structure, integer};
+use crate::encoding::integer;
 use crate::error::{Result, StoreError};
+use crate::postgres::SERVER_RECONNECT_TIMEOUT;
 use crate::records::Commit;
-use crate::store::SERVER_RECONNECT_TIMEOUT;
 
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -36,14 +32,6 @@ const INSERT_CANDIDATES: &str = "INSERT INTO candidate ({columns}, structure)
     FROM {rows} WHERE TRUE ON CONFLICT (id) DO NOTHING";
 
 const INSERT_CANDIDATE_DATA: &str = "INSERT INTO candidate_data ({columns}) SELECT * FROM {rows}";
-
-/// Adds a job for each structure that has none. It is done at once if the label exists.
-const INSERT_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state)
-    SELECT structure.number, new.protocol, new.decision, new.priority, CASE WHEN EXISTS (
-        SELECT 1 FROM label WHERE label.structure = structure.number AND label.protocol = new.protocol
-        AND standing IN ('label', 'excluded')) THEN 'labelled' ELSE 'queued' END
-    FROM {rows} CROSS JOIN structure ON structure.hash = new.hash WHERE TRUE
-    ON CONFLICT (structure, protocol) DO NOTHING";
 
 const UPSERT_COMPONENTS: &str = "INSERT INTO component ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (element, slot) DO UPDATE SET bytes = excluded.bytes, checksum = excluded.checksum";
@@ -113,7 +101,7 @@ async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last:
     }
     execute_rows(transaction, COUNT_CANDIDATES, &CANDIDATE_COUNT, rows.candidate_counts).await?;
     execute_rows(transaction, INSERT_CANDIDATE_DATA, &CANDIDATE_DATA, rows.candidate_data).await?;
-    execute_rows(transaction, INSERT_JOBS, &JOB, rows.jobs).await?;
+    insert_jobs(transaction, rows.jobs).await?;
     if commit.restart_mixture {
         query("DELETE FROM component").execute(&mut *transaction).await?;
     }
@@ -132,48 +120,4 @@ async fn duplicate(transaction: &mut Transaction, commit: &Commit, last: i64) ->
         }
     }
     Ok(StoreError::Inconsistent("candidates were not written".into()))
-}
-
-/// Row number of the structure, which is inserted if it does not exist. Until the end of the transaction, no other
-/// label or job is added for it.
-pub(super) async fn structure_id(
-    transaction: &mut Transaction,
-    structure: &Structure,
-    hash: ContentHash,
-) -> Result<i64> {
-    let sql = "INSERT INTO structure (hash, atoms, formula, data, checksum) VALUES ($1, $2, $3, $4, $5)
-               ON CONFLICT (hash) DO UPDATE SET atoms = excluded.atoms RETURNING number";
-    let row = vec![
-        hash.0[..].into(),
-        integer("count", structure.len() as u64)?.into(),
-        structure.formula().into(),
-        encode_structure(structure).into(),
-    ];
-    let insert = query(sql).bind_all(checksum::STRUCTURE.with_checksum(row));
-    insert.fetch_one(&mut *transaction).await
-}
-
-/// Adds jobs for existing candidates, given as (structure, decision).
-pub(super) async fn enqueue(
-    transaction: &mut Transaction,
-    candidates: &[(Vec<u8>, i64)],
-    protocol: i64,
-    priority: i32,
-) -> Result<()> {
-    let row = |(hash, decision): &(Vec<u8>, i64)| {
-        vec![hash.clone().into(), protocol.into(), (*decision).into(), priority.into()]
-    };
-    execute_rows(transaction, INSERT_JOBS, &JOB, candidates.iter().map(row).collect()).await?;
-    Ok(())
-}
-
-/// Only the newest record for each key, in order: a statement may write a row only once.
-fn newest<'a, T, K: Eq + std::hash::Hash>(
-    records: &'a [T],
-    key: impl Fn(&'a T) -> K,
-) -> impl Iterator<Item = &'a T> {
-    let mut seen = HashSet::new();
-    let mut newest: Vec<_> = records.iter().rev().filter(|record| seen.insert(key(record))).collect();
-    newest.reverse();
-    newest.into_iter()
 }

@@ -3,9 +3,9 @@
 use atoms::Structure;
 use wire::ContentHash;
 
-use super::commit::structure_id;
 use super::labels::{add, check, finish_job};
 use super::protocols;
+use super::structures::structure_id;
 use crate::Store;
 use crate::checksum::IMPORT;
 use crate::database::{Transaction, query};

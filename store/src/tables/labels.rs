@@ -3,7 +3,7 @@
 
 use atoms::Vec3;
 
-use super::queue::{end_attempt, job_row};
+use super::attempt_end::{end_attempt, job_row};
 use super::relabel::status_of_result;
 use crate::Store;
 use crate::checksum::{LABEL, Names};
@@ -13,10 +13,6 @@ use crate::error::{Result, StoreError};
 use crate::exclude::Exclusion;
 use crate::jobs::{CompleteOutcome, LabelRecord, LabelSource, LabelStatus, Supersession};
 use crate::records::{Label, LabelDetails, Lease};
-
-/// Whether there is a label, excluded or not.
-pub(crate) const CURRENT: &str = "SELECT EXISTS (SELECT 1 FROM label WHERE structure = $1 AND protocol = $2
-    AND standing IN ('label', 'excluded'))";
 
 /// A label as a row.
 pub(super) struct LabelRow {

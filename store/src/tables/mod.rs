@@ -1,10 +1,12 @@
 //! The functions of [`crate::Store`] that access its tables, one file per topic.
 
 mod archives;
+pub mod attempt_end;
 pub mod budget;
 pub mod candidate_history;
 pub mod checksums;
 mod commit;
+mod create;
 mod energies;
 pub mod exclude;
 pub mod export;
@@ -14,6 +16,7 @@ pub mod labels;
 pub mod listing;
 pub mod logs;
 mod near_duplicates;
+mod new_jobs;
 pub mod outcomes;
 mod pauses;
 pub mod processes;
@@ -25,4 +28,5 @@ pub mod relabel;
 pub mod report;
 mod restore;
 pub mod status;
+pub mod structures;
 mod walk_progress;

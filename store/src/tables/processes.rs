@@ -2,8 +2,8 @@
 
 use serde_json::json;
 
+use super::attempt_end::{AttemptEnd, end_without_label};
 use super::logs::insert_operation;
-use super::queue::{AttemptEnd, end_without_label};
 use crate::Store;
 use crate::database::{Query, Transaction, query};
 use crate::error::Result;

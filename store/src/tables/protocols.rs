@@ -3,11 +3,12 @@
 use wire::ContentHash;
 
 use super::checksums::CAMPAIGN_KEYS;
-use super::commit::{enqueue, structure_id};
 use super::logs::insert_operation;
+use super::new_jobs::enqueue;
+use super::structures::structure_id;
 use crate::Store;
 use crate::checksum::{CAMPAIGN, Names, PROTOCOL, SEED_STRUCTURE, joined};
-use crate::database::{Database, FromRow, Row, Transaction, Value, query};
+use crate::database::{FromRow, Row, Transaction, Value, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::records::{Campaign, Protocol, SeedStructure};
@@ -38,32 +39,6 @@ impl FromRow for SeedStructure {
             structure: read_structure(row)?,
         })
     }
-}
-
-/// Writes the initial rows of a database.
-pub(crate) async fn write_campaign(
-    database: &Database,
-    campaign: &Campaign,
-    seed_structures: &[SeedStructure],
-    now: i64,
-) -> Result<()> {
-    let mut transaction = database.begin_as_leader().await?;
-    for (key, value) in [
-        ("id", campaign.id.to_string().as_str()),
-        ("program_version", &campaign.program_version),
-        ("mode", &campaign.mode),
-        ("configuration", &campaign.configuration),
-        ("resolved_configuration", &campaign.resolved_configuration),
-        ("configuration_in_force", &campaign.configuration_in_force),
-    ] {
-        set_campaign_value(&mut transaction, key, value).await?;
-    }
-    for seed_structure in seed_structures {
-        insert_seed_structure(&mut transaction, seed_structure).await?;
-    }
-    let detail = serde_json::json!({ "program_version": campaign.program_version });
-    insert_operation(&mut transaction, now, "created", &detail).await?;
-    transaction.commit().await
 }
 
 impl Store {
@@ -244,7 +219,10 @@ pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str,
     Ok(())
 }
 
-async fn insert_seed_structure(transaction: &mut Transaction, seed_structure: &SeedStructure) -> Result<()> {
+pub(super) async fn insert_seed_structure(
+    transaction: &mut Transaction,
+    seed_structure: &SeedStructure,
+) -> Result<()> {
     let structure = structure_id(
         transaction,
         &seed_structure.structure,

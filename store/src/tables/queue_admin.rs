@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
 
+use super::attempt_end::end_attempt;
 use super::exclude;
 use super::job_counts;
 use super::labels::LabelRow;
 use super::logs::insert_operation;
-use super::queue::end_attempt;
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, joined};
 use crate::database::{self, FromRow, Transaction, query};

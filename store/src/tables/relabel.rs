@@ -10,9 +10,9 @@ use std::collections::HashSet;
 use serde_json::json;
 use wire::ContentHash;
 
-use super::labels::CURRENT;
 use super::logs::insert_operation;
 use super::protocols::{in_force, insert_protocol, protocol_id, set_campaign_value};
+use super::structures::has_label;
 use crate::Store;
 use crate::database::{FromRow, Row, Transaction, Value, execute_rows, from_columns, query};
 use crate::encoding::decode_hash;
@@ -231,7 +231,7 @@ pub(super) async fn status_of_result(
     source: &LabelSource,
     now: i64,
 ) -> Result<LabelStatus> {
-    let labelled: bool = query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await?;
+    let labelled = has_label(transaction, structure, protocol).await?;
     let first = if labelled { LabelStatus::Check } else { LabelStatus::Label };
     let sql = "SELECT number, state, relabel, relabel_after FROM job WHERE structure = $1 AND protocol = $2";
     let job = query(sql).bind(structure).bind(protocol).locked();

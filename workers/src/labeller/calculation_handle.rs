@@ -5,8 +5,10 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use store::StoreError;
 
+use super::blocking::blocking;
 use super::calculation_runner::CalculationEnd;
-use super::code::{blocking, file_error};
+use super::calculation_state::CalculationState;
+use super::file_error::file_error;
 use super::local::{self, LocalCalculation};
 use super::slurm::{Job, Slurm};
 
@@ -18,20 +20,6 @@ pub(super) enum CalculationHandle {
     Local(LocalCalculation),
     /// A batch job on a cluster.
     Slurm(Job),
-}
-
-/// The state of a calculation.
-#[derive(Debug, PartialEq)]
-pub(super) enum CalculationState {
-    /// It has ended, and its results can be read.
-    Ended(CalculationEnd),
-    Running,
-    /// It is prepared and can be started.
-    Ready,
-    /// It was interrupted, or its directory was removed.
-    Gone,
-    /// It cannot be observed from this host.
-    Elsewhere,
 }
 
 impl CalculationHandle {

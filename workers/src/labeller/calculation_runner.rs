@@ -22,7 +22,7 @@ use rustix::process::{
 use serde::{Deserialize, Serialize};
 
 use super::private_directory;
-use super::process_tree::{self, Children};
+use super::process_tree::{self, Children, MARK};
 use super::remove_tree::remove_tree;
 
 /// Working directory of the program, in the directory of the calculation.
@@ -31,8 +31,6 @@ pub(super) const WORK: &str = "work";
 const END: &str = "end.json";
 /// Time between two checks of memory use and of ended processes.
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
-/// Environment variable that marks all processes of a calculation; it holds its directory.
-pub(super) const MARK: &str = "CALMWALK_CALCULATION";
 /// Environment variable in which Slurm gives the node of a job.
 const NODE_VARIABLE: &str = "SLURMD_NODENAME";
 /// Slurm kills the processes of a job one after the other: the runner may outlive its program for this time.

@@ -12,19 +12,19 @@ use dft::{DftBackend, Failure, FailureClass, Size};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::sync::OnceCell;
-use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use super::calculation_handle::{CalculationHandle, CalculationState};
+use super::blocking::blocking;
+use super::calculation_handle::CalculationHandle;
 use super::calculation_runner::{Calculation, CalculationEnd, EndReason, WORK};
+use super::calculation_state::CalculationState;
+use super::file_error::file_error;
+use super::label_attempt::{EndedCalculation, LabelAttempt, SingleLabel};
 use super::local;
-use super::method::LabelAttempt;
 use super::prepare::{PreparedInput, prepare, read, write};
 use super::scratch::{self, ScratchRoot};
 use super::slurm::{self, Slurm};
-use super::{
-    BatchSystem, ExecutionSettings, RunnerCommand, SingleLabel, log, private_directory, retry_until_written,
-};
+use super::{BatchSystem, ExecutionSettings, RunnerCommand, log, private_directory, retry_until_written};
 
 /// Minimum time allowed for reading results, even if the calculation used up its time limit.
 const MIN_READ_TIME: Duration = Duration::from_secs(60);
@@ -47,16 +47,6 @@ struct CurrentCalculation {
     handle: CalculationHandle,
     /// Its runner, if this process started it and must reap it.
     runner: Option<Child>,
-}
-
-/// A calculation that has ended.
-pub(super) struct EndedCalculation {
-    pub core_seconds: f64,
-    /// The end of the program's output.
-    pub log: String,
-    /// The node where it ran, for a batch job.
-    node: Option<String>,
-    handle: CalculationHandle,
 }
 
 /// A calculation that is ready to start.
@@ -434,14 +424,4 @@ impl PreparedCalculation {
             Self::Slurm(job) => CalculationHandle::Slurm(job.clone()),
         }
     }
-}
-
-/// Runs slow work on a thread of its own. A panic in it propagates to the caller.
-pub(super) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
-    spawn_blocking(work).await.unwrap_or_else(|crash| std::panic::resume_unwind(crash.into_panic()))
-}
-
-/// An error that fails the labeller and not the job: another host may be able to run it.
-pub(super) fn file_error(path: &Path, source: io::Error) -> StoreError {
-    StoreError::File { path: path.to_owned(), source }
 }

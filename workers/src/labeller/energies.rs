@@ -8,10 +8,18 @@ use store::{Store, StoreError};
 use tokio_util::sync::CancellationToken;
 
 use super::retry_until_written;
-use super::validate::EnergyReference;
 
 /// The fit is repeated when this labeller has made 1/8 as many new labels as the last fit used.
 const REFIT_DIVISOR: usize = 8;
+
+/// The reference for the energy of a label.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct EnergyReference<'a> {
+    /// Energy by the potential, eV.
+    pub model: f64,
+    /// Offsets of the elements, fitted to the labels so far.
+    pub offsets: &'a EnergyOffsets,
+}
 
 /// A labeller's current offsets.
 #[derive(Debug, Default)]

@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 use store::{is_local, is_running, process_start_time, this_host};
 use tracing::warn;
 
-use super::calculation_handle::CalculationState;
 use super::calculation_runner::{self, Calculation, CalculationEnd, RunnerRequest};
+use super::calculation_state::CalculationState;
 use super::remove_tree::remove_tree;
 use super::{private_directory, process_tree};
 

@@ -10,8 +10,8 @@ use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use super::code::{CodeMethod, EndedCalculation, failure_classes};
-use super::validate::{EnergyReference, LabelBounds, validate};
+use super::code::{CodeMethod, failure_classes};
+use super::label_attempt::{EndedCalculation, LabelAttempt};
 use super::{ExecutionSettings, ReferenceMethod, RunnerCommand};
 
 /// A way to make labels.
@@ -20,26 +20,6 @@ pub enum Method {
     Reference(Arc<Mutex<ReferenceMethod>>),
     /// Another program, run in processes that outlive this one.
     Code(Box<CodeMethod>),
-}
-
-/// Its result.
-pub(super) struct LabelAttempt {
-    pub result: Result<Results, Failure>,
-    /// Its calculation behind it, if it was a process of its own.
-    pub ended: Option<EndedCalculation>,
-}
-
-impl LabelAttempt {
-    /// The same, with an invalid result replaced by a failure.
-    pub fn validated(
-        self,
-        lease: &Lease,
-        bounds: &LabelBounds,
-        expected: Option<EnergyReference<'_>>,
-    ) -> Self {
-        let result = self.result.and_then(|results| validate(results, &lease.structure, bounds, expected));
-        Self { result, ..self }
-    }
 }
 
 impl Method {

@@ -3,14 +3,18 @@
 //! [`run`] is a task within a process. [`serve`] runs a labeller as a process of its own, which outlives its
 //! orchestrator.
 
+mod blocking;
 mod calculation_handle;
 mod calculation_runner;
+mod calculation_state;
 mod code;
 mod energies;
 mod execution;
+mod file_error;
 mod guard;
 mod heartbeat;
 mod input_diff;
+mod label_attempt;
 mod local;
 mod log;
 mod method;
@@ -37,9 +41,8 @@ use store::{LeaseStatus, Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
-use code::EndedCalculation;
 use energies::Offsets;
-use method::LabelAttempt;
+use label_attempt::{EndedCalculation, LabelAttempt};
 use report_line::DeliveryOutcome;
 
 pub use calculation_runner::{RunnerCommand, run_calculation};
@@ -47,11 +50,12 @@ pub use code::CodeMethod;
 pub use execution::{BatchSystem, ExecutionSettings, KeepDirectories};
 pub use guard::{GUARD, LabelGuard, Pair};
 pub use heartbeat::{ExitPolicy, serve};
+pub use label_attempt::SingleLabel;
 pub use method::Method;
 pub use reference::ReferenceMethod;
 pub use retry::retry_until_written;
 pub use shutdown::Shutdown;
-pub use single_label::{SingleLabel, label_structure};
+pub use single_label::label_structure;
 pub use validate::LabelBounds;
 
 /// Time between two heartbeats in the store, for every process that sends them.

@@ -11,7 +11,7 @@ use store::{CalculationRecord, StoreError};
 
 use super::ExecutionSettings;
 use super::calculation_runner::WORK;
-use super::code::file_error;
+use super::file_error::file_error;
 use super::input_diff::input_diff;
 
 /// Beside [`WORK`]: input files that all calculations share.

@@ -14,7 +14,7 @@ use rustix::io::Errno;
 use rustix::process::{getegid, geteuid};
 use store::StoreError;
 
-use super::code::file_error;
+use super::file_error::file_error;
 
 /// Random bytes in a name.
 const RANDOM_BYTES: usize = 8;

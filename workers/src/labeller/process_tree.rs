@@ -20,8 +20,8 @@ use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, Signal, WaitOptions, getpid, pidfd_open, pidfd_send_signal, wait};
 use store::is_running;
 
-use super::calculation_runner::MARK;
-
+/// Environment variable that marks all processes of a calculation; it holds its directory.
+pub(super) const MARK: &str = "CALMWALK_CALCULATION";
 /// Time between two checks whether all have ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(2);
 /// How long a program may take to end the processes that it started. A program that started processes on other

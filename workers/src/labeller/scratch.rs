@@ -14,9 +14,11 @@ use store::{Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use wire::CampaignId;
 
-use super::calculation_handle::{CalculationHandle, CalculationState};
-use super::code::{blocking, file_error};
+use super::blocking::blocking;
+use super::calculation_handle::CalculationHandle;
+use super::calculation_state::CalculationState;
 use super::execution::KeepDirectories;
+use super::file_error::file_error;
 use super::slurm::{self, Slurm};
 use super::{local, pack, private_directory, retry_until_written};
 

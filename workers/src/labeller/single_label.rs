@@ -4,22 +4,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use atoms::Structure;
-use dft::{Failure, Results};
 use store::StoreError;
 
+use super::label_attempt::SingleLabel;
 use super::method::{Method, evaluate};
 use super::validate::{LabelBounds, validate};
-
-/// The result of a single calculation.
-#[derive(Clone, Debug)]
-pub struct SingleLabel {
-    /// Its numbers, validated like those of a campaign are.
-    pub result: Result<Results, Failure>,
-    /// The end of what the program said; empty for a potential.
-    pub log: String,
-    /// Cores times duration, s.
-    pub core_seconds: f64,
-}
 
 /// Labels one structure in a directory below [`super::ExecutionSettings::scratch`], which is removed afterwards.
 ///

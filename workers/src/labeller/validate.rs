@@ -1,11 +1,12 @@
 //! Validation of results.
 
-use analysis::EnergyOffsets;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use dft::{Failure, FailureClass, Results};
 use monitor::energy_offsets::labelled_energy;
 use serde::{Deserialize, Serialize};
+
+use super::energies::EnergyReference;
 
 /// Minimum number of labelled structures that must support a composition before energies are compared for it.
 const MIN_SUPPORT: f64 = 5.0;
@@ -72,15 +73,6 @@ impl LabelBounds {
         (force > self.max_force)
             .then(|| format!("a force of {found} eV/Å, beyond label.max_force = {largest} eV/Å"))
     }
-}
-
-/// The reference for the energy of a label.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct EnergyReference<'a> {
-    /// Energy by the potential, eV.
-    pub model: f64,
-    /// Offsets of the elements, fitted to the labels so far.
-    pub offsets: &'a EnergyOffsets,
 }
 
 /// Validates a result: its numbers must be finite, match the number of atoms and be within bounds. The energy is

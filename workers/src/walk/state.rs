@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use wire::Origin;
 use wire::messages::Assignment;
 
-use super::WalkError;
+use super::error::WalkError;
 use crate::bias::{BiasState, BiasedPotential};
 use crate::guard;
 use crate::settings::WalkSettings;

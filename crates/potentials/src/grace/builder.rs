@@ -3,9 +3,9 @@
 use atoms::Species;
 use npz::Archive;
 
+use super::description::{Architecture, GraceDescription};
 use super::error::{GraceError, mismatch};
 use super::layer::LayerDraft;
-use super::model::{Architecture, GraceDescription};
 use super::network::Network;
 use super::networks::readout;
 use super::projection::{FeatureMap, Projection, ProjectionMaps, rows_of_projection};

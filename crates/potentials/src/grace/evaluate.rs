@@ -10,7 +10,7 @@ use super::layer_passes::LayerState;
 use super::model::GraceModel;
 use super::network::Network;
 use super::projection::ProjectionWork;
-use super::sweeps::Scratch;
+use super::scratch::Scratch;
 use super::threads::Threads;
 use super::vector::Vector;
 

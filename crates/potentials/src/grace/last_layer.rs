@@ -10,7 +10,8 @@ use super::instructions::Instructions;
 use super::layer_passes::{Cotangents, Gradients, LayerInput, LayerState};
 use super::network::Network;
 use super::projection::Projected;
-use super::sweeps::{Scratch, begin_returns, gradients_of, lock_scratch};
+use super::scratch::{Scratch, lock_scratch};
+use super::sweeps::{begin_returns, gradients_of};
 use super::vector::Vector;
 
 /// Maximum number of layers before the last.

@@ -11,10 +11,10 @@
 use npz::Archive;
 
 use super::builder::{ModelBuilder, ModelParts};
+use super::description::Architecture;
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
 use super::layer::{LayerDraft, Message};
-use super::model::Architecture;
 use super::networks::enveloped_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;

@@ -9,11 +9,11 @@ use npz::Archive;
 
 use super::block_aliases::{BlockAliases, ignore_aliases};
 use super::builder::{ModelBuilder, ModelParts};
+use super::description::Architecture;
 use super::error::{GraceError, mismatch, unsupported};
 use super::graph::Graph;
 use super::invariant_norm::InvariantNorm;
 use super::layer::{LayerDraft, Message};
-use super::model::Architecture;
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;

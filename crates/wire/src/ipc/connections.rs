@@ -1,23 +1,22 @@
-//! The server's connections to walkers: routes of answers, wakeup events, and traffic statistics.
+//! The server's connections to walkers: answers, wakeup events, candidates in place, and traffic statistics.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fmt;
-use std::pin::Pin;
-use std::sync::{Arc, Mutex, PoisonError};
-use std::task::{Context, Poll};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
-use calm::Mixture;
 use iceoryx2::node::Node;
 use iceoryx2::port::notifier::Notifier;
-use tokio::sync::oneshot;
 
 use super::IpcError;
 use super::borrowed_request::BorrowedRequest;
-use super::config::{self, Service};
+use super::config::{self, MAX_IN_PLACE, MAX_IN_PLACE_TOTAL, Service};
+use crate::block::{BlockError, CandidateBlock};
+use crate::control::encode;
 use crate::protocol::frame;
-use crate::protocol::message::SenderId;
-use crate::transport::WorkItem;
+use crate::protocol::message::{Answer, SenderId};
+use crate::protocol::server_session::ServerTransport;
 
 /// Statistics of received messages.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -40,89 +39,75 @@ pub struct Traffic {
 
 pub(super) struct Connections {
     node: Node<Service>,
-    walkers: BTreeMap<u32, Connection>,
+    /// Wakes each walker; opened at its first answer.
+    wakeups: BTreeMap<u32, Notifier<Service>>,
+    /// Candidates that may still be read in place.
+    in_place: Vec<(SenderId, Weak<BorrowedRequest>)>,
     traffic: Arc<Mutex<Traffic>>,
     message_bytes: usize,
 }
 
-#[derive(Default)]
-struct Connection {
-    /// Wakes the walker; opened at its first message.
-    wakeup: Option<Notifier<Service>>,
-    /// The request whose response channel takes the answer.
-    route: Option<Arc<BorrowedRequest>>,
-    /// Receives the reactor's decision.
-    decision: Option<oneshot::Receiver<Option<WorkItem>>>,
-    /// The mixture of the walker's assignment, kept until its report.
-    mixture: Option<Arc<Mixture>>,
-}
+impl ServerTransport for Connections {
+    type Request = Arc<BorrowedRequest>;
 
-impl Connections {
-    pub(super) fn new(node: Node<Service>, traffic: Arc<Mutex<Traffic>>, message_bytes: usize) -> Self {
-        Self { node, walkers: BTreeMap::new(), traffic, message_bytes }
+    /// The answer to a poll is the server's sign of life.
+    const HOLDS_POLLS: bool = false;
+
+    fn encode(answer: Answer<'_>) -> Vec<u8> {
+        encode(&answer)
     }
 
-    pub(super) fn open(&mut self, walker: u32) {
-        self.walkers.insert(walker, Connection::default());
-    }
-
-    pub(super) fn close(&mut self, walker: u32) {
-        self.walkers.remove(&walker);
-    }
-
-    /// Removes resources of dead processes from iceoryx2's tables.
-    pub(super) fn clean(&self) {
-        self.node.try_cleanup_dead_nodes();
-    }
-
-    /// Sets the request that takes the answer to the walker's offer.
-    pub(super) fn set_route(&mut self, sender: SenderId, request: &Arc<BorrowedRequest>) {
-        if let Some(connection) = self.walkers.get_mut(&sender.walker) {
-            connection.route = Some(Arc::clone(request));
-        }
-    }
-
-    /// Creates the channel for the reactor's decision. The walker has reported, so the mixture of its assignment is
-    /// released.
-    pub(super) fn decision_channel(&mut self, sender: SenderId) -> oneshot::Sender<Option<WorkItem>> {
-        let (reply, decision) = oneshot::channel();
-        if let Some(connection) = self.walkers.get_mut(&sender.walker) {
-            connection.decision = Some(decision);
-            connection.mixture = None;
-        }
-        reply
-    }
-
-    pub(super) fn poll_decision(&mut self, context: &mut Context<'_>) -> Poll<(u32, Option<WorkItem>)> {
-        for (walker, connection) in &mut self.walkers {
-            let Some(receiver) = &mut connection.decision else { continue };
-            if let Poll::Ready(decision) = Pin::new(receiver).poll(context) {
-                connection.decision = None;
-                return Poll::Ready((*walker, decision.ok().flatten()));
-            }
-        }
-        Poll::Pending
-    }
-
-    /// Answers the walker's offer and keeps the mixture of its new assignment.
-    pub(super) fn answer(&mut self, sender: SenderId, answer: &[u8], mixture: Option<Arc<Mixture>>) {
-        let Some(connection) = self.walkers.get_mut(&sender.walker) else { return };
-        connection.mixture = mixture;
-        if let Some(route) = connection.route.take() {
-            self.send(sender, &route, answer);
-        }
-    }
-
-    /// Sends an answer and wakes the walker. If the answer is lost, the walker polls again.
-    pub(super) fn send(&mut self, sender: SenderId, route: &BorrowedRequest, answer: &[u8]) {
-        let Some(connection) = self.walkers.get_mut(&sender.walker) else { return };
+    /// Also wakes the walker.
+    fn send(&mut self, sender: SenderId, request: &Self::Request, answer: &[u8]) {
         let sent = config::check_free_space(frame::length(answer.len(), None), self.message_bytes)
-            .and_then(|()| route.answer(answer))
-            .and_then(|()| connection.wake(&self.node, sender));
+            .and_then(|()| request.answer(answer))
+            .and_then(|()| self.wake(sender));
         if let Err(reason) = sent {
             let mut traffic = self.traffic.lock().unwrap_or_else(PoisonError::into_inner);
             traffic.unsent += 1;
             traffic.last_unsent = Some(reason.to_string());
+        }
+    }
+
+    /// Read in place unless too many are already.
+    fn candidate(
+        &mut self,
+        sender: SenderId,
+        request: &Self::Request,
+        block: &[u8],
+    ) -> Result<CandidateBlock, BlockError> {
+        self.in_place.retain(|(_, request)| request.strong_count() > 0);
+        let of_sender = self.in_place.iter().filter(|(of, _)| *of == sender).count();
+        if of_sender >= MAX_IN_PLACE || self.in_place.len() >= MAX_IN_PLACE_TOTAL {
+            return CandidateBlock::from_bytes(block);
+        }
+        let candidate = CandidateBlock::in_place(Arc::clone(request) as _)?;
+        self.in_place.push((sender, Arc::downgrade(request)));
+        Ok(candidate)
+    }
+}
+
+impl Connections {
+    pub(super) fn new(node: Node<Service>, traffic: Arc<Mutex<Traffic>>, message_bytes: usize) -> Self {
+        Self { node, wakeups: BTreeMap::new(), in_place: Vec::new(), traffic, message_bytes }
+    }
+
+    /// Closes the connection to a walker that has exited, and removes the resources of dead processes from iceoryx2's
+    /// tables.
+    pub(super) fn close(&mut self, walker: u32) {
+        self.wakeups.remove(&walker);
+        self.node.try_cleanup_dead_nodes();
+    }
+
+    fn wake(&mut self, sender: SenderId) -> Result<(), IpcError> {
+        let wakeup = match self.wakeups.entry(sender.walker) {
+            Entry::Occupied(wakeup) => wakeup.into_mut(),
+            Entry::Vacant(vacant) => vacant.insert(config::open_walker_wakeup(&self.node, sender)?),
+        };
+        match wakeup.notify() {
+            Ok(0) => Err(IpcError::new("wake a walker", "it has no listener")),
+            Ok(_) => Ok(()),
+            Err(reason) => Err(IpcError::new("wake a walker", reason)),
         }
     }
 
@@ -135,20 +120,6 @@ impl Connections {
         if let Some(reason) = rejected {
             traffic.rejected += 1;
             traffic.last_rejected = Some(reason.to_string());
-        }
-    }
-}
-
-impl Connection {
-    fn wake(&mut self, node: &Node<Service>, sender: SenderId) -> Result<(), IpcError> {
-        let wakeup = match &self.wakeup {
-            Some(wakeup) => wakeup,
-            None => self.wakeup.insert(config::open_walker_wakeup(node, sender)?),
-        };
-        match wakeup.notify() {
-            Ok(0) => Err(IpcError::new("wake a walker", "it has no listener")),
-            Ok(_) => Ok(()),
-            Err(reason) => Err(IpcError::new("wake a walker", reason)),
         }
     }
 }

@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 
 use super::config::{self, ServerPort, Service};
 use super::connections::{Connections, Traffic};
-use super::session::ServerSession;
+use super::session::IpcSession;
 use super::{ConnectInfo, IpcError, Sizes};
 use crate::mixture::SharedMixture;
 use crate::protocol::message::SenderId;
@@ -133,7 +133,7 @@ impl Server {
         mut on_message: impl FnMut(u32, bool) + Send + 'static,
     ) -> Result<(), IpcError> {
         let mut session =
-            ServerSession::new(self.handle.connect_info.sender.session, mixtures, self.connections);
+            IpcSession::new(self.handle.connect_info.sender.session, mixtures, self.connections);
         let wakeup = descriptor(&self.wakeup).map_err(|e| IpcError::new("wait for events", e))?;
         let mut more = false;
         loop {
@@ -148,7 +148,7 @@ impl Server {
                     }
                     Some(Command::Close) | None => {
                         // The reactor waits for the exits, even if other senders keep its channel open.
-                        for incoming in session.outbox.drain(..) {
+                        for incoming in session.walkers.outbox.drain(..) {
                             if to_reactor.send(incoming).await.is_err() {
                                 break;
                             }
@@ -156,11 +156,11 @@ impl Server {
                         return Ok(());
                     }
                 },
-                (walker, work) = poll_fn(|context| session.poll_decision(context)) => session.handle_decision(walker, work)?,
-                permit = to_reactor.reserve(), if !session.outbox.is_empty() => match permit {
-                    Ok(permit) => if let Some(incoming) = session.outbox.pop_front() { permit.send(incoming) },
+                decision = poll_fn(|context| session.walkers.poll_decision(context)) => session.handle_decision(decision)?,
+                permit = to_reactor.reserve(), if !session.walkers.outbox.is_empty() => match permit {
+                    Ok(permit) => if let Some(incoming) = session.walkers.outbox.pop_front() { permit.send(incoming) },
                     // The reactor has ended: all waiting walkers shut down.
-                    Err(_) => session.outbox.clear(),
+                    Err(_) => session.walkers.outbox.clear(),
                 },
                 () = tokio::task::yield_now(), if more => more = receive_batch(&self.port, &mut session, &mut on_message)?,
                 guard = wakeup.readable() => {
@@ -177,7 +177,7 @@ impl Server {
 /// Handles received messages. Returns whether there may be more.
 fn receive_batch(
     port: &ServerPort,
-    session: &mut ServerSession,
+    session: &mut IpcSession,
     on_message: &mut impl FnMut(u32, bool),
 ) -> Result<bool, IpcError> {
     for _ in 0..BATCH {

@@ -11,11 +11,8 @@ use rustix::io::{Errno, retry_on_intr};
 use zerocopy::IntoBytes;
 
 use super::error::SharedMixtureError;
-use super::layout::{BlockHeader, Layout};
+use super::layout::{BlockHeader, Layout, SPARE};
 use super::memory::Mapping;
-
-/// Number of free blocks that keep their memory.
-pub(super) const SPARE: u32 = 16;
 
 /// The blocks of the file.
 #[derive(Debug)]

@@ -7,7 +7,6 @@ use std::path::Path;
 use calm::Mixture;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
-use super::allocator::SPARE;
 use super::error::SharedMixtureError;
 
 const MAGIC: [u8; 8] = *b"CALMMIXT";
@@ -17,6 +16,8 @@ const FORMAT: u32 = 1;
 const PAGE: u64 = 4096;
 /// Words of different readers are in separate cache lines to avoid false sharing.
 pub(super) const CACHE_LINE: u64 = 64;
+/// Number of free blocks that keep their memory.
+pub(super) const SPARE: u32 = 16;
 /// Number of live versions in addition to one per walker.
 const SPARE_ROWS: u32 = 64;
 

@@ -9,10 +9,10 @@ use std::{fmt, io};
 
 use calm::Mixture;
 
-use super::allocator::{BlockAllocator, SPARE};
+use super::allocator::BlockAllocator;
 use super::error::SharedMixtureError;
 use super::index::MixtureIndex;
-use super::layout::Layout;
+use super::layout::{Layout, SPARE};
 use super::pinning::{NONE, Word, retire_version};
 
 /// The writer's end of the mixture in shared memory. There must be only one for a file.

@@ -1,6 +1,7 @@
 //! The agent's end: a session with the orchestrator. Requests are repeated until they are answered.
 
 use std::collections::VecDeque;
+use std::ops::Range;
 use std::sync::{Arc, Mutex as Lock, PoisonError};
 use std::time::Duration;
 
@@ -16,10 +17,10 @@ use super::NetError;
 use super::address::{Address, Announcement};
 use super::certificates::Tls;
 use super::delta::{DeltaError, DeltaReceiver};
-use super::endpoint::{self, Endpoint, Side};
+use super::endpoint::{self, Endpoint};
 use super::handshake;
 use super::message::{AGENTS, Agent, ORCHESTRATOR, Reply, Request};
-use super::slot::Slot;
+use super::side::Side;
 use crate::control::{ControlError, decode, encode};
 use crate::protocol::frame;
 
@@ -271,10 +272,9 @@ fn unexpected(to: &str) -> LinkError {
 }
 
 impl Membership {
-    /// The slots of this agent.
-    pub fn slots(&self) -> Vec<Slot> {
-        let numbers = self.first_slot..self.first_slot + self.client.agent.slots();
-        numbers.map(|number| Slot::new(self.session, number)).collect()
+    /// Numbers of this agent's slots.
+    pub(super) fn slot_numbers(&self) -> Range<u32> {
+        self.first_slot..self.first_slot + self.client.agent.slots()
     }
 
     pub(super) fn client(&self) -> &AgentClient {

@@ -1,11 +1,10 @@
 //! The orchestrator's end: a task that receives requests of agents, answers them, and forwards reports to the reactor.
 
+use std::future::poll_fn;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use calm::Mixture;
-use futures_util::StreamExt;
-use futures_util::stream::FuturesUnordered;
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
@@ -15,11 +14,12 @@ use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
 
+use super::agent_event::AgentEvent;
 use super::certificates::Tls;
-use super::endpoint::{self, Endpoint, Side};
-use super::files::Files;
-use super::message::{AGENTS, Agent, ORCHESTRATOR};
-use super::session::ServerSession;
+use super::endpoint::{self, Endpoint};
+use super::message::{AGENTS, ORCHESTRATOR};
+use super::session::AgentSession;
+use super::side::Side;
 use super::{AgentBootstrap, NetError};
 use crate::transport::Incoming;
 
@@ -27,23 +27,6 @@ use crate::transport::Incoming;
 const QUEUE_LENGTH: usize = 1024;
 /// Interval between checks for unresponsive agents.
 const EXPIRY_INTERVAL: Duration = Duration::from_millis(500);
-
-/// An event of an agent.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum AgentEvent {
-    /// It has joined.
-    Joined(Agent),
-    /// Its heartbeat is missing: the link is down, or the agent is dead.
-    Unresponsive(Agent),
-    /// Its heartbeat is back.
-    Recovered(Agent),
-    /// Its heartbeat was missing for too long: others get its assignments.
-    Lost(Agent),
-    /// It has left.
-    Left(Agent),
-    /// A message was rejected, with the reason.
-    MessageRejected(String),
-}
 
 /// The orchestrator's end of the transport. Agents can connect as soon as it is open; [`AgentServer::run`] handles
 /// their requests.
@@ -109,23 +92,21 @@ impl AgentServer {
         to_reactor: mpsc::Sender<Incoming>,
         mut on_event: impl FnMut(AgentEvent) + Send + 'static,
     ) -> Result<(), NetError> {
-        let files = Files::new(self.bootstrap.files);
         let mut state =
-            ServerSession::new(self.session_id, self.agent_timeout, self.bootstrap.setup, mixture, stopping);
+            AgentSession::new(self.session_id, self.agent_timeout, self.bootstrap, mixture, stopping);
         let mut is_closing = false;
-        let mut decisions = FuturesUnordered::new();
         let mut expiry = tokio::time::interval(EXPIRY_INTERVAL);
         expiry.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
-                // Complete aborted decisions before the reactor learns of the reason.
+                // Answers go before new requests.
                 biased;
                 () = closing.cancelled(), if !is_closing => is_closing = true,
-                Some((slot, work)) = decisions.next() => state.handle_decision(slot, work),
-                permit = to_reactor.reserve(), if !state.outbox.is_empty() => match permit {
-                    Ok(permit) => if let Some(incoming) = state.outbox.pop_front() { permit.send(incoming) },
+                decision = poll_fn(|context| state.slots.poll_decision(context)) => state.handle_decision(decision),
+                permit = to_reactor.reserve(), if !state.slots.outbox.is_empty() => match permit {
+                    Ok(permit) => if let Some(incoming) = state.slots.outbox.pop_front() { permit.send(incoming) },
                     // The reactor has ended: all waiting walkers shut down.
-                    Err(_) => state.outbox.clear(),
+                    Err(_) => state.slots.outbox.clear(),
                 },
                 change = self.liveliness.recv_async() => {
                     let change = change.map_err(|why| NetError::SessionClosed { why: why.to_string() })?;
@@ -134,9 +115,7 @@ impl AgentServer {
                 }
                 query = self.queries.recv_async() => {
                     let query = query.map_err(|why| NetError::SessionClosed { why: why.to_string() })?;
-                    if let Some(decision) = state.receive(query, &files) {
-                        decisions.push(decision);
-                    }
+                    state.receive(&query);
                 }
                 _ = expiry.tick() => state.expire(Instant::now()),
             }

@@ -24,7 +24,7 @@ use x509_parser::prelude::FromDer;
 use x509_parser::time::ASN1Time;
 
 pub use self::error::{CertificateError, CertificateFault};
-use super::endpoint::Side;
+use super::side::Side;
 
 /// Warn about certificates that expire within this time.
 const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 24 * 3600);

@@ -11,6 +11,7 @@ use zenoh::{Config, Session, Wait};
 
 use super::NetError;
 use super::certificates::Tls;
+use super::side::Side;
 
 /// Where the orchestrator listens and agents connect: `tcp/HOST:PORT`. Listening on port 0 chooses a free port.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -92,13 +93,6 @@ impl fmt::Display for Endpoint {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "tcp/{}:{}", self.host, self.port)
     }
-}
-
-/// Side of a connection.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Side {
-    Orchestrator,
-    Agent,
 }
 
 /// Opens a session on an endpoint; an agent's session connects.

@@ -17,6 +17,7 @@
 
 mod address;
 mod agent_client;
+mod agent_event;
 mod agent_server;
 mod certificates;
 mod delta;
@@ -25,7 +26,9 @@ mod files;
 mod handshake;
 mod message;
 mod registry;
+mod replies;
 mod session;
+mod side;
 mod slot;
 
 use std::collections::BTreeMap;
@@ -34,7 +37,8 @@ use std::path::PathBuf;
 
 pub use address::{Address, Announcement};
 pub use agent_client::{AgentClient, LinkError, Membership};
-pub use agent_server::{AgentEvent, AgentServer, StopTokens};
+pub use agent_event::AgentEvent;
+pub use agent_server::{AgentServer, StopTokens};
 pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
 pub use delta::DeltaError;
 pub use endpoint::{Endpoint, EndpointError};

@@ -35,11 +35,15 @@ pub enum SlotReport {
     },
 }
 
-impl Slot {
-    pub(super) fn new(session: u64, number: u32) -> Self {
-        Self { sender: SenderId { session, walker: number, incarnation: 1 }, sequence: 0 }
+impl Membership {
+    /// The slots of this agent.
+    pub fn slots(&self) -> Vec<Slot> {
+        let sender = |walker| SenderId { session: self.session, walker, incarnation: 1 };
+        self.slot_numbers().map(|number| Slot { sender: sender(number), sequence: 0 }).collect()
     }
+}
 
+impl Slot {
     /// Delivers the last report and waits for the next assignment, across broken links. Returns `None` when there is no
     /// more work. The report is committed once this has returned `Ok`.
     ///

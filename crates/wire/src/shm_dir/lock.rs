@@ -8,8 +8,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
 use super::error::{ShmDirError, io_error};
-use super::private::{create_private, user};
-use super::user_root;
+use super::private::{create_private, user, user_root};
 
 /// A short-term lock on all directories of this user. While it is held, no directory is created, removed or locked by
 /// another process.

@@ -32,9 +32,8 @@ pub use files::Removed;
 use error::io_error;
 use files::{entries, remove_file, remove_tree};
 use lock::{DirLock, UserLock};
-use private::{create_private, user};
+use private::{SHARED_MEMORY, create_private, user, user_root};
 
-const SHARED_MEMORY: &str = "/dev/shm";
 /// The file with the path of the campaign's directory.
 const CAMPAIGN: &str = "campaign";
 const MIXTURE: &str = "mixture";
@@ -176,11 +175,6 @@ impl ShmDir {
         }
         Ok(removed)
     }
-}
-
-/// The parent of all directories of this user.
-fn user_root() -> PathBuf {
-    Path::new(SHARED_MEMORY).join(format!("calmwalk-{}", user()))
 }
 
 /// Free shared memory, bytes.

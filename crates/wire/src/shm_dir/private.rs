@@ -3,12 +3,20 @@
 use std::fs::{self, DirBuilder, Metadata, Permissions};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::error::{ShmDirError, io_error};
 
+/// Where the kernel keeps shared memory.
+pub(super) const SHARED_MEMORY: &str = "/dev/shm";
+
 pub(super) fn user() -> u32 {
     rustix::process::geteuid().as_raw()
+}
+
+/// The parent of all directories of this user.
+pub(super) fn user_root() -> PathBuf {
+    Path::new(SHARED_MEMORY).join(format!("calmwalk-{}", user()))
 }
 
 /// Creates a directory with mode 0700, or checks that the existing one has it.

@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 
 use wire::CandidateView;
 
-use super::newest;
 use crate::checksum::{
     CANDIDATE as CANDIDATES, COMPONENT as COMPONENTS, CheckedColumn, DECISION as DECISIONS,
     STRUCTURE as STRUCTURES, VALUE as VALUES, WALK as WALKS,
@@ -56,7 +55,6 @@ pub(super) const CANDIDATE: [&str; 29] = [
 pub(super) const CANDIDATE_COUNT: [&str; 3] = ["origin", "fate", "number"];
 pub(super) const CANDIDATE_DATA: [&str; 5] =
     ["decision", "block", "features", "selector_grades", "original_grades"];
-pub(super) const JOB: [&str; 4] = ["hash", "protocol", "decision", "priority"];
 pub(super) const WALK: [&str; 20] = [
     "walk",
     "origin",
@@ -329,6 +327,17 @@ fn walk(walk: &WalkRecord) -> Result<Row> {
     let checkpoint = CheckedColumn::checksum(walk.walk.0.into(), walk.checkpoint.as_deref());
     row.extend([walk.checkpoint.clone().into(), checkpoint.into()]);
     Ok(row)
+}
+
+/// Only the newest record for each key, in order: a statement may write a row only once.
+fn newest<'a, T, K: Eq + std::hash::Hash>(
+    records: &'a [T],
+    key: impl Fn(&'a T) -> K,
+) -> impl Iterator<Item = &'a T> {
+    let mut seen = HashSet::new();
+    let mut newest: Vec<_> = records.iter().rev().filter(|record| seen.insert(key(record))).collect();
+    newest.reverse();
+    newest.into_iter()
 }
 
 fn count(number: usize) -> Result<i64> {

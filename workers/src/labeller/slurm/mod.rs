@@ -10,6 +10,7 @@
 //! forgets finished ones after a while (`MinJobAge`): a job that it does not know is finished, and the job's log
 //! gives the reason if Slurm ended it.
 
+mod job;
 mod script;
 mod squeue;
 mod squeue_cache;
@@ -17,33 +18,26 @@ mod squeue_cache;
 use std::ffi::OsStr;
 use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use ::slurm::{JobPhase, SlurmClient, SlurmError};
 use dft::PassedEnvironment;
-use serde::{Deserialize, Serialize};
 use store::StoreError;
 use tokio::sync::OnceCell;
 use tokio::time::sleep;
 
-use super::calculation_handle::CalculationState;
 use super::calculation_runner::CalculationEnd;
-use super::code::file_error;
+use super::calculation_state::CalculationState;
+use super::file_error::file_error;
 use super::private_directory;
+use job::BEGUN;
 use squeue::{SqueueJob, Traces};
+use squeue_cache::SQUEUE_INTERVAL;
 
+pub(super) use job::Job;
 pub(super) use script::{JobRequirements, write};
 pub(super) use squeue_cache::remove_cache;
-
-/// Created in the directory by the job that calculates.
-const BEGUN: &str = "begun";
-/// The batch script.
-const SCRIPT: &str = "job.sh";
-/// The request to its runner.
-const REQUEST: &str = "order.json";
-/// Output of Slurm and of the script.
-const LOG: &str = "slurm.log";
 
 /// Timeout of Slurm's commands.
 const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
@@ -51,8 +45,6 @@ const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
 const MIN_POLL_INTERVAL: Duration = Duration::from_millis(50);
 /// Longest time between two checks of a calculation's directory.
 const MAX_POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// Time between two queries to Slurm.
-const SQUEUE_INTERVAL: Duration = Duration::from_secs(20);
 /// Delay after which files written by a node are visible here.
 const SETTLE_TIME: Duration = Duration::from_secs(2);
 /// Time between two tries to submit.
@@ -61,22 +53,6 @@ const RETRY_INTERVAL: Duration = Duration::from_secs(3);
 const MAX_REFUSALS: u32 = 3;
 /// How long a cancelled job may take to end before its directory is left for later.
 const CANCEL_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// Identifies a job.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Job {
-    /// The cluster: elsewhere the name has no meaning.
-    pub cluster: String,
-    pub directory: PathBuf,
-    /// The name, unique to the calculation.
-    pub name: String,
-    /// The user who submitted it: others may not see it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub user: Option<u32>,
-    /// The node where it failed, if another node may help.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub node: Option<String>,
-}
 
 /// Access to Slurm for calculations.
 pub(super) struct Slurm {

@@ -8,9 +8,8 @@ use std::path::Path;
 
 use dft::result_file;
 
-use super::super::RunnerCommand;
-use super::super::calculation_runner::{self, Calculation, RunnerRequest};
-use super::{BEGUN, Job, LOG, REQUEST, SCRIPT};
+use super::super::calculation_runner::{self, Calculation, RunnerCommand, RunnerRequest};
+use super::job::{BEGUN, Job, LOG, REQUEST, SCRIPT};
 
 /// Slurm's time limit exceeds that of the runner, which ends the calculation in order, by this, s.
 const MARGIN: f64 = 60.0;

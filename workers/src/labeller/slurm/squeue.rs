@@ -9,7 +9,7 @@ use dft::Exit;
 
 use super::super::calculation_runner::{CalculationEnd, EndReason};
 use super::super::log::last_lines;
-use super::{BEGUN, LOG};
+use super::job::{BEGUN, LOG};
 
 /// A job, as `squeue` shows it.
 #[derive(Clone, Debug, PartialEq)]

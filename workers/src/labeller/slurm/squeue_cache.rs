@@ -5,12 +5,15 @@
 
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
 use ::slurm::SlurmClient;
 use dft::result_file;
 
-use super::{Job, SQUEUE_INTERVAL};
+use super::job::Job;
 
+/// Time between two queries to Slurm.
+pub(super) const SQUEUE_INTERVAL: Duration = Duration::from_secs(20);
 /// File beside the directories of calculations.
 const CACHE_FILE: &str = "calmwalk-squeue";
 

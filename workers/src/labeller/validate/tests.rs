@@ -1,4 +1,4 @@
-use analysis::LabelledEnergy;
+use analysis::{EnergyOffsets, LabelledEnergy};
 use atoms::Cell;
 
 use super::*;

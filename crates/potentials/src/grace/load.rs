@@ -1,0 +1,76 @@
+//! Reads a model: detects its architecture, calls that reader, and checks the result.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use npz::Archive;
+
+use super::builder::ModelParts;
+use super::description::Architecture;
+use super::error::GraceError;
+use super::model::GraceModel;
+use super::network::{AnyNetwork, Network};
+use super::precision::Precision;
+use super::radial::RadialPath;
+use super::symmetry::require_invariance;
+use super::vector::Vector;
+use super::{one_layer, three_layers, two_layers};
+
+impl GraceModel {
+    /// Reads a model for double precision with tabulated radial functions.
+    ///
+    /// # Errors
+    /// With file, array, what was found and what was expected.
+    pub fn load(path: &Path) -> Result<Self, GraceError> {
+        Self::load_with(path, RadialPath::default())
+    }
+
+    /// Reads a model with this evaluation of radial functions.
+    ///
+    /// # Errors
+    /// As [`GraceModel::load`].
+    pub fn load_with(path: &Path, radial: RadialPath) -> Result<Self, GraceError> {
+        Self::load_in(path, Precision::Double, radial)
+    }
+
+    /// Reads a model for this precision.
+    ///
+    /// # Errors
+    /// As [`GraceModel::load`].
+    pub fn load_in(path: &Path, precision: Precision, radial: RadialPath) -> Result<Self, GraceError> {
+        let archive = Archive::open(path)?;
+        match precision {
+            Precision::Double => Self::read(&archive, radial, AnyNetwork::Double),
+            Precision::Mixed => Self::read(&archive, radial, AnyNetwork::Mixed),
+        }
+    }
+
+    fn read<V: Vector>(
+        archive: &Archive,
+        path: RadialPath,
+        any: fn(Arc<Network<V>>) -> AnyNetwork,
+    ) -> Result<Self, GraceError> {
+        let architecture = detect(archive);
+        let ModelParts { network, pair_cutoffs, description } = match architecture {
+            Architecture::OneLayer => one_layer::read(archive, path)?,
+            Architecture::TwoLayer => two_layers::read(archive, path)?,
+            Architecture::ThreeLayer => three_layers::read(archive, path)?,
+        };
+        let model = Self { network: any(Arc::new(network)), pair_cutoffs, description };
+        match architecture {
+            Architecture::OneLayer => Ok(model),
+            _ => require_invariance(archive, model),
+        }
+    }
+}
+
+/// Detects the depth by the lists of single-particle basis functions that only deeper models have.
+fn detect(archive: &Archive) -> Architecture {
+    if archive.contains("spbf_names") {
+        Architecture::ThreeLayer
+    } else if archive.contains("spb_names") {
+        Architecture::TwoLayer
+    } else {
+        Architecture::OneLayer
+    }
+}

@@ -1,0 +1,8 @@
+//! The two sides of a connection.
+
+/// Side of a connection.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Side {
+    Orchestrator,
+    Agent,
+}

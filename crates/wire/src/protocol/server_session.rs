@@ -1,0 +1,231 @@
+//! The server's end of the protocol, the same for every transport between processes: what an offer, a poll and progress
+//! mean. The reactor decides each offer once, and the walker receives the answer after the commit.
+
+use std::borrow::Cow;
+use std::collections::{BTreeMap, VecDeque};
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use calm::Mixture;
+use tokio::sync::oneshot;
+
+use super::message::{Answer, AnswerBody, Envelope, Payload, SenderId, attach_candidate};
+use super::rejected::RejectedMessage;
+use super::sequence::{OfferStatus, SequenceTracker};
+use crate::block::{BlockError, CandidateBlock};
+use crate::ids::WalkId;
+use crate::messages::{Progress, Report};
+use crate::transport::{Incoming, WorkItem};
+
+/// Maximum number of progress messages queued for the reactor.
+const MAX_QUEUED_PROGRESS: usize = 64;
+
+/// What a transport between processes does for the server.
+pub(crate) trait ServerTransport {
+    /// A received request, kept until it is answered.
+    type Request: Clone;
+
+    /// Whether a poll waits for the decision. Otherwise the server answers at once that the offer is pending.
+    const HOLDS_POLLS: bool;
+
+    /// Encodes an answer.
+    fn encode(answer: Answer<'_>) -> Vec<u8>;
+
+    /// Sends an encoded answer to a request. If it is lost, the walker polls again.
+    fn send(&mut self, sender: SenderId, request: &Self::Request, answer: &[u8]);
+
+    /// The candidate of a new offer from its block, which is not empty.
+    fn candidate(
+        &mut self,
+        sender: SenderId,
+        request: &Self::Request,
+        block: &[u8],
+    ) -> Result<CandidateBlock, BlockError>;
+}
+
+/// The walkers of a session and their offers.
+pub(crate) struct ServerSession<T: ServerTransport> {
+    pub transport: T,
+    /// Messages for the reactor: at most one offer and one exit of each walker, and some progress.
+    pub outbox: VecDeque<Incoming>,
+    sequences: SequenceTracker,
+    /// The pending offer of each walker.
+    pending: BTreeMap<u32, PendingOffer<T::Request>>,
+    /// The mixture of each walker's assignment, kept until its report.
+    mixtures: BTreeMap<u32, Arc<Mixture>>,
+}
+
+/// An offer that waits for the reactor's decision.
+struct PendingOffer<R> {
+    /// The walker's latest request about it, which takes the answer.
+    request: R,
+    decision: oneshot::Receiver<Option<WorkItem>>,
+}
+
+/// The reactor's decision on an offer.
+pub(crate) struct Decision<R> {
+    walker: u32,
+    request: R,
+    /// The next assignment; `None` for shutdown.
+    pub work: Option<WorkItem>,
+}
+
+impl<T: ServerTransport> ServerSession<T> {
+    pub(crate) fn new(session: u64, transport: T) -> Self {
+        Self {
+            transport,
+            outbox: VecDeque::new(),
+            sequences: SequenceTracker::new(session),
+            pending: BTreeMap::new(),
+            mixtures: BTreeMap::new(),
+        }
+    }
+
+    /// Accepts messages only of this incarnation of the walker from now on.
+    pub(crate) fn expect(&mut self, walker: u32, incarnation: u32) {
+        self.sequences.expect(walker, incarnation);
+    }
+
+    /// The incarnation of the walker whose messages are accepted.
+    pub(crate) fn incarnation(&self, walker: u32) -> Option<u32> {
+        self.sequences.incarnation(walker)
+    }
+
+    /// Rejects all further messages of the walker. Drops its pending decision before the reactor learns of the loss, so
+    /// that the reactor recognizes an assignment sent in the meantime as lost either way.
+    pub(crate) fn remove(&mut self, walker: u32, crashed: bool) {
+        self.sequences.remove(walker);
+        self.pending.remove(&walker);
+        self.mixtures.remove(&walker);
+        self.outbox.push_back(Incoming::Lost { walker, crashed });
+    }
+
+    /// Handles a message of a walker. `block` is the candidate that came with it, or empty.
+    pub(crate) fn receive(
+        &mut self,
+        Envelope { sender, payload }: Envelope<'_>,
+        request: &T::Request,
+        block: &[u8],
+    ) -> Result<(), RejectedMessage> {
+        self.sequences.check_sender(sender)?;
+        match payload {
+            Payload::Offer { sequence, report } => {
+                if self.is_new(sender, sequence, request)? {
+                    let candidate = (!block.is_empty())
+                        .then(|| self.transport.candidate(sender, request, block))
+                        .transpose()?;
+                    self.begin(sender.walker, request, attach_candidate(report, candidate)?);
+                }
+            }
+            Payload::Poll { sequence } => self.poll(sender, sequence, request)?,
+            Payload::Progress(walk, progress) => self.progress(walk, progress.into_owned()),
+        }
+        Ok(())
+    }
+
+    /// Handles an offer without report of a sender that lost its walker: forwards the loss first.
+    pub(crate) fn receive_loss(
+        &mut self,
+        sender: SenderId,
+        sequence: u64,
+        crashed: bool,
+        request: &T::Request,
+    ) -> Result<(), RejectedMessage> {
+        if self.is_new(sender, sequence, request)? {
+            self.outbox.push_back(Incoming::Lost { walker: sender.walker, crashed });
+            self.begin(sender.walker, request, None);
+        }
+        Ok(())
+    }
+
+    /// Whether an offer is new. Repeats the answer to an answered offer; a pending one is answered through its latest
+    /// request.
+    fn is_new(
+        &mut self,
+        sender: SenderId,
+        sequence: u64,
+        request: &T::Request,
+    ) -> Result<bool, RejectedMessage> {
+        match self.sequences.offer(sender, sequence)? {
+            OfferStatus::Answered(answer) => self.transport.send(sender, request, answer),
+            OfferStatus::Pending => self.hold(sender.walker, request),
+            OfferStatus::New | OfferStatus::Unknown => return Ok(true),
+        }
+        Ok(false)
+    }
+
+    fn hold(&mut self, walker: u32, request: &T::Request) {
+        if let Some(pending) = self.pending.get_mut(&walker) {
+            pending.request = request.clone();
+        }
+    }
+
+    /// Forwards an offer to the reactor. The walker has reported, so the mixture of its assignment is released.
+    fn begin(&mut self, walker: u32, request: &T::Request, report: Option<Report>) {
+        self.sequences.begin(walker);
+        self.mixtures.remove(&walker);
+        let (reply, decision) = oneshot::channel();
+        self.pending.insert(walker, PendingOffer { request: request.clone(), decision });
+        self.outbox.push_back(Incoming::Idle { walker, report, reply });
+    }
+
+    fn poll(&mut self, sender: SenderId, sequence: u64, request: &T::Request) -> Result<(), RejectedMessage> {
+        let body = match self.sequences.poll(sender, sequence)? {
+            OfferStatus::Answered(answer) => {
+                self.transport.send(sender, request, answer);
+                return Ok(());
+            }
+            OfferStatus::Pending if T::HOLDS_POLLS => {
+                self.hold(sender.walker, request);
+                return Ok(());
+            }
+            OfferStatus::Pending => AnswerBody::Pending,
+            OfferStatus::New | OfferStatus::Unknown => AnswerBody::Unknown,
+        };
+        self.transport.send(sender, request, &T::encode(Answer { sequence, body }));
+        Ok(())
+    }
+
+    /// May drop the message.
+    fn progress(&mut self, walk: WalkId, progress: Progress) {
+        if self.outbox.len() < MAX_QUEUED_PROGRESS {
+            self.outbox.push_back(Incoming::Progress(walk, progress));
+        }
+    }
+
+    /// The next decision of the reactor, for [`ServerSession::answer`].
+    pub(crate) fn poll_decision(&mut self, context: &mut Context<'_>) -> Poll<Decision<T::Request>> {
+        let decided = self.pending.iter_mut().find_map(|(walker, pending)| {
+            match Pin::new(&mut pending.decision).poll(context) {
+                Poll::Ready(decision) => Some((*walker, decision.ok().flatten())),
+                Poll::Pending => None,
+            }
+        });
+        let Some((walker, work)) = decided else { return Poll::Pending };
+        let Some(PendingOffer { request, .. }) = self.pending.remove(&walker) else { return Poll::Pending };
+        Poll::Ready(Decision { walker, request, work })
+    }
+
+    /// Answers a pending offer and keeps the mixture of the new assignment.
+    pub(crate) fn answer(&mut self, decision: Decision<T::Request>) {
+        let Decision { walker, request, work } = decision;
+        let Some((sender, sequence)) = self.sequences.pending(walker) else { return };
+        let body = match &work {
+            Some(WorkItem { assignment, mixture }) => AnswerBody::Assignment {
+                mixture_version: mixture.version(),
+                assignment: Cow::Borrowed(assignment),
+            },
+            None => AnswerBody::Shutdown,
+        };
+        let answer = T::encode(Answer { sequence, body });
+        self.transport.send(sender, &request, &answer);
+        self.sequences.set_answer(walker, answer);
+        self.mixtures.extend(work.map(|work| (walker, work.mixture)));
+    }
+
+    /// The mixtures of all assignments that walkers have not reported on.
+    pub(crate) fn mixtures(&self) -> impl Iterator<Item = &Arc<Mixture>> {
+        self.mixtures.values()
+    }
+}

@@ -1,0 +1,47 @@
+//! Errors.
+
+use calm::MixtureError;
+use wire::CandidateId;
+
+use crate::grader::GraderError;
+
+/// Why the selector failed.
+#[derive(Debug, thiserror::Error)]
+pub enum SelectorError {
+    /// A candidate that cannot be graded.
+    #[error("candidate {candidate}: {source}")]
+    Grade {
+        /// The candidate.
+        candidate: CandidateId,
+        /// The error.
+        source: GraderError,
+    },
+    /// The mixture update failed.
+    #[error("updating the mixture for candidate {candidate}: {source}")]
+    Update {
+        /// The candidate.
+        candidate: CandidateId,
+        /// The error.
+        source: calm::UpdateError,
+    },
+    /// Components that do not form a mixture.
+    #[error(transparent)]
+    Mixture(#[from] MixtureError),
+    /// An unusable seed structure.
+    #[error("seed structure '{name}': {source}")]
+    SeedStructure {
+        /// Name of the seed structure.
+        name: String,
+        /// The error.
+        source: GraderError,
+    },
+    /// A database that does not match the campaign.
+    #[error("cannot continue the campaign's database: {0}")]
+    Snapshot(String),
+    /// Training frames that do not match the mixture.
+    #[error("grading the training frames: {source}")]
+    Training {
+        /// The error.
+        source: calm::GradeError,
+    },
+}

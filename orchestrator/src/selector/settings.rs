@@ -1,0 +1,93 @@
+//! What a selector works with: settings, seed structures, and the stored state.
+
+use atoms::Structure;
+use calm::forgetting::ForgettingAlarm;
+use serde::{Deserialize, Serialize};
+use store::records::{ComponentRecord, WalkRecord};
+use wire::ContentHash;
+
+/// Whether a campaign is reproducible bit by bit, or walks never wait for each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// Walks advance in rounds. Decisions do not depend on the number of walkers or on their speed.
+    Reproducible,
+    /// The mixture is updated as candidates arrive.
+    Live,
+}
+
+impl Mode {
+    /// The serialized name: `"reproducible"` or `"live"`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Reproducible => "reproducible",
+            Self::Live => "live",
+        }
+    }
+}
+
+/// What happens to the mixture between seed structures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum UpdateProtocol {
+    /// Updates accumulate over all seed structures.
+    Cumulative,
+    /// Each seed structure starts from the original mixture.
+    PerSeedStructure,
+    /// The mixture is never updated.
+    Never,
+}
+
+/// The settings of the selector.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Reproducible or live.
+    pub mode: Mode,
+    /// Number of biased walks that advance together in a round.
+    pub walks_per_round: usize,
+    /// Number of steps in an assignment.
+    pub steps_per_assignment: u64,
+    /// What happens to the mixture between seed structures.
+    pub update: UpdateProtocol,
+    /// How the covariance is updated, and when the search for α stops.
+    pub search: calm::UpdateSettings,
+    /// When the grades of the training frames raise an alarm.
+    pub forgetting_alarm: ForgettingAlarm,
+    /// When a structure is a candidate.
+    pub collection: calm::CollectionRule,
+    /// Maximum number of structures accepted from one seed structure.
+    pub max_per_seed_structure: u32,
+    /// Maximum number of structures accepted in the campaign.
+    pub max_structures: Option<u32>,
+    /// Whether each biased walk that collected structures is followed by its unbiased control walk.
+    pub control: bool,
+    /// Minimum distance between atoms, Å, and as a fraction of the shortest distance in the seed structure. Structures
+    /// with shorter distances are declined.
+    pub min_distance: (f64, f64),
+    /// Maximum size of the stored feature vectors of declined candidates, bytes.
+    pub declined_feature_bytes: u64,
+}
+
+/// The start of a walk.
+#[derive(Clone, Debug)]
+pub struct SeedStructure {
+    /// Name.
+    pub name: String,
+    /// Structure.
+    pub structure: Structure,
+}
+
+/// The state of a selector, as restored from a store.
+#[derive(Clone, Debug, Default)]
+pub struct SelectorSnapshot {
+    /// Every walk.
+    pub walks: Vec<WalkRecord>,
+    /// Components that differ from the original mixture.
+    pub components: Vec<ComponentRecord>,
+    /// Hashes of the known structures.
+    pub known: Vec<ContentHash>,
+    /// Number of known structures that were imported.
+    pub imported: u64,
+    /// Values of past commits.
+    pub values: Vec<(String, String)>,
+}
