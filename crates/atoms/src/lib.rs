@@ -3,7 +3,10 @@
 //! Internal units: eV, Å, fs, u, K. The module of a foreign format converts its units.
 
 pub mod cell;
+mod covalent_radius;
+mod element_pair;
 pub mod extxyz;
+mod min_distances;
 mod neighbours;
 pub mod poscar;
 mod potential;
@@ -13,6 +16,8 @@ mod structure;
 pub mod units;
 
 pub use cell::{Cell, Matrix3, Vec3};
+pub use element_pair::{ElementPair, ShortestDistances};
+pub use min_distances::{CloseContact, MinDistanceRule, MinDistances, PerPair, Uniform};
 pub use neighbours::{Bond, Neighbour, NeighbourList, shortest_distance};
 pub use potential::{Evaluation, Potential, PotentialError};
 pub use read::{FileError, open_extxyz, read_extxyz, read_poscar, read_structures};
