@@ -3,11 +3,16 @@
 use std::fmt;
 use std::str::FromStr;
 
+use schemars::JsonSchema;
 use serde::de::{Error, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// A wall-clock time that is written with its unit.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, JsonSchema)]
+#[schemars(
+    with = "String",
+    extend("pattern" = r"^\s*[0-9][0-9\s.a-zA-Zµ]*[a-zA-Zµ]\s*$", "examples" = ["90s", "10m", "2h 30m"])
+)]
 pub struct Duration(std::time::Duration);
 
 /// What a value looks like, for error messages.

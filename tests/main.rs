@@ -36,6 +36,7 @@ mod places;
 mod processes;
 mod relabel;
 mod replay;
+mod schema;
 mod status;
 mod wrong_artifacts;
 mod wrong_campaign;

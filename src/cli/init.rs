@@ -4,9 +4,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::{ExitStatus, Failure};
+use crate::config::schema_text;
 use crate::output::print;
 
 /// Create a small runnable example with a commented campaign.toml
+///
+/// Writes campaign.schema.json beside it, with which editors complete and check campaign.toml.
 #[derive(Debug, clap::Args)]
 pub struct Init {
     /// Directory for the files; created if it does not exist
@@ -30,11 +33,21 @@ const FILES: [(&str, &[u8]); 5] = [
     example!("data/Al_mm.eam.fs"),
 ];
 
+/// The schema of the configuration, and the line by which editors find it.
+const SCHEMA: &str = "campaign.schema.json";
+const SCHEMA_LINE: &str = "#:schema ./campaign.schema.json\n\n";
+
 impl Init {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let config = self.directory.join("campaign.toml");
-        let files = FILES.iter().map(|(path, content)| (self.directory.join(path), *content));
-        let files: Vec<_> = files.chain([(config.clone(), CAMPAIGN)]).collect();
+        let written = [SCHEMA_LINE.as_bytes(), CAMPAIGN].concat();
+        let schema = schema_text();
+        let written = [("campaign.toml", &written[..]), (SCHEMA, schema.as_bytes())];
+        let files: Vec<_> = FILES
+            .into_iter()
+            .chain(written)
+            .map(|(path, content)| (self.directory.join(path), content))
+            .collect();
         if let Some((existing, _)) = files.iter().find(|(path, _)| path.exists()) {
             let existing = existing.display();
             return Err(Failure::Input(format!(

@@ -23,6 +23,7 @@ mod relabel;
 mod replay;
 mod report;
 mod run;
+mod schema;
 pub mod status;
 mod store;
 mod validate;
@@ -54,6 +55,7 @@ pub struct Arguments {
 enum Command {
     Init(init::Init),
     Validate(validate::Validate),
+    Schema(schema::Schema),
     Estimate(estimate::Estimate),
     Run(run::Run),
     Agent(agent::Agent),
@@ -91,6 +93,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, Failure> {
     match arguments.command {
         Command::Init(command) => command.run(),
         Command::Validate(command) => command.run(),
+        Command::Schema(command) => command.run(),
         Command::Estimate(command) => command.run(),
         Command::Run(command) => command.run(),
         Command::Agent(command) => command.run(),

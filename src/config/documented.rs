@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use super::Config;
 use super::changes::differences;
 use super::ranges::{RANGES, Range};
+use super::schema::{at_key, schema};
 
 const CAMPAIGNS: [&str; 4] =
     ["aluminium.toml", "silicon.toml", "silicon-dft.toml", "foundation-expansion.toml"];
@@ -129,6 +130,38 @@ fn the_reference_describes_every_key() {
             rows.map(|key| key.split('.').next().unwrap_or(key).to_owned()).collect();
         assert_eq!(described, keys, "docs/configuration.md: [{section}]");
     }
+}
+
+#[test]
+fn the_schema_describes_every_key() {
+    let schema = schema();
+    for (section, keys) in all_keys() {
+        let described = schema["properties"][&section]["properties"].as_object().unwrap();
+        assert_eq!(described.keys().cloned().collect::<BTreeSet<_>>(), keys, "[{section}]");
+        for (key, schema) in described {
+            assert!(schema["description"].is_string(), "{section}.{key}");
+        }
+    }
+}
+
+#[test]
+fn the_schema_has_every_key_of_the_reference() {
+    let (mut schema, text) = (schema(), read("docs/configuration.md"));
+    let (campaign, _) = text.split_once("\n## `calmwalk md`").unwrap();
+    let mut keys = 0;
+    for chapter in campaign.split("\n## ").skip(1) {
+        let (heading, rows) = chapter.split_once('\n').unwrap();
+        let section = heading.strip_prefix("`[").and_then(|rest| rest.strip_suffix("]`"));
+        for row in rows.lines().filter_map(|line| line.strip_prefix("| `")) {
+            let key = row.split(['`', ' ']).next().unwrap();
+            let key = section.map_or(key.to_owned(), |section| format!("{section}.{key}"));
+            let mut found = false;
+            at_key(&mut schema, &key, &mut |_| found = true);
+            assert!(found, "{key}");
+            keys += 1;
+        }
+    }
+    assert!(keys > RANGES.len());
 }
 
 #[test]

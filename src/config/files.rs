@@ -6,11 +6,12 @@ use std::sync::Arc;
 use atoms::Potential;
 use potentials::grace::{Grace, GraceModel};
 use potentials::{Eam, EamStyle, StillingerWeber};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
 
 /// What a potential file holds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PotentialKind {
     /// GRACE, the exported `kokkos.npz`.
@@ -24,12 +25,13 @@ pub enum PotentialKind {
 }
 
 /// `{ kind, file }`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PotentialFile {
     /// What it holds.
     pub kind: PotentialKind,
     /// Where it is.
+    #[schemars(with = "PathBuf")]
     pub file: Spanned<PathBuf>,
 }
 

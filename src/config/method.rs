@@ -3,6 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDeserializer};
 use serde::{Deserialize, Deserializer, Serialize};
 use toml::Spanned;
@@ -41,7 +42,7 @@ const THROUGH_ASE: [&str; 27] = [
 ];
 
 /// How labels are made: a table with one key, the name of the method.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LabelMethod {
     /// Any potential that calmwalk evaluates.

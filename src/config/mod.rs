@@ -14,6 +14,7 @@ mod method;
 mod mutated;
 mod notify;
 mod ranges;
+mod schema;
 mod sections;
 mod warning;
 
@@ -21,6 +22,7 @@ use std::path::{Path, PathBuf};
 
 use calm::UpdateSettings;
 use calm::rules::Positive;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
@@ -35,11 +37,12 @@ pub use hints::{KnownKeys, nearest};
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};
 pub use ranges::impossible;
+pub use schema::schema_text;
 pub use sections::*;
 pub use warning::Warning;
 
 /// A whole campaign.
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Mode and random seed.

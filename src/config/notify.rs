@@ -3,16 +3,18 @@
 use std::num::NonZeroU32;
 use std::path::Path;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::defaults;
 use crate::duration::Duration;
 
 /// The user's command that calmwalk runs at events of a campaign.
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct NotifySection {
     /// The command and its arguments. Default: none, and no notification is sent.
+    #[schemars(length(min = 1))]
     pub command: Option<Vec<String>>,
     /// Events for which the command is run.
     pub on: Vec<NotifyEvent>,
@@ -25,7 +27,7 @@ pub struct NotifySection {
 }
 
 /// What may happen to a campaign.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum NotifyEvent {
     /// It is finished.

@@ -160,23 +160,37 @@ impl Range {
         (self.usual[0]..=self.usual[1]).contains(&value)
     }
 
-    /// What is possible, in words.
+    /// What is possible, in words, with the hint.
     pub fn expected(&self) -> String {
+        match self.hint {
+            "" => self.possible_in_words(),
+            hint => format!("{}: {hint}", self.possible_in_words()),
+        }
+    }
+
+    /// What a schema cannot have as limits, in words: what is usual, and of times also what is possible.
+    pub fn note(&self) -> String {
+        let usual = format!("Usual: {}.", self.usual_in_words());
+        if self.unit == TIME { format!("Possible: {}. {usual}", self.possible_in_words()) } else { usual }
+    }
+
+    fn possible_in_words(&self) -> String {
         let [least, most] = self.possible.map(|bound| self.shown(bound));
         let bounds =
             if self.possible[0] > 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
-        match self.hint {
-            "" => self.with_unit(bounds),
-            hint => format!("{}: {hint}", self.with_unit(bounds)),
-        }
+        self.with_unit(bounds)
+    }
+
+    fn usual_in_words(&self) -> String {
+        let [least, most] = self.usual.map(|bound| self.shown(bound));
+        self.with_unit(format!("{least} to {most}"))
     }
 
     /// That a value is unusual, in words.
     pub fn unusual(&self, value: f64) -> String {
-        let [least, most] = self.usual.map(|bound| self.shown(bound));
         let value = self.with_unit(self.shown(value));
         let hint = if self.hint.is_empty() { String::new() } else { format!("; {}", self.hint) };
-        format!("{value} is unusual ({} is usual){hint}", self.with_unit(format!("{least} to {most}")))
+        format!("{value} is unusual ({} is usual){hint}", self.usual_in_words())
     }
 
     /// A value as people write it, without its unit; times have theirs.

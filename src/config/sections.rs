@@ -9,15 +9,16 @@ use dft::PassedEnvironment;
 use md::ThermostatSettings;
 use orchestrator::selector::{Mode, UpdateProtocol};
 use potentials::grace::Precision;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use workers::labeller::{BatchSystem, ExecutionSettings, KeepDirectories, LabelBounds, LabelGuard};
 
-use super::{LabelMethod, defaults};
+use super::{LabelMethod, defaults, schema};
 use crate::duration::Duration;
 
 /// `[campaign]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CampaignSection {
     /// `reproducible`: rounds of a fixed number of walks. `live`: every walk goes on as soon as it can.
@@ -29,10 +30,11 @@ pub struct CampaignSection {
 }
 
 /// `[potential]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PotentialSection {
     /// File of the exported GRACE model (`kokkos.npz`).
+    #[schemars(with = "PathBuf")]
     pub model: Spanned<PathBuf>,
     /// Floating-point precision in which walkers evaluate the model.
     #[serde(default)]
@@ -40,15 +42,17 @@ pub struct PotentialSection {
 }
 
 /// `[calm]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CalmSection {
     /// File of the mixture with scatter matrices and counts (`gmm_artifacts.npz`). Default: the mixture in the
     /// model's file, which cannot be updated.
     #[serde(default)]
+    #[schemars(with = "Option<PathBuf>")]
     pub artifact: Option<Spanned<PathBuf>>,
     /// File of the frames that the mixture was built from. calmwalk grades them again with each mixture.
     #[serde(default)]
+    #[schemars(with = "Option<PathBuf>")]
     pub training_frames: Option<Spanned<PathBuf>>,
     /// Share of training atoms with γ > 1 under the current mixture above which calmwalk warns.
     #[serde(default = "defaults::forgetting_alarm")]
@@ -65,15 +69,16 @@ pub struct CalmSection {
 }
 
 /// `[seed_structures]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SeedStructuresSection {
     /// Extended XYZ or POSCAR files; each frame is a seed structure.
+    #[schemars(with = "Vec<PathBuf>", length(min = 1))]
     pub files: Vec<Spanned<PathBuf>>,
 }
 
 /// `[walk]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WalkSection {
     /// Temperature of the thermostat, K.
@@ -90,6 +95,7 @@ pub struct WalkSection {
     pub time_step: Option<Positive>,
     /// Thermostat: Langevin or Nosé–Hoover.
     #[serde(default = "defaults::thermostat")]
+    #[schemars(transform = schema::without_none)]
     pub thermostat: ThermostatSettings,
     /// Linear change of the volume over the biased steps. Default: the cell is fixed.
     #[serde(default)]
@@ -103,7 +109,7 @@ pub struct WalkSection {
 }
 
 /// `volume_ramp = { from, to }`
-#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
+#[derive(Clone, Copy, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct VolumeRampSection {
     /// V/V₀ at the first biased step.
@@ -113,7 +119,7 @@ pub struct VolumeRampSection {
 }
 
 /// `[collect]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CollectSection {
     /// Rule by which a walker sends a structure as a candidate.
@@ -138,7 +144,7 @@ pub struct CollectSection {
 }
 
 /// `[guard]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct GuardSection {
     /// Shortest allowed distance of two atoms, Å.
@@ -160,7 +166,7 @@ pub struct GuardSection {
 }
 
 /// `zbl = { inner, outer }`
-#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
+#[derive(Clone, Copy, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ZblSection {
     /// Distance below which the repulsion has its full strength, Å.
@@ -170,7 +176,7 @@ pub struct ZblSection {
 }
 
 /// `[label]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct LabelSection {
     /// What calculates the labels.
@@ -219,6 +225,7 @@ pub struct LabelSection {
     pub batch_system: Option<BatchSystem>,
     /// Further options for the batch system.
     #[serde(default)]
+    #[schemars(inner(regex(pattern = "^-")))]
     pub batch_options: Vec<String>,
     /// Number of unfinished label jobs above which `on_queue_full` applies.
     #[serde(default = "defaults::queue_limit")]
@@ -232,7 +239,7 @@ pub struct LabelSection {
 }
 
 /// What happens while the label queue is longer than `queue_limit`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum QueueFull {
     /// Walkers wait.
@@ -243,7 +250,7 @@ pub enum QueueFull {
 }
 
 /// `[budget]`
-#[derive(Clone, Debug, Default, Deserialize, Serialize)]
+#[derive(Clone, Debug, Default, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BudgetSection {
     /// Largest number of labels.
@@ -255,7 +262,7 @@ pub struct BudgetSection {
 }
 
 /// `[run]`
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunSection {
     /// Number of walkers. 0: as many as the processor cores allow.

@@ -4,11 +4,13 @@ use std::fmt;
 use std::str::FromStr;
 
 use mendeleev::Element;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A chemical element, by atomic number (1 … 118).
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
+#[schemars(extend("pattern" = "^[A-Z][a-z]?$"))]
 pub struct Species(u8);
 
 /// A symbol or atomic number of no element.

@@ -4,6 +4,7 @@ mod atom_count;
 mod maximum_grade;
 mod numbers;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use self::atom_count::{AtomCount, AtomCountUpdate, atom_limit};
@@ -12,7 +13,7 @@ pub use self::numbers::{AlphaValues, Fraction, Positive, RuleError};
 use crate::update::CovarianceUpdate;
 
 /// When a structure becomes a candidate: enough of its atoms have a grade above a threshold.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "rule", rename_all = "snake_case")]
 pub enum CollectionRule {
     /// γ_max above a threshold.
@@ -22,7 +23,7 @@ pub enum CollectionRule {
 }
 
 /// How α is chosen.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "rule", rename_all = "snake_case")]
 pub enum UpdateRule {
     /// γ_max below a target.
@@ -120,7 +121,7 @@ impl UpdateRule {
 }
 
 /// How the old covariance and that of the batch are combined.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CovarianceUpdateKind {
     /// (1 − α) C + α C_batch (paper).

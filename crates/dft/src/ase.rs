@@ -12,6 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use atoms::{Species, Structure};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -31,8 +32,9 @@ const CALCULATOR_FILE: &str = "calculator.py";
 const INPUT_VERSION: u32 = 1;
 
 /// The settings of `[label.method.ase]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
+#[schemars(extend("required" = ["calculator"]))]
 pub struct Settings {
     /// A Python with ASE and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
     pub command: Vec<String>,

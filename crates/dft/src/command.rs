@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::extxyz::{Frame, write_frame};
 use atoms::{Species, Structure};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
@@ -32,7 +33,7 @@ const LABEL: &str = "label.extxyz";
 const RESERVED: [&str; 4] = [STRUCTURE, LABEL, "stdout", "stderr"];
 
 /// The settings of `[label.method.command]`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
     /// The program and its arguments, one word each, without a shell. The program is an absolute path or a name

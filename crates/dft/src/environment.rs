@@ -7,6 +7,7 @@
 use std::env;
 use std::ffi::{OsStr, OsString};
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Variables that every program receives.
@@ -157,10 +158,11 @@ const SECRETS: [&str; 10] = [
 ];
 
 /// The environment variables that a labeller passes to programs in addition to the standard ones.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(transparent)]
 pub struct PassedEnvironment {
     /// Names, and prefixes followed by `*`.
+    #[schemars(inner(regex(pattern = r"^[^*= ]+\*?$")))]
     patterns: Vec<String>,
 }
 

@@ -1,9 +1,10 @@
 //! Partial occupation of electronic states.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Occupation function of the states near the Fermi level.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Smearing {
     /// f = ½ erfc((ε − μ) / width).

@@ -27,6 +27,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::poscar::write_poscar;
 use atoms::{Species, Structure};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -43,8 +44,9 @@ use potcar::Potcar;
 const INPUT_VERSION: u32 = 1;
 
 /// The settings of `[label.method.vasp]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
+#[schemars(extend("required" = ["version", "pseudopotentials", "pseudopotential_variants"]))]
 pub struct Settings {
     /// VASP with its launcher: `["mpirun", "-np", "16", "vasp_std"]`.
     pub command: Vec<String>,
@@ -58,12 +60,15 @@ pub struct Settings {
     /// The potential of each element that may occur: `{ Al = "Al", Fe = "Fe_pv" }`. Required.
     pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV (`ENCUT`).
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub cutoff: f64,
     /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub k_spacing: f64,
     /// Occupation function of the electronic states (`ISMEAR`).
     pub smearing: Smearing,
     /// Width of the smearing, eV (`SIGMA`).
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised (`ISPIN`).
     #[serde(rename = "spin_polarized")]
@@ -72,15 +77,20 @@ pub struct Settings {
     #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// Tolerance of the energy in the last electronic step, eV (`EDIFF`).
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
     /// Maximum number of electronic steps (`NELM`).
     #[serde(rename = "max_scf_steps")]
+    #[schemars(range(min = 1))]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
     /// Number of process groups that share the k-points (`KPAR`).
+    #[schemars(range(min = 1))]
     pub kpar: u32,
     /// Number of processes that share a band (`NCORE`).
+    #[schemars(range(min = 1))]
     pub ncore: u32,
     /// Further INCAR tags, part of the protocol: `{ LASPH = ".TRUE." }`.
     pub tags: BTreeMap<String, String>,

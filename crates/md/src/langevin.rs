@@ -2,16 +2,18 @@
 
 use atoms::units::{ACCELERATION, BOLTZMANN};
 use atoms::{Vec3, cell};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::random::{Stream, StreamId};
 use crate::thermostat::{WrongSetting, is_positive};
 
 /// Settings of Langevin dynamics.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct LangevinSettings {
     /// Friction, 1/fs.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub friction: f64,
 }
 

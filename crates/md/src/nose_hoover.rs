@@ -1,6 +1,7 @@
 //! The Nosé–Hoover chain.
 
 use atoms::units::BOLTZMANN;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::thermostat::{WrongSetting, is_positive};
@@ -9,10 +10,11 @@ use crate::thermostat::{WrongSetting, is_positive};
 const SUZUKI_YOSHIDA: [f64; 3] = [1.351_207_191_959_657_8, -1.702_414_383_919_315_3, 1.351_207_191_959_657_8];
 
 /// Settings of a Nosé–Hoover chain.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NoseHooverSettings {
     /// Relaxation time, fs.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub relaxation_time: f64,
     /// Number of thermostats in the chain.
     #[serde(default = "usual_length")]

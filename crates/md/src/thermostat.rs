@@ -1,6 +1,7 @@
 //! The choice of a thermostat. Each thermostat has its own file, with its settings and its dynamics.
 
 use atoms::{Vec3, cell};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::langevin::{Langevin, LangevinSettings};
@@ -9,7 +10,7 @@ use crate::random::Stream;
 use crate::state;
 
 /// A thermostat as a configuration names it.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum ThermostatSettings {
     /// Langevin dynamics, integrated by BAOAB.

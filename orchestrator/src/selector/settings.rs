@@ -2,12 +2,13 @@
 
 use atoms::Structure;
 use calm::forgetting::ForgettingAlarm;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use store::records::{ComponentRecord, WalkRecord};
 use wire::ContentHash;
 
 /// Whether a campaign is reproducible bit by bit, or walks never wait for each other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
     /// Walks advance in rounds. Decisions do not depend on the number of walkers or on their speed.
@@ -27,7 +28,7 @@ impl Mode {
 }
 
 /// What happens to the mixture between seed structures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum UpdateProtocol {
     /// Updates accumulate over all seed structures.

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use dft::PassedEnvironment;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How to run the calculations of another program. None of these settings changes the results.
@@ -32,7 +33,7 @@ pub struct ExecutionSettings {
 }
 
 /// A batch system that runs calculations as jobs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum BatchSystem {
     /// Slurm.
@@ -40,7 +41,7 @@ pub enum BatchSystem {
 }
 
 /// Which directories of calculations to pack into the store; all others are removed.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum KeepDirectories {
     /// None.

@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use analysis::{CostModel, Measured, Size};
 use atoms::Structure;
 use atoms::cell::{dot, norm};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use store::records::Lease;
 use store::{Store, StoreError};
@@ -28,27 +29,41 @@ const MAX_COMPARED: u32 = 32;
 const MAX_COST_LABELS: u32 = 1_000;
 
 /// `[label.guard]`: limits that are not set do not apply. Shape limits ignore non-periodic directions.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LabelGuard {
     /// Minimum bond length for pairs of elements, Å.
+    #[schemars(
+        with = "BTreeMap<String, f64>",
+        extend(
+            "additionalProperties" = false,
+            "patternProperties" = { "^[A-Z][a-z]?-[A-Z][a-z]?$": { "type": "number", "exclusiveMinimum": 0 } },
+        )
+    )]
     pub min_bond_lengths: BTreeMap<Pair, f64>,
     /// Minimum distance between opposite faces of the cell, Å.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub min_height: Option<f64>,
     /// Maximum ratio of the longest to the shortest edge of the cell.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub max_edge_ratio: Option<f64>,
     /// Minimum angle α between edges of the cell; angles must be between α and 180° − α, degrees.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 90))]
     pub min_angle: Option<f64>,
     /// Minimum volume per atom, Å³.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub min_volume_per_atom: Option<f64>,
     /// Maximum volume per atom, Å³.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub max_volume_per_atom: Option<f64>,
     /// Maximum number of atoms.
     pub max_atoms: Option<u32>,
     /// Refuses a structure if the features of each atom differ from those of a labelled structure by less than this
     /// fraction of their norm.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
     pub duplicate_tolerance: Option<f64>,
     /// Maximum expected cost of a label, core-seconds.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub max_cost: Option<f64>,
 }
 

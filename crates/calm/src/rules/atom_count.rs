@@ -2,12 +2,13 @@
 
 use std::num::NonZeroUsize;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Fraction, Positive, UpdateGoal};
 
 /// At least max[`min_atoms`, ⌈`fraction` N⌉] of the N atoms above a threshold (paper, foundation model).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AtomCount {
     /// Grade above which an atom counts (paper: 1.3).
@@ -23,7 +24,7 @@ pub struct AtomCount {
 
 /// The smallest α that leaves fewer than max[`min_atoms`, ⌈`fraction` N⌉] atoms above the threshold; if there is none,
 /// the smallest with γ_max below the target; otherwise the last (paper, foundation model).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AtomCountUpdate {
     /// Grade above which an atom counts (paper: 1.3).

@@ -1,11 +1,12 @@
 //! Rules about the largest grade of a structure.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Positive, UpdateGoal};
 
 /// γ_max above a threshold (paper, aluminium and silicon: 1.5).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MaximumGrade {
     /// The threshold.
@@ -15,7 +16,7 @@ pub struct MaximumGrade {
 
 /// The smallest α with γ_max below the target. If there is none: the last α, followed by a bounded inflation (paper,
 /// aluminium and silicon).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MaximumGradeUpdate {
     /// Update target (paper: 1.25).

@@ -1,20 +1,24 @@
 //! Numbers of which some values are impossible.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A finite number above zero.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "f64", into = "f64")]
+#[schemars(extend("exclusiveMinimum" = 0))]
 pub struct Positive(pub(super) f64);
 
 /// A number above 0 and at most 1.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "f64", into = "f64")]
+#[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
 pub struct Fraction(pub(super) f64);
 
 /// The values of α to try: ascending, each above 0 and at most 1.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "Vec<f64>", into = "Vec<f64>")]
+#[schemars(extend("minItems" = 1, "items" = { "type": "number", "exclusiveMinimum": 0, "maximum": 1 }))]
 pub struct AlphaValues(pub(super) Vec<f64>);
 
 /// A setting out of range.

@@ -22,6 +22,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use atoms::{Species, Structure};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -41,7 +42,7 @@ const HARTREE: f64 = 27.211_386_245_988;
 const INPUT_VERSION: u32 = 1;
 
 /// The settings of `[label.method.abinit]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
     /// ABINIT with its launcher: `["mpirun", "-np", "4", "abinit"]`.
@@ -53,14 +54,17 @@ pub struct Settings {
     /// File names that differ from that pattern: `{ Zn = "Zn-sp.psp8" }`.
     pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub cutoff: f64,
     /// Cutoff of the fine PAW grid, eV. Default: twice `cutoff`.
     pub fine_cutoff: Option<f64>,
     /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub k_spacing: f64,
     /// Occupation function of the electronic states.
     pub smearing: Smearing,
     /// Width of the smearing, eV.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
     #[serde(rename = "spin_polarized")]
@@ -69,11 +73,14 @@ pub struct Settings {
     #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// Tolerance of the energy between electronic steps, met twice in a row, eV.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
     /// Maximum number of electronic steps.
     #[serde(rename = "max_scf_steps")]
+    #[schemars(range(min = 1))]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
 }
 

@@ -20,6 +20,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use atoms::{Species, Structure};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -48,7 +49,7 @@ const INPUT_VERSION: u32 = 1;
 const MIN_CUTOFF: f64 = 1000.0;
 
 /// The settings of `[label.method.cp2k]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
     /// CP2K with its launcher: `["mpirun", "-np", "4", "cp2k"]`.
@@ -62,12 +63,16 @@ pub struct Settings {
     /// Basis set of all elements.
     pub basis: String,
     /// Cutoff of the finest grid, eV (8163 eV are 600 Ry).
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub cutoff: f64,
     /// Cutoff for a Gaussian of exponent 1, eV (816 eV are 60 Ry).
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub relative_cutoff: f64,
     /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub k_spacing: f64,
     /// k_B T of the Fermi–Dirac occupation, eV.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
     #[serde(rename = "spin_polarized")]
@@ -76,11 +81,14 @@ pub struct Settings {
     #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// CP2K's `EPS_SCF`: tolerance of the density between electronic steps.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub density_tolerance: f64,
     /// Maximum number of electronic steps.
     #[serde(rename = "max_scf_steps")]
+    #[schemars(range(min = 1))]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
 }
 

@@ -19,6 +19,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use atoms::{Species, Structure};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -38,7 +39,7 @@ pub const SCRIPT: &str = concat!(include_str!("../script.py"), include_str!("job
 const INPUT_VERSION: u32 = 1;
 
 /// The settings of `[label.method.gpaw]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
     /// A Python with GPAW and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
@@ -50,12 +51,15 @@ pub struct Settings {
     /// Setups other than the default one of an element: `{ Ni = "10" }`.
     pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub cutoff: f64,
     /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub k_spacing: f64,
     /// Occupation function of the electronic states.
     pub smearing: Smearing,
     /// Width of the smearing, eV.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
     #[serde(rename = "spin_polarized")]
@@ -64,13 +68,17 @@ pub struct Settings {
     #[serde(rename = "initial_magnetic_moments")]
     pub moments: Moments,
     /// Tolerance of the energy over the last three electronic steps, eV.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
     /// Tolerance of the forces in the last electronic step, eV/Å.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub force_tolerance: f64,
     /// Maximum number of electronic steps.
     #[serde(rename = "max_scf_steps")]
+    #[schemars(range(min = 1))]
     pub steps: u32,
     /// Vacuum along non-periodic directions, Å.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
 }
 
