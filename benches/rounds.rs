@@ -66,7 +66,7 @@ impl Campaign {
         let (mut campaign, mut running, mut begun) = (Self::default(), BinaryHeap::new(), 0);
         loop {
             // There are as many walkers as walks, so every assignment starts at once.
-            while let Scheduling::Assign(assignment) = selector.next_assignment() {
+            while let Scheduling::Assign(assignment) = selector.next_assignment(0) {
                 let used = processor_time();
                 let report = advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {});
                 let taken = processor_time() - used;

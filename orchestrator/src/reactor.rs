@@ -91,8 +91,6 @@ struct ReactorState {
     waiting: VecDeque<(u32, Reply)>,
     /// Replies that wait for the commit before them.
     pending_replies: Vec<PendingReply>,
-    /// The walk assigned to each busy walker.
-    assigned: HashMap<u32, WalkId>,
     /// Number of walkers that crashed with the current assignment of a walk.
     crash_counts: HashMap<WalkId, u32>,
     /// Upper bound of the number of unfinished label jobs, and when it was determined.
@@ -189,7 +187,6 @@ impl ReactorState {
             decided: None,
             waiting: VecDeque::new(),
             pending_replies: Vec::new(),
-            assigned: HashMap::new(),
             crash_counts: HashMap::new(),
             unfinished: None,
             paused_polled_at: None,
@@ -209,9 +206,10 @@ impl ReactorState {
                     None
                 }
                 ReactorEvent::Idle { walker, report, reply } => {
-                    self.assigned.remove(&walker);
+                    self.take_back(walker);
                     self.waiting.push_back((walker, reply));
-                    match report.filter(|report| !self.is_assigned(report.walk)) {
+                    // A report is ignored if its sender was considered lost and another walker has the walk now.
+                    match report.filter(|report| !self.selector.is_assigned(report.walk)) {
                         Some(report) => {
                             self.crash_counts.remove(&report.walk);
                             self.selector.report_regraded(report)?
@@ -232,28 +230,28 @@ impl ReactorState {
         Ok(())
     }
 
-    /// Whether the walk is assigned, or about to be. If so, a report of a walker that was considered lost is ignored.
-    fn is_assigned(&self, walk: WalkId) -> bool {
-        let pending = self.pending_replies.iter().filter_map(|pending| pending.work.as_ref());
-        let mut assigned = self.assigned.values().copied().chain(pending.map(|work| work.assignment.walk));
-        assigned.any(|other| other == walk)
+    /// Takes back the walk that a walker has in hand.
+    fn take_back(&mut self, walker: u32) -> Option<WalkId> {
+        let walk = self.selector.walk_of(walker);
+        walk.inspect(|walk| self.selector.assignment_lost(*walk))
     }
 
     /// Whether no walker is busy, waiting, or will get an assignment.
     fn is_over(&self) -> bool {
         let no_more = self.selector.is_done() || self.stopping.is_cancelled();
-        no_more && self.waiting.is_empty() && self.assigned.is_empty()
+        no_more && self.waiting.is_empty() && !self.selector.has_assignments()
     }
 
     /// Handles the loss of a walker. Its assignment goes to another walker, unless it has crashed too many.
     fn walker_lost(&mut self, walker: u32, crashed: bool) -> Result<Option<Commit>, ReactorError> {
-        if let Some(index) = self.pending_replies.iter().position(|pending| pending.walker == walker) {
-            if let Some(work) = self.pending_replies.remove(index).work {
-                self.selector.assignment_lost(work.assignment.walk);
-            }
+        self.waiting.retain(|(waiting, _)| *waiting != walker);
+        let replies = self.pending_replies.len();
+        self.pending_replies.retain(|pending| pending.walker != walker);
+        let Some(walk) = self.take_back(walker) else { return Ok(None) };
+        if self.pending_replies.len() < replies {
+            // It never received the assignment.
             return Ok(None);
         }
-        let Some(walk) = self.assigned.remove(&walker) else { return Ok(None) };
         warn!(walker, walk = walk.0, crashed, "a walker was lost with an assignment");
         if crashed {
             let crashes = self.crash_counts.entry(walk).or_default();
@@ -264,7 +262,6 @@ impl ReactorState {
                 return Ok(self.selector.abandon_walk(walk, reason)?);
             }
         }
-        self.selector.assignment_lost(walk);
         Ok(None)
     }
 
@@ -282,7 +279,7 @@ impl ReactorState {
         }
         self.refresh_paused().await?;
         while let Some((walker, reply)) = self.waiting.pop_front() {
-            match self.selector.next_assignment() {
+            match self.selector.next_assignment(walker) {
                 Scheduling::Assign(assignment) => {
                     let mixture = Arc::clone(self.selector.mixture());
                     let work = Some(WorkItem { assignment: *assignment, mixture });
@@ -340,10 +337,7 @@ impl ReactorState {
         for PendingReply { walker, reply, work } in self.pending_replies.drain(..) {
             let walk = work.as_ref().map(|work| work.assignment.walk);
             match (reply.send(work), walk) {
-                (Ok(()), Some(walk)) => {
-                    debug!(walker, walk = walk.0, "sent an assignment");
-                    self.assigned.insert(walker, walk);
-                }
+                (Ok(()), Some(walk)) => debug!(walker, walk = walk.0, "sent an assignment"),
                 // The walker has exited; another walker gets its assignment.
                 (Err(_), Some(walk)) => self.selector.assignment_lost(walk),
                 (_, None) => {}

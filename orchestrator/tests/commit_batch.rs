@@ -60,7 +60,7 @@ fn any_settings() -> impl Strategy<Value = Settings> {
 
 /// The report on the next assignment for this event, if there is an assignment.
 fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Report> {
-    let Scheduling::Assign(assignment) = selector.next_assignment() else { return None };
+    let Scheduling::Assign(assignment) = selector.next_assignment(0) else { return None };
     let progress = at(10 * (number as u64 + 1));
     let outcome = match *event {
         Event::Candidate(structure_number, direction, far) => {
@@ -162,9 +162,10 @@ impl Live {
         sqlx::query(sql).execute(&mut self.connection).await.unwrap();
     }
 
-    /// A report of each walk, with a structure that is new to the mixture.
+    /// A report of each walk, with a structure that is new to the mixture. The walker has the number of its walk.
     fn reports(&mut self) -> Vec<Report> {
-        let assignments: Vec<_> = (0..WALKS).map(|_| next_assignment(&mut self.selector)).collect();
+        let assignments: Vec<_> =
+            (0..WALKS as u32).map(|walker| next_assignment_of(walker, &mut self.selector)).collect();
         let offer = |(k, assignment)| {
             let mut z = [0.0; DIMENSION];
             z[k] = 5.0;
@@ -200,12 +201,13 @@ async fn create(directory: &Path) -> Store {
 impl Arrived {
     fn new(reports: Vec<Report>) -> Self {
         let (to_reactor, incoming) = mpsc::channel(8);
-        let send = |(walker, report)| {
+        let send = |report: Report| {
             let (reply, answer) = oneshot::channel();
+            let walker = report.walk.0;
             to_reactor.try_send(Incoming::Idle { walker, report: Some(report), reply }).unwrap();
             answer
         };
-        let answers = (0..).zip(reports).map(send).collect();
+        let answers = reports.into_iter().map(send).collect();
         Self { to_reactor, incoming, answers }
     }
 }

@@ -328,7 +328,7 @@ fn each_seed_structure_starts_from_the_original_mixture() {
 /// Accepts a candidate of the first walk, which then ends. Returns the last commit.
 fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     let mut reports = Vec::new();
-    while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment() {
+    while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment(0) {
         let number = u64::from(assignment.walk.0);
         let z = if number == 0 { NEW } else { KNOWN };
         reports.push(offer(selector, &assignment, 5, structure(number, SHORTEST), z));
@@ -336,7 +336,7 @@ fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     let last = reports.into_iter().filter_map(|report| selector.report(report).unwrap()).last().unwrap();
     assert_eq!(kinds(&last)[0], "accepted");
     let mut reports = Vec::new();
-    while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment() {
+    while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment(0) {
         let done = wire::messages::Outcome::StepsDone;
         reports.push(match assignment.walk.0 {
             0 => ended(&assignment, 10, WalkEnd::Steps),

@@ -316,6 +316,25 @@ async fn assignments_of_dead_walkers_are_completed_by_others() {
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
+/// A walker that asks again without a report no longer has its walk in hand.
+#[tokio::test(flavor = "multi_thread")]
+async fn walks_without_a_report_are_assigned_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = open(folder.path()).await;
+    let stopping = CancellationToken::new();
+    let (reactor, to_reactor) = reactor(&store, &stopping).await;
+    let running = tokio::spawn(end_of(reactor, |_| {}));
+    for _ in 0..2 {
+        let (reply, answer) = tokio::sync::oneshot::channel();
+        to_reactor.send(Incoming::Idle { walker: 9, report: None, reply }).await.unwrap();
+        assert_eq!(answer.await.unwrap().expect("an assignment").assignment.walk, WalkId(0));
+    }
+    to_reactor.send(Incoming::Lost { walker: 9, crashed: false }).await.unwrap();
+    let threads = start_walkers(2, to_reactor, &stopping);
+    assert_eq!(running.await.unwrap(), RunOutcome::Finished);
+    threads.into_iter().for_each(|thread| thread.join().unwrap());
+}
+
 #[tokio::test]
 async fn a_campaign_without_walkers_is_not_finished() {
     let folder = tempfile::tempdir().unwrap();

@@ -15,7 +15,7 @@ use crate::common::{
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];
 
 fn is_waiting(selector: &mut Selector) -> bool {
-    matches!(selector.next_assignment(), Scheduling::Wait)
+    matches!(selector.next_assignment(0), Scheduling::Wait)
 }
 
 #[test]
@@ -149,7 +149,7 @@ fn assignments_of_lost_walkers_are_assigned_again() {
         assert_eq!(kinds(&commit), ["ended"]);
         selector.assignment_lost(second.walk);
         assert!(
-            matches!(selector.next_assignment(), Scheduling::Done),
+            matches!(selector.next_assignment(0), Scheduling::Done),
             "what has ended is not given out again"
         );
     }
@@ -267,7 +267,7 @@ fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
         assert!(candidate.selector.gamma.len() == 2 && candidate.original.gamma.len() == 2);
         store.commit(&commit);
     }
-    assert!(matches!(selector.next_assignment(), Scheduling::Done), "a control has no control");
+    assert!(matches!(selector.next_assignment(0), Scheduling::Done), "a control has no control");
     assert_eq!(store.walks[&WalkId(1)].state, "collected");
     assert_eq!(store.known.len(), 3, "control frames are not what later candidates are compared with");
 }
@@ -275,7 +275,7 @@ fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
 #[test]
 fn a_walk_that_collected_nothing_has_no_control() {
     let mut selector = with_control(&mut MemoryStore::default(), &[]);
-    assert!(matches!(selector.next_assignment(), Scheduling::Done));
+    assert!(matches!(selector.next_assignment(0), Scheduling::Done));
 }
 
 #[test]
@@ -348,7 +348,7 @@ fn paused_walks_get_no_assignments_while_others_continue_in_live_mode() {
     let _ = selector.start_walks();
     selector.set_paused([WalkId(0), WalkId(2)].into());
     assert_eq!(next_assignment(&mut selector).walk, WalkId(1));
-    assert!(matches!(selector.next_assignment(), Scheduling::Wait) && !selector.is_done());
+    assert!(matches!(selector.next_assignment(0), Scheduling::Wait) && !selector.is_done());
     selector.set_paused([WalkId(0)].into());
     assert_eq!(next_assignment(&mut selector).walk, WalkId(2));
     selector.set_paused([].into());

@@ -141,7 +141,7 @@ async fn recover(model: &Model, location: Location) {
     let mut selector =
         Selector::restore(settings, CAMPAIGN, seeds, grader, original, training, snapshot).unwrap();
     selector.start_walks();
-    assert!(matches!(selector.next_assignment(), Scheduling::Assign(_)));
+    assert!(matches!(selector.next_assignment(0), Scheduling::Assign(_)));
     println!("  gone on after {:.2} s", begun.elapsed().as_secs_f64());
     store.close().await;
 }

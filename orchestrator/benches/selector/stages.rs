@@ -62,7 +62,7 @@ impl Stages {
         let mut offers: Vec<_> = recording.iter().map(|blocks| blocks.iter()).collect();
         let mut assignments = Vec::new();
         loop {
-            while let Scheduling::Assign(assignment) = selector.next_assignment() {
+            while let Scheduling::Assign(assignment) = selector.next_assignment(0) {
                 assignments.push(assignment);
             }
             if assignments.is_empty() {

@@ -1,6 +1,6 @@
 //! Decisions on the reports of a round, in the order of walks.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use calm::UpdateOutcome;
@@ -15,14 +15,19 @@ use super::decision_state::DecisionState;
 use super::error::SelectorError;
 use super::regrade::{RegradedCandidate, RegradedReport};
 use super::settings::UpdateProtocol;
+use super::walk::Walk;
 
 /// Priority of label jobs of biased candidates; control frames come after them.
 const BIASED_PRIORITY: i32 = 10;
 const CONTROL_PRIORITY: i32 = 0;
 
 impl DecisionState {
-    /// Decides on the reports of a round, in order.
-    pub fn decide(&mut self, reports: Vec<RegradedReport>) -> Result<Commit, SelectorError> {
+    /// Decides on the reports of a round, in order. `in_hand` contains the walks that walkers work on.
+    pub fn decide(
+        &mut self,
+        reports: Vec<RegradedReport>,
+        in_hand: &BTreeMap<WalkId, u32>,
+    ) -> Result<Commit, SelectorError> {
         let mut commit = Commit::default();
         let mut touched = BTreeSet::new();
         for report in reports {
@@ -42,7 +47,7 @@ impl DecisionState {
                 Outcome::StepsDone | Outcome::Interrupted => {}
             }
         }
-        touched.extend(self.end_by_budget(&mut commit));
+        touched.extend(self.end_by_budget(in_hand, &mut commit));
         touched.extend(self.start_controls(&mut commit));
         commit.walks = touched.iter().map(|id| self.walks[id].to_record()).collect();
         self.add_values(&mut commit);
@@ -269,13 +274,14 @@ impl DecisionState {
     }
 
     /// Ends the unassigned biased walks once the campaign has its maximum number of structures.
-    fn end_by_budget(&mut self, commit: &mut Commit) -> Vec<WalkId> {
+    fn end_by_budget(&mut self, in_hand: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> Vec<WalkId> {
         if !self.is_budget_exhausted() {
             return Vec::new();
         }
-        let idle =
-            self.walks.values().filter(|walk| walk.is_biased() && !walk.has_ended() && !walk.is_assigned);
-        let idle: Vec<_> = idle.map(|walk| walk.record.walk).collect();
+        let idle = |(id, walk): (&WalkId, &Walk)| {
+            (walk.is_biased() && !walk.has_ended() && !in_hand.contains_key(id)).then_some(*id)
+        };
+        let idle: Vec<_> = self.walks.iter().filter_map(idle).collect();
         idle.iter().for_each(|id| self.end_walk(*id, &WalkEnd::Budget, commit));
         idle
     }

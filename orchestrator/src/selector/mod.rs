@@ -46,6 +46,8 @@ pub struct Selector {
     campaign: CampaignId,
     seeds: Vec<SeedStructure>,
     decisions: DecisionState,
+    /// The walker that has each assigned walk in hand, until it reports or is lost.
+    in_hand: BTreeMap<WalkId, u32>,
     /// Walks of the current round, with the reports received so far.
     in_round: BTreeMap<WalkId, Option<RegradedReport>>,
     /// Walks that get no assignments for now.
@@ -65,7 +67,8 @@ impl Selector {
         snapshot: SelectorSnapshot,
     ) -> Result<Self, SelectorError> {
         let decisions = DecisionState::restore(settings, &seeds, grader, original, training, snapshot)?;
-        Ok(Self { campaign, seeds, decisions, in_round: BTreeMap::new(), paused: BTreeSet::new() })
+        let (in_hand, in_round, paused) = (BTreeMap::new(), BTreeMap::new(), BTreeSet::new());
+        Ok(Self { campaign, seeds, decisions, in_hand, in_round, paused })
     }
 
     /// The mixture for the assignments of [`Selector::next_assignment`].
@@ -155,7 +158,7 @@ impl Selector {
         };
         let present = |walk: &&mut Walk| in_round && walk.record.turn == number && !walk.has_ended();
         let Some(walk) = self.decisions.walks.get_mut(&id).filter(present) else { return Ok(None) };
-        walk.is_assigned = false;
+        self.in_hand.remove(&id);
         if matches!(report.outcome, Outcome::Interrupted) {
             walk.interrupt(report);
             return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
@@ -170,6 +173,6 @@ impl Selector {
                 std::mem::take(&mut self.in_round).into_values().flatten().collect()
             }
         };
-        self.decisions.decide(reports).map(Some)
+        self.decisions.decide(reports, &self.in_hand).map(Some)
     }
 }

@@ -18,8 +18,8 @@ pub enum Scheduling {
 }
 
 impl Selector {
-    /// The next assignment for an idle walker.
-    pub fn next_assignment(&mut self) -> Scheduling {
+    /// The next assignment for an idle walker, which has it in hand from then on.
+    pub fn next_assignment(&mut self, walker: u32) -> Scheduling {
         if self.decisions.settings.mode == Mode::Reproducible && self.in_round.is_empty() {
             self.start_round();
         }
@@ -28,10 +28,10 @@ impl Selector {
                 Mode::Live => !walk.has_ended(),
                 Mode::Reproducible => self.in_round.get(id).is_some_and(Option::is_none),
             };
-            (in_turn && !walk.is_assigned && !self.paused.contains(id)).then_some(*id)
+            (in_turn && !self.in_hand.contains_key(id) && !self.paused.contains(id)).then_some(*id)
         };
         if let Some(id) = self.decisions.walks.iter().find_map(ready) {
-            return Scheduling::Assign(Box::new(self.assign(id)));
+            return Scheduling::Assign(Box::new(self.assign(id, walker)));
         }
         if self.is_done() { Scheduling::Done } else { Scheduling::Wait }
     }
@@ -41,11 +41,24 @@ impl Selector {
         self.decisions.walks.values().all(Walk::has_ended)
     }
 
-    /// Returns the assignment of a lost walker; it is assigned again.
+    /// Whether a walker has this walk in hand.
+    pub fn is_assigned(&self, id: WalkId) -> bool {
+        self.in_hand.contains_key(&id)
+    }
+
+    /// Whether any walker has a walk in hand.
+    pub fn has_assignments(&self) -> bool {
+        !self.in_hand.is_empty()
+    }
+
+    /// The walk that this walker has in hand.
+    pub fn walk_of(&self, walker: u32) -> Option<WalkId> {
+        self.in_hand.iter().find_map(|(id, holder)| (*holder == walker).then_some(*id))
+    }
+
+    /// Takes back a walk from a walker that will not report on it; another walker gets it.
     pub fn assignment_lost(&mut self, id: WalkId) {
-        if let Some(walk) = self.decisions.walks.get_mut(&id) {
-            walk.is_assigned = false;
-        }
+        self.in_hand.remove(&id);
     }
 
     /// Starts a round with the first unfinished biased walks and as many control walks.
@@ -62,9 +75,9 @@ impl Selector {
         }
     }
 
-    fn assign(&mut self, id: WalkId) -> Assignment {
+    fn assign(&mut self, id: WalkId, walker: u32) -> Assignment {
         let walk = self.decisions.walks.get_mut(&id).expect("the id comes from this table");
-        walk.is_assigned = true;
+        self.in_hand.insert(id, walker);
         walk.record.state = "running".to_owned();
         Assignment {
             campaign: self.campaign,

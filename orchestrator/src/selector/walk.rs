@@ -7,12 +7,10 @@ use wire::{Origin, WalkId};
 
 use super::error::SelectorError;
 
-/// A walk: its stored record, and whether it is assigned.
+/// A walk: its stored record, decoded.
 pub(super) struct Walk {
     pub record: WalkRecord,
     pub state: SelectorState,
-    /// Whether a walker works on it.
-    pub is_assigned: bool,
 }
 
 /// State of a walk that the selector keeps between assignments.
@@ -47,7 +45,7 @@ impl Walk {
             selector_state: String::new(),
             checkpoint: None,
         };
-        Self { record, state: SelectorState { until, ..SelectorState::default() }, is_assigned: false }
+        Self { record, state: SelectorState { until, ..SelectorState::default() } }
     }
 
     /// Whether it has accepted structures without a control walk.
@@ -73,7 +71,7 @@ impl Walk {
         let state = serde_json::from_str(&record.selector_state).map_err(|error| {
             SelectorError::Snapshot(format!("state of walk {} is damaged: {error}", record.walk))
         })?;
-        Ok(Self { record, state, is_assigned: false })
+        Ok(Self { record, state })
     }
 
     pub fn to_record(&self) -> WalkRecord {

@@ -131,7 +131,7 @@ impl<'a> Campaign<'a> {
         if self.at_work.len() == self.walkers {
             return false;
         }
-        match self.selector.next_assignment() {
+        match self.selector.next_assignment(0) {
             Scheduling::Assign(assignment) => {
                 let mixture = Arc::clone(self.selector.mixture());
                 self.at_work.push(WorkItem { assignment: *assignment, mixture });

@@ -113,7 +113,12 @@ pub fn begin(settings: &Settings, seeds: usize) -> Selector {
 
 /// The next assignment, which must exist.
 pub fn next_assignment(selector: &mut Selector) -> Assignment {
-    match selector.next_assignment() {
+    next_assignment_of(0, selector)
+}
+
+/// The next assignment of this walker, which must exist.
+pub fn next_assignment_of(walker: u32, selector: &mut Selector) -> Assignment {
+    match selector.next_assignment(walker) {
         Scheduling::Assign(assignment) => *assignment,
         other => panic!("expected an assignment, found {other:?}"),
     }
