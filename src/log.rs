@@ -14,10 +14,12 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
-use tracing::span::{Attributes, Id, Record};
-use tracing::{Event, Level, Metadata, Subscriber};
+use tracing::level_filters::LevelFilter;
+use tracing::{Event, Subscriber};
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
+use tracing_subscriber::registry::Registry;
 
-use self::format::{Fields, LogLine};
 use crate::exit_status::Failure;
 
 /// The packages of this program. Only warnings and errors are logged from other crates.
@@ -97,9 +99,9 @@ pub fn init(setup: Option<LogConfig>, process: &'static str, number: Option<u32>
     let opened = OpenOptions::new().append(true).create(true).mode(0o600).open(&setup.file);
     let file = opened.map_err(|error| cannot_write(&setup.file, &error))?;
     let name = number.map_or_else(|| process.to_owned(), |number| format!("{process} {number}"));
-    let log = Log { file, level: setup.level.into(), format: setup.format, name };
+    let log = Log { file, format: setup.format, process: name };
     // A process has one log, initialized by its command.
-    if tracing::subscriber::set_global_default(log).is_ok() {
+    if tracing::subscriber::set_global_default(log.with_level(setup.level)).is_ok() {
         let _ = CONFIG.set(setup);
     }
     Ok(())
@@ -109,54 +111,33 @@ fn cannot_write(file: &Path, error: &std::io::Error) -> Failure {
     Failure::Input(format!("--log: cannot write to {}: {error}", file.display()))
 }
 
-/// Subscriber that writes events to the file.
+/// Writes events to the file.
 struct Log {
     file: File,
-    level: Level,
     format: Format,
-    /// Name of the process.
-    name: String,
+    /// Name of the process, such as `walker 3`.
+    process: String,
 }
 
-impl Subscriber for Log {
-    fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        let package = metadata.target().split("::").next().unwrap_or_default();
-        let level =
-            if WORKSPACE_CRATES.contains(&package) { self.level } else { self.level.min(Level::WARN) };
-        metadata.is_event() && *metadata.level() <= level
+impl Log {
+    /// The subscriber for events of this and higher severity, of libraries only for warnings and errors.
+    fn with_level(self, level: LogLevel) -> impl Subscriber + Send + Sync {
+        let level = LevelFilter::from(level);
+        let targets = WORKSPACE_CRATES.map(|package| (package, level));
+        let filter = Targets::new().with_default(level.min(LevelFilter::WARN)).with_targets(targets);
+        Registry::default().with(filter).with(self)
     }
+}
 
-    fn event(&self, event: &Event<'_>) {
-        let mut fields = Fields::default();
-        event.record(&mut fields);
-        fields.remove_wrong_hint();
-        let line = LogLine {
-            time: store::unix_milliseconds(),
-            level: *event.metadata().level(),
-            process: &self.name,
-            pid: std::process::id(),
-            target: event.metadata().target(),
-            fields,
-        };
-        let text = match self.format {
-            Format::Text => line.text(),
-            Format::Json => line.json(),
-        };
+impl<S: Subscriber> Layer<S> for Log {
+    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+        let line = format::line(self.format, &self.process, event);
         // A log that cannot be written stops no work.
-        let _ = (&self.file).write_all(text.as_bytes());
+        let _ = (&self.file).write_all(line.as_bytes());
     }
-
-    // Only libraries create spans, and they are never enabled.
-    fn new_span(&self, _: &Attributes<'_>) -> Id {
-        Id::from_u64(1)
-    }
-    fn record(&self, _: &Id, _: &Record<'_>) {}
-    fn record_follows_from(&self, _: &Id, _: &Id) {}
-    fn enter(&self, _: &Id) {}
-    fn exit(&self, _: &Id) {}
 }
 
-impl From<LogLevel> for Level {
+impl From<LogLevel> for LevelFilter {
     fn from(level: LogLevel) -> Self {
         match level {
             LogLevel::Error => Self::ERROR,

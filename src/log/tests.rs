@@ -1,30 +1,20 @@
 use std::fs;
 use std::sync::Arc;
 use std::thread;
+use std::time::{Duration, SystemTime};
 
 use tracing::{debug, info, warn};
 
-use super::format::format_utc;
 use super::*;
 
-fn log(file: &Path, format: Format, level: LogLevel) -> Log {
+fn log(file: &Path, format: Format, level: LogLevel) -> impl Subscriber + Send + Sync + use<> {
     let file = OpenOptions::new().append(true).create(true).open(file).unwrap();
-    Log { file, level: level.into(), format, name: "walker 3".to_owned() }
-}
-
-#[test]
-fn a_time_is_a_date() {
-    assert_eq!(format_utc(0), "1970-01-01T00:00:00.000Z");
-    assert_eq!(format_utc(951_782_400_000), "2000-02-29T00:00:00.000Z");
-    assert_eq!(format_utc(1_709_251_199_999), "2024-02-29T23:59:59.999Z");
-    assert_eq!(format_utc(1_709_251_200_000), "2024-03-01T00:00:00.000Z");
-    assert_eq!(format_utc(4_107_542_400_000), "2100-03-01T00:00:00.000Z");
-    assert_eq!(format_utc(-1), "1969-12-31T23:59:59.999Z");
+    Log { file, format, process: "walker 3".to_owned() }.with_level(level)
 }
 
 #[test]
 fn an_event_is_one_line_whatever_it_says() {
-    let directory = tempfile::tempdir().unwrap();
+    let (directory, started) = (tempfile::tempdir().unwrap(), SystemTime::now());
     for format in [Format::Text, Format::Json] {
         let path = directory.path().join("log");
         let said = || warn!(walk = 3_u64, gamma = 1.5, name = "a \"b\"\nc", "two\nlines, é");
@@ -34,7 +24,9 @@ fn an_event_is_one_line_whatever_it_says() {
         fs::remove_file(&path).unwrap();
         if format == Format::Text {
             let pid = std::process::id();
-            let rest = text.split_once(' ').unwrap().1;
+            let (time, rest) = text.split_once(' ').unwrap();
+            let time = humantime::parse_rfc3339(time).unwrap();
+            assert!(started <= time + Duration::from_millis(1) && time <= SystemTime::now(), "{text}");
             let said = r#"two\nlines, é gamma=1.5 name="a \"b\"\nc" walk=3"#;
             assert_eq!(rest, format!("WARN  walker 3 [{pid}] {said}\n"));
         } else {
