@@ -140,8 +140,8 @@ mod tests {
         failed.remark = "exit code 2: cannot read\x1b[2J the mixture\n\nsecond line\n".into();
         let text = text(&[process("orchestrator", None, "running"), failed], false);
         let expected = [
-            "process        pid  state     restarts      last seen  remark",
-            "orchestrator  4711  running          0  1 min 1 s ago",
+            "process        pid  state    restarts      last seen  remark",
+            "orchestrator  4711  running         0  1 min 1 s ago",
             "walker 3      4711  failed          5  1 min 1 s ago  exit code 2: cannot read[2J the mixture …",
         ];
         assert_eq!(text.trim().lines().collect::<Vec<_>>(), expected);
