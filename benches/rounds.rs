@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use atoms::MinDistanceRule;
 use calm::forgetting::ForgettingAlarm;
 use calm::{Artifact, UpdateSettings};
 use md::{LangevinSettings, ThermostatSettings};
@@ -20,6 +21,7 @@ use orchestrator::selector::{
     Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
 };
 use potentials::grace::{GraceModel, Threads};
+use potentials::{ZblWindow, ZblWindows};
 use rustix::time::{ClockId, clock_gettime};
 use wire::messages::{Outcome, Report};
 use wire::{CampaignId, CandidateBlock};
@@ -117,7 +119,7 @@ fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
         max_per_seed_structure: u32::MAX,
         max_structures: None,
         control: false,
-        min_distance: (1.2, 0.75),
+        min_distances: MinDistanceRule::default(),
         declined_feature_bytes: 0,
     };
     let n = model.elements().len();
@@ -144,10 +146,9 @@ fn walk_settings() -> WalkSettings {
             .unwrap(),
         gap: 200,
         min_interval_after_decline: 20,
-        zbl: Some((1.6, 2.4)),
+        zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
         guard: GuardSettings {
-            min_distance: 1.2,
-            min_distance_fraction: 0.75,
+            min_distances: MinDistanceRule::default(),
             max_temperature: 20_000.0,
             max_consecutive_rejections: 10,
             max_rollbacks: 3,

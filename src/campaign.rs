@@ -2,6 +2,7 @@
 
 mod load;
 mod seed_structures;
+mod short_range;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -23,6 +24,8 @@ use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
 use load::Loader;
 pub use load::{SourcedStructure, check_sound};
+pub use short_range::PairRange;
+use short_range::pair_ranges;
 
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
 const FILE_KEYS: [&str; 4] =
@@ -42,6 +45,10 @@ pub struct Campaign {
     pub artifact: Artifact,
     /// Seed structures, in the order of the files.
     pub seed_structures: Vec<SourcedStructure>,
+    /// Number of seed structures that no walk can start from.
+    pub skipped: usize,
+    /// The pairs of elements in the seed structures.
+    pub pair_ranges: Vec<PairRange>,
     /// Features of the training frames, if the configuration names them.
     pub training: Option<TrainingFrames>,
     /// The label protocol.
@@ -66,13 +73,15 @@ impl Campaign {
             Ok((artifact, training))
         });
         let labels = loader.seed_structures(&model).and_then(|seeds| {
-            let protocol = loader.protocol(&seeds)?;
+            let protocol = loader.protocol(&seeds.valid)?;
             Ok((seeds, protocol))
         });
         let ((artifact, training), (seeds, (protocol, mut file_hashes))) =
             combine_errors(path, grades, labels)?;
-        warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds, training.as_ref())?);
+        warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds.valid, training.as_ref())?);
         warnings.extend(loader.suspicious_seed_structures(&seeds, &model));
+        let pair_ranges = pair_ranges(&config, &seeds.valid, model.cutoff());
+        warnings.extend(loader.repulsion_in_bonds(&pair_ranges));
         file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [
             ("calm.artifact", &config.calm.artifact),
@@ -88,7 +97,9 @@ impl Campaign {
             text,
             model,
             artifact,
-            seed_structures: seeds,
+            skipped: seeds.skipped.len(),
+            seed_structures: seeds.valid,
+            pair_ranges,
             training,
             protocol,
             file_hashes,
@@ -225,10 +236,9 @@ impl Campaign {
             collection: collect.criterion,
             gap: collect.min_interval,
             min_interval_after_decline: collect.min_interval_after_decline.get(),
-            zbl: guard.zbl.map(|zbl| (zbl.inner.get(), zbl.outer.get())),
+            zbl: guard.zbl.clone(),
             guard: GuardSettings {
-                min_distance: guard.min_distance.get(),
-                min_distance_fraction: guard.min_distance_fraction.get(),
+                min_distances: guard.min_distances.clone(),
                 max_temperature: guard.max_temperature.get(),
                 max_consecutive_rejections: guard.max_consecutive_rejections.get(),
                 max_rollbacks: guard.max_rollbacks,
@@ -291,7 +301,7 @@ pub fn selector_settings(config: &Config) -> selector::Settings {
         max_per_seed_structure: collect.max_per_seed_structure.get(),
         max_structures: config.most_structures(),
         control: campaign.control,
-        min_distance: (guard.min_distance.get(), guard.min_distance_fraction.get()),
+        min_distances: guard.min_distances.clone(),
         declined_feature_bytes: collect.declined_features_mb * 1_000_000,
     }
 }

@@ -145,6 +145,6 @@ fn the_demos_are_sound() {
         let output = calmwalk(tester.path(), ["validate", "c.toml"]);
         assert_eq!((output.status.code(), stderr(&output).as_str()), (Some(0), ""), "{name}");
         let shown = String::from_utf8(output.stdout).unwrap();
-        assert!(shown.ends_with("  warnings         none\n"), "{shown}");
+        assert!(shown.contains("  warnings         none\n"), "{shown}");
     }
 }

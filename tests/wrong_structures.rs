@@ -89,16 +89,36 @@ fn structures_that_no_walk_can_start_from_are_refused() {
         ),
         (
             good.replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0.1"),
-            ":1: atoms 12 and 13 are 0.100 Å apart, closer than guard.min_distance = 1.2 Å",
+            ":1: the shortest Al-Al distance is 0.100 Å, below the 1.210 Å that guard.min_distances allows",
         ),
-        (good.replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0"), ":1: atoms 12 and 13 are 0.000 Å apart"),
-        (crowded, ":1: atoms 0 and 0 are 0.500 Å apart"),
+        (good.replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0"), "(atoms 12 and 13 are 0.000 Å apart)"),
+        (crowded, "(atoms 0 and 0 are 0.500 Å apart)"),
         (good.replace("0 0 8.4\"", "0 8.4 0\""), ":1: the cell is periodic but its volume is 0"),
         (good.replace(CELL, "pbc=\"T T T\""), ":1: the cell is periodic but its volume is 0"),
         (alone, ":1: atom 27 has no neighbour within the cutoff, 6.5 Å"),
     ] {
         seeds.refused("unfit.extxyz", content, &[words]);
     }
+}
+
+/// The campaign runs with the others, unless the configuration wants all of them.
+#[test]
+fn a_structure_that_no_walk_can_start_from_is_skipped_and_listed() {
+    let seeds = Seeds::new();
+    let crowded = good().replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0.1");
+    seeds.tester.write("mixed.extxyz", good() + &crowded);
+    let text = changed(&seeds.files, "mixed.extxyz");
+    seeds.tester.write("c.toml", &text);
+    let output = calmwalk(seeds.tester.path(), ["validate", "c.toml"]);
+    let (shown, listed) = (String::from_utf8_lossy(&output.stdout), stderr(&output));
+    assert_eq!(output.status.code(), Some(0), "{listed}");
+    assert!(shown.contains("seed structures  1, with 27 to 27 atoms; 1 skipped, see above"), "{shown}");
+    let expected =
+        "seed structure 'mixed-1' (mixed.extxyz:30) is skipped: the shortest Al-Al distance is 0.100 Å";
+    assert!(listed.contains(expected), "{listed}");
+    let text = text.replace("# on_invalid = \"skip\"", "on_invalid = \"error\"");
+    let message = seeds.tester.refused(&text);
+    assert!(message.contains("mixed.extxyz:30: the shortest Al-Al distance is 0.100 Å"), "{message}");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Grades of a structure with known features: γ from the mixture, γ_nbr from the structure.
 
-use atoms::{NeighbourList, Species, Structure, StructureError, cell};
+use atoms::{NeighbourList, ShortestDistances, Species, Structure, StructureError, cell};
 use calm::neighbourhood::{Pair, PairError, neighbourhood_average};
 use calm::{GradeError, Grades, Mixture};
 use store::records::AtomGrades;
@@ -51,12 +51,12 @@ impl Grader {
         structure.species.iter().enumerate().map(index).collect()
     }
 
-    /// The bonds of a structure within the pair cutoffs, for γ_nbr, and its shortest distance, Å.
+    /// The bonds of a structure within the pair cutoffs, for γ_nbr, and its shortest distances.
     pub fn bonds(&self, structure: &Structure) -> Result<Bonds, GraderError> {
         let elements = self.element_indices(structure)?;
         let mut list = NeighbourList::new(self.largest_cutoff, 0.0);
         list.update(structure)?;
-        let mut bonds = Bonds { elements, pairs: Vec::new(), shortest: f64::INFINITY };
+        let mut bonds = Bonds { elements, pairs: Vec::new(), shortest: ShortestDistances::new(structure) };
         self.compute_pairs(structure, &list, &mut bonds);
         Ok(bonds)
     }
@@ -81,8 +81,10 @@ impl Grader {
             for images in list.neighbours_of(i)[below..].chunk_by(|a, b| a.atom == b.atom) {
                 let j = images[0].atom as usize;
                 for (k, neighbour) in images.iter().enumerate() {
-                    let distance = cell::norm(neighbour.displacement(structure, i));
-                    *shortest = shortest.min(distance);
+                    let displacement = neighbour.displacement(structure, i);
+                    let squared = cell::dot(displacement, displacement);
+                    shortest.add(i, j, squared);
+                    let distance = squared.sqrt();
                     let pair = Pair::new(i, j, distance, cutoff(i, j));
                     let reverse = if cutoff(j, i) == cutoff(i, j) {
                         Pair { i: j, j: i, ..pair }
@@ -113,8 +115,8 @@ pub struct Bonds {
     pub elements: Vec<usize>,
     /// Directed pairs within the largest cutoff, with weights; the weight is 0 beyond the cutoff of the pair.
     pub pairs: Vec<Pair>,
-    /// Shortest distance, Å; infinite without neighbours.
-    pub shortest: f64,
+    /// Shortest distance of each pair of elements.
+    pub shortest: ShortestDistances,
 }
 
 impl Bonds {
@@ -146,16 +148,15 @@ mod tests {
             let bonds = Grader::new(elements.clone(), cutoffs.to_vec()).bonds(&structure).unwrap();
             let mut list = NeighbourList::new(6.0, 0.0);
             list.update(&structure).unwrap();
-            let (mut expected, mut shortest) = (Vec::new(), f64::INFINITY);
+            let mut expected = Vec::new();
             for i in 0..structure.len() {
                 for neighbour in list.neighbours_of(i) {
                     let (j, r) = (neighbour.atom as usize, cell::norm(neighbour.displacement(&structure, i)));
                     expected.push(Pair::new(i, j, r, cutoffs[i % 2 * 2 + j % 2]));
-                    shortest = f64::min(shortest, r);
                 }
             }
             assert_eq!(bonds.pairs, expected);
-            assert_eq!(bonds.shortest, shortest);
+            assert_eq!(bonds.shortest, ShortestDistances::from_neighbours(&structure, &list));
         }
     }
 }

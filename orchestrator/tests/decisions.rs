@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use atoms::{MinDistanceRule, Uniform};
 use calm::UpdateRule;
 use calm::grade::maximum;
 use calm::rules::MaximumGradeUpdate;
@@ -103,7 +104,17 @@ fn atoms_too_close_are_declined() {
 /// The guard's absolute minimum distance applies if the fraction of the seed structure's distance is smaller.
 #[test]
 fn the_minimum_distance_is_the_larger_of_two() {
-    let mut selector = begin(&Settings { min_distance: (2.5, 0.75), ..live() }, 1);
+    let min_distances = MinDistanceRule::Uniform(Uniform { min_distance: 2.5, fraction: 0.75 });
+    check_limit_of_2_5(min_distances);
+}
+
+#[test]
+fn pairs_of_elements_have_their_own_minimum_distances() {
+    check_limit_of_2_5(serde_json::from_str(r#"{ "rule": "per_pair", "pairs": { "Al-Al": 2.5 } }"#).unwrap());
+}
+
+fn check_limit_of_2_5(min_distances: MinDistanceRule) {
+    let mut selector = begin(&Settings { min_distances, ..live() }, 1);
     let assignment = next_assignment(&mut selector);
     let report = offer(&selector, &assignment, 1, structure(1, 2.45), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["declined guard"]);

@@ -12,6 +12,7 @@ use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
+use super::short_range::PairRange;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_method::{self, REFERENCE_FILE};
 
@@ -67,15 +68,26 @@ impl Loader<'_> {
                  CALM artifact"
             )));
         }
-        if let Some(zbl) = self.config.guard.zbl
-            && zbl.outer.get() > model.cutoff()
+        let widest = self.config.guard.zbl.as_ref().and_then(|windows| windows.widest(model.elements()));
+        if let Some((pair, window)) = widest
+            && window.outer > model.cutoff()
         {
             let (at, key) = (place(self.path, self.text, "guard.zbl"), "guard.zbl".to_owned());
-            let found = format!("outer {} Å", zbl.outer.get());
+            let found = format!("outer {} Å of {pair}", window.outer);
             let expected = format!("at most the cutoff of the model, {} Å", model.cutoff());
             return Err(ConfigError::Value { at, key, found, expected });
         }
         Ok(Arc::new(model))
+    }
+
+    /// Warns of pairs of elements whose repulsion reaches into bonds of the seed structures.
+    pub fn repulsion_in_bonds(&self, ranges: &[PairRange]) -> Vec<Warning> {
+        let warning = |message| Warning {
+            at: place(self.path, self.text, "guard.zbl"),
+            key: "guard.zbl".to_owned(),
+            message,
+        };
+        ranges.iter().filter_map(PairRange::warning).map(warning).collect()
     }
 
     /// Loads the initial mixture: that of the artifact, or else that of the export.

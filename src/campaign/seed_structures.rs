@@ -2,13 +2,15 @@
 
 use std::collections::HashMap;
 
-use atoms::{NeighbourList, Structure, extxyz, read_structures, shortest_distance};
+use atoms::{
+    CloseContact, NeighbourList, ShortestDistances, Structure, extxyz, read_structures, shortest_distance,
+};
 use orchestrator::selector::SeedStructure;
 use potentials::grace::GraceModel;
 use wire::ContentHash;
 
 use super::load::{Loader, SourcedStructure};
-use crate::config::{ConfigError, Warning, place};
+use crate::config::{ConfigError, OnInvalid, Warning, place};
 
 const FILES: &str = "seed_structures.files";
 
@@ -16,10 +18,22 @@ const FILES: &str = "seed_structures.files";
 /// Bohr and Å changes distances by a factor of 1.89.
 const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
 
+/// The seed structures of a campaign.
+#[derive(Default)]
+pub struct SeedStructures {
+    /// Those that walks start from.
+    pub valid: Vec<SourcedStructure>,
+    /// A sentence for each that is left out.
+    pub skipped: Vec<String>,
+}
+
 impl Loader<'_> {
-    /// Reads every frame of every file. Names must be unique.
-    pub fn seed_structures(&self, model: &GraceModel) -> Result<Vec<SourcedStructure>, ConfigError> {
-        let mut seeds: Vec<SourcedStructure> = Vec::new();
+    /// Reads every frame of every file. Names must be unique. Frames that no walk can start from are left out, with a
+    /// reason each, if the configuration allows it and others remain.
+    pub fn seed_structures(&self, model: &GraceModel) -> Result<SeedStructures, ConfigError> {
+        let mut seeds = SeedStructures::default();
+        let mut sources: HashMap<String, String> = HashMap::new();
+        let mut first_error = None;
         for file in &self.config.seed_structures.files {
             let path = file.get_ref();
             let wrong = |message: String| self.file_error(FILES, file, message);
@@ -29,22 +43,29 @@ impl Loader<'_> {
                 let source = format!("{}:{}", path.display(), frame.line);
                 let named = frame.info.get("name").and_then(extxyz::Value::text).map(str::to_owned);
                 let name = named.unwrap_or_else(|| format!("{stem}-{number}"));
-                self.check_seed_structure(&frame.structure, model)
-                    .map_err(|error| wrong(format!("{source}: {error}")))?;
-                if let Some(first) = seeds.iter().find(|other| other.seed.name == name) {
+                if let Some(first) = sources.insert(name.clone(), source.clone()) {
                     return Err(wrong(format!(
-                        "{source}: a second seed structure named '{name}', the first is {}; give each a unique name \
+                        "{source}: a second seed structure named '{name}', the first is {first}; give each a unique name \
                          (name=… in its comment line)",
-                        first.source
                     )));
                 }
-                seeds.push(SourcedStructure {
-                    seed: SeedStructure { name, structure: frame.structure },
-                    source,
-                });
+                let Err(reason) = self.check_seed_structure(&frame.structure, model) else {
+                    let seed = SeedStructure { name, structure: frame.structure };
+                    seeds.valid.push(SourcedStructure { seed, source });
+                    continue;
+                };
+                let error = wrong(format!("{source}: {reason}"));
+                if self.config.seed_structures.on_invalid == OnInvalid::Error {
+                    return Err(error);
+                }
+                first_error.get_or_insert(error);
+                seeds.skipped.push(format!("seed structure '{name}' ({source}) is skipped: {reason}"));
             }
         }
-        Ok(seeds)
+        match first_error.filter(|_| seeds.valid.is_empty()) {
+            Some(error) => Err(error),
+            None => Ok(seeds),
+        }
     }
 
     /// Checks that a walk can start and collect: the model knows the elements, no atoms overlap, each atom has a
@@ -54,13 +75,14 @@ impl Loader<'_> {
         model.element_indices(&structure.species).map_err(|error| error.to_string())?;
         let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
         neighbours.update(structure).map_err(|error| error.to_string())?;
-        let min_distance = self.config.guard.min_distance.get();
-        if let Some((i, j, d)) =
-            shortest_distance(structure, &neighbours).filter(|(_, _, d)| *d < min_distance)
-        {
+        let shortest = ShortestDistances::from_neighbours(structure, &neighbours);
+        if let Some(contact) = self.config.guard.min_distances.prevents_start(&shortest) {
+            let CloseContact { pair, distance, limit } = contact;
+            let closest = shortest_distance(structure, &neighbours)
+                .map_or(String::new(), |(i, j, d)| format!(" (atoms {i} and {j} are {d:.3} Å apart)"));
             return Err(format!(
-                "atoms {i} and {j} are {d:.3} Å apart, closer than guard.min_distance = {min_distance} Å: no walk can start \
-                 here"
+                "the shortest {pair} distance is {distance:.3} Å, below the {limit:.3} Å that guard.min_distances allows at \
+                 the start of a walk{closest}"
             ));
         }
         let alone =
@@ -93,11 +115,13 @@ impl Loader<'_> {
         Ok(())
     }
 
-    /// Warns of likely mistakes: duplicate structures and distances that do not match the elements.
-    pub fn suspicious_seed_structures(&self, seeds: &[SourcedStructure], model: &GraceModel) -> Vec<Warning> {
+    /// Warns of skipped structures, and of likely mistakes: duplicate structures and distances that do not match the
+    /// elements.
+    pub fn suspicious_seed_structures(&self, seeds: &SeedStructures, model: &GraceModel) -> Vec<Warning> {
         let mut first = HashMap::new();
-        let mut warnings = Vec::new();
-        for named in seeds {
+        let mut warnings: Vec<_> =
+            seeds.skipped.iter().map(|skipped| self.seeds_warning(skipped.clone())).collect();
+        for named in &seeds.valid {
             let SourcedStructure { seed: SeedStructure { name, structure }, source } = named;
             if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
                 let message = format!(

@@ -1,17 +1,23 @@
 //! The rules of a configuration that no single value can check.
 
+use atoms::MinDistanceRule;
 use md::{ThermostatSettings, WrongSetting};
 use orchestrator::selector::{Mode, UpdateProtocol};
+use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
 
 use super::error::Wrong;
 use super::{Config, LabelSection, NotifySection, QueueFull};
+
+/// Largest shortest distance of a pair of elements, Å.
+const MAX_MIN_DISTANCE: f64 = 10.0;
 
 /// Checks a configuration as a whole; everything that is wrong.
 pub fn check(config: &Config) -> Vec<Wrong> {
     let checks = [
         check_mixture(config),
         check_thermostat(config),
+        check_min_distances(config),
         check_zbl(config),
         check_temperature(config),
         check_store(config),
@@ -154,11 +160,37 @@ pub fn wrong_thermostat(thermostat: &ThermostatSettings, section: &str) -> Optio
     Some((format!("{section}.thermostat.{key}"), found.to_string(), expected.to_owned()))
 }
 
+fn check_min_distances(config: &Config) -> Result<(), Wrong> {
+    let MinDistanceRule::PerPair(rule) = &config.guard.min_distances else { return Ok(()) };
+    let is_wrong = |limit: f64| !(limit > 0.0 && limit <= MAX_MIN_DISTANCE);
+    match rule.pairs.iter().find(|(_, limit)| is_wrong(**limit)) {
+        Some((pair, limit)) => wrong(
+            &format!("guard.min_distances.pairs.{pair}"),
+            limit,
+            format!("above 0, at most {MAX_MIN_DISTANCE} Å"),
+        ),
+        None => Ok(()),
+    }
+}
+
 fn check_zbl(config: &Config) -> Result<(), Wrong> {
-    match config.guard.zbl {
-        Some(zbl) if zbl.inner >= zbl.outer => {
-            let found = format!("inner {} and outer {}", zbl.inner.get(), zbl.outer.get());
-            wrong("guard.zbl", found, "inner below outer")
+    let expected = "inner below outer, both 0 or above";
+    let is_wrong = |inner: f64, outer: f64| !(0.0 <= inner && inner < outer && outer.is_finite());
+    let found = |inner: f64, outer: f64| format!("inner {inner} and outer {outer}");
+    match &config.guard.zbl {
+        Some(ZblWindows::Uniform(ZblWindow { inner, outer })) if is_wrong(*inner, *outer) => {
+            wrong("guard.zbl", found(*inner, *outer), expected)
+        }
+        Some(ZblWindows::PerPair(RadiiWindows { inner, outer, .. })) if is_wrong(*inner, *outer) => {
+            wrong("guard.zbl", found(*inner, *outer), expected)
+        }
+        Some(ZblWindows::PerPair(RadiiWindows { pairs, .. })) => {
+            match pairs.iter().find(|(_, window)| is_wrong(window.inner, window.outer)) {
+                Some((pair, window)) => {
+                    wrong(&format!("guard.zbl.pairs.{pair}"), found(window.inner, window.outer), expected)
+                }
+                None => Ok(()),
+            }
         }
         _ => Ok(()),
     }

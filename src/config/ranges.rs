@@ -49,6 +49,9 @@ const CUTOFF: &str = "it is in eV: 1 Ry is 13.6 eV, 1 Ha is 27.2 eV";
 const K_SPACING: &str = "it is in 1/Å with 2π included: the paper's is 0.125";
 const SMEARING: &str = "it is in eV: 1 Ry is 13.6 eV, 1000 K are 0.086 eV";
 const VACUUM: &str = "it is in Å";
+const BOND_FRACTION: &str = "it is a fraction of the bond's length in the seed structure";
+const RADII_FRACTION: &str = "it is a multiple of the sum of covalent radii";
+const ZBL: &str = "it is a fraction of the sum of covalent radii, and in Å with rule = \"uniform\"";
 
 const fn range(
     key: &'static str,
@@ -61,7 +64,7 @@ const fn range(
 }
 
 /// All of them, by table.
-pub static RANGES: [Range; 79] = [
+pub static RANGES: [Range; 82] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -84,10 +87,13 @@ pub static RANGES: [Range; 79] = [
     range("collect.max_per_seed_structure", "", [0.0, 1e9], [1.0, 1e4], ""),
     range("collect.max_structures", "", [0.0, 1e9], [1.0, 1e7], ""),
     range("collect.declined_features_mb", "MB", [0.0, 1e9], [0.0, 1e6], "it is in MB"),
-    range("guard.min_distance", "Å", [0.0, 10.0], [0.3, 4.0], "it is in Å"),
-    range("guard.min_distance_fraction", "", [0.0, 1.0], [0.2, 0.95], ""),
-    range("guard.zbl.inner", "Å", [0.0, 20.0], [0.1, 4.0], "it is in Å"),
-    range("guard.zbl.outer", "Å", [0.0, 20.0], [0.2, 5.0], "it is in Å"),
+    range("guard.min_distances.min_distance", "Å", [0.01, 10.0], [0.3, 4.0], "it is in Å"),
+    range("guard.min_distances.fraction", "", [0.01, 1.0], [0.2, 0.95], ""),
+    range("guard.min_distances.bonded", "", [0.01, 1.0], [0.5, 0.95], BOND_FRACTION),
+    range("guard.min_distances.nonbonded", "", [0.01, 2.0], [0.4, 1.0], RADII_FRACTION),
+    range("guard.min_distances.bond_cutoff", "", [0.5, 5.0], [1.1, 1.6], RADII_FRACTION),
+    range("guard.zbl.inner", "", [0.0, 20.0], [0.1, 4.0], ZBL),
+    range("guard.zbl.outer", "", [0.0, 20.0], [0.2, 5.0], ZBL),
     range("guard.max_temperature", "K", [0.0, 1e9], [300.0, 1e6], ""),
     range("guard.max_consecutive_rejections", "", [0.0, 1e9], [1.0, 1e3], ""),
     range("guard.max_rollbacks", "", [0.0, 1e9], [0.0, 100.0], ""),

@@ -3,11 +3,13 @@
 use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};
 use std::path::PathBuf;
 
+use atoms::MinDistanceRule;
 use calm::CollectionRule;
 use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use dft::PassedEnvironment;
 use md::ThermostatSettings;
 use orchestrator::selector::{Mode, UpdateProtocol};
+use potentials::ZblWindows;
 use potentials::grace::Precision;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -75,6 +77,20 @@ pub struct SeedStructuresSection {
     /// Extended XYZ or POSCAR files; each frame is a seed structure.
     #[schemars(with = "Vec<PathBuf>", length(min = 1))]
     pub files: Vec<Spanned<PathBuf>>,
+    /// What to do with a structure that no walk can start from.
+    #[serde(default)]
+    pub on_invalid: OnInvalid,
+}
+
+/// What happens to a seed structure that no walk can start from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnInvalid {
+    /// It is left out and listed; the campaign runs with the others.
+    #[default]
+    Skip,
+    /// The campaign is refused.
+    Error,
 }
 
 /// `[walk]`
@@ -147,12 +163,10 @@ pub struct CollectSection {
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct GuardSection {
-    /// Shortest allowed distance of two atoms, Å.
-    pub min_distance: Positive,
-    /// Shortest allowed distance as a fraction of the seed structure's shortest distance.
-    pub min_distance_fraction: Fraction,
+    /// Rule for the shortest allowed distances between atoms.
+    pub min_distances: MinDistanceRule,
     /// Switched ZBL repulsion at short range. Default: none.
-    pub zbl: Option<ZblSection>,
+    pub zbl: Option<ZblWindows>,
     /// Highest allowed kinetic temperature, K.
     pub max_temperature: Positive,
     /// Number of refused configurations in a row after which a walk goes back to a checkpoint.
@@ -163,16 +177,6 @@ pub struct GuardSection {
     pub tau_factor: Fraction,
     /// Number of steps between checkpoints.
     pub checkpoint_interval: NonZeroU64,
-}
-
-/// `zbl = { inner, outer }`
-#[derive(Clone, Copy, Debug, Deserialize, Serialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ZblSection {
-    /// Distance below which the repulsion has its full strength, Å.
-    pub inner: Positive,
-    /// Distance above which the repulsion is zero, Å.
-    pub outer: Positive,
 }
 
 /// `[label]`
@@ -323,8 +327,7 @@ impl Default for CampaignSection {
 impl Default for GuardSection {
     fn default() -> Self {
         Self {
-            min_distance: defaults::positive(1.2),
-            min_distance_fraction: defaults::fraction(0.75),
+            min_distances: MinDistanceRule::default(),
             zbl: None,
             max_temperature: defaults::positive(20_000.0),
             max_consecutive_rejections: defaults::nonzero(10),

@@ -8,7 +8,7 @@ use crate::config::{Config, impossible, in_plain_words};
 use crate::exit_status::Failure;
 
 /// Keys that affect the selector's decisions. Their effect on walks is recorded and does not change.
-const KEYS: [&str; 11] = [
+const KEYS: [&str; 10] = [
     "budget.labels",
     "calm.covariance_update",
     "calm.forgetting_alarm",
@@ -18,8 +18,7 @@ const KEYS: [&str; 11] = [
     "collect.max_structures",
     "collect.update_target",
     "collect.criterion",
-    "guard.min_distance",
-    "guard.min_distance_fraction",
+    "guard.min_distances",
 ];
 
 /// A key with another value, as `key=value`.

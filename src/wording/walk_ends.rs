@@ -60,7 +60,7 @@ pub fn warning(ends: &WalkEnds) -> String {
 
 #[cfg(test)]
 mod tests {
-    use atoms::{Cell, Evaluation, NeighbourList, Structure};
+    use atoms::{Cell, Evaluation, MinDistanceRule, NeighbourList, Structure};
     use monitor::walk_ends::early_end_cause;
     use store::WalkStatus;
     use workers::guard::blown_up;
@@ -71,8 +71,7 @@ mod tests {
     #[test]
     fn reasons_of_the_guard_have_causes() {
         let settings = GuardSettings {
-            min_distance: 1.2,
-            min_distance_fraction: 0.75,
+            min_distances: MinDistanceRule::default(),
             max_temperature: 1000.0,
             max_consecutive_rejections: 10,
             max_rollbacks: 3,

@@ -63,7 +63,7 @@ min_interval = 30
 min_interval_after_decline = 5
 max_per_seed_structure = {max_per_seed_structure}
 [guard]
-zbl = {{ inner = 1.6, outer = 2.4 }}
+zbl = {{ rule = "uniform", inner = 1.6, outer = 2.4 }}
 [label]
 method = {{ potential = {{ kind = "eam_fs", file = "{label}" }} }}
 [run]

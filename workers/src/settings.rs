@@ -1,5 +1,7 @@
 //! Settings of walks.
 
+use atoms::MinDistanceRule;
+use potentials::ZblWindows;
 use serde::{Deserialize, Serialize};
 
 /// Dynamics, bias and guards of every walk of a campaign.
@@ -31,8 +33,8 @@ pub struct WalkSettings {
     pub gap: u64,
     /// Minimum number of steps between two candidates after one that was declined or refused.
     pub min_interval_after_decline: u64,
-    /// Switched ZBL repulsion: inner and outer radius of the switch, Å.
-    pub zbl: Option<(f64, f64)>,
+    /// Windows of the switched ZBL repulsion; `None` without one.
+    pub zbl: Option<ZblWindows>,
     /// Guards.
     pub guard: GuardSettings,
 }
@@ -40,10 +42,8 @@ pub struct WalkSettings {
 /// Settings of the guards.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GuardSettings {
-    /// A structure with a shorter distance is refused, Å.
-    pub min_distance: f64,
-    /// The same limit as a fraction of the seed structure's shortest distance; the larger of the two applies.
-    pub min_distance_fraction: f64,
+    /// How close atoms may come.
+    pub min_distances: MinDistanceRule,
     /// Temperature above which a walk ends, K.
     pub max_temperature: f64,
     /// Consecutive refusals by the same guard after which the walk rolls back to a checkpoint.

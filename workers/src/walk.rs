@@ -9,6 +9,7 @@ mod state;
 
 use std::sync::Arc;
 
+use atoms::ShortestDistances;
 use calm::{CollectionRule, Mixture};
 use md::{Dynamics, Stream};
 use potentials::Zbl;
@@ -84,7 +85,7 @@ impl<'a> Walk<'a> {
     ) -> Result<Self, WalkError> {
         let WalkContext { model, threads, settings } = context;
         let species = &assignment.seed_structure.species;
-        let zbl = settings.zbl.map(|(inner, outer)| Zbl::new(species, inner, outer)).transpose()?;
+        let zbl = settings.zbl.as_ref().map(|windows| Zbl::new(species, windows)).transpose()?;
         let mixture_version = mixture.version();
         let bias_averaging_steps = settings.bias_averaging_steps;
         let grace = Grace::with(Arc::clone(model), Instructions::best(), threads.clone());
@@ -199,8 +200,9 @@ impl<'a> Walk<'a> {
     }
 
     fn is_too_close(&self) -> bool {
-        let least = self.state.min_distance;
-        guard::too_close(self.dynamics.structure(), self.dynamics.neighbours(), least)
+        let shortest =
+            ShortestDistances::from_neighbours(self.dynamics.structure(), self.dynamics.neighbours());
+        self.state.min_distances.violation(&shortest).is_some()
     }
 
     fn save_checkpoint(&mut self) {

@@ -8,8 +8,8 @@ use std::sync::Arc;
 use atoms::{Structure, read_extxyz};
 use calm::Artifact;
 use md::{Dynamics, Langevin, Settings, State, Stream, Thermostat};
-use potentials::Zbl;
 use potentials::grace::{Grace, GraceModel, Precision, RadialPath};
+use potentials::{Zbl, ZblWindow, ZblWindows};
 use workers::bias::BiasedPotential;
 
 thread_local! {
@@ -64,7 +64,8 @@ fn check(precision: Precision) {
     let file = data("al_eam_1l/kokkos.npz");
     let model = Arc::new(GraceModel::load_in(&file, precision, RadialPath::default()).unwrap());
     let mixture = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
-    let zbl = Zbl::new(&structure.species, 1.6, 2.4).unwrap();
+    let zbl =
+        Zbl::new(&structure.species, &ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })).unwrap();
     let mut potential =
         BiasedPotential::new(Grace::new(model), mixture, Some(zbl), 2, &structure.species).unwrap();
     let stream = Stream::new(3, 0, 0);

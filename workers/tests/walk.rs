@@ -4,10 +4,13 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use atoms::{Evaluation, NeighbourList, Potential, Structure, Vec3, cell, read_extxyz};
+use atoms::{
+    Evaluation, MinDistanceRule, NeighbourList, Potential, Structure, Uniform, Vec3, cell, read_extxyz,
+};
 use calm::{Artifact, CollectionRule, Grades, Mixture};
 use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
+use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, Outcome, Report, Verdict, WalkEnd};
 use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::bias::BiasedPotential;
@@ -33,6 +36,10 @@ fn mixture() -> Arc<Mixture> {
     Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture)
 }
 
+fn uniform_zbl(inner: f64, outer: f64) -> Option<ZblWindows> {
+    Some(ZblWindows::Uniform(ZblWindow { inner, outer }))
+}
+
 fn settings() -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
@@ -48,10 +55,9 @@ fn settings() -> WalkSettings {
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         gap: 200,
         min_interval_after_decline: 20,
-        zbl: Some((1.6, 2.4)),
+        zbl: uniform_zbl(1.6, 2.4),
         guard: GuardSettings {
-            min_distance: 1.2,
-            min_distance_fraction: 0.75,
+            min_distances: MinDistanceRule::Uniform(Uniform::default()),
             max_temperature: 20_000.0,
             max_consecutive_rejections: 5,
             max_rollbacks: 3,
@@ -195,7 +201,7 @@ fn reference(
 /// The trap of the reference's walker: τ = 2.0 on a model of one phase, and a ZBL that ends at 1.8 Å.
 #[test]
 fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
-    let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), ..settings() };
+    let settings = WalkSettings { tau: 2.0, zbl: uniform_zbl(1.0, 1.8), ..settings() };
     let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
     let last = reports.last().unwrap();
     assert!(last.progress.returns >= 1, "{last:?}");
@@ -211,7 +217,7 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
 #[test]
 fn the_interval_between_collections_holds_across_roll_backs() {
     let guard = GuardSettings { tau_factor: 0.8, max_rollbacks: 6, ..settings().guard };
-    let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), gap: 120, guard, ..settings() };
+    let settings = WalkSettings { tau: 2.0, zbl: uniform_zbl(1.0, 1.8), gap: 120, guard, ..settings() };
     let reports = whole_walk(&settings, seed_structure("fcc-097"), 150);
     let candidate = |report: &Report<Candidate>| match &report.outcome {
         Outcome::Candidate(candidate) => Some((candidate.id.segment, candidate.id.step)),
@@ -254,7 +260,8 @@ fn the_skin_changes_nothing() {
 
 #[test]
 fn a_walk_that_cannot_leave_a_trap_ends() {
-    let guard = GuardSettings { min_distance: 3.0, ..settings().guard };
+    let min_distances = MinDistanceRule::Uniform(Uniform { min_distance: 3.0, fraction: 0.75 });
+    let guard = GuardSettings { min_distances, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
     let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
     let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);

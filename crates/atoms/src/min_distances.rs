@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::{ElementPair, ShortestDistances};
 
 /// How the shortest allowed distances of a walk follow from its seed structure.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "rule", rename_all = "snake_case")]
 pub enum MinDistanceRule {
     /// For each pair of elements.
@@ -18,7 +19,7 @@ pub enum MinDistanceRule {
 
 /// Pairs that are bonded in the seed structure, d⁰ < `bond_cutoff` Σr, keep d ≥ `bonded` d⁰; all others keep
 /// d ≥ `nonbonded` Σr. d⁰ is the shortest distance of the pair of elements there, Σr the sum of their covalent radii.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PerPair {
     /// Fraction of d⁰.
@@ -28,11 +29,18 @@ pub struct PerPair {
     /// Longest bond, as a multiple of Σr.
     pub bond_cutoff: f64,
     /// Shortest allowed distances of single pairs, Å, instead of these rules.
+    #[schemars(
+        with = "BTreeMap<String, f64>",
+        extend(
+            "additionalProperties" = false,
+            "patternProperties" = { "^[A-Z][a-z]?-[A-Z][a-z]?$": { "type": "number", "exclusiveMinimum": 0 } },
+        )
+    )]
     pub pairs: BTreeMap<ElementPair, f64>,
 }
 
 /// max(`min_distance`, `fraction` d_nn⁰) for all pairs, where d_nn⁰ is the seed structure's shortest distance.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Uniform {
     /// Å (paper: 1.2).

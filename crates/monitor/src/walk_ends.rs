@@ -79,7 +79,7 @@ impl EarlyEndCause {
             Self::Crashed => {
                 "nothing in the configuration: check the walkers' last output in the log, and the free memory"
             }
-            Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.min_distance says what is too close",
+            Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.min_distances says what is too close",
             Self::BadStart => "the seed structure: the reason says what is wrong with it",
             Self::Other => "a smaller walk.time_step or walk.tau, or guard.zbl",
         }

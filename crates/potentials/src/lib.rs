@@ -11,9 +11,11 @@ mod setfl;
 mod stillinger_weber;
 mod stillinger_weber_file;
 mod zbl;
+mod zbl_windows;
 
 pub use eam::Eam;
 pub use potential_file::PotentialFileError;
 pub use setfl::EamStyle;
 pub use stillinger_weber::StillingerWeber;
 pub use zbl::{Zbl, ZblRangeError};
+pub use zbl_windows::{RadiiWindows, ZblWindow, ZblWindows};

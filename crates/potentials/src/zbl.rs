@@ -2,9 +2,10 @@
 
 use atoms::cell::dot;
 use atoms::units::COULOMB;
-use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
+use atoms::{ElementPair, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 
 use crate::pairs::{self, Elements};
+use crate::zbl_windows::{ZblWindow, ZblWindows};
 
 /// The Ziegler–Biersack–Littmark repulsion with a smooth switch.
 ///
@@ -13,13 +14,13 @@ use crate::pairs::{self, Elements};
 /// Source: J. F. Ziegler, J. P. Biersack, U. Littmark, The Stopping and Range of Ions in Solids (Pergamon,
 /// 1985).
 ///
-/// S(x) = 1 − 10 x³ + 15 x⁴ − 6 x⁵ with x = (r − inner) / (outer − inner) between `inner` and `outer`; it is
-/// continuous up to its second derivative. S = 1 below and 0 above.
+/// S(x) = 1 − 10 x³ + 15 x⁴ − 6 x⁵ with x = (r − inner) / (outer − inner) between `inner` and `outer` of the pair of
+/// elements; it is continuous up to its second derivative. S = 1 below and 0 above.
 #[derive(Clone, Debug)]
 pub struct Zbl {
     elements: Elements,
-    inner: f64,
-    outer: f64,
+    /// The largest `outer`, Å.
+    cutoff: f64,
     /// `[i * elements + j]`.
     repulsions: Vec<Repulsion>,
 }
@@ -31,6 +32,7 @@ struct Repulsion {
     strength: f64,
     /// a, Å.
     screening_length: f64,
+    window: ZblWindow,
 }
 
 /// Φ: (factor, exponent) of each term.
@@ -40,9 +42,11 @@ const SCREENING: [(f64, f64); 4] =
 /// An invalid switch.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "the ZBL repulsion cannot be switched off between {inner} Å and {outer} Å: expected 0 ≤ inner < outer"
+    "the ZBL repulsion of {pair} cannot be switched off between {inner} Å and {outer} Å: expected 0 ≤ inner < outer"
 )]
 pub struct ZblRangeError {
+    /// The pair of elements.
+    pub pair: ElementPair,
     /// Where the switch starts, Å.
     pub inner: f64,
     /// Where the repulsion ends, Å.
@@ -50,25 +54,34 @@ pub struct ZblRangeError {
 }
 
 impl Zbl {
-    /// The repulsion between all pairs of `species`, complete up to `inner` and zero from `outer`, Å.
-    pub fn new(species: &[Species], inner: f64, outer: f64) -> Result<Self, ZblRangeError> {
-        if !(0.0 <= inner && inner < outer && outer.is_finite()) {
-            return Err(ZblRangeError { inner, outer });
-        }
+    /// The repulsion between all pairs of `species`.
+    ///
+    /// # Errors
+    /// A window without width.
+    pub fn new(species: &[Species], windows: &ZblWindows) -> Result<Self, ZblRangeError> {
         let mut species = species.to_vec();
         species.sort_unstable();
         species.dedup();
-        let charges: Vec<f64> = species.iter().map(|s| f64::from(s.atomic_number())).collect();
         let mut repulsions = Vec::new();
-        for zi in &charges {
-            for zj in &charges {
+        let mut cutoff = 0.0_f64;
+        for a in &species {
+            for b in &species {
+                let pair = ElementPair::new(*a, *b);
+                let window = windows.window(pair);
+                let ZblWindow { inner, outer } = window;
+                if !(0.0 <= inner && inner < outer && outer.is_finite()) {
+                    return Err(ZblRangeError { pair, inner, outer });
+                }
+                cutoff = cutoff.max(outer);
+                let (za, zb) = (f64::from(a.atomic_number()), f64::from(b.atomic_number()));
                 repulsions.push(Repulsion {
-                    strength: COULOMB * zi * zj,
-                    screening_length: 0.46850 / (zi.powf(0.23) + zj.powf(0.23)),
+                    strength: COULOMB * za * zb,
+                    screening_length: 0.46850 / (za.powf(0.23) + zb.powf(0.23)),
+                    window,
                 });
             }
         }
-        Ok(Self { elements: Elements::new(species), inner, outer, repulsions })
+        Ok(Self { elements: Elements::new(species), cutoff, repulsions })
     }
 
     /// Adds energies, forces and virial of the repulsion to `out`, which must have as many atoms.
@@ -78,19 +91,22 @@ impl Zbl {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.elements.check(structure, neighbours, self.outer)?;
+        self.elements.check(structure, neighbours, self.cutoff)?;
         for i in 0..structure.len() {
             let row = self.elements.index(structure.species[i]) * self.elements.len();
             for neighbour in neighbours.later_neighbours_of(i) {
                 let d = neighbour.displacement(structure, i);
                 let squared = dot(d, d);
-                if squared >= self.outer * self.outer {
+                if squared >= self.cutoff * self.cutoff {
                     continue;
                 }
                 let j = neighbour.atom as usize;
                 let r = squared.sqrt();
                 let repulsion = &self.repulsions[row + self.elements.index(structure.species[j])];
-                let (energy, slope) = self.energy_and_slope(repulsion, r);
+                if r >= repulsion.window.outer {
+                    continue;
+                }
+                let (energy, slope) = repulsion.energy_and_slope(r);
                 out.atomic_energies[i] += 0.5 * energy;
                 out.atomic_energies[j] += 0.5 * energy;
                 pairs::add_pair_force(out, i, j, d, slope / r);
@@ -98,24 +114,27 @@ impl Zbl {
         }
         Ok(())
     }
+}
 
-    /// E(r), eV, and E′(r), eV/Å, of a pair.
-    fn energy_and_slope(&self, repulsion: &Repulsion, r: f64) -> (f64, f64) {
-        let y = r / repulsion.screening_length;
+impl Repulsion {
+    /// E(r), eV, and E′(r), eV/Å, within the window.
+    fn energy_and_slope(&self, r: f64) -> (f64, f64) {
+        let ZblWindow { inner, outer } = self.window;
+        let y = r / self.screening_length;
         let (mut screening, mut screening_slope) = (0.0, 0.0);
         for (factor, exponent) in SCREENING {
             let term = factor * (exponent * y).exp();
             screening += term;
             screening_slope += exponent * term;
         }
-        let coulomb = repulsion.strength / r;
+        let coulomb = self.strength / r;
         let energy = coulomb * screening;
-        let slope = coulomb * (screening_slope / repulsion.screening_length - screening / r);
-        if r <= self.inner {
+        let slope = coulomb * (screening_slope / self.screening_length - screening / r);
+        if r <= inner {
             return (energy, slope);
         }
-        let width = self.outer - self.inner;
-        let x = (r - self.inner) / width;
+        let width = outer - inner;
+        let x = (r - inner) / width;
         let switch = 1.0 - x * x * x * (10.0 - x * (15.0 - 6.0 * x));
         let switch_slope = -30.0 * x * x * (1.0 - x) * (1.0 - x) / width;
         (switch * energy, switch * slope + switch_slope * energy)
@@ -124,7 +143,7 @@ impl Zbl {
 
 impl Potential for Zbl {
     fn cutoff(&self) -> f64 {
-        self.outer
+        self.cutoff
     }
 
     fn species(&self) -> &[Species] {

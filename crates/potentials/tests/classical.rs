@@ -1,7 +1,7 @@
 //! Properties of EAM, Stillinger–Weber and ZBL that hold for any parameters.
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
-use potentials::{Eam, EamStyle, StillingerWeber, Zbl};
+use potentials::{Eam, EamStyle, RadiiWindows, StillingerWeber, Zbl, ZblWindow, ZblWindows};
 use proptest::prelude::Rng;
 use proptest::test_runner::{RngAlgorithm, TestRng};
 
@@ -29,8 +29,14 @@ fn silicon_carbide() -> StillingerWeber {
     StillingerWeber::load(format!("{HERE}/tests/data/two_elements.sw")).unwrap()
 }
 
+/// Each pair of elements has another window.
 fn repulsion() -> Zbl {
-    Zbl::new(&species(&["Al", "Si"]), 1.2, 2.9).unwrap()
+    let windows = RadiiWindows { inner: 0.5, outer: 1.2, ..RadiiWindows::default() };
+    Zbl::new(&species(&["Al", "Si"]), &ZblWindows::PerPair(windows)).unwrap()
+}
+
+fn window(inner: f64, outer: f64) -> ZblWindows {
+    ZblWindows::Uniform(ZblWindow { inner, outer })
 }
 
 /// A crystal of `corner` in skewed cubes of edge `a`, rattled by up to ±`width`, with alternating elements.
@@ -235,8 +241,8 @@ fn the_repulsion_is_added_to_what_is_there() {
 fn the_switch_of_the_repulsion_is_smooth() {
     let (inner, outer) = (1.2, 2.4);
     let elements = species(&["Al"]);
-    let mut switched = Zbl::new(&elements, inner, outer).unwrap();
-    let mut plain = Zbl::new(&elements, 19.0, 20.0).unwrap();
+    let mut switched = Zbl::new(&elements, &window(inner, outer)).unwrap();
+    let mut plain = Zbl::new(&elements, &window(19.0, 20.0)).unwrap();
     let dimer = |r: f64| Structure {
         species: species(&["Al", "Al"]),
         positions: vec![[0.0; 3], [r, 0.0, 0.0]],
@@ -261,7 +267,31 @@ fn the_switch_of_the_repulsion_is_smooth() {
 fn a_switch_must_have_a_width() {
     let elements = species(&["Al"]);
     for (inner, outer) in [(2.0, 2.0), (2.4, 2.0), (-0.1, 2.0), (f64::NAN, 2.0), (1.0, f64::INFINITY)] {
-        assert!(Zbl::new(&elements, inner, outer).is_err());
+        assert!(Zbl::new(&elements, &window(inner, outer)).is_err());
+    }
+}
+
+/// A pair has no repulsion beyond its own window, whatever those of others.
+#[test]
+fn every_pair_of_elements_has_its_window() {
+    let windows: RadiiWindows =
+        serde_json::from_str(r#"{ "pairs": { "H-O": { "inner": 0.3, "outer": 0.5 } } }"#).unwrap();
+    let elements = species(&["H", "O", "Al"]);
+    let mut repulsion = Zbl::new(&elements, &ZblWindows::PerPair(windows)).unwrap();
+    assert!((repulsion.cutoff() - 0.75 * 2.42).abs() < 1e-12);
+    for (a, b, outer) in
+        [("H", "H", 0.75 * 0.62), ("H", "O", 0.5), ("O", "Al", 0.75 * 1.87), ("Al", "Al", 0.75 * 2.42)]
+    {
+        let mut energy = |r: f64| {
+            let structure = Structure {
+                species: species(&[a, b]),
+                positions: vec![[0.0; 3], [r, 0.0, 0.0]],
+                cell: Cell::orthorhombic(50.0, 50.0, 50.0),
+                periodic: [false; 3],
+            };
+            common::evaluate(&mut repulsion, &structure).atomic_energies.iter().sum::<f64>()
+        };
+        assert!(energy(outer - 0.02) > 0.0 && energy(outer) == 0.0 && energy(outer + 0.02) == 0.0, "{a}-{b}");
     }
 }
 

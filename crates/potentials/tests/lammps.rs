@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::units::COULOMB;
 use atoms::{Cell, Matrix3, Potential, Structure, Vec3};
-use potentials::{Eam, StillingerWeber, Zbl};
+use potentials::{Eam, StillingerWeber, Zbl, ZblWindow, ZblWindows};
 use serde_json::Value;
 
 use crate::common;
@@ -148,5 +148,9 @@ fn stillinger_weber_mixture() {
 #[test]
 fn zbl() {
     let species = ["Al", "Si"].map(|symbol| symbol.parse().unwrap());
-    compare(&mut Zbl::new(&species, 19.0, 20.0).unwrap(), "zbl", COULOMB / 14.399645);
+    compare(
+        &mut Zbl::new(&species, &ZblWindows::Uniform(ZblWindow { inner: 19.0, outer: 20.0 })).unwrap(),
+        "zbl",
+        COULOMB / 14.399645,
+    );
 }

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use atoms::{MinDistanceRule, Uniform};
 use calm::forgetting::ForgettingAlarm;
 use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
@@ -40,7 +41,7 @@ pub fn settings(threshold: f64) -> Settings {
         max_per_seed_structure: u32::MAX,
         max_structures: None,
         control: false,
-        min_distance: (1.2, 0.75),
+        min_distances: MinDistanceRule::Uniform(Uniform::default()),
         declined_feature_bytes: 1_000_000_000,
     }
 }

@@ -126,7 +126,7 @@ impl Model {
         evaluator: &mut Evaluator,
     ) -> Option<Candidate> {
         let bonds = self.grader.bonds(&structure).unwrap();
-        if bonds.shortest < plan.min_distance {
+        if bonds.shortest.shortest() < plan.min_distance {
             return None;
         }
         evaluator.forward(&structure);

@@ -177,7 +177,8 @@ impl DecisionState {
         graded: &RegradedCandidate,
     ) -> Option<DeclineReason> {
         let walk = &self.walks[&id].record;
-        if graded.bonds.shortest < self.min_distances[walk.seed_structure as usize] {
+        let min_distances = &self.min_distances[walk.seed_structure as usize];
+        if min_distances.violation(&graded.bonds.shortest).is_some() {
             Some(DeclineReason::Guard)
         } else if self.known.contains(&content) {
             Some(DeclineReason::Duplicate)

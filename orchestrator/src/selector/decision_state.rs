@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
+use atoms::MinDistances;
 use calm::{Mixture, MixtureError, Staleness};
 use serde::de::DeserializeOwned;
 use serde_json::json;
@@ -21,8 +22,8 @@ use crate::grader::Grader;
 /// Decides on candidates and walks.
 pub(super) struct DecisionState {
     pub settings: Settings,
-    /// Minimum distance in candidates of each seed structure, Å.
-    pub min_distances: Vec<f64>,
+    /// How close atoms may come in candidates of each seed structure.
+    pub min_distances: Vec<MinDistances>,
     pub regrader: Regrader,
     pub mixture: Arc<Mixture>,
     pub training: Option<TrainingFrames>,
@@ -108,16 +109,14 @@ impl DecisionState {
     }
 }
 
-/// max(minimum distance, fraction × shortest distance) for each seed structure, Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
+/// How close atoms may come in walks from each seed structure.
 fn min_distances(
     settings: &Settings,
     seeds: &[SeedStructure],
     grader: &Grader,
-) -> Result<Vec<f64>, SelectorError> {
-    let (least, fraction) = settings.min_distance;
+) -> Result<Vec<MinDistances>, SelectorError> {
     let of = |seed: &SeedStructure| match grader.bonds(&seed.structure) {
-        Ok(bonds) if bonds.shortest.is_finite() => Ok(least.max(fraction * bonds.shortest)),
-        Ok(_) => Ok(least),
+        Ok(bonds) => Ok(settings.min_distances.limits(&bonds.shortest)),
         Err(source) => Err(SelectorError::SeedStructure { name: seed.name.clone(), source }),
     };
     seeds.iter().map(of).collect()

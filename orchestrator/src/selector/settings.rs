@@ -1,6 +1,6 @@
 //! What a selector works with: settings, seed structures, and the stored state.
 
-use atoms::Structure;
+use atoms::{MinDistanceRule, Structure};
 use calm::forgetting::ForgettingAlarm;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -62,9 +62,8 @@ pub struct Settings {
     pub max_structures: Option<u32>,
     /// Whether each biased walk that collected structures is followed by its unbiased control walk.
     pub control: bool,
-    /// Minimum distance between atoms, Å, and as a fraction of the shortest distance in the seed structure. Structures
-    /// with shorter distances are declined.
-    pub min_distance: (f64, f64),
+    /// How close atoms may come. Structures with closer atoms are declined.
+    pub min_distances: MinDistanceRule,
     /// Maximum size of the stored feature vectors of declined candidates, bytes.
     pub declined_feature_bytes: u64,
 }

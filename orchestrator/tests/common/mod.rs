@@ -5,7 +5,7 @@ pub mod scripted;
 
 use std::sync::Arc;
 
-use atoms::{Cell, Species, Structure};
+use atoms::{Cell, MinDistanceRule, Species, Structure, Uniform};
 use calm::forgetting::ForgettingAlarm;
 use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{
@@ -85,7 +85,7 @@ pub fn settings(mode: Mode) -> Settings {
         max_per_seed_structure: 3,
         max_structures: None,
         control: false,
-        min_distance: (1.2, 0.75),
+        min_distances: MinDistanceRule::Uniform(Uniform::default()),
         declined_feature_bytes: 1 << 20,
     }
 }

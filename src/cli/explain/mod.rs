@@ -6,7 +6,9 @@ mod labels;
 
 use std::io::{self, Write};
 
-use monitor::candidate_details::{self, CandidateDetails, Discovery, Distances, StructureSummary};
+use monitor::candidate_details::{
+    self, CandidateDetails, Discovery, Distances, PairDistance, StructureSummary,
+};
 use store::{Location, Store};
 
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
@@ -148,19 +150,20 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
 }
 
 fn write_distances(out: &mut dyn Write, distances: &Distances, control: bool) -> io::Result<()> {
-    let Distances { shortest, atoms, seed_structure, least } = distances;
+    let Distances { shortest, atoms, pairs } = distances;
     let pair = atoms.map_or(String::new(), |[i, j]| format!(" (atoms {i} and {j})"));
-    let found = format!("shortest distance {} Å{pair}", decimals(*shortest, 3));
-    let limit = match (control, shortest, least) {
-        (true, ..) => "; no limit for control frames".to_owned(),
-        (false, Some(shortest), Some(least)) => format!(
-            ", {} the selector's limit of {least:.3} Å (seed structure: {} Å)",
-            if shortest < least { "below" } else { "at least" },
-            decimals(*seed_structure, 3)
-        ),
-        _ => String::new(),
-    };
-    line(out, "guard", &(found + &limit))
+    let exempt = if control { "; no limit for control frames" } else { "" };
+    line(out, "guard", &format!("shortest distance {} Å{pair}{exempt}", decimals(*shortest, 3)))?;
+    for PairDistance { pair, shortest, seed_structure, limit } in pairs.iter().filter(|_| !control) {
+        let Some(limit) = limit else { continue };
+        let position = if shortest < limit { "below" } else { "at least" };
+        let seed = decimals(*seed_structure, 3);
+        let text = format!(
+            "{pair}: {shortest:.3} Å, {position} the selector's limit of {limit:.3} Å (seed structure: {seed} Å)"
+        );
+        line(out, "", &text)?;
+    }
+    Ok(())
 }
 
 fn write_same(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {

@@ -3,10 +3,11 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use atoms::{Cell, Species, Structure};
+use atoms::{Cell, MinDistanceRule, Species, Structure, Uniform};
 use calm::Mixture;
 use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{GraceModel, Threads};
+use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, Outcome, Report};
 use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::settings::{GuardSettings, WalkSettings};
@@ -79,10 +80,9 @@ fn settings(threshold: f64) -> WalkSettings {
             .expect("a rule"),
         gap: 200,
         min_interval_after_decline: 20,
-        zbl: Some((1.6, 2.4)),
+        zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
         guard: GuardSettings {
-            min_distance: 1.2,
-            min_distance_fraction: 0.5,
+            min_distances: MinDistanceRule::Uniform(Uniform { min_distance: 1.2, fraction: 0.5 }),
             max_temperature: 20_000.0,
             max_consecutive_rejections: 10,
             max_rollbacks: 3,

@@ -7,14 +7,12 @@ mod tests;
 use std::collections::BTreeMap;
 
 use analysis::{CostModel, Measured, Size};
-use atoms::Structure;
 use atoms::cell::{dot, norm};
+use atoms::{ElementPair, Structure};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use store::records::Lease;
 use store::{Store, StoreError};
-
-pub use bonds::Pair;
 
 /// Metadata name under which the leader stores the campaign's guard as JSON. It applies to every labeller from the
 /// next label on.
@@ -40,7 +38,7 @@ pub struct LabelGuard {
             "patternProperties" = { "^[A-Z][a-z]?-[A-Z][a-z]?$": { "type": "number", "exclusiveMinimum": 0 } },
         )
     )]
-    pub min_bond_lengths: BTreeMap<Pair, f64>,
+    pub min_bond_lengths: BTreeMap<ElementPair, f64>,
     /// Minimum distance between opposite faces of the cell, Å.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub min_height: Option<f64>,

@@ -48,7 +48,7 @@ use report_line::DeliveryOutcome;
 pub use calculation_runner::{RunnerCommand, run_calculation};
 pub use code::CodeMethod;
 pub use execution::{BatchSystem, ExecutionSettings, KeepDirectories};
-pub use guard::{GUARD, LabelGuard, Pair};
+pub use guard::{GUARD, LabelGuard};
 pub use heartbeat::{ExitPolicy, serve};
 pub use label_attempt::SingleLabel;
 pub use method::Method;

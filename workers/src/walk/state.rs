@@ -1,6 +1,6 @@
 //! The state of a walk between assignments, and its initial state.
 
-use atoms::shortest_distance;
+use atoms::{MinDistances, ShortestDistances};
 use md::{Checkpoint, Dynamics, State, Stream, VolumeRamp};
 use serde::{Deserialize, Serialize};
 use wire::Origin;
@@ -8,7 +8,6 @@ use wire::messages::Assignment;
 
 use super::error::WalkError;
 use crate::bias::{BiasState, BiasedPotential};
-use crate::guard;
 use crate::settings::WalkSettings;
 
 /// Number of checkpoints kept for roll backs. The oldest one is used, so that a roll back leads out of the trap.
@@ -30,8 +29,8 @@ pub(super) struct WalkState {
     pub next_offer: u64,
     /// Points at which structures were collected.
     pub collected: Vec<CollectionPoint>,
-    /// The guard's minimum distance, Å.
-    pub min_distance: f64,
+    /// How close atoms may come.
+    pub min_distances: MinDistances,
     /// Targets of roll backs, oldest first.
     pub good: Vec<(Checkpoint, BiasState)>,
     pub gamma_max: f64,
@@ -84,7 +83,7 @@ pub(super) fn start(
     let thermostat = settings.thermostat.start(settings.temperature);
     let run = md::Settings { time_step, thermostat, ramp, stream, skin: settings.skin };
     let dynamics = Dynamics::new(start, run, potential)?;
-    let shortest = shortest_distance(dynamics.structure(), dynamics.neighbours()).map(|(_, _, d)| d);
+    let shortest = ShortestDistances::from_neighbours(dynamics.structure(), dynamics.neighbours());
     let state = WalkState {
         dynamics: dynamics.checkpoint().clone(),
         bias: BiasState::default(),
@@ -96,7 +95,7 @@ pub(super) fn start(
         max_consecutive_rejections: 0,
         next_offer: 0,
         collected: Vec::new(),
-        min_distance: guard::min_distance(&settings.guard, shortest),
+        min_distances: settings.guard.min_distances.limits(&shortest),
         good: vec![(dynamics.checkpoint().clone(), BiasState::default())],
         gamma_max: 0.0,
     };

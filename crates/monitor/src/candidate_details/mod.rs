@@ -20,7 +20,7 @@ use wire::ContentHash;
 pub use decision::{Coverage, DecisionDetails, ELEMENTS_KEY, Update};
 pub use grades::{Atom, CandidateGrades, Trigger};
 pub use labels::{CandidateLabel, ForceError, LabelJob};
-pub use walk::{Discovery, Distances};
+pub use walk::{Discovery, Distances, PairDistance};
 
 /// Version of the JSON form. Adding fields keeps the version; removing or changing them increments it.
 pub const FORMAT: u32 = 1;

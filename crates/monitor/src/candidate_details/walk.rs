@@ -1,6 +1,11 @@
 //! Where a candidate was found, and the distances of its atoms.
 
-use atoms::{NeighbourList, Structure, shortest_distance};
+use std::collections::BTreeMap;
+
+use atoms::{
+    ElementPair, MinDistanceRule, MinDistances, NeighbourList, ShortestDistances, Structure,
+    shortest_distance,
+};
 use serde::Serialize;
 use serde_json::Value;
 use store::{CandidateRef, Store, StoreError, StoredCandidate, WalkStatus};
@@ -37,18 +42,28 @@ pub struct Discovery {
     pub walk_now: Option<WalkStatus>,
 }
 
-/// Shortest distance, and the limit of the selector's guard.
+/// Shortest distances, and the limits of the selector's guard.
 #[derive(Clone, Debug, Serialize)]
 pub struct Distances {
     /// Å. `None` if no two atoms are within 8 Å.
     pub shortest: Option<f64>,
     /// The pair of atoms at this distance.
     pub atoms: Option<[usize; 2]>,
-    /// Shortest distance of the seed structure, Å.
+    /// Each pair of elements with atoms within 8 Å.
+    pub pairs: Vec<PairDistance>,
+}
+
+/// The atoms of a pair of elements.
+#[derive(Clone, Debug, Serialize)]
+pub struct PairDistance {
+    /// The elements: `Al-O`.
+    pub pair: ElementPair,
+    /// Their shortest distance, Å.
+    pub shortest: f64,
+    /// That in the seed structure, Å.
     pub seed_structure: Option<f64>,
-    /// The selector declines below this distance, Å: max(`guard.min_distance`, `guard.min_distance_fraction` ×
-    /// that of the seed structure). Control frames are exempt.
-    pub least: Option<f64>,
+    /// The selector declines below this distance, Å (`guard.min_distances`). Control frames are exempt.
+    pub limit: Option<f64>,
 }
 
 impl Discovery {
@@ -66,7 +81,7 @@ impl Discovery {
             Some(partner) => store.accepted_at(partner, id.step).await?,
             None => None,
         };
-        let of_seed = seed.as_ref().and_then(|seed| shortest(&seed.structure)).map(|(.., r)| r);
+        let of_seed = seed.as_ref().and_then(|seed| shortest_distances(&seed.structure));
         Ok(Self {
             walk: id.walk.0,
             segment: id.segment,
@@ -85,22 +100,32 @@ impl Discovery {
 }
 
 impl Distances {
-    fn new(structure: &Structure, seed_structure: Option<f64>, rules: &Value) -> Self {
-        let found = shortest(structure);
-        let number = |key: &str| rules["guard"][key].as_f64();
-        let limits = number("min_distance").zip(number("min_distance_fraction"));
-        Self {
-            shortest: found.map(|(.., r)| r),
-            atoms: found.map(|(i, j, _)| [i, j]),
-            seed_structure,
-            least: limits
-                .map(|(least, fraction)| seed_structure.map_or(least, |r| f64::max(least, fraction * r))),
-        }
+    fn new(structure: &Structure, seed_structure: Option<ShortestDistances>, rules: &Value) -> Self {
+        let rule: Option<MinDistanceRule> =
+            serde_json::from_value(rules["guard"]["min_distances"].clone()).ok();
+        let limits = rule.zip(seed_structure.as_ref()).map(|(rule, seed)| rule.limits(seed));
+        let limits: BTreeMap<_, _> = limits.iter().flat_map(MinDistances::iter).collect();
+        let in_seed: BTreeMap<_, _> = seed_structure.iter().flat_map(ShortestDistances::iter).collect();
+        let pair = |(pair, shortest): (ElementPair, f64)| PairDistance {
+            pair,
+            shortest,
+            seed_structure: in_seed.get(&pair).copied().filter(|d| d.is_finite()),
+            limit: limits.get(&pair).copied(),
+        };
+        let pairs = shortest_distances(structure);
+        let pairs = pairs.iter().flat_map(ShortestDistances::iter).filter(|(_, d)| d.is_finite());
+        let pairs = pairs.map(pair).collect();
+        let found = neighbours(structure).and_then(|list| shortest_distance(structure, &list));
+        Self { shortest: found.map(|(.., r)| r), atoms: found.map(|(i, j, _)| [i, j]), pairs }
     }
 }
 
-fn shortest(structure: &Structure) -> Option<(usize, usize, f64)> {
+fn shortest_distances(structure: &Structure) -> Option<ShortestDistances> {
+    Some(ShortestDistances::from_neighbours(structure, &neighbours(structure)?))
+}
+
+fn neighbours(structure: &Structure) -> Option<NeighbourList> {
     let mut neighbours = NeighbourList::new(NEIGHBOUR_CUTOFF, 0.0);
     neighbours.update(structure).ok()?;
-    shortest_distance(structure, &neighbours)
+    Some(neighbours)
 }

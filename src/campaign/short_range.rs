@@ -1,0 +1,65 @@
+//! What the guard and the repulsion at short range mean for the pairs of elements in the seed structures.
+
+use std::collections::BTreeMap;
+
+use atoms::{ElementPair, NeighbourList, ShortestDistances};
+use potentials::ZblWindow;
+
+use super::load::SourcedStructure;
+use crate::config::Config;
+
+/// A pair of elements that are neighbours in a seed structure.
+#[derive(Clone, Debug)]
+pub struct PairRange {
+    /// The elements.
+    pub pair: ElementPair,
+    /// Their shortest distance in all seed structures, Å.
+    pub shortest: f64,
+    /// Name of the seed structure with that distance.
+    pub seed_structure: String,
+    /// The lowest of the limits of `guard.min_distances` in walks from all seed structures, Å.
+    pub limit: f64,
+    /// The window of the repulsion.
+    pub zbl: Option<ZblWindow>,
+}
+
+/// All pairs with a distance within `cutoff`, Å, in their order.
+pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure], cutoff: f64) -> Vec<PairRange> {
+    let mut ranges: BTreeMap<ElementPair, PairRange> = BTreeMap::new();
+    for SourcedStructure { seed, .. } in seeds {
+        let mut neighbours = NeighbourList::new(cutoff, 0.0);
+        if neighbours.update(&seed.structure).is_err() {
+            continue;
+        }
+        let found = ShortestDistances::from_neighbours(&seed.structure, &neighbours);
+        let limits: BTreeMap<_, _> = config.guard.min_distances.limits(&found).iter().collect();
+        for (pair, distance) in found.iter().filter(|(_, distance)| distance.is_finite()) {
+            let range = ranges.entry(pair).or_insert_with(|| PairRange {
+                pair,
+                shortest: f64::INFINITY,
+                seed_structure: String::new(),
+                limit: f64::INFINITY,
+                zbl: config.guard.zbl.as_ref().map(|windows| windows.window(pair)),
+            });
+            range.limit = limits.get(&pair).map_or(range.limit, |limit| limit.min(range.limit));
+            if distance < range.shortest {
+                range.shortest = distance;
+                range.seed_structure.clone_from(&seed.name);
+            }
+        }
+    }
+    ranges.into_values().collect()
+}
+
+impl PairRange {
+    /// A warning if the repulsion reaches into bonds.
+    pub fn warning(&self) -> Option<String> {
+        let Self { pair, shortest, seed_structure, zbl, .. } = self;
+        let window = zbl.filter(|window| window.outer > *shortest)?;
+        Some(format!(
+            "the repulsion of {pair} reaches to {:.3} Å and changes distances of {shortest:.3} Å in seed structure \
+             '{seed_structure}'; give this pair a shorter window in guard.zbl.pairs",
+            window.outer
+        ))
+    }
+}
