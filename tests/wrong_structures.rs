@@ -212,7 +212,9 @@ fn lengths_in_bohr_are_warned_of() {
         (0.5292, "nearest neighbours are 1.48 Å apart, 0.59 times the sum of their radii"),
     ] {
         let found = warnings(&seeds, "bohr.extxyz", scaled(factor));
-        let [warning] = found.as_slice() else { panic!("{found:?}") };
+        // A repulsion that reaches into these bonds is another warning.
+        let near: Vec<_> = found.iter().filter(|warning| warning.contains("nearest neighbours")).collect();
+        let [warning] = near.as_slice() else { panic!("{found:?}") };
         assert!(
             warning.contains("seed structure 'bohr-0' (bohr.extxyz:1): ") && warning.contains(words),
             "{warning}"
