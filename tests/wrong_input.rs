@@ -15,6 +15,7 @@ const ARTIFACT: &str = "data/al_eam_1l/gmm_artifacts.npz";
 #[test]
 fn every_wrong_key_is_named_with_its_line() {
     let tester = ConfigTester::new();
+    let distances = "# min_distances = { rule = \"per_pair\", bonded = 0.75, nonbonded = 0.65, bond_cutoff = 1.3, pairs = {} }";
     let langevin = "# thermostat = { langevin = { friction = 0.01 } }";
     for (from, to, expected) in [
         ("temperature = 600.0", "temprature = 600.0", "unknown key `temprature`, expected one of"),
@@ -59,6 +60,11 @@ fn every_wrong_key_is_named_with_its_line() {
             "expected at least one value, ascending",
         ),
         (
+            "min_atoms = 3, target = 1.25",
+            "min_atoms = 4, target = 1.25",
+            "collect.update_target is atom_count: fewer than 4 atoms with γ > 1.3, else γ_max below 1.25; expected a rule after",
+        ),
+        (
             langevin,
             "thermostat = { langevin = { friction = 0 } }",
             "walk.thermostat.langevin.friction is 0; expected",
@@ -82,6 +88,28 @@ fn every_wrong_key_is_named_with_its_line() {
             "expected at most the cutoff of the model, 6.5 Å",
         ),
         ("inner = 1.6, outer = 2.4", "inner = 1.6", "missing key `outer`"),
+        (
+            distances,
+            "min_distances = { rule = \"per_pair\", pairs = { O-H = -1 } }",
+            "guard.min_distances.pairs.H-O is -1; expected above 0, at most 10 Å",
+        ),
+        (
+            distances,
+            "min_distances = { rule = \"per_pair\", pairs = { O-X = 1 } }",
+            "'O-X' is not a pair of elements",
+        ),
+        (
+            distances,
+            "min_distances = { rule = \"per_pair\", bonded = 1.5 }",
+            "guard.min_distances.bonded is 1.5; expected 0.01 to 1: it is a fraction",
+        ),
+        (distances, "min_distances = { rule = \"uniform\", bonded = 0.7 }", "unknown key `bonded`"),
+        (distances, "min_distances = { rule = \"papers\" }", "unknown value `papers`"),
+        (
+            "rule = \"uniform\", inner = 1.6,",
+            "rule = \"per_pair\", inner = 3.6,",
+            "expected inner below outer",
+        ),
         ("# max_temperature = 20000.0", "max_temperature = 500", "more than walk.temperature = 600 K"),
         (
             "# update = \"cumulative\"",

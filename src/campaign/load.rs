@@ -12,7 +12,6 @@ use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
-use super::short_range::PairRange;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_method::{self, REFERENCE_FILE};
 
@@ -78,16 +77,6 @@ impl Loader<'_> {
             return Err(ConfigError::Value { at, key, found, expected });
         }
         Ok(Arc::new(model))
-    }
-
-    /// Warns of pairs of elements whose repulsion reaches into bonds of the seed structures.
-    pub fn repulsion_in_bonds(&self, ranges: &[PairRange]) -> Vec<Warning> {
-        let warning = |message| Warning {
-            at: place(self.path, self.text, "guard.zbl"),
-            key: "guard.zbl".to_owned(),
-            message,
-        };
-        ranges.iter().filter_map(PairRange::warning).map(warning).collect()
     }
 
     /// Loads the initial mixture: that of the artifact, or else that of the export.

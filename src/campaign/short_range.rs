@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use atoms::{ElementPair, NeighbourList, ShortestDistances};
 use potentials::ZblWindow;
 
-use super::load::SourcedStructure;
-use crate::config::Config;
+use super::load::{Loader, SourcedStructure};
+use crate::config::{Config, Warning, place};
 
 /// A pair of elements that are neighbours in a seed structure.
 #[derive(Clone, Debug)]
@@ -61,5 +61,17 @@ impl PairRange {
              '{seed_structure}'; give this pair a shorter window in guard.zbl.pairs",
             window.outer
         ))
+    }
+}
+
+impl Loader<'_> {
+    /// Warns of pairs of elements whose repulsion reaches into bonds of the seed structures.
+    pub fn repulsion_in_bonds(&self, ranges: &[PairRange]) -> Vec<Warning> {
+        let warning = |message| Warning {
+            at: place(self.path, self.text, "guard.zbl"),
+            key: "guard.zbl".to_owned(),
+            message,
+        };
+        ranges.iter().filter_map(PairRange::warning).map(warning).collect()
     }
 }

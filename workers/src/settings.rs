@@ -15,7 +15,7 @@ pub struct WalkSettings {
     pub thermostat: md::ThermostatSettings,
     /// Time step, fs; `None` for the paper's rule (2 fs; 0.5 fs with H, He, Li or Be).
     pub time_step: Option<f64>,
-    /// Unbiased steps at the start, at V₀.
+    /// Unbiased steps at the start, at the volume at which the ramp starts.
     pub equilibration: u64,
     /// Biased steps after equilibration.
     pub steps: u64,

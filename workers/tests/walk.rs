@@ -124,6 +124,26 @@ fn a_split_assignment_gives_the_same_result() {
     assert_eq!(turn.checkpoint, Some(whole.checkpoint));
 }
 
+/// It equilibrates there, like a walk from a seed structure of that volume.
+#[test]
+fn a_walk_begins_at_the_volume_of_its_ramp() {
+    let frame = |structure: Structure, ramp: (f64, f64)| {
+        let settings = WalkSettings { volume_ramp: Some(ramp), ..settings() };
+        let mut control = assignment(structure, 120);
+        (control.origin, control.frame_steps) = (Origin::Control, vec![40]);
+        let Outcome::Candidate(frame) = run(&settings, &control).outcome else { panic!("no frame") };
+        frame.structure
+    };
+    let seed = seed_structure("vacancy");
+    let mut expanded = seed.clone();
+    md::scale_volume(&mut expanded, 1.1);
+    let (found, expected) = (frame(seed, (1.1, 1.32)), frame(expanded, (1.0, 1.2)));
+    assert!((found.cell.volume() / expected.cell.volume() - 1.0).abs() < 1e-12);
+    for (a, b) in found.positions.iter().zip(&expected.positions) {
+        assert!(cell::norm(cell::sub(*a, *b)) < 1e-6, "{a:?} {b:?}");
+    }
+}
+
 /// A damaged checkpoint continues or ends its walk. `CALMWALK_MUTATIONS=5000` runs the long version.
 #[test]
 fn damaged_checkpoints_do_not_stop_a_walker() {

@@ -103,6 +103,16 @@ impl CollectionRule {
 }
 
 impl UpdateRule {
+    /// Whether a structure of `atoms` atoms for which an update met this rule no longer meets `collection`. Otherwise
+    /// its walk would offer it again and again.
+    pub fn ends_candidacy(&self, collection: &CollectionRule, atoms: usize) -> bool {
+        let UpdateGoal { threshold, limit, target } = self.goal(atoms);
+        match limit {
+            Some(limit) => threshold <= collection.threshold() && limit <= collection.needed_atoms(atoms),
+            None => target <= collection.threshold(),
+        }
+    }
+
     /// What the search aims at in a structure of `atoms` atoms.
     pub fn goal(&self, atoms: usize) -> UpdateGoal {
         match self {

@@ -210,3 +210,26 @@ fn outcomes_are_the_same_bits_every_time() {
     };
     assert_eq!(bytes(&first), bytes(&second));
 }
+
+/// Otherwise a walk would offer the structure again after its update.
+#[test]
+fn an_update_ends_what_made_a_structure_a_candidate() {
+    let collection = |text: &str| toml::from_str::<CollectionRule>(text).unwrap();
+    let update = |text: &str| toml::from_str::<UpdateRule>(text).unwrap();
+    let (largest, count) = ("rule = 'maximum_grade'\n", "rule = 'atom_count'\n");
+    for (criterion, target, atoms, expected) in [
+        (largest.to_owned(), largest.to_owned(), 54, true),
+        (format!("{largest}threshold = 1.2"), largest.to_owned(), 54, false),
+        (count.to_owned(), count.to_owned(), 54, true),
+        (count.to_owned(), largest.to_owned(), 54, true),
+        // One atom above the threshold is a candidate, and two of three may stay there.
+        (largest.to_owned(), count.to_owned(), 54, false),
+        (count.to_owned(), format!("{count}threshold = 1.4"), 54, false),
+        (count.to_owned(), format!("{count}min_atoms = 4"), 8, false),
+        (count.to_owned(), format!("{count}min_atoms = 4"), 54, true),
+        (count.to_owned(), format!("{count}fraction = 0.2"), 54, false),
+    ] {
+        let found = update(&target).ends_candidacy(&collection(&criterion), atoms);
+        assert_eq!(found, expected, "{criterion} {target} {atoms}");
+    }
+}

@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::random::{Stream, StreamId};
-use crate::thermostat::{WrongSetting, is_positive};
+use crate::wrong_setting::{WrongSetting, is_positive};
 
 /// Settings of Langevin dynamics.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

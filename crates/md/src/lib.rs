@@ -16,6 +16,7 @@ mod random;
 mod state;
 mod thermostat;
 mod volume_ramp;
+mod wrong_setting;
 
 pub use checkpoint::Checkpoint;
 pub use dynamics::{Dynamics, Settings, default_time_step};
@@ -24,5 +25,6 @@ pub use langevin::{Langevin, LangevinSettings};
 pub use nose_hoover::{NoseHooverChain, NoseHooverSettings};
 pub use random::{Stream, StreamId, philox};
 pub use state::{State, kinetic_energy, masses, maxwell_boltzmann, momentum, temperature};
-pub use thermostat::{Thermostat, ThermostatSettings, WrongSetting};
+pub use thermostat::{Thermostat, ThermostatSettings};
 pub use volume_ramp::{VolumeRamp, scale_volume};
+pub use wrong_setting::WrongSetting;

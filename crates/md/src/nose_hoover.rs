@@ -4,7 +4,7 @@ use atoms::units::BOLTZMANN;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::thermostat::{WrongSetting, is_positive};
+use crate::wrong_setting::{WrongSetting, is_positive};
 
 /// Weights of the fourth-order Suzuki–Yoshida factorisation, w = 1 / (2 − 2^(1/3)).
 const SUZUKI_YOSHIDA: [f64; 3] = [1.351_207_191_959_657_8, -1.702_414_383_919_315_3, 1.351_207_191_959_657_8];

@@ -8,6 +8,7 @@ use crate::langevin::{Langevin, LangevinSettings};
 use crate::nose_hoover::{NoseHooverChain, NoseHooverSettings};
 use crate::random::Stream;
 use crate::state;
+use crate::wrong_setting::WrongSetting;
 
 /// A thermostat as a configuration names it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -19,17 +20,6 @@ pub enum ThermostatSettings {
     NoseHoover(NoseHooverSettings),
     /// Constant energy.
     None {},
-}
-
-/// A setting of a thermostat that has an impossible value.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct WrongSetting {
-    /// Dotted key below that of the thermostat.
-    pub key: &'static str,
-    /// Its value.
-    pub found: f64,
-    /// What is possible.
-    pub expected: &'static str,
 }
 
 impl ThermostatSettings {
@@ -49,12 +39,6 @@ impl ThermostatSettings {
             Self::NoseHoover(settings) => settings.wrong(),
             Self::None {} => None,
         }
-    }
-}
-
-impl WrongSetting {
-    pub(crate) fn unless_positive(key: &'static str, found: f64) -> Option<Self> {
-        (!is_positive(found)).then_some(Self { key, found, expected: "a finite number above 0" })
     }
 }
 
@@ -124,8 +108,4 @@ impl Thermostat {
             Self::NoseHooverChain(chain) => chain.invalid_setting(atoms),
         }
     }
-}
-
-pub(crate) fn is_positive(x: f64) -> bool {
-    x.is_finite() && x > 0.0
 }

@@ -1,6 +1,6 @@
 //! Errors.
 
-use atoms::PotentialError;
+use atoms::{PotentialError, StructureError};
 use md::DynamicsError;
 use potentials::ZblRangeError;
 
@@ -13,6 +13,8 @@ pub(super) enum WalkError {
     Dynamics(#[from] DynamicsError),
     #[error(transparent)]
     Potential(#[from] PotentialError),
+    #[error(transparent)]
+    Structure(#[from] StructureError),
     #[error(transparent)]
     Ungraded(#[from] UngradedError),
     #[error(transparent)]

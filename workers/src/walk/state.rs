@@ -1,6 +1,6 @@
 //! The state of a walk between assignments, and its initial state.
 
-use atoms::{MinDistances, ShortestDistances};
+use atoms::{MinDistances, NeighbourList, Potential, ShortestDistances};
 use md::{Checkpoint, Dynamics, State, Stream, VolumeRamp};
 use serde::{Deserialize, Serialize};
 use wire::Origin;
@@ -73,17 +73,24 @@ pub(super) fn start(
     potential: &mut BiasedPotential,
 ) -> Result<(Dynamics, WalkState), WalkError> {
     let structure = assignment.seed_structure.clone();
+    let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
+    neighbours.update(&structure)?;
+    let min_distances =
+        settings.guard.min_distances.limits(&ShortestDistances::from_neighbours(&structure, &neighbours));
     let stream = Stream::new(settings.rng_seed, assignment.random_walk.0, 0);
     let time_step = settings.time_step.unwrap_or_else(|| md::default_time_step(&structure.species));
-    let start = State::thermal(structure, settings.temperature, &stream);
+    let mut start = State::thermal(structure, settings.temperature, &stream);
     let ramp = settings.volume_ramp.map(|(from, to)| {
         let ramp = VolumeRamp::new(&start, from, to, settings.steps);
         VolumeRamp { start: settings.equilibration, ..ramp }
     });
+    // Equilibration runs at the volume at which the ramp begins.
+    if let Some(ramp) = ramp.filter(|ramp| ramp.from != 1.0) {
+        ramp.apply(&mut start.structure, 0);
+    }
     let thermostat = settings.thermostat.start(settings.temperature);
     let run = md::Settings { time_step, thermostat, ramp, stream, skin: settings.skin };
     let dynamics = Dynamics::new(start, run, potential)?;
-    let shortest = ShortestDistances::from_neighbours(dynamics.structure(), dynamics.neighbours());
     let state = WalkState {
         dynamics: dynamics.checkpoint().clone(),
         bias: BiasState::default(),
@@ -95,7 +102,7 @@ pub(super) fn start(
         max_consecutive_rejections: 0,
         next_offer: 0,
         collected: Vec::new(),
-        min_distances: settings.guard.min_distances.limits(&shortest),
+        min_distances,
         good: vec![(dynamics.checkpoint().clone(), BiasState::default())],
         gamma_max: 0.0,
     };
