@@ -73,6 +73,7 @@ impl Campaign {
             Ok((artifact, training))
         });
         let labels = loader.seed_structures(&model).and_then(|seeds| {
+            loader.check_update_target(&seeds.valid)?;
             let protocol = loader.protocol(&seeds.valid)?;
             Ok((seeds, protocol))
         });

@@ -12,7 +12,7 @@ const HYSTERESIS: f64 = 0.9;
 pub struct ForgettingRule {
     /// Share of the training atoms above which the alarm is raised.
     limit: f64,
-    combination: CovarianceUpdateKind,
+    covariance_update: CovarianceUpdateKind,
 }
 
 /// State of the alarm in a run.
@@ -25,7 +25,7 @@ pub struct AlarmState {
 impl ForgettingRule {
     /// Reads the section `[calm]`.
     pub fn new(calm: &CalmSection) -> Self {
-        Self { limit: calm.forgetting_alarm.get(), combination: calm.covariance_update }
+        Self { limit: calm.forgetting_alarm.get(), covariance_update: calm.covariance_update }
     }
 
     /// Whether the alarm holds for this share of training atoms with γ > 1. `raised` is the selector's own check.
@@ -36,7 +36,7 @@ impl ForgettingRule {
 
     /// Message when the alarm is raised, with advice.
     pub fn raised_message(&self, share: f64) -> String {
-        let other = match self.combination {
+        let other = match self.covariance_update {
             CovarianceUpdateKind::Convex => {
                 "covariance_update = \"additive\", which forgets nothing, or with smaller values in calm.alpha_values"
             }
@@ -83,7 +83,7 @@ mod tests {
 
     #[test]
     fn an_alarm_is_reported_when_it_begins_and_when_it_ends() {
-        let forgetting = ForgettingRule { limit: 0.2, combination: CovarianceUpdateKind::Convex };
+        let forgetting = ForgettingRule { limit: 0.2, covariance_update: CovarianceUpdateKind::Convex };
         let mut alarm = AlarmState::new(forgetting);
         let said: Vec<_> = [0.1, 0.21, 0.3, 0.19, 0.21, 0.17, 0.1, 0.25]
             .into_iter()

@@ -60,9 +60,9 @@ fn every_wrong_key_is_named_with_its_line() {
             "expected at least one value, ascending",
         ),
         (
-            "min_atoms = 3, target = 1.25",
-            "min_atoms = 4, target = 1.25",
-            "collect.update_target is atom_count: fewer than 4 atoms with γ > 1.3, else γ_max below 1.25; expected a rule after",
+            "fraction = 0.15, min_atoms = 3, target = 1.25",
+            "fraction = 0.25, min_atoms = 3, target = 1.25",
+            "collect.update_target is atom_count: fewer than 8 atoms with γ > 1.3, else γ_max below 1.25; expected a rule after",
         ),
         (
             langevin,

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use atoms::{NeighbourList, Structure, read_structures};
 use calm::forgetting::grade_distribution;
 use calm::{Artifact, ArtifactError, Mixture};
-use orchestrator::selector::{SeedStructure, TrainingFrames};
+use orchestrator::selector::{SeedStructure, TrainingFrames, UpdateProtocol};
 use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
 use store::Protocol;
@@ -77,6 +77,29 @@ impl Loader<'_> {
             return Err(ConfigError::Value { at, key, found, expected });
         }
         Ok(Arc::new(model))
+    }
+
+    /// Checks that an update ends what made a seed structure's atoms a candidate. Otherwise its walks would offer the
+    /// same structure again and again.
+    pub fn check_update_target(&self, seeds: &[SourcedStructure]) -> Result<(), ConfigError> {
+        let (rule, criterion) = (&self.config.collect.update_target, &self.config.collect.criterion);
+        let mut sizes = seeds.iter().map(|named| named.seed.structure.len());
+        let Some(atoms) = sizes.find(|atoms| !rule.ends_candidacy(criterion, *atoms)) else { return Ok(()) };
+        if self.config.calm.update == UpdateProtocol::Never {
+            return Ok(());
+        }
+        let key = "collect.update_target".to_owned();
+        let expected = format!(
+            "a rule after which a structure of {atoms} atoms is no candidate any more ({}): otherwise walks collect the \
+             same structure again and again",
+            criterion.condition(atoms)
+        );
+        Err(ConfigError::Value {
+            at: place(self.path, self.text, &key),
+            key,
+            found: rule.condition(atoms),
+            expected,
+        })
     }
 
     /// Loads the initial mixture: that of the artifact, or else that of the export.

@@ -9,8 +9,6 @@ use store::ServerUrl;
 use super::error::Wrong;
 use super::{Config, LabelSection, NotifySection, QueueFull};
 
-/// Largest structure for which the rules of collection and update are compared.
-const MAX_CHECKED_ATOMS: usize = 500;
 /// Largest shortest distance of a pair of elements, Å.
 const MAX_MIN_DISTANCE: f64 = 10.0;
 
@@ -19,7 +17,6 @@ pub fn check(config: &Config) -> Vec<Wrong> {
     let checks = [
         check_mixture(config),
         check_thermostat(config),
-        check_update_target(config),
         check_min_distances(config),
         check_zbl(config),
         check_temperature(config),
@@ -161,23 +158,6 @@ fn check_thermostat(config: &Config) -> Result<(), Wrong> {
 pub fn wrong_thermostat(thermostat: &ThermostatSettings, section: &str) -> Option<Wrong> {
     let WrongSetting { key, found, expected } = thermostat.wrong()?;
     Some((format!("{section}.thermostat.{key}"), found.to_string(), expected.to_owned()))
-}
-
-fn check_update_target(config: &Config) -> Result<(), Wrong> {
-    let rule = &config.collect.update_target;
-    let ends = |atoms| rule.ends_candidacy(&config.collect.criterion, atoms);
-    match (1..=MAX_CHECKED_ATOMS).find(|atoms| !ends(*atoms)) {
-        Some(atoms) if config.calm.update != UpdateProtocol::Never => wrong(
-            "collect.update_target",
-            rule.condition(atoms),
-            format!(
-                "a rule after which a structure of {atoms} atoms is no candidate, {}: otherwise walks collect the same \
-                 structure again and again",
-                config.collect.criterion.condition(atoms)
-            ),
-        ),
-        _ => Ok(()),
-    }
 }
 
 fn check_min_distances(config: &Config) -> Result<(), Wrong> {

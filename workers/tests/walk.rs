@@ -95,14 +95,14 @@ fn whole_walk(
     structure: Structure,
     steps_per_assignment: u64,
 ) -> Vec<Report<Candidate>> {
-    let mut turn = assignment(structure, steps_per_assignment);
+    let mut next = assignment(structure, steps_per_assignment);
     let mut reports = Vec::new();
     loop {
-        let report = run(settings, &turn);
-        turn.checkpoint = Some(report.checkpoint.clone());
-        turn.last_step = report.progress.step + steps_per_assignment;
-        turn.number += 1;
-        turn.verdict = matches!(report.outcome, Outcome::Candidate(_)).then_some(Verdict::Accepted);
+        let report = run(settings, &next);
+        next.checkpoint = Some(report.checkpoint.clone());
+        next.last_step = report.progress.step + steps_per_assignment;
+        next.number += 1;
+        next.verdict = matches!(report.outcome, Outcome::Candidate(_)).then_some(Verdict::Accepted);
         let ended = matches!(report.outcome, Outcome::Ended(_));
         reports.push(report);
         if ended {
@@ -116,12 +116,12 @@ fn a_split_assignment_gives_the_same_result() {
     let settings = WalkSettings { collection: never(), ..settings() };
     let whole = run(&settings, &assignment(seed_structure("vacancy"), 120));
     assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::StepsDone, 120));
-    let mut turn = assignment(seed_structure("vacancy"), 0);
+    let mut next = assignment(seed_structure("vacancy"), 0);
     for last_step in [1, 19, 20, 21, 33, 90, 120] {
-        turn.last_step = last_step;
-        turn.checkpoint = Some(run(&settings, &turn).checkpoint);
+        next.last_step = last_step;
+        next.checkpoint = Some(run(&settings, &next).checkpoint);
     }
-    assert_eq!(turn.checkpoint, Some(whole.checkpoint));
+    assert_eq!(next.checkpoint, Some(whole.checkpoint));
 }
 
 /// It equilibrates there, like a walk from a seed structure of that volume.
@@ -148,15 +148,15 @@ fn a_walk_begins_at_the_volume_of_its_ramp() {
 #[test]
 fn damaged_checkpoints_do_not_stop_a_walker() {
     let settings = WalkSettings { collection: never(), ..settings() };
-    let mut turn = assignment(seed_structure("vacancy"), 110);
-    let checkpoint = run(&settings, &turn).checkpoint;
+    let mut next = assignment(seed_structure("vacancy"), 110);
+    let checkpoint = run(&settings, &next).checkpoint;
     let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
     let mixture = mixture();
-    turn.last_step = 115;
+    next.last_step = 115;
     let mut refused = 0;
     for number in 0..mutate::mutations(60) {
-        turn.checkpoint = Some(mutate::mutated(&checkpoint, number));
-        let go = || advance(&context, &turn, Arc::clone(&mixture), || false, |_| {});
+        next.checkpoint = Some(mutate::mutated(&checkpoint, number));
+        let go = || advance(&context, &next, Arc::clone(&mixture), || false, |_| {});
         let report = catch_unwind(AssertUnwindSafe(go));
         let report = report.unwrap_or_else(|_| panic!("a panic at mutation {number}"));
         refused += u32::from(matches!(report.outcome, Outcome::Ended(WalkEnd::BadStart { .. })));
