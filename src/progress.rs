@@ -111,6 +111,13 @@ impl Display {
             self.accepted += u64::from(candidate.fate == Fate::Accepted && view.origin() == Origin::Biased);
             self.show(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
         }
+        for decision in commit.decisions.iter().filter(|decision| decision.kind == "left_out") {
+            let (step, error) = (&decision.detail["step"], decision.detail["error"].as_str().unwrap_or_default());
+            let name = decision.walk.map_or("?", |walk| self.name(walk));
+            let line = format!("WARNING: {name}: step {step}, a candidate is left out: {error}");
+            tracing::warn!("{line}");
+            self.show_lasting(&line);
+        }
         for decision in &commit.decisions {
             let share = decision.detail["training_frames"]["share_above_one"].as_f64();
             let raised = decision.detail["forgetting_alarm"].as_bool();

@@ -2,7 +2,7 @@
 
 use calm::Staleness;
 use serde_json::{Value, json};
-use store::records::{STALENESS, TRAINING_FRAMES};
+use store::records::{LEFT_OUT, STALENESS, TRAINING_FRAMES};
 
 /// Values that the selector stores with its commits, by name.
 #[derive(Debug)]
@@ -39,6 +39,11 @@ impl MixtureValues {
     /// The same as a histogram.
     pub fn staleness(&self) -> Option<Staleness> {
         self.read(STALENESS)
+    }
+
+    /// Number of candidates that could not be graded.
+    pub fn left_out(&self) -> u64 {
+        self.read(LEFT_OUT).unwrap_or(0)
     }
 
     fn read<T: serde::de::DeserializeOwned>(&self, name: &str) -> Option<T> {

@@ -63,6 +63,7 @@ impl Snapshot {
         }));
         json["mode"] = campaign.mode.clone().into();
         json["training_frames"] = mixture.training_frames();
+        json["candidates"]["left_out"] = mixture.left_out().into();
         json["staleness"] = mixture.staleness_json();
         json["disk"] = serde_json::to_value(disk)?;
         json["disk"]["at_the_end"] = json!(disk.at_the_end(status));

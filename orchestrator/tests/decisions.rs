@@ -90,6 +90,23 @@ fn each_candidate_has_three_grades() {
     );
 }
 
+/// The walk goes on, and the log says why nothing came of it.
+#[test]
+fn a_candidate_that_cannot_be_graded_is_left_out() {
+    let mut selector = begin(&live(), 1);
+    let commit = next_candidate(&mut selector, 5, 1, [0.0, f64::NAN, 0.0]);
+    assert_eq!(kinds(&commit), ["left_out"]);
+    let [decision] = commit.decisions.as_slice() else { panic!("{commit:?}") };
+    assert_eq!((decision.detail["step"].as_u64(), decision.candidate), (Some(5), None));
+    assert!(decision.detail["error"].as_str().unwrap().contains("features are not finite"), "{decision:?}");
+    assert_eq!((commit.candidates.len(), commit.components.len(), value(&commit, "left_out")), (0, 0, "1"));
+
+    let assignment = next_assignment(&mut selector);
+    assert_eq!(assignment.verdict, Some(Verdict::Declined(DeclineReason::LeftOut)));
+    let report = offer(&selector, &assignment, 6, structure(2, SHORTEST), NEW);
+    assert_eq!(kinds(&decided(&mut selector, report)), ["accepted"]);
+}
+
 #[test]
 fn atoms_too_close_are_declined() {
     let mut selector = begin(&live(), 1);

@@ -101,6 +101,7 @@ fn the_scripts_reach_every_kind_of_decision() {
         "declined duplicate",
         "declined guard",
         "ended",
+        "left_out",
         "segment",
     ];
     assert_eq!(seen.iter().map(String::as_str).collect::<Vec<_>>(), expected);

@@ -120,7 +120,7 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Resu
     }
     page.titled(out, "mixture", &format!("version {}", status.mixture_version))?;
     mixture::write(out, mixture, page, &campaign.mode)?;
-    write_candidates(out, page, &status.candidates, labels.shared)?;
+    write_candidates(out, page, &status.candidates, mixture.left_out(), labels.shared)?;
     labels::write(out, labels, page, status)?;
     if let Some(budget) = budget::describe(&status.budget) {
         page.titled(out, "budget", &budget)?;
@@ -174,6 +174,7 @@ fn write_candidates(
     out: &mut dyn Write,
     page: &Page,
     candidates: &Candidates,
+    left_out: u64,
     shared: Option<u64>,
 ) -> io::Result<()> {
     let Candidates { seen, accepted, declined, control, refused_by_walkers } = candidates;
@@ -196,5 +197,9 @@ fn write_candidates(
         Some(shared) => format!(" ({shared} also biased)"),
     };
     let control = count(*control, "control frame");
-    page.titled(out, "", &format!("{control}{shared}; {refused_by_walkers} rejected by guards"))
+    let left_out = match left_out {
+        0 => String::new(),
+        left_out => format!("; {left_out} left out (could not be graded: calmwalk log)"),
+    };
+    page.titled(out, "", &format!("{control}{shared}; {refused_by_walkers} rejected by guards{left_out}"))
 }

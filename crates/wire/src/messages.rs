@@ -60,13 +60,16 @@ pub enum DeclineReason {
     Budget,
     /// The grade is below the threshold, which was raised because many structures wait for labels.
     Backlog,
+    /// It cannot be graded, or the mixture cannot be updated with it.
+    LeftOut,
 }
 
 impl DeclineReason {
     /// All reasons, in the order of summaries.
-    pub const ALL: [Self; 5] = [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget, Self::Backlog];
+    pub const ALL: [Self; 6] =
+        [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget, Self::Backlog, Self::LeftOut];
 
-    /// The serialized name: `"covered"`, `"duplicate"`, `"guard"`, `"budget"` or `"backlog"`.
+    /// The serialized name: `"covered"`, `"duplicate"`, `"guard"`, `"budget"`, `"backlog"` or `"left_out"`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Covered => "covered",
@@ -74,6 +77,7 @@ impl DeclineReason {
             Self::Guard => "guard",
             Self::Budget => "budget",
             Self::Backlog => "backlog",
+            Self::LeftOut => "left_out",
         }
     }
 }

@@ -21,6 +21,9 @@ use super::walk::Walk;
 const BIASED_PRIORITY: i32 = 10;
 const CONTROL_PRIORITY: i32 = 0;
 
+/// Kind of the decision on a candidate that cannot be graded.
+pub(super) const LEFT_OUT: &str = "left_out";
+
 impl DecisionState {
     /// Decides on the reports of a round, in order. `in_hand` contains the walks that walkers work on.
     pub fn decide(
@@ -35,10 +38,21 @@ impl DecisionState {
             touched.insert(id);
             self.apply_report(&report, &mut commit);
             match report.outcome {
-                Outcome::Candidate(regraded) if self.walks[&id].is_biased() => {
-                    self.decide_candidate(id, regraded?, &mut commit)?;
+                Outcome::Candidate(regraded) => {
+                    let decided = match regraded {
+                        Ok(regraded) if self.walks[&id].is_biased() => {
+                            self.decide_candidate(id, regraded, &mut commit)
+                        }
+                        Ok(regraded) => self.keep_control_frame(id, regraded, &mut commit),
+                        Err(error) => Err(error),
+                    };
+                    match decided {
+                        Err(error) if error.is_of_candidate() => {
+                            self.leave_out(id, report.progress.step, &error.to_string(), &mut commit);
+                        }
+                        other => other?,
+                    }
                 }
-                Outcome::Candidate(regraded) => self.keep_control_frame(id, regraded?, &mut commit)?,
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
                 // A control walk that missed its last frame will not provide it in a later assignment.
                 Outcome::StepsDone if self.walks[&id].missed_its_frames() => {
@@ -137,6 +151,21 @@ impl DecisionState {
             self.end_walk(id, &WalkEnd::Collected, commit);
         }
         Ok(())
+    }
+
+    /// Declines a candidate that cannot be graded, or that the mixture cannot be updated with. Its walk goes on. The
+    /// log has the reason; there are no grades to store the candidate with.
+    pub fn leave_out(&mut self, id: WalkId, step: u64, error: &str, commit: &mut Commit) {
+        self.left_out += 1;
+        commit.decisions.push(self.decision(LEFT_OUT, id, json!({ "step": step, "error": error })));
+        let walk = self.walk_mut(id);
+        walk.state.verdict = Some(Verdict::Declined(DeclineReason::LeftOut));
+        if !walk.is_biased() {
+            walk.state.wanted.retain(|wanted| *wanted > step);
+            if walk.state.wanted.is_empty() {
+                self.end_walk(id, &WalkEnd::Collected, commit);
+            }
+        }
     }
 
     /// Adds a decision with its candidate to the commit.

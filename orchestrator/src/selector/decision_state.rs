@@ -33,6 +33,8 @@ pub(super) struct DecisionState {
     pub round: u64,
     pub accepted: u32,
     pub declined_feature_bytes: u64,
+    /// Number of candidates that could not be graded.
+    pub left_out: u64,
     pub staleness: Staleness,
     /// Number of imported structures: now, and when the log last recorded it.
     pub imported: (u64, u64),
@@ -61,6 +63,7 @@ impl DecisionState {
         };
         let (round, version) = (value("round")?, value("mixture_version")?);
         let (declined_feature_bytes, imported) = (value("declined_feature_bytes")?, value("imported")?);
+        let left_out = value(store::records::LEFT_OUT)?;
         let staleness = restored(STALENESS, &snapshot.values)?.unwrap_or_default();
         let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
         let walks = restored_walks(snapshot.walks, seeds.len())?;
@@ -76,6 +79,7 @@ impl DecisionState {
             round,
             accepted,
             declined_feature_bytes,
+            left_out,
             staleness,
             imported: (snapshot.imported, imported),
             rules: restored(RULES, &snapshot.values)?,
@@ -100,6 +104,9 @@ impl DecisionState {
         commit.values.extend(values.map(|(name, value)| (name.to_owned(), value.to_string())));
         if !commit.candidates.is_empty() {
             commit.values.push((STALENESS.to_owned(), json!(self.staleness).to_string()));
+        }
+        if self.left_out > 0 {
+            commit.values.push((store::records::LEFT_OUT.to_owned(), self.left_out.to_string()));
         }
     }
 

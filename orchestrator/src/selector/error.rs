@@ -45,3 +45,10 @@ pub enum SelectorError {
         source: calm::GradeError,
     },
 }
+
+impl SelectorError {
+    /// Whether one candidate is at fault, so that the campaign can go on without it.
+    pub(super) fn is_of_candidate(&self) -> bool {
+        matches!(self, Self::Grade { .. } | Self::Update { .. })
+    }
+}

@@ -14,6 +14,7 @@ use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, LoggedD
 use wire::messages::WalkEnd;
 use wire::{ContentHash, WalkId};
 
+use super::decide::LEFT_OUT;
 use super::decision_state::{DecisionState, restored_mixture};
 use super::rules::CONFIGURATION;
 use super::{
@@ -129,6 +130,7 @@ impl Replay {
             "begun" => self.begin(recorded)?,
             "resumed" => self.resume(recorded)?,
             "segment" => self.segment(recorded)?,
+            LEFT_OUT => self.left_out(recorded)?,
             "ended" => match ended {
                 Some(ended) if ended.walk.map(|walk| walk.0) == recorded.walk => Some(ended),
                 _ => self.end(recorded)?,
@@ -230,6 +232,23 @@ impl Replay {
     fn segment(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
         let id = self.walk_under_way(recorded)?;
         Ok(id.map(|id| self.decisions.decision("segment", id, recorded.detail.clone())))
+    }
+
+    fn left_out(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
+        #[derive(Deserialize)]
+        struct Detail {
+            step: u64,
+            error: String,
+        }
+        let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
+        let Detail { step, error } = read(recorded)?;
+        let mut commit = Commit::default();
+        self.decisions.walk_mut(id).record.progress.step = step;
+        self.decisions.leave_out(id, step, &error, &mut commit);
+        let mut decisions = commit.decisions.into_iter();
+        let decision = decisions.next();
+        self.ended = decisions.next();
+        Ok(decision)
     }
 
     fn end(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {

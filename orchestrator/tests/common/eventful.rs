@@ -70,6 +70,7 @@ fn event() -> impl Strategy<Value = Event> {
         8 => structure,
         2 => Just(Event::Return),
         1 => Just(Event::BlowUp),
+        1 => Just(Event::Ungradable),
     ]
 }
 

@@ -15,7 +15,7 @@ use orchestrator::grader::Grader;
 use orchestrator::selector::{
     Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol,
 };
-use store::records::Commit;
+use store::records::{AtomGrades, Commit};
 use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash};
 
@@ -145,7 +145,9 @@ pub fn block(
     z: [f64; DIMENSION],
 ) -> CandidateBlock {
     let features = features(z);
-    let grades = grader().bonds(&structure).unwrap().grade(mixture, &features).unwrap();
+    let grades = grader().bonds(&structure).unwrap().grade(mixture, &features);
+    // What cannot be graded is offered nevertheless.
+    let grades = grades.unwrap_or_else(|_| AtomGrades { gamma: vec![9.0; ATOMS], gamma_nbr: vec![9.0; ATOMS] });
     CandidateBlock::encode(&Candidate {
         id: CandidateId {
             campaign: assignment.campaign,

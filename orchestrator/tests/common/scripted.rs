@@ -23,6 +23,8 @@ pub enum Event {
     /// A rollback to the checkpoint of two steps before.
     Return,
     BlowUp,
+    /// A structure whose features are not finite.
+    Ungradable,
 }
 
 /// The checkpoint of a scripted walk.
@@ -75,8 +77,9 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
     if assignment.origin == Origin::Control {
         // Without bias, a control walk meets no events of the script; its frames are those of another walk.
         let number = 2_000_000 + 1000 * u64::from(assignment.walk.0) + state.step;
-        let frame =
-            || block(assignment, mixture, &progress(state), structure(number, SHORTEST), [0.5; DIMENSION]);
+        // Some of them cannot be graded.
+        let z = if state.step % 7 == 3 { [f64::NAN; DIMENSION] } else { [0.5; DIMENSION] };
+        let frame = || block(assignment, mixture, &progress(state), structure(number, SHORTEST), z);
         return assignment.frame_steps.contains(&state.step).then(|| Outcome::Candidate(frame()));
     }
     match *event {
@@ -90,6 +93,11 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
             state.segment += 1;
             state.step = state.step.saturating_sub(2);
             None
+        }
+        Event::Ungradable => {
+            let structure = structure(1_000_000 + state.step, SHORTEST);
+            let block = block(assignment, mixture, &progress(state), structure, [f64::NAN; DIMENSION]);
+            Some(Outcome::Candidate(block))
         }
         Event::BlowUp => Some(Outcome::Ended(WalkEnd::BlewUp { reason: format!("at step {}", state.step) })),
     }
