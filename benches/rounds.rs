@@ -150,6 +150,7 @@ fn walk_settings() -> WalkSettings {
         guard: GuardSettings {
             min_distances: MinDistanceRule::default(),
             max_temperature: 20_000.0,
+            rollback: true,
             max_consecutive_rejections: 10,
             max_rollbacks: 3,
             tau_factor: 0.5,

@@ -241,6 +241,7 @@ impl Campaign {
             guard: GuardSettings {
                 min_distances: guard.min_distances.clone(),
                 max_temperature: guard.max_temperature.get(),
+                rollback: guard.rollback,
                 max_consecutive_rejections: guard.max_consecutive_rejections.get(),
                 max_rollbacks: guard.max_rollbacks,
                 tau_factor: guard.tau_factor.get(),

@@ -169,7 +169,10 @@ pub struct GuardSection {
     pub zbl: Option<ZblWindows>,
     /// Highest allowed kinetic temperature, K.
     pub max_temperature: Positive,
-    /// Number of refused configurations in a row after which a walk goes back to a checkpoint.
+    /// Whether a walk rolls back to a checkpoint when the guard refuses one configuration after the other. If not, it
+    /// goes on.
+    pub rollback: bool,
+    /// Number of refused configurations in a row after which a walk rolls back to a checkpoint.
     pub max_consecutive_rejections: NonZeroU32,
     /// Number of returns to a checkpoint after which the walk ends.
     pub max_rollbacks: u32,
@@ -330,6 +333,7 @@ impl Default for GuardSection {
             min_distances: MinDistanceRule::default(),
             zbl: None,
             max_temperature: defaults::positive(20_000.0),
+            rollback: true,
             max_consecutive_rejections: defaults::nonzero(10),
             max_rollbacks: 3,
             tau_factor: defaults::fraction(0.5),

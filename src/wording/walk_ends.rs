@@ -73,6 +73,7 @@ mod tests {
         let settings = GuardSettings {
             min_distances: MinDistanceRule::default(),
             max_temperature: 1000.0,
+            rollback: true,
             max_consecutive_rejections: 10,
             max_rollbacks: 3,
             tau_factor: 0.5,

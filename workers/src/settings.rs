@@ -46,6 +46,8 @@ pub struct GuardSettings {
     pub min_distances: MinDistanceRule,
     /// Temperature above which a walk ends, K.
     pub max_temperature: f64,
+    /// Whether a walk rolls back to a checkpoint after refusals; if not, it goes on.
+    pub rollback: bool,
     /// Consecutive refusals by the same guard after which the walk rolls back to a checkpoint.
     pub max_consecutive_rejections: u32,
     /// Number of roll backs after which the walk ends instead.

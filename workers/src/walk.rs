@@ -215,7 +215,7 @@ impl<'a> Walk<'a> {
         self.state.refused += 1;
         self.state.max_consecutive_rejections += 1;
         self.state.next_offer = self.step() + self.settings.min_interval_after_decline;
-        if self.state.max_consecutive_rejections < guard.max_consecutive_rejections {
+        if !guard.rollback || self.state.max_consecutive_rejections < guard.max_consecutive_rejections {
             return Ok(None);
         }
         if self.state.returns == guard.max_rollbacks || self.state.good.is_empty() {

@@ -59,6 +59,7 @@ fn settings() -> WalkSettings {
         guard: GuardSettings {
             min_distances: MinDistanceRule::Uniform(Uniform::default()),
             max_temperature: 20_000.0,
+            rollback: true,
             max_consecutive_rejections: 5,
             max_rollbacks: 3,
             tau_factor: 0.5,
@@ -292,6 +293,19 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
     );
     assert_eq!(last.progress.returns, settings.guard.max_rollbacks);
     assert!(last.progress.step < 600);
+}
+
+#[test]
+fn without_rollbacks_a_refused_walk_goes_on() {
+    let min_distances = MinDistanceRule::Uniform(Uniform { min_distance: 3.0, fraction: 0.75 });
+    let guard = GuardSettings { min_distances, rollback: false, ..settings().guard };
+    let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
+    let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
+    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
+    let last = reports.last().unwrap();
+    assert!(matches!(&last.outcome, Outcome::Ended(WalkEnd::Steps)), "{last:?}");
+    assert_eq!((last.progress.returns, last.progress.segment), (0, 0));
+    assert!(last.progress.refused > u64::from(settings.guard.max_consecutive_rejections), "{last:?}");
 }
 
 #[test]

@@ -84,6 +84,7 @@ fn settings(threshold: f64) -> WalkSettings {
         guard: GuardSettings {
             min_distances: MinDistanceRule::Uniform(Uniform { min_distance: 1.2, fraction: 0.5 }),
             max_temperature: 20_000.0,
+            rollback: true,
             max_consecutive_rejections: 10,
             max_rollbacks: 3,
             tau_factor: 0.5,
