@@ -118,7 +118,7 @@ fn text() -> String {
     let text = fs::read_to_string(configs.join("aluminium.toml")).expect("a file of the project");
     let longer = text
         .replace("\nsteps = 2000 ", "\nsteps = 6000 ")
-        .replace("# max_per_seed_structure = 3 ", "max_per_seed_structure = 9 ");
+        .replace("# max_per_walk = 3 ", "max_per_walk = 9 ");
     assert_ne!(longer, text, "the keys stand in the file as they are replaced here");
     longer.replace("\"data/", &format!("\"{}/", configs.join("data").display()))
 }

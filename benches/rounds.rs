@@ -18,13 +18,13 @@ use calm::{Artifact, UpdateSettings};
 use md::{LangevinSettings, ThermostatSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+    Mode, OnForgetting, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
 };
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use rustix::time::{ClockId, clock_gettime};
 use wire::messages::{Outcome, Report};
-use wire::{CampaignId, CandidateBlock};
+use wire::{CampaignId, CandidateBlock, WalkConditions};
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
@@ -115,10 +115,13 @@ fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
             stop: toml::from_str(&format!("{rule}target = 1.25")).unwrap(),
         },
         forgetting_alarm: ForgettingAlarm::default(),
+        on_forgetting: OnForgetting::default(),
         collection: toml::from_str(rule).unwrap(),
-        max_per_seed_structure: u32::MAX,
+        max_per_walk: u32::MAX,
+        max_per_seed_structure: None,
         max_structures: None,
         control: false,
+        control_share: 0.5,
         min_distances: MinDistanceRule::default(),
         declined_feature_bytes: 0,
     };
@@ -133,14 +136,11 @@ fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
 fn walk_settings() -> WalkSettings {
     WalkSettings {
         rng_seed: 1,
-        temperature: 600.0,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
         equilibration: 500,
         steps: 2000,
-        tau: 0.15,
         bias_averaging_steps: 10,
-        volume_ramp: Some((1.0, 1.4)),
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),
@@ -164,6 +164,12 @@ fn seeds() -> Vec<SeedStructure> {
     let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedStructure {
         name: number.to_string(),
         structure: frame.structure,
+        walks: vec![WalkConditions {
+            temperature: 600.0,
+            tau: 0.15,
+            volume_ramp: Some((1.0, 1.4)),
+            ..WalkConditions::default()
+        }],
     };
     frames.into_iter().enumerate().map(seed).collect()
 }

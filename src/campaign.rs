@@ -3,7 +3,10 @@
 mod load;
 mod seed_structures;
 mod short_range;
+mod training_sample;
+mod walk_plan;
 
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -72,7 +75,8 @@ impl Campaign {
             let training = loader.training_frames(&model, &artifact.mixture)?;
             Ok((artifact, training))
         });
-        let labels = loader.seed_structures(&model).and_then(|seeds| {
+        let labels = loader.seed_structures(&model).and_then(|mut seeds| {
+            warnings.extend(loader.plan_walks(&mut seeds.valid)?);
             loader.check_update_target(&seeds.valid)?;
             let protocol = loader.protocol(&seeds.valid)?;
             Ok((seeds, protocol))
@@ -225,14 +229,11 @@ impl Campaign {
         let Config { campaign, walk, collect, guard, .. } = &self.config;
         WalkSettings {
             rng_seed: campaign.rng_seed,
-            temperature: walk.temperature.get(),
             thermostat: walk.thermostat,
             time_step: walk.time_step.map(|dt| dt.get()),
             equilibration: walk.equilibration_steps,
             steps: walk.biased_steps.get(),
-            tau: walk.tau.get(),
             bias_averaging_steps: walk.bias_averaging_steps.get(),
-            volume_ramp: walk.volume_ramp.map(|ramp| (ramp.from.get(), ramp.to.get())),
             skin: walk.skin.get(),
             collection: collect.criterion,
             gap: collect.min_interval,
@@ -298,11 +299,17 @@ pub fn selector_settings(config: &Config) -> selector::Settings {
         steps_per_assignment: run.steps_per_assignment.get(),
         update: calm.update,
         search: config.update_settings(),
-        forgetting_alarm: ForgettingAlarm { share_above_one: calm.forgetting_alarm },
+        forgetting_alarm: ForgettingAlarm {
+            share_above_one: calm.forgetting_alarm,
+            mean_square_growth: calm.max_mean_square_growth,
+        },
+        on_forgetting: calm.on_forgetting,
         collection: collect.criterion,
-        max_per_seed_structure: collect.max_per_seed_structure.get(),
+        max_per_walk: collect.max_per_walk.get(),
+        max_per_seed_structure: collect.max_per_seed_structure.map(NonZeroU32::get),
         max_structures: config.most_structures(),
         control: campaign.control,
+        control_share: campaign.control_share.get(),
         min_distances: guard.min_distances.clone(),
         declined_feature_bytes: collect.declined_features_mb * 1_000_000,
     }

@@ -22,13 +22,14 @@ pub fn estimate(campaign: &Campaign) -> DiskForecast {
     let features = campaign.artifact.mixture.dimension() as u64;
     let seeds = || campaign.seed_structures.iter().map(|named| named.seed.structure.len() as u64);
     let number = seeds().len() as u64;
-    let max_per_seed_structure = u64::from(config.collect.max_per_seed_structure.get());
-    let collected = max_per_seed_structure.saturating_mul(number);
+    let walks = || campaign.seed_structures.iter().map(|named| named.seed.walks.len());
+    let collected = walks().map(|walks| config.most_structures_of(walks)).fold(0, u64::saturating_add);
     let collected =
         config.collect.max_structures.map_or(collected, |total| collected.min(total.get().into()));
     let copies = if config.campaign.control { 2 } else { 1 };
     let mean = seeds().map(|atoms| structure_bytes(atoms, features)).sum::<u64>() / number.max(1);
-    let checkpoints = seeds().map(|atoms| CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES).sum::<u64>();
+    let checkpoint = |(atoms, walks)| walks as u64 * (CHECKPOINT_BYTES_PER_ATOM * atoms + HALF_PAGE_BYTES);
+    let checkpoints = seeds().zip(walks()).map(checkpoint).sum::<u64>();
     let mixture: usize =
         campaign.artifact.mixture.iter().map(|(.., component)| component.to_bytes().len()).sum();
     DiskForecast {

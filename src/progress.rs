@@ -7,10 +7,12 @@ use std::time::{Duration, Instant};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use monitor::walk_ends::WalkEnds;
 use orchestrator::reactor::Notice;
+use serde::Deserialize;
 use store::Fate;
+use tokio_util::sync::CancellationToken;
 use wire::{Origin, WalkId};
 
-use crate::forgetting::{AlarmState, ForgettingRule};
+use crate::forgetting::{AlarmState, ForgettingRule, Measured};
 use crate::output::{count, print_stderr};
 use crate::wording::walk_ends;
 
@@ -28,6 +30,8 @@ pub struct Display {
     /// Whether the display has reported that walkers wait for labels.
     waiting: bool,
     forgetting: AlarmState,
+    /// Stops the run, if the alarm asks for it.
+    stop: CancellationToken,
     ends: WalkEnds,
     /// Whether the display has warned of early ends.
     warned: bool,
@@ -48,6 +52,7 @@ impl Display {
         walks: Vec<(WalkId, String, u64)>,
         ends: WalkEnds,
         forgetting: ForgettingRule,
+        stop: CancellationToken,
     ) -> Self {
         let (mut names, mut steps) = (BTreeMap::new(), BTreeMap::new());
         for (walk, name, step) in walks {
@@ -63,6 +68,7 @@ impl Display {
             accepted: 0,
             waiting: false,
             forgetting: AlarmState::new(forgetting),
+            stop,
             warned: ends.is_alarming(),
             ends,
             last_line: Instant::now(),
@@ -80,6 +86,7 @@ impl Display {
             }
             Notice::Committed(commit) => self.committed(commit),
             Notice::QueueFull(jobs) => self.on_queue_full(*jobs),
+            Notice::Walkers { .. } => {}
         }
         self.draw();
     }
@@ -112,19 +119,22 @@ impl Display {
             self.show(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
         }
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "left_out") {
-            let (step, error) = (&decision.detail["step"], decision.detail["error"].as_str().unwrap_or_default());
+            let (step, error) =
+                (&decision.detail["step"], decision.detail["error"].as_str().unwrap_or_default());
             let name = decision.walk.map_or("?", |walk| self.name(walk));
             let line = format!("WARNING: {name}: step {step}, a candidate is left out: {error}");
             tracing::warn!("{line}");
             self.show_lasting(&line);
         }
         for decision in &commit.decisions {
-            let share = decision.detail["training_frames"]["share_above_one"].as_f64();
-            let raised = decision.detail["forgetting_alarm"].as_bool();
-            let alarm = share.zip(raised).and_then(|(share, raised)| self.forgetting.update(share, raised));
-            if let Some(alarm) = alarm {
+            let Ok(measured) = Measured::deserialize(&decision.detail["forgetting"]) else { continue };
+            let share_above_one = decision.detail["training_frames"]["share_above_one"].as_f64();
+            if let Some(alarm) = self.forgetting.update(&Measured { share_above_one, ..measured }) {
                 tracing::warn!("{alarm}");
                 self.show_lasting(&alarm);
+                if self.forgetting.pauses() {
+                    self.stop.cancel();
+                }
             }
         }
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "ended") {

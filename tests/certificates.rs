@@ -56,8 +56,7 @@ fn tls(directory: &Path) -> Vec<String> {
 /// A campaign whose orchestrator and agent have these certificates, and speak to each other at `localhost`.
 fn hosts(orchestrator: &Path, agent: &Path) -> Hosts {
     // It does not end by itself.
-    let small =
-        Small { mode: "live", steps: 1_000_000, max_per_seed_structure: 1_000_000, ..Small::default() };
+    let small = Small { mode: "live", steps: 1_000_000, max_per_walk: 1_000_000, ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "");
     let port = hosts.endpoints[0].rsplit(':').next().unwrap().to_owned();
     hosts.endpoints = [format!("tcp/127.0.0.1:{port}"), format!("tcp/localhost:{port}")];

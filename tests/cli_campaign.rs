@@ -32,7 +32,7 @@ criterion = { rule = "maximum_grade", threshold = 1.5 }
 update_target = { rule = "maximum_grade", target = 1.25 }
 min_interval = 20
 min_interval_after_decline = 10
-max_per_seed_structure = 2
+max_per_walk = 2
 [label]
 method = { potential = { kind = "eam_fs", file = "CONFIGS/data/Al_mm.eam.fs" } }
 max_attempts = 2

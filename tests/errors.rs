@@ -71,7 +71,7 @@ fn atoms_in(bin: &Json, pairs: &[(f64, f64)]) -> usize {
 fn structures_of_both_walks_are_counted_and_not_compared() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let path = Small { max_per_seed_structure: 2, ..Small::default() }.write(here);
+    let path = Small { max_per_walk: 2, ..Small::default() }.write(here);
     let text = fs::read_to_string(&path).unwrap();
     let text = text.replacen("threshold = 1.0, fraction = 0.1", "threshold = 0.01, fraction = 0.1", 1);
     fs::write(&path, text.replace("[calm]\n", "[calm]\nupdate = \"never\"\n")).unwrap();

@@ -144,10 +144,10 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
     let here = directory.path();
     let before = walks(here);
     assert!(before.iter().all(|walk| walk.0 == "control" || walk.2 == "steps"), "{before:?}");
-    replace(here, "max_per_seed_structure = 4", "max_per_seed_structure = 6\nmax_structures = 20");
+    replace(here, "max_per_walk = 4", "max_per_walk = 6\nmax_structures = 20");
     replace(here, "walkers = 2", "walkers = 1");
     replace(here, "[label]", "[label]\nconcurrency = 2");
-    let shown = "configuration: collect.max_per_seed_structure is now 6 (was 4)\n\
+    let shown = "configuration: collect.max_per_walk is now 6 (was 4)\n\
                  configuration: collect.max_structures is now 20 (was left out)\n\
                  configuration: label.concurrency is now 2 (was 1)\n\
                  configuration: run.walkers is now 1 (was 2)";
@@ -155,7 +155,7 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
     let change =
         |key: &str, before: Value, after: Value| json!({ "key": key, "before": before, "after": after });
     let expected = [
-        change("collect.max_per_seed_structure", 4.into(), 6.into()),
+        change("collect.max_per_walk", 4.into(), 6.into()),
         change("collect.max_structures", Value::Null, 20.into()),
         change("label.concurrency", 1.into(), 2.into()),
         change("run.walkers", 2.into(), 1.into()),
@@ -170,7 +170,7 @@ fn a_larger_budget_lets_walks_go_on() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     Small::default().write(here);
-    replace(here, "max_per_seed_structure = 4", "max_per_seed_structure = 1");
+    replace(here, "max_per_walk = 4", "max_per_walk = 1");
     succeed(here, RUN);
     let accepted = || -> Vec<_> {
         let biased = walks(here).into_iter().filter(|walk| walk.0 == "biased");
@@ -179,11 +179,11 @@ fn a_larger_budget_lets_walks_go_on() {
     let collected =
         |accepted: u32| ["fcc-100", "vacancy"].map(|n| (n.to_owned(), "collected".to_owned(), accepted));
     assert_eq!(accepted(), collected(1));
-    replace(here, "max_per_seed_structure = 1", "max_per_seed_structure = 2");
-    assert_eq!(resume_processes(here), "configuration: collect.max_per_seed_structure is now 2 (was 1)");
+    replace(here, "max_per_walk = 1", "max_per_walk = 2");
+    assert_eq!(resume_processes(here), "configuration: collect.max_per_walk is now 2 (was 1)");
     assert_eq!(accepted(), collected(2));
     // One for all of them: whoever comes first takes what is left.
-    replace(here, "max_per_seed_structure = 2", "max_per_seed_structure = 4\nmax_structures = 5");
+    replace(here, "max_per_walk = 2", "max_per_walk = 4\nmax_structures = 5");
     resume_processes(here);
     assert_eq!(accepted().iter().map(|walk| walk.2).sum::<u32>(), 5);
 }

@@ -14,7 +14,7 @@ fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
 
 /// A small campaign with these keys in `[label]`.
 fn write(here: &Path, keys: &str) {
-    let config = Small { seeds: &["fcc-100"], max_per_seed_structure: 2, ..Small::default() }.write(here);
+    let config = Small { seeds: &["fcc-100"], max_per_walk: 2, ..Small::default() }.write(here);
     let text = fs::read_to_string(&config).unwrap();
     fs::write(&config, text.replace("[label]", &format!("[label]\n{keys}"))).unwrap();
 }
@@ -100,7 +100,7 @@ fn a_campaign_has_a_bill_before_it_begins() {
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
     fs::write(
         here.join("less.toml"),
-        text.replace("max_per_seed_structure = 4", "max_per_seed_structure = 4\nmax_structures = 2"),
+        text.replace("max_per_walk = 4", "max_per_walk = 4\nmax_structures = 2"),
     )
     .unwrap();
     let less = json(here, ["estimate", "less.toml", "--core-seconds", "3600"]);

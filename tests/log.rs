@@ -66,7 +66,7 @@ fn a_log_has_what_all_processes_of_a_campaign_do() {
 #[test]
 fn a_log_grows_from_run_to_run_and_has_no_more_than_it_is_to_have() {
     let directory = tempfile::tempdir().unwrap();
-    Small { max_per_seed_structure: 1, steps: 60, ..Small::default() }.write(directory.path());
+    Small { max_per_walk: 1, steps: 60, ..Small::default() }.write(directory.path());
     let run = ["run", "campaign.toml", "--in-process", "--log", "campaign.log"];
     succeed(directory.path(), run);
     let first = fs::read_to_string(directory.path().join("campaign.log")).unwrap();

@@ -106,8 +106,7 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
 #[test]
 fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     // It does not end by itself.
-    let small =
-        Small { mode: "live", steps: 1_000_000, max_per_seed_structure: 1_000_000, ..Small::default() };
+    let small = Small { mode: "live", steps: 1_000_000, max_per_walk: 1_000_000, ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "");
     hosts.options[1] = vec!["--metrics=127.0.0.1:0".into()];
     let mut agent = hosts.agent(0);

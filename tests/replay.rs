@@ -107,11 +107,11 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
         (&strict["now"], &"1.2".into())
     );
 
-    let one = replayed(here, &["collect.max_per_seed_structure=1"]);
+    let one = replayed(here, &["collect.max_per_walk=1"]);
     assert_eq!(accepted(&one, "now"), 4, "{one}");
     let over = one["no_longer_accepted"].as_array().unwrap();
     assert!(over.iter().all(|change| change["reason"] == "walk over"), "{over:?}");
-    let other = replayed(here, &["calm.update=never", "collect.max_per_seed_structure=100"]);
+    let other = replayed(here, &["calm.update=never", "collect.max_per_walk=100"]);
     assert_eq!(other["now"]["mixture_version"], 0);
     let other = replayed(here, &["calm.covariance_update=additive"]);
     assert_eq!(other["difference"], Value::Null);
@@ -121,17 +121,14 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
 #[test]
 fn a_live_campaign_that_went_on_by_other_limits_comes_out_as_it_was() {
     let live = Small { mode: "live", ..Small::default() };
-    let directory = finished(&live, &[("max_per_seed_structure = 4", "max_per_seed_structure = 1")]);
+    let directory = finished(&live, &[("max_per_walk = 4", "max_per_walk = 1")]);
     let here = directory.path();
     check_exact(here);
     // Structures that the walks will meet again when they go on would be duplicates; these are of another campaign.
     let other = finished(&Small { steps: 120, ..Small::default() }, &[]);
     let labelled = export(other.path());
     succeed(here, ["import", "here", labelled.to_str().unwrap()]);
-    change(
-        &here.join("campaign.toml"),
-        &[("max_per_seed_structure = 1", "max_per_seed_structure = 3\nmax_structures = 5")],
-    );
+    change(&here.join("campaign.toml"), &[("max_per_walk = 1", "max_per_walk = 3\nmax_structures = 5")]);
     succeed(here, RUN);
     check_exact(here);
     let kinds = kinds(here);
@@ -161,10 +158,7 @@ fn a_mixture_that_begins_anew_comes_out_as_it_was() {
 
 #[test]
 fn it_says_from_where_on_features_are_missing() {
-    let directory = finished(
-        &many(),
-        &[("max_per_seed_structure = 4", "max_per_seed_structure = 4\ndeclined_features_mb = 0")],
-    );
+    let directory = finished(&many(), &[("max_per_walk = 4", "max_per_walk = 4\ndeclined_features_mb = 0")]);
     let here = directory.path();
     let report = replayed(here, &[]);
     let stopped = &report["stopped"];
@@ -182,7 +176,7 @@ fn what_cannot_be_set_is_refused() {
     let here = directory.path();
     for (setting, words) in [
         ("walk.tau=0.2", "walk.tau cannot be replayed: expected a key that acts on the selector alone"),
-        ("collect.max_per_seed_structure=0", "expected a whole number above 0"),
+        ("collect.max_per_walk=0", "expected a whole number above 0"),
         ("collect.criterion.threshold=\"a\"", "--set collect.criterion.threshold=\"a\": "),
         ("calm.update=per_seed_structure", "run.walks_per_round = 1"),
     ] {

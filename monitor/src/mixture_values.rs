@@ -19,12 +19,6 @@ impl MixtureValues {
         self.training_frames()["share_above_one"].as_f64()
     }
 
-    /// The fraction of the training atoms with γ > 1, and whether it raises an alarm. `None` before the first update.
-    pub fn forgetting(&self) -> Option<(f64, bool)> {
-        let training = self.training_frames();
-        training["share_above_one"].as_f64().zip(training["alarm"].as_bool())
-    }
-
     /// By how many versions walkers' mixtures were behind the newest at decisions; null before the first decision.
     pub fn staleness_json(&self) -> Value {
         let Some(staleness) = self.staleness() else { return Value::Null };

@@ -42,6 +42,11 @@ impl Grader {
         Self { elements, pair_cutoffs, largest_cutoff }
     }
 
+    /// Chemical symbols by element index.
+    pub fn symbols(&self) -> Vec<String> {
+        self.elements.iter().map(|species| species.symbol().to_owned()).collect()
+    }
+
     /// Element index of each atom.
     pub fn element_indices(&self, structure: &Structure) -> Result<Vec<usize>, GraderError> {
         let index = |(atom, species): (usize, &Species)| {

@@ -54,6 +54,13 @@ pub enum Notice<'a> {
     Committed(&'a Commit),
     /// Walkers wait because this many label jobs are unfinished.
     QueueFull(u64),
+    /// Of the connected walkers, so many have a walk in hand from now on.
+    Walkers {
+        /// With a walk in hand.
+        busy: usize,
+        /// All.
+        all: usize,
+    },
 }
 
 /// How the reactor ended.
@@ -148,6 +155,8 @@ impl Reactor {
                 continue;
             }
             state.schedule(&mut watch).await?;
+            let busy = state.selector.assignments();
+            watch(Notice::Walkers { busy, all: busy + state.waiting.len() });
             if let Some(commit) = state.decided.take() {
                 writing.spawn(write(state.store.clone(), commit));
             } else {
@@ -239,7 +248,7 @@ impl ReactorState {
     /// Whether no walker is busy, waiting, or will get an assignment.
     fn is_over(&self) -> bool {
         let no_more = self.selector.is_done() || self.stopping.is_cancelled();
-        no_more && self.waiting.is_empty() && !self.selector.has_assignments()
+        no_more && self.waiting.is_empty() && self.selector.assignments() == 0
     }
 
     /// Handles the loss of a walker. Its assignment goes to another walker, unless it has crashed too many.

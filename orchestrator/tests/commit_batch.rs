@@ -23,7 +23,7 @@ use crate::common::*;
 const WALKS: usize = 3;
 
 fn live_settings() -> Settings {
-    Settings { max_per_seed_structure: 100, ..settings(Mode::Live) }
+    Settings { max_per_walk: 100, ..settings(Mode::Live) }
 }
 
 /// What a walker may report on an assignment.
@@ -48,9 +48,9 @@ fn event() -> impl Strategy<Value = Event> {
 fn any_settings() -> impl Strategy<Value = Settings> {
     let update = prop::sample::select(vec![UpdateProtocol::Cumulative, UpdateProtocol::PerSeedStructure]);
     (update, 1..5_u32, prop::option::of(1..9_u32), any::<bool>()).prop_map(
-        |(update, max_per_seed_structure, total, control)| Settings {
+        |(update, max_per_walk, total, control)| Settings {
             update,
-            max_per_seed_structure,
+            max_per_walk,
             max_structures: total,
             control,
             ..live_settings()
@@ -191,7 +191,7 @@ async fn create(directory: &Path) -> Store {
         configuration_in_force: "{}".into(),
     };
     let stored = |index| {
-        let orchestrator::selector::SeedStructure { name, structure } = seed(index as usize);
+        let orchestrator::selector::SeedStructure { name, structure, .. } = seed(index as usize);
         store::SeedStructure { index, name, source: "seeds.extxyz".into(), structure }
     };
     let seeds: Vec<_> = (0..WALKS as u32).map(stored).collect();

@@ -4,9 +4,12 @@ use std::sync::Arc;
 
 use atoms::{MinDistanceRule, Uniform};
 use calm::UpdateRule;
+use calm::forgetting::ForgettingAlarm;
 use calm::grade::maximum;
 use calm::rules::MaximumGradeUpdate;
-use orchestrator::selector::{Mode, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol};
+use orchestrator::selector::{
+    Mode, OnForgetting, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol,
+};
 use store::records::{Commit, Fate};
 use wire::messages::{DeclineReason, Verdict, WalkEnd};
 
@@ -107,6 +110,38 @@ fn a_candidate_that_cannot_be_graded_is_left_out() {
     assert_eq!(kinds(&decided(&mut selector, report)), ["accepted"]);
 }
 
+/// The second walk ends when the first has collected all that its seed structure may give, and goes on when that is more.
+#[test]
+fn walks_of_one_seed_structure_share_a_limit() {
+    let limited = Settings {
+        update: UpdateProtocol::Never,
+        max_per_walk: 3,
+        max_per_seed_structure: Some(2),
+        ..live()
+    };
+    let mut seed = common::seed(0);
+    seed.walks = vec![seed.walks[0].clone(); 2];
+    let start = |settings: &Settings, snapshot| {
+        let (grader, original) = (common::grader(), mixture());
+        let seeds = vec![seed.clone()];
+        Selector::restore(settings.clone(), common::CAMPAIGN, seeds, grader, original, None, snapshot)
+            .unwrap()
+    };
+    let mut selector = start(&limited, SelectorSnapshot::default());
+    let mut store = common::memory::MemoryStore::default();
+    store.commit(&selector.start_walks());
+    for (number, expected) in [(1, vec!["accepted"]), (2, vec!["accepted", "ended", "ended"])] {
+        let commit = next_candidate(&mut selector, number, number, NEW);
+        assert_eq!(kinds(&commit), expected);
+        store.commit(&commit);
+    }
+    assert!(selector.is_done());
+    let more = Settings { max_per_seed_structure: Some(4), ..limited };
+    let mut selector = start(&more, store.snapshot());
+    let resumed = kinds(&selector.start_walks());
+    assert_eq!(resumed.iter().filter(|kind| *kind == "resumed").count(), 2, "{resumed:?}");
+}
+
 #[test]
 fn atoms_too_close_are_declined() {
     let mut selector = begin(&live(), 1);
@@ -165,8 +200,7 @@ fn without_updates_everything_new_to_the_original_mixture_is_accepted() {
 
 #[test]
 fn the_limit_per_seed_structure_is_enforced() {
-    let mut selector =
-        begin(&Settings { update: UpdateProtocol::Never, max_per_seed_structure: 2, ..live() }, 2);
+    let mut selector = begin(&Settings { update: UpdateProtocol::Never, max_per_walk: 2, ..live() }, 2);
     assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
     let commit = next_candidate(&mut selector, 6, 2, NEW);
     assert_eq!(kinds(&commit), ["accepted", "ended"]);
@@ -178,13 +212,13 @@ fn the_limit_per_seed_structure_is_enforced() {
 #[test]
 fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
     let mut store = common::memory::MemoryStore::default();
-    let more = Settings { update: UpdateProtocol::Never, max_per_seed_structure: 3, ..live() };
+    let more = Settings { update: UpdateProtocol::Never, max_per_walk: 3, ..live() };
     let mut selector = common::restore(&more, 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
     for number in 1..=2 {
         store.commit(&next_candidate(&mut selector, number, number, NEW));
     }
-    let mut selector = common::restore(&Settings { max_per_seed_structure: 2, ..more }, 1, store.snapshot());
+    let mut selector = common::restore(&Settings { max_per_walk: 2, ..more }, 1, store.snapshot());
     let commit = next_candidate(&mut selector, 3, 3, NEW);
     assert_eq!(kinds(&commit), ["declined budget", "ended"]);
     assert!(selector.is_done());
@@ -256,7 +290,7 @@ fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
 
 #[test]
 fn the_first_reason_applies() {
-    let limited = Settings { max_per_seed_structure: 1, max_structures: Some(1), ..live() };
+    let limited = Settings { max_per_walk: 1, max_structures: Some(1), ..live() };
     let known = vec![
         wire::ContentHash::from_structure(&structure(1, 1.0)),
         wire::ContentHash::from_structure(&structure(2, SHORTEST)),
@@ -341,7 +375,7 @@ fn each_seed_structure_starts_from_the_original_mixture() {
         walks_per_round: 1,
         ..settings(Mode::Reproducible)
     };
-    let training = TrainingFrames::new(vec![0], vec![0.0, 0.0, 0.9], &mixture()).unwrap();
+    let training = TrainingFrames::new(&[0], &[0.0, 0.0, 0.9], &mixture()).unwrap();
     let mut selector = try_restore(&restarted, 2, Some(training), SelectorSnapshot::default()).unwrap();
     selector.start_walks();
     let commit = end_first_walk_after_a_collection(&mut selector);
@@ -376,32 +410,95 @@ fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     last
 }
 
+/// Training frames along one direction.
+fn training_frames() -> TrainingFrames {
+    let features: Vec<f64> = (0..60).flat_map(|k| [0.0, 0.0, 0.015 * f64::from(k) + 0.09]).collect();
+    TrainingFrames::new(&[0; 60], &features, &mixture()).unwrap()
+}
+
+/// Settings under which every candidate of [`offer_far_ones`] is accepted.
+fn patient() -> Settings {
+    let mut patient = Settings { max_per_walk: 50, ..live() };
+    patient.search.stop = UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(2.9) });
+    patient
+}
+
+/// Offers candidates along another direction than the training frames, each farther than the one before.
+fn offer_far_ones(settings: &Settings, training: Option<TrainingFrames>) -> (Selector, Vec<Commit>) {
+    let mut selector = try_restore(settings, 1, training, SelectorSnapshot::default()).unwrap();
+    selector.start_walks();
+    let far = |number| [0.0, 1.5 * 2_f64.powi(number as i32), 0.0];
+    let commits = (1..=8).map(|number| next_candidate(&mut selector, number, number, far(number))).collect();
+    (selector, commits)
+}
+
 #[test]
 fn forgetting_is_recorded_and_raises_an_alarm() {
-    // Training frames along one direction; the candidates are along another.
-    let features: Vec<f64> = (0..20).flat_map(|k| [0.0, 0.0, 0.045 * f64::from(k) + 0.09]).collect();
-    let training = TrainingFrames::new(vec![0; 20], features, &mixture()).unwrap();
-    let share = training.original.share_above_one;
-    assert_eq!(share, 0.0);
-    let mut patient = Settings { max_per_seed_structure: 50, ..live() };
-    patient.search.stop = UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(2.9) });
-    let mut selector = try_restore(&patient, 1, Some(training), SelectorSnapshot::default()).unwrap();
-    selector.start_walks();
+    assert_eq!(training_frames().original().share_above_one, 0.0);
+    let (selector, commits) = offer_far_ones(&patient(), Some(training_frames()));
     let mut alarms = Vec::new();
-    for number in 1..=8 {
-        let z = [0.0, 1.5 * 2_f64.powi(number as i32), 0.0];
-        let commit = next_candidate(&mut selector, number, number, z);
-        assert_eq!(kinds(&commit), ["accepted"]);
+    for commit in &commits {
+        assert_eq!(kinds(commit), ["accepted"]);
         let detail = &commit.decisions[0].detail;
         let alarm = detail["forgetting_alarm"].as_bool().unwrap();
-        let mut watched: serde_json::Value = serde_json::from_str(value(&commit, "training_frames")).unwrap();
-        assert_eq!(watched.as_object_mut().unwrap().remove("alarm"), Some(alarm.into()));
+        let watched: serde_json::Value = serde_json::from_str(value(commit, "training_frames")).unwrap();
+        assert_eq!(watched["alarm"], alarm);
         let live = &detail["training_frames"];
-        assert_eq!(*live, watched);
+        for key in ["atoms", "median", "percentile_95", "maximum", "share_above_one"] {
+            assert_eq!(live[key], watched[key]);
+        }
+        let [element] = watched["elements"].as_array().unwrap().as_slice() else { panic!("{watched}") };
+        assert_eq!(
+            (&element["element"], &element["share_above_one"]),
+            (&"Al".into(), &live["share_above_one"])
+        );
         assert_eq!(alarm, live["share_above_one"].as_f64().unwrap() > 0.2);
         alarms.push(alarm);
     }
     assert!(!alarms[0] && alarms[7], "{alarms:?}");
+    assert!(selector.forgetting_level() > 1.0);
+}
+
+/// The covariances alone tell it too.
+#[test]
+fn forgetting_raises_an_alarm_without_training_frames() {
+    let limit = ForgettingAlarm { mean_square_growth: positive(1.5), ..ForgettingAlarm::default() };
+    let (selector, commits) = offer_far_ones(&Settings { forgetting_alarm: limit, ..patient() }, None);
+    let growth: Vec<f64> = commits
+        .iter()
+        .map(|commit| {
+            let detail = &commit.decisions[0].detail;
+            assert!(detail["forgetting"]["elements"][0]["share_above_one"].is_null());
+            let growth = detail["forgetting"]["elements"][0]["mean_square_growth"].as_f64().unwrap();
+            assert_eq!(detail["forgetting_alarm"], growth > 1.5);
+            growth
+        })
+        .collect();
+    assert!(growth[2..].is_sorted() && growth[0] < 1.1 && growth[7] > 2.0, "{growth:?}");
+    assert!(selector.forgetting_level() > 1.0);
+}
+
+#[test]
+fn updates_become_additive_when_the_campaign_asks_for_it() {
+    let settings = Settings { on_forgetting: OnForgetting::Additive, ..patient() };
+    let (selector, commits) = offer_far_ones(&settings, Some(training_frames()));
+    let switch = commits.iter().position(|commit| kinds(commit).len() > 1).unwrap();
+    assert_eq!(kinds(&commits[switch]), ["accepted", "forgetting"]);
+    assert_eq!(commits[switch].decisions[0].detail["forgetting_alarm"], true);
+    let share =
+        |commit: &Commit| commit.decisions[0].detail["training_frames"]["share_above_one"].as_f64().unwrap();
+    for (number, commit) in commits.iter().enumerate() {
+        // Additive updates take smaller values of α, and nothing shrinks.
+        if number > switch {
+            assert!(share(commit) <= share(&commits[switch]), "{number}");
+            assert_eq!(
+                (kinds(commit), value(commit, "additive_updates")),
+                (vec!["accepted".to_owned()], "1")
+            );
+        }
+    }
+    let (convex, _) = offer_far_ones(&patient(), Some(training_frames()));
+    assert!(switch < 7 && selector.forgetting_level() < convex.forgetting_level());
 }
 
 /// Candidates that are new, but below the threshold raised by a long queue, have their own reason to decline.

@@ -49,7 +49,7 @@ async fn a_stop_before_the_first_message_ends_the_reactor() {
 }
 
 fn rounds() -> Settings {
-    Settings { max_per_seed_structure: 9, control: true, ..settings(Mode::Reproducible) }
+    Settings { max_per_walk: 9, control: true, ..settings(Mode::Reproducible) }
 }
 
 /// Opens or creates the campaign's database.
@@ -202,7 +202,7 @@ async fn walkers_wait_while_the_label_queue_is_full() {
     let running = tokio::spawn(end_of(reactor, move |notice| match notice {
         Notice::QueueFull(unfinished) => full.send(unfinished).unwrap(),
         Notice::Committed(_) => drop(count.fetch_add(1, Ordering::Relaxed)),
-        Notice::Progress(..) => {}
+        Notice::Progress(..) | Notice::Walkers { .. } => {}
     }));
     let mut times = 0;
     while let Some(unfinished) = seen_full.recv().await {

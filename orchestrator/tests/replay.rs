@@ -110,7 +110,7 @@ proptest! {
         let mode = if live { Mode::Live } else { Mode::Reproducible };
         let settings = Settings { mode, ..settings };
         let [second, third] =
-            limits.map(|(max_per_seed_structure, total)| Settings { max_per_seed_structure, max_structures: total, ..settings.clone() });
+            limits.map(|(max_per_walk, total)| Settings { max_per_walk, max_structures: total, ..settings.clone() });
         let [first, middle, last] = parts;
         let mut campaign = Campaign::begin(&settings, &scripts, walkers);
         first.into_iter().for_each(|act| campaign.act(act));
@@ -128,7 +128,7 @@ proptest! {
     fn a_stricter_rule_accepts_structures_above_its_threshold(
         settings in any_settings(), scripts in scripts(), threshold in 1.5..9.0,
     ) {
-        let settings = Settings { update: UpdateProtocol::Never, max_per_seed_structure: 100, max_structures: None, ..settings };
+        let settings = Settings { update: UpdateProtocol::Never, max_per_walk: 100, max_per_seed_structure: None, max_structures: None, ..settings };
         let campaign = Campaign::begin(&settings, &scripts, 1).finish(false);
         let log = log(&campaign);
         let collection = CollectionRule::MaximumGrade(MaximumGrade { threshold: positive(threshold) });
@@ -160,11 +160,8 @@ fn the_campaigns_cover_the_intended_cases() {
         let settings = any_settings().new_tree(&mut runner).unwrap().current();
         let settings = Settings { mode: Mode::Live, update: UpdateProtocol::Cumulative, ..settings };
         let scripts: Vec<Script> = scripts().new_tree(&mut runner).unwrap().current();
-        let more = Settings {
-            max_per_seed_structure: settings.max_per_seed_structure + 3,
-            max_structures: None,
-            ..settings.clone()
-        };
+        let more =
+            Settings { max_per_walk: settings.max_per_walk + 3, max_structures: None, ..settings.clone() };
         let mut campaign = Campaign::begin(&settings, &scripts, 2);
         for act in acts().new_tree(&mut runner).unwrap().current() {
             campaign.act(act);

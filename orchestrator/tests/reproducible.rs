@@ -9,7 +9,7 @@ use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
 use wire::Origin;
 
-use crate::common::eventful::{Campaign, acts, any_settings, scripts};
+use crate::common::eventful::{Campaign, acts, any_settings, biased_walks, scripts};
 use crate::common::kinds;
 use crate::common::scripted::Script;
 
@@ -62,10 +62,17 @@ proptest! {
         }
         let campaign = campaign.finish(false);
         let count = |kind: &str| campaign.store.decisions.iter().filter(|d| d.kind == kind).count();
-        let biased = campaign.store.walks.values().filter(|walk| walk.origin == Origin::Biased);
-        let accepted: Vec<u32> = biased.map(|walk| walk.accepted).collect();
-        prop_assert_eq!(accepted.len(), scripts.len());
-        prop_assert!(accepted.iter().all(|accepted| *accepted <= settings.max_per_seed_structure));
+        let biased = || campaign.store.walks.values().filter(|walk| walk.origin == Origin::Biased);
+        let accepted: Vec<u32> = biased().map(|walk| walk.accepted).collect();
+        prop_assert_eq!(accepted.len(), biased_walks(scripts.len()));
+        let of_seed = |seed: usize| biased().filter(move |walk| walk.seed_structure as usize == seed);
+        for seed in 0..scripts.len() {
+            let accepted: u32 = of_seed(seed).map(|walk| walk.accepted).sum();
+            prop_assert!(settings.max_per_seed_structure.is_none_or(|most| accepted <= most));
+            let repeats: Vec<u32> = of_seed(seed).map(|walk| walk.conditions.repeat).collect();
+            prop_assert_eq!(repeats, (0..1 + seed as u32 % 2).collect::<Vec<_>>(), "walks in order");
+        }
+        prop_assert!(accepted.iter().all(|accepted| *accepted <= settings.max_per_walk));
         prop_assert_eq!(accepted.iter().sum::<u32>() as usize, count("accepted"));
         prop_assert_eq!(campaign.store.known.len(), count("accepted"));
         prop_assert!(settings.max_structures.is_none_or(|total| count("accepted") <= total as usize));
@@ -76,6 +83,8 @@ proptest! {
         let steps = match settings.update {
             UpdateProtocol::Never => 0,
             UpdateProtocol::Cumulative => count("accepted"),
+            // Walks of a seed structure share the mixture, if they follow one another.
+            UpdateProtocol::PerSeedStructure if live => return Ok(()),
             UpdateProtocol::PerSeedStructure => count("accepted") + scripts.len(),
         };
         prop_assert_eq!(campaign.selector.mixture().version(), steps as u64, "one version an update");
@@ -101,6 +110,7 @@ fn the_scripts_reach_every_kind_of_decision() {
         "declined duplicate",
         "declined guard",
         "ended",
+        "forgetting",
         "left_out",
         "segment",
     ];

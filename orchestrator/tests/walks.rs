@@ -221,7 +221,7 @@ fn every_end_is_logged_with_its_reason() {
 fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
     let controlled = Settings {
         control: true,
-        max_per_seed_structure: 9,
+        max_per_walk: 9,
         update: UpdateProtocol::Never,
         ..settings(Mode::Reproducible)
     };
@@ -236,6 +236,38 @@ fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
     let commit = decided(&mut selector, ended(&assignment, 30, WalkEnd::BlewUp { reason: "hot".into() }));
     store.commit(&commit);
     selector
+}
+
+/// Control walks get their share of the walkers, and biased walks the rest, however many of either there are.
+#[test]
+fn control_walks_do_not_wait_behind_all_seed_structures() {
+    let live = |control_share| Settings {
+        control: true,
+        max_per_walk: 1,
+        control_share,
+        update: UpdateProtocol::Never,
+        ..settings(Mode::Live)
+    };
+    for (share, expected) in [(0.5, [1, 2, 2, 3]), (0.25, [1, 1, 1, 1]), (0.01, [1, 1, 1, 1])] {
+        let mut selector = begin(&live(share), 20);
+        // Eight biased walks collect a structure each, and get their control walks.
+        for number in 1..=8 {
+            let assignment = next_assignment(&mut selector);
+            let walk = assignment.walk;
+            let report = offer(&selector, &assignment, 5, structure(number, SHORTEST), NEW);
+            assert_eq!(kinds(&decided(&mut selector, report)), ["accepted", "ended", "begun"], "{walk}");
+            // Nobody has a control walk in hand, so each of them would be next.
+            let control = next_assignment(&mut selector);
+            assert_eq!(control.origin, Origin::Control);
+            selector.assignment_lost(control.walk);
+        }
+        let mut controls = 0;
+        let counts = [(); 4].map(|()| {
+            controls += u32::from(next_assignment(&mut selector).origin == Origin::Control);
+            controls
+        });
+        assert_eq!(counts, expected, "share {share}");
+    }
 }
 
 #[test]

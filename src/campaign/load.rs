@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use atoms::{NeighbourList, Structure, read_structures};
+use atoms::{NeighbourList, Structure};
 use calm::forgetting::grade_distribution;
 use calm::{Artifact, ArtifactError, Mixture};
 use orchestrator::selector::{SeedStructure, TrainingFrames, UpdateProtocol};
@@ -12,8 +12,10 @@ use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
+use super::training_sample;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_method::{self, REFERENCE_FILE};
+use crate::xyz_reader::XyzReader;
 
 /// A seed structure and its source.
 pub struct SourcedStructure {
@@ -22,9 +24,6 @@ pub struct SourcedStructure {
     /// `file:line`
     pub source: String,
 }
-
-/// Largest number of training atoms whose grades are monitored: enough for the share above 1 to a percent.
-const MAX_MONITORED_ATOMS: usize = 4000;
 
 /// Largest number of seed-structure atoms that are graded.
 const MAX_GRADED_ATOMS: usize = 256;
@@ -123,8 +122,7 @@ impl Loader<'_> {
         Ok(artifact)
     }
 
-    /// Computes features of the training frames, evenly sampled to [`MAX_MONITORED_ATOMS`]. The median of γ must be between
-    /// 0.001 and 1.
+    /// Computes features of a sample of the training frames. The median of γ must be between 0.001 and 1.
     pub fn training_frames(
         &self,
         model: &Arc<GraceModel>,
@@ -132,22 +130,26 @@ impl Loader<'_> {
     ) -> Result<Option<TrainingFrames>, ConfigError> {
         let Some(file) = &self.config.calm.training_frames else { return Ok(None) };
         let wrong = |message: String| self.file_error(TRAINING_FRAMES, file, message);
-        let frames = read_structures(file.get_ref()).map_err(|error| wrong(error.to_string()))?;
-        let atoms: usize = frames.iter().map(|frame| frame.structure.len()).sum();
-        let every = atoms.div_ceil(MAX_MONITORED_ATOMS);
+        let path = file.get_ref();
+        let selected = training_sample::select(path).map_err(wrong)?;
         let mut features = Features::new(model);
-        for frame in frames.iter().step_by(every) {
-            let place = || format!("{}:{}", file.get_ref().display(), frame.line);
+        for (frame, _) in XyzReader::open(path)
+            .map_err(|error| wrong(error.to_string()))?
+            .zip(&selected)
+            .filter(|(_, selected)| **selected)
+        {
+            let frame = frame.map_err(|error| wrong(error.to_string()))?;
+            let place = || format!("{}:{}", path.display(), frame.line);
             features.add(&frame.structure).map_err(|error| wrong(format!("{}: {error}", place())))?;
         }
-        let training = TrainingFrames::new(features.elements, features.values, original)
+        let training = TrainingFrames::new(&features.elements, &features.values, original)
             .map_err(|error| wrong(error.to_string()))?;
-        let median = training.original.median;
+        let median = training.original().median;
         if !(MIN_MEDIAN_GRADE..=1.0).contains(&median) {
             return Err(wrong(format!(
                 "{}: the median of γ is {median:.3e} under the initial mixture; expected {MIN_MEDIAN_GRADE} to 1: either \
                  these are not the frames that the mixture was built from, or its covariances or thresholds are wrong",
-                file.get_ref().display()
+                path.display()
             )));
         }
         Ok(Some(training))
@@ -162,7 +164,7 @@ impl Loader<'_> {
         training: Option<&TrainingFrames>,
     ) -> Result<Option<Warning>, ConfigError> {
         if let (Some(training), Some(file)) = (training, &self.config.calm.training_frames) {
-            let share = training.original.share_above_one;
+            let share = training.original().share_above_one;
             return Ok((share > SUSPICIOUS_SHARE).then(|| {
                 let percent = 100.0 * share;
                 let message = format!(

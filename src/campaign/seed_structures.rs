@@ -50,7 +50,7 @@ impl Loader<'_> {
                     )));
                 }
                 let Err(reason) = self.check_seed_structure(&frame.structure, model) else {
-                    let seed = SeedStructure { name, structure: frame.structure };
+                    let seed = SeedStructure { name, structure: frame.structure, walks: Vec::new() };
                     seeds.valid.push(SourcedStructure { seed, source });
                     continue;
                 };
@@ -105,7 +105,9 @@ impl Loader<'_> {
                  (collect.criterion.{key}): nothing can ever be collected from it; give a larger cell or a smaller `{key}`"
             ));
         }
-        if self.config.walk.volume_ramp.is_some() && structure.periodic == [false; 3] {
+        // Groups of walks say for themselves which of them change the volume.
+        let ramp = self.config.walk.volume_ramp.filter(|_| self.config.walks.is_empty());
+        if ramp.is_some() && structure.periodic == [false; 3] {
             return Err(
                 "the structure has no periodic direction, and so no volume for walk.volume_ramp to change; give it a \
                  cell (Lattice=… in its comment line), or leave walk.volume_ramp out"
@@ -122,7 +124,7 @@ impl Loader<'_> {
         let mut warnings: Vec<_> =
             seeds.skipped.iter().map(|skipped| self.seeds_warning(skipped.clone())).collect();
         for named in &seeds.valid {
-            let SourcedStructure { seed: SeedStructure { name, structure }, source } = named;
+            let SourcedStructure { seed: SeedStructure { name, structure, .. }, source } = named;
             if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
                 let message = format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",

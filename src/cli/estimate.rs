@@ -87,9 +87,7 @@ impl Estimate {
         let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
         let config = &campaign.config;
-        let (copies, max_per_seed_structure) =
-            (config.labels_of_each(), config.collect.max_per_seed_structure.get());
-        let labels = u64::from(copies) * u64::from(max_per_seed_structure);
+        let copies = config.labels_of_each();
         let seed_structures: Vec<_> = campaign
             .seed_structures
             .iter()
@@ -97,11 +95,11 @@ impl Estimate {
             .map(|(seed, size)| SeedEstimate {
                 name: seed.seed.name.clone(),
                 size,
-                labels,
+                labels: u64::from(copies) * config.most_structures_of(seed.seed.walks.len()),
                 cost_per_label: costs.as_ref().and_then(|costs| costs.predict([(size, 1)])),
             })
             .collect();
-        let sum = labels * seed_structures.len() as u64;
+        let sum = seed_structures.iter().map(|seed| seed.labels).sum();
         let limit = config.most_structures().map(|limit| u64::from(copies) * u64::from(limit));
         let cost = costs
             .and_then(|costs| costs.predict(seed_structures.iter().map(|seed| (seed.size, seed.labels))));

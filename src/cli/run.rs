@@ -11,11 +11,13 @@ use std::sync::Arc;
 
 use monitor::candidate_details;
 use monitor::disk;
+use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
 use monitor::walk_ends::WalkEnds;
 use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
-use orchestrator::selector::{Selector, SelectorSnapshot};
+use orchestrator::selector::{OnForgetting, Selector, SelectorSnapshot};
+use serde::Deserialize;
 use serde_json::json;
 use store::{
     DATABASE, Location, ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds,
@@ -29,6 +31,7 @@ use super::{ExitStatus, Failure, block_on, duration_between};
 use crate::campaign::Campaign;
 use crate::disk_forecast;
 use crate::duration::Duration;
+use crate::forgetting::{ForgettingRule, Measured};
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
 use crate::runtime::notify::{self, Notifier};
@@ -167,6 +170,13 @@ async fn run(
     }
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
+    let pauses = campaign.config.calm.on_forgetting == OnForgetting::Pause;
+    if pauses && selector.forgetting_level() > 1.0 && !selector.is_done() {
+        return Err(paused_by_alarm(campaign, &store).await?);
+    }
+    if let Some(idle) = runtime::idle_walkers(campaign) {
+        log_and_warn(format_args!("WARNING: {idle}"));
+    }
     if campaign.config.label.concurrency == 0 {
         let store = shell_argument(location);
         log_and_print(format_args!(
@@ -208,6 +218,9 @@ async fn run(
         }
     }
     if !store.status().await?.finished {
+        if pauses && MixtureValues(store.values().await?).training_frames()["alarm"] == true {
+            return Err(paused_by_alarm(campaign, &store).await?);
+        }
         store.close().await;
         return Ok(ExitStatus::Interrupted);
     }
@@ -307,6 +320,16 @@ async fn warn_if_disk_is_too_small(
         ));
     }
     Ok(())
+}
+
+/// Why the campaign does not go on, and how it does.
+async fn paused_by_alarm(campaign: &Campaign, store: &Store) -> Result<Failure, Failure> {
+    let values = MixtureValues(store.values().await?).training_frames();
+    let measured = Measured::deserialize(values).map_err(Failure::failed)?;
+    Ok(Failure::Failed(format!(
+        "the campaign is paused: {}, then run it again",
+        ForgettingRule::new(&campaign.config.calm).raised_message(&measured)
+    )))
 }
 
 /// Registers this process, and reclaims the leases of dead ones. The caller holds the lock, so there is no other orchestrator.

@@ -167,7 +167,9 @@ fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {} steps/s", decimals(Some(speed), 1)));
-    format!("{under_way} {state}, {ended}{speed}")
+    let busy = status.walkers_busy.filter(|_| under_way > 0);
+    let busy = busy.map_or(String::new(), |busy| format!("; walkers busy {:.0} %", 100.0 * busy));
+    format!("{under_way} {state}, {ended}{speed}{busy}")
 }
 
 fn write_candidates(

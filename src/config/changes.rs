@@ -5,12 +5,15 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 46] = [
+pub(super) const CHANGEABLE: [&str; 49] = [
+    "campaign.control_share",
     "seed_structures",
+    "collect.max_per_walk",
     "collect.max_per_seed_structure",
     "collect.max_structures",
     "collect.declined_features_mb",
     "calm.forgetting_alarm",
+    "calm.max_mean_square_growth",
     "label.concurrency",
     "label.lease_timeout",
     "label.max_attempts",

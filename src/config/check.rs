@@ -1,5 +1,7 @@
 //! The rules of a configuration that no single value can check.
 
+use std::collections::HashSet;
+
 use atoms::MinDistanceRule;
 use md::{ThermostatSettings, WrongSetting};
 use orchestrator::selector::{Mode, UpdateProtocol};
@@ -7,10 +9,14 @@ use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
 
 use super::error::Wrong;
+use super::ranges;
 use super::{Config, LabelSection, NotifySection, QueueFull};
 
 /// Largest shortest distance of a pair of elements, Å.
 const MAX_MIN_DISTANCE: f64 = 10.0;
+
+/// Largest number of walks under the same conditions.
+const MAX_REPEATS: u32 = 1000;
 
 /// Checks a configuration as a whole; everything that is wrong.
 pub fn check(config: &Config) -> Vec<Wrong> {
@@ -19,6 +25,7 @@ pub fn check(config: &Config) -> Vec<Wrong> {
         check_thermostat(config),
         check_min_distances(config),
         check_zbl(config),
+        check_groups(config),
         check_temperature(config),
         check_store(config),
         check_queue(config),
@@ -196,12 +203,49 @@ fn check_zbl(config: &Config) -> Result<(), Wrong> {
     }
 }
 
-fn check_temperature(config: &Config) -> Result<(), Wrong> {
-    let Config { walk, guard, .. } = config;
-    let (highest, temperature) = (guard.max_temperature.get(), walk.temperature.get());
-    if highest <= temperature {
-        let expected = format!("more than walk.temperature = {temperature} K: every walk would end at once");
-        return wrong("guard.max_temperature", highest, expected);
+/// Names, and numbers that have the ranges of `[walk]`.
+fn check_groups(config: &Config) -> Result<(), Wrong> {
+    let mut names = HashSet::new();
+    for (number, group) in config.walks.iter().enumerate() {
+        let key = |name: &str| format!("walks.{number}.{name}");
+        if group.name.trim().is_empty() || !names.insert(&group.name) {
+            return wrong(&key("name"), format!("{:?}", group.name), "a name that no other group has");
+        }
+        if group.repeats.get() > MAX_REPEATS {
+            return wrong(&key("repeats"), group.repeats, format!("at most {MAX_REPEATS}"));
+        }
+        let volumes = group.volume_ramps.iter().flat_map(|ramp| [ramp.from, ramp.to]);
+        let all = [
+            ("temperatures", "walk.temperature", group.temperatures.clone()),
+            ("volume_ramps", "walk.volume_ramp.from", volumes.collect()),
+            ("tau_values", "walk.tau", group.tau_values.clone()),
+        ];
+        for (name, of_walk, values) in all {
+            let impossible =
+                values.into_iter().find_map(|value| ranges::expected_instead(of_walk, value.get()));
+            if let Some((found, expected)) = impossible {
+                return wrong(&key(name), found, expected);
+            }
+        }
     }
     Ok(())
+}
+
+fn check_temperature(config: &Config) -> Result<(), Wrong> {
+    let Config { walk, walks, guard, .. } = config;
+    let highest = guard.max_temperature.get();
+    let of_groups = walks.iter().enumerate().flat_map(|(number, group)| {
+        group
+            .temperatures
+            .iter()
+            .map(move |temperature| (format!("walks.{number}.temperatures"), temperature))
+    });
+    let all = [("walk.temperature".to_owned(), &walk.temperature)].into_iter().chain(of_groups);
+    match all.filter(|(_, temperature)| highest <= temperature.get()).next() {
+        Some((key, temperature)) => {
+            let expected = format!("more than {key} = {} K: every walk would end at once", temperature.get());
+            wrong("guard.max_temperature", highest, expected)
+        }
+        None => Ok(()),
+    }
 }

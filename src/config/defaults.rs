@@ -53,7 +53,15 @@ pub fn min_interval_after_decline() -> NonZeroU64 {
     nonzero(20).into()
 }
 
-pub fn max_per_seed_structure() -> NonZeroU32 {
+pub fn max_mean_square_growth() -> Positive {
+    positive(4.0)
+}
+
+pub fn repeats() -> NonZeroU32 {
+    NonZeroU32::MIN
+}
+
+pub fn max_per_walk() -> NonZeroU32 {
     nonzero(3)
 }
 

@@ -154,6 +154,7 @@ fn the_schema_has_every_key_of_the_reference() {
         let section = heading.strip_prefix("`[").and_then(|rest| rest.strip_suffix("]`"));
         for row in rows.lines().filter_map(|line| line.strip_prefix("| `")) {
             let key = row.split(['`', ' ']).next().unwrap();
+            let section = section.map(|section| section.trim_matches(['[', ']']));
             let key = section.map_or(key.to_owned(), |section| format!("{section}.{key}"));
             let mut found = false;
             at_key(&mut schema, &key, &mut |_| found = true);

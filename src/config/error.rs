@@ -185,6 +185,15 @@ pub(super) fn nearest(table: &DeTable<'_>, key: &str) -> Option<usize> {
     let (found, value) = table.get_key_value(name)?;
     let inside = match value.get_ref() {
         DeValue::Table(inner) if !rest.is_empty() => nearest(inner, rest),
+        // Tables of an array by their number.
+        DeValue::Array(tables) if !rest.is_empty() => {
+            let (number, rest) = rest.split_once('.').unwrap_or((rest, ""));
+            let table = number.parse::<usize>().ok().and_then(|number| tables.get(number));
+            table.map(|table| match table.get_ref() {
+                DeValue::Table(inner) => nearest(inner, rest).unwrap_or(table.span().start),
+                _ => table.span().start,
+            })
+        }
         _ => None,
     };
     Some(inside.unwrap_or(found.span().start))

@@ -56,6 +56,9 @@ pub struct Config {
     pub seed_structures: SeedStructuresSection,
     /// Dynamics and bias.
     pub walk: WalkSection,
+    /// Groups of walks under several conditions. Without them, one walk starts from each seed structure.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub walks: Vec<WalkGroupSection>,
     /// When a structure is collected.
     pub collect: CollectSection,
     /// What keeps walks physical.
@@ -139,6 +142,7 @@ impl Config {
             .with::<CalmSection>("calm")
             .with::<SeedStructuresSection>("seed_structures")
             .with::<WalkSection>("walk")
+            .with::<WalkGroupSection>("walks")
             .with::<CollectSection>("collect")
             .with::<GuardSection>("guard")
             .with::<LabelSection>("label")
@@ -184,6 +188,12 @@ impl Config {
     /// Label jobs of each structure that is collected: its own, and that of its control frame.
     pub fn labels_of_each(&self) -> u32 {
         1 + u32::from(self.campaign.control)
+    }
+
+    /// Most structures that may be collected from a seed structure with so many walks.
+    pub fn most_structures_of(&self, walks: usize) -> u64 {
+        let all = u64::from(self.collect.max_per_walk.get()).saturating_mul(walks as u64);
+        self.collect.max_per_seed_structure.map_or(all, |most| all.min(most.get().into()))
     }
 
     /// Most structures that may be collected, each with all its labels.

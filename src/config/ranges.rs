@@ -64,7 +64,7 @@ const fn range(
 }
 
 /// All of them, by table.
-pub static RANGES: [Range; 82] = [
+pub static RANGES: [Range; 84] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -77,6 +77,7 @@ pub static RANGES: [Range; 82] = [
     range("walk.volume_ramp.to", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
     range("walk.bias_averaging_steps", "", [0.0, STEPS], [1.0, 1e3], ""),
     range("walk.skin", "Å", [0.0, 10.0], [0.05, 3.0], ""),
+    range("calm.max_mean_square_growth", "", [1.0, 1e6], [1.5, 100.0], ""),
     range("collect.criterion.threshold", "", [0.0, 1e12], [0.5, 1e3], ""),
     range("collect.criterion.min_atoms", "", [0.0, 1e9], [1.0, 1e3], ""),
     range("collect.update_target.threshold", "", [0.0, 1e12], [0.5, 1e3], ""),
@@ -84,7 +85,8 @@ pub static RANGES: [Range; 82] = [
     range("collect.update_target.min_atoms", "", [0.0, 1e9], [1.0, 1e3], ""),
     range("collect.min_interval", "", [0.0, STEPS], [0.0, 1e5], ""),
     range("collect.min_interval_after_decline", "", [0.0, STEPS], [1.0, 1e5], ""),
-    range("collect.max_per_seed_structure", "", [0.0, 1e9], [1.0, 1e4], ""),
+    range("collect.max_per_seed_structure", "", [0.0, 1e9], [1.0, 1e5], ""),
+    range("collect.max_per_walk", "", [0.0, 1e9], [1.0, 1e4], ""),
     range("collect.max_structures", "", [0.0, 1e9], [1.0, 1e7], ""),
     range("collect.declined_features_mb", "MB", [0.0, 1e9], [0.0, 1e6], "it is in MB"),
     range("guard.min_distances.min_distance", "Å", [0.01, 10.0], [0.3, 4.0], "it is in Å"),
@@ -235,6 +237,12 @@ pub fn found(table: &DeTable<'_>, walk: &str) -> Vec<Found> {
         Some(Found { range, key, value, offset })
     };
     RANGES.iter().filter_map(found).collect()
+}
+
+/// What was found and what is expected instead, if `value` is impossible for the key.
+pub fn expected_instead(key: &str, value: f64) -> Option<(String, String)> {
+    let range = RANGES.iter().find(|range| range.key == key)?;
+    (!range.is_possible(value)).then(|| (range.written(value), range.expected()))
 }
 
 /// The numbers of a text that cannot be meant.

@@ -40,6 +40,9 @@ pub(super) fn at_key(schema: &mut Value, key: &str, visit: &mut dyn FnMut(&mut V
         let choices = schema.get_mut(choices).and_then(Value::as_array_mut);
         choices.into_iter().flatten().for_each(|choice| at_key(choice, key, visit));
     }
+    if let Some(items) = schema.get_mut("items") {
+        at_key(items, key, visit);
+    }
     let (name, rest) = key.split_once('.').unwrap_or((key, ""));
     match schema.get_mut("properties").and_then(|properties| properties.get_mut(name)) {
         Some(property) if rest.is_empty() => visit(property),

@@ -8,7 +8,7 @@ use calm::CollectionRule;
 use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use dft::PassedEnvironment;
 use md::ThermostatSettings;
-use orchestrator::selector::{Mode, UpdateProtocol};
+use orchestrator::selector::{Mode, OnForgetting, UpdateProtocol};
 use potentials::ZblWindows;
 use potentials::grace::Precision;
 use schemars::JsonSchema;
@@ -29,6 +29,9 @@ pub struct CampaignSection {
     pub rng_seed: u64,
     /// Whether each biased walk that collected a structure is followed by its unbiased control walk.
     pub control: bool,
+    /// Share of the walkers that work on control walks while there are any. Applies to live mode; in reproducible mode, a
+    /// round has as many control walks as biased ones.
+    pub control_share: Fraction,
 }
 
 /// `[potential]`
@@ -56,9 +59,17 @@ pub struct CalmSection {
     #[serde(default)]
     #[schemars(with = "Option<PathBuf>")]
     pub training_frames: Option<Spanned<PathBuf>>,
-    /// Share of training atoms with γ > 1 under the current mixture above which calmwalk warns.
+    /// Share of training atoms with γ > 1 under the current mixture, of all or of one element, above which the alarm is
+    /// raised.
     #[serde(default = "defaults::forgetting_alarm")]
     pub forgetting_alarm: Fraction,
+    /// Growth of the mean σ² of an element's training atoms above which the alarm is raised, for elements without
+    /// training frames.
+    #[serde(default = "defaults::max_mean_square_growth")]
+    pub max_mean_square_growth: Positive,
+    /// What happens when the alarm is raised.
+    #[serde(default)]
+    pub on_forgetting: OnForgetting,
     /// What happens to the mixture between seed structures.
     #[serde(default = "defaults::update")]
     pub update: UpdateProtocol,
@@ -124,6 +135,29 @@ pub struct WalkSection {
     pub skin: Positive,
 }
 
+/// `[[walks]]`
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct WalkGroupSection {
+    /// Name, by which views and filters select the walks of the group.
+    pub name: String,
+    /// Filter of the seed structures that the group walks from, by `atoms`, `element` and `seed`. Default: all.
+    #[serde(default)]
+    pub seed_structures: Option<String>,
+    /// Temperatures of the thermostat, K. Default: `walk.temperature`.
+    #[serde(default)]
+    pub temperatures: Vec<Positive>,
+    /// Volume ramps. Default: `walk.volume_ramp`.
+    #[serde(default)]
+    pub volume_ramps: Vec<VolumeRampSection>,
+    /// Scales τ of the uncertainty force. Default: `walk.tau`.
+    #[serde(default)]
+    pub tau_values: Vec<Positive>,
+    /// Number of walks under each combination of conditions, which differ in their random numbers.
+    #[serde(default = "defaults::repeats")]
+    pub repeats: NonZeroU32,
+}
+
 /// `volume_ramp = { from, to }`
 #[derive(Clone, Copy, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -148,9 +182,12 @@ pub struct CollectSection {
     /// Least number of steps after a candidate that was declined or refused.
     #[serde(default = "defaults::min_interval_after_decline")]
     pub min_interval_after_decline: NonZeroU64,
-    /// Largest number of structures collected from one seed structure.
-    #[serde(default = "defaults::max_per_seed_structure")]
-    pub max_per_seed_structure: NonZeroU32,
+    /// Largest number of structures collected by one walk.
+    #[serde(default = "defaults::max_per_walk")]
+    pub max_per_walk: NonZeroU32,
+    /// Largest number of structures collected by all walks of one seed structure.
+    #[serde(default)]
+    pub max_per_seed_structure: Option<NonZeroU32>,
     /// Largest number of structures collected by the campaign.
     #[serde(default)]
     pub max_structures: Option<NonZeroU32>,
@@ -290,6 +327,19 @@ pub struct RunSection {
     pub store: Option<String>,
 }
 
+impl Default for WalkGroupSection {
+    fn default() -> Self {
+        Self {
+            name: String::new(),
+            seed_structures: None,
+            temperatures: Vec::new(),
+            volume_ramps: Vec::new(),
+            tau_values: Vec::new(),
+            repeats: defaults::repeats(),
+        }
+    }
+}
+
 impl LabelSection {
     /// Name of the protocol.
     pub fn protocol_name(&self) -> &str {
@@ -323,7 +373,7 @@ impl LabelSection {
 
 impl Default for CampaignSection {
     fn default() -> Self {
-        Self { mode: Mode::Reproducible, rng_seed: 1, control: true }
+        Self { mode: Mode::Reproducible, rng_seed: 1, control: true, control_share: defaults::fraction(0.5) }
     }
 }
 

@@ -8,6 +8,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use atoms::Species;
+use wire::WalkConditions;
 
 pub use parse::FilterError;
 
@@ -21,7 +22,9 @@ pub struct StructureProperties<'a> {
     /// V/V₀.
     pub volume: Option<f64>,
     /// Kinetic temperature, K.
-    pub temperature: Option<f64>,
+    pub kinetic_temperature: Option<f64>,
+    /// Conditions of the walk.
+    pub conditions: Option<&'a WalkConditions>,
     /// Walk.
     pub walk: Option<u32>,
     /// Step, equilibration included.
@@ -93,7 +96,8 @@ macro_rules! names {
 names! {
     /// Numeric properties.
     NumberField {
-        Gamma "gamma", GammaNbr "gamma_nbr", Volume "volume", Temperature "temperature", Walk "walk", Step "step",
+        Gamma "gamma", GammaNbr "gamma_nbr", Volume "volume", Temperature "temperature",
+        KineticTemperature "kinetic_temperature", Tau "tau", Walk "walk", Step "step",
         MixtureVersion "mixture_version", Atoms "atoms", Energy "energy", EnergyPerAtom "energy_per_atom",
         MaxForce "max_force"
     }
@@ -101,7 +105,7 @@ names! {
 
 names! {
     /// Text properties.
-    TextField { Element "element", Kind "kind", Seed "seed" }
+    TextField { Element "element", Kind "kind", Seed "seed", Group "group" }
 }
 
 impl Filter {
@@ -164,7 +168,9 @@ impl StructureProperties<'_> {
             NumberField::Gamma => self.gamma,
             NumberField::GammaNbr => self.gamma_nbr,
             NumberField::Volume => self.volume,
-            NumberField::Temperature => self.temperature,
+            NumberField::Temperature => self.conditions.map(|conditions| conditions.temperature),
+            NumberField::KineticTemperature => self.kinetic_temperature,
+            NumberField::Tau => self.conditions.map(|conditions| conditions.tau),
             NumberField::Walk => self.walk.map(f64::from),
             NumberField::Step => self.step.map(|step| step as f64),
             NumberField::MixtureVersion => self.mixture_version.map(|version| version as f64),
@@ -181,6 +187,7 @@ impl StructureProperties<'_> {
             TextField::Element if self.species.is_empty() => None,
             TextField::Element => Some(self.species.iter().any(|species| species.symbol() == value)),
             TextField::Kind => Some(self.kind == value),
+            TextField::Group => self.conditions.map(|conditions| conditions.group == value),
             TextField::Seed => self.seed.map(|seed| seed == value),
         }
     }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use store::Status;
 
 use crate::config::{NotifyEvent, NotifySection};
-use crate::forgetting::ForgettingRule;
+use crate::forgetting::{ForgettingRule, Measured};
 use crate::output::count;
 use crate::wording::walk_ends;
 
@@ -78,20 +78,18 @@ impl NotificationTracker {
         due
     }
 
-    /// Returns an event if the forgetting alarm is raised or cleared. `share` is that of training atoms with γ > 1,
-    /// `raised` the selector's check.
+    /// Returns an event if the forgetting alarm is raised or cleared.
     pub fn check_training(
         &mut self,
         forgetting: &ForgettingRule,
-        share: f64,
-        raised: bool,
+        measured: &Measured,
     ) -> Option<Notification> {
         let event = NotifyEvent::Forgetting;
-        let (holds, was) = (forgetting.evaluate(share, raised)?, self.sent.0.get(event.name()));
+        let (holds, was) = (forgetting.evaluate(measured.level)?, self.sent.0.get(event.name()));
         match holds {
-            true => self.due(event, ALARM_RAISED.to_owned(), forgetting.raised_message(share)),
+            true => self.due(event, ALARM_RAISED.to_owned(), forgetting.raised_message(measured)),
             false if was.is_some_and(|was| was == ALARM_RAISED) => {
-                self.due(event, "over".to_owned(), forgetting.cleared_message(share))
+                self.due(event, "over".to_owned(), forgetting.cleared_message(measured))
             }
             false => None,
         }

@@ -51,7 +51,10 @@ pub async fn replay(
 async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Result<Replay, Failure> {
     let (model, artifact, training) = campaign::load_for_grades(config, Path::new("(the campaign)"))?;
     let seeds = store.seed_structures().await?.into_iter();
-    let seeds = seeds.map(|seed| SeedStructure { name: seed.name, structure: seed.structure }).collect();
+    // The log has the conditions of walks.
+    let seeds =
+        seeds.map(|seed| SeedStructure { name: seed.name, structure: seed.structure, walks: Vec::new() });
+    let seeds = seeds.collect();
     let set = settings.iter().map(|setting| setting.rule().to_owned()).collect();
     let replay = Replay::new(
         campaign::selector_settings(config),

@@ -8,12 +8,15 @@ use crate::config::{Config, impossible, in_plain_words};
 use crate::exit_status::Failure;
 
 /// Keys that affect the selector's decisions. Their effect on walks is recorded and does not change.
-const KEYS: [&str; 10] = [
+const KEYS: [&str; 13] = [
     "budget.labels",
     "calm.covariance_update",
     "calm.forgetting_alarm",
+    "calm.max_mean_square_growth",
+    "calm.on_forgetting",
     "calm.alpha_values",
     "calm.update",
+    "collect.max_per_walk",
     "collect.max_per_seed_structure",
     "collect.max_structures",
     "collect.update_target",
@@ -155,22 +158,19 @@ mod tests {
             let settings: Vec<_> = texts.iter().map(|text| setting(text).unwrap()).collect();
             configuration(&text, &settings)
         };
-        assert_eq!(
-            with(&["collect.max_per_seed_structure=7"]).unwrap().collect.max_per_seed_structure.get(),
-            7
-        );
+        assert_eq!(with(&["collect.max_per_walk=7"]).unwrap().collect.max_per_walk.get(), 7);
         let rule =
             with(&["collect.criterion={ rule = \"maximum_grade\" }", "collect.criterion.threshold=2.5"]);
         assert!(rule.unwrap().collect.criterion.is_met(&[2.6]));
         for (texts, words) in [
             (
-                &["collect.max_per_seed_structure=0"][..],
-                "--set collect.max_per_seed_structure=0: invalid value: integer `0`, expected a whole",
+                &["collect.max_per_walk=0"][..],
+                "--set collect.max_per_walk=0: invalid value: integer `0`, expected a whole",
             ),
             (&["collect.criterion.threshold=-1.0"], "expected a finite number above 0"),
             (&["collect.criterion.treshold=1.0"], "unknown key `treshold`"),
             (&["calm.covariance_update=conves"], "did you mean `convex`?"),
-            (&["collect.max_per_seed_structure.x=1"], "invalid type: map, expected a whole number"),
+            (&["collect.max_per_walk.x=1"], "invalid type: map, expected a whole number"),
         ] {
             let Err(Failure::Input(error)) = with(texts) else { panic!("{texts:?} are taken") };
             assert!(error.contains(words), "{error}");

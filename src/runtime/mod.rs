@@ -22,7 +22,7 @@ use std::thread;
 
 use monitor::walk_ends::WalkEnds;
 use orchestrator::reactor::{self, Notice, Reactor};
-use orchestrator::selector::Selector;
+use orchestrator::selector::{Mode, Selector};
 use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -30,7 +30,7 @@ use wire::transport::Incoming;
 
 use self::throughput::Throughput;
 use crate::campaign::Campaign;
-use crate::config::QueueFull;
+use crate::config::{Config, QueueFull};
 use crate::forgetting::ForgettingRule;
 use crate::progress::Display;
 pub use listen::Listen;
@@ -72,8 +72,8 @@ fn start_reactor(
     let walk_steps = config.walk.equilibration_steps + config.walk.biased_steps.get();
     let mut ends = WalkEnds::default();
     selector.ended_walks().for_each(|(walk, end, reason)| ends.add(walk.0, end, reason));
-    let mut display =
-        Display::new(walk_steps, selector.walk_progress(walk_steps), ends, ForgettingRule::new(&config.calm));
+    let (walks, forgetting) = (selector.walk_progress(walk_steps), ForgettingRule::new(&config.calm));
+    let mut display = Display::new(walk_steps, walks, ends, forgetting, run.stop.clone());
     let queue_limit = u64::from(config.label.queue_limit.get());
     if config.label.on_queue_full == QueueFull::Raise {
         selector.raise_threshold_above(queue_limit);
@@ -106,6 +106,21 @@ fn wanted_walkers(campaign: &Campaign) -> u32 {
         0 => (cores() / campaign.config.run.threads_per_walker.get() as u32).max(1),
         wanted => wanted as u32,
     }
+}
+
+/// A sentence about walkers that can have nothing to do, if there are any: rounds have too few walks for them.
+pub fn idle_walkers(campaign: &Campaign) -> Option<String> {
+    let Config { campaign: section, run, .. } = &campaign.config;
+    let walkers = wanted_walkers(campaign) as usize;
+    let walks = run.walks_per_round.get() * (1 + usize::from(section.control));
+    (section.mode == Mode::Reproducible && walkers > walks).then(|| {
+        let control = if section.control { ", and as many control walks" } else { "" };
+        format!(
+            "at most {walks} of the {walkers} walkers have something to do at a time: a round has {} biased walks \
+             (run.walks_per_round){control}",
+            run.walks_per_round
+        )
+    })
 }
 
 /// Number of processor cores that this process may use.

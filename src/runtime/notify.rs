@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use monitor::Snapshot;
 use monitor::mixture_values::MixtureValues;
+use serde::Deserialize;
 use serde_json::{Value, json};
 use store::{Location, Store, StoreError, unix_milliseconds};
 use tokio::io::AsyncWriteExt;
@@ -16,7 +17,7 @@ use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::config::{Config, NotifyEvent};
 use crate::exit_status::Failure;
-use crate::forgetting::ForgettingRule;
+use crate::forgetting::{ForgettingRule, Measured};
 use crate::notify::{METADATA_KEY, Notification, NotificationTracker};
 use crate::output::log_and_warn;
 
@@ -79,8 +80,8 @@ impl<'a> Notifier<'a> {
     async fn check(&mut self) -> Result<(), Failure> {
         let mut due = self.tracker.check(&self.store.status().await?, unix_milliseconds());
         let values = MixtureValues(self.store.values().await?);
-        if let Some((share, raised)) = values.forgetting() {
-            due.extend(self.tracker.check_training(&self.forgetting, share, raised));
+        if let Ok(measured) = Measured::deserialize(values.training_frames()) {
+            due.extend(self.tracker.check_training(&self.forgetting, &measured));
         }
         if due.is_empty() {
             return Ok(());

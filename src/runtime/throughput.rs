@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use orchestrator::reactor::Notice;
-use store::{Store, WalkProgress, unix_milliseconds};
+use store::{Store, TotalThroughput, WalkProgress, unix_milliseconds};
 use tokio::time::{MissedTickBehavior, interval};
 use wire::WalkId;
 use wire::messages::Progress;
@@ -26,6 +26,7 @@ pub struct Throughput {
     /// Walks with changes since the last write.
     changed: BTreeSet<u32>,
     all: Speed,
+    busy: Busy,
     /// Steps of all walks in this run.
     steps: u64,
 }
@@ -36,6 +37,28 @@ struct Walk {
     speed: Speed,
     /// Steps in this run, including repeated ones.
     steps: u64,
+}
+
+/// Moving average of the share of walkers that have a walk in hand.
+#[derive(Debug, Default)]
+struct Busy {
+    /// The share since a time, ms.
+    now: Option<(f64, i64)>,
+    average: Option<f64>,
+}
+
+impl Busy {
+    /// Takes the share that holds from now on, or measures up to now.
+    fn update(&mut self, share: Option<f64>, now: i64) {
+        if let Some((held, since)) = self.now {
+            let weight = 1.0 - (-((now - since) as f64 / 1000.0) / AVERAGING_TIME).exp();
+            self.average = Some(self.average.map_or(held, |average| average + weight * (held - average)));
+            self.now = Some((held, now));
+        }
+        if let Some(share) = share {
+            self.now = Some((share, now));
+        }
+    }
 }
 
 /// Exponential moving average of steps per second.
@@ -69,7 +92,10 @@ impl Throughput {
                 let begun = commit.walks.iter().filter(|record| record.progress.step > 0);
                 begun.for_each(|record| self.update(record.walk, &record.progress, now));
             }
-            Notice::QueueFull(_) => {}
+            Notice::Walkers { busy, all } if *all > 0 => {
+                self.busy.update(Some(*busy as f64 / *all as f64), now);
+            }
+            Notice::Walkers { .. } | Notice::QueueFull(_) => {}
         }
     }
 
@@ -97,11 +123,13 @@ impl Throughput {
         self.changed.insert(walk.0);
     }
 
-    /// The changed walks, and steps per second of all walks.
-    fn take_changes(&mut self, now: i64) -> (Vec<WalkProgress>, Option<f64>) {
+    /// The changed walks, and the throughput of all.
+    fn take_changes(&mut self, now: i64) -> (Vec<WalkProgress>, TotalThroughput) {
         self.all.update(self.steps, now);
+        self.busy.update(None, now);
         let changed = std::mem::take(&mut self.changed);
-        (changed.iter().map(|walk| self.walks[walk].pace.clone()).collect(), self.all.average)
+        let all = TotalThroughput { steps_per_second: self.all.average, walkers_busy: self.busy.average };
+        (changed.iter().map(|walk| self.walks[walk].pace.clone()).collect(), all)
     }
 }
 
@@ -142,6 +170,21 @@ mod tests {
     }
 
     #[test]
+    fn walkers_are_busy_for_a_share_of_the_time() {
+        let mut throughput = Throughput::default();
+        // Four walkers, three of which wait every other second.
+        for second in 0..300_i64 {
+            let busy = if second % 2 == 0 { 4 } else { 1 };
+            throughput.notice(&Notice::Walkers { busy, all: 4 }, 1000 * second);
+        }
+        let busy = throughput.take_changes(300_000).1.walkers_busy.unwrap();
+        assert!((busy - 0.625).abs() < 0.02, "{busy}");
+        // All walkers are gone.
+        throughput.notice(&Notice::Walkers { busy: 0, all: 0 }, 301_000);
+        assert!(throughput.take_changes(302_000).1.walkers_busy.is_some());
+    }
+
+    #[test]
     fn rollbacks_do_not_count_as_steps() {
         let mut throughput = Throughput::default();
         throughput.take_changes(0);
@@ -149,6 +192,6 @@ mod tests {
             throughput.notice(&Notice::Progress(WalkId(0), at(segment, step)), now);
         }
         let (_, all) = throughput.take_changes(4000);
-        assert_eq!(all, Some(50.0), "200 steps in 4 s");
+        assert_eq!(all.steps_per_second, Some(50.0), "200 steps in 4 s");
     }
 }

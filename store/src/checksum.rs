@@ -106,6 +106,10 @@ pub static WALK: CheckedTable = checked!("walk" by walk Integer {
     gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
 });
 
+/// Conditions of walks, which have never been without checksums.
+pub static WALK_CONDITIONS: CheckedTable =
+    checked!("walk_conditions" by walk Integer { walk: Integer, conditions: Text });
+
 /// Labels, without their status and why it changed.
 pub static LABEL: CheckedTable = checked!("label" by number Integer {
     structure: Integer, protocol: Integer, energy: Real, forces: Bytes, stress: Bytes, job: Integer,

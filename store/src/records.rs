@@ -6,7 +6,7 @@ use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
 use wire::messages::{DeclineReason, Progress};
-use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 /// Name of the value with the grades of the training frames under the newest mixture (JSON of
 /// `calm::forgetting::GradeDistribution`, with `alarm`).
@@ -206,6 +206,8 @@ pub struct WalkRecord {
     pub partner: Option<WalkId>,
     /// Index of the seed structure.
     pub seed_structure: u32,
+    /// Its conditions; those of the default in campaigns of early versions.
+    pub conditions: WalkConditions,
     /// `waiting`, `running`, or the name of its [`wire::messages::End`].
     pub state: String,
     /// Why it ended, as text; empty while it runs.

@@ -1,6 +1,7 @@
 //! A summary of the campaign's state, for display and as JSON.
 
 use serde::Serialize;
+use wire::WalkConditions;
 
 use crate::budget::BudgetStatus;
 use crate::checksum::{Names, WALK};
@@ -30,6 +31,8 @@ pub struct Status {
     pub round: u64,
     /// Steps per second of all walks together; `None` without a report in the last minute.
     pub steps_per_second: Option<f64>,
+    /// Average share of the walkers that have a walk in hand; `None` without a report in the last minute.
+    pub walkers_busy: Option<f64>,
     /// Every walk, in order.
     pub walks: Vec<WalkStatus>,
     /// Processes registered for the campaign.
@@ -102,6 +105,8 @@ pub struct WalkStatus {
     pub walk: u32,
     /// Name of its seed structure.
     pub seed_structure: String,
+    /// Its conditions; `None` in campaigns of early versions.
+    pub conditions: Option<WalkConditions>,
     /// `biased` or `control`.
     pub origin: String,
     /// `waiting`, `running`, or the reason why it ended.
@@ -146,6 +151,7 @@ impl FromRow for WalkStatus {
         Ok(Self {
             walk: row.get("walk")?,
             seed_structure: row.get("seed_structure")?,
+            conditions: None,
             origin: row.get("origin")?,
             state: row.get("state")?,
             reason: row.get("reason")?,

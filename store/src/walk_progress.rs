@@ -1,6 +1,6 @@
 //! Progress and speed of walks between checkpoints.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::database::from_columns;
 
@@ -25,6 +25,15 @@ pub struct WalkProgress {
     pub relative_volume: Option<f64>,
     /// Largest γ of the last graded step.
     pub gamma_max: Option<f64>,
+}
+
+/// Throughput of all walks together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct TotalThroughput {
+    /// Steps per second; `None` until it can be computed.
+    pub steps_per_second: Option<f64>,
+    /// Average share of the walkers that have a walk in hand; `None` without walkers.
+    pub walkers_busy: Option<f64>,
 }
 
 from_columns!(WalkProgress {

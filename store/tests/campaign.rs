@@ -4,7 +4,7 @@ use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
 };
 use wire::messages::{DeclineReason, Progress};
-use wire::{Origin, WalkId};
+use wire::{Origin, WalkConditions, WalkId};
 
 use crate::common::*;
 
@@ -317,4 +317,27 @@ async fn the_newest_decisions_are_summarized() {
         (job.temperature, job.relative_volume, job.original_gamma_nbr),
         (Some(300.25), Some(1.01), Some(1.1))
     );
+}
+
+/// They are written before the first assignment and never again.
+#[tokio::test]
+async fn conditions_of_walks_are_read_back() {
+    let home = Home::new();
+    let store = home.create().await;
+    let conditions = WalkConditions {
+        group: "hot".into(),
+        temperature: 900.0,
+        tau: 0.15,
+        volume_ramp: Some((1.0, 0.85)),
+        repeat: 2,
+    };
+    let begun = WalkRecord { conditions: conditions.clone(), ..walk(0, 0) };
+    store.commit(&Commit { walks: vec![begun.clone()], ..Commit::default() }).await.unwrap();
+    // Interrupted in its first assignment; then reported on.
+    store.commit(&Commit { walks: vec![begun], ..Commit::default() }).await.unwrap();
+    let later = WalkRecord { conditions: conditions.clone(), ..walk(0, 1) };
+    store.commit(&Commit { walks: vec![later.clone()], ..Commit::default() }).await.unwrap();
+    assert_eq!(store.load_walks().await.unwrap(), [later]);
+    assert_eq!(store.walk_conditions().await.unwrap()[&WalkId(0)], conditions);
+    assert_eq!(store.status().await.unwrap().walks[0].conditions, Some(conditions));
 }

@@ -15,28 +15,21 @@ pub struct Small {
     pub walkers: usize,
     pub walks_per_round: usize,
     pub steps: u64,
-    pub max_per_seed_structure: u32,
+    pub max_per_walk: u32,
     pub seeds: &'static [&'static str],
 }
 
 impl Default for Small {
     fn default() -> Self {
         let seeds = &["fcc-100", "vacancy"];
-        Self {
-            mode: "reproducible",
-            walkers: 2,
-            walks_per_round: 2,
-            steps: 240,
-            max_per_seed_structure: 4,
-            seeds,
-        }
+        Self { mode: "reproducible", walkers: 2, walks_per_round: 2, steps: 240, max_per_walk: 4, seeds }
     }
 }
 
 impl Small {
     /// Text of the configuration.
     pub fn text(&self) -> String {
-        let Self { mode, walkers, walks_per_round, steps, max_per_seed_structure, .. } = self;
+        let Self { mode, walkers, walks_per_round, steps, max_per_walk, .. } = self;
         let file = |path: &str| config(path).display().to_string();
         format!(
             r#"
@@ -61,7 +54,7 @@ criterion = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1 }}
 update_target = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1, target = 1.25 }}
 min_interval = 30
 min_interval_after_decline = 5
-max_per_seed_structure = {max_per_seed_structure}
+max_per_walk = {max_per_walk}
 [guard]
 zbl = {{ rule = "uniform", inner = 1.6, outer = 2.4 }}
 [label]

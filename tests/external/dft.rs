@@ -66,9 +66,7 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
     fs::create_dir(&scratch).unwrap();
     let text = fs::read_to_string(config("silicon-dft.toml")).unwrap();
     let data = format!("\"{}/data/", config("").display()).replace("//", "/");
-    let text = text
-        .replace("\"data/", &data)
-        .replace("# max_per_seed_structure = 3 ", "max_per_seed_structure = 1 ");
+    let text = text.replace("\"data/", &data).replace("# max_per_walk = 3 ", "max_per_walk = 1 ");
     let label = format!("[label]\nscratch = \"{}\"\nmax_attempts = 20", scratch.display());
     fs::write(here.join("campaign.toml"), text.replace("[label]", &label)).unwrap();
     let mut run = program(here)

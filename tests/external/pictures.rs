@@ -26,7 +26,7 @@ fn the_readme_shows_a_campaign() {
     // Long enough for lines over time.
     let text = text
         .replace("biased_steps = 2000", "biased_steps = 12000")
-        .replace("# max_per_seed_structure = 3", "max_per_seed_structure = 20");
+        .replace("# max_per_walk = 3", "max_per_walk = 20");
     fs::write(here.join("aluminium.toml"), text).unwrap();
     let mut command = program(here);
     command.args(["run", "aluminium.toml", "--dashboard", "127.0.0.1:0"]);

@@ -4,13 +4,12 @@ use atoms::MinDistanceRule;
 use potentials::ZblWindows;
 use serde::{Deserialize, Serialize};
 
-/// Dynamics, bias and guards of every walk of a campaign.
+/// Dynamics, bias and guards of every walk of a campaign. What differs between walks is in their conditions
+/// ([`wire::WalkConditions`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct WalkSettings {
     /// Random seed.
     pub rng_seed: u64,
-    /// Temperature, K.
-    pub temperature: f64,
     /// Thermostat.
     pub thermostat: md::ThermostatSettings,
     /// Time step, fs; `None` for the paper's rule (2 fs; 0.5 fs with H, He, Li or Be).
@@ -19,12 +18,8 @@ pub struct WalkSettings {
     pub equilibration: u64,
     /// Biased steps after equilibration.
     pub steps: u64,
-    /// Uncertainty-force scale τ.
-    pub tau: f64,
     /// Steps over which the two norms of τ_r are exponentially averaged.
     pub bias_averaging_steps: u64,
-    /// V/V₀ at the start and at the end of the biased steps; `None` for a fixed cell.
-    pub volume_ramp: Option<(f64, f64)>,
     /// Neighbour-list skin, Å.
     pub skin: f64,
     /// When a structure becomes a candidate.

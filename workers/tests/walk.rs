@@ -12,7 +12,7 @@ use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, Outcome, Report, Verdict, WalkEnd};
-use wire::{CampaignId, Candidate, Origin, WalkId};
+use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
 use workers::bias::BiasedPotential;
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
@@ -43,14 +43,11 @@ fn uniform_zbl(inner: f64, outer: f64) -> Option<ZblWindows> {
 fn settings() -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
-        temperature: 600.0,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
         equilibration: 20,
         steps: 600,
-        tau: 0.15,
         bias_averaging_steps: 10,
-        volume_ramp: Some((1.0, 1.4)),
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
         gap: 200,
@@ -68,6 +65,15 @@ fn settings() -> WalkSettings {
     }
 }
 
+fn conditions() -> WalkConditions {
+    WalkConditions {
+        temperature: 600.0,
+        tau: 0.15,
+        volume_ramp: Some((1.0, 1.4)),
+        ..WalkConditions::default()
+    }
+}
+
 fn assignment(structure: Structure, until: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([1; 16]),
@@ -76,6 +82,7 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure: structure,
+        conditions: conditions(),
         checkpoint: None,
         verdict: None,
         last_step: until,
@@ -90,13 +97,15 @@ fn run(settings: &WalkSettings, assignment: &Assignment) -> Report<Candidate> {
     advance(&context, assignment, mixture(), || false, |_| {})
 }
 
-/// Runs a walk, one assignment after the other, with every candidate accepted, until it ends.
-fn whole_walk(
-    settings: &WalkSettings,
-    structure: Structure,
-    steps_per_assignment: u64,
-) -> Vec<Report<Candidate>> {
-    let mut next = assignment(structure, steps_per_assignment);
+/// The first 150 steps of a walk under these conditions.
+fn first_of(seed: &str, conditions: WalkConditions) -> Assignment {
+    Assignment { conditions, ..assignment(seed_structure(seed), 150) }
+}
+
+/// Runs a walk, one assignment as long as the first after the other, with every candidate accepted, until it ends.
+fn whole_walk(settings: &WalkSettings, first: Assignment) -> Vec<Report<Candidate>> {
+    let steps_per_assignment = first.last_step;
+    let mut next = first;
     let mut reports = Vec::new();
     loop {
         let report = run(settings, &next);
@@ -129,8 +138,9 @@ fn a_split_assignment_gives_the_same_result() {
 #[test]
 fn a_walk_begins_at_the_volume_of_its_ramp() {
     let frame = |structure: Structure, ramp: (f64, f64)| {
-        let settings = WalkSettings { volume_ramp: Some(ramp), ..settings() };
+        let settings = settings();
         let mut control = assignment(structure, 120);
+        control.conditions.volume_ramp = Some(ramp);
         (control.origin, control.frame_steps) = (Origin::Control, vec![40]);
         let Outcome::Candidate(frame) = run(&settings, &control).outcome else { panic!("no frame") };
         frame.structure
@@ -222,8 +232,8 @@ fn reference(
 /// The trap of the reference's walker: τ = 2.0 on a model of one phase, and a ZBL that ends at 1.8 Å.
 #[test]
 fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
-    let settings = WalkSettings { tau: 2.0, zbl: uniform_zbl(1.0, 1.8), ..settings() };
-    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
+    let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), ..settings() };
+    let reports = whole_walk(&settings, first_of("fcc-100", WalkConditions { tau: 2.0, ..conditions() }));
     let last = reports.last().unwrap();
     assert!(last.progress.returns >= 1, "{last:?}");
     assert_eq!(last.progress.segment, last.progress.returns);
@@ -238,8 +248,8 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
 #[test]
 fn the_interval_between_collections_holds_across_roll_backs() {
     let guard = GuardSettings { tau_factor: 0.8, max_rollbacks: 6, ..settings().guard };
-    let settings = WalkSettings { tau: 2.0, zbl: uniform_zbl(1.0, 1.8), gap: 120, guard, ..settings() };
-    let reports = whole_walk(&settings, seed_structure("fcc-097"), 150);
+    let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), gap: 120, guard, ..settings() };
+    let reports = whole_walk(&settings, first_of("fcc-097", WalkConditions { tau: 2.0, ..conditions() }));
     let candidate = |report: &Report<Candidate>| match &report.outcome {
         Outcome::Candidate(candidate) => Some((candidate.id.segment, candidate.id.step)),
         _ => None,
@@ -269,9 +279,9 @@ fn the_skin_changes_nothing() {
     cluster.species.truncate(5);
     cluster.positions.truncate(5);
     let ends = [0.1, 0.5, 3.0].map(|skin| {
-        let settings =
-            WalkSettings { skin, temperature: 6000.0, steps: 4000, collection: never(), ..settings() };
-        let report = run(&settings, &assignment(cluster.clone(), 4020));
+        let settings = WalkSettings { skin, steps: 4000, collection: never(), ..settings() };
+        let conditions = WalkConditions { temperature: 6000.0, ..conditions() };
+        let report = run(&settings, &Assignment { conditions, ..assignment(cluster.clone(), 4020) });
         (report.outcome, report.progress.step)
     });
     let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(WalkEnd::BlewUp { reason }) if reason.contains("no neighbour"));
@@ -284,8 +294,9 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
     let min_distances = MinDistanceRule::Uniform(Uniform { min_distance: 3.0, fraction: 0.75 });
     let guard = GuardSettings { min_distances, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
-    let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
-    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
+    let settings = WalkSettings { collection, guard, ..settings() };
+    let first = first_of("fcc-100", WalkConditions { volume_ramp: None, ..conditions() });
+    let reports = whole_walk(&settings, first);
     let last = reports.last().unwrap();
     assert!(
         matches!(&last.outcome, Outcome::Ended(WalkEnd::Trapped { guard }) if guard == "shortest-bond"),
@@ -300,8 +311,9 @@ fn without_rollbacks_a_refused_walk_goes_on() {
     let min_distances = MinDistanceRule::Uniform(Uniform { min_distance: 3.0, fraction: 0.75 });
     let guard = GuardSettings { min_distances, rollback: false, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
-    let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
-    let reports = whole_walk(&settings, seed_structure("fcc-100"), 150);
+    let settings = WalkSettings { collection, guard, ..settings() };
+    let first = first_of("fcc-100", WalkConditions { volume_ramp: None, ..conditions() });
+    let reports = whole_walk(&settings, first);
     let last = reports.last().unwrap();
     assert!(matches!(&last.outcome, Outcome::Ended(WalkEnd::Steps)), "{last:?}");
     assert_eq!((last.progress.returns, last.progress.segment), (0, 0));
@@ -311,8 +323,10 @@ fn without_rollbacks_a_refused_walk_goes_on() {
 #[test]
 fn a_diverging_walk_ends_with_its_reason() {
     let guard = GuardSettings { max_temperature: 900.0, ..settings().guard };
-    let settings = WalkSettings { temperature: 2500.0, collection: never(), guard, ..settings() };
-    let report = run(&settings, &assignment(seed_structure("fcc-100"), 600));
+    let settings = WalkSettings { collection: never(), guard, ..settings() };
+    let conditions = WalkConditions { temperature: 2500.0, ..conditions() };
+    let first = Assignment { conditions, ..assignment(seed_structure("fcc-100"), 600) };
+    let report = run(&settings, &first);
     let Outcome::Ended(WalkEnd::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };
     assert!(reason.contains("above the allowed 900 K"), "{reason}");
 }

@@ -5,9 +5,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::component::Component;
 use crate::grade::{GradeError, Grades};
 use crate::mixture::Mixture;
-use crate::rules::Fraction;
+use crate::rules::{Fraction, Positive};
 
 /// The distribution of γ over atoms.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -25,12 +26,25 @@ pub struct GradeDistribution {
     pub share_above_one: f64,
 }
 
-/// When the drift of the training data's grades raises an alarm.
+/// How much of an element's training data the live mixture still covers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ElementForgetting {
+    /// Chemical symbol.
+    pub element: String,
+    /// Mean σ² of its training atoms relative to that at the start, see [`mean_square_growth`].
+    pub mean_square_growth: f64,
+    /// Share of its sampled training atoms with γ > 1; `None` without a sample.
+    pub share_above_one: Option<f64>,
+}
+
+/// Limits above which the mixture has forgotten too much of its training data.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ForgettingAlarm {
-    /// Raises the alarm when more than this fraction of the training atoms has γ > 1.
+    /// Share of the sampled training atoms with γ > 1, of all atoms and of each element.
     pub share_above_one: Fraction,
+    /// Growth of the mean σ² of an element's training atoms. Applies to elements without sampled atoms.
+    pub mean_square_growth: Positive,
 }
 
 impl GradeDistribution {
@@ -67,19 +81,45 @@ pub fn grade_distribution(
     Ok(GradeDistribution::from_grades(&grades.gamma))
 }
 
+/// By which factor the mean σ² of a component's own training atoms has grown since the start:
+/// tr(C⁻¹ C₀) / tr(C₀⁻¹ C₀), with the regularised inverses of both and the covariance C₀ of the training atoms about the
+/// centroid. `None` for components without statistics.
+pub fn mean_square_growth(before: &Component, now: &Component) -> Option<f64> {
+    let covariance = before.statistics()?.covariance();
+    // Both are symmetric.
+    let trace = |inverse: &[f64]| inverse.iter().zip(&covariance).map(|(a, b)| a * b).sum::<f64>();
+    let growth = trace(now.inverse()) / trace(before.inverse());
+    growth.is_finite().then_some(growth)
+}
+
 impl Default for ForgettingAlarm {
-    /// 20 %, well above the 2 to 9 % of fresh mixtures.
+    /// 20 %, well above the 2 to 9 % of fresh mixtures; and a mean σ² four times as large, which is σ twice as large.
     fn default() -> Self {
-        Self { share_above_one: Fraction::FIFTH }
+        Self { share_above_one: Fraction::FIFTH, mean_square_growth: Positive(4.0) }
     }
 }
 
 impl ForgettingAlarm {
-    /// Whether the live distribution of the training data's grades raises the alarm.
+    /// How near the alarm is for all sampled training atoms: it is raised above 1.
     ///
-    /// If the original mixture already exceeds the limit, the alarm requires that the live one is worse.
-    pub fn is_raised(&self, original: &GradeDistribution, live: &GradeDistribution) -> bool {
-        live.share_above_one > self.share_above_one.get() && live.share_above_one > original.share_above_one
+    /// If the original mixture already exceeds the limit, the live one must be worse.
+    pub fn level_of_share(&self, original: GradeDistribution, live: GradeDistribution) -> f64 {
+        if live.share_above_one > original.share_above_one {
+            live.share_above_one / self.share_above_one.get()
+        } else {
+            0.0
+        }
+    }
+
+    /// The same for an element; `original` is the share of its atoms with γ > 1 under the original mixture. A few of an
+    /// element's environments may be rare from the start, so the share must also have grown by half the limit.
+    pub fn level_of(&self, element: &ElementForgetting, original: Option<f64>) -> f64 {
+        let limit = self.share_above_one.get();
+        match element.share_above_one.zip(original) {
+            Some((share, original)) if share - original > 0.5 * limit => share / limit,
+            Some(_) => 0.0,
+            None => element.mean_square_growth / self.mean_square_growth.get(),
+        }
     }
 }
 

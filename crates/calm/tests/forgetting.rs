@@ -1,7 +1,9 @@
 //! Measures of forgetting.
 
-use calm::forgetting::{ForgettingAlarm, GradeDistribution, grade_distribution};
-use calm::{Artifact, Component, Grades};
+use calm::forgetting::{
+    ElementForgetting, ForgettingAlarm, GradeDistribution, grade_distribution, mean_square_growth,
+};
+use calm::{Artifact, Batch, ChangedComponent, Component, CovarianceUpdate, Grades};
 
 use crate::common::{assert_close, indices, model, numbers, peer};
 
@@ -19,12 +21,73 @@ fn the_distribution_is_made_of_order_statistics() {
 fn the_alarm_compares_live_with_original() {
     let share =
         |share_above_one| GradeDistribution { share_above_one, ..GradeDistribution::from_grades(&[0.5]) };
+    let is_raised =
+        |alarm: ForgettingAlarm, before, live| alarm.level_of_share(share(before), share(live)) > 1.0;
     let alarm = ForgettingAlarm::default();
-    assert!(!alarm.is_raised(&share(0.04), &share(0.2)) && alarm.is_raised(&share(0.04), &share(0.21)));
-    assert!(!alarm.is_raised(&share(0.3), &share(0.3)) && alarm.is_raised(&share(0.3), &share(0.31)));
+    assert!(!is_raised(alarm, 0.04, 0.2) && is_raised(alarm, 0.04, 0.21));
+    assert!(!is_raised(alarm, 0.3, 0.3) && is_raised(alarm, 0.3, 0.31));
     let alarm: ForgettingAlarm = toml::from_str("share_above_one = 0.3").unwrap();
-    assert!(!alarm.is_raised(&share(0.04), &share(0.25)));
+    assert!(!is_raised(alarm, 0.04, 0.25));
     assert!(toml::from_str::<ForgettingAlarm>("share = 0.3").is_err());
+}
+
+/// An element with a sample by its share, another by its covariances.
+#[test]
+fn the_alarm_looks_at_each_element() {
+    let element = |mean_square_growth, share_above_one| ElementForgetting {
+        element: "H".to_owned(),
+        mean_square_growth,
+        share_above_one,
+    };
+    let alarm = ForgettingAlarm::default();
+    let level = |growth, share, before| alarm.level_of(&element(growth, share), before);
+    assert_eq!(level(9.0, Some(0.3), Some(0.05)), 1.5);
+    assert_eq!(level(9.0, Some(0.3), Some(0.25)), 0.0, "many were rare from the start");
+    assert_eq!((level(9.0, None, None), level(2.0, None, None)), (2.25, 0.5));
+}
+
+/// The mean σ² of the training atoms after an update, from the covariances alone.
+#[test]
+fn the_growth_of_the_mean_square_is_that_of_the_training_atoms() {
+    let Some(folder) = peer("grace") else { return };
+    let file = folder.join("calm_build/features_uqtrain.npz");
+    let (elements, features) = (indices(&file, "elements"), numbers(&file, "features"));
+    let original = Artifact::load(folder.join("grace1l_tiny/gmm_artifacts.npz")).unwrap().mixture;
+    let dimension = original.dimension();
+    let mut grades = Grades::default();
+    grades.evaluate(&original, &elements, &features, None).unwrap();
+    // Twenty training atoms, pushed out along one direction of feature space.
+    let far: Vec<f64> = features[..20 * dimension]
+        .iter()
+        .enumerate()
+        .map(|(k, z)| if k % dimension == 0 { z + 5.0 } else { *z })
+        .collect();
+    let batch = Batch::new(&original, &elements[..20], &far).unwrap();
+    let changed = batch.updated(CovarianceUpdate::Convex { alpha: 0.4 }).unwrap();
+    assert!(!changed.is_empty());
+    for ChangedComponent { element, slot, component } in changed {
+        let before = original.component(element, slot).unwrap();
+        let own: Vec<usize> = (0..elements.len())
+            .filter(|atom| (elements[*atom], grades.component[*atom]) == (element, slot))
+            .collect();
+        let mean = |component: &Component| {
+            let square = |atom: &usize| {
+                let delta: Vec<f64> = features[atom * dimension..][..dimension]
+                    .iter()
+                    .zip(component.centroid())
+                    .map(|(z, centre)| z - centre)
+                    .collect();
+                let row = |k: usize| &component.inverse()[k * dimension..][..dimension];
+                let product = |k| row(k).iter().zip(&delta).map(|(s, d)| s * d).sum::<f64>();
+                (0..dimension).map(|k| delta[k] * product(k)).sum::<f64>()
+            };
+            own.iter().map(square).sum::<f64>() / own.len() as f64
+        };
+        let growth = mean_square_growth(before, &component).unwrap();
+        // Scatter and inverse in the file are rounded to f32.
+        assert_close("growth", &[growth], &[mean(&component) / mean(before)], 2e-3);
+        assert!(growth > 1.1, "{growth}");
+    }
 }
 
 /// √⟨σ²⟩/θ of the training atoms of a component, from its statistics alone: ⟨σ²⟩ = tr(S C).

@@ -22,7 +22,7 @@ use wire::messages::{Assignment, Outcome, Progress, Report};
 use wire::mixture::SharedMixture;
 use wire::shm_dir::ShmDir;
 use wire::transport::{Incoming, Transport, WorkItem};
-use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
+use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 const DOOR: &str = "CALMWALK_BENCH_DOOR";
 const TRIPS: usize = 2_000;
@@ -187,6 +187,7 @@ fn assignment(number: u64) -> Assignment {
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure: structure(108),
+        conditions: WalkConditions::default(),
         checkpoint: Some(vec![1; CHECKPOINT]),
         verdict: None,
         last_step: 1000,

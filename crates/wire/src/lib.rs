@@ -7,6 +7,7 @@ extern crate self as wire;
 
 pub mod block;
 mod bytes;
+pub mod conditions;
 mod control;
 pub mod ids;
 pub mod ipc;
@@ -18,5 +19,6 @@ pub mod shm_dir;
 pub mod transport;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};
+pub use conditions::WalkConditions;
 pub use ids::{CampaignId, CandidateId, ContentHash, IdError, Origin, WalkId};
 pub use mixture::{MixtureReader, SharedMixture, SharedMixtureError};

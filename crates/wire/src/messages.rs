@@ -6,6 +6,7 @@ use atoms::Structure;
 use serde::{Deserialize, Serialize};
 
 use crate::block::CandidateBlock;
+use crate::conditions::WalkConditions;
 use crate::ids::{CampaignId, Origin, WalkId};
 
 /// A piece of one walk, for any idle walker.
@@ -23,6 +24,8 @@ pub struct Assignment {
     pub random_walk: WalkId,
     /// Starting structure.
     pub seed_structure: Structure,
+    /// Temperature, τ and volume ramp.
+    pub conditions: WalkConditions,
     /// The walker's checkpoint of the walk; `None` at the start.
     #[serde(with = "crate::bytes::optional")]
     pub checkpoint: Option<Vec<u8>>,

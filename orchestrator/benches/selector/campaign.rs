@@ -8,13 +8,15 @@ use calm::forgetting::ForgettingAlarm;
 use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
-use orchestrator::selector::{Mode, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol};
+use orchestrator::selector::{
+    Mode, OnForgetting, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+};
 use store::{Campaign, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use wire::messages::{Assignment, Outcome, Report, WalkEnd};
 use wire::transport::Incoming;
-use wire::{CandidateBlock, ContentHash};
+use wire::{CandidateBlock, ContentHash, WalkConditions};
 
 use crate::recording::{CAMPAIGN, Model, crystal, progress};
 
@@ -37,10 +39,13 @@ pub fn settings(threshold: f64) -> Settings {
             stop: UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(1.25) }),
         },
         forgetting_alarm: ForgettingAlarm::default(),
+        on_forgetting: OnForgetting::default(),
         collection: CollectionRule::MaximumGrade(MaximumGrade { threshold: positive(threshold) }),
-        max_per_seed_structure: u32::MAX,
+        max_per_walk: u32::MAX,
+        max_per_seed_structure: None,
         max_structures: None,
         control: false,
+        control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),
         declined_feature_bytes: 1_000_000_000,
     }
@@ -65,7 +70,13 @@ pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
 
 /// The seed structures.
 pub fn seeds(walks: usize) -> Vec<SeedStructure> {
-    (0..walks).map(|k| SeedStructure { name: format!("fcc-{k}"), structure: crystal() }).collect()
+    (0..walks)
+        .map(|k| SeedStructure {
+            name: format!("fcc-{k}"),
+            structure: crystal(),
+            walks: vec![WalkConditions::default()],
+        })
+        .collect()
 }
 
 /// The campaign's database, with a label protocol, so that every accept queues a job.

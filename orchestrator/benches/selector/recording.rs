@@ -64,7 +64,7 @@ impl Model {
             elements.extend(grader.element_indices(&frame.structure).unwrap());
             features.extend_from_slice(evaluator.grace.features());
         }
-        let training = TrainingFrames::new(elements, features, &original).unwrap();
+        let training = TrainingFrames::new(&elements, &features, &original).unwrap();
         Self { grace, grader, original, training }
     }
 

@@ -5,7 +5,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use calm::Mixture;
-use calm::forgetting::grade_distribution;
 use orchestrator::reactor::commit_batch;
 use orchestrator::selector::{Scheduling, Settings};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
@@ -99,8 +98,8 @@ impl Stages {
         if !Arc::ptr_eq(before, after) {
             let search = || calm::update(before, &bonds.elements, view.features, &settings.search);
             timed(&mut self.search, search).unwrap();
-            let training = &model.training;
-            let watch = || grade_distribution(after, &training.elements, &training.features);
+            let mut training = model.training.clone();
+            let watch = || training.regrade(after, |_| true);
             timed(&mut self.watch, watch).unwrap();
         }
     }

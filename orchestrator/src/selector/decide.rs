@@ -3,9 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use calm::UpdateOutcome;
-use calm::forgetting::GradeDistribution;
 use calm::grade::maximum;
+use calm::rules::CovarianceUpdateKind;
+use calm::{UpdateOutcome, UpdateSettings};
 use serde_json::json;
 use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate, TRAINING_FRAMES};
 use wire::messages::{DeclineReason, Outcome, Verdict, WalkEnd};
@@ -13,8 +13,9 @@ use wire::{CandidateBlock, ContentHash, WalkId};
 
 use super::decision_state::DecisionState;
 use super::error::SelectorError;
+use super::forgetting::ForgettingState;
 use super::regrade::{RegradedCandidate, RegradedReport};
-use super::settings::UpdateProtocol;
+use super::settings::{OnForgetting, UpdateProtocol};
 use super::walk::Walk;
 
 /// Priority of label jobs of biased candidates; control frames come after them.
@@ -23,6 +24,8 @@ const CONTROL_PRIORITY: i32 = 0;
 
 /// Kind of the decision on a candidate that cannot be graded.
 pub(super) const LEFT_OUT: &str = "left_out";
+/// Kind of the decision that makes updates additive.
+pub(super) const FORGETTING: &str = "forgetting";
 
 impl DecisionState {
     /// Decides on the reports of a round, in order. `in_hand` contains the walks that walkers work on.
@@ -61,7 +64,7 @@ impl DecisionState {
                 Outcome::StepsDone | Outcome::Interrupted => {}
             }
         }
-        touched.extend(self.end_by_budget(in_hand, &mut commit));
+        touched.extend(self.end_by_limits(in_hand, &mut commit));
         touched.extend(self.start_controls(&mut commit));
         commit.walks = touched.iter().map(|id| self.walks[id].to_record()).collect();
         self.add_values(&mut commit);
@@ -124,10 +127,11 @@ impl DecisionState {
             }
         };
         let keep_features = self.should_keep_features(fate, &graded.block);
+        let alarm = detail["forgetting_alarm"] == true;
         self.record_decision(id, graded, fate, keep_features, detail, commit);
-        let walk = self.walk_mut(id);
-        walk.state.verdict = Some(verdict);
-        if walk.record.accepted >= self.settings.max_per_seed_structure {
+        self.act_on_alarm(id, alarm, commit);
+        self.walk_mut(id).state.verdict = Some(verdict);
+        if self.has_collected_enough(&self.walks[&id]) {
             self.end_walk(id, &WalkEnd::Collected, commit);
         }
         Ok(())
@@ -205,13 +209,13 @@ impl DecisionState {
         content: ContentHash,
         graded: &RegradedCandidate,
     ) -> Option<DeclineReason> {
-        let walk = &self.walks[&id].record;
-        let min_distances = &self.min_distances[walk.seed_structure as usize];
+        let walk = &self.walks[&id];
+        let min_distances = &self.min_distances[walk.record.seed_structure as usize];
         if min_distances.violation(&graded.bonds.shortest).is_some() {
             Some(DeclineReason::Guard)
         } else if self.known.contains(&content) {
             Some(DeclineReason::Duplicate)
-        } else if walk.accepted >= self.settings.max_per_seed_structure || self.is_budget_exhausted() {
+        } else if self.has_collected_enough(walk) || self.is_budget_exhausted() {
             Some(DeclineReason::Budget)
         } else if !self.settings.collection.is_met(&graded.selector.gamma) {
             Some(DeclineReason::Covered)
@@ -239,7 +243,7 @@ impl DecisionState {
         }
         let view = graded.block.view();
         let elements = &graded.bonds.elements;
-        let outcome = calm::update(&self.mixture, elements, view.features, &self.settings.search)
+        let outcome = calm::update(&self.mixture, elements, view.features, &self.update_settings())
             .map_err(|source| SelectorError::Update { candidate: view.id(), source })?;
         self.mixture = Arc::new(self.mixture.with_changes(&outcome.changed)?);
         for change in &outcome.changed {
@@ -247,14 +251,40 @@ impl DecisionState {
             commit.components.push(ComponentRecord { element, slot, bytes: change.component.to_bytes() });
         }
         detail["update"] = update_summary(&outcome);
-        if let Some(training) = &self.training {
-            let live = training.grades(&self.mixture)?;
-            detail["training_frames"] = json!(live);
-            let alarm = self.settings.forgetting_alarm.is_raised(&training.original, &live);
-            detail["forgetting_alarm"] = json!(alarm);
-            commit.values.push(training_frames(&live, alarm));
+        let changed = outcome.changed.iter().map(|change| (change.element, change.slot)).collect();
+        self.forgetting.update(&self.regrader.original, &self.mixture, &changed)?;
+        let state = self.forgetting_state();
+        if let Some(training) = state.training {
+            detail["training_frames"] = json!(training);
         }
+        detail["forgetting"] = json!({ "level": state.level, "elements": state.elements });
+        detail["forgetting_alarm"] = json!(state.is_alarming());
+        commit.values.push((TRAINING_FRAMES.to_owned(), state.to_json().to_string()));
         Ok(())
+    }
+
+    /// What the live mixture has forgotten.
+    pub fn forgetting_state(&self) -> ForgettingState {
+        self.forgetting.state(&self.regrader.original, self.settings.forgetting_alarm)
+    }
+
+    /// How the mixture is updated.
+    fn update_settings(&self) -> UpdateSettings {
+        let mut settings = self.settings.search.clone();
+        if self.switched_to_additive {
+            (settings.covariance_update, settings.alpha_values) = (CovarianceUpdateKind::Additive, None);
+        }
+        settings
+    }
+
+    /// Makes updates additive after an update that raised the alarm, if the campaign asks for it.
+    fn act_on_alarm(&mut self, id: WalkId, alarm: bool, commit: &mut Commit) {
+        let is_convex = self.settings.search.covariance_update == CovarianceUpdateKind::Convex;
+        let switches = self.settings.on_forgetting == OnForgetting::Additive && is_convex;
+        if alarm && switches && !self.switched_to_additive {
+            self.switched_to_additive = true;
+            commit.decisions.push(self.decision(FORGETTING, id, json!({ "covariance_update": "additive" })));
+        }
     }
 
     fn accept(&mut self, id: WalkId, content: ContentHash, step: u64) {
@@ -263,6 +293,8 @@ impl DecisionState {
         let walk = self.walk_mut(id);
         walk.record.accepted += 1;
         walk.state.accepted_steps.push(step);
+        let seed_structure = walk.record.seed_structure;
+        *self.accepted_by_seed.entry(seed_structure).or_default() += 1;
     }
 
     /// Features of accepted candidates are always stored, those of declined candidates within a limit.
@@ -290,30 +322,41 @@ impl DecisionState {
             "end": end, "reason": walk.record.reason, "step": walk.record.progress.step,
             "accepted": walk.record.accepted,
         });
-        let restart = walk.is_biased() && self.settings.update == UpdateProtocol::PerSeedStructure;
-        if restart {
+        let seed_structure = walk.is_biased().then_some(walk.record.seed_structure);
+        if seed_structure.is_some_and(|seed| self.restarts_mixture_after(seed)) {
             let next_version = self.mixture.version() + 1;
             self.mixture = Arc::new(self.regrader.original.at_version(next_version));
             commit.components.clear();
             commit.restart_mixture = true;
-            if let Some(training) = &self.training {
-                commit.values.push(training_frames(&training.original, false));
-            }
+            self.forgetting.restart();
+            let state = self.forgetting_state();
+            commit.values.push((TRAINING_FRAMES.to_owned(), state.to_json().to_string()));
         }
         commit.decisions.push(self.decision("ended", id, detail));
     }
 
-    /// Ends the unassigned biased walks once the campaign has its maximum number of structures.
-    fn end_by_budget(&mut self, in_hand: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> Vec<WalkId> {
-        if !self.is_budget_exhausted() {
+    /// Whether the next biased walk starts from another seed structure, and so from the original mixture.
+    fn restarts_mixture_after(&self, seed_structure: u32) -> bool {
+        let mut unfinished = self.walks.values().filter(|walk| walk.is_biased() && !walk.has_ended());
+        let next = unfinished.next().map(|walk| walk.record.seed_structure);
+        self.settings.update == UpdateProtocol::PerSeedStructure && next != Some(seed_structure)
+    }
+
+    /// Ends the unassigned biased walks once the campaign has its maximum number of structures, and those whose seed
+    /// structure has.
+    fn end_by_limits(&mut self, in_hand: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> Vec<WalkId> {
+        let campaign = self.is_budget_exhausted();
+        if !campaign && self.settings.max_per_seed_structure.is_none() {
             return Vec::new();
         }
-        let idle = |(id, walk): (&WalkId, &Walk)| {
-            (walk.is_biased() && !walk.has_ended() && !in_hand.contains_key(id)).then_some(*id)
+        let end = if campaign { WalkEnd::Budget } else { WalkEnd::Collected };
+        let is_over = |(id, walk): (&WalkId, &Walk)| {
+            let is_idle = walk.is_biased() && !walk.has_ended() && !in_hand.contains_key(id);
+            (is_idle && (campaign || self.has_collected_enough(walk))).then_some(*id)
         };
-        let idle: Vec<_> = self.walks.iter().filter_map(idle).collect();
-        idle.iter().for_each(|id| self.end_walk(*id, &WalkEnd::Budget, commit));
-        idle
+        let over: Vec<_> = self.walks.iter().filter_map(is_over).collect();
+        over.iter().for_each(|id| self.end_walk(*id, &end, commit));
+        over
     }
 
     /// Creates the control walks of biased walks that have ended. Returns all changed walks.
@@ -349,13 +392,6 @@ fn describe_end(end: &WalkEnd) -> String {
         WalkEnd::Trapped { guard } => format!("refused by the {guard} guard again and again"),
         WalkEnd::BlewUp { reason } | WalkEnd::BadStart { reason } => reason.clone(),
     }
-}
-
-/// The value that shows how well the mixture still covers the training frames.
-fn training_frames(grades: &GradeDistribution, alarm: bool) -> (String, String) {
-    let mut value = json!(grades);
-    value["alarm"] = json!(alarm);
-    (TRAINING_FRAMES.to_owned(), value.to_string())
 }
 
 fn grade_summary(gamma: &[f64], mixture_version: u64) -> serde_json::Value {

@@ -1,6 +1,6 @@
 //! The state that decisions depend on, and its restoration from the store.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 
 use atoms::MinDistances;
@@ -12,12 +12,16 @@ use wire::{ContentHash, WalkId};
 
 use super::backlog::Backlog;
 use super::error::SelectorError;
+use super::forgetting::Forgetting;
 use super::regrade::Regrader;
 use super::rules::{ChangeableRules, RULES};
 use super::settings::{SeedStructure, SelectorSnapshot, Settings};
 use super::training_frames::TrainingFrames;
 use super::walk::Walk;
 use crate::grader::Grader;
+
+/// Name of the value that tells that updates have become additive.
+const ADDITIVE: &str = "additive_updates";
 
 /// Decides on candidates and walks.
 pub(super) struct DecisionState {
@@ -26,12 +30,16 @@ pub(super) struct DecisionState {
     pub min_distances: Vec<MinDistances>,
     pub regrader: Regrader,
     pub mixture: Arc<Mixture>,
-    pub training: Option<TrainingFrames>,
+    pub forgetting: Forgetting,
+    /// Updates are additive from here on: the mixture had forgotten too much.
+    pub switched_to_additive: bool,
     pub walks: BTreeMap<WalkId, Walk>,
     pub known: HashSet<ContentHash>,
     /// Number of started rounds; always 0 in live mode.
     pub round: u64,
     pub accepted: u32,
+    /// Number of structures accepted from the biased walks of each seed structure.
+    pub accepted_by_seed: HashMap<u32, u32>,
     pub declined_feature_bytes: u64,
     /// Number of candidates that could not be graded.
     pub left_out: u64,
@@ -66,18 +74,27 @@ impl DecisionState {
         let left_out = value(store::records::LEFT_OUT)?;
         let staleness = restored(STALENESS, &snapshot.values)?.unwrap_or_default();
         let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
+        let mut forgetting = Forgetting::new(grader.symbols(), training);
+        let changed =
+            snapshot.components.iter().map(|record| (record.element as usize, record.slot as usize));
+        forgetting.update(&original, &mixture, &changed.collect())?;
         let walks = restored_walks(snapshot.walks, seeds.len())?;
-        let accepted = walks.values().filter(|walk| walk.is_biased()).map(|walk| walk.record.accepted).sum();
+        let mut accepted_by_seed = HashMap::new();
+        for Walk { record, .. } in walks.values().filter(|walk| walk.is_biased()) {
+            *accepted_by_seed.entry(record.seed_structure).or_default() += record.accepted;
+        }
         Ok(Self {
             settings,
             min_distances,
             regrader: Regrader { grader: Arc::new(grader), original },
             mixture,
-            training,
+            forgetting,
+            switched_to_additive: value(ADDITIVE)? > 0,
             walks,
             known: snapshot.known.into_iter().collect(),
             round,
-            accepted,
+            accepted: accepted_by_seed.values().sum(),
+            accepted_by_seed,
             declined_feature_bytes,
             left_out,
             staleness,
@@ -104,6 +121,9 @@ impl DecisionState {
         commit.values.extend(values.map(|(name, value)| (name.to_owned(), value.to_string())));
         if !commit.candidates.is_empty() {
             commit.values.push((STALENESS.to_owned(), json!(self.staleness).to_string()));
+        }
+        if self.switched_to_additive {
+            commit.values.push((ADDITIVE.to_owned(), "1".to_owned()));
         }
         if self.left_out > 0 {
             commit.values.push((store::records::LEFT_OUT.to_owned(), self.left_out.to_string()));

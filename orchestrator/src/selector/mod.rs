@@ -13,6 +13,7 @@ mod backlog;
 mod decide;
 mod decision_state;
 mod error;
+mod forgetting;
 mod regrade;
 mod replay;
 mod rules;
@@ -27,6 +28,7 @@ use std::sync::Arc;
 
 use calm::Mixture;
 use store::records::{Commit, WalkRecord};
+use wire::conditions::VariedConditions;
 use wire::messages::{Outcome, Report, WalkEnd};
 use wire::{CampaignId, WalkId};
 
@@ -37,7 +39,7 @@ pub use error::SelectorError;
 pub use regrade::{RegradedCandidate, RegradedReport, Regrader};
 pub use replay::{Replay, ReplayError, ReplayedDecision};
 pub use scheduling::Scheduling;
-pub use settings::{Mode, SeedStructure, SelectorSnapshot, Settings, UpdateProtocol};
+pub use settings::{Mode, OnForgetting, SeedStructure, SelectorSnapshot, Settings, UpdateProtocol};
 pub use training_frames::TrainingFrames;
 use walk::Walk;
 
@@ -76,10 +78,18 @@ impl Selector {
         &self.decisions.mixture
     }
 
+    /// How near the alarm over a mixture that forgets its training data is: it is raised above 1.
+    pub fn forgetting_level(&self) -> f64 {
+        self.decisions.forgetting_state().level
+    }
+
     /// Every walk, for display: name of its seed structure, and its step (`last` if it has ended).
     pub fn walk_progress(&self, last: u64) -> Vec<(WalkId, String, u64)> {
+        let varied =
+            VariedConditions::among(self.decisions.walks.values().map(|walk| &walk.record.conditions));
         let standing = |walk: &Walk| {
             let name = &self.seeds[walk.record.seed_structure as usize].name;
+            let name = varied.name(name, &walk.record.conditions);
             let control = if walk.is_biased() { "" } else { " (control)" };
             let step = if walk.has_ended() { last } else { walk.record.progress.step };
             (walk.record.walk, format!("{name}{control}"), step)

@@ -3,7 +3,7 @@
 //! The actions of walkers are taken from the log: which structures they offered and when, rollbacks, and ends of walks.
 //! The decisions are made again. With the same rules, every decision must be the same.
 
-use std::collections::HashSet;
+use std::collections::{HashSet, VecDeque};
 use std::sync::Arc;
 
 use calm::Mixture;
@@ -12,9 +12,9 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, LoggedDecision};
 use wire::messages::WalkEnd;
-use wire::{ContentHash, WalkId};
+use wire::{ContentHash, WalkConditions, WalkId};
 
-use super::decide::LEFT_OUT;
+use super::decide::{FORGETTING, LEFT_OUT};
 use super::decision_state::{DecisionState, restored_mixture};
 use super::rules::CONFIGURATION;
 use super::{
@@ -65,8 +65,8 @@ pub struct Replay {
     imported: Vec<ContentHash>,
     /// Configuration keys that differ from the campaign's.
     set: HashSet<String>,
-    /// The end of a walk that resulted from the last candidate.
-    ended: Option<Decision>,
+    /// Decisions that followed from the last candidate: a switch to additive updates, the end of the walk.
+    following: VecDeque<Decision>,
     cut_short: u64,
 }
 
@@ -85,7 +85,7 @@ impl Replay {
         let decisions =
             DecisionState::restore(settings, &seeds, grader, original, training, SelectorSnapshot::default());
         let decisions = decisions.map_err(|source| ReplayError::Settings(Box::new(source)))?;
-        Ok(Self { decisions, seeds, imported, set, ended: None, cut_short: 0 })
+        Ok(Self { decisions, seeds, imported, set, following: VecDeque::new(), cut_short: 0 })
     }
 
     /// Whether all rules are the same. Only then are control walks and their frames replayed: they do not affect
@@ -122,7 +122,7 @@ impl Replay {
         candidate: Option<RegradedCandidate>,
     ) -> Result<Option<ReplayedDecision>, ReplayError> {
         self.decisions.round = recorded.round;
-        let ended = self.ended.take();
+        let expected = self.expected(recorded);
         let decision = match recorded.kind.as_str() {
             "accepted" | "declined" | "control" => return self.candidate(recorded, candidate),
             "imported" => Some(self.import(recorded)?),
@@ -131,13 +131,30 @@ impl Replay {
             "resumed" => self.resume(recorded)?,
             "segment" => self.segment(recorded)?,
             LEFT_OUT => self.left_out(recorded)?,
-            "ended" => match ended {
-                Some(ended) if ended.walk.map(|walk| walk.0) == recorded.walk => Some(ended),
-                _ => self.end(recorded)?,
+            // With other rules it may not come to that, or earlier.
+            FORGETTING => expected,
+            "ended" => match expected {
+                Some(ended) => Some(ended),
+                None => self.end(recorded)?,
             },
             _ => return Err(damaged(recorded, "its kind is unknown to this version")),
         };
         Ok(decision.map(|decision| ReplayedDecision { decision, candidate: None }))
+    }
+
+    /// The decision that followed from the last candidate and is recorded here.
+    fn expected(&mut self, recorded: &LoggedDecision) -> Option<Decision> {
+        let same =
+            |next: &Decision| next.kind == recorded.kind && next.walk.map(|walk| walk.0) == recorded.walk;
+        let place = self.following.iter().position(same);
+        match place {
+            Some(place) => self.following.drain(..=place).next_back(),
+            None if recorded.kind == FORGETTING => None,
+            None => {
+                self.following.clear();
+                None
+            }
+        }
     }
 
     fn candidate(
@@ -162,7 +179,7 @@ impl Replay {
         })?;
         let mut decisions = commit.decisions.into_iter();
         let decision = decisions.next();
-        self.ended = decisions.next();
+        self.following = decisions.collect();
         let candidate = commit.candidates.pop();
         Ok(decision.map(|decision| ReplayedDecision { decision, candidate }))
     }
@@ -201,17 +218,24 @@ impl Replay {
         #[derive(Deserialize)]
         #[serde(untagged)]
         enum Detail {
-            Biased { seed_structure: String },
-            Control { control_of: WalkId },
+            Biased {
+                seed_structure: String,
+                /// Campaigns of early versions have the same conditions in all walks.
+                #[serde(default)]
+                conditions: WalkConditions,
+            },
+            Control {
+                control_of: WalkId,
+            },
         }
         // With other rules there are no control walks, but walks keep their numbers from the log.
         let id = if self.is_exact() { self.decisions.next_walk_id() } else { walk(recorded)? };
         match read(recorded)? {
-            Detail::Biased { seed_structure: name } => {
+            Detail::Biased { seed_structure: name, conditions } => {
                 let seed = self.seeds.iter().position(|seed| seed.name == name);
                 let seed =
                     seed.ok_or_else(|| damaged(recorded, &format!("there is no seed structure '{name}'")))?;
-                Ok(Some(self.decisions.start_walk(id, seed, &name)))
+                Ok(Some(self.decisions.start_walk(id, seed, &name, conditions)))
             }
             Detail::Control { control_of } if self.is_exact() => {
                 let is_there = self.decisions.walks.contains_key(&control_of);
@@ -247,7 +271,7 @@ impl Replay {
         self.decisions.leave_out(id, step, &error, &mut commit);
         let mut decisions = commit.decisions.into_iter();
         let decision = decisions.next();
-        self.ended = decisions.next();
+        self.following = decisions.collect();
         Ok(decision)
     }
 
@@ -260,7 +284,9 @@ impl Replay {
         }
         let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
         let Detail { end, reason, step } = read(recorded)?;
-        let collected = end == WalkEnd::Collected.name();
+        // Other walks of its seed structure may have collected enough.
+        let enough = self.decisions.has_collected_enough(&self.decisions.walks[&id]);
+        let collected = end == WalkEnd::Collected.name() && !enough;
         if collected && self.is_exact() {
             // The selector itself would have ended the walk.
             return Ok(None);

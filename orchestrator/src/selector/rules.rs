@@ -2,7 +2,7 @@
 //! log.
 
 use calm::forgetting::ForgettingAlarm;
-use calm::rules::Fraction;
+use calm::rules::{Fraction, Positive};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -15,15 +15,21 @@ pub(super) const CONFIGURATION: &str = "configuration";
 /// The settings that may change and that affect decisions, by configuration key.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ChangeableRules {
+    /// See [`Settings::max_per_walk`].
+    #[serde(rename = "collect.max_per_walk")]
+    pub max_per_walk: u32,
     /// See [`Settings::max_per_seed_structure`].
     #[serde(rename = "collect.max_per_seed_structure")]
-    pub max_per_seed_structure: u32,
+    pub max_per_seed_structure: Option<u32>,
     /// See [`Settings::max_structures`]: the smallest of the configured limits.
     #[serde(rename = "collect.max_structures")]
     pub max_structures: Option<u32>,
     /// See [`ForgettingAlarm`].
     #[serde(rename = "calm.forgetting_alarm")]
     pub forgetting_alarm: Fraction,
+    /// See [`ForgettingAlarm`].
+    #[serde(rename = "calm.max_mean_square_growth")]
+    pub max_mean_square_growth: Positive,
 }
 
 impl ChangeableRules {
@@ -38,16 +44,26 @@ impl Settings {
     /// The rules that may change.
     pub fn changeable_rules(&self) -> ChangeableRules {
         ChangeableRules {
+            max_per_walk: self.max_per_walk,
             max_per_seed_structure: self.max_per_seed_structure,
             max_structures: self.max_structures,
             forgetting_alarm: self.forgetting_alarm.share_above_one,
+            max_mean_square_growth: self.forgetting_alarm.mean_square_growth,
         }
     }
 
     /// Applies changed rules.
     pub fn apply_rules(&mut self, rules: &ChangeableRules) {
-        let ChangeableRules { max_per_seed_structure, max_structures, forgetting_alarm } = *rules;
-        (self.max_per_seed_structure, self.max_structures) = (max_per_seed_structure, max_structures);
-        self.forgetting_alarm = ForgettingAlarm { share_above_one: forgetting_alarm };
+        let ChangeableRules {
+            max_per_walk,
+            max_per_seed_structure,
+            max_structures,
+            forgetting_alarm,
+            max_mean_square_growth,
+        } = *rules;
+        (self.max_per_walk, self.max_structures) = (max_per_walk, max_structures);
+        self.max_per_seed_structure = max_per_seed_structure;
+        self.forgetting_alarm =
+            ForgettingAlarm { share_above_one: forgetting_alarm, mean_square_growth: max_mean_square_growth };
     }
 }

@@ -4,7 +4,7 @@ use wire::WalkId;
 use wire::messages::Assignment;
 
 use super::walk::Walk;
-use super::{Mode, Selector};
+use super::{Mode, Selector, Settings};
 
 /// What an idle walker does next.
 #[derive(Debug)]
@@ -30,10 +30,37 @@ impl Selector {
             };
             (in_turn && !self.in_hand.contains_key(id) && !self.paused.contains(id)).then_some(*id)
         };
-        if let Some(id) = self.decisions.walks.iter().find_map(ready) {
+        let controls_first = self.controls_are_due();
+        let mut candidates =
+            self.decisions.walks.iter().filter_map(|walk| Some((walk.1.is_biased(), ready(walk)?)));
+        let next = match controls_first {
+            // Rounds have as many control walks as biased ones.
+            None => candidates.next().map(|(_, id)| id),
+            Some(control) => {
+                let mut other = None;
+                let preferred = candidates.find_map(|(biased, id)| {
+                    if biased != control {
+                        return Some(id);
+                    }
+                    other.get_or_insert(id);
+                    None
+                });
+                preferred.or(other)
+            }
+        };
+        if let Some(id) = next {
             return Scheduling::Assign(Box::new(self.assign(id, walker)));
         }
         if self.is_done() { Scheduling::Done } else { Scheduling::Wait }
+    }
+
+    /// Whether the next assignment goes to a control walk, if one is ready: fewer have one in hand than their share.
+    /// `None` in reproducible mode.
+    fn controls_are_due(&self) -> Option<bool> {
+        let Settings { mode, control_share, .. } = self.decisions.settings;
+        let is_control = |id: &WalkId| self.decisions.walks.get(id).is_some_and(|walk| !walk.is_biased());
+        let controls = self.in_hand.keys().filter(|id| is_control(id)).count() as f64;
+        (mode == Mode::Live).then(|| controls < control_share * (self.in_hand.len() + 1) as f64)
     }
 
     /// Whether every walk has ended.
@@ -46,9 +73,9 @@ impl Selector {
         self.in_hand.contains_key(&id)
     }
 
-    /// Whether any walker has a walk in hand.
-    pub fn has_assignments(&self) -> bool {
-        !self.in_hand.is_empty()
+    /// Number of walks that walkers have in hand.
+    pub fn assignments(&self) -> usize {
+        self.in_hand.len()
     }
 
     /// The walk that this walker has in hand.
@@ -86,6 +113,7 @@ impl Selector {
             origin: walk.record.origin,
             random_walk: walk.record.partner.unwrap_or(id),
             seed_structure: self.seeds[walk.record.seed_structure as usize].structure.clone(),
+            conditions: walk.record.conditions.clone(),
             checkpoint: walk.record.checkpoint.clone(),
             verdict: walk.state.verdict.clone(),
             last_step: walk.state.until,

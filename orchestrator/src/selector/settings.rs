@@ -5,7 +5,7 @@ use calm::forgetting::ForgettingAlarm;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use store::records::{ComponentRecord, WalkRecord};
-use wire::ContentHash;
+use wire::{ContentHash, WalkConditions};
 
 /// Whether a campaign is reproducible bit by bit, or walks never wait for each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -39,6 +39,19 @@ pub enum UpdateProtocol {
     Never,
 }
 
+/// What happens when the mixture has forgotten too much of the training data.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnForgetting {
+    /// The campaign says so and goes on.
+    #[default]
+    Warn,
+    /// The run stops in order, and goes on when the limit is raised.
+    Pause,
+    /// Later updates are additive, and forget nothing more.
+    Additive,
+}
+
 /// The settings of the selector.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -52,29 +65,37 @@ pub struct Settings {
     pub update: UpdateProtocol,
     /// How the covariance is updated, and when the search for α stops.
     pub search: calm::UpdateSettings,
-    /// When the grades of the training frames raise an alarm.
+    /// When the mixture has forgotten too much of the training data.
     pub forgetting_alarm: ForgettingAlarm,
+    /// What happens then.
+    pub on_forgetting: OnForgetting,
     /// When a structure is a candidate.
     pub collection: calm::CollectionRule,
-    /// Maximum number of structures accepted from one seed structure.
-    pub max_per_seed_structure: u32,
+    /// Maximum number of structures accepted from one walk.
+    pub max_per_walk: u32,
+    /// Maximum number of structures accepted from all walks of one seed structure.
+    pub max_per_seed_structure: Option<u32>,
     /// Maximum number of structures accepted in the campaign.
     pub max_structures: Option<u32>,
     /// Whether each biased walk that collected structures is followed by its unbiased control walk.
     pub control: bool,
+    /// Share of the walkers that work on control walks while there are any (live mode).
+    pub control_share: f64,
     /// How close atoms may come. Structures with closer atoms are declined.
     pub min_distances: MinDistanceRule,
     /// Maximum size of the stored feature vectors of declined candidates, bytes.
     pub declined_feature_bytes: u64,
 }
 
-/// The start of a walk.
+/// The start of walks.
 #[derive(Clone, Debug)]
 pub struct SeedStructure {
     /// Name.
     pub name: String,
     /// Structure.
     pub structure: Structure,
+    /// The conditions of each of its biased walks, in order.
+    pub walks: Vec<WalkConditions>,
 }
 
 /// The state of a selector, as restored from a store.

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 use store::records::{Commit, Decision};
-use wire::WalkId;
+use wire::{WalkConditions, WalkId};
 
 use super::SeedStructure;
 use super::decision_state::DecisionState;
@@ -23,9 +23,9 @@ impl DecisionState {
         self.log_rule_changes(&mut commit);
         self.resume_walks(&mut commit);
         let begun = self.walks.values().filter(|walk| walk.is_biased()).count();
-        for (seed, SeedStructure { name, .. }) in seeds.iter().enumerate().skip(begun) {
+        for (seed, SeedStructure { name, .. }, conditions) in planned_walks(seeds).skip(begun) {
             let id = self.next_walk_id();
-            commit.decisions.push(self.start_walk(id, seed, name));
+            commit.decisions.push(self.start_walk(id, seed, name, conditions.clone()));
             commit.walks.push(self.walks[&id].to_record());
         }
         self.add_values(&mut commit);
@@ -50,10 +50,17 @@ impl DecisionState {
         Decision { walk: None, ..self.decision(kind, WalkId(0), detail) }
     }
 
-    /// Creates the biased walk of the seed structure with this name.
-    pub fn start_walk(&mut self, id: WalkId, seed: usize, name: &str) -> Decision {
-        self.walks.insert(id, Walk::new(id, seed as u32, self.settings.steps_per_assignment));
-        self.decision("begun", id, json!({ "seed_structure": name }))
+    /// Creates a biased walk of the seed structure with this name.
+    pub fn start_walk(
+        &mut self,
+        id: WalkId,
+        seed: usize,
+        name: &str,
+        conditions: WalkConditions,
+    ) -> Decision {
+        let detail = json!({ "seed_structure": name, "conditions": conditions });
+        self.walks.insert(id, Walk::new(id, seed as u32, conditions, self.settings.steps_per_assignment));
+        self.decision("begun", id, detail)
     }
 
     fn resume_walks(&mut self, commit: &mut Commit) {
@@ -67,9 +74,14 @@ impl DecisionState {
     /// Whether a walk ended only because of a limit that is no longer reached.
     pub fn can_resume(&self, id: WalkId) -> bool {
         let walk = &self.walks[&id];
-        !self.is_budget_exhausted()
-            && walk.ended_by_budget()
-            && walk.record.accepted < self.settings.max_per_seed_structure
+        !self.is_budget_exhausted() && walk.ended_by_budget() && !self.has_collected_enough(walk)
+    }
+
+    /// Whether a walk, or all walks of its seed structure together, have their maximum number of structures.
+    pub fn has_collected_enough(&self, walk: &Walk) -> bool {
+        let of_seed = self.accepted_by_seed.get(&walk.record.seed_structure).copied().unwrap_or(0);
+        walk.record.accepted >= self.settings.max_per_walk
+            || self.settings.max_per_seed_structure.is_some_and(|most| of_seed >= most)
     }
 
     /// Resumes a walk that has ended.
@@ -86,4 +98,10 @@ impl DecisionState {
     pub fn next_walk_id(&self) -> WalkId {
         WalkId(self.walks.len() as u32)
     }
+}
+
+/// The biased walks of a campaign, in order: those of the first seed structure, then those of the next.
+fn planned_walks(seeds: &[SeedStructure]) -> impl Iterator<Item = (usize, &SeedStructure, &WalkConditions)> {
+    let of_seed = |(index, seed)| move |conditions| (index, seed, conditions);
+    seeds.iter().enumerate().flat_map(move |(index, seed)| seed.walks.iter().map(of_seed((index, seed))))
 }

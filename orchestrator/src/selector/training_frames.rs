@@ -1,51 +1,106 @@
-//! The frames that the potential was trained on.
+//! A sample of the atoms that the potential was trained on.
 
+use std::ops::Range;
 use std::panic::resume_unwind;
 use std::thread::{self, available_parallelism};
 
-use calm::forgetting::{GradeDistribution, grade_distribution};
+use calm::forgetting::GradeDistribution;
 use calm::{GradeError, Grades, Mixture};
 
 use super::error::SelectorError;
 
-/// Features of the original training frames. Their γ under the live mixture is monitored: the mixture must not forget
-/// what the potential was trained on.
+/// Features of original training atoms. Their γ under the live mixture is monitored: the mixture must not forget what the
+/// potential was trained on.
 #[derive(Clone, Debug)]
 pub struct TrainingFrames {
-    /// Element index of each atom.
-    pub elements: Vec<usize>,
+    /// The atoms of each element follow one another: element index and place of each.
+    elements: Vec<(usize, Range<usize>)>,
     /// Features, [atoms × D].
-    pub features: Vec<f64>,
-    /// Their grades under the original mixture.
-    pub original: GradeDistribution,
+    features: Vec<f64>,
+    /// γ of each atom under the original mixture.
+    original: Vec<f64>,
+    /// γ of each atom under the live mixture.
+    live: Vec<f64>,
 }
 
 impl TrainingFrames {
-    /// Training frames with these features; grades them under the original mixture.
-    pub fn new(elements: Vec<usize>, features: Vec<f64>, original: &Mixture) -> Result<Self, GradeError> {
-        let original = grade_distribution(original, &elements, &features)?;
-        Ok(Self { elements, features, original })
+    /// Takes atoms with these element indices, [n], and features, [n × D], and grades them under the original mixture.
+    pub fn new(elements: &[usize], features: &[f64], original: &Mixture) -> Result<Self, GradeError> {
+        let dimension = original.dimension();
+        let mut order: Vec<usize> = (0..elements.len()).collect();
+        order.sort_by_key(|atom| elements[*atom]);
+        let sorted: Vec<usize> = order.iter().map(|atom| elements[*atom]).collect();
+        let sorted_features: Vec<f64> =
+            order.iter().flat_map(|atom| &features[atom * dimension..][..dimension]).copied().collect();
+        let mut first = 0;
+        let ranges = sorted.chunk_by(|a, b| a == b).map(|atoms| {
+            let range = first..first + atoms.len();
+            first = range.end;
+            (atoms[0], range)
+        });
+        let gamma = gamma(original, &sorted, &sorted_features)?;
+        Ok(Self {
+            elements: ranges.collect(),
+            features: sorted_features,
+            live: gamma.clone(),
+            original: gamma,
+        })
     }
 
-    /// Their grades under another mixture, computed on all cores, since atoms are independent.
-    pub(super) fn grades(&self, mixture: &Mixture) -> Result<GradeDistribution, SelectorError> {
-        let cores = available_parallelism().map_or(1, |cores| cores.get());
-        let atoms = self.elements.len().div_ceil(cores).max(1);
-        let parts = self.elements.chunks(atoms).zip(self.features.chunks(atoms * mixture.dimension()));
-        let gamma = thread::scope(|scope| {
-            let parts: Vec<_> = parts
-                .map(|(elements, features)| scope.spawn(move || gamma(mixture, elements, features)))
-                .collect();
-            let gammas =
-                parts.into_iter().map(|part| part.join().unwrap_or_else(|panic| resume_unwind(panic)));
-            gammas.collect::<Result<Vec<_>, _>>()
-        });
-        let gamma = gamma.map_err(|source| SelectorError::Training { source })?;
-        Ok(GradeDistribution::from_grades(&gamma.concat()))
+    /// The distribution under the original mixture.
+    pub fn original(&self) -> GradeDistribution {
+        GradeDistribution::from_grades(&self.original)
+    }
+
+    /// The distribution under the live mixture.
+    pub(super) fn live(&self) -> GradeDistribution {
+        GradeDistribution::from_grades(&self.live)
+    }
+
+    /// The same of one element: original and live. `None` without atoms of it.
+    pub(super) fn of_element(&self, element: usize) -> Option<[GradeDistribution; 2]> {
+        let (_, range) = self.elements.iter().find(|(known, _)| *known == element)?;
+        Some([&self.original, &self.live].map(|gamma| GradeDistribution::from_grades(&gamma[range.clone()])))
+    }
+
+    /// Grades the atoms again whose element is among `changed`; those of others have the same grades as before.
+    pub fn regrade(
+        &mut self,
+        mixture: &Mixture,
+        changed: impl Fn(usize) -> bool,
+    ) -> Result<(), SelectorError> {
+        let dimension = mixture.dimension();
+        for (element, range) in self.elements.iter().filter(|(element, _)| changed(*element)) {
+            let features = &self.features[range.start * dimension..range.end * dimension];
+            let graded = gamma(mixture, &vec![*element; range.len()], features);
+            self.live[range.clone()]
+                .copy_from_slice(&graded.map_err(|source| SelectorError::Training { source })?);
+        }
+        Ok(())
+    }
+
+    /// The original mixture is in force again.
+    pub(super) fn restart(&mut self) {
+        self.live.clone_from(&self.original);
     }
 }
 
+/// Grades on all cores, since atoms are independent.
 fn gamma(mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result<Vec<f64>, GradeError> {
+    let cores = available_parallelism().map_or(1, |cores| cores.get());
+    let atoms = elements.len().div_ceil(cores).max(1);
+    let parts = elements.chunks(atoms).zip(features.chunks(atoms * mixture.dimension()));
+    let gamma = thread::scope(|scope| {
+        let parts: Vec<_> = parts
+            .map(|(elements, features)| scope.spawn(move || part_gamma(mixture, elements, features)))
+            .collect();
+        let gammas = parts.into_iter().map(|part| part.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        gammas.collect::<Result<Vec<_>, _>>()
+    });
+    Ok(gamma?.concat())
+}
+
+fn part_gamma(mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result<Vec<f64>, GradeError> {
     let mut grades = Grades::default();
     grades.evaluate(mixture, elements, features, None)?;
     Ok(grades.gamma)

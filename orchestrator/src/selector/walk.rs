@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use store::records::WalkRecord;
 use wire::messages::{Progress, Report, Verdict, WalkEnd};
-use wire::{Origin, WalkId};
+use wire::{Origin, WalkConditions, WalkId};
 
 use super::error::SelectorError;
 
@@ -31,12 +31,13 @@ pub(super) struct SelectorState {
 }
 
 impl Walk {
-    pub fn new(walk: WalkId, seed_structure: u32, until: u64) -> Self {
+    pub fn new(walk: WalkId, seed_structure: u32, conditions: WalkConditions, until: u64) -> Self {
         let record = WalkRecord {
             walk,
             origin: Origin::Biased,
             partner: None,
             seed_structure,
+            conditions,
             state: "waiting".to_owned(),
             reason: String::new(),
             turn: 0,
@@ -55,7 +56,7 @@ impl Walk {
 
     /// The unbiased control of a biased walk, with frames at the steps where the biased walk collected.
     pub fn new_control(&mut self, walk: WalkId, steps_per_assignment: u64) -> Self {
-        let mut control = Self::new(walk, self.record.seed_structure, 0);
+        let mut control = Self::new(walk, self.record.seed_structure, self.record.conditions.clone(), 0);
         control.record.origin = Origin::Control;
         control.record.partner = Some(self.record.walk);
         let wanted = &mut control.state.wanted;

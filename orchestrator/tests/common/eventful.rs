@@ -2,26 +2,42 @@
 
 use std::sync::Arc;
 
-use orchestrator::selector::{Mode, Scheduling, Selector, SelectorSnapshot, Settings, UpdateProtocol};
+use orchestrator::selector::{
+    Mode, OnForgetting, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use store::records::Commit;
+use wire::WalkConditions;
 use wire::messages::Outcome;
 use wire::transport::WorkItem;
 
 use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
-use super::{restore, settings};
+use super::{CAMPAIGN, grader, mixture, seed, settings};
 
 /// Number of label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
 
 fn open(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
-    let mut selector = restore(settings, seeds, snapshot);
+    let seeds = (0..seeds).map(|number| SeedStructure { walks: walks_of(number), ..seed(number) }).collect();
+    let selector = Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), None, snapshot);
+    let mut selector = selector.unwrap();
     if settings.mode == Mode::Live {
         selector.raise_threshold_above(QUEUE_LIMIT);
     }
     selector
+}
+
+/// Every other seed structure has two walks.
+fn walks_of(seed: usize) -> Vec<WalkConditions> {
+    let walk = |repeat| WalkConditions { repeat, ..WalkConditions::default() };
+    (0..1 + seed as u32 % 2).map(walk).collect()
+}
+
+/// Number of biased walks of so many seed structures.
+pub fn biased_walks(seeds: usize) -> usize {
+    (0..seeds).map(|seed| walks_of(seed).len()).sum()
 }
 
 /// The next event of a campaign.
@@ -84,15 +100,22 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
         UpdateProtocol::PerSeedStructure,
         UpdateProtocol::Never,
     ]);
-    (1..5_usize, update, 1..6_u32, prop::option::of(1..12_u32), any::<bool>(), 0..300_u64).prop_map(
-        |(walks, update, max_per_seed_structure, total, control, declined_feature_bytes)| Settings {
-            walks_per_round: if update == UpdateProtocol::PerSeedStructure { 1 } else { walks },
-            update,
-            max_per_seed_structure,
-            max_structures: total,
-            control,
-            declined_feature_bytes,
-            ..settings(Mode::Reproducible)
+    let limits = (1..6_u32, prop::option::of(1..8_u32), prop::option::of(1..12_u32));
+    let on_forgetting = prop::sample::select(vec![OnForgetting::Warn, OnForgetting::Additive]);
+    (1..5_usize, update, limits, any::<bool>(), 0..300_u64, on_forgetting).prop_map(
+        |(walks, update, limits, control, declined_feature_bytes, on_forgetting)| {
+            let (max_per_walk, max_per_seed_structure, total) = limits;
+            Settings {
+                walks_per_round: if update == UpdateProtocol::PerSeedStructure { 1 } else { walks },
+                update,
+                max_per_walk,
+                max_per_seed_structure,
+                max_structures: total,
+                control,
+                declined_feature_bytes,
+                on_forgetting,
+                ..settings(Mode::Reproducible)
+            }
         },
     )
 }

@@ -13,11 +13,12 @@ use calm::{
 };
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    Mode, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol,
+    Mode, OnForgetting, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, TrainingFrames,
+    UpdateProtocol,
 };
 use store::records::{AtomGrades, Commit};
 use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash};
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, WalkConditions};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const DIMENSION: usize = 3;
@@ -58,6 +59,7 @@ pub fn seed(number: usize) -> SeedStructure {
     SeedStructure {
         name: format!("seed-{number}"),
         structure: structure(1_000_000 + number as u64, SHORTEST),
+        walks: vec![WalkConditions::default()],
     }
 }
 
@@ -81,10 +83,13 @@ pub fn settings(mode: Mode) -> Settings {
             stop: UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(1.25) }),
         },
         forgetting_alarm: ForgettingAlarm::default(),
+        on_forgetting: OnForgetting::default(),
         collection: CollectionRule::MaximumGrade(MaximumGrade { threshold: positive(1.5) }),
-        max_per_seed_structure: 3,
+        max_per_walk: 3,
+        max_per_seed_structure: None,
         max_structures: None,
         control: false,
+        control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),
         declined_feature_bytes: 1 << 20,
     }
@@ -147,7 +152,8 @@ pub fn block(
     let features = features(z);
     let grades = grader().bonds(&structure).unwrap().grade(mixture, &features);
     // What cannot be graded is offered nevertheless.
-    let grades = grades.unwrap_or_else(|_| AtomGrades { gamma: vec![9.0; ATOMS], gamma_nbr: vec![9.0; ATOMS] });
+    let grades =
+        grades.unwrap_or_else(|_| AtomGrades { gamma: vec![9.0; ATOMS], gamma_nbr: vec![9.0; ATOMS] });
     CandidateBlock::encode(&Candidate {
         id: CandidateId {
             campaign: assignment.campaign,

@@ -1,12 +1,18 @@
 //! A labelled structure as a frame with its origin, and its quantities for filters.
 
+use std::collections::BTreeMap;
+
 use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, Value};
 use store::{ExportRow, ExportSource};
+use wire::{WalkConditions, WalkId};
 
 use crate::filter::StructureProperties;
 
 /// The quantities of a structure for a filter.
-pub fn facts(row: &ExportRow) -> StructureProperties<'_> {
+pub fn facts<'a>(
+    row: &'a ExportRow,
+    conditions: &'a BTreeMap<WalkId, WalkConditions>,
+) -> StructureProperties<'a> {
     let largest = |grades: &[f64]| grades.iter().copied().reduce(f64::max);
     let of_label = StructureProperties {
         energy: Some(row.label.energy),
@@ -26,7 +32,8 @@ pub fn facts(row: &ExportRow) -> StructureProperties<'_> {
         gamma: largest(&original.gamma),
         gamma_nbr: largest(&original.gamma_nbr),
         volume: Some(view.relative_volume()),
-        temperature: Some(view.temperature()),
+        kinetic_temperature: Some(view.temperature()),
+        conditions: conditions.get(&view.id().walk),
         walk: Some(view.id().walk.0),
         step: Some(view.id().step),
         mixture_version: Some(*mixture_version_after),
@@ -36,8 +43,13 @@ pub fn facts(row: &ExportRow) -> StructureProperties<'_> {
     }
 }
 
-/// The frame of a labelled structure.
-pub fn frame(row: ExportRow, keys: LabelKeys, campaign: &str) -> Frame {
+/// The frame of a labelled structure, with the conditions of its walk if they are known.
+pub fn frame(
+    row: ExportRow,
+    keys: LabelKeys,
+    campaign: &str,
+    conditions: &BTreeMap<WalkId, WalkConditions>,
+) -> Frame {
     let mut frame = Frame::from(row.structure);
     let label = row.label;
     let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
@@ -75,6 +87,13 @@ pub fn frame(row: ExportRow, keys: LabelKeys, campaign: &str) -> Frame {
             info("segment", i64::from(view.id().segment).into());
             info("step", integer(view.id().step));
             info("origin", origin.name().into());
+            if let Some(conditions) = conditions.get(&view.id().walk) {
+                if !conditions.group.is_empty() {
+                    info("group", conditions.group.clone().into());
+                }
+                info("temperature", conditions.temperature.into());
+                info("tau", conditions.tau.into());
+            }
             info("mixture_version", integer(mixture_version_after));
             info("mixture_version_seen", integer(view.mixture_version()));
             info("relative_volume", view.relative_volume().into());

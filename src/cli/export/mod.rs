@@ -7,9 +7,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::path::PathBuf;
 
-use atoms::extxyz::{LabelKeys, write_frame};
+use atoms::extxyz::{Frame, LabelKeys, write_frame};
 use store::records::Protocol;
-use store::{DATABASE, ExportCursor, ExportFilter, ExportRow, ExportSource, JobState, LOCK, Store};
+use store::{DATABASE, ExportCursor, ExportFilter, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
@@ -187,6 +187,7 @@ impl Export {
         let protocol = self.select_protocol(&store).await?;
         let (filter, campaign) = (self.filter(&protocol), store.campaign().await?.id.to_string());
         let (mut parts, assigned) = self.parts(&store).await?;
+        let conditions = store.walk_conditions().await?;
         let mut missing = store.labelled_cursors(&filter).await?;
         let (mut frames, mut last, bar) = (0, None, Bar::new(None, BAR));
         loop {
@@ -195,7 +196,11 @@ impl Export {
             last = Some(row.cursor);
             for row in page {
                 missing.remove(&row.cursor);
-                if self.condition.as_ref().is_some_and(|condition| !condition.matches(&frame::facts(&row))) {
+                if self
+                    .condition
+                    .as_ref()
+                    .is_some_and(|condition| !condition.matches(&frame::facts(&row, &conditions)))
+                {
                     continue;
                 }
                 frames += 1;
@@ -204,7 +209,9 @@ impl Export {
                     ExportSource::Import { .. } => None,
                 };
                 let part = seed.and_then(|seed| assigned.get(&seed)).copied().unwrap_or_default();
-                parts[part].write(row, seed, self.keys.into(), &campaign)?;
+                let has_stress = row.label.stress.is_some();
+                let frame = frame::frame(row, self.keys.into(), &campaign, &conditions);
+                parts[part].write(&frame, seed, has_stress)?;
             }
             bar.set(frames, String::new);
         }
@@ -315,17 +322,10 @@ impl From<KeyNames> for LabelKeys {
 }
 
 impl Part {
-    fn write(
-        &mut self,
-        row: ExportRow,
-        seed: Option<u32>,
-        keys: LabelKeys,
-        campaign: &str,
-    ) -> Result<(), Failure> {
+    fn write(&mut self, frame: &Frame, seed: Option<u32>, has_stress: bool) -> Result<(), Failure> {
         self.count.frames += 1;
-        self.count.without_stress += u64::from(row.label.stress.is_none());
+        self.count.without_stress += u64::from(!has_stress);
         self.count.seed_structures.extend(seed);
-        let frame = frame::frame(row, keys, campaign);
-        write_frame(&mut self.file, &frame).map_err(|error| cannot_write(&self.path, error))
+        write_frame(&mut self.file, frame).map_err(|error| cannot_write(&self.path, error))
     }
 }

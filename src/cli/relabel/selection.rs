@@ -111,6 +111,7 @@ pub async fn matching(
     condition: &Filter,
 ) -> Result<Vec<Relabellable>, Failure> {
     let mut matching = HashSet::new();
+    let conditions = store.walk_conditions().await?;
     for protocol in store.protocols().await? {
         let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: false };
         let mut last = None;
@@ -118,7 +119,7 @@ pub async fn matching(
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
             last = Some(row.cursor);
-            let rows = page.iter().filter(|row| condition.matches(&facts(row)));
+            let rows = page.iter().filter(|row| condition.matches(&facts(row, &conditions)));
             matching.extend(rows.map(|row| ContentHash::from_structure(&row.structure).0));
         }
     }

@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 
+use calm::forgetting::ElementForgetting;
 use monitor::mixture_values::MixtureValues;
 
 use super::page::Page;
@@ -18,6 +19,22 @@ pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &Page, mode: &st
             "",
             &format!("training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"),
         )?;
+    }
+    let elements: Vec<ElementForgetting> =
+        serde_json::from_value(training["elements"].clone()).unwrap_or_default();
+    let worst = elements.iter().max_by(|a, b| a.mean_square_growth.total_cmp(&b.mean_square_growth));
+    if let Some(ElementForgetting { element, mean_square_growth, share_above_one }) = worst {
+        let share =
+            share_above_one.map_or(String::new(), |share| format!(", {:.1} % above 1", 100.0 * share));
+        let alarm = if number("share_above_one").is_none() && training["alarm"] == true {
+            "; ALARM: the mixture forgets them"
+        } else {
+            ""
+        };
+        let text = format!(
+            "of its training data, {element} is forgotten most: σ² × {mean_square_growth:.2}{share}{alarm}"
+        );
+        page.titled(out, "", &text)?;
     }
     // Walks that run one after the other have the newest version by construction.
     match values.staleness().filter(|staleness| mode == "live" || staleness.largest() > 0) {

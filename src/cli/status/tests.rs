@@ -16,7 +16,7 @@ use store::{
     Budget, BudgetStatus, BudgetUse, Declined, FailureCount, Labels, OldestLease, ProcessRecord, Unlabelled,
     ValueRange, WalkStatus, unix_milliseconds,
 };
-use wire::CampaignId;
+use wire::{CampaignId, WalkConditions};
 
 use super::*;
 
@@ -25,6 +25,7 @@ pub fn large() -> Snapshot {
     let staleness = json!({ "counts": { "0": 900_000, "3": 100_000 }, "largest": 3 });
     let training = json!({
         "atoms": 20_000, "median": 0.51, "percentile_95": 1.2, "maximum": 7.0, "share_above_one": 0.25, "alarm": true,
+        "level": 1.25, "elements": [{ "element": "Mo", "mean_square_growth": 2.5, "share_above_one": 0.25 }],
     });
     let values = [(STALENESS, staleness), (TRAINING_FRAMES, training)];
     let hours = CoreHours { expected: 123_456.0, low: 98_765.0, high: 234_567.0 };
@@ -110,6 +111,7 @@ fn status() -> CampaignStatus {
         relative_volume: Some(1.234),
         gamma_max: Some(123.45),
         steps_per_second: Some(1234.5),
+        conditions: Some(WalkConditions { volume_ramp: Some((1.0, 1.4)), ..WalkConditions::default() }),
         accepted: 300,
         ..WalkStatus::default()
     };
@@ -120,6 +122,7 @@ fn status() -> CampaignStatus {
     let declined =
         Declined { covered: 900_000, duplicate: 10_000, guard: 1_000, budget: 100, backlog: 10_000 };
     CampaignStatus {
+        walkers_busy: Some(0.625),
         candidates: Candidates {
             seen: 1_000_000,
             accepted: 80_000,

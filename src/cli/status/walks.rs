@@ -4,6 +4,7 @@ use std::cmp::Reverse;
 use std::io::{self, Write};
 
 use store::WalkStatus;
+use wire::conditions::VariedConditions;
 
 use super::page::{Page, cut};
 use crate::output::{Table, decimals};
@@ -38,18 +39,21 @@ pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &Page) 
         return Ok(());
     }
     let mut table = Table::new(&TITLES);
+    let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
     let name = if page.walks == usize::MAX { usize::MAX } else { NAME };
     for walk in &shown {
-        table.push(line(walk, led, name));
+        table.push(line(walk, &varied, led, name));
     }
     page.table(out, &table, shown.len(), walks.len(), "walks")
 }
 
-/// The row of a walk below [`TITLES`], with at most `name` characters of the name of its seed structure. `led`: whether an
-/// orchestrator runs.
-pub fn line(walk: &WalkStatus, led: bool, name: usize) -> Vec<String> {
+/// The row of a walk below [`TITLES`], with at most `name` characters of its name. `varied`: the conditions that
+/// distinguish walks. `led`: whether an orchestrator runs.
+pub fn line(walk: &WalkStatus, varied: &VariedConditions, led: bool, name: usize) -> Vec<String> {
     let control = if walk.origin == "control" { "c: " } else { "" };
-    let name = cut(&format!("{control}{}", walk.seed_structure), name);
+    let conditions = walk.conditions.as_ref().map_or(String::new(), |conditions| varied.describe(conditions));
+    let of_seed = cut(&format!("{control}{}", walk.seed_structure), name);
+    let name = if conditions.is_empty() { of_seed } else { format!("{of_seed} ({conditions})") };
     let state = match walk.state.as_str() {
         _ if walk.paused => "paused".to_owned(),
         "running" if !led => "stopped".to_owned(),

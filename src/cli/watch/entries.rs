@@ -2,6 +2,8 @@
 
 use atoms::Species;
 use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus};
+use wire::WalkConditions;
+use wire::conditions::VariedConditions;
 
 use super::pane::{Entry, Tone};
 use crate::cli::status::page::cut;
@@ -35,9 +37,10 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) ->
         "trapped" | "blew_up" | "bad_start" => Tone::Attention,
         _ => Tone::Ended,
     };
+    let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
     let entry = |walk: &WalkStatus| Entry {
         key: walk.walk.to_string(),
-        columns: walks::line(walk, led, walks::NAME),
+        columns: walks::line(walk, &varied, led, walks::NAME),
         tone: tone(walk),
         candidate: None,
     };
@@ -45,10 +48,10 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) ->
 }
 
 /// The entries of label jobs that match the filter.
-pub fn job_entries(jobs: &[Job], filter: Option<&Filter>) -> Vec<Entry> {
+pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&Filter>) -> Vec<Entry> {
     let matches = |job: &&Job| {
         let species = filter::species(&job.formula);
-        filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species)))
+        filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species, walks)))
     };
     let tone = |state: JobState| match state {
         JobState::Leased | JobState::Labelled => Tone::Active,
@@ -76,12 +79,13 @@ pub fn job_entries(jobs: &[Job], filter: Option<&Filter>) -> Vec<Entry> {
 /// The entries of decisions that match the filter.
 pub fn decision_entries<'a>(
     decisions: impl Iterator<Item = &'a RecentDecision>,
+    walks: &[WalkStatus],
     filter: Option<&Filter>,
 ) -> Vec<Entry> {
     let matches = |decision: &&RecentDecision| {
         let formula = decision.candidate.as_ref().map_or("", |found| &found.formula);
         let species = filter::species(formula);
-        filter.is_none_or(|filter| filter.matches(&facts_of_decision(decision, &species)))
+        filter.is_none_or(|filter| filter.matches(&facts_of_decision(decision, &species, walks)))
     };
     decisions.filter(matches).map(decision_entry).collect()
 }
@@ -130,7 +134,8 @@ fn facts_of_walk(walk: &WalkStatus) -> StructureProperties<'_> {
     StructureProperties {
         gamma: walk.gamma_max,
         volume: walk.relative_volume,
-        temperature: walk.temperature,
+        kinetic_temperature: walk.temperature,
+        conditions: walk.conditions.as_ref(),
         walk: Some(walk.walk),
         step: Some(walk.step),
         kind: &walk.origin,
@@ -139,12 +144,22 @@ fn facts_of_walk(walk: &WalkStatus) -> StructureProperties<'_> {
     }
 }
 
-fn facts_of_job<'a>(job: &'a Job, species: &'a [Species]) -> StructureProperties<'a> {
+/// Walks are numbered from 0 and listed in order.
+fn conditions_of(walks: &[WalkStatus], walk: u32) -> Option<&WalkConditions> {
+    walks.get(walk as usize)?.conditions.as_ref()
+}
+
+fn facts_of_job<'a>(
+    job: &'a Job,
+    species: &'a [Species],
+    walks: &'a [WalkStatus],
+) -> StructureProperties<'a> {
     StructureProperties {
         gamma: job.original_gamma,
         gamma_nbr: job.original_gamma_nbr,
         volume: job.relative_volume,
-        temperature: job.temperature,
+        kinetic_temperature: job.temperature,
+        conditions: conditions_of(walks, job.walk),
         walk: Some(job.walk),
         step: Some(job.step),
         species,
@@ -154,9 +169,14 @@ fn facts_of_job<'a>(job: &'a Job, species: &'a [Species]) -> StructureProperties
     }
 }
 
-fn facts_of_decision<'a>(decision: &'a RecentDecision, species: &'a [Species]) -> StructureProperties<'a> {
+fn facts_of_decision<'a>(
+    decision: &'a RecentDecision,
+    species: &'a [Species],
+    walks: &'a [WalkStatus],
+) -> StructureProperties<'a> {
     let of_walk = StructureProperties {
         walk: decision.walk,
+        conditions: decision.walk.and_then(|walk| conditions_of(walks, walk)),
         mixture_version: Some(decision.mixture_version),
         ..StructureProperties::default()
     };
@@ -165,7 +185,7 @@ fn facts_of_decision<'a>(decision: &'a RecentDecision, species: &'a [Species]) -
         gamma: found.original_gamma,
         gamma_nbr: found.original_gamma_nbr,
         volume: found.relative_volume,
-        temperature: found.temperature,
+        kinetic_temperature: found.temperature,
         step: Some(found.step),
         species,
         kind: found.origin.name(),

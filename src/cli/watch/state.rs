@@ -165,8 +165,9 @@ impl State {
         let store::Status { walks, led, .. } = &self.snapshot.status;
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
         of_walks.set_entries(entries::walk_entries(walks, *led, of_walks.filter.as_ref()), walks.len());
-        of_queue.set_entries(entries::job_entries(&self.jobs, of_queue.filter.as_ref()), self.jobs.len());
-        let decisions = entries::decision_entries(self.decisions.iter(), of_decisions.filter.as_ref());
+        of_queue
+            .set_entries(entries::job_entries(&self.jobs, walks, of_queue.filter.as_ref()), self.jobs.len());
+        let decisions = entries::decision_entries(self.decisions.iter(), walks, of_decisions.filter.as_ref());
         of_decisions.set_entries(decisions, self.decisions.len());
         self.charts = Charts::from_decisions(self.decisions.iter());
     }

@@ -1,13 +1,14 @@
 //! The table of candidates, one page at a time. A request scans a limited number of candidates. If a filter matches
 //! few of them, the response says how many were scanned and where to continue.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::str::FromStr;
 
 use atoms::Species;
 use axum::extract::{RawQuery, State};
 use serde_json::json;
 use store::{JobState, ListCursor, ListOrder, ListedCandidate, Store, StoreError};
+use wire::{WalkConditions, WalkId};
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult, json};
@@ -95,13 +96,17 @@ impl Query {
         let limit = self.limit.unwrap_or(50);
         let window = if self.filters_rows() { SCAN_ROWS } else { limit };
         let (mut page, mut place, mut elements) = (Page::default(), self.after, HashMap::new());
+        let conditions = match self.filter {
+            Some(_) => store.walk_conditions().await?,
+            None => BTreeMap::new(),
+        };
         loop {
             let rows = self.rows(store, place, window).await?;
             let is_last = rows.len() < window as usize;
             for row in rows {
                 page.scanned += 1;
                 place = Some(self.cursor_of(&row));
-                if self.matches(&row, &mut elements) {
+                if self.matches(&row, &mut elements, &conditions) {
                     page.rows.push(row);
                 }
                 if page.rows.len() == limit as usize {
@@ -162,7 +167,12 @@ impl Query {
     }
 
     /// `elements` caches the species of formulas.
-    fn matches(&self, row: &ListedCandidate, elements: &mut HashMap<String, Vec<Species>>) -> bool {
+    fn matches(
+        &self,
+        row: &ListedCandidate,
+        elements: &mut HashMap<String, Vec<Species>>,
+        conditions: &BTreeMap<WalkId, WalkConditions>,
+    ) -> bool {
         let fate = if row.origin == "control" { "control" } else { &row.fate };
         if self.fate.as_deref().is_some_and(|wanted| wanted != fate) {
             return false;
@@ -172,17 +182,22 @@ impl Query {
         }
         let Some(filter) = &self.filter else { return true };
         let species = elements.entry(row.formula.clone()).or_insert_with(|| species(&row.formula));
-        filter.matches(&properties(row, species))
+        filter.matches(&properties(row, species, conditions.get(&WalkId(row.walk))))
     }
 }
 
 /// Properties for the filter, the same as in `calmwalk export`.
-fn properties<'a>(row: &'a ListedCandidate, species: &'a [Species]) -> StructureProperties<'a> {
+fn properties<'a>(
+    row: &'a ListedCandidate,
+    species: &'a [Species],
+    conditions: Option<&'a WalkConditions>,
+) -> StructureProperties<'a> {
     StructureProperties {
         gamma: row.gamma,
         gamma_nbr: row.gamma_nbr,
         volume: row.relative_volume,
-        temperature: row.temperature,
+        kinetic_temperature: row.temperature,
+        conditions,
         walk: Some(row.walk),
         step: Some(row.step),
         mixture_version: Some(row.mixture_version),

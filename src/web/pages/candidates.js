@@ -77,7 +77,7 @@ function filters(params, change) {
   return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
     choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
     element("details", {}, element("summary", {}, "Syntax"), element("p", {},
-      "gamma, gamma_nbr (original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version (after the decision), atoms, " +
+      "gamma, gamma_nbr (original mixture), volume (V/V₀), kinetic_temperature (K), temperature, tau and group of its walk, walk, step, mixture_version (after the decision), atoms, " +
       "energy (eV), energy_per_atom and max_force (eV/Å) of the label, with = != < <= > >=; " +
       "element, kind (biased or control), seed with = and !=; and, or, not and parentheses. " +
       "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));

@@ -65,7 +65,8 @@ function summary(status) {
         labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
       `${whole(status.labels_last_hour)} in the last hour`),
     tile("Mixture", `version ${whole(version)}`,
-      training ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
+      training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
+      ...(training?.elements ?? []).toSorted((a, b) => b.mean_square_growth - a.mean_square_growth).map((of) => `${of.element}: mean σ² of training atoms × ${of.mean_square_growth.toFixed(2)}`).slice(0, 4),
       training?.alarm ? element("span", { class: "wrong" }, "forgetting: above calm.forgetting_alarm") : "",
       staleness ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
   ];

@@ -44,7 +44,7 @@ macro_rules! table {
 
 /// All tables except those of the leader, of processes and their progress, and of job counts, which triggers count
 /// again. Each table comes after those that it references. A new database already has some rows of `campaign`.
-const TABLES: [Table; 16] = [
+const TABLES: [Table; 17] = [
     table!("campaign" { key: T, value: T, checksum: I }),
     table!("value" { name: T, value: T, checksum: I }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B, checksum: I }),
@@ -69,6 +69,7 @@ const TABLES: [Table; 16] = [
         segment: I, tau: R, temperature: R, relative_volume: R, gamma_max: R, refused: I, returns: I,
         selector_state: T, checkpoint: B, checksum: I, checkpoint_checksum: I,
     }),
+    table!("walk_conditions" { walk: I, conditions: T, checksum: I }),
     table!("job" {
         number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,
         failures: I, overruled: I, relabel: T, relabel_after: I,

@@ -2,7 +2,7 @@
 
 use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
-    LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK,
+    LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK, WALK_CONDITIONS,
 };
 use crate::database::{Row, Transaction, Value, execute_rows, query};
 use crate::error::Result;
@@ -92,6 +92,7 @@ static WALKS: Paged = Paged {
         WHERE walk.walk = new.walk",
     ..paged!(WALK, "walk", "walk")
 };
+static CONDITIONS: Paged = paged!(WALK_CONDITIONS, "walk_conditions", "walk");
 static CANDIDATES: Paged = Paged {
     columns: &["decision", "checksum", "features_checksum", "selector_checksum", "original_checksum"],
     page: "SELECT candidate.*, features, selector_grades, original_grades
@@ -198,6 +199,9 @@ async fn next(
 /// and the mixture. Returns the faults.
 pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<String>> {
     let mut faults = Vec::new();
+    if transaction.has_table(CONDITIONS.table.name).await? {
+        CONDITIONS.verify(transaction, &[], &mut faults).await?;
+    }
     for paged in [&SEED_STRUCTURES, &IMPORTS] {
         paged.verify(transaction, &[], &mut faults).await?;
     }

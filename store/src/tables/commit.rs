@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use self::rows::{
     CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, COMPONENT, DECISION, Rows, STRUCTURE, VALUE, WALK,
+    WALK_CONDITIONS,
 };
 use super::new_jobs::insert_jobs;
 use super::protocols;
@@ -38,6 +39,10 @@ const UPSERT_COMPONENTS: &str = "INSERT INTO component ({columns}) SELECT * FROM
 
 const UPSERT_WALKS: &str = "INSERT INTO walk ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (walk) DO UPDATE SET {excluded}";
+
+/// A walk that was interrupted in its first assignment has them already.
+const INSERT_WALK_CONDITIONS: &str = "INSERT INTO walk_conditions ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (walk) DO NOTHING";
 
 const COUNT_CANDIDATES: &str = "INSERT INTO candidate_count ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (origin, fate) DO UPDATE SET number = candidate_count.number + excluded.number";
@@ -107,6 +112,7 @@ async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last:
     }
     execute_rows(transaction, UPSERT_COMPONENTS, &COMPONENT, rows.components).await?;
     execute_rows(transaction, UPSERT_WALKS, &WALK, rows.walks).await?;
+    execute_rows(transaction, INSERT_WALK_CONDITIONS, &WALK_CONDITIONS, rows.walk_conditions).await?;
     execute_rows(transaction, UPSERT_VALUES, &VALUE, rows.values).await?;
     Ok(())
 }

@@ -29,4 +29,5 @@ pub mod report;
 mod restore;
 pub mod status;
 pub mod structures;
+mod walk_conditions;
 mod walk_progress;

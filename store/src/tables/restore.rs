@@ -1,8 +1,9 @@
 //! The state from which a selector continues, and complete candidates.
 
 use wire::messages::{DeclineReason, Progress};
-use wire::{CandidateBlock, ContentHash, Origin, WalkId};
+use wire::{CandidateBlock, ContentHash, Origin, WalkConditions, WalkId};
 
+use super::walk_conditions;
 use crate::Store;
 use crate::checksum::{
     CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG_COLUMNS, Names, STRUCTURE, VALUE, WALK, joined,
@@ -87,7 +88,15 @@ from_columns!(WalkRow {
 impl Store {
     /// Every walk, in order.
     pub async fn load_walks(&self) -> Result<Vec<WalkRecord>> {
-        query("SELECT * FROM walk ORDER BY walk").fetch_all(&self.database).await
+        let mut transaction = self.database.begin_read().await?;
+        let mut conditions = walk_conditions::read(&mut transaction).await?;
+        let walks = query("SELECT * FROM walk ORDER BY walk");
+        let mut walks: Vec<WalkRecord> = walks.fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        for walk in &mut walks {
+            walk.conditions = conditions.remove(&walk.walk).unwrap_or_default();
+        }
+        Ok(walks)
     }
 
     /// Every component that has changed since the mixture was last restarted, by element and slot.
@@ -194,6 +203,8 @@ impl WalkRow {
             origin: origin(&self.origin)?,
             partner: self.partner.map(WalkId),
             seed_structure: self.seed_structure,
+            // Another table has them.
+            conditions: WalkConditions::default(),
             state: self.state,
             reason: self.reason,
             turn: self.turn,

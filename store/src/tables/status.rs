@@ -2,7 +2,7 @@
 
 use wire::WalkId;
 
-use super::{budget, exclude, job_counts, pauses, processes, relabel, walk_progress};
+use super::{budget, exclude, job_counts, pauses, processes, relabel, walk_conditions, walk_progress};
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
 use crate::checksum::joined;
@@ -11,7 +11,7 @@ use crate::error::Result;
 use crate::processes::ProcessRecord;
 use crate::status::{Candidates, Labels, Status, WalkStatus};
 use crate::unix_milliseconds;
-use crate::walk_progress::WalkProgress;
+use crate::walk_progress::{TotalThroughput, WalkProgress};
 
 const END_BY_BUDGET: &str = "budget";
 
@@ -57,6 +57,10 @@ impl Store {
         let oldest_lease = job_counts::oldest_lease(&mut transaction).await?;
         let labels_last_hour = job_counts::labels_in_last_hour(&mut transaction, now).await?;
         let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
+        let mut conditions = walk_conditions::read(&mut transaction).await?;
+        for walk in &mut walks {
+            walk.conditions = conditions.remove(&WalkId(walk.walk));
+        }
         let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
         let refused: u64 = refused.fetch_one(&mut transaction).await?;
         let sql = "SELECT mixture_version, round FROM decision ORDER BY sequence DESC LIMIT 1";
@@ -67,10 +71,10 @@ impl Store {
         let led = processes.iter().any(ProcessRecord::is_leading);
         let (limits, used) = budget::read(&mut transaction, now).await?;
         let paused = pauses::read(&mut transaction).await?;
-        let mut steps_per_second = None;
+        let mut total = TotalThroughput::default();
         if led {
             apply_progress(&mut walks, &walk_progress::recent(&mut transaction, now).await?);
-            steps_per_second = walk_progress::total_steps_per_second(&mut transaction, now).await?;
+            total = walk_progress::total(&mut transaction, now).await?;
         }
         transaction.commit().await?;
         let labels = Labels { excluded, ..labels(&states, &asked) };
@@ -92,7 +96,8 @@ impl Store {
             labels,
             oldest_lease,
             labels_last_hour,
-            steps_per_second,
+            steps_per_second: total.steps_per_second,
+            walkers_busy: total.walkers_busy,
             walks,
             processes: with_visible_state(processes),
         })

@@ -6,7 +6,7 @@ use super::protocols::set_campaign_value;
 use crate::Store;
 use crate::database::{Transaction, Value, execute_rows, query};
 use crate::error::Result;
-use crate::walk_progress::WalkProgress;
+use crate::walk_progress::{TotalThroughput, WalkProgress};
 
 /// Progress older than this (ms) is ignored.
 const MAX_AGE: i64 = 60_000;
@@ -30,8 +30,13 @@ const UPSERT: &str = "INSERT INTO pace ({columns}) SELECT * FROM {rows} WHERE TR
     ON CONFLICT (walk) DO UPDATE SET {excluded}";
 
 impl Store {
-    /// Stores the progress of these walks and the steps per second of all walks together.
-    pub async fn set_walk_progress(&self, walks: &[WalkProgress], all: Option<f64>, now: i64) -> Result<()> {
+    /// Stores the progress of these walks and the throughput of all together.
+    pub async fn set_walk_progress(
+        &self,
+        walks: &[WalkProgress],
+        all: TotalThroughput,
+        now: i64,
+    ) -> Result<()> {
         let row = |walk: &WalkProgress| {
             let integer = |number: i64| Value::Integer(Some(number));
             let step = i64::try_from(walk.step).unwrap_or(i64::MAX);
@@ -49,7 +54,9 @@ impl Store {
         };
         let mut transaction = self.database.begin_as_leader().await?;
         execute_rows(&mut transaction, UPSERT, &COLUMNS, walks.iter().map(row).collect()).await?;
-        let all = json!({ "time": now, "steps_per_second": all }).to_string();
+        let TotalThroughput { steps_per_second, walkers_busy } = all;
+        let all = json!({ "time": now, "steps_per_second": steps_per_second, "walkers_busy": walkers_busy });
+        let all = all.to_string();
         set_campaign_value(&mut transaction, TOTAL_KEY, &all).await?;
         transaction.commit().await
     }
@@ -68,11 +75,12 @@ pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Ve
     query("SELECT * FROM pace WHERE seen > $1 ORDER BY walk").bind(now - MAX_AGE).fetch_all(transaction).await
 }
 
-/// Steps per second of all walks together; `None` without a report in the last minute.
-pub(super) async fn total_steps_per_second(transaction: &mut Transaction, now: i64) -> Result<Option<f64>> {
+/// Throughput of all walks together; empty without a report in the last minute.
+pub(super) async fn total(transaction: &mut Transaction, now: i64) -> Result<TotalThroughput> {
     let found = query("SELECT value FROM campaign WHERE key = $1").bind(TOTAL_KEY);
     let found: Option<String> = found.fetch_optional(transaction).await?;
     let found: Json = found.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
     let is_fresh = found["time"].as_i64().is_some_and(|time| time > now - MAX_AGE);
-    Ok(found["steps_per_second"].as_f64().filter(|_| is_fresh))
+    let found = if is_fresh { serde_json::from_value(found).ok() } else { None };
+    Ok(found.unwrap_or_default())
 }

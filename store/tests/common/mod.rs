@@ -10,7 +10,7 @@ use store::{
     Store, WalkRecord,
 };
 use wire::messages::Progress;
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 pub use home::{Home, server};
 
@@ -132,6 +132,7 @@ pub fn walk(walk: u32, turn: u64) -> WalkRecord {
         origin: Origin::Biased,
         partner: None,
         seed_structure: 0,
+        conditions: WalkConditions::default(),
         state: "running".into(),
         reason: String::new(),
         turn,

@@ -66,7 +66,7 @@ fn jumping(small: &Small, disturb: impl Fn(&Path, u64)) -> tempfile::TempDir {
 
 #[test]
 fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
-    let small = Small { steps: 1600, max_per_seed_structure: 16, ..Small::default() };
+    let small = Small { steps: 1600, max_per_walk: 16, ..Small::default() };
     let directory = jumping(&small, |here, _| {
         let status = calmwalk(here, ["status", ".", "--json"]);
         let status: Value = serde_json::from_slice(&status.stdout).unwrap();
@@ -84,7 +84,7 @@ fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
 /// What a labeller held that is killed comes back, whatever its clock said.
 #[test]
 fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
-    let small = Small { steps: 1600, max_per_seed_structure: 16, ..Small::default() };
+    let small = Small { steps: 1600, max_per_walk: 16, ..Small::default() };
     let killed = Cell::new(0);
     jumping(&small, |here, jump| {
         // After one more it would be given up.
@@ -103,7 +103,7 @@ fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
 fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
     let small = Small {
         steps: 1600,
-        max_per_seed_structure: 12,
+        max_per_walk: 12,
         walks_per_round: 3,
         seeds: &["fcc-100", "vacancy", "fcc-097"],
         ..Small::default()

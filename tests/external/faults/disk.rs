@@ -18,7 +18,7 @@ use crate::common::{Running, program, random, through};
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
 
 fn small() -> Small {
-    Small { steps: 1600, max_per_seed_structure: 12, ..Small::default() }
+    Small { steps: 1600, max_per_walk: 12, ..Small::default() }
 }
 
 /// A small disk.

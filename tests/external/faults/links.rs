@@ -18,7 +18,7 @@ fn small() -> Small {
         walks_per_round: 3,
         seeds: &["fcc-100", "vacancy", "fcc-097"],
         steps: 1600,
-        max_per_seed_structure: 8,
+        max_per_walk: 8,
         ..Small::default()
     }
 }

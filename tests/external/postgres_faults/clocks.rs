@@ -35,7 +35,7 @@ fn clocks(place: &LabelCampaign) -> [Clock; 2] {
 /// Every label is made by one of two whose clocks are never the same, nor that of the server.
 #[test]
 fn labellers_with_wrong_clocks_label_everything_once() {
-    let small = Small { steps: 1600, max_per_seed_structure: 12, ..Small::default() };
+    let small = Small { steps: 1600, max_per_walk: 12, ..Small::default() };
     let place =
         LabelCampaign::on_server(&small, &[("[label]", "[label]\nconcurrency = 0\nlease_timeout = \"2s\"")]);
     let mut run = place.run();

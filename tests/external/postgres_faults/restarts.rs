@@ -11,7 +11,7 @@ use crate::common::random;
 
 /// Some 20 s of work for two walkers.
 fn long() -> Small {
-    Small { steps: 1600, max_per_seed_structure: 16, ..Small::default() }
+    Small { steps: 1600, max_per_walk: 16, ..Small::default() }
 }
 
 /// In order and after crashes, while walkers and labellers are at work here and on another host.

@@ -9,7 +9,7 @@ use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use wire::messages::{Assignment, Outcome, Report};
-use wire::{CampaignId, Candidate, Origin, WalkId};
+use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
@@ -67,14 +67,11 @@ const EQUILIBRATION: u64 = 100;
 fn settings(threshold: f64) -> WalkSettings {
     WalkSettings {
         rng_seed: 3,
-        temperature: 600.0,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
         equilibration: EQUILIBRATION,
         steps: 10_000_000,
-        tau: 0.15,
         bias_averaging_steps: 10,
-        volume_ramp: Some((1.0, 1.0)),
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
             .expect("a rule"),
@@ -101,6 +98,12 @@ fn assignment(seed_structure: Structure, until: u64) -> Assignment {
         origin: Origin::Biased,
         random_walk: WalkId(0),
         seed_structure,
+        conditions: WalkConditions {
+            temperature: 600.0,
+            tau: 0.15,
+            volume_ramp: Some((1.0, 1.0)),
+            ..WalkConditions::default()
+        },
         checkpoint: None,
         verdict: None,
         last_step: until,

@@ -109,7 +109,7 @@ impl AgentMetrics {
 mod tests {
     use atoms::{Cell, Structure};
     use wire::messages::{Report, WalkEnd};
-    use wire::{CampaignId, Origin};
+    use wire::{CampaignId, Origin, WalkConditions};
 
     use super::*;
 
@@ -126,6 +126,7 @@ mod tests {
             origin: Origin::Biased,
             random_walk: WALK,
             seed_structure,
+            conditions: WalkConditions::default(),
             checkpoint,
             verdict: None,
             last_step: 100,

@@ -72,15 +72,15 @@ pub(super) fn start(
     assignment: &Assignment,
     potential: &mut BiasedPotential,
 ) -> Result<(Dynamics, WalkState), WalkError> {
-    let structure = assignment.seed_structure.clone();
+    let (structure, conditions) = (assignment.seed_structure.clone(), &assignment.conditions);
     let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
     neighbours.update(&structure)?;
     let min_distances =
         settings.guard.min_distances.limits(&ShortestDistances::from_neighbours(&structure, &neighbours));
     let stream = Stream::new(settings.rng_seed, assignment.random_walk.0, 0);
     let time_step = settings.time_step.unwrap_or_else(|| md::default_time_step(&structure.species));
-    let mut start = State::thermal(structure, settings.temperature, &stream);
-    let ramp = settings.volume_ramp.map(|(from, to)| {
+    let mut start = State::thermal(structure, conditions.temperature, &stream);
+    let ramp = conditions.volume_ramp.map(|(from, to)| {
         let ramp = VolumeRamp::new(&start, from, to, settings.steps);
         VolumeRamp { start: settings.equilibration, ..ramp }
     });
@@ -88,13 +88,13 @@ pub(super) fn start(
     if let Some(ramp) = ramp.filter(|ramp| ramp.from != 1.0) {
         ramp.apply(&mut start.structure, 0);
     }
-    let thermostat = settings.thermostat.start(settings.temperature);
+    let thermostat = settings.thermostat.start(conditions.temperature);
     let run = md::Settings { time_step, thermostat, ramp, stream, skin: settings.skin };
     let dynamics = Dynamics::new(start, run, potential)?;
     let state = WalkState {
         dynamics: dynamics.checkpoint().clone(),
         bias: BiasState::default(),
-        tau: if assignment.origin == Origin::Control { 0.0 } else { settings.tau },
+        tau: if assignment.origin == Origin::Control { 0.0 } else { conditions.tau },
         segment: 0,
         returns: 0,
         last_return: None,

@@ -12,7 +12,7 @@ use tokio_util::sync::CancellationToken;
 use wire::ipc::{ConnectInfo, IpcWalker};
 use wire::messages::{Assignment, Outcome, Report};
 use wire::transport::Transport;
-use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
+use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 use super::test_server::TestServer;
 
@@ -101,6 +101,7 @@ pub fn assignment(walk: u32, number: u64, (atoms, features): (usize, usize)) -> 
         origin: Origin::Biased,
         random_walk: walk,
         seed_structure: structure(atoms),
+        conditions: WalkConditions::default(),
         checkpoint: Some(vec![number as u8; 100]),
         verdict: None,
         last_step: features as u64,

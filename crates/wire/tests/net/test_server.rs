@@ -17,7 +17,7 @@ use wire::net::{
     Tls,
 };
 use wire::transport::{Incoming, WorkItem};
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 /// Timeout, much longer than anything here takes.
 pub const LIMIT: Duration = Duration::from_secs(60);
@@ -170,6 +170,7 @@ pub fn work(walk: u32, number: u64, mixture: &Arc<Mixture>) -> WorkItem {
         origin: Origin::Biased,
         random_walk: walk,
         seed_structure: structure(),
+        conditions: WalkConditions::default(),
         checkpoint: Some(vec![number as u8; 100]),
         verdict: None,
         last_step: number * 1000,

@@ -6,7 +6,7 @@ use wire::CandidateView;
 
 use crate::checksum::{
     CANDIDATE as CANDIDATES, COMPONENT as COMPONENTS, CheckedColumn, DECISION as DECISIONS,
-    STRUCTURE as STRUCTURES, VALUE as VALUES, WALK as WALKS,
+    STRUCTURE as STRUCTURES, VALUE as VALUES, WALK as WALKS, WALK_CONDITIONS as CONDITIONS,
 };
 use crate::database::Value;
 use crate::encoding::{encode_structure, integer};
@@ -55,6 +55,7 @@ pub(super) const CANDIDATE: [&str; 29] = [
 pub(super) const CANDIDATE_COUNT: [&str; 3] = ["origin", "fate", "number"];
 pub(super) const CANDIDATE_DATA: [&str; 5] =
     ["decision", "block", "features", "selector_grades", "original_grades"];
+pub(super) const WALK_CONDITIONS: [&str; 3] = ["walk", "conditions", "checksum"];
 pub(super) const WALK: [&str; 20] = [
     "walk",
     "origin",
@@ -90,6 +91,8 @@ pub(super) struct Rows {
     pub jobs: Vec<Row>,
     pub components: Vec<Row>,
     pub walks: Vec<Row>,
+    /// For every walk that has no assignment behind it.
+    pub walk_conditions: Vec<Row>,
     pub values: Vec<Row>,
 }
 
@@ -110,6 +113,10 @@ impl Rows {
                 })
                 .collect(),
             walks: newest(&commit.walks, |walk| walk.walk).map(walk).collect::<Result<_>>()?,
+            walk_conditions: newest(&commit.walks, |walk| walk.walk)
+                .filter(|walk| walk.turn == 0)
+                .map(walk_conditions)
+                .collect(),
             values: newest(&commit.values, |(name, _)| name)
                 .map(|(name, value)| VALUES.with_checksum(vec![name.into(), value.into()]))
                 .collect(),
@@ -327,6 +334,11 @@ fn walk(walk: &WalkRecord) -> Result<Row> {
     let checkpoint = CheckedColumn::checksum(walk.walk.0.into(), walk.checkpoint.as_deref());
     row.extend([walk.checkpoint.clone().into(), checkpoint.into()]);
     Ok(row)
+}
+
+fn walk_conditions(walk: &WalkRecord) -> Row {
+    let conditions = serde_json::to_string(&walk.conditions).expect("plain data becomes JSON");
+    CONDITIONS.with_checksum(vec![walk.walk.0.into(), conditions.into()])
 }
 
 /// Only the newest record for each key, in order: a statement may write a row only once.

@@ -9,6 +9,7 @@ use proptest::prelude::*;
 use super::common::{candidate, origin, usable_structure};
 use super::encode_message;
 use crate::block::Candidate;
+use crate::conditions::WalkConditions;
 use crate::ids::{CampaignId, Origin, WalkId};
 use crate::messages::{Assignment, DeclineReason, Outcome, Progress, Report, Verdict, WalkEnd};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
@@ -56,10 +57,11 @@ pub fn assignment() -> impl Strategy<Value = Assignment> {
         option::of(verdict()),
         btree_set(any::<u64>(), 0..6),
         1.0..9.0,
+        conditions(),
     );
     (ids, origin(), usable_structure(), rest).prop_map(|(ids, origin, seed_structure, rest)| {
         let (campaign, walk, random_walk, number, last_step) = ids;
-        let (checkpoint, verdict, frame_steps, threshold_factor) = rest;
+        let (checkpoint, verdict, frame_steps, threshold_factor, conditions) = rest;
         let (campaign, walk, random_walk) = (CampaignId(campaign), WalkId(walk), WalkId(random_walk));
         let frame_steps =
             if origin == Origin::Control { frame_steps.into_iter().collect() } else { Vec::new() };
@@ -70,6 +72,7 @@ pub fn assignment() -> impl Strategy<Value = Assignment> {
             origin,
             random_walk,
             seed_structure,
+            conditions,
             checkpoint,
             verdict,
             last_step,
@@ -77,6 +80,19 @@ pub fn assignment() -> impl Strategy<Value = Assignment> {
             threshold_factor,
         }
     })
+}
+
+fn conditions() -> impl Strategy<Value = WalkConditions> {
+    let ramp = option::of((0.1..9.0, 0.1..9.0));
+    ("[a-z]{0,9}", 1.0..9000.0, 0.0..9.0, ramp, any::<u32>()).prop_map(
+        |(group, temperature, tau, volume_ramp, repeat)| WalkConditions {
+            group,
+            temperature,
+            tau,
+            volume_ramp,
+            repeat,
+        },
+    )
 }
 
 pub fn report() -> impl Strategy<Value = Report<Candidate>> {

@@ -1,0 +1,115 @@
+//! What the live mixture has forgotten of the training data, by element.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use calm::Mixture;
+use calm::forgetting::{ElementForgetting, ForgettingAlarm, GradeDistribution, mean_square_growth};
+use serde_json::{Value, json};
+
+use super::error::SelectorError;
+use super::training_frames::TrainingFrames;
+
+/// Least number of sampled atoms of an element for which the share above 1 means something.
+const MIN_ATOMS: usize = 50;
+
+/// Compares the live mixture with the original one.
+pub(super) struct Forgetting {
+    /// Chemical symbols by element index.
+    symbols: Vec<String>,
+    training: Option<TrainingFrames>,
+    /// Growth of the mean σ² of each component that has changed, by element and slot.
+    growth: BTreeMap<(usize, usize), f64>,
+}
+
+/// The state after an update.
+pub(super) struct ForgettingState {
+    /// The grades of the sampled training atoms, if there are any.
+    pub training: Option<GradeDistribution>,
+    /// Of every element with a changed component.
+    pub elements: Vec<ElementForgetting>,
+    /// How near the alarm is: it is raised above 1.
+    pub level: f64,
+}
+
+impl Forgetting {
+    pub fn new(symbols: Vec<String>, training: Option<TrainingFrames>) -> Self {
+        Self { symbols, training, growth: BTreeMap::new() }
+    }
+
+    /// Takes an update of these components, by element and slot.
+    pub fn update(
+        &mut self,
+        original: &Mixture,
+        live: &Mixture,
+        changed: &BTreeSet<(usize, usize)>,
+    ) -> Result<(), SelectorError> {
+        for &(element, slot) in changed {
+            let components = original.component(element, slot).zip(live.component(element, slot));
+            let growth = components.and_then(|(before, now)| mean_square_growth(before, now));
+            self.growth.extend(growth.map(|growth| ((element, slot), growth)));
+        }
+        match &mut self.training {
+            Some(training) => {
+                let elements: BTreeSet<usize> = changed.iter().map(|(element, _)| *element).collect();
+                training.regrade(live, |element| elements.contains(&element))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// The original mixture is in force again.
+    pub fn restart(&mut self) {
+        self.growth.clear();
+        if let Some(training) = &mut self.training {
+            training.restart();
+        }
+    }
+
+    /// The state under the live mixture.
+    pub fn state(&self, original: &Mixture, alarm: ForgettingAlarm) -> ForgettingState {
+        let elements: BTreeSet<usize> = self.growth.keys().map(|(element, _)| *element).collect();
+        let elements: Vec<_> = elements.into_iter().map(|element| self.element(original, element)).collect();
+        let levels = elements.iter().map(|(element, before)| alarm.level_of(element, *before));
+        let training = self.training.as_ref().map(|training| (training.original(), training.live()));
+        let total = training.map(|(before, live)| alarm.level_of_share(before, live));
+        ForgettingState {
+            level: levels.chain(total).fold(0.0, f64::max),
+            training: training.map(|(_, live)| live),
+            elements: elements.into_iter().map(|(element, _)| element).collect(),
+        }
+    }
+
+    /// An element, with the share above 1 under the original mixture.
+    fn element(&self, original: &Mixture, element: usize) -> (ElementForgetting, Option<f64>) {
+        let components = original.components(element).unwrap_or_default().iter().enumerate();
+        let (mut sum, mut atoms) = (0.0, 0.0);
+        for (slot, component) in components {
+            let count = component.statistics().map_or(0.0, |statistics| statistics.count);
+            sum += count * self.growth.get(&(element, slot)).copied().unwrap_or(1.0);
+            atoms += count;
+        }
+        let shares = self.training.as_ref().and_then(|training| training.of_element(element));
+        let shares = shares.filter(|[before, _]| before.atoms >= MIN_ATOMS);
+        let forgetting = ElementForgetting {
+            element: self.symbols.get(element).cloned().unwrap_or_default(),
+            mean_square_growth: if atoms > 0.0 { sum / atoms } else { 1.0 },
+            share_above_one: shares.map(|[_, live]| live.share_above_one),
+        };
+        (forgetting, shares.map(|[before, _]| before.share_above_one))
+    }
+}
+
+impl ForgettingState {
+    pub fn is_alarming(&self) -> bool {
+        self.level > 1.0
+    }
+
+    /// As stored for display.
+    pub fn to_json(&self) -> Value {
+        let mut value = self.training.map_or_else(|| json!({}), |training| json!(training));
+        value["elements"] = json!(self.elements);
+        value["level"] = json!(self.level);
+        value["alarm"] = json!(self.is_alarming());
+        value
+    }
+}
