@@ -1,5 +1,6 @@
 //! Loads and checks everything that a configuration names. `validate` stops there, and `run` starts with it.
 
+mod geometry;
 mod load;
 mod seed_structures;
 mod short_range;
@@ -80,8 +81,8 @@ impl Campaign {
         let ((artifact, training), (seeds, (protocol, mut file_hashes))) =
             combine_errors(path, grades, labels)?;
         warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds.valid, training.as_ref())?);
-        warnings.extend(loader.suspicious_seed_structures(&seeds, &model));
-        let pair_ranges = pair_ranges(&config, &seeds.valid, model.cutoff());
+        warnings.extend(loader.suspicious_seed_structures(&seeds));
+        let pair_ranges = pair_ranges(&config, &seeds.valid);
         warnings.extend(loader.repulsion_in_bonds(&pair_ranges));
         file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [

@@ -2,6 +2,7 @@
 //! gradient of the CALM extrapolation grade, a selector accepts the structures that are new, and labellers label
 //! them.
 
+mod all_cores;
 mod atomic_file;
 mod campaign;
 mod cli;

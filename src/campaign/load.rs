@@ -12,6 +12,7 @@ use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
+use super::geometry::Geometry;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_method::{self, REFERENCE_FILE};
 
@@ -21,6 +22,8 @@ pub struct SourcedStructure {
     pub seed: SeedStructure,
     /// `file:line`
     pub source: String,
+    /// Its distances.
+    pub geometry: Geometry,
 }
 
 /// Largest number of training atoms whose grades are monitored: enough for the share above 1 to a percent.
