@@ -8,6 +8,7 @@ mod short_range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use atoms::Repetition;
 use calm::Artifact;
 use calm::forgetting::ForgettingAlarm;
 use orchestrator::grader::Grader;
@@ -31,6 +32,9 @@ use short_range::pair_ranges;
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
 const FILE_KEYS: [&str; 4] =
     ["/potential/model", "/calm/artifact", "/calm/training_frames", "/label/method/potential/file"];
+
+/// Number of supercells that are named.
+const MAX_SHOWN_SUPERCELLS: usize = 5;
 
 /// A campaign that is ready to run.
 pub struct Campaign {
@@ -203,6 +207,23 @@ impl Campaign {
         let mut id = [0; 16];
         id.copy_from_slice(&hasher.finalize().as_bytes()[..16]);
         CampaignId(id)
+    }
+
+    /// Which seed structures are supercells of the cells in the files, if any.
+    pub fn supercells(&self) -> Option<String> {
+        let made: Vec<_> =
+            self.seed_structures.iter().filter(|named| named.repetition != Repetition::ONE).collect();
+        let shown =
+            made.iter().take(MAX_SHOWN_SUPERCELLS).map(|SourcedStructure { seed, repetition, .. }| {
+                format!("'{}' {repetition} ({} atoms)", seed.name, seed.structure.len())
+            });
+        let shown = shown.collect::<Vec<_>>().join(", ");
+        let more = match made.len().saturating_sub(MAX_SHOWN_SUPERCELLS) {
+            0 => String::new(),
+            more => format!(" and {more} more"),
+        };
+        let all = self.seed_structures.len();
+        (!made.is_empty()).then(|| format!("{} of {all} seed structures: {shown}{more}", made.len()))
     }
 
     /// The seed structures as stored.

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use atoms::{NeighbourList, Structure, read_structures};
+use atoms::{NeighbourList, Repetition, Structure, read_structures};
 use calm::forgetting::grade_distribution;
 use calm::{Artifact, ArtifactError, Mixture};
 use orchestrator::selector::{SeedStructure, TrainingFrames, UpdateProtocol};
@@ -20,8 +20,10 @@ use crate::label_method::{self, REFERENCE_FILE};
 pub struct SourcedStructure {
     /// Name and structure.
     pub seed: SeedStructure,
-    /// `file:line`
+    /// `file:line`, and the repetition of a supercell.
     pub source: String,
+    /// Repetition of the cell in the file.
+    pub repetition: Repetition,
     /// Its distances.
     pub geometry: Geometry,
 }

@@ -1,9 +1,11 @@
 //! Reads the seed structures and checks that walks can start from them.
 
 use std::collections::HashMap;
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
-use atoms::{CloseContact, Structure, extxyz, read_structures};
+use atoms::{CloseContact, Repetition, Structure, extxyz, read_structures};
+use calm::rules::Positive;
 use orchestrator::selector::SeedStructure;
 use potentials::grace::GraceModel;
 use toml::Spanned;
@@ -19,6 +21,9 @@ const FILES: &str = "seed_structures.files";
 /// Nearest neighbours of solids and molecules are 0.79 to 1.48 times the sum of their radii (U, H₂) apart. Confusing
 /// Bohr and Å changes distances by a factor of 1.89.
 const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
+
+/// Largest supercell: a walk of a larger one takes weeks.
+const MAX_SUPERCELL_ATOMS: u64 = 100_000;
 
 /// The seed structures of a campaign.
 #[derive(Default)]
@@ -49,8 +54,9 @@ impl SkippedStructure {
 /// A frame of a file.
 struct SourcedFrame<'a> {
     seed: SeedStructure,
-    /// `file:line`
+    /// `file:line`, and the repetition of a supercell.
     source: String,
+    repetition: Repetition,
     /// The file as the configuration names it.
     file: &'a Spanned<PathBuf>,
 }
@@ -63,16 +69,18 @@ impl Loader<'_> {
         let examined = all_cores::map(
             frames,
             || (),
-            |(), frame| {
-                let geometry = self.check_seed_structure(&frame.seed.structure, model);
+            |(), mut frame| {
+                let geometry = self
+                    .make_supercell(&mut frame)
+                    .and_then(|()| self.check_seed_structure(&frame.seed.structure, model));
                 (frame, geometry)
             },
         );
         let (mut seeds, mut first_error) = (SeedStructures::default(), None);
-        for (SourcedFrame { seed, source, file }, geometry) in examined {
+        for (SourcedFrame { seed, source, repetition, file }, geometry) in examined {
             let reason = match geometry {
                 Ok(geometry) => {
-                    seeds.valid.push(SourcedStructure { seed, source, geometry });
+                    seeds.valid.push(SourcedStructure { seed, source, repetition, geometry });
                     continue;
                 }
                 Err(reason) => reason,
@@ -110,16 +118,39 @@ impl Loader<'_> {
                     )));
                 }
                 let seed = SeedStructure { name, structure: frame.structure };
-                all.push(SourcedFrame { seed, source, file });
+                all.push(SourcedFrame { seed, source, repetition: Repetition::ONE, file });
             }
         }
         Ok(all)
     }
 
+    /// Repeats a cell that is smaller than `min_atoms` or `min_height`.
+    fn make_supercell(&self, frame: &mut SourcedFrame<'_>) -> Result<(), String> {
+        let section = &self.config.seed_structures;
+        let structure = &frame.seed.structure;
+        structure.validate().map_err(|error| error.to_string())?;
+        let min_atoms = section.min_atoms.map_or(1, NonZeroUsize::get);
+        let min_height = section.min_height.map_or(0.0, Positive::get);
+        let repetition = Repetition::for_size(structure, min_atoms, min_height);
+        if repetition == Repetition::ONE {
+            return Ok(());
+        }
+        let atoms = repetition.cells().saturating_mul(structure.len() as u64);
+        if atoms > MAX_SUPERCELL_ATOMS {
+            return Err(format!(
+                "seed_structures.min_atoms and min_height ask for a supercell of {repetition} cells with {atoms} atoms, more \
+                 than {MAX_SUPERCELL_ATOMS}"
+            ));
+        }
+        frame.seed.structure = structure.repeated(repetition);
+        frame.source = format!("{}, {repetition} supercell", frame.source);
+        frame.repetition = repetition;
+        Ok(())
+    }
+
     /// Checks that a walk can start and collect: the model knows the elements, no atoms overlap, each atom has a
     /// neighbour, there are as many atoms as the collection rule requires, and a volume ramp has a cell.
     fn check_seed_structure(&self, structure: &Structure, model: &GraceModel) -> Result<Geometry, String> {
-        structure.validate().map_err(|error| error.to_string())?;
         model.element_indices(&structure.species).map_err(|error| error.to_string())?;
         let geometry = Geometry::new(structure, model.cutoff()).map_err(|error| error.to_string())?;
         if let Some(contact) = self.config.guard.min_distances.prevents_start(&geometry.shortest) {
@@ -148,7 +179,8 @@ impl Loader<'_> {
         if let Some((needed, key)) = self.config.collect.criterion.too_small(atoms) {
             return Err(format!(
                 "the structure has {atoms} atoms, fewer than the {needed} that must be new at once \
-                 (collect.criterion.{key}): nothing can ever be collected from it; give a larger cell or a smaller `{key}`"
+                 (collect.criterion.{key}): nothing can ever be collected from it; give a larger cell (seed_structures.min_atoms makes supercells) or a \
+                 smaller `{key}`"
             ));
         }
         if self.config.walk.volume_ramp.is_some() && structure.periodic == [false; 3] {
@@ -169,7 +201,7 @@ impl Loader<'_> {
         let mut messages: Vec<_> = seeds.skipped.iter().map(SkippedStructure::message).collect();
         let mut first = HashMap::new();
         for named in &seeds.valid {
-            let SourcedStructure { seed: SeedStructure { name, structure }, source, geometry } = named;
+            let SourcedStructure { seed: SeedStructure { name, structure }, source, geometry, .. } = named;
             if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
                 messages.push(format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",

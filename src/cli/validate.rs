@@ -59,6 +59,9 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign, all: bool) -> io
         skipped => format!("; {skipped} skipped, see above"),
     };
     writeln!(out, "  seed structures  {}, with {min} to {max} atoms{skipped}", seed_structures.len())?;
+    if let Some(supercells) = campaign.supercells() {
+        writeln!(out, "  supercells       {supercells}")?;
+    }
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
     writeln!(out, "  disk             {}", wording::disk::forecast(&disk_forecast::estimate(campaign)))?;
     match campaign.warnings.len() {
