@@ -4,6 +4,8 @@ mod geometry;
 mod load;
 mod seed_structures;
 mod short_range;
+mod triage;
+mod walk_time;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,8 +28,11 @@ use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
 use load::Loader;
 pub use load::{SourcedStructure, check_sound};
+pub use seed_structures::SkippedStructure;
 pub use short_range::PairRange;
 use short_range::pair_ranges;
+pub use triage::{Remark, SeedTriage, triage};
+pub use walk_time::{StepTimes, WalkTime};
 
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
 const FILE_KEYS: [&str; 4] =
@@ -50,8 +55,8 @@ pub struct Campaign {
     pub artifact: Artifact,
     /// Seed structures, in the order of the files.
     pub seed_structures: Vec<SourcedStructure>,
-    /// Number of seed structures that no walk can start from.
-    pub skipped: usize,
+    /// Seed structures that no walk can start from.
+    pub skipped: Vec<SkippedStructure>,
     /// The pairs of elements in the seed structures.
     pub pair_ranges: Vec<PairRange>,
     /// Features of the training frames, if the configuration names them.
@@ -103,7 +108,7 @@ impl Campaign {
             text,
             model,
             artifact,
-            skipped: seeds.skipped.len(),
+            skipped: seeds.skipped,
             seed_structures: seeds.valid,
             pair_ranges,
             training,

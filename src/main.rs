@@ -7,6 +7,7 @@ mod atomic_file;
 mod campaign;
 mod cli;
 mod config;
+mod csv;
 mod disk_forecast;
 mod duration;
 mod exit_status;

@@ -38,6 +38,7 @@ mod relabel;
 mod replay;
 mod schema;
 mod status;
+mod triage;
 mod wrong_artifacts;
 mod wrong_campaign;
 mod wrong_input;

@@ -9,6 +9,8 @@ pub struct Geometry {
     pub shortest: ShortestDistances,
     /// The two atoms that are closest, and their distance, Å.
     pub closest: Option<(usize, usize, f64)>,
+    /// Number of neighbours within the cutoff, summed over the atoms.
+    pub bonds: usize,
     /// An atom without neighbours in a structure with several atoms.
     pub isolated: Option<usize>,
     /// The distance of an atom to its nearest neighbour, Å, and the same divided by the sum of their radii: the median
@@ -24,10 +26,12 @@ impl Geometry {
     pub fn new(structure: &Structure, cutoff: f64) -> Result<Self, StructureError> {
         let mut neighbours = NeighbourList::new(cutoff, 0.0);
         neighbours.update(structure)?;
-        let is_alone = |i: &usize| structure.len() > 1 && neighbours.neighbours_of(*i).is_empty();
+        let bonds = |i: &usize| neighbours.neighbours_of(*i).len();
+        let is_alone = |i: &usize| structure.len() > 1 && bonds(i) == 0;
         Ok(Self {
             shortest: ShortestDistances::from_neighbours(structure, &neighbours),
             closest: shortest_distance(structure, &neighbours),
+            bonds: (0..structure.len()).map(|i| bonds(&i)).sum(),
             isolated: (0..structure.len()).find(is_alone),
             nearest: median_nearest(structure, &neighbours),
         })

@@ -22,6 +22,9 @@ const FILES: &str = "seed_structures.files";
 /// Bohr and Å changes distances by a factor of 1.89.
 const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
 
+/// Number of skipped seed structures that are listed with their reason.
+const MAX_LISTED: usize = 20;
+
 /// Largest supercell: a walk of a larger one takes weeks.
 const MAX_SUPERCELL_ATOMS: u64 = 100_000;
 
@@ -198,7 +201,13 @@ impl Loader<'_> {
     pub fn suspicious_seed_structures(&self, seeds: &SeedStructures) -> Vec<Warning> {
         let at = place(self.path, self.text, FILES);
         let warning = |message| Warning { at: at.clone(), key: FILES.to_owned(), message };
-        let mut messages: Vec<_> = seeds.skipped.iter().map(SkippedStructure::message).collect();
+        let mut messages: Vec<_> =
+            seeds.skipped.iter().take(MAX_LISTED).map(SkippedStructure::message).collect();
+        if let Some(more @ 1..) = seeds.skipped.len().checked_sub(MAX_LISTED) {
+            messages.push(format!(
+                "{more} more seed structures are skipped (calmwalk validate --csv FILE lists all)"
+            ));
+        }
         let mut first = HashMap::new();
         for named in &seeds.valid {
             let SourcedStructure { seed: SeedStructure { name, structure }, source, geometry, .. } = named;
