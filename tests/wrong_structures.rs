@@ -214,7 +214,7 @@ fn small_cells_become_supercells() {
     let cluster = changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# ");
     assert!(!validate(&enlarged(&cluster, "100", "50.0")).contains("supercells"));
     seeds.tester.write("small.extxyz", primitive);
-    let message = seeds.tester.refused(&enlarged(&small, "1", "200.0"));
+    let message = seeds.tester.refused(enlarged(&small, "1", "200.0"));
     let expected = "ask for a supercell of 86 × 86 × 86 cells with 636056 atoms, more than 100000";
     assert!(message.contains(expected), "{message}");
 }
