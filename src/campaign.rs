@@ -1,15 +1,19 @@
 //! Loads and checks everything that a configuration names. `validate` stops there, and `run` starts with it.
 
+mod geometry;
 mod load;
 mod seed_structures;
 mod short_range;
 mod training_sample;
+mod triage;
 mod walk_plan;
+mod walk_time;
 
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use atoms::Repetition;
 use calm::Artifact;
 use calm::forgetting::ForgettingAlarm;
 use orchestrator::grader::Grader;
@@ -27,12 +31,18 @@ use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
 use load::Loader;
 pub use load::{SourcedStructure, check_sound};
+pub use seed_structures::SkippedStructure;
 pub use short_range::PairRange;
 use short_range::pair_ranges;
+pub use triage::{Remark, SeedTriage, triage};
+pub use walk_time::{StepTimes, WalkTime};
 
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
 const FILE_KEYS: [&str; 4] =
     ["/potential/model", "/calm/artifact", "/calm/training_frames", "/label/method/potential/file"];
+
+/// Number of supercells that are named.
+const MAX_SHOWN_SUPERCELLS: usize = 5;
 
 /// A campaign that is ready to run.
 pub struct Campaign {
@@ -48,8 +58,8 @@ pub struct Campaign {
     pub artifact: Artifact,
     /// Seed structures, in the order of the files.
     pub seed_structures: Vec<SourcedStructure>,
-    /// Number of seed structures that no walk can start from.
-    pub skipped: usize,
+    /// Seed structures that no walk can start from.
+    pub skipped: Vec<SkippedStructure>,
     /// The pairs of elements in the seed structures.
     pub pair_ranges: Vec<PairRange>,
     /// Features of the training frames, if the configuration names them.
@@ -84,8 +94,8 @@ impl Campaign {
         let ((artifact, training), (seeds, (protocol, mut file_hashes))) =
             combine_errors(path, grades, labels)?;
         warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds.valid, training.as_ref())?);
-        warnings.extend(loader.suspicious_seed_structures(&seeds, &model));
-        let pair_ranges = pair_ranges(&config, &seeds.valid, model.cutoff());
+        warnings.extend(loader.suspicious_seed_structures(&seeds));
+        let pair_ranges = pair_ranges(&config, &seeds.valid);
         warnings.extend(loader.repulsion_in_bonds(&pair_ranges));
         file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [
@@ -102,7 +112,7 @@ impl Campaign {
             text,
             model,
             artifact,
-            skipped: seeds.skipped.len(),
+            skipped: seeds.skipped,
             seed_structures: seeds.valid,
             pair_ranges,
             training,
@@ -206,6 +216,23 @@ impl Campaign {
         let mut id = [0; 16];
         id.copy_from_slice(&hasher.finalize().as_bytes()[..16]);
         CampaignId(id)
+    }
+
+    /// Which seed structures are supercells of the cells in the files, if any.
+    pub fn supercells(&self) -> Option<String> {
+        let made: Vec<_> =
+            self.seed_structures.iter().filter(|named| named.repetition != Repetition::ONE).collect();
+        let shown =
+            made.iter().take(MAX_SHOWN_SUPERCELLS).map(|SourcedStructure { seed, repetition, .. }| {
+                format!("'{}' {repetition} ({} atoms)", seed.name, seed.structure.len())
+            });
+        let shown = shown.collect::<Vec<_>>().join(", ");
+        let more = match made.len().saturating_sub(MAX_SHOWN_SUPERCELLS) {
+            0 => String::new(),
+            more => format!(" and {more} more"),
+        };
+        let all = self.seed_structures.len();
+        (!made.is_empty()).then(|| format!("{} of {all} seed structures: {shown}{more}", made.len()))
     }
 
     /// The seed structures as stored.

@@ -2,10 +2,12 @@
 //! gradient of the CALM extrapolation grade, a selector accepts the structures that are new, and labellers label
 //! them.
 
+mod all_cores;
 mod atomic_file;
 mod campaign;
 mod cli;
 mod config;
+mod csv;
 mod disk_forecast;
 mod duration;
 mod exit_status;

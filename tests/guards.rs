@@ -88,6 +88,12 @@ fn a_campaign_has_a_bill_before_it_begins() {
     let plan = json(here, ["estimate", "campaign.toml"]);
     assert_eq!((&plan["labels"], &plan["core_hours"]), (&16.into(), &Json::Null));
     assert!(succeed(here, ["estimate", "campaign.toml"]).contains("cost unknown"));
+    let walks = |of: &Json| ["biased", "control"].map(|kind| of["walk_hours"][kind].as_f64().unwrap());
+    let (all, seeds) = (walks(&plan), [0, 1].map(|k| walks(&plan["seed_structures"][k])));
+    assert!(all.iter().all(|hours| *hours > 0.0), "{plan}");
+    for (k, sum) in all.into_iter().enumerate() {
+        assert!((sum / (seeds[0][k] + seeds[1][k]) - 1.0).abs() < 1e-9, "{plan}");
+    }
     let priced = json(here, ["estimate", "campaign.toml", "--core-seconds", "3600"]);
     let hours = |plan: &Json| plan["core_hours"]["expected"].as_f64().unwrap();
     let first = priced["seed_structures"][0]["core_hours_each"]["expected"].as_f64().unwrap();

@@ -38,6 +38,7 @@ mod relabel;
 mod replay;
 mod schema;
 mod status;
+mod triage;
 mod walk_groups;
 mod wrong_artifacts;
 mod wrong_campaign;

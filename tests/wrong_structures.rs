@@ -1,9 +1,14 @@
 //! Wrong seed structures: refused with file and line before any walk begins.
 
 use std::fmt::Write;
+use std::fs;
 
+use store::Location;
+
+use crate::common::campaign::Small;
 use crate::common::config_tester::{ConfigTester, changed, line};
-use crate::common::{calmwalk, config, stderr, succeed};
+use crate::common::label_campaign::on_store;
+use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const CELL: &str = "Lattice=\"8.4 0 0 0 8.4 0 0 0 8.4\"";
 
@@ -166,6 +171,83 @@ fn structures_from_which_nothing_can_be_collected_are_refused() {
     // Without a ramp it needs no cell.
     seeds.tester.write("c.toml", changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# "));
     succeed(seeds.tester.path(), ["validate", "c.toml"]);
+}
+
+/// The commented keys of the demo with these values.
+fn enlarged(text: &str, min_atoms: &str, min_height: &str) -> String {
+    let (atoms, height) = ("# min_atoms = 32 ", "# min_height = 10.0 ");
+    assert!(text.contains(atoms) && text.contains(height));
+    text.replace(atoms, &format!("min_atoms = {min_atoms} "))
+        .replace(height, &format!("min_height = {min_height} "))
+}
+
+#[test]
+fn small_cells_become_supercells() {
+    let seeds = Seeds::new();
+    let primitive = "1\nLattice=\"0 2.025 2.025 2.025 0 2.025 2.025 2.025 0\" Properties=species:S:1:pos:R:3 name=fcc\nAl 0 0 0\n";
+    seeds.tester.write("small.extxyz", format!("{primitive}{}", good()));
+    let small = changed(&seeds.files, "small.extxyz");
+    let validate = |text: &str| {
+        seeds.tester.write("c.toml", text);
+        succeed(seeds.tester.path(), ["validate", "c.toml"])
+    };
+    // Its faces are 2.34 Å apart.
+    let valid = validate(&enlarged(&small, "1", "8.0"));
+    assert!(valid.contains("supercells       1 of 2 seed structures: 'fcc' 4 × 4 × 4 (64 atoms)"), "{valid}");
+    let valid = validate(&enlarged(&small, "40", "6.0"));
+    let expected =
+        "supercells       2 of 2 seed structures: 'fcc' 4 × 4 × 3 (48 atoms), 'small-1' 2 × 1 × 1 (54 atoms)";
+    assert!(valid.contains(expected), "{valid}");
+    assert!(
+        !validate(&enlarged(
+            &small
+                .replace(" min_atoms = 3 ", " min_atoms = 1 ")
+                .replace(" min_atoms = 3,", " min_atoms = 1,"),
+            "1",
+            "1.0"
+        ))
+        .contains("supercells")
+    );
+    // A cluster is left as it is, and too large a supercell is refused.
+    let cluster = good().replace(CELL, "pbc=\"F F F\"");
+    seeds.tester.write("cluster.extxyz", &cluster);
+    let cluster = changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# ");
+    assert!(!validate(&enlarged(&cluster, "100", "50.0")).contains("supercells"));
+    seeds.tester.write("small.extxyz", primitive);
+    let message = seeds.tester.refused(enlarged(&small, "1", "200.0"));
+    let expected = "ask for a supercell of 86 × 86 × 86 cells with 636056 atoms, more than 100000";
+    assert!(message.contains(expected), "{message}");
+}
+
+/// A campaign cannot change the structures that it has, and so not their repetition.
+#[test]
+fn a_campaign_keeps_its_supercells() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small::default().write(here);
+    let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
+    let with = |min_atoms: u32| {
+        let enlarged =
+            text.replace("[seed_structures]", &format!("[seed_structures]\nmin_atoms = {min_atoms}"));
+        fs::write(here.join("campaign.toml"), enlarged).unwrap();
+    };
+    with(40);
+    let output = calmwalk(here, ["run", "campaign.toml"]);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    assert!(said.contains("supercells: 1 of 2 seed structures: "), "{said}");
+    let seeds = on_store(Location::from(&*here.join("campaign")), async |store| {
+        store.seed_structures().await.unwrap()
+    });
+    assert_eq!((seeds[0].structure.len(), seeds[1].structure.len()), (64, 47));
+    assert!(seeds[0].source.ends_with(":1, 2 × 1 × 1 supercell"), "{}", seeds[0].source);
+    assert!(!seeds[1].source.contains("supercell"));
+    with(70);
+    let message = refuse(here, ["run", "campaign.toml"]);
+    assert!(
+        message.contains("seed structure 0 is") && message.contains("min_atoms and min_height as they were"),
+        "{message}"
+    );
 }
 
 /// What `validate` warns of, in a valid campaign with these seed structures.

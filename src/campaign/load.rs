@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use atoms::{NeighbourList, Structure};
+use atoms::{NeighbourList, Repetition, Structure};
 use calm::forgetting::grade_distribution;
 use calm::{Artifact, ArtifactError, Mixture};
 use orchestrator::selector::{SeedStructure, TrainingFrames, UpdateProtocol};
@@ -12,6 +12,7 @@ use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
+use super::geometry::Geometry;
 use super::training_sample;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_method::{self, REFERENCE_FILE};
@@ -21,8 +22,12 @@ use crate::xyz_reader::XyzReader;
 pub struct SourcedStructure {
     /// Name and structure.
     pub seed: SeedStructure,
-    /// `file:line`
+    /// `file:line`, and the repetition of a supercell.
     pub source: String,
+    /// Repetition of the cell in the file.
+    pub repetition: Repetition,
+    /// Its distances.
+    pub geometry: Geometry,
 }
 
 /// Largest number of seed-structure atoms that are graded.

@@ -1,15 +1,19 @@
 //! Reads the seed structures and checks that walks can start from them.
 
 use std::collections::HashMap;
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
 
-use atoms::{
-    CloseContact, NeighbourList, ShortestDistances, Structure, extxyz, read_structures, shortest_distance,
-};
+use atoms::{CloseContact, Repetition, Structure, extxyz, read_structures};
+use calm::rules::Positive;
 use orchestrator::selector::SeedStructure;
 use potentials::grace::GraceModel;
+use toml::Spanned;
 use wire::ContentHash;
 
+use super::geometry::Geometry;
 use super::load::{Loader, SourcedStructure};
+use crate::all_cores;
 use crate::config::{ConfigError, OnInvalid, Warning, place};
 
 const FILES: &str = "seed_structures.files";
@@ -18,22 +22,89 @@ const FILES: &str = "seed_structures.files";
 /// Bohr and Å changes distances by a factor of 1.89.
 const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
 
+/// Number of skipped seed structures that are listed with their reason.
+const MAX_LISTED: usize = 20;
+
+/// Largest supercell: a walk of a larger one takes weeks.
+const MAX_SUPERCELL_ATOMS: u64 = 100_000;
+
 /// The seed structures of a campaign.
 #[derive(Default)]
 pub struct SeedStructures {
     /// Those that walks start from.
     pub valid: Vec<SourcedStructure>,
-    /// A sentence for each that is left out.
-    pub skipped: Vec<String>,
+    /// Those that no walk can start from.
+    pub skipped: Vec<SkippedStructure>,
+}
+
+/// A seed structure that is left out.
+pub struct SkippedStructure {
+    /// Name and structure.
+    pub seed: SeedStructure,
+    /// `file:line`
+    pub source: String,
+    /// Why no walk can start from it.
+    pub reason: String,
+}
+
+impl SkippedStructure {
+    fn message(&self) -> String {
+        let Self { seed, source, reason } = self;
+        format!("seed structure '{}' ({source}) is skipped: {reason}", seed.name)
+    }
+}
+
+/// A frame of a file.
+struct SourcedFrame<'a> {
+    seed: SeedStructure,
+    /// `file:line`, and the repetition of a supercell.
+    source: String,
+    repetition: Repetition,
+    /// The file as the configuration names it.
+    file: &'a Spanned<PathBuf>,
 }
 
 impl Loader<'_> {
     /// Reads every frame of every file. Names must be unique. Frames that no walk can start from are left out, with a
     /// reason each, if the configuration allows it and others remain.
     pub fn seed_structures(&self, model: &GraceModel) -> Result<SeedStructures, ConfigError> {
-        let mut seeds = SeedStructures::default();
+        let frames = self.read_seed_structures()?.into_iter();
+        let examined = all_cores::map(
+            frames,
+            || (),
+            |(), mut frame| {
+                let geometry = self
+                    .make_supercell(&mut frame)
+                    .and_then(|()| self.check_seed_structure(&frame.seed.structure, model));
+                (frame, geometry)
+            },
+        );
+        let (mut seeds, mut first_error) = (SeedStructures::default(), None);
+        for (SourcedFrame { seed, source, repetition, file }, geometry) in examined {
+            let reason = match geometry {
+                Ok(geometry) => {
+                    seeds.valid.push(SourcedStructure { seed, source, repetition, geometry });
+                    continue;
+                }
+                Err(reason) => reason,
+            };
+            let error = || self.file_error(FILES, file, format!("{source}: {reason}"));
+            if self.config.seed_structures.on_invalid == OnInvalid::Error {
+                return Err(error());
+            }
+            first_error.get_or_insert_with(error);
+            seeds.skipped.push(SkippedStructure { seed, source, reason });
+        }
+        match first_error.filter(|_| seeds.valid.is_empty()) {
+            Some(error) => Err(error),
+            None => Ok(seeds),
+        }
+    }
+
+    /// Reads every frame of every file, in order, and names it.
+    fn read_seed_structures(&self) -> Result<Vec<SourcedFrame<'_>>, ConfigError> {
+        let mut all = Vec::new();
         let mut sources: HashMap<String, String> = HashMap::new();
-        let mut first_error = None;
         for file in &self.config.seed_structures.files {
             let path = file.get_ref();
             let wrong = |message: String| self.file_error(FILES, file, message);
@@ -49,52 +120,61 @@ impl Loader<'_> {
                          (name=… in its comment line)",
                     )));
                 }
-                let Err(reason) = self.check_seed_structure(&frame.structure, model) else {
-                    let seed = SeedStructure { name, structure: frame.structure, walks: Vec::new() };
-                    seeds.valid.push(SourcedStructure { seed, source });
-                    continue;
-                };
-                let error = wrong(format!("{source}: {reason}"));
-                if self.config.seed_structures.on_invalid == OnInvalid::Error {
-                    return Err(error);
-                }
-                first_error.get_or_insert(error);
-                seeds.skipped.push(format!("seed structure '{name}' ({source}) is skipped: {reason}"));
+                let seed = SeedStructure { name, structure: frame.structure, walks: Vec::new() };
+                all.push(SourcedFrame { seed, source, repetition: Repetition::ONE, file });
             }
         }
-        match first_error.filter(|_| seeds.valid.is_empty()) {
-            Some(error) => Err(error),
-            None => Ok(seeds),
+        Ok(all)
+    }
+
+    /// Repeats a cell that is smaller than `min_atoms` or `min_height`.
+    fn make_supercell(&self, frame: &mut SourcedFrame<'_>) -> Result<(), String> {
+        let section = &self.config.seed_structures;
+        let structure = &frame.seed.structure;
+        structure.validate().map_err(|error| error.to_string())?;
+        let min_atoms = section.min_atoms.map_or(1, NonZeroUsize::get);
+        let min_height = section.min_height.map_or(0.0, Positive::get);
+        let repetition = Repetition::for_size(structure, min_atoms, min_height);
+        if repetition == Repetition::ONE {
+            return Ok(());
         }
+        let atoms = repetition.cells().saturating_mul(structure.len() as u64);
+        if atoms > MAX_SUPERCELL_ATOMS {
+            return Err(format!(
+                "seed_structures.min_atoms and min_height ask for a supercell of {repetition} cells with {atoms} atoms, more \
+                 than {MAX_SUPERCELL_ATOMS}"
+            ));
+        }
+        frame.seed.structure = structure.repeated(repetition);
+        frame.source = format!("{}, {repetition} supercell", frame.source);
+        frame.repetition = repetition;
+        Ok(())
     }
 
     /// Checks that a walk can start and collect: the model knows the elements, no atoms overlap, each atom has a
     /// neighbour, there are as many atoms as the collection rule requires, and a volume ramp has a cell.
-    fn check_seed_structure(&self, structure: &Structure, model: &GraceModel) -> Result<(), String> {
-        structure.validate().map_err(|error| error.to_string())?;
+    fn check_seed_structure(&self, structure: &Structure, model: &GraceModel) -> Result<Geometry, String> {
         model.element_indices(&structure.species).map_err(|error| error.to_string())?;
-        let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
-        neighbours.update(structure).map_err(|error| error.to_string())?;
-        let shortest = ShortestDistances::from_neighbours(structure, &neighbours);
-        if let Some(contact) = self.config.guard.min_distances.prevents_start(&shortest) {
+        let geometry = Geometry::new(structure, model.cutoff()).map_err(|error| error.to_string())?;
+        if let Some(contact) = self.config.guard.min_distances.prevents_start(&geometry.shortest) {
             let CloseContact { pair, distance, limit } = contact;
-            let closest = shortest_distance(structure, &neighbours)
+            let closest = geometry
+                .closest
                 .map_or(String::new(), |(i, j, d)| format!(" (atoms {i} and {j} are {d:.3} Å apart)"));
             return Err(format!(
                 "the shortest {pair} distance is {distance:.3} Å, below the {limit:.3} Å that guard.min_distances allows at \
                  the start of a walk{closest}"
             ));
         }
-        let alone =
-            (0..structure.len()).find(|i| structure.len() > 1 && neighbours.neighbours_of(*i).is_empty());
-        if let Some(atom) = alone {
+        if let Some(atom) = geometry.isolated {
             let cutoff = model.cutoff();
             return Err(format!(
                 "atom {atom} has no neighbour within the cutoff, {cutoff} Å: a walk would end at its first step (are \
                  positions and cell in Å, not Bohr?)"
             ));
         }
-        self.check_collectable(structure)
+        self.check_collectable(structure)?;
+        Ok(geometry)
     }
 
     fn check_collectable(&self, structure: &Structure) -> Result<(), String> {
@@ -102,7 +182,8 @@ impl Loader<'_> {
         if let Some((needed, key)) = self.config.collect.criterion.too_small(atoms) {
             return Err(format!(
                 "the structure has {atoms} atoms, fewer than the {needed} that must be new at once \
-                 (collect.criterion.{key}): nothing can ever be collected from it; give a larger cell or a smaller `{key}`"
+                 (collect.criterion.{key}): nothing can ever be collected from it; give a larger cell (seed_structures.min_atoms makes supercells) or a \
+                 smaller `{key}`"
             ));
         }
         // Groups of walks say for themselves which of them change the volume.
@@ -119,28 +200,31 @@ impl Loader<'_> {
 
     /// Warns of skipped structures, and of likely mistakes: duplicate structures and distances that do not match the
     /// elements.
-    pub fn suspicious_seed_structures(&self, seeds: &SeedStructures, model: &GraceModel) -> Vec<Warning> {
+    pub fn suspicious_seed_structures(&self, seeds: &SeedStructures) -> Vec<Warning> {
+        let at = place(self.path, self.text, FILES);
+        let warning = |message| Warning { at: at.clone(), key: FILES.to_owned(), message };
+        let mut messages: Vec<_> =
+            seeds.skipped.iter().take(MAX_LISTED).map(SkippedStructure::message).collect();
+        if let Some(more @ 1..) = seeds.skipped.len().checked_sub(MAX_LISTED) {
+            messages.push(format!(
+                "{more} more seed structures are skipped (calmwalk validate --csv FILE lists all)"
+            ));
+        }
         let mut first = HashMap::new();
-        let mut warnings: Vec<_> =
-            seeds.skipped.iter().map(|skipped| self.seeds_warning(skipped.clone())).collect();
         for named in &seeds.valid {
-            let SourcedStructure { seed: SeedStructure { name, structure, .. }, source } = named;
+            let SourcedStructure { seed: SeedStructure { name, structure, .. }, source, geometry, .. } =
+                named;
             if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
-                let message = format!(
+                messages.push(format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",
                     other.seed.name, other.source
-                );
-                warnings.push(self.seeds_warning(message));
+                ));
             }
-            if let Some(strange) = suspicious_distances(structure, model.cutoff()) {
-                warnings.push(self.seeds_warning(format!("seed structure '{name}' ({source}): {strange}")));
+            if let Some(strange) = suspicious_distances(structure, geometry) {
+                messages.push(format!("seed structure '{name}' ({source}): {strange}"));
             }
         }
-        warnings
-    }
-
-    fn seeds_warning(&self, message: String) -> Warning {
-        Warning { at: place(self.path, self.text, FILES), key: FILES.to_owned(), message }
+        messages.into_iter().map(warning).collect()
     }
 }
 
@@ -155,23 +239,8 @@ fn rounded(structure: &Structure) -> Structure {
 }
 
 /// Describes nearest-neighbour distances that do not match the elements.
-fn suspicious_distances(structure: &Structure, cutoff: f64) -> Option<String> {
-    let mut neighbours = NeighbourList::new(cutoff, 0.0);
-    neighbours.update(structure).ok()?;
-    let mut bonds = Vec::new();
-    // For each atom, the nearest neighbour relative to the radii: distance, and distance divided by the sum of radii.
-    let mut nearest: Vec<(f64, f64)> = (0..structure.len())
-        .filter_map(|i| {
-            neighbours.bonds_within(structure, i, cutoff, &mut bonds);
-            let relative = bonds.iter().filter_map(|bond| {
-                let other = structure.species[bond.atom as usize];
-                Some((bond.r, bond.r / (structure.species[i].radius()? + other.radius()?)))
-            });
-            relative.min_by(|a, b| a.1.total_cmp(&b.1))
-        })
-        .collect();
-    nearest.sort_by(|a, b| a.1.total_cmp(&b.1));
-    let (distance, ratio) = *nearest.get(nearest.len() / 2)?;
+fn suspicious_distances(structure: &Structure, geometry: &Geometry) -> Option<String> {
+    let (distance, ratio) = geometry.nearest?;
     if USUAL_BONDS.contains(&ratio) {
         return None;
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use atoms::{ElementPair, NeighbourList, ShortestDistances};
+use atoms::ElementPair;
 use potentials::ZblWindow;
 
 use super::load::{Loader, SourcedStructure};
@@ -23,17 +23,12 @@ pub struct PairRange {
     pub zbl: Option<ZblWindow>,
 }
 
-/// All pairs with a distance within `cutoff`, Å, in their order.
-pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure], cutoff: f64) -> Vec<PairRange> {
+/// All pairs with a distance within the cutoff of the model, in their order.
+pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure]) -> Vec<PairRange> {
     let mut ranges: BTreeMap<ElementPair, PairRange> = BTreeMap::new();
-    for SourcedStructure { seed, .. } in seeds {
-        let mut neighbours = NeighbourList::new(cutoff, 0.0);
-        if neighbours.update(&seed.structure).is_err() {
-            continue;
-        }
-        let found = ShortestDistances::from_neighbours(&seed.structure, &neighbours);
-        let limits: BTreeMap<_, _> = config.guard.min_distances.limits(&found).iter().collect();
-        for (pair, distance) in found.iter().filter(|(_, distance)| distance.is_finite()) {
+    for SourcedStructure { seed, geometry, .. } in seeds {
+        let limits: BTreeMap<_, _> = config.guard.min_distances.limits(&geometry.shortest).iter().collect();
+        for (pair, distance) in geometry.shortest.iter().filter(|(_, distance)| distance.is_finite()) {
             let range = ranges.entry(pair).or_insert_with(|| PairRange {
                 pair,
                 shortest: f64::INFINITY,

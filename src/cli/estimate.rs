@@ -10,18 +10,19 @@ use serde_json::json;
 use store::{Location, Store};
 
 use super::{ExitStatus, Failure, block_on, campaign_location};
-use crate::campaign::Campaign;
+use crate::campaign::{Campaign, StepTimes, WalkTime};
 use crate::disk_forecast;
 use crate::output::{Table, count, print, print_json};
 use crate::wording;
-use crate::wording::cost::{core_hours, two_digits};
+use crate::wording::cost::{core_hours, two_digits, wall_time};
 
 /// Seed structures shown without --all.
 const SHOWN: usize = 20;
 
 /// Estimate the cost of a campaign before it starts
 ///
-/// Shows the largest number of labels that the configuration allows, their expected cost and the disk use. The cost of a label
+/// Shows the largest number of labels that the configuration allows, their expected cost, the time of the walks and the disk use.
+/// Walks are estimated from a few steps that are measured on this host. The cost of a label
 /// is extrapolated from the labels of another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk
 /// label-file`).
 #[derive(Debug, clap::Args)]
@@ -57,6 +58,8 @@ struct SeedEstimate {
     labels: u64,
     /// Cost of one label.
     cost_per_label: Option<CoreHours>,
+    /// Time of its walks.
+    walks: Option<WalkTime>,
 }
 
 /// The estimate for the campaign.
@@ -68,6 +71,8 @@ struct CampaignEstimate {
     cost: Option<CoreHours>,
     /// Where the costs come from.
     cost_source: String,
+    /// Time of all walks.
+    walks: Option<WalkTime>,
     disk: DiskForecast,
 }
 
@@ -86,6 +91,7 @@ impl Estimate {
     fn estimate(&self, campaign: &Campaign) -> Result<CampaignEstimate, Failure> {
         let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
+        let times = StepTimes::measure(campaign)?;
         let config = &campaign.config;
         let copies = config.labels_of_each();
         let seed_structures: Vec<_> = campaign
@@ -97,6 +103,7 @@ impl Estimate {
                 size,
                 labels: u64::from(copies) * config.most_structures_of(seed.seed.walks.len()),
                 cost_per_label: costs.as_ref().and_then(|costs| costs.predict([(size, 1)])),
+                walks: times.of(seed),
             })
             .collect();
         let sum = seed_structures.iter().map(|seed| seed.labels).sum();
@@ -112,6 +119,7 @@ impl Estimate {
             limited_by: limit.and(config.budget().structures_by),
             cost: cost.map(|cost| cost.scaled(fraction)),
             cost_source,
+            walks: times.total(&campaign.seed_structures),
             disk: disk_forecast::estimate(campaign),
         })
     }
@@ -153,7 +161,7 @@ async fn fit_costs(location: &Location) -> Result<CostEstimator, Failure> {
 }
 
 fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: bool) -> io::Result<()> {
-    let CampaignEstimate { seed_structures, labels, limited_by, cost, cost_source, disk } = estimate;
+    let CampaignEstimate { seed_structures, labels, limited_by, cost, cost_source, walks, disk } = estimate;
     let limit = limited_by.as_ref().map_or(String::new(), |key| format!(", limited by {key}"));
     writeln!(out, "{}: at most {}{limit}", path.display(), count(*labels, "label"))?;
     match cost {
@@ -170,6 +178,8 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
              and pass its cost with --core-seconds"
         )?,
     }
+    let walks = walks.map_or("no step could be measured".to_owned(), wording::cost::walks);
+    writeln!(out, "  walks    {walks}")?;
     writeln!(out, "  disk     {}", wording::disk::forecast(disk))?;
     let mut table = Table::new(&[
         "seed structure",
@@ -178,9 +188,10 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
         ">electrons",
         ">k-points",
         ">core-hours per label",
+        ">walk",
     ]);
     let shown = if all { seed_structures.len() } else { SHOWN.min(seed_structures.len()) };
-    for SeedEstimate { name, size, labels, cost_per_label } in &seed_structures[..shown] {
+    for SeedEstimate { name, size, labels, cost_per_label, walks } in &seed_structures[..shown] {
         table.push(vec![
             name.clone(),
             labels.to_string(),
@@ -188,6 +199,7 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
             size.electrons.map_or("–".into(), |electrons| electrons.to_string()),
             size.k_points.to_string(),
             cost_per_label.map_or("–".into(), |hours| two_digits(hours.expected)),
+            walks.map_or("–".into(), |time| wall_time(time.biased)),
         ]);
     }
     table.write(out)?;
@@ -198,16 +210,19 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
 }
 
 fn as_json(estimate: &CampaignEstimate) -> serde_json::Value {
+    let hours = |walks: Option<WalkTime>| {
+        walks.map(|time| json!({ "biased": time.biased / 3600.0, "control": time.control / 3600.0 }))
+    };
     let of_seed = |seed: &SeedEstimate| {
         let Size { atoms, electrons, k_points } = seed.size;
         json!({
             "seed_structure": seed.name, "labels": seed.labels, "atoms": atoms, "electrons": electrons,
-            "k_points": k_points, "core_hours_each": seed.cost_per_label,
+            "k_points": k_points, "core_hours_each": seed.cost_per_label, "walk_hours": hours(seed.walks),
         })
     };
     json!({
         "labels": estimate.labels, "limited_by": estimate.limited_by, "core_hours": estimate.cost,
-        "disk": estimate.disk,
+        "walk_hours": hours(estimate.walks), "disk": estimate.disk,
         "seed_structures": estimate.seed_structures.iter().map(of_seed).collect::<Vec<_>>(),
     })
 }

@@ -187,7 +187,13 @@ impl Launch {
                 specs.remove_endpoint()?;
             }
             let request = specs.request(submission.role, orchestrator);
-            let id = slurm.submit(names, submission, &request).await.map_err(Failure::failed)?;
+            let role = submission.role;
+            let on_full = |full: &SlurmError| {
+                log_and_print(format_args!(
+                    "{role}: {full}; waiting until it does. To stop waiting, press Ctrl-C and launch again later"
+                ));
+            };
+            let id = slurm.submit(names, submission, &request, on_full).await.map_err(Failure::failed)?;
             orchestrator = orchestrator.or(Some(id));
             print(|out| writeln!(out, "{}: job {id} submitted", submission.role))?;
         }

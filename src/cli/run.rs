@@ -279,6 +279,9 @@ async fn open_store(
             store
         }
     };
+    if let Some(supercells) = campaign.supercells() {
+        log_and_print(format_args!("supercells: {supercells}"));
+    }
     store.set_budget(&campaign.config.budget()).await?;
     store.set_grade_files(&campaign.grade_files()).await?;
     write_metadata(campaign, &store).await?;

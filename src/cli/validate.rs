@@ -1,43 +1,96 @@
 //! `calmwalk validate`
 
+mod seed_table;
+
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use calm::Artifact;
 
 use super::{ExitStatus, Failure};
-use crate::campaign::{Campaign, PairRange};
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::campaign::{Campaign, PairRange, Remark, SeedTriage, StepTimes, triage};
 use crate::disk_forecast;
-use crate::output::{Table, count, decimals, print};
+use crate::output::{Bar, Table, count, decimals, print};
 use crate::wording;
 
-/// Number of pairs of elements that are shown.
+/// Number of pairs of elements, and of seed structures, that are shown.
 const SHOWN: usize = 20;
+
+const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Check a configuration and all files that it refers to
 ///
 /// Reports all errors with file, line and key (exit code 2). Valid but suspicious values are warnings on standard error and do
-/// not change the exit code.
+/// not change the exit code. Grades every seed structure under the original mixture, measures a few steps on this host to
+/// estimate the time of walks, and shows the worst seed structures.
 #[derive(Debug, clap::Args)]
 pub struct Validate {
     /// Configuration of a campaign (TOML)
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
-    /// List every pair of elements instead of the first 20
+    /// List every pair of elements and every seed structure instead of the first 20
     #[arg(long)]
     all: bool,
+    /// Write what is known of every seed structure to this file, also of those that are skipped
+    #[arg(long, value_name = "FILE.csv")]
+    csv: Option<PathBuf>,
 }
 
 impl Validate {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
-        print(|out| write(out, &self.config, &campaign, self.all))?;
+        let csv = self.csv.as_deref().map(AtomicFile::create).transpose()?;
+        let seeds = graded(&campaign);
+        let times = StepTimes::measure(&campaign)?;
+        if let (Some(mut file), Some(path)) = (csv, &self.csv) {
+            let bytes = seed_table::csv(&campaign, &seeds, &times).into_bytes();
+            file.write_all(&bytes).map_err(|error| cannot_write(path, error))?;
+            file.finish()?;
+        }
+        let shown = if self.all { usize::MAX } else { SHOWN };
+        print(|out| {
+            write(out, &self.config, &campaign)?;
+            write_seeds(out, &seeds, &times)?;
+            write_short_range(out, &campaign.pair_ranges, shown)?;
+            writeln!(out)?;
+            seed_table::write(out, &seeds, &times, shown)
+        })?;
         Ok(ExitStatus::Done)
     }
 }
 
-fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign, all: bool) -> io::Result<()> {
+/// Grades the seed structures with a progress bar.
+fn graded(campaign: &Campaign) -> Vec<SeedTriage<'_>> {
+    let (bar, done) = (Bar::new(Some(campaign.seed_structures.len() as u64), BAR), AtomicU64::new(0));
+    triage(campaign, || bar.set(done.fetch_add(1, Ordering::Relaxed) + 1, || "seed structures".to_owned()))
+}
+
+/// How many seed structures are noteworthy, and how long walks take.
+fn write_seeds(out: &mut dyn Write, seeds: &[SeedTriage<'_>], times: &StepTimes) -> io::Result<()> {
+    let number = |is: fn(&Remark) -> bool| seeds.iter().filter(|found| is(&found.remark)).count();
+    let remarks = [
+        (number(|remark| *remark == Remark::Candidate), "meet the collection rule before their walks start"),
+        (
+            number(|remark| matches!(remark, Remark::NotInMixture(_))),
+            "have an element that the mixture has no data of",
+        ),
+        (number(|remark| matches!(remark, Remark::Ungraded(_))), "cannot be graded"),
+    ];
+    for (number, words) in remarks.into_iter().filter(|(number, _)| *number > 0) {
+        writeln!(out, "  at the start     {number} of {} {words}", count(seeds.len(), "seed structure"))?;
+    }
+    let walks = times.total(seeds.iter().map(|found| found.seed));
+    writeln!(
+        out,
+        "  walks            {}",
+        walks.map_or("no step could be measured".to_owned(), wording::cost::walks)
+    )
+}
+
+fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()> {
     let Campaign { model, artifact: Artifact { mixture, .. }, seed_structures, .. } = campaign;
     let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
     let architecture = model.description().architecture;
@@ -54,22 +107,24 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign, all: bool) -> io
             "                   without scatter matrices and counts: it can grade structures but not be updated"
         )?;
     }
-    let skipped = match campaign.skipped {
+    let skipped = match campaign.skipped.len() {
         0 => String::new(),
         skipped => format!("; {skipped} skipped, see above"),
     };
     writeln!(out, "  seed structures  {}, with {min} to {max} atoms{skipped}", seed_structures.len())?;
+    if let Some(supercells) = campaign.supercells() {
+        writeln!(out, "  supercells       {supercells}")?;
+    }
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
     writeln!(out, "  disk             {}", wording::disk::forecast(&disk_forecast::estimate(campaign)))?;
     match campaign.warnings.len() {
-        0 => writeln!(out, "  warnings         none")?,
-        count => writeln!(out, "  warnings         {count}, see above")?,
+        0 => writeln!(out, "  warnings         none"),
+        count => writeln!(out, "  warnings         {count}, see above"),
     }
-    write_short_range(out, &campaign.pair_ranges, all)
 }
 
 /// The pairs of elements in the seed structures with their limits and windows.
-fn write_short_range(out: &mut dyn Write, ranges: &[PairRange], all: bool) -> io::Result<()> {
+fn write_short_range(out: &mut dyn Write, ranges: &[PairRange], shown: usize) -> io::Result<()> {
     let mut table = Table::new(&[
         "pair",
         ">sum of radii (Å)",
@@ -78,7 +133,7 @@ fn write_short_range(out: &mut dyn Write, ranges: &[PairRange], all: bool) -> io
         ">ZBL full below (Å)",
         ">ZBL zero above (Å)",
     ]);
-    let shown = if all { ranges.len() } else { ranges.len().min(SHOWN) };
+    let shown = shown.min(ranges.len());
     for PairRange { pair, shortest, limit, zbl, .. } in &ranges[..shown] {
         table.push(vec![
             pair.to_string(),

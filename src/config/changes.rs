@@ -116,7 +116,8 @@ pub enum Refused {
     /// A seed structure that is gone or changed.
     #[error(
         "seed_structures.files: seed structure {number} is {after}, but this campaign has {before} there: seed structures can be \
-         added behind those that it has, but not changed, moved or taken away. Put it back"
+         added behind those that it has, but not changed, moved or taken away. Put it back, and seed_structures.min_atoms and min_height \
+         as they were"
     )]
     SeedStructure {
         /// Its number, from 0.

@@ -64,7 +64,7 @@ const fn range(
 }
 
 /// All of them, by table.
-pub static RANGES: [Range; 84] = [
+pub static RANGES: [Range; 86] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -78,6 +78,8 @@ pub static RANGES: [Range; 84] = [
     range("walk.bias_averaging_steps", "", [0.0, STEPS], [1.0, 1e3], ""),
     range("walk.skin", "Å", [0.0, 10.0], [0.05, 3.0], ""),
     range("calm.max_mean_square_growth", "", [1.0, 1e6], [1.5, 100.0], ""),
+    range("seed_structures.min_atoms", "", [0.0, 1e5], [2.0, 1e3], ""),
+    range("seed_structures.min_height", "Å", [0.0, 1e3], [2.0, 50.0], "it is in Å"),
     range("collect.criterion.threshold", "", [0.0, 1e12], [0.5, 1e3], ""),
     range("collect.criterion.min_atoms", "", [0.0, 1e9], [1.0, 1e3], ""),
     range("collect.update_target.threshold", "", [0.0, 1e12], [0.5, 1e3], ""),

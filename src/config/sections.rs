@@ -91,6 +91,13 @@ pub struct SeedStructuresSection {
     /// What to do with a structure that no walk can start from.
     #[serde(default)]
     pub on_invalid: OnInvalid,
+    /// Smallest number of atoms: a periodic cell with fewer is repeated to a supercell. Default: cells stay as they are.
+    #[serde(default)]
+    pub min_atoms: Option<NonZeroUsize>,
+    /// Smallest distance between opposite faces of the cell along periodic directions, Å: a smaller cell is repeated to a
+    /// supercell. Default: cells stay as they are.
+    #[serde(default)]
+    pub min_height: Option<Positive>,
 }
 
 /// What happens to a seed structure that no walk can start from.

@@ -3,7 +3,6 @@
 //! place of its making.
 
 mod collections;
-mod csv;
 mod features;
 mod figures;
 mod page;
@@ -16,8 +15,8 @@ mod tests;
 use ::figures::{to_png, to_svg};
 use store::Store;
 
-use self::csv::Csv;
 use self::report_data::ReportData;
+use crate::csv::{self, Csv};
 use crate::exit_status::Failure;
 
 /// Resolution of the images, dots per inch.

@@ -2,12 +2,32 @@
 
 use monitor::label_cost::{CoreHours, RelabelCost};
 
+use crate::campaign::WalkTime;
 use crate::output::count;
 
 /// The expected value with its interval.
 pub fn core_hours(hours: &CoreHours) -> String {
     let [expected, low, high] = [hours.expected, hours.low, hours.high].map(two_digits);
     format!("{expected} core-hours (90 % interval: {low} to {high})")
+}
+
+/// The time of all walks.
+pub fn walks(time: WalkTime) -> String {
+    let [biased, control] = [time.biased, time.control].map(wall_time);
+    let controls = match time.control > 0.0 {
+        true => format!(", and at most {control} for their control walks"),
+        false => String::new(),
+    };
+    format!("about {biased} of one walker for all biased walks{controls} (from steps measured on this host)")
+}
+
+/// A time in s, min or h, with two significant digits.
+pub fn wall_time(seconds: f64) -> String {
+    match seconds {
+        ..60.0 => format!("{} s", two_digits(seconds)),
+        60.0..3600.0 => format!("{} min", two_digits(seconds / 60.0)),
+        _ => format!("{} h", two_digits(seconds / 3600.0)),
+    }
 }
 
 /// The expected cost of making labels again, with its source.
@@ -34,6 +54,20 @@ pub fn two_digits(x: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn times_have_a_unit() {
+        for (seconds, text) in [
+            (0.0, "0 s"),
+            (0.25, "0.25 s"),
+            (59.0, "59 s"),
+            (90.0, "1.5 min"),
+            (3600.0, "1.0 h"),
+            (7.2e5, "200 h"),
+        ] {
+            assert_eq!(wall_time(seconds), text);
+        }
+    }
 
     #[test]
     fn hours_have_two_digits() {

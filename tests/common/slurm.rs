@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use super::processes::wait_until;
 use super::stderr;
 
 /// Only one campaign at a time: tests share the nodes, and some kill slurmctld.
@@ -13,6 +14,35 @@ static NODE: Mutex<()> = Mutex::new(());
 pub fn hold() -> MutexGuard<'static, ()> {
     assert!(std::env::var_os("SLURM_CONF").is_some(), "SLURM_CONF=$(.ci/slurm start) is needed");
     NODE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Slurm has as many jobs as it may, until this is dropped.
+pub struct FullQueue;
+
+impl FullQueue {
+    pub fn new() -> Self {
+        ci("full");
+        Self
+    }
+
+    /// Waits until slurmctld has refused so many jobs since it was last started.
+    pub fn wait_for_refusals(&self, least: usize) {
+        let configuration = std::env::var_os("SLURM_CONF").expect("that of the test cluster");
+        let log = Path::new(&configuration).with_file_name("slurmctld.log");
+        // slurmctld complains as well of the jobs that it finds when it starts.
+        const REFUSED: &str = "job_allocate: MaxJobCount limit from slurm.conf reached";
+        wait_until("Slurm has refused enough", || {
+            let text = std::fs::read_to_string(&log).unwrap();
+            let since = text.rfind("slurmctld version").map_or(&*text, |start| &text[start..]);
+            since.matches(REFUSED).count() >= least
+        });
+    }
+}
+
+impl Drop for FullQueue {
+    fn drop(&mut self) {
+        ci("room");
+    }
 }
 
 /// Output of a Slurm command, which must succeed.

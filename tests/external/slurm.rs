@@ -15,7 +15,7 @@ use crate::common;
 use crate::common::campaign::{Outcome, Small, outcome_at};
 use crate::common::hosts::uninterrupted_outcome;
 use crate::common::processes::{assert_no_leftovers, processes_running, wait_until};
-use crate::common::slurm::{ci, hold, slurm};
+use crate::common::slurm::{FullQueue, ci, hold, slurm};
 use crate::common::{Running, calmwalk, program, stderr, succeed};
 
 /// A campaign that is launched on Slurm.
@@ -213,6 +213,29 @@ fn said(output: Output) -> String {
 fn restarts(id: &str) -> u32 {
     let text = slurm(&["scontrol", "--oneliner", "show", "job", id]);
     text.split_whitespace().find_map(|word| word.strip_prefix("Restarts=")?.parse().ok()).unwrap()
+}
+
+/// Its own jobs or those of others: `launch` waits for a place, and submits each job once.
+#[test]
+fn a_launch_waits_while_slurm_accepts_no_jobs() {
+    let campaign = OnSlurm::unlabelled(&Small::default(), 1);
+    let full = FullQueue::new();
+    let (said, errors) = (campaign.directory().join("said"), campaign.directory().join("errors"));
+    let [out, err] = [&said, &errors].map(|path| fs::File::create(path).unwrap());
+    let mut launch =
+        Running(campaign.launch().args(&campaign.options).stdout(out).stderr(err).spawn().unwrap());
+    full.wait_for_refusals(3);
+    let text = || fs::read_to_string(&errors).unwrap();
+    let refused = "orchestrator: Slurm accepts no further jobs for now (Slurm temporarily unable to accept job); waiting";
+    assert_eq!(text().matches(refused).count(), 1, "{}", text());
+    assert!(launch.0.try_wait().unwrap().is_none() && campaign.jobs().is_empty());
+    drop(full);
+    assert_eq!(launch.0.wait().unwrap().code(), Some(0), "{}", text());
+    assert_eq!(fs::read_to_string(&said).unwrap().matches("submitted").count(), 2);
+    for role in ["orchestrator", "agent-0"] {
+        campaign.job(role);
+    }
+    campaign.stop();
 }
 
 #[test]

@@ -13,6 +13,7 @@ mod potential;
 mod read;
 mod species;
 mod structure;
+mod supercell;
 pub mod units;
 
 pub use cell::{Cell, Matrix3, Vec3};
@@ -23,3 +24,4 @@ pub use potential::{Evaluation, Potential, PotentialError};
 pub use read::{FileError, open_extxyz, read_extxyz, read_poscar, read_structures};
 pub use species::{Species, UnknownSpecies};
 pub use structure::{Structure, StructureError};
+pub use supercell::Repetition;

@@ -14,6 +14,7 @@
 use crate::artifact::{Artifact, SENTINEL};
 use crate::component::Component;
 use crate::linear::{LinearError, REGULARISATION, cholesky, eigenvalues, regularised, view};
+use crate::mixture::Mixture;
 
 /// Files store single precision: the relative rounding of a number, with a margin for sums of rounded numbers.
 const STORAGE_ROUNDING: f64 = 1.0 / (1 << 22) as f64;
@@ -291,6 +292,14 @@ fn check_centroid(component: &Component, reach: &[f64]) -> Result<(), ComponentF
     match beyond.find(|(_, (value, most))| value.abs() > *most) {
         Some((feature, (&found, most))) => Err(ComponentFault::Centroid { feature, found, most }),
         None => Ok(()),
+    }
+}
+
+impl Mixture {
+    /// Whether a component of this element represents data. Without any, all grades of the element are huge.
+    pub fn has_data_of(&self, element: usize) -> bool {
+        self.components(element)
+            .is_some_and(|components| components.iter().any(|component| is_used(component)))
     }
 }
 

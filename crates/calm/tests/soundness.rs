@@ -46,6 +46,22 @@ fn faults(artifact: &Artifact) -> Vec<String> {
 }
 
 #[test]
+fn an_element_without_data_is_told_from_others() {
+    for path in ["al_eam_1l/gmm_artifacts.npz", "al_eam_1l/kokkos.npz"] {
+        let known = if path.ends_with("kokkos.npz") {
+            Artifact::load_export(model(path))
+        } else {
+            Artifact::load(model(path))
+        };
+        let known = known.unwrap().mixture;
+        let unknown = Arc::new(Component::unknown_element(known.dimension()));
+        let elements = vec![known.components(0).unwrap().to_vec(), vec![unknown]];
+        let mixture = Mixture::new(0, elements).unwrap();
+        assert_eq!([0, 1, 2].map(|element| mixture.has_data_of(element)), [true, false, false], "{path}");
+    }
+}
+
+#[test]
 fn artifacts_of_real_builds_are_sound() {
     assert_eq!(faults(&niobium()), [""; 0]);
     for name in ["al_eam_1l", "si_sw_1l"] {

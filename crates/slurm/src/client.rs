@@ -2,16 +2,24 @@
 
 use std::ffi::{OsStr, OsString};
 use std::io;
-use std::process::Stdio;
+use std::process::{Output, Stdio};
 use std::time::Duration;
 
 use tokio::process::Command;
+use tokio::time::sleep;
+
+use crate::queue_full;
 
 /// Maximum number of jobs per call of `scancel`.
 const JOBS_PER_CANCEL: usize = 200;
 /// Variables that locate Slurm and identify the user. All other Slurm variables belong to a job that this
 /// process may be part of; commands would take them for options.
 const KEPT_VARIABLES: [&str; 3] = ["SLURM_CONF", "SLURM_CONF_SERVER", "SLURM_JWT"];
+
+/// First time between two tries to submit a job while Slurm accepts none.
+const MIN_FULL_PAUSE: Duration = Duration::from_secs(2);
+/// Longest such time.
+const MAX_FULL_PAUSE: Duration = Duration::from_secs(60);
 
 /// Slurm, through its commands on this host.
 #[derive(Clone, Debug)]
@@ -49,6 +57,12 @@ pub enum SlurmError {
         program: &'static str,
         /// Its message.
         stderr: String,
+    },
+    /// Slurm accepts no further job for now: its queue is full, or a limit on the number of jobs is reached.
+    #[error("Slurm accepts no further jobs for now ({reason})")]
+    Full {
+        /// What `sbatch` said.
+        reason: String,
     },
     /// Its output has an unexpected format.
     #[error("{program} wrote {found:?}, expected {expected}")]
@@ -113,11 +127,40 @@ impl SlurmClient {
         Ok(name.to_owned())
     }
 
-    /// Submits a job with these arguments of `sbatch` and returns its id.
-    pub async fn submit(&self, arguments: &[impl AsRef<OsStr>]) -> Result<u64, SlurmError> {
+    /// Submits a job with these arguments of `sbatch` and returns its id. Waits while Slurm accepts no further job,
+    /// however long that takes, and calls `on_full` with the error when it starts to wait.
+    pub async fn submit(
+        &self,
+        arguments: &[impl AsRef<OsStr>],
+        on_full: impl FnOnce(&SlurmError),
+    ) -> Result<u64, SlurmError> {
+        let (mut on_full, mut pause) = (Some(on_full), MIN_FULL_PAUSE);
+        loop {
+            match self.try_submit(arguments).await {
+                Err(full @ SlurmError::Full { .. }) => {
+                    if let Some(on_full) = on_full.take() {
+                        on_full(&full);
+                    }
+                }
+                result => return result,
+            }
+            sleep(pause).await;
+            pause = (2 * pause).min(MAX_FULL_PAUSE);
+        }
+    }
+
+    async fn try_submit(&self, arguments: &[impl AsRef<OsStr>]) -> Result<u64, SlurmError> {
         const SBATCH: &str = "sbatch";
         let arguments = arguments.iter().map(AsRef::as_ref);
-        let text = self.run(SBATCH, [OsStr::new("--parsable")].into_iter().chain(arguments)).await?;
+        let mut command = self.command(SBATCH, [OsStr::new("--parsable")].into_iter().chain(arguments));
+        let full = |error| match error {
+            SlurmError::Failed { program, stderr } => match queue_full::reason(&stderr) {
+                Some(reason) => SlurmError::Full { reason },
+                None => SlurmError::Failed { program, stderr },
+            },
+            error => error,
+        };
+        let text = self.answer(SBATCH, queue_full::submission(&mut command)).await.map_err(full)?;
         // With several clusters the name of the cluster follows.
         let id = text.trim().split(';').next().and_then(|id| id.parse().ok());
         let expected = "a job id";
@@ -144,6 +187,16 @@ impl SlurmClient {
         program: &'static str,
         arguments: impl IntoIterator<Item = impl AsRef<OsStr>>,
     ) -> Result<String, SlurmError> {
+        let mut command = self.command(program, arguments);
+        self.answer(program, command.output()).await
+    }
+
+    /// A command without the user's own settings.
+    fn command(
+        &self,
+        program: &'static str,
+        arguments: impl IntoIterator<Item = impl AsRef<OsStr>>,
+    ) -> Command {
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null()).kill_on_drop(true);
         // The user's own settings would change the output format too.
@@ -159,8 +212,17 @@ impl SlurmClient {
             }
         }
         command.env("SLURM_TIME_FORMAT", "standard");
+        command
+    }
+
+    /// The standard output of a command, once it has ended well.
+    async fn answer(
+        &self,
+        program: &'static str,
+        output: impl Future<Output = io::Result<Output>>,
+    ) -> Result<String, SlurmError> {
         let timed_out = |_| SlurmError::TimedOut { program, seconds: self.timeout.as_secs() };
-        let output = tokio::time::timeout(self.timeout, command.output()).await.map_err(timed_out)?;
+        let output = tokio::time::timeout(self.timeout, output).await.map_err(timed_out)?;
         let output = output.map_err(|source| SlurmError::Missing { program, source })?;
         if !output.status.success() {
             let stderr = String::from_utf8_lossy(&output.stderr).trim().to_owned();

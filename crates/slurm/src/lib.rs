@@ -5,6 +5,7 @@
 
 mod client;
 mod job_phase;
+mod queue_full;
 
 pub use client::{SlurmClient, SlurmError};
 pub use job_phase::JobPhase;

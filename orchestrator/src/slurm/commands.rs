@@ -55,14 +55,16 @@ impl Slurm {
         self.commands.exit_code(id).await
     }
 
-    /// Submits a job and returns its id.
+    /// Submits a job and returns its id. Waits while Slurm accepts no further job, and calls `on_full` when it starts to
+    /// wait.
     pub async fn submit(
         &self,
         names: &JobNames,
         submission: &Submission,
         request: &JobOptions<'_>,
+        on_full: impl FnOnce(&SlurmError),
     ) -> Result<u64, SlurmError> {
-        self.commands.submit(&request.arguments(names, submission)).await
+        self.commands.submit(&request.arguments(names, submission), on_full).await
     }
 
     /// Cancels jobs: each of their processes gets SIGTERM, and SIGKILL after Slurm's `KillWait`. Jobs that have already

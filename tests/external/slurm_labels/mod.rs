@@ -4,4 +4,5 @@ mod allocation;
 mod daemon;
 mod ends;
 mod found_again;
+mod full_queue;
 mod jobs;

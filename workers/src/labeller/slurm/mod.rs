@@ -19,6 +19,7 @@ use std::ffi::OsStr;
 use std::fs;
 use std::io;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use ::slurm::{JobPhase, SlurmClient, SlurmError};
@@ -26,6 +27,7 @@ use dft::PassedEnvironment;
 use store::StoreError;
 use tokio::sync::OnceCell;
 use tokio::time::sleep;
+use tracing::{info, warn};
 
 use super::calculation_runner::CalculationEnd;
 use super::calculation_state::CalculationState;
@@ -58,6 +60,8 @@ const CANCEL_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) struct Slurm {
     commands: SlurmClient,
     cluster: OnceCell<String>,
+    /// Whether Slurm accepts no further jobs, and that was logged.
+    is_full: AtomicBool,
 }
 
 impl Slurm {
@@ -70,7 +74,7 @@ impl Slurm {
         let own = std::env::vars_os().filter(|(name, _)| is_slurm_variable(name));
         let environment = passed.from_current_process().chain(own).collect();
         let commands = SlurmClient::with_timeout(COMMAND_TIMEOUT).with_environment(environment);
-        Self { commands, cluster: OnceCell::new() }
+        Self { commands, cluster: OnceCell::new(), is_full: AtomicBool::new(false) }
     }
 
     /// The job of the calculation in this directory, which is below its campaign's.
@@ -82,15 +86,21 @@ impl Slurm {
         Ok(Job { cluster, directory: directory.to_owned(), name, user: Some(own_user()), node: None })
     }
 
-    /// Submits a job that Slurm does not know. If the reply is lost, looks for the job. If Slurm responds but
-    /// refuses the job, the labeller fails, not the calculation.
+    /// Submits a job that Slurm does not know. Waits while Slurm accepts no further job. If the reply is lost, looks for
+    /// the job. If Slurm responds but refuses the job, the labeller fails, not the calculation.
     pub async fn submit(&self, job: &Job) -> Result<(), StoreError> {
         let mut refused = 0;
         loop {
-            let error = match self.commands.submit(&script::arguments(job)).await {
-                Ok(_) => return Ok(()),
-                Err(error) => error,
+            let on_full = |full: &SlurmError| {
+                if !self.is_full.swap(true, Ordering::Relaxed) {
+                    warn!("{full}: labels wait until it does");
+                }
             };
+            let submitted = self.commands.submit(&script::arguments(job), on_full).await;
+            if self.is_full.swap(false, Ordering::Relaxed) {
+                info!("Slurm accepts jobs again");
+            }
+            let Err(error) = submitted else { return Ok(()) };
             if !self.jobs(job).await?.is_empty() {
                 return Ok(());
             }

@@ -1,0 +1,141 @@
+//! What there is to know about each seed structure before its walks start.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use atoms::{ElementPair, NeighbourList, Species, Structure};
+use calm::rules::count_above;
+use calm::{Grades, Mixture};
+use potentials::grace::Grace;
+
+use super::{Campaign, SourcedStructure};
+use crate::all_cores;
+
+/// What is noteworthy about a seed structure; the worst comes first.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Remark {
+    /// It cannot be graded, and why.
+    Ungraded(String),
+    /// The mixture has no data of these elements.
+    NotInMixture(BTreeSet<Species>),
+    /// It meets the collection rule before its walks start.
+    Candidate,
+    /// Nothing.
+    Nothing,
+}
+
+/// The shortest distance of a pair of elements.
+#[derive(Clone, Copy, Debug)]
+pub struct PairDistance {
+    /// The elements.
+    pub pair: ElementPair,
+    /// Å.
+    pub distance: f64,
+    /// The shortest distance that `guard.min_distances` allows in walks from this seed structure, Å.
+    pub limit: f64,
+}
+
+/// A seed structure under the original mixture.
+pub struct SeedTriage<'a> {
+    /// The structure.
+    pub seed: &'a SourcedStructure,
+    /// All pairs of its elements with neighbours, those closest to their limits first.
+    pub pairs: Vec<PairDistance>,
+    /// Its largest grade; `None` if it cannot be graded.
+    pub gamma_max: Option<f64>,
+    /// Number of its atoms above the threshold of the collection rule.
+    pub atoms_above: usize,
+    /// Number that the collection rule requires.
+    pub needed_atoms: usize,
+    /// What is noteworthy.
+    pub remark: Remark,
+}
+
+/// Grades every seed structure of a campaign, on all cores. The worst structures come first: by their remark, then by
+/// γ_max. Calls `on_graded` after each.
+pub fn triage(campaign: &Campaign, on_graded: impl Fn() + Sync) -> Vec<SeedTriage<'_>> {
+    let examiner = || Examiner::new(campaign);
+    let mut all = all_cores::map(campaign.seed_structures.iter(), examiner, |examiner, seed| {
+        let found = examiner.examine(seed);
+        on_graded();
+        found
+    });
+    let grade = |found: &SeedTriage<'_>| found.gamma_max.unwrap_or(f64::INFINITY);
+    all.sort_by(|a, b| a.remark.cmp(&b.remark).then_with(|| grade(b).total_cmp(&grade(a))));
+    all
+}
+
+/// Examines one seed structure after another.
+struct Examiner<'a> {
+    campaign: &'a Campaign,
+    grace: Grace,
+    neighbours: NeighbourList,
+    grades: Grades,
+}
+
+impl<'a> Examiner<'a> {
+    fn new(campaign: &'a Campaign) -> Self {
+        let model = Arc::clone(&campaign.model);
+        let neighbours = NeighbourList::new(model.cutoff(), 0.0);
+        Self { campaign, grace: Grace::new(model), neighbours, grades: Grades::default() }
+    }
+
+    fn examine(&mut self, seed: &'a SourcedStructure) -> SeedTriage<'a> {
+        let rule = &self.campaign.config.collect.criterion;
+        let structure = &seed.seed.structure;
+        let graded = self.grade(structure);
+        let gamma = self.grades.gamma.as_slice();
+        let missing = not_in_mixture(self.campaign, structure);
+        let remark = match &graded {
+            Err(error) => Remark::Ungraded(error.clone()),
+            Ok(()) if !missing.is_empty() => Remark::NotInMixture(missing),
+            Ok(()) if rule.is_met(gamma) => Remark::Candidate,
+            Ok(()) => Remark::Nothing,
+        };
+        SeedTriage {
+            seed,
+            pairs: self.pairs(seed),
+            gamma_max: graded.is_ok().then(|| self.grades.maximum()),
+            atoms_above: if graded.is_ok() { count_above(gamma, rule.threshold()) } else { 0 },
+            needed_atoms: rule.needed_atoms(structure.len()),
+            remark,
+        }
+    }
+
+    fn grade(&mut self, structure: &Structure) -> Result<(), String> {
+        let Self { campaign, grace, neighbours, grades } = self;
+        let elements =
+            grace.model().element_indices(&structure.species).map_err(|error| error.to_string())?;
+        neighbours.update(structure).map_err(|error| error.to_string())?;
+        grace.forward(structure, neighbours).map_err(|error| error.to_string())?;
+        grades
+            .evaluate(&campaign.artifact.mixture, &elements, grace.features(), None)
+            .map_err(|error| error.to_string())
+    }
+
+    fn pairs(&self, SourcedStructure { geometry, .. }: &SourcedStructure) -> Vec<PairDistance> {
+        let limits = self.campaign.config.guard.min_distances.limits(&geometry.shortest);
+        let distances = geometry.shortest.iter().zip(limits.iter());
+        let pairs = distances.map(|((pair, distance), (_, limit))| PairDistance { pair, distance, limit });
+        let mut pairs: Vec<_> = pairs.filter(|pair| pair.distance.is_finite()).collect();
+        pairs.sort_by(|a, b| a.relative().total_cmp(&b.relative()));
+        pairs
+    }
+}
+
+impl PairDistance {
+    /// The distance divided by its limit.
+    pub fn relative(&self) -> f64 {
+        self.distance / self.limit
+    }
+}
+
+/// The elements of a structure of which the original mixture has no data.
+fn not_in_mixture(campaign: &Campaign, structure: &Structure) -> BTreeSet<Species> {
+    let (elements, mixture): (_, &Mixture) = (campaign.model.elements(), &campaign.artifact.mixture);
+    let species: BTreeSet<_> = structure.species.iter().copied().collect();
+    let has_data = |species: &Species| {
+        elements.iter().position(|element| element == species).is_some_and(|index| mixture.has_data_of(index))
+    };
+    species.into_iter().filter(|species| !has_data(species)).collect()
+}

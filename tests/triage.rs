@@ -1,0 +1,147 @@
+//! What `validate` finds out about seed structures before a campaign starts.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::fs;
+use std::path::Path;
+
+use atoms::read_extxyz;
+
+use crate::common::campaign::Small;
+use crate::common::{calmwalk, config, refuse, stderr, succeed};
+
+/// `n`³ atoms of simple cubic aluminium with the edge `a`, Å, whose first atom is displaced.
+fn cubic(name: &str, n: u8, a: f64, displacement: f64) -> String {
+    let edge = f64::from(n) * a;
+    let mut text = format!(
+        "{}\nLattice=\"{edge} 0 0 0 {edge} 0 0 0 {edge}\" Properties=species:S:1:pos:R:3 name={name}\n",
+        usize::from(n).pow(3)
+    );
+    for atom in 0..n.pow(3) {
+        let [x, y, z] = [atom / n / n, atom / n % n, atom % n].map(|place| a * f64::from(place));
+        let x = if atom == 0 { x + displacement } else { x };
+        writeln!(text, "Al {x} {y} {z}").unwrap();
+    }
+    text
+}
+
+/// A campaign with these structures behind those of [`Small`], a known crystal among them.
+fn write(here: &Path, more: &str) {
+    Small::default().write(here);
+    let known = fs::read_to_string(here.join("seeds.extxyz")).unwrap();
+    fs::write(here.join("seeds.extxyz"), known + more).unwrap();
+}
+
+/// The rows of a CSV whose cells in use have no commas and quotes, by their first cell.
+fn rows(path: &Path) -> BTreeMap<String, BTreeMap<String, String>> {
+    let text = fs::read_to_string(path).unwrap();
+    let mut lines = text.lines().map(|line| line.split(',').map(str::to_owned).collect::<Vec<_>>());
+    let titles = lines.next().unwrap();
+    let row = |cells: Vec<String>| (cells[0].clone(), titles.iter().cloned().zip(cells).collect());
+    lines.map(row).collect()
+}
+
+#[test]
+fn seed_structures_are_graded_and_measured() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let close = cubic("close", 3, 2.8, 2.7);
+    let seeds =
+        [cubic("cubic", 3, 2.8, 0.0), cubic("strained", 3, 2.5, 0.5), cubic("large", 5, 2.8, 0.0), close];
+    write(here, &seeds.concat());
+    let shown = succeed(here, ["validate", "campaign.toml", "--csv", "seeds.csv"]);
+    let rows = rows(&here.join("seeds.csv"));
+    assert_eq!(rows.len(), 6);
+    let text = |name: &str, column: &str| rows[name][column].as_str();
+    let number = |name: &str, column: &str| rows[name][column].parse::<f64>().unwrap();
+
+    // The grades are those of `calm score`, and what it counts.
+    let [model, artifact] =
+        ["kokkos.npz", "gmm_artifacts.npz"].map(|name| config(&format!("data/al_eam_1l/{name}")));
+    let (model, artifact) = (model.display().to_string(), artifact.display().to_string());
+    fs::write(here.join("graded.extxyz"), seeds[..3].concat()).unwrap();
+    let score = [
+        "calm",
+        "score",
+        "--model",
+        &model,
+        "--artifact",
+        &artifact,
+        "graded.extxyz",
+        "--output",
+        "scored.extxyz",
+    ];
+    succeed(here, score);
+    for (frame, name) in
+        read_extxyz(&here.join("scored.extxyz")).unwrap().iter().zip(["cubic", "strained", "large"])
+    {
+        let gamma = frame.arrays["gamma"].reals().unwrap();
+        let max = gamma.iter().copied().fold(0.0, f64::max);
+        assert!((number(name, "gamma_max") / max - 1.0).abs() < 1e-9, "{name}");
+        let above = gamma.iter().filter(|gamma| **gamma > 1.0).count();
+        assert_eq!(text(name, "atoms_above"), above.to_string());
+        let needed = if name == "large" { 13 } else { 3 };
+        assert_eq!(text(name, "atoms_needed"), needed.to_string());
+        let state = if above >= needed { "candidate" } else { "ready" };
+        assert_eq!(text(name, "state"), state, "{name}");
+    }
+    let candidates = rows.values().filter(|row| row["state"] == "candidate").count();
+    assert!(candidates > 0 && text("fcc-100", "state") == "ready", "{rows:?}");
+    assert!(
+        shown.contains(&format!("{candidates} of 5 seed structures meet the collection rule")),
+        "{shown}"
+    );
+
+    assert_eq!((text("close", "state"), text("close", "gamma_max")), ("skipped", ""));
+    assert_eq!((text("cubic", "closest_pair"), text("cubic", "formula")), ("Al-Al", "Al27"));
+    assert!(
+        (number("cubic", "distance") - 2.8).abs() < 1e-9 && (number("cubic", "limit") - 2.1).abs() < 1e-9
+    );
+
+    // Both are of one size, and their steps scale with atoms and neighbours.
+    let work = |name: &str| number(name, "atoms") * (1.0 + number(name, "neighbours_per_atom"));
+    for hours in ["walk_hours", "control_hours"] {
+        let time = |name: &str| number(name, hours);
+        assert!(time("cubic") > 0.0 && time("large") > 0.0);
+        assert!((time("cubic") / time("strained") / (work("cubic") / work("strained")) - 1.0).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn the_worst_seed_structures_come_first() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let many: String = (0..30).map(|k| cubic(&format!("c{k}"), 3, 2.6 + 0.01 * f64::from(k), 0.3)).collect();
+    let skipped: String = (0..22).map(|k| cubic(&format!("x{k}"), 3, 2.8, 2.7)).collect();
+    write(here, &(many + &skipped));
+    let table = |arguments: &[&str]| -> Vec<String> {
+        let output = calmwalk(here, ["validate", "campaign.toml"].iter().chain(arguments));
+        let listed = stderr(&output);
+        assert_eq!(output.status.code(), Some(0), "{listed}");
+        assert!(listed.contains("'x19' (") && !listed.contains("'x20' ("), "{listed}");
+        assert!(listed.contains("2 more seed structures are skipped"), "{listed}");
+        let text = String::from_utf8(output.stdout).unwrap();
+        let (_, table) = text.split_once("\nseed structure ").unwrap();
+        table.lines().skip(1).map(str::to_owned).collect()
+    };
+    let (shown, all) = (table(&[]), table(&["--all"]));
+    assert_eq!(all.len(), 32);
+    assert_eq!(shown.last().unwrap(), "… and 12 more seed structures (use --all, or --csv FILE)");
+    // Times are measured again, the order is the same.
+    let names = |rows: &[String]| {
+        rows.iter().map(|row| row.split(' ').next().unwrap().to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(names(&shown[..20]), names(&all[..20]));
+    let is_candidate: Vec<_> =
+        all.iter().map(|row| row.ends_with("a candidate before its walk starts")).collect();
+    assert!(is_candidate.is_sorted_by(|a, b| a >= b) && is_candidate[0] && !is_candidate[31], "{all:?}");
+}
+
+#[test]
+fn a_csv_that_cannot_be_written_is_wrong_input() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, "");
+    let message = refuse(here, ["validate", "campaign.toml", "--csv", "absent/seeds.csv"]);
+    assert!(message.contains("absent/seeds.csv"), "{message}");
+}
