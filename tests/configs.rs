@@ -11,8 +11,9 @@ use serde_json::Value;
 
 use crate::common::{config, deviation, refuse, stderr, succeed};
 
-/// Runs a demo to its end and checks its books; returns its labelled frames, control walks included.
-fn campaign(directory: &Path, name: &str) -> Vec<Frame> {
+/// Runs a demo to its end and checks its books; returns its labelled frames, control walks included. No two atoms may be
+/// closer than `least` Å.
+fn campaign(directory: &Path, name: &str, least: f64) -> Vec<Frame> {
     let file = config(name).display().to_string();
     // Beside its configuration it would be in the project.
     let here = directory.join(Path::new(name).file_stem().unwrap()).display().to_string();
@@ -35,7 +36,7 @@ fn campaign(directory: &Path, name: &str) -> Vec<Frame> {
     succeed(directory, arguments);
     let frames = read_extxyz(&output).unwrap();
     assert_eq!(frames.len() as u64, accepted + control);
-    check_frames(&frames, accepted as usize);
+    check_frames(&frames, accepted as usize, least);
     read_by_ase(&output, &frames);
     frames
 }
@@ -45,13 +46,13 @@ fn text<'a>(frame: &'a Frame, key: &str) -> &'a str {
 }
 
 /// Structures are physical, and those of biased walks are new to the model.
-fn check_frames(frames: &[Frame], accepted: usize) {
+fn check_frames(frames: &[Frame], accepted: usize, least: f64) {
     let mut neighbours = NeighbourList::new(6.0, 0.0);
     let mut biased = 0;
     for frame in frames {
         neighbours.update(&frame.structure).unwrap();
         let (_, _, shortest) = shortest_distance(&frame.structure, &neighbours).unwrap();
-        assert!(shortest > 1.2, "{shortest} Å");
+        assert!(shortest > least, "{shortest} Å");
         let volume: f64 = frame.info["relative_volume"].number().unwrap();
         assert!((1.0..=1.4).contains(&volume), "V/V₀ = {volume}");
         if text(frame, "origin") == "biased" {
@@ -113,7 +114,7 @@ fn read_by_ase(path: &Path, frames: &[Frame]) {
 #[test]
 fn aluminium_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), "aluminium.toml");
+    let frames = campaign(directory.path(), "aluminium.toml", 1.2);
     let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
     check_labels(&frames, &mut potential);
 }
@@ -121,8 +122,17 @@ fn aluminium_runs_as_it_stands() {
 #[test]
 fn silicon_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), "silicon.toml");
+    let frames = campaign(directory.path(), "silicon.toml", 1.2);
     check_labels(&frames, &mut StillingerWeber::load(config("data/Si.sw")).unwrap());
+}
+
+#[test]
+fn nickel_aluminium_hydrogen_runs_as_it_stands() {
+    let directory = tempfile::tempdir().unwrap();
+    // Two hydrogen atoms may come as close as the configuration says.
+    let frames = campaign(directory.path(), "nickel-aluminium-hydrogen.toml", 0.6);
+    let mut potential = Eam::load_as(config("data/NiAlH_jea.eam.alloy"), EamStyle::Alloy).unwrap();
+    check_labels(&frames, &mut potential);
 }
 
 #[test]
@@ -174,6 +184,7 @@ fn every_file_of_configs_is_run_by_a_test() {
         "aluminium.toml",
         "foundation-expansion.toml",
         "md-aluminium.toml",
+        "nickel-aluminium-hydrogen.toml",
         "silicon-dft.toml",
         "silicon.toml",
     ];

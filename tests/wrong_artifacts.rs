@@ -140,7 +140,7 @@ fn score_refuses_nonsense_and_info_shows_it() {
 #[test]
 fn the_demos_are_sound() {
     let tester = ConfigTester::new();
-    for name in ["aluminium.toml", "silicon.toml"] {
+    for name in ["aluminium.toml", "silicon.toml", "nickel-aluminium-hydrogen.toml"] {
         tester.write("c.toml", common::demo(name));
         let output = calmwalk(tester.path(), ["validate", "c.toml"]);
         assert_eq!((output.status.code(), stderr(&output).as_str()), (Some(0), ""), "{name}");

@@ -12,8 +12,13 @@ use super::changes::differences;
 use super::ranges::{RANGES, Range};
 use super::schema::{at_key, schema};
 
-const CAMPAIGNS: [&str; 4] =
-    ["aluminium.toml", "silicon.toml", "silicon-dft.toml", "foundation-expansion.toml"];
+const CAMPAIGNS: [&str; 5] = [
+    "aluminium.toml",
+    "silicon.toml",
+    "silicon-dft.toml",
+    "nickel-aluminium-hydrogen.toml",
+    "foundation-expansion.toml",
+];
 
 fn read(path: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()

@@ -64,7 +64,7 @@ fn an_element_without_data_is_told_from_others() {
 #[test]
 fn artifacts_of_real_builds_are_sound() {
     assert_eq!(faults(&niobium()), [""; 0]);
-    for name in ["al_eam_1l", "si_sw_1l"] {
+    for name in ["al_eam_1l", "si_sw_1l", "ni_al_h_eam_1l"] {
         assert_eq!(faults(&Artifact::load(model(&format!("{name}/gmm_artifacts.npz"))).unwrap()), [""; 0]);
         assert_eq!(faults(&Artifact::load_export(model(&format!("{name}/kokkos.npz"))).unwrap()), [""; 0]);
     }

@@ -118,6 +118,11 @@ fn silicon() {
 }
 
 #[test]
+fn nickel_aluminium_hydrogen() {
+    check(&committed("ni_al_h_eam_1l"));
+}
+
+#[test]
 fn four_elements() {
     if let Some(model) = peer("grace1l_tiny") {
         check(&model);
