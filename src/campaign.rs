@@ -1,6 +1,7 @@
 //! Loads and checks everything that a configuration names. `validate` stops there, and `run` starts with it.
 
 mod geometry;
+mod known_structures;
 mod load;
 mod seed_structures;
 mod short_range;
@@ -16,6 +17,7 @@ use std::sync::Arc;
 use atoms::Repetition;
 use calm::Artifact;
 use calm::forgetting::ForgettingAlarm;
+use monitor::reference_check::{self, KnownStructure};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{self, Mode, TrainingFrames};
 use potentials::grace::{GraceModel, Precision};
@@ -66,6 +68,8 @@ pub struct Campaign {
     pub training: Option<TrainingFrames>,
     /// The label protocol.
     pub protocol: Protocol,
+    /// The structures of `label.check`.
+    pub known: Vec<KnownStructure>,
     /// Name and hash of every file whose content must not change.
     pub file_hashes: Vec<(String, String)>,
     /// Settings that are valid but likely mistakes.
@@ -97,6 +101,8 @@ impl Campaign {
         warnings.extend(loader.suspicious_seed_structures(&seeds));
         let pair_ranges = pair_ranges(&config, &seeds.valid);
         warnings.extend(loader.repulsion_in_bonds(&pair_ranges));
+        let (known, suspicious) = loader.known_structures(&model)?;
+        warnings.extend(suspicious);
         file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [
             ("calm.artifact", &config.calm.artifact),
@@ -117,6 +123,7 @@ impl Campaign {
             pair_ranges,
             training,
             protocol,
+            known,
             file_hashes,
             warnings,
         })
@@ -191,6 +198,10 @@ impl Campaign {
         if self.config.potential.precision == Precision::Double {
             value["potential"].as_object_mut().map(|potential| potential.remove("precision"));
         }
+        match self.known_hash() {
+            Some(hash) => value["label"]["check"]["structures"] = json!(hash),
+            None => drop(value["label"].as_object_mut().map(|label| label.remove("check"))),
+        }
         // The location of the store is not part of the campaign's identity.
         value["run"].as_object_mut().map(|run| run.remove("store"));
         if self.config.campaign.mode == Mode::Reproducible {
@@ -201,6 +212,11 @@ impl Campaign {
         };
         value["seed_structures"] = self.seed_structures.iter().map(seed).collect();
         value
+    }
+
+    /// Hash of the structures of `label.check` and what is known of them; `None` without the check.
+    fn known_hash(&self) -> Option<String> {
+        (!self.known.is_empty()).then(|| reference_check::hash(&self.known).to_string())
     }
 
     /// Hash of everything that cannot change during a campaign, and of the initial seed structures.

@@ -52,7 +52,7 @@ impl MethodConfig {
                 Ok(Self::Potential { kind: *kind, file: absolute(file)?, file_hash })
             }
             LabelMethod::Code(settings) => {
-                let mut settings = Box::new(settings.clone());
+                let mut settings = settings.clone();
                 for path in settings.paths() {
                     *path = absolute(path)?;
                 }

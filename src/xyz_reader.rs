@@ -1,4 +1,4 @@
-//! Reads the frames of a file one at a time. Errors name the file.
+//! Reads the frames of a file one at a time, and their labels. Errors name the file.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use atoms::extxyz::{Frame, Reader};
+use atoms::extxyz::{Frame, Labels, Reader};
 use atoms::{FileError, open_extxyz};
+use store::records::{Label, LabelDetails};
 
 /// Reads an extended XYZ file frame by frame.
 pub struct XyzReader {
@@ -55,5 +56,21 @@ impl Read for Counting {
         let count = self.0.read(buffer)?;
         self.1.fetch_add(count as u64, Ordering::Relaxed);
         Ok(count)
+    }
+}
+
+/// The label of a frame, which must have energy and forces. An error says what is missing or wrong.
+pub fn label(frame: &Frame) -> Result<Label, String> {
+    match frame
+        .labels()
+        .map_err(|error| format!("{} is {}, expected {}", error.key, error.found, error.expected))?
+    {
+        Labels { energy: Some(energy), forces: Some(forces), stress } => {
+            Ok(Label { energy, forces, stress, details: LabelDetails::default() })
+        }
+        Labels { energy, .. } => {
+            let missing = if energy.is_none() { "energy" } else { "forces" };
+            Err(format!("the frame has no {missing}: expected {missing} or REF_{missing}"))
+        }
     }
 }

@@ -34,6 +34,7 @@ mod mutations;
 mod notify;
 mod places;
 mod processes;
+mod reference_check;
 mod relabel;
 mod replay;
 mod schema;

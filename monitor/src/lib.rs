@@ -16,6 +16,7 @@ pub mod label_statistics;
 pub mod mixture_status;
 pub mod mixture_values;
 pub mod provenance;
+pub mod reference_check;
 pub mod snapshot;
 pub mod walk_ends;
 

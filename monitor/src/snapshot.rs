@@ -8,6 +8,7 @@ use crate::expected_end::ExpectedEnd;
 use crate::label_queue::LabelQueue;
 use crate::mixture_values::MixtureValues;
 use crate::provenance::Provenance;
+use crate::reference_check::ReferenceCheck;
 use crate::walk_ends::WalkEnds;
 
 /// Version of the JSON format; incremented when a key is removed or changes its meaning.
@@ -30,6 +31,8 @@ pub struct Snapshot {
     pub labels: LabelQueue,
     /// The expected end.
     pub end: ExpectedEnd,
+    /// The check of the reference. `None` if there was none.
+    pub check: Option<ReferenceCheck>,
 }
 
 impl Snapshot {
@@ -43,6 +46,7 @@ impl Snapshot {
         Ok(Self {
             end: ExpectedEnd::extrapolate(&status, &configuration, &labels.cost),
             origin: Provenance::read(store).await?,
+            check: ReferenceCheck::read(store).await?,
             mixture: MixtureValues(store.values().await?),
             disk: DiskUse { bytes: store.size().await?, forecast },
             campaign,
@@ -53,7 +57,7 @@ impl Snapshot {
 
     /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
     pub fn to_json(&self) -> serde_json::Result<Value> {
-        let Self { campaign, origin, status, mixture, disk, labels, end } = self;
+        let Self { campaign, origin, status, mixture, disk, labels, end, check } = self;
         let mut json = serde_json::to_value(status)?;
         json["version"] = FORMAT.into();
         json["campaign"] = campaign.id.to_string().into();
@@ -69,6 +73,7 @@ impl Snapshot {
         json["disk"]["at_the_end"] = json!(disk.at_the_end(status));
         json["ends"] = json!(WalkEnds::from_walks(&status.walks));
         json["expected_end"] = json!(end);
+        json["reference_check"] = check.as_ref().map_or(Value::Null, ReferenceCheck::to_json);
         labels.add_to(&mut json, status);
         Ok(json)
     }

@@ -2,9 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use atoms::extxyz::{Frame, Labels};
 use atoms::{FileError, Structure};
-use store::records::{Label, LabelDetails, Protocol};
+use store::records::{Label, Protocol};
 use store::{CampaignLock, ImportCounts, Store, unix_milliseconds};
 use wire::ContentHash;
 use workers::labeller::LabelBounds;
@@ -12,7 +11,7 @@ use workers::labeller::LabelBounds;
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::label_setup;
 use crate::output::{count, print};
-use crate::xyz_reader::XyzReader;
+use crate::xyz_reader::{XyzReader, label};
 
 /// Import labelled structures
 ///
@@ -109,21 +108,6 @@ fn read(path: &Path) -> Result<File, Failure> {
         return Err(Failure::input(FileError::Empty(path.to_owned())));
     }
     Ok(File { name, frames, lines })
-}
-
-fn label(frame: &Frame) -> Result<Label, String> {
-    match frame
-        .labels()
-        .map_err(|error| format!("{} is {}, expected {}", error.key, error.found, error.expected))?
-    {
-        Labels { energy: Some(energy), forces: Some(forces), stress } => {
-            Ok(Label { energy, forces, stress, details: LabelDetails::default() })
-        }
-        Labels { energy, .. } => {
-            let missing = if energy.is_none() { "energy" } else { "forces" };
-            Err(format!("the frame has no {missing}: expected {missing} or REF_{missing}"))
-        }
-    }
 }
 
 /// The current protocol of the campaign.

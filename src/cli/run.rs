@@ -35,7 +35,7 @@ use crate::forgetting::{ForgettingRule, Measured};
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
 use crate::runtime::notify::{self, Notifier};
-use crate::runtime::{self, multi_process, single_process, time_budget};
+use crate::runtime::{self, time_budget};
 use crate::wording::disk::megabytes;
 use crate::wording::{self, walk_ends};
 use crate::{log, summary, web};
@@ -55,6 +55,11 @@ pub struct Run {
     /// Resume a campaign that was started with another configuration file, and use CONFIG from now on
     #[arg(long)]
     adopt: bool,
+    /// Go on although labels of the structures of label.check differ from what is known by more than the bounds. The campaign
+    /// records that the differences were accepted; the check is repeated when the label protocol, these structures or the
+    /// bounds change
+    #[arg(long)]
+    accept_check: bool,
     /// Run walkers and labellers as threads of this process instead of as separate processes; uses no shared memory
     #[arg(long)]
     in_process: bool,
@@ -85,6 +90,12 @@ impl Run {
         self.log.init("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
+        if self.accept_check && campaign.known.is_empty() {
+            let config = self.config.display();
+            return Err(Failure::Input(format!(
+                "--accept-check: {config} has no label.check.structures, so there is no check to accept"
+            )));
+        }
         let directory = match self.directory {
             Some(directory) => directory,
             None => {
@@ -111,8 +122,9 @@ impl Run {
             let web = self.web.listen().await?;
             let _lock = lock::directory(&directory, &location, wait_timeout).await?;
             listen.iter().try_for_each(runtime::Listen::clear_announcement)?;
-            let (in_process, adopt) = (self.in_process, self.adopt);
-            let options = RunOptions { in_process, adopt, listen: listen.as_ref(), web, wait_timeout };
+            let (in_process, adopt, accept_check) = (self.in_process, self.adopt, self.accept_check);
+            let options =
+                RunOptions { in_process, adopt, accept_check, listen: listen.as_ref(), web, wait_timeout };
             run(&campaign, &directory, &location, options).await
         })?
         .map_err(|failure| failure.in_campaign(&directory))?;
@@ -149,6 +161,8 @@ struct RunOptions<'a> {
     in_process: bool,
     /// Whether the campaign may have been started with another configuration file.
     adopt: bool,
+    /// Whether differences from the reference are accepted.
+    accept_check: bool,
     listen: Option<&'a runtime::Listen>,
     web: web::BoundListeners,
     wait_timeout: std::time::Duration,
@@ -160,7 +174,7 @@ async fn run(
     location: &Location,
     options: RunOptions<'_>,
 ) -> Result<ExitStatus, Failure> {
-    let RunOptions { in_process, adopt, listen, web, wait_timeout } = options;
+    let RunOptions { in_process, adopt, accept_check, listen, web, wait_timeout } = options;
     let lock = lock::server(location, wait_timeout).await?;
     let origin = Provenance::new(&campaign.path, &campaign.text, directory);
     let store = open_store(campaign, location, &origin, adopt).await?;
@@ -192,11 +206,7 @@ async fn run(
             // The budget allows no further work.
             return Ok(reactor::RunOutcome::Stopped);
         }
-        if in_process {
-            single_process::run(run, selector).await
-        } else {
-            multi_process::run(run, selector).await
-        }
+        runtime::run(run, selector, in_process, accept_check).await
     };
     let serving = web.serve(location, &store, &campaign.artifact).await?;
     let mut notifier = Notifier::new(&campaign.config, &store, location).await?;

@@ -15,17 +15,18 @@ use monitor::Snapshot;
 use monitor::disk::DiskUse;
 use monitor::expected_end::ExpectedEnd;
 use monitor::label_cost::SECONDS_PER_HOUR;
+use monitor::reference_check::ReferenceCheck;
 use monitor::walk_ends::WalkEnds;
 use store::{Candidates, Location, Status as CampaignStatus, Store, unix_milliseconds};
 
 use self::batch_jobs::BatchJobs;
-use self::page::Page;
+use self::page::{Page, cut};
 pub use self::processes::state;
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::output::{count, decimals, print, print_json};
 use crate::wording::cost::two_digits;
 use crate::wording::disk::megabytes;
-use crate::wording::{budget, walk_ends};
+use crate::wording::{budget, reference_check, walk_ends};
 
 /// Show the progress of a campaign
 ///
@@ -97,7 +98,7 @@ fn write(
 }
 
 fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Result<()> {
-    let Snapshot { campaign, origin, status, mixture, disk, labels, end } = snapshot;
+    let Snapshot { campaign, origin, status, mixture, disk, labels, end, check } = snapshot;
     let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
     let id = campaign.id.to_string();
     // Ids of candidates start with the same eight characters.
@@ -108,7 +109,9 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Resu
     if let Some(origin) = origin.as_ref().filter(|_| page.is_unlimited()) {
         page.titled(out, "", &format!("configured by {}", origin.file.path))?;
     }
-    page.titled(out, "state", &state(status))?;
+    let checked = check.as_ref().filter(|_| !page.is_unlimited()).map(reference_check::state);
+    let checked = checked.map_or(String::new(), |checked| format!("; reference check {checked}"));
+    page.titled(out, "state", &format!("{}{checked}", state(status)))?;
     let ends = WalkEnds::from_walks(&status.walks);
     page.titled(out, "walks", &describe_walks(status, &ends))?;
     if page.is_unlimited() {
@@ -122,6 +125,9 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Resu
     mixture::write(out, mixture, page, &campaign.mode)?;
     write_candidates(out, page, &status.candidates, mixture.left_out(), labels.shared)?;
     labels::write(out, labels, page, status)?;
+    if let Some(check) = check.as_ref().filter(|_| page.is_unlimited()) {
+        write_check(out, page, check)?;
+    }
     if let Some(budget) = budget::describe(&status.budget) {
         page.titled(out, "budget", &budget)?;
     }
@@ -130,6 +136,13 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Resu
         Some(end) => page.titled(out, "end", &end),
         None => Ok(()),
     }
+}
+
+/// The check of the reference with its differences.
+fn write_check(out: &mut dyn Write, page: &Page, check: &ReferenceCheck) -> io::Result<()> {
+    page.titled(out, "check", &format!("reference {}", reference_check::summary(check)))?;
+    check.faults().try_for_each(|fault| page.titled(out, "", &fault))?;
+    reference_check::table(check).lines().try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
 }
 
 fn describe_disk(disk: &DiskUse, page: &Page, status: &CampaignStatus) -> String {

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 49] = [
+pub(super) const CHANGEABLE: [&str; 53] = [
     "campaign.control_share",
     "seed_structures",
     "collect.max_per_walk",
@@ -40,6 +40,10 @@ pub(super) const CHANGEABLE: [&str; 49] = [
     "label.guard.max_atoms",
     "label.guard.duplicate_tolerance",
     "label.guard.max_cost",
+    "label.check.structures",
+    "label.check.max_energy_difference",
+    "label.check.max_force_difference",
+    "label.check.max_stress_difference",
     "budget.labels",
     "budget.core_hours",
     "budget.wall_hours",
@@ -296,6 +300,8 @@ pub(super) fn differences(
     } else if before.is_null() && is_section(key) {
         // A section that an earlier version did not know.
         differences(key, &json!({}), after, changes);
+    } else if after.is_null() && is_section(key) {
+        differences(key, before, &json!({}), changes);
     } else if before != after {
         changes.push((key.to_owned(), before.clone(), after.clone()));
     }

@@ -49,7 +49,7 @@ pub enum LabelMethod {
     Potential(PotentialFile),
     /// A program.
     #[serde(untagged)]
-    Code(dft::Settings),
+    Code(Box<dft::Settings>),
 }
 
 impl LabelMethod {
@@ -98,7 +98,8 @@ impl<'de> Visitor<'de> for Methods {
         }
         if name != "potential" {
             let settings = MapAccessDeserializer::new(Again { name: Some(name), map });
-            return dft::Settings::deserialize(settings).map(LabelMethod::Code);
+            return dft::Settings::deserialize(settings)
+                .map(|settings| LabelMethod::Code(Box::new(settings)));
         }
         let reference = map.next_value()?;
         match map.next_key::<String>()? {

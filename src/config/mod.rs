@@ -147,6 +147,7 @@ impl Config {
             .with::<GuardSection>("guard")
             .with::<LabelSection>("label")
             .with::<LabelGuard>("label.guard")
+            .with::<CheckSection>("label.check")
             .with::<BudgetSection>("budget")
             .with::<RunSection>("run")
             .with::<NotifySection>("notify")
@@ -168,6 +169,7 @@ impl Config {
     /// Every path in it.
     fn paths(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         let optional = self.calm.artifact.iter_mut().chain(&mut self.calm.training_frames);
+        let optional = optional.chain(&mut self.label.check.structures);
         let others =
             [&mut self.potential.model].into_iter().chain(optional).chain(&mut self.seed_structures.files);
         others.map(Spanned::get_mut).chain(self.label.method.paths())

@@ -47,6 +47,8 @@ const RELATIVE_VOLUME: &str = "it is V/V₀ and no percentage: +40 % is 1.4";
 const TAU: &str = "it is the bias as a part of the force: 0.15 to 2";
 const CUTOFF: &str = "it is in eV: 1 Ry is 13.6 eV, 1 Ha is 27.2 eV";
 const K_SPACING: &str = "it is in 1/Å with 2π included: the paper's is 0.125";
+const STRESS: &str = "it is in eV/Å³: 1 GPa is 0.00624 eV/Å³";
+const PER_ATOM: &str = "it is that of an atom, in eV: 1 meV is 0.001";
 const SMEARING: &str = "it is in eV: 1 Ry is 13.6 eV, 1000 K are 0.086 eV";
 const VACUUM: &str = "it is in Å";
 const BOND_FRACTION: &str = "it is a fraction of the bond's length in the seed structure";
@@ -64,7 +66,7 @@ const fn range(
 }
 
 /// All of them, by table.
-pub static RANGES: [Range; 86] = [
+pub static RANGES: [Range; 89] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -106,7 +108,7 @@ pub static RANGES: [Range; 86] = [
     range("label.lease_timeout", TIME, [1.0, 86_400.0], [10.0, 86_400.0], ""),
     range("label.max_attempts", "", [0.0, 1e9], [1.0, 20.0], ""),
     range("label.max_force", "eV/Å", [0.0, 1e9], [5.0, 1e5], ""),
-    range("label.max_stress", "eV/Å³", [0.0, 1e9], [0.01, 1e3], "it is in eV/Å³: 1 GPa is 0.00624 eV/Å³"),
+    range("label.max_stress", "eV/Å³", [0.0, 1e9], [0.01, 1e3], STRESS),
     range("label.max_energy_per_atom", "eV", [0.0, 1e12], [10.0, 1e7], "it is that of an atom, in eV"),
     range(
         "label.max_energy_difference_per_atom",
@@ -124,6 +126,9 @@ pub static RANGES: [Range; 86] = [
     range("label.guard.min_volume_per_atom", "Å³", [0.0, 1e3], [1.0, 50.0], "it is that of an atom, in Å³"),
     range("label.guard.max_volume_per_atom", "Å³", [0.0, 1e6], [5.0, 1e3], "it is that of an atom, in Å³"),
     range("label.guard.max_atoms", "", [0.0, 1e9], [1.0, 1e5], ""),
+    range("label.check.max_energy_difference", "eV/atom", [0.0, 1e3], [1e-4, 0.1], PER_ATOM),
+    range("label.check.max_force_difference", "eV/Å", [0.0, 1e3], [1e-3, 0.5], ""),
+    range("label.check.max_stress_difference", "eV/Å³", [0.0, 1e3], [1e-4, 0.1], STRESS),
     range("label.method.abinit.cutoff", "eV", [20.0, 1e5], [100.0, 1e4], CUTOFF),
     range("label.method.abinit.fine_cutoff", "eV", [20.0, 1e6], [100.0, 5e4], CUTOFF),
     range("label.method.abinit.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),

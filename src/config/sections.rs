@@ -8,6 +8,7 @@ use calm::CollectionRule;
 use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use dft::PassedEnvironment;
 use md::ThermostatSettings;
+use monitor::reference_check::DifferenceBounds;
 use orchestrator::selector::{Mode, OnForgetting, UpdateProtocol};
 use potentials::ZblWindows;
 use potentials::grace::Precision;
@@ -287,6 +288,25 @@ pub struct LabelSection {
     /// Checks of a structure before it is labelled.
     #[serde(default)]
     pub guard: LabelGuard,
+    /// Comparison of labels with known ones before the first walk starts.
+    #[serde(default)]
+    pub check: CheckSection,
+}
+
+/// `[label.check]`
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct CheckSection {
+    /// Extended XYZ file of structures with energy, forces and, where known, stress by the reference that the potential was
+    /// trained on. Default: nothing is compared.
+    #[schemars(with = "Option<PathBuf>")]
+    pub structures: Option<Spanned<PathBuf>>,
+    /// Largest difference in energy, after the offsets of the elements are fitted, eV/atom.
+    pub max_energy_difference: Positive,
+    /// Largest length of the difference of an atom's force, eV/Å.
+    pub max_force_difference: Positive,
+    /// Largest difference of a component of the stress, eV/Å³.
+    pub max_stress_difference: Positive,
 }
 
 /// What happens while the label queue is longer than `queue_limit`.
@@ -374,6 +394,28 @@ impl LabelSection {
             pass_environment: self.pass_environment.clone(),
             batch_system: self.batch_system,
             batch_options: self.batch_options.clone(),
+        }
+    }
+}
+
+impl CheckSection {
+    /// The largest differences.
+    pub fn bounds(&self) -> DifferenceBounds {
+        DifferenceBounds {
+            energy: self.max_energy_difference.get(),
+            force: self.max_force_difference.get(),
+            stress: self.max_stress_difference.get(),
+        }
+    }
+}
+
+impl Default for CheckSection {
+    fn default() -> Self {
+        Self {
+            structures: None,
+            max_energy_difference: defaults::positive(0.005),
+            max_force_difference: defaults::positive(0.05),
+            max_stress_difference: defaults::positive(0.005),
         }
     }
 }

@@ -6,12 +6,13 @@ mod db_status;
 pub mod label_pool;
 mod labellers;
 mod listen;
-pub mod multi_process;
+mod multi_process;
 pub mod notify;
 mod process_manager;
 mod process_records;
+mod reference_check;
 pub mod scratch_dir;
-pub mod single_process;
+mod single_process;
 mod spawn;
 mod throughput;
 pub mod time_budget;
@@ -31,8 +32,10 @@ use wire::transport::Incoming;
 use self::throughput::Throughput;
 use crate::campaign::Campaign;
 use crate::config::{Config, QueueFull};
+use crate::exit_status::Failure;
 use crate::forgetting::ForgettingRule;
 use crate::progress::Display;
+use crate::signals::cancel_on_signal;
 pub use listen::Listen;
 
 /// Capacity of the channel of reports from walkers to the reactor.
@@ -57,6 +60,28 @@ pub struct RunContext<'a> {
 
 /// Printed when a campaign is asked to stop.
 const STOP_MESSAGE: &str = "stopping: walks are checkpointed …";
+
+/// Checks the reference, and runs the campaign until it is finished or stopped. `accept`: whether the user accepts
+/// differences from the reference.
+///
+/// Await this on the main thread: the walkers end with the thread that starts them.
+pub async fn run(
+    run: RunContext<'_>,
+    selector: Selector,
+    in_process: bool,
+    accept: bool,
+) -> Result<reactor::RunOutcome, Failure> {
+    cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
+    let go_on = tokio::select! {
+        go_on = reference_check::run(run, accept) => go_on?,
+        never = single_process::write_heartbeats(run.store.clone(), run.process.clone()) => match never {},
+    };
+    match (go_on, in_process) {
+        (false, _) => Ok(reactor::RunOutcome::Stopped),
+        (true, true) => single_process::run(run, selector).await,
+        (true, false) => multi_process::run(run, selector).await,
+    }
+}
 
 /// The task that runs the reactor.
 type ReactorTask = tokio::task::JoinHandle<Result<reactor::RunOutcome, reactor::ReactorError>>;

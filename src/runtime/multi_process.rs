@@ -22,9 +22,8 @@ use wire::shm_dir::ShmDir;
 
 use super::agent_service::AgentService;
 use super::process_manager::{self, ProcessManager};
-use super::{CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, spawn, start_reactor, wanted_walkers};
+use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
 use crate::exit_status::Failure;
-use crate::signals::cancel_on_signal;
 
 /// Time that the last writes to the database may take after all processes have ended.
 const DATABASE_TIMEOUT: Duration = Duration::from_secs(60);
@@ -60,7 +59,6 @@ async fn run_in(
     let shared = shared.map_err(Failure::failed)?;
     let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
 
-    cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
     // The manager cancels it too, when the run cannot go on.
     let stopping = run.stop.child_token();
     let limits = Limits {

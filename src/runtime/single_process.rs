@@ -1,5 +1,6 @@
 //! Runs a campaign in one process: walkers as threads, reactor and labellers as tasks.
 
+use std::convert::Infallible;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
@@ -19,10 +20,9 @@ use workers::walker;
 use super::db_status::DbStatus;
 use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
-use super::{CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, start_reactor, wanted_walkers};
+use super::{CHANNEL, ReactorTask, RunContext, start_reactor, wanted_walkers};
 use crate::campaign::Campaign;
 use crate::exit_status::Failure;
-use crate::signals::cancel_on_signal;
 
 /// Runs the campaign until it is finished or stopped.
 pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
@@ -39,7 +39,7 @@ pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::Run
 }
 
 /// Keeps the heartbeat in `status` fresh.
-async fn write_heartbeats(store: Store, mut process: ProcessRecord) {
+pub(super) async fn write_heartbeats(store: Store, mut process: ProcessRecord) -> Infallible {
     let mut db_status = DbStatus::default();
     loop {
         tokio::time::sleep(HEARTBEAT_INTERVAL).await;
@@ -64,7 +64,6 @@ struct Tasks {
 impl Tasks {
     /// Starts all of them.
     fn start(run: RunContext<'_>, selector: Selector) -> Result<Self, Failure> {
-        cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
         let stopping = run.stop.child_token();
         let closing = Arc::new(Shutdown::new(run.stop.child_token()));
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);

@@ -4,5 +4,6 @@ pub mod budget;
 pub mod cost;
 pub mod disk;
 pub mod energies;
+pub mod reference_check;
 pub mod unlabelled;
 pub mod walk_ends;

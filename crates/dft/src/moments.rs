@@ -11,7 +11,7 @@ pub type Moments = BTreeMap<Species, f64>;
 
 /// Default moment of an element, μ_B. A calculation that starts without moments never finds any, and strained
 /// structures of nonmagnetic elements may have some.
-const DEFAULT_MOMENT: f64 = 1.0;
+pub(crate) const DEFAULT_MOMENT: f64 = 1.0;
 
 /// Initial moment of each atom, `[n]`, μ_B. [`RetryAdjustment::OtherMoments`] halves it, to converge to another
 /// solution.

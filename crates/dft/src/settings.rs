@@ -49,7 +49,7 @@ impl Settings {
             Self::Command(settings) => settings.files.iter_mut().collect(),
             Self::Cp2k(settings) => vec![&mut settings.pseudopotentials],
             Self::Gpaw(settings) => settings.pseudopotentials.iter_mut().collect(),
-            Self::Vasp(settings) => vec![&mut settings.pseudopotentials],
+            Self::Vasp(settings) => settings.paths(),
         }
     }
 

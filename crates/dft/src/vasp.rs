@@ -12,6 +12,7 @@
 //! - other moments: half of the initial moments;
 //! - more memory: all processes share each k-point (`KPAR = 1`).
 
+mod element_table;
 mod fixed_width;
 mod incar;
 mod outcar;
@@ -40,13 +41,15 @@ use crate::{
 };
 use potcar::Potcar;
 
+pub use element_table::ElementTable;
+
 /// Version of the generated input; raised when a change affects label values.
 const INPUT_VERSION: u32 = 1;
 
 /// The settings of `[label.method.vasp]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-#[schemars(extend("required" = ["version", "pseudopotentials", "pseudopotential_variants"]))]
+#[schemars(extend("required" = ["version", "pseudopotentials"]))]
 pub struct Settings {
     /// VASP with its launcher: `["mpirun", "-np", "16", "vasp_std"]`.
     pub command: Vec<String>,
@@ -57,7 +60,16 @@ pub struct Settings {
     pub version: String,
     /// Directory of the POTCAR files: `Al_pv/POTCAR`, `POTCAR.Al_pv` or `Al_pv`. Required.
     pub pseudopotentials: PathBuf,
-    /// The potential of each element that may occur: `{ Al = "Al", Fe = "Fe_pv" }`. Required.
+    /// Table of the potentials and initial moments of the elements: `"MPRelaxSet"`, or `{ file = "mine.toml" }`.
+    /// Entries of `pseudopotential_variants` and `initial_magnetic_moments` come before those of the table.
+    /// Default: none.
+    pub element_table: Option<ElementTable>,
+    /// With `element_table`: the elements that may occur, besides those of `pseudopotential_variants`. Default:
+    /// all of the table.
+    #[schemars(with = "Vec<String>")]
+    pub elements: Vec<Species>,
+    /// The potential of each element that may occur: `{ Al = "Al", Fe = "Fe_pv" }`. Required without
+    /// `element_table`.
     pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV (`ENCUT`).
     #[schemars(extend("exclusiveMinimum" = 0))]
@@ -103,6 +115,8 @@ impl Default for Settings {
             environment: BTreeMap::new(),
             version: String::new(),
             pseudopotentials: PathBuf::new(),
+            element_table: None,
+            elements: Vec::new(),
             pseudopotential_variants: BTreeMap::new(),
             cutoff: 500.0,
             k_spacing: 0.125,
@@ -148,9 +162,10 @@ impl Settings {
         )?;
         needed(
             "pseudopotential_variants",
-            self.pseudopotential_variants.is_empty(),
-            "the potential of each element, such as { Al = \"Al\" }",
+            self.pseudopotential_variants.is_empty() && self.element_table.is_none(),
+            "the potential of each element, such as { Al = \"Al\" }, or an element_table",
         )?;
+        self.check_elements()?;
         needed(
             "command",
             self.command.is_empty(),
@@ -158,10 +173,50 @@ impl Settings {
         )?;
         incar::check(self)?;
         executable::find(&self.command[0])?;
-        let potcars = self.pseudopotential_variants.iter().map(|(species, variant)| {
-            Ok((*species, Potcar::find(&self.pseudopotentials, *species, variant)?))
+        let settings = match &self.element_table {
+            Some(table) => table.fill(self)?,
+            None => self.clone(),
+        };
+        let potcars = settings.pseudopotential_variants.iter().map(|(species, variant)| {
+            let potcar = Potcar::find(&self.pseudopotentials, *species, variant);
+            Ok((*species, potcar.map_err(|error| self.with_table(error, *species, variant))?))
         });
-        Ok(Vasp { potcars: potcars.collect::<Result<_, _>>()?, settings: self.clone() })
+        Ok(Vasp { potcars: potcars.collect::<Result<_, _>>()?, settings })
+    }
+
+    /// All paths in the settings.
+    pub(crate) fn paths(&mut self) -> Vec<&mut PathBuf> {
+        let table = match &mut self.element_table {
+            Some(ElementTable::File(path)) => Some(path),
+            _ => None,
+        };
+        [&mut self.pseudopotentials].into_iter().chain(table).collect()
+    }
+
+    fn check_elements(&self) -> Result<(), SetupError> {
+        if self.element_table.is_some() || self.elements.is_empty() {
+            return Ok(());
+        }
+        Err(SetupError::Setting {
+            key: "elements",
+            found: "elements without an element_table".to_owned(),
+            expected: "an element_table, such as \"MPRelaxSet\", or each element in pseudopotential_variants"
+                .to_owned(),
+        })
+    }
+
+    /// Names the table if it has selected this potential.
+    fn with_table(&self, error: SetupError, species: Species, variant: &str) -> SetupError {
+        match (error, &self.element_table) {
+            (SetupError::Pseudopotential { reason, .. }, Some(table))
+                if !self.pseudopotential_variants.contains_key(&species) =>
+            {
+                let hint = "or list the elements that may occur in `elements`";
+                let reason = format!("{table} selects {variant}, but {reason}, {hint}");
+                SetupError::Pseudopotential { species, reason }
+            }
+            (error, _) => error,
+        }
     }
 }
 
@@ -195,6 +250,8 @@ impl DftBackend for Vasp {
             environment: _,
             version,
             pseudopotentials: _,
+            element_table: _,
+            elements: _,
             pseudopotential_variants: _,
             cutoff,
             k_spacing,

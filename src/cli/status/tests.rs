@@ -82,6 +82,7 @@ pub fn large() -> Snapshot {
             by_protocol: Vec::new(),
             shared: Some(12),
         },
+        check: Some(crate::wording::reference_check::tests::example()),
         end: ExpectedEnd {
             walks_hours: Some(12.0),
             labels_hours: Some(30.1),

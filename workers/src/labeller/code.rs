@@ -22,6 +22,7 @@ use super::file_error::file_error;
 use super::label_attempt::{EndedCalculation, LabelAttempt, SingleLabel};
 use super::local;
 use super::prepare::{PreparedInput, prepare, read, write};
+use super::recorded_label::{LabelProgress, RecordedLabel};
 use super::scratch::{self, ScratchRoot};
 use super::slurm::{self, Slurm};
 use super::{BatchSystem, ExecutionSettings, RunnerCommand, log, private_directory, retry_until_written};
@@ -55,6 +56,30 @@ enum PreparedCalculation {
     Slurm(slurm::Job),
 }
 
+/// A structure to calculate, and what was tried before.
+pub(super) struct CalculationRequest<'a> {
+    pub structure: &'a Structure,
+    /// Number of the job and of its attempt, for the name of the directory.
+    pub job: i64,
+    pub attempt: u32,
+    /// Classes of the failures so far, oldest first.
+    pub failures: Vec<FailureClass>,
+    /// Calculations that may still be running or unread, newest first, as they were recorded.
+    pub earlier: &'a [String],
+    /// Calculations that failed.
+    pub failed: &'a [String],
+    pub record: CalculationNote<'a>,
+}
+
+/// Where a calculation is recorded before it starts.
+#[derive(Clone, Copy)]
+pub(super) enum CalculationNote<'a> {
+    /// With the attempt of this lease.
+    Lease(&'a Lease),
+    /// In the progress of a label outside the queue.
+    Progress(&'a RecordedLabel<'a>, &'a LabelProgress),
+}
+
 impl CodeMethod {
     pub(super) fn new(
         runner: RunnerCommand,
@@ -81,15 +106,43 @@ impl CodeMethod {
         lease: &Lease,
         stop: &CancellationToken,
     ) -> Result<Option<LabelAttempt>, StoreError> {
-        let prepared = match self.prepare(lease.structure.clone(), failure_classes(lease)).await {
+        let request = CalculationRequest {
+            structure: &lease.structure,
+            job: lease.job,
+            attempt: lease.attempt,
+            failures: failure_classes(&lease.failures),
+            earlier: &lease.earlier_calculations,
+            failed: &lease.failed_calculations,
+            record: CalculationNote::Lease(lease),
+        };
+        self.calculate(store, request, stop).await
+    }
+
+    /// The same for a calculation of the queue or outside it.
+    pub(super) async fn calculate(
+        &self,
+        store: &Store,
+        request: CalculationRequest<'_>,
+        stop: &CancellationToken,
+    ) -> Result<Option<LabelAttempt>, StoreError> {
+        let CalculationRequest { structure, job, attempt, failures, earlier, failed, record } = request;
+        let prepared = match self.prepare(structure.clone(), failures).await {
             Ok(prepared) => prepared,
             Err(failure) => return Ok(Some(LabelAttempt { result: Err(failure), ended: None })),
         };
         let record = async |handle: &CalculationHandle| {
             let identity = handle.identity();
-            retry_until_written(stop, || store.record_calculation(lease, &identity, &prepared.record)).await
+            match record {
+                CalculationNote::Lease(lease) => {
+                    retry_until_written(stop, || store.record_calculation(lease, &identity, &prepared.record))
+                        .await
+                }
+                CalculationNote::Progress(label, progress) => {
+                    label.record_calculation(store, progress, identity, stop).await
+                }
+            }
         };
-        let handle = match self.find(&lease.earlier_calculations).await? {
+        let handle = match self.find(earlier).await? {
             Some((handle, found)) => {
                 self.take(handle.clone(), None);
                 record(&handle).await?;
@@ -99,13 +152,13 @@ impl CodeMethod {
                 handle
             }
             None => {
-                let directory = self.scratch_root(store, stop).await?.make(lease.job, lease.attempt)?;
-                let ready = self.prepare_directory(&directory, &prepared, &failed_nodes(lease)).await?;
+                let directory = self.scratch_root(store, stop).await?.make(job, attempt)?;
+                let ready = self.prepare_directory(&directory, &prepared, &failed_nodes(failed)).await?;
                 record(&ready.handle()).await?;
                 self.start(ready).await?
             }
         };
-        let outcome = self.outcome(lease.structure.clone(), handle, prepared.time_limit, stop).await?;
+        let outcome = self.outcome(structure.clone(), handle, prepared.time_limit, stop).await?;
         let Some(attempt) = outcome else { return Ok(None) };
         if let Some(failed) = failed_on_node(&attempt) {
             record(&failed).await?;
@@ -378,6 +431,11 @@ impl CodeMethod {
         if self.execution.keep.keeps(failed) {
             scratch::pack(store, lease.job, lease.attempt, stop, ended.handle.directory()).await?;
         }
+        self.discard(ended).await
+    }
+
+    /// Removes the directory of a calculation whose result is stored.
+    pub(super) async fn discard(&self, ended: EndedCalculation) -> Result<(), StoreError> {
         ended.handle.remove().await?;
         self.reap();
         Ok(())
@@ -388,14 +446,14 @@ impl CodeMethod {
     }
 }
 
-/// The classes of the failures of a job so far.
-pub(super) fn failure_classes(lease: &Lease) -> Vec<FailureClass> {
-    lease.failures.iter().filter_map(|name| FailureClass::from_name(name)).collect()
+/// The classes of failures with these names.
+pub(super) fn failure_classes(names: &[String]) -> Vec<FailureClass> {
+    names.iter().filter_map(|name| FailureClass::from_name(name)).collect()
 }
 
-/// Nodes where the job failed and another node may help.
-fn failed_nodes(lease: &Lease) -> Vec<String> {
-    let failed = lease.failed_calculations.iter().filter_map(|text| CalculationHandle::parse(text));
+/// Nodes where these calculations failed and another node may help.
+fn failed_nodes(failed: &[String]) -> Vec<String> {
+    let failed = failed.iter().filter_map(|text| CalculationHandle::parse(text));
     let nodes = failed.filter_map(|handle| match handle {
         CalculationHandle::Slurm(job) => job.node,
         CalculationHandle::Local(_) => None,

@@ -66,8 +66,8 @@ impl Method {
         }
     }
 
-    /// Cleans up at the end.
-    pub(super) fn end(&self) {
+    /// Removes empty directories. Call this at the end.
+    pub fn end(&self) {
         if let Self::Code(method) = self {
             method.end();
         }
@@ -134,7 +134,7 @@ impl Method {
             // Every attempt would give the same result.
             Self::Reference(_) => false,
             Self::Code(_) => {
-                let failures = failure_classes(lease).into_iter().chain([failure.class]);
+                let failures = failure_classes(&lease.failures).into_iter().chain([failure.class]);
                 dft::adjustments(&failures.collect::<Vec<_>>()).is_none()
             }
         }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use dft::vasp::Settings;
+use dft::vasp::{ElementTable, Settings};
 use dft::{DftBackend, SetupError};
 use tempfile::TempDir;
 
@@ -40,6 +40,32 @@ fn the_identity_holds_what_changes_a_label() {
     assert!(!same(&|settings| settings.moments = [("O".parse().unwrap(), 2.0)].into()));
     assert!(!same(&|settings| drop(settings.tags.insert("LASPH".into(), ".TRUE.".into()))));
     assert_eq!(identity(&first)["pseudopotentials"]["O"]["title"], "PAW_PBE O 01Jan2000");
+}
+
+#[test]
+fn the_identity_is_the_same_with_a_table_as_with_its_entries_written_out() {
+    let home = TempDir::new().unwrap();
+    let mut written_out = settings(home.path(), "5.4.4", &["Al", "O"]);
+    written_out.moments = ["Al", "O"].map(|symbol| (symbol.parse().unwrap(), 0.6)).into();
+    let mut with_table = Settings {
+        element_table: Some(ElementTable::MpRelaxSet),
+        elements: ["Al", "O"].map(|symbol| symbol.parse().unwrap()).into(),
+        pseudopotential_variants: [].into(),
+        moments: [].into(),
+        ..written_out.clone()
+    };
+    let identity = |settings: &Settings| settings.prepare().unwrap().identity();
+    assert_eq!(identity(&with_table), identity(&written_out));
+    with_table.moments = [("O".parse().unwrap(), 2.0)].into();
+    assert_ne!(identity(&with_table), identity(&written_out));
+    // A table selects more potentials than there are.
+    with_table.elements.push("Fe".parse().unwrap());
+    let missing = with_table.prepare().unwrap_err().to_string();
+    assert!(
+        missing.contains("of Fe: the table MPRelaxSet selects Fe_pv, but none of ")
+            && missing.ends_with("or list the elements that may occur in `elements`"),
+        "{missing}"
+    );
 }
 
 #[test]
@@ -85,6 +111,7 @@ fn what_is_missing_is_named() {
     };
     assert_eq!(key(fault(&|settings| settings.version.clear())), "version");
     assert_eq!(key(fault(&|settings| settings.pseudopotential_variants.clear())), "pseudopotential_variants");
+    assert_eq!(key(fault(&|settings| settings.elements = vec!["Al".parse().unwrap()])), "elements");
     assert_eq!(key(fault(&|settings| settings.pseudopotentials = "".into())), "pseudopotentials");
     assert_eq!(key(fault(&|settings| settings.command.clear())), "command");
     assert_eq!(key(fault(&|settings| settings.cutoff = f64::NAN)), "cutoff");
