@@ -11,14 +11,14 @@ use serde_json::Value;
 
 use crate::common::{config, deviation, refuse, stderr, succeed};
 
-/// Runs a demo to its end and checks its books; returns its labelled frames, control walks included. No two atoms may be
-/// closer than `least` Å.
-fn campaign(directory: &Path, name: &str, least: f64) -> Vec<Frame> {
+/// Runs a demo of so many biased walks to its end and checks its books; returns its labelled frames, control walks included.
+/// No two atoms may be closer than `least` Å.
+fn campaign(directory: &Path, name: &str, walks: usize, least: f64) -> Vec<Frame> {
     let file = config(name).display().to_string();
     // Beside its configuration it would be in the project.
     let here = directory.join(Path::new(name).file_stem().unwrap()).display().to_string();
     let summary = succeed(directory, ["run", &file, "--directory", &here]);
-    assert!(summary.contains("walks            8 biased"), "{summary}");
+    assert!(summary.contains(&format!("walks            {walks} biased")), "{summary}");
     let status: Value = serde_json::from_str(&succeed(directory, ["status", &here, "--json"])).unwrap();
     assert_eq!(status["finished"], true, "{status}");
     let labels = &status["labels"];
@@ -114,7 +114,7 @@ fn read_by_ase(path: &Path, frames: &[Frame]) {
 #[test]
 fn aluminium_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), "aluminium.toml", 1.2);
+    let frames = campaign(directory.path(), "aluminium.toml", 8, 1.2);
     let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
     check_labels(&frames, &mut potential);
 }
@@ -122,15 +122,16 @@ fn aluminium_runs_as_it_stands() {
 #[test]
 fn silicon_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), "silicon.toml", 1.2);
+    let frames = campaign(directory.path(), "silicon.toml", 8, 1.2);
     check_labels(&frames, &mut StillingerWeber::load(config("data/Si.sw")).unwrap());
 }
 
 #[test]
 fn nickel_aluminium_hydrogen_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    // Two hydrogen atoms may come as close as the configuration says.
-    let frames = campaign(directory.path(), "nickel-aluminium-hydrogen.toml", 0.6);
+    // Three temperatures of 8 seed structures, and two more of the 7 with hydrogen, two atoms of which may come as close
+    // as the configuration says.
+    let frames = campaign(directory.path(), "nickel-aluminium-hydrogen.toml", 38, 0.6);
     let mut potential = Eam::load_as(config("data/NiAlH_jea.eam.alloy"), EamStyle::Alloy).unwrap();
     check_labels(&frames, &mut potential);
 }

@@ -21,6 +21,7 @@ mod explain;
 mod export;
 mod failing_walks;
 mod floods;
+mod forgetting;
 mod going_on;
 mod guards;
 mod hostile_labels;

@@ -93,7 +93,7 @@ fn many_training_atoms_outside_are_warned_of() {
     let output = calmwalk(tester.path(), ["validate", "c.toml"]);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let at = format!("WARNING: c.toml:{}: calm.training_frames: ", line("training_frames = "));
-    let words = "35 % of the atoms have γ > 1 under the initial mixture, where 2 to 9 % are usual";
+    let words = "39 % of the atoms have γ > 1 under the initial mixture, where 2 to 9 % are usual";
     let warning = stderr(&output);
     assert!(warning.starts_with(&at) && warning.contains(words), "{warning}");
 }

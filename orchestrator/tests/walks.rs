@@ -238,7 +238,7 @@ fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
     selector
 }
 
-/// Control walks get their share of the walkers, and biased walks the rest, however many of either there are.
+/// Control walks get their share of the assignments, and biased walks the rest.
 #[test]
 fn control_walks_do_not_wait_behind_all_seed_structures() {
     let live = |control_share| Settings {
@@ -248,21 +248,18 @@ fn control_walks_do_not_wait_behind_all_seed_structures() {
         update: UpdateProtocol::Never,
         ..settings(Mode::Live)
     };
-    for (share, expected) in [(0.5, [1, 2, 2, 3]), (0.25, [1, 1, 1, 1]), (0.01, [1, 1, 1, 1])] {
+    for (share, expected) in
+        [(0.5, [0, 1, 1, 2, 2, 3]), (0.25, [0, 0, 0, 1, 1, 1]), (1.0, [1, 2, 3, 4, 4, 4])]
+    {
         let mut selector = begin(&live(share), 20);
-        // Eight biased walks collect a structure each, and get their control walks.
-        for number in 1..=8 {
-            let assignment = next_assignment(&mut selector);
-            let walk = assignment.walk;
-            let report = offer(&selector, &assignment, 5, structure(number, SHORTEST), NEW);
-            assert_eq!(kinds(&decided(&mut selector, report)), ["accepted", "ended", "begun"], "{walk}");
-            // Nobody has a control walk in hand, so each of them would be next.
-            let control = next_assignment(&mut selector);
-            assert_eq!(control.origin, Origin::Control);
-            selector.assignment_lost(control.walk);
+        // Four biased walks collect a structure each, and get their control walks.
+        let assignments = [(); 4].map(|()| next_assignment(&mut selector));
+        for (number, assignment) in (1..).zip(&assignments) {
+            let report = offer(&selector, assignment, 5, structure(number, SHORTEST), NEW);
+            assert_eq!(kinds(&decided(&mut selector, report)), ["accepted", "ended", "begun"]);
         }
         let mut controls = 0;
-        let counts = [(); 4].map(|()| {
+        let counts = [(); 6].map(|()| {
             controls += u32::from(next_assignment(&mut selector).origin == Origin::Control);
             controls
         });

@@ -111,7 +111,9 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Resu
     }
     let checked = check.as_ref().filter(|_| !page.is_unlimited()).map(reference_check::state);
     let checked = checked.map_or(String::new(), |checked| format!("; reference check {checked}"));
-    page.titled(out, "state", &format!("{}{checked}", state(status)))?;
+    let busy = status.walkers_busy.filter(|_| status.led && !status.finished);
+    let busy = busy.map_or(String::new(), |busy| format!("; walkers {:.0} % busy", 100.0 * busy));
+    page.titled(out, "state", &format!("{}{busy}{checked}", state(status)))?;
     let ends = WalkEnds::from_walks(&status.walks);
     page.titled(out, "walks", &describe_walks(status, &ends))?;
     if page.is_unlimited() {
@@ -180,9 +182,7 @@ fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {} steps/s", decimals(Some(speed), 1)));
-    let busy = status.walkers_busy.filter(|_| under_way > 0);
-    let busy = busy.map_or(String::new(), |busy| format!("; walkers busy {:.0} %", 100.0 * busy));
-    format!("{under_way} {state}, {ended}{speed}{busy}")
+    format!("{under_way} {state}, {ended}{speed}")
 }
 
 fn write_candidates(

@@ -30,7 +30,7 @@ pub struct CampaignSection {
     pub rng_seed: u64,
     /// Whether each biased walk that collected a structure is followed by its unbiased control walk.
     pub control: bool,
-    /// Share of the walkers that work on control walks while there are any. Applies to live mode; in reproducible mode, a
+    /// Share of the assignments that control walks get while there are any. Applies to live mode; in reproducible mode, a
     /// round has as many control walks as biased ones.
     pub control_share: Fraction,
 }

@@ -2,9 +2,9 @@
 //! each collects. Prints a table.
 //!
 //! Three elements have four Gaussian components each in 32 dimensions; 2,000 atoms of each are the training data. Structures
-//! of 24 atoms of one element drift away from the training data along one of 60 directions of feature space, which the
-//! campaign visits one after the other. A structure is offered; if it is a candidate, the mixture is updated. The campaign
-//! ends after 1,000 collected structures.
+//! of 24 atoms of one element and phase, which differ by 0.3 of the spread of the training data, drift away along one of 60
+//! directions of feature space, which the campaign visits one after the other. A structure is offered; if it is a candidate, the mixture is updated. The campaign
+//! ends after 20,000 offered structures.
 
 use std::sync::Arc;
 
@@ -20,7 +20,9 @@ const COMPONENTS: usize = 4;
 const TRAINING_ATOMS: usize = 2000;
 const ATOMS: usize = 24;
 const DIRECTIONS: usize = 60;
-const ACCEPTS: usize = 1000;
+const OFFERS: usize = 20_000;
+/// Spread of the atoms of a structure, relative to that of the training data.
+const SPREAD: f64 = 0.3;
 
 /// xorshift64* and Box–Muller.
 struct Random(u64);
@@ -97,14 +99,14 @@ fn main() {
         });
         let mut mixture = Mixture::new(0, elements.collect()).expect("a mixture");
         let directions: Vec<Vec<f64>> = (0..DIRECTIONS).map(|_| random.vector()).collect();
-        campaign(kind, &mut mixture, &data, &directions, &mut random);
+        campaign(kind, &mut mixture, (&centroids, &data), &directions, &mut random);
     }
 }
 
 fn campaign(
     kind: CovarianceUpdateKind,
     mixture: &mut Mixture,
-    data: &[Vec<Vec<f64>>],
+    (centroids, data): (&[Vec<Vec<f64>>], &[Vec<Vec<f64>>]),
     directions: &[Vec<f64>],
     random: &mut Random,
 ) {
@@ -116,16 +118,20 @@ fn campaign(
         stop: toml::from_str("rule = 'atom_count'").expect("a rule"),
     };
     let (mut accepts, mut offered) = (0, 0);
-    while accepts < ACCEPTS {
+    while offered < OFFERS {
         // A walk: twenty structures along one direction, each farther than the one before.
         let element = offered / 20 % ELEMENTS;
         let direction = &directions[offered / 20 % DIRECTIONS];
         let distance = 0.25 * (1 + offered % 20) as f64;
+        // All atoms belong to one phase, and differ less than the training data do.
+        let centroid = &centroids[element][offered / 20 % COMPONENTS];
         let features: Vec<f64> = (0..ATOMS)
             .flat_map(|_| {
-                let of = (random.uniform() * TRAINING_ATOMS as f64) as usize;
-                let far = distance * random.uniform();
-                data[element][of].iter().zip(direction).map(move |(z, d)| z + far * d).collect::<Vec<_>>()
+                let of = (random.uniform() * (TRAINING_ATOMS / COMPONENTS) as f64) as usize * COMPONENTS;
+                let atom = &data[element][of + offered / 20 % COMPONENTS];
+                let far = distance * (0.8 + 0.2 * random.uniform());
+                let moved = atom.iter().zip(centroid).zip(direction);
+                moved.map(|((z, c), d)| c + SPREAD * (z - c) + far * d).collect::<Vec<_>>()
             })
             .collect();
         offered += 1;
@@ -133,15 +139,12 @@ fn campaign(
             let outcome = calm::update(mixture, &[element; ATOMS], &features, &settings).expect("an update");
             *mixture = mixture.with_changes(&outcome.changed).expect("components of this mixture");
             accepts += 1;
-            if [1, 10, 30, 100, 300, ACCEPTS].contains(&accepts) {
+            if [1, 10, 30, 100, 300, 1000, 3000].contains(&accepts) {
                 report(kind, mixture, data, accepts, offered);
             }
         }
-        if offered == 100 * ACCEPTS {
-            report(kind, mixture, data, accepts, offered);
-            break;
-        }
     }
+    report(kind, mixture, data, accepts, offered);
 }
 
 fn report(

@@ -4,7 +4,7 @@ use wire::WalkId;
 use wire::messages::Assignment;
 
 use super::walk::Walk;
-use super::{Mode, Selector, Settings};
+use super::{Mode, Selector};
 
 /// What an idle walker does next.
 #[derive(Debug)]
@@ -23,44 +23,39 @@ impl Selector {
         if self.decisions.settings.mode == Mode::Reproducible && self.in_round.is_empty() {
             self.start_round();
         }
-        let ready = |(id, walk): (&WalkId, &Walk)| {
-            let in_turn = match self.decisions.settings.mode {
+        match self.next_walk() {
+            Some(id) => Scheduling::Assign(Box::new(self.assign(id, walker))),
+            None if self.is_done() => Scheduling::Done,
+            None => Scheduling::Wait,
+        }
+    }
+
+    /// The next walk that is ready. In live mode, control walks get their share of the assignments while biased walks are
+    /// ready, too.
+    fn next_walk(&mut self) -> Option<WalkId> {
+        let mode = self.decisions.settings.mode;
+        let is_ready = |(id, walk): &(&WalkId, &Walk)| {
+            let in_turn = match mode {
                 Mode::Live => !walk.has_ended(),
                 Mode::Reproducible => self.in_round.get(id).is_some_and(Option::is_none),
             };
-            (in_turn && !self.in_hand.contains_key(id) && !self.paused.contains(id)).then_some(*id)
+            in_turn && !self.in_hand.contains_key(id) && !self.paused.contains(id)
         };
-        let controls_first = self.controls_are_due();
-        let mut candidates =
-            self.decisions.walks.iter().filter_map(|walk| Some((walk.1.is_biased(), ready(walk)?)));
-        let next = match controls_first {
-            // Rounds have as many control walks as biased ones.
-            None => candidates.next().map(|(_, id)| id),
-            Some(control) => {
-                let mut other = None;
-                let preferred = candidates.find_map(|(biased, id)| {
-                    if biased != control {
-                        return Some(id);
-                    }
-                    other.get_or_insert(id);
-                    None
-                });
-                preferred.or(other)
-            }
+        let mut ready = self.decisions.walks.iter().filter(is_ready);
+        let (first, walk) = ready.next()?;
+        // A round has as many control walks as biased ones.
+        let other = match mode {
+            Mode::Live => ready.find(|(_, other)| other.is_biased() != walk.is_biased()),
+            Mode::Reproducible => None,
         };
-        if let Some(id) = next {
-            return Scheduling::Assign(Box::new(self.assign(id, walker)));
+        let Some((second, _)) = other else { return Some(*first) };
+        let (biased, control) = if walk.is_biased() { (*first, *second) } else { (*second, *first) };
+        self.control_credit += self.decisions.settings.control_share;
+        if self.control_credit < 1.0 {
+            return Some(biased);
         }
-        if self.is_done() { Scheduling::Done } else { Scheduling::Wait }
-    }
-
-    /// Whether the next assignment goes to a control walk, if one is ready: fewer have one in hand than their share.
-    /// `None` in reproducible mode.
-    fn controls_are_due(&self) -> Option<bool> {
-        let Settings { mode, control_share, .. } = self.decisions.settings;
-        let is_control = |id: &WalkId| self.decisions.walks.get(id).is_some_and(|walk| !walk.is_biased());
-        let controls = self.in_hand.keys().filter(|id| is_control(id)).count() as f64;
-        (mode == Mode::Live).then(|| controls < control_share * (self.in_hand.len() + 1) as f64)
+        self.control_credit -= 1.0;
+        Some(control)
     }
 
     /// Whether every walk has ended.

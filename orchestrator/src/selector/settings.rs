@@ -79,7 +79,7 @@ pub struct Settings {
     pub max_structures: Option<u32>,
     /// Whether each biased walk that collected structures is followed by its unbiased control walk.
     pub control: bool,
-    /// Share of the walkers that work on control walks while there are any (live mode).
+    /// Share of the assignments that control walks get while there are any (live mode).
     pub control_share: f64,
     /// How close atoms may come. Structures with closer atoms are declined.
     pub min_distances: MinDistanceRule,

@@ -22,19 +22,10 @@ pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &Page, mode: &st
     }
     let elements: Vec<ElementForgetting> =
         serde_json::from_value(training["elements"].clone()).unwrap_or_default();
+    let is_sampled = number("share_above_one").is_some();
     let worst = elements.iter().max_by(|a, b| a.mean_square_growth.total_cmp(&b.mean_square_growth));
-    if let Some(ElementForgetting { element, mean_square_growth, share_above_one }) = worst {
-        let share =
-            share_above_one.map_or(String::new(), |share| format!(", {:.1} % above 1", 100.0 * share));
-        let alarm = if number("share_above_one").is_none() && training["alarm"] == true {
-            "; ALARM: the mixture forgets them"
-        } else {
-            ""
-        };
-        let text = format!(
-            "of its training data, {element} is forgotten most: σ² × {mean_square_growth:.2}{share}{alarm}"
-        );
-        page.titled(out, "", &text)?;
+    if let Some(worst) = worst.filter(|_| page.is_unlimited() || !is_sampled) {
+        page.titled(out, "", &describe_worst(worst, !is_sampled && training["alarm"] == true))?;
     }
     // Walks that run one after the other have the newest version by construction.
     match values.staleness().filter(|staleness| mode == "live" || staleness.largest() > 0) {
@@ -52,6 +43,14 @@ pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &Page, mode: &st
         ),
         None => Ok(()),
     }
+}
+
+/// The element whose training data have moved away most.
+fn describe_worst(worst: &ElementForgetting, alarm: bool) -> String {
+    let ElementForgetting { element, mean_square_growth, share_above_one } = worst;
+    let share = share_above_one.map_or(String::new(), |share| format!(", {:.1} % above 1", 100.0 * share));
+    let alarm = if alarm { "; ALARM: the mixture forgets them" } else { "" };
+    format!("of its training data, {element} is forgotten most: σ² × {mean_square_growth:.2}{share}{alarm}")
 }
 
 #[cfg(test)]
