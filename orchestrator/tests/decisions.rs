@@ -261,8 +261,14 @@ fn imports_are_logged_once_when_they_begin_to_count() {
 
 #[test]
 fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
-    let limited =
-        Settings { update: UpdateProtocol::Never, max_structures: Some(1), control: true, ..live() };
+    // It is not the turn of control walks.
+    let limited = Settings {
+        update: UpdateProtocol::Never,
+        max_structures: Some(1),
+        control: true,
+        control_share: 0.1,
+        ..live()
+    };
     let mut selector = common::restore(&limited, 2, SelectorSnapshot::default());
     let mut walks = std::collections::BTreeMap::new();
     let mut keep = |commit: &Commit| walks.extend(commit.walks.iter().map(|walk| (walk.walk, walk.clone())));

@@ -240,8 +240,8 @@ fn check_temperature(config: &Config) -> Result<(), Wrong> {
             .iter()
             .map(move |temperature| (format!("walks.{number}.temperatures"), temperature))
     });
-    let all = [("walk.temperature".to_owned(), &walk.temperature)].into_iter().chain(of_groups);
-    match all.filter(|(_, temperature)| highest <= temperature.get()).next() {
+    let mut all = [("walk.temperature".to_owned(), &walk.temperature)].into_iter().chain(of_groups);
+    match all.find(|(_, temperature)| highest <= temperature.get()) {
         Some((key, temperature)) => {
             let expected = format!("more than {key} = {} K: every walk would end at once", temperature.get());
             wrong("guard.max_temperature", highest, expected)

@@ -3,8 +3,8 @@
 //!
 //! Three elements have four Gaussian components each in 32 dimensions; 2,000 atoms of each are the training data. Structures
 //! of 24 atoms of one element and phase, which differ by 0.3 of the spread of the training data, drift away along one of 60
-//! directions of feature space, which the campaign visits one after the other. A structure is offered; if it is a candidate, the mixture is updated. The campaign
-//! ends after 20,000 offered structures.
+//! directions of feature space, which the campaign visits one after the other. A structure is offered; if it is a candidate,
+//! the mixture is updated. The campaign ends after 20,000 offered structures.
 
 use std::sync::Arc;
 
@@ -23,6 +23,9 @@ const DIRECTIONS: usize = 60;
 const OFFERS: usize = 20_000;
 /// Spread of the atoms of a structure, relative to that of the training data.
 const SPREAD: f64 = 0.3;
+
+/// Of the centroids or the atoms of one element.
+type Vectors = Vec<Vec<f64>>;
 
 /// xorshift64* and Box–Muller.
 struct Random(u64);
@@ -106,7 +109,7 @@ fn main() {
 fn campaign(
     kind: CovarianceUpdateKind,
     mixture: &mut Mixture,
-    (centroids, data): (&[Vec<Vec<f64>>], &[Vec<Vec<f64>>]),
+    (centroids, data): (&[Vectors], &[Vectors]),
     directions: &[Vec<f64>],
     random: &mut Random,
 ) {

@@ -54,8 +54,6 @@ pub struct Selector {
     in_round: BTreeMap<WalkId, Option<RegradedReport>>,
     /// Walks that get no assignments for now.
     paused: BTreeSet<WalkId>,
-    /// Assignments that control walks have not had of their share (live mode). Less than 1.
-    control_credit: f64,
 }
 
 impl Selector {
@@ -72,7 +70,7 @@ impl Selector {
     ) -> Result<Self, SelectorError> {
         let decisions = DecisionState::restore(settings, &seeds, grader, original, training, snapshot)?;
         let (in_hand, in_round, paused) = (BTreeMap::new(), BTreeMap::new(), BTreeSet::new());
-        Ok(Self { campaign, seeds, decisions, in_hand, in_round, paused, control_credit: 0.0 })
+        Ok(Self { campaign, seeds, decisions, in_hand, in_round, paused })
     }
 
     /// The mixture for the assignments of [`Selector::next_assignment`].

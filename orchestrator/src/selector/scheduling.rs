@@ -32,7 +32,7 @@ impl Selector {
 
     /// The next walk that is ready. In live mode, control walks get their share of the assignments while biased walks are
     /// ready, too.
-    fn next_walk(&mut self) -> Option<WalkId> {
+    fn next_walk(&self) -> Option<WalkId> {
         let mode = self.decisions.settings.mode;
         let is_ready = |(id, walk): &(&WalkId, &Walk)| {
             let in_turn = match mode {
@@ -50,12 +50,16 @@ impl Selector {
         };
         let Some((second, _)) = other else { return Some(*first) };
         let (biased, control) = if walk.is_biased() { (*first, *second) } else { (*second, *first) };
-        self.control_credit += self.decisions.settings.control_share;
-        if self.control_credit < 1.0 {
-            return Some(biased);
-        }
-        self.control_credit -= 1.0;
-        Some(control)
+        Some(if self.is_turn_of_controls() { control } else { biased })
+    }
+
+    /// Whether the next assignment is one of the share of control walks. It follows from the number of assignments so
+    /// far, and is the same after a restart.
+    fn is_turn_of_controls(&self) -> bool {
+        let done: u64 = self.decisions.walks.values().map(|walk| walk.record.turn).sum();
+        let number = (done + self.in_hand.len() as u64) as f64;
+        let share = self.decisions.settings.control_share;
+        ((number + 1.0) * share).floor() > (number * share).floor()
     }
 
     /// Whether every walk has ended.

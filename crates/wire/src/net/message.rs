@@ -58,6 +58,7 @@ pub(super) enum Request<'a> {
 }
 
 #[derive(Serialize, Deserialize)]
+#[expect(clippy::large_enum_variant, reason = "there is never more than one")]
 pub(super) enum Reply<'a> {
     #[serde(borrow)]
     Joined(JoinReply<'a>),
