@@ -111,9 +111,7 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Resu
     }
     let checked = check.as_ref().filter(|_| !page.is_unlimited()).map(reference_check::state);
     let checked = checked.map_or(String::new(), |checked| format!("; reference check {checked}"));
-    let busy = status.walkers_busy.filter(|_| status.led && !status.finished);
-    let busy = busy.map_or(String::new(), |busy| format!("; walkers {:.0} % busy", 100.0 * busy));
-    page.titled(out, "state", &format!("{}{busy}{checked}", state(status)))?;
+    page.titled(out, "state", &format!("{}{checked}", state(status)))?;
     let ends = WalkEnds::from_walks(&status.walks);
     page.titled(out, "walks", &describe_walks(status, &ends))?;
     if page.is_unlimited() {

@@ -15,6 +15,8 @@ pub fn state(status: &Status) -> String {
     };
     let alive = |kind| number(kind, |state| state != "dead" && !is_failed(state));
     let failed = number(ProcessRecord::WALKER, is_failed);
+    let busy = status.walkers_busy.map(|share| format!("; walkers {:.0} % busy", 100.0 * share));
+    let busy = busy.unwrap_or_default();
     match (status.finished, alive(ProcessRecord::ORCHESTRATOR), alive(ProcessRecord::LABELLER)) {
         (true, ..) => match &status.budget.used_up {
             Some(key) => format!("finished: {key} is used up (raise it and resume with calmwalk run)"),
@@ -29,9 +31,9 @@ pub fn state(status: &Status) -> String {
         }
         _ if failed > 0 => {
             let all = number(ProcessRecord::WALKER, |_| true);
-            format!("running, but {failed} of {all} walkers failed")
+            format!("running, but {failed} of {all} walkers failed{busy}")
         }
-        _ => "running".to_owned(),
+        _ => format!("running{busy}"),
     }
 }
 
