@@ -270,6 +270,7 @@ fn check_mixture(live: &Live) {
         let has_moved = found["moved"] == true;
         assert_eq!(number("distance") > 0.0, has_moved, "{found}");
         assert_eq!(number("environments") > number("environments_before"), has_moved, "{found}");
+        assert_eq!(number("mean_square_growth") != 1.0, has_moved, "{found}");
         assert!(number("shrunk") <= number("grown") && number("condition_number") >= 1.0, "{found}");
     }
     assert!(found.iter().any(|component| component["moved"] == true));

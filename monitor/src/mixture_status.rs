@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use calm::drift::{self, Drift};
+use calm::forgetting::mean_square_growth;
 use calm::{Component, LinearError, Mixture, MixtureError};
 use serde::Serialize;
 use store::NewestMixture;
@@ -61,6 +62,8 @@ struct ComponentStatus {
     shrunk: Option<f64>,
     /// Distance of the covariances, √Σ ln²λ.
     distance: Option<f64>,
+    /// Mean σ² of the component's training atoms, relative to the start. `None` without statistics.
+    mean_square_growth: Option<f64>,
 }
 
 /// Compares each component with its start.
@@ -108,6 +111,7 @@ impl ComponentStatus {
             grown: drift.map(|drift| drift.grown),
             shrunk: drift.map(|drift| drift.shrunk),
             distance: drift.map(|drift| drift.distance),
+            mean_square_growth: before.and_then(|before| mean_square_growth(before, now)),
         })
     }
 }

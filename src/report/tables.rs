@@ -1,5 +1,6 @@
 //! The tables of a report, rounded for the page and with full precision for a file.
 
+mod conditions;
 mod facts;
 mod labels;
 mod seed_structures;
@@ -91,7 +92,8 @@ fn percent(share: Option<f64>) -> Cell {
 
 /// All tables with rows, in the order of the page.
 pub fn all(data: &ReportData) -> Vec<Table> {
-    let mut tables = vec![facts::summary(data), seed_structures::seed_structures(data)];
+    let mut tables =
+        vec![facts::summary(data), conditions::conditions(data), seed_structures::seed_structures(data)];
     if let Some(found) = &data.labels {
         tables.extend([
             labels::correlations(&found.statistics),

@@ -106,6 +106,13 @@ fn walks(text: &mut Text, status: &Status) {
     if let Some(pace) = status.steps_per_second {
         text.gauge("calmwalk_steps_per_second", "Steps per second of all walks together.", &[(&[], pace)]);
     }
+    if let Some(busy) = status.walkers_busy {
+        text.gauge(
+            "calmwalk_walkers_busy_ratio",
+            "Average share of the walkers that have a walk in hand.",
+            &[(&[], busy)],
+        );
+    }
     let under_way = status.walks.iter().filter(|walk| matches!(walk.state.as_str(), "waiting" | "running"));
     if let Some(gamma) = under_way.filter_map(|walk| walk.gamma_max).reduce(f64::max) {
         text.gauge(

@@ -20,7 +20,7 @@ use crate::ids::{CandidateId, Origin, WalkId};
 use crate::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 
 const MAGIC: [u8; 4] = *b"CALM";
-const VERSION: u8 = 2;
+const VERSION: u8 = 3;
 const PREFIX: usize = MAGIC.len() + 1 + 4;
 
 /// Why bytes are not a valid control message.

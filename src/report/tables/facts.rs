@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use calm::CollectionRule;
+use calm::forgetting::ElementForgetting;
 use serde_json::Value;
 
 use super::super::report_data::ReportData;
@@ -10,6 +11,9 @@ use super::super::style::grouped;
 use super::settings::flatten;
 use super::{Table, text};
 use crate::wording;
+
+/// Elements in the summary, those first whose training data are forgotten most.
+const MAX_ELEMENTS: usize = 6;
 
 /// The campaign in a few lines.
 pub fn summary(data: &ReportData) -> Table {
@@ -58,6 +62,17 @@ pub fn summary(data: &ReportData) -> Table {
             &format!("; training atoms under it: median γ {median:.2}, {:.1} % above 1", 100.0 * share);
     }
     row("mixture", mixture);
+    let forgotten = training.map(|training| training["elements"].clone()).unwrap_or_default();
+    let mut forgotten: Vec<ElementForgetting> = serde_json::from_value(forgotten).unwrap_or_default();
+    forgotten.sort_by(|a, b| b.mean_square_growth.total_cmp(&a.mean_square_growth));
+    if !forgotten.is_empty() {
+        let element = |of: &ElementForgetting| {
+            let share = of.share_above_one.map(|share| format!(" ({:.1} % above 1)", 100.0 * share));
+            format!("{} × {:.2}{}", of.element, of.mean_square_growth, share.unwrap_or_default())
+        };
+        let shown: Vec<_> = forgotten.iter().take(MAX_ELEMENTS).map(element).collect();
+        row("mean σ² of training atoms, relative to the start", shown.join(", "));
+    }
     if let Some(key) = &status.budget.used_up {
         row("ended by", format!("the budget {key}"));
     }

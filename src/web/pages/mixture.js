@@ -10,7 +10,7 @@ export const TITLE = "Mixture";
 const ELEMENTS = [["element"], ["components", true], ["moved", true], ["environments at the start", true], ["gained", true],
   ["largest condition number", true], ["largest distance", true], [""]];
 const COMPONENTS = [["component", true], ["θ", true], ["environments at the start", true], ["gained", true], ["weighted", true],
-  ["condition number", true], ["widest growth", true], ["strongest shrinkage", true], ["distance", true], [""]];
+  ["condition number", true], ["widest growth", true], ["strongest shrinkage", true], ["training σ²", true], ["distance", true], [""]];
 
 /** Width of the longest bar. */
 const BAR = 120;
@@ -78,11 +78,11 @@ function byName(elements, one, choose) {
 function components({ name, own }) {
   const most = Math.max(...own.map(({ distance }) => distance ?? 0));
   const rows = own.map((one) => [whole(one.component), decimals(one.threshold, 4), whole(one.environments_before),
-    gained(one.environments_before, one.environments), decimals(one.weighted, 1), power(one.condition_number), times(one.grown), times(one.shrunk),
+    gained(one.environments_before, one.environments), decimals(one.weighted, 1), power(one.condition_number), times(one.grown), times(one.shrunk), times(one.mean_square_growth),
     one.moved ? digits(one.distance) : "not moved", bar(one.distance, most)]);
   return section(`Components of ${name}`, table(`Components of ${name}`, COMPONENTS, rows),
     element("p", { class: "quiet" }, "θ: calibrated threshold of σ. Condition number of C + εI. Widest growth √λ_max and strongest shrinkage √λ_min: ",
-      "factors on the width, in the direction of feature space that changed most. Distance: √Σ ln²λ, 0 if it has not moved. All are dimensionless."));
+      "factors on the width, in the direction of feature space that changed most. Training σ²: factor on the mean σ² of the training atoms; what the mixture forgets grows. Distance: √Σ ln²λ, 0 if it has not moved. All are dimensionless."));
 }
 
 function gained(before, now) {

@@ -1,0 +1,97 @@
+//! Results by the conditions of walks.
+
+use std::collections::BTreeMap;
+
+use store::WalkStatus;
+use wire::WalkConditions;
+
+use super::super::report_data::ReportData;
+use super::{Table, count, real, text};
+
+/// The biased walks under the same conditions, from any seed structure. Without rows if all walks have the same.
+pub fn conditions(data: &ReportData) -> Table {
+    let titles = [
+        "group",
+        "T (K)",
+        "V/V_{0} from",
+        "to",
+        "τ",
+        "walks",
+        "ended",
+        "accepted",
+        "per walk",
+        "refused",
+        "roll-backs",
+    ];
+    let caption = "Results by the conditions of biased walks: temperature of the thermostat, volume ramp and τ at the start; accepted \
+                   structures, structures refused by the guard, and roll-backs to a checkpoint.";
+    let mut table = Table::new("conditions", caption, &titles);
+    let all = by_conditions(&data.status.walks);
+    for (conditions, walks) in all.iter().filter(|_| all.len() > 1) {
+        let sum = |of: fn(&WalkStatus) -> u64| walks.iter().map(|walk| of(walk)).sum::<u64>();
+        let (accepted, number) = (sum(|walk| walk.accepted.into()), walks.len() as u64);
+        let (from, to) = conditions.volume_ramp.unwrap_or((1.0, 1.0));
+        table.rows.push(vec![
+            text(&conditions.group),
+            real(conditions.temperature, 0),
+            real(from, 2),
+            real(to, 2),
+            real(conditions.tau, 3),
+            count(number),
+            text(ends(walks)),
+            count(accepted),
+            real(accepted as f64 / number as f64, 2),
+            count(sum(|walk| walk.refused.unsigned_abs())),
+            count(sum(|walk| walk.returns.into())),
+        ]);
+    }
+    table
+}
+
+/// The biased walks by their conditions, repeats together, in order of the first.
+fn by_conditions(walks: &[WalkStatus]) -> Vec<(WalkConditions, Vec<&WalkStatus>)> {
+    let mut all: Vec<(WalkConditions, Vec<&WalkStatus>)> = Vec::new();
+    for walk in walks.iter().filter(|walk| walk.origin == "biased") {
+        let Some(conditions) = &walk.conditions else { continue };
+        let conditions = WalkConditions { repeat: 0, ..conditions.clone() };
+        match all.iter_mut().find(|(known, _)| *known == conditions) {
+            Some((_, walks)) => walks.push(walk),
+            None => all.push((conditions, vec![walk])),
+        }
+    }
+    all
+}
+
+/// How walks ended, with numbers.
+fn ends(walks: &[&WalkStatus]) -> String {
+    let mut states: BTreeMap<&str, u64> = BTreeMap::new();
+    for walk in walks {
+        *states.entry(&walk.state).or_default() += 1;
+    }
+    let words = |(state, number): (&&str, &u64)| format!("{number} {}", state.replace('_', " "));
+    states.iter().map(words).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn repeats_and_seed_structures_are_taken_together() {
+        let walk = |temperature, repeat, origin: &str| WalkStatus {
+            origin: origin.to_owned(),
+            conditions: Some(WalkConditions { temperature, repeat, ..WalkConditions::default() }),
+            ..WalkStatus::default()
+        };
+        let walks = [
+            walk(600.0, 0, "biased"),
+            walk(600.0, 1, "biased"),
+            walk(300.0, 0, "biased"),
+            walk(600.0, 0, "biased"),
+            walk(600.0, 0, "control"),
+        ];
+        let found = by_conditions(&walks);
+        let numbers: Vec<_> = found.iter().map(|(of, walks)| (of.temperature, walks.len())).collect();
+        assert_eq!(numbers, [(600.0, 3), (300.0, 1)]);
+    }
+}
