@@ -89,7 +89,8 @@ fn walks_of_all_groups_share_a_mixture_and_give_the_same_bytes_for_any_number_of
     }
     succeed(here, ["report", "campaign", "--output", "report"]);
     let table = fs::read_to_string(here.join("report/tables/conditions.csv")).unwrap();
-    let groups: Vec<_> = table.lines().skip(1).map(|line| line.split(',').next().unwrap().to_owned()).collect();
+    let groups: Vec<_> =
+        table.lines().skip(1).map(|line| line.split(',').next().unwrap().to_owned()).collect();
     assert_eq!(groups, ["hot", "hot", "hot", "hot", "hole", "hole"], "{table}");
     assert!(succeed(here, ["replay", "campaign"]).contains("all reproduced bit by bit"));
 }

@@ -16,6 +16,7 @@ const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE label DROP COLUMN checksum, DROP COLUMN excluded, DROP COLUMN exclusion;
     ALTER TABLE walk DROP COLUMN checksum, DROP COLUMN checkpoint_checksum;
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
+    DROP TABLE walk_conditions;
     DELETE FROM _sqlx_migrations WHERE version > 8";
 
 async fn exported(location: impl Into<Location>) -> Vec<String> {
