@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::common::campaign::{Small, outcome};
-use crate::common::label_campaign::on_store;
+use crate::common::label_campaign::{WRITE_FIXED_LABEL, on_store};
 use crate::common::processes::{assert_no_leftovers, signal, wait_until};
 use crate::common::{Running, calmwalk, program, refuse, stderr, succeed, write_frames};
 
@@ -138,16 +138,10 @@ fn labels_that_differ_stop_the_campaign_until_they_are_accepted() {
     outcome(here);
 }
 
-/// A label that waits for the file `go` of the campaign, and writes a line to `started` before.
+/// Before a label: writes a line to `started`, and waits for the file `go` of the campaign.
 const WAITING_SCRIPT: &str = r#"
 echo >> HERE/started
 while [ ! -e HERE/go ]; do sleep 0.02; done
-awk '
-    NR == 1 { print; next }
-    NR == 2 { sub(/Properties=[^ ]*/, "Properties=species:S:1:pos:R:3:forces:R:3"); print $0 " energy=-1.5"; next }
-    { print $0, 0.25, 0, 0 }
-' structure.extxyz > unfinished
-mv unfinished label.extxyz
 "#;
 
 #[test]
@@ -156,7 +150,7 @@ fn a_killed_check_continues_with_the_calculation_that_is_running() {
         "{ command = { command = [\"sh\", \"label.sh\"], files = [\"label.sh\"], version = \"1\" } }";
     let directory = campaign(Some(command));
     let here = directory.path();
-    let script = WAITING_SCRIPT.replace("HERE", &here.display().to_string());
+    let script = WAITING_SCRIPT.replace("HERE", &here.display().to_string()) + WRITE_FIXED_LABEL;
     fs::write(here.join("label.sh"), script).unwrap();
     let scratch = here.join("scratch");
     fs::create_dir(&scratch).unwrap();

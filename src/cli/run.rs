@@ -182,12 +182,12 @@ async fn run(
     if let Location::Directory(directory) = &location {
         warn_if_disk_is_too_small(campaign, directory, &store).await?;
     }
-    let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
     let pauses = campaign.config.calm.on_forgetting == OnForgetting::Pause;
     if pauses && selector.forgetting_level() > 1.0 && !selector.is_done() {
         return Err(paused_by_alarm(campaign, &store).await?);
     }
+    let process = register(&store).await?;
     if let Some(idle) = runtime::idle_walkers(campaign) {
         log_and_warn(format_args!("WARNING: {idle}"));
     }

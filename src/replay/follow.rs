@@ -1,9 +1,7 @@
 //! Feeds decisions and candidates from the store to the replay.
 
 use std::collections::VecDeque;
-use std::panic::resume_unwind;
 use std::sync::Arc;
-use std::thread;
 
 use calm::Mixture;
 use orchestrator::selector::{RegradedCandidate, Regrader, Replay, SelectorError};
@@ -11,6 +9,7 @@ use store::{Store, StoredCandidate};
 
 use super::failure;
 use super::report::{LogEntry, Report};
+use crate::all_cores;
 use crate::exit_status::Failure;
 use crate::output::Bar;
 use crate::runtime::cores;
@@ -95,36 +94,17 @@ impl Prefetch {
         if self.ready.is_empty() {
             let cores = cores();
             let stored = store.candidates(decision - 1, self.control, CANDIDATES_PER_CORE * cores).await?;
-            self.ready = examine(stored, replay.regrader(), replay.mixture(), cores as usize)?.into();
+            let (examiner, mixture) = (replay.regrader(), replay.mixture());
+            let examined = all_cores::map(
+                stored.into_iter(),
+                || (),
+                |(), stored| examine_one(stored, examiner, mixture),
+            );
+            self.ready = examined.into_iter().collect::<Result<_, _>>()?;
         }
         let ready = self.ready.pop_front().filter(|ready| ready.stored.decision == decision);
         ready.ok_or_else(|| damaged(decision, "its candidate is missing"))
     }
-}
-
-/// Grades candidates on every core.
-fn examine(
-    stored: Vec<StoredCandidate>,
-    examiner: &Regrader,
-    mixture: &Arc<Mixture>,
-    cores: usize,
-) -> Result<Vec<PrefetchedCandidate>, Failure> {
-    let each = stored.len().div_ceil(cores).max(1);
-    let (mut stored, mut parts) = (stored.into_iter(), Vec::new());
-    while stored.len() > 0 {
-        parts.push(stored.by_ref().take(each).collect::<Vec<_>>());
-    }
-    let examined = thread::scope(|scope| {
-        let examine = |part: Vec<StoredCandidate>| {
-            let one = |stored| examine_one(stored, examiner, mixture);
-            scope.spawn(move || part.into_iter().map(one).collect::<Result<Vec<_>, _>>())
-        };
-        let threads: Vec<_> = parts.into_iter().map(examine).collect();
-        let joined =
-            threads.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
-        joined.collect::<Result<Vec<_>, Failure>>()
-    });
-    Ok(examined?.into_iter().flatten().collect())
 }
 
 fn examine_one(

@@ -6,6 +6,10 @@ mod labels;
 mod seed_structures;
 mod settings;
 
+use std::collections::BTreeMap;
+
+use store::WalkStatus;
+
 use super::csv::{self, Csv};
 use super::report_data::ReportData;
 
@@ -88,6 +92,20 @@ fn real(x: impl Into<Option<f64>>, decimals: usize) -> Cell {
 /// A share, in percent on the page and in the file.
 fn percent(share: Option<f64>) -> Cell {
     real(share.map(|share| 100.0 * share), 1)
+}
+
+/// Number of walks, and their states.
+fn states<'a>(walks: impl Iterator<Item = &'a WalkStatus>) -> (u64, String) {
+    let mut states: BTreeMap<&str, u64> = BTreeMap::new();
+    for walk in walks {
+        *states.entry(&walk.state).or_default() += 1;
+    }
+    let all = states.values().sum();
+    let words = |(state, number): (&&str, &u64)| {
+        let state = state.replace('_', " ");
+        if all == 1 { state } else { format!("{number} {state}") }
+    };
+    (all, states.iter().map(words).collect::<Vec<_>>().join(", "))
 }
 
 /// All tables with rows, in the order of the page.

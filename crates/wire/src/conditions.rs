@@ -1,7 +1,5 @@
 //! The conditions of walks: what one walk from a seed structure has otherwise than another.
 
-use std::collections::HashSet;
-
 use serde::{Deserialize, Serialize};
 
 /// The conditions of a walk.
@@ -73,13 +71,6 @@ impl WalkConditions {
     /// Whether the volume changes.
     pub fn changes_volume(&self) -> bool {
         self.volume_ramp.is_some_and(|(from, to)| from != 1.0 || to != 1.0)
-    }
-
-    /// The names of the groups, in order of their first walk.
-    pub fn groups<'a>(walks: impl IntoIterator<Item = &'a Self>) -> Vec<&'a str> {
-        let mut seen = HashSet::new();
-        let names = walks.into_iter().map(|walk| walk.group.as_str());
-        names.filter(|name| seen.insert(*name)).collect()
     }
 }
 

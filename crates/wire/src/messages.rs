@@ -105,7 +105,7 @@ pub enum Outcome<C = CandidateBlock> {
 pub enum WalkEnd {
     /// All steps are done.
     Steps,
-    /// The maximum number of structures from this seed structure was collected.
+    /// The maximum number of structures of this walk, or of its seed structure, was collected.
     Collected,
     /// The campaign has reached its maximum number of structures.
     Budget,

@@ -42,13 +42,7 @@ impl DecisionState {
             self.apply_report(&report, &mut commit);
             match report.outcome {
                 Outcome::Candidate(regraded) => {
-                    let decided = match regraded {
-                        Ok(regraded) if self.walks[&id].is_biased() => {
-                            self.decide_candidate(id, regraded, &mut commit)
-                        }
-                        Ok(regraded) => self.keep_control_frame(id, regraded, &mut commit),
-                        Err(error) => Err(error),
-                    };
+                    let decided = regraded.and_then(|regraded| self.take(id, regraded, &mut commit));
                     match decided {
                         Err(error) if error.is_of_candidate() => {
                             self.leave_out(id, report.progress.step, &error.to_string(), &mut commit);
@@ -94,6 +88,19 @@ impl DecisionState {
         }
     }
 
+    /// Decides on what a walk offers: a candidate, or a requested frame of a control walk.
+    fn take(
+        &mut self,
+        id: WalkId,
+        regraded: RegradedCandidate,
+        commit: &mut Commit,
+    ) -> Result<(), SelectorError> {
+        match self.walks[&id].is_biased() {
+            true => self.decide_candidate(id, regraded, commit),
+            false => self.keep_control_frame(id, regraded, commit),
+        }
+    }
+
     /// Decides on a candidate of a biased walk, and ends the walk if it has reached its limit.
     pub fn decide_candidate(
         &mut self,
@@ -115,19 +122,19 @@ impl DecisionState {
             detail["threshold"] =
                 json!(self.settings.collection.with_threshold_factor(self.threshold_factor).threshold());
         }
+        let mut alarm = false;
         let (fate, verdict) = match self.reason_to_decline(id, candidate.content, &graded) {
             Some(reason) => {
                 detail["reason"] = json!(reason.name());
                 (Fate::Declined(reason), Verdict::Declined(reason))
             }
             None => {
-                self.update(&graded, commit, &mut detail)?;
+                alarm = self.update(&graded, commit, &mut detail)?;
                 self.accept(id, candidate.content, candidate.step);
                 (Fate::Accepted, Verdict::Accepted)
             }
         };
         let keep_features = self.should_keep_features(fate, &graded.block);
-        let alarm = detail["forgetting_alarm"] == true;
         self.record_decision(id, graded, fate, keep_features, detail, commit);
         self.act_on_alarm(id, alarm, commit);
         self.walk_mut(id).state.verdict = Some(verdict);
@@ -231,15 +238,16 @@ impl DecisionState {
         }
     }
 
-    /// Updates the mixture to cover the candidate, and adds the new version to the commit.
+    /// Updates the mixture to cover the candidate, and adds the new version to the commit. Returns whether the mixture
+    /// has forgotten too much.
     fn update(
         &mut self,
         graded: &RegradedCandidate,
         commit: &mut Commit,
         detail: &mut serde_json::Value,
-    ) -> Result<(), SelectorError> {
+    ) -> Result<bool, SelectorError> {
         if self.settings.update == UpdateProtocol::Never {
-            return Ok(());
+            return Ok(false);
         }
         let view = graded.block.view();
         let elements = &graded.bonds.elements;
@@ -260,7 +268,7 @@ impl DecisionState {
         detail["forgetting"] = json!({ "level": state.level, "elements": state.elements });
         detail["forgetting_alarm"] = json!(state.is_alarming());
         commit.values.push((TRAINING_FRAMES.to_owned(), state.to_json().to_string()));
-        Ok(())
+        Ok(state.is_alarming())
     }
 
     /// What the live mixture has forgotten.

@@ -88,14 +88,13 @@ impl Forgetting {
             sum += count * self.growth.get(&(element, slot)).copied().unwrap_or(1.0);
             atoms += count;
         }
-        let shares = self.training.as_ref().and_then(|training| training.of_element(element));
-        let shares = shares.filter(|[before, _]| before.atoms >= MIN_ATOMS);
+        let shares = self.training.as_ref().and_then(|training| training.shares_of(element, MIN_ATOMS));
         let forgetting = ElementForgetting {
             element: self.symbols.get(element).cloned().unwrap_or_default(),
             mean_square_growth: if atoms > 0.0 { sum / atoms } else { 1.0 },
-            share_above_one: shares.map(|[_, live]| live.share_above_one),
+            share_above_one: shares.map(|[_, live]| live),
         };
-        (forgetting, shares.map(|[before, _]| before.share_above_one))
+        (forgetting, shares.map(|[before, _]| before))
     }
 }
 

@@ -5,6 +5,7 @@ use std::panic::resume_unwind;
 use std::thread::{self, available_parallelism};
 
 use calm::forgetting::GradeDistribution;
+use calm::rules::count_above;
 use calm::{GradeError, Grades, Mixture};
 
 use super::error::SelectorError;
@@ -17,8 +18,9 @@ pub struct TrainingFrames {
     elements: Vec<(usize, Range<usize>)>,
     /// Features, [atoms × D].
     features: Vec<f64>,
-    /// γ of each atom under the original mixture.
+    /// γ of each atom under the original mixture, and their distribution.
     original: Vec<f64>,
+    original_distribution: GradeDistribution,
     /// γ of each atom under the live mixture.
     live: Vec<f64>,
 }
@@ -42,6 +44,7 @@ impl TrainingFrames {
         Ok(Self {
             elements: ranges.collect(),
             features: sorted_features,
+            original_distribution: GradeDistribution::from_grades(&gamma),
             live: gamma.clone(),
             original: gamma,
         })
@@ -49,7 +52,7 @@ impl TrainingFrames {
 
     /// The distribution under the original mixture.
     pub fn original(&self) -> GradeDistribution {
-        GradeDistribution::from_grades(&self.original)
+        self.original_distribution
     }
 
     /// The distribution under the live mixture.
@@ -57,10 +60,13 @@ impl TrainingFrames {
         GradeDistribution::from_grades(&self.live)
     }
 
-    /// The same of one element: original and live. `None` without atoms of it.
-    pub(super) fn of_element(&self, element: usize) -> Option<[GradeDistribution; 2]> {
+    /// Shares of the atoms of one element with γ > 1, under the original and under the live mixture. `None` if there are
+    /// fewer than `least`.
+    pub(super) fn shares_of(&self, element: usize, least: usize) -> Option<[f64; 2]> {
         let (_, range) = self.elements.iter().find(|(known, _)| *known == element)?;
-        Some([&self.original, &self.live].map(|gamma| GradeDistribution::from_grades(&gamma[range.clone()])))
+        let share = |gamma: &[f64]| count_above(gamma, 1.0) as f64 / gamma.len() as f64;
+        let shares = || [&self.original, &self.live].map(|gamma| share(&gamma[range.clone()]));
+        (range.len() >= least).then(shares)
     }
 
     /// Grades the atoms again whose element is among `changed`; those of others have the same grades as before.

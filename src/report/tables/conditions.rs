@@ -1,12 +1,10 @@
 //! Results by the conditions of walks.
 
-use std::collections::BTreeMap;
-
 use store::WalkStatus;
 use wire::WalkConditions;
 
 use super::super::report_data::ReportData;
-use super::{Table, count, real, text};
+use super::{Table, count, real, states, text};
 
 /// The biased walks under the same conditions, from any seed structure. Without rows if all walks have the same.
 pub fn conditions(data: &ReportData) -> Table {
@@ -38,7 +36,7 @@ pub fn conditions(data: &ReportData) -> Table {
             real(to, 2),
             real(conditions.tau, 3),
             count(number),
-            text(ends(walks)),
+            text(states(walks.iter().copied()).1),
             count(accepted),
             real(accepted as f64 / number as f64, 2),
             count(sum(|walk| walk.refused.unsigned_abs())),
@@ -60,16 +58,6 @@ fn by_conditions(walks: &[WalkStatus]) -> Vec<(WalkConditions, Vec<&WalkStatus>)
         }
     }
     all
-}
-
-/// How walks ended, with numbers.
-fn ends(walks: &[&WalkStatus]) -> String {
-    let mut states: BTreeMap<&str, u64> = BTreeMap::new();
-    for walk in walks {
-        *states.entry(&walk.state).or_default() += 1;
-    }
-    let words = |(state, number): (&&str, &u64)| format!("{number} {}", state.replace('_', " "));
-    states.iter().map(words).collect::<Vec<_>>().join(", ")
 }
 
 #[cfg(test)]

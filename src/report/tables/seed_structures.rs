@@ -2,8 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use store::WalkStatus;
+
 use super::super::report_data::ReportData;
-use super::{Table, count, text};
+use super::{Table, count, states, text};
 
 /// Walks, candidates by fate and labels of each seed structure.
 pub fn seed_structures(data: &ReportData) -> Table {
@@ -35,7 +37,8 @@ pub fn seed_structures(data: &ReportData) -> Table {
             |name: &str| fates.get(&seed.index.into()).and_then(|of| of.get(name)).copied().unwrap_or(0);
         let biased = data.collections.biased.labels.get(&seed.index).copied().unwrap_or_default();
         let control = data.collections.control.labels.get(&seed.index).copied().unwrap_or_default();
-        let (walks, ended) = walks(data, &seed.name);
+        let of_seed = |walk: &&WalkStatus| walk.seed_structure == seed.name && walk.origin == "biased";
+        let (walks, ended) = states(data.status.walks.iter().filter(of_seed));
         let names = ["accepted", "covered", "duplicate", "guard", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
         row.push(count(names.iter().map(|name| fate(name)).sum()));
@@ -45,20 +48,4 @@ pub fn seed_structures(data: &ReportData) -> Table {
         table.rows.push(row);
     }
     table
-}
-
-/// Number of biased walks from a seed structure, and their states.
-fn walks(data: &ReportData, seed: &str) -> (u64, String) {
-    let walks = data.status.walks.iter();
-    let walks = walks.filter(|walk| walk.seed_structure == seed && walk.origin == "biased");
-    let mut states: BTreeMap<&str, u64> = BTreeMap::new();
-    for walk in walks {
-        *states.entry(&walk.state).or_default() += 1;
-    }
-    let all = states.values().sum();
-    let words = |(state, number): (&&str, &u64)| {
-        let state = state.replace('_', " ");
-        if all == 1 { state } else { format!("{number} {state}") }
-    };
-    (all, states.iter().map(words).collect::<Vec<_>>().join(", "))
 }

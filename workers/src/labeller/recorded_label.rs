@@ -1,5 +1,5 @@
-//! Labels outside the queue, whose progress is recorded in the store under a key: whoever asks for the same label
-//! again after a crash gets the result, or waits for the calculation that is still running.
+//! Labels outside the queue. The store has the progress of each under a key. After a crash, the next process that makes
+//! the same label reads the result, or waits for the calculation that still runs.
 
 use std::sync::Arc;
 
