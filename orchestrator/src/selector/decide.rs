@@ -16,7 +16,6 @@ use super::error::SelectorError;
 use super::forgetting::ForgettingState;
 use super::regrade::{RegradedCandidate, RegradedReport};
 use super::settings::{OnForgetting, UpdateProtocol};
-use super::walk::Walk;
 
 /// Priority of label jobs of biased candidates; control frames come after them.
 const BIASED_PRIORITY: i32 = 10;
@@ -52,7 +51,7 @@ impl DecisionState {
                 }
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
                 // A control walk that missed its last frame will not provide it in a later assignment.
-                Outcome::StepsDone if self.walks[&id].missed_its_frames() => {
+                Outcome::StepsDone if self.walks[id].missed_its_frames() => {
                     self.end_walk(id, &WalkEnd::Steps, &mut commit);
                 }
                 Outcome::StepsDone | Outcome::Interrupted => {}
@@ -60,7 +59,7 @@ impl DecisionState {
         }
         touched.extend(self.end_by_limits(in_hand, &mut commit));
         touched.extend(self.start_controls(&mut commit));
-        commit.walks = touched.iter().map(|id| self.walks[id].to_record()).collect();
+        commit.walks = touched.iter().map(|id| self.walks[*id].to_record()).collect();
         self.add_values(&mut commit);
         Ok(commit)
     }
@@ -68,10 +67,9 @@ impl DecisionState {
     /// Updates the walk from the report, and logs rollbacks.
     fn apply_report(&mut self, report: &RegradedReport, commit: &mut Commit) {
         let steps_per_assignment = self.settings.steps_per_assignment;
-        let walk = self.walk_mut(report.walk);
+        let walk = self.walks.count_report(report.walk);
         let returned = report.progress.segment > walk.state.segment;
         walk.state.segment = walk.state.segment.max(report.progress.segment);
-        walk.record.turn += 1;
         if !matches!(report.outcome, Outcome::Ended(WalkEnd::BadStart { .. })) {
             walk.record.checkpoint = Some(report.checkpoint.clone());
             walk.record.progress = report.progress.clone();
@@ -95,7 +93,7 @@ impl DecisionState {
         regraded: RegradedCandidate,
         commit: &mut Commit,
     ) -> Result<(), SelectorError> {
-        match self.walks[&id].is_biased() {
+        match self.walks[id].is_biased() {
             true => self.decide_candidate(id, regraded, commit),
             false => self.keep_control_frame(id, regraded, commit),
         }
@@ -138,7 +136,7 @@ impl DecisionState {
         self.record_decision(id, graded, fate, keep_features, detail, commit);
         self.act_on_alarm(id, alarm, commit);
         self.walk_mut(id).state.verdict = Some(verdict);
-        if self.has_collected_enough(&self.walks[&id]) {
+        if self.has_collected_enough(&self.walks[id]) {
             self.end_walk(id, &WalkEnd::Collected, commit);
         }
         Ok(())
@@ -190,7 +188,7 @@ impl DecisionState {
         commit: &mut Commit,
     ) {
         let RegradedCandidate { block, selector, original, .. } = graded;
-        let (walk, candidate) = (&self.walks[&id], Some(block.view().id()));
+        let (walk, candidate) = (&self.walks[id], Some(block.view().id()));
         let (kind, priority) = match fate {
             _ if !walk.is_biased() => ("control", CONTROL_PRIORITY),
             Fate::Accepted => ("accepted", BIASED_PRIORITY),
@@ -216,7 +214,7 @@ impl DecisionState {
         content: ContentHash,
         graded: &RegradedCandidate,
     ) -> Option<DeclineReason> {
-        let walk = &self.walks[&id];
+        let walk = &self.walks[id];
         let min_distances = &self.min_distances[walk.record.seed_structure as usize];
         if min_distances.violation(&graded.bonds.shortest).is_some() {
             Some(DeclineReason::Guard)
@@ -302,7 +300,11 @@ impl DecisionState {
         walk.record.accepted += 1;
         walk.state.accepted_steps.push(step);
         let seed_structure = walk.record.seed_structure;
-        *self.accepted_by_seed.entry(seed_structure).or_default() += 1;
+        let of_seed = self.accepted_by_seed.entry(seed_structure).or_default();
+        *of_seed += 1;
+        if self.settings.max_per_seed_structure.is_some_and(|most| *of_seed >= most) {
+            self.full_seeds.insert(seed_structure);
+        }
     }
 
     /// Features of accepted candidates are always stored, those of declined candidates within a limit.
@@ -324,8 +326,7 @@ impl DecisionState {
 
     /// Ends a walk with this final state, and the reason as text.
     pub fn end_walk_as(&mut self, id: WalkId, end: &str, reason: String, commit: &mut Commit) {
-        let walk = self.walk_mut(id);
-        (walk.record.state, walk.record.reason) = (end.to_owned(), reason);
+        let walk = self.walks.end(id, end, reason);
         let detail = json!({
             "end": end, "reason": walk.record.reason, "step": walk.record.progress.step,
             "accepted": walk.record.accepted,
@@ -345,25 +346,22 @@ impl DecisionState {
 
     /// Whether the next biased walk starts from another seed structure, and so from the original mixture.
     fn restarts_mixture_after(&self, seed_structure: u32) -> bool {
-        let mut unfinished = self.walks.values().filter(|walk| walk.is_biased() && !walk.has_ended());
-        let next = unfinished.next().map(|walk| walk.record.seed_structure);
+        let next = self.walks.unfinished(true).next().map(|id| self.walks[id].record.seed_structure);
         self.settings.update == UpdateProtocol::PerSeedStructure && next != Some(seed_structure)
     }
 
     /// Ends the unassigned biased walks once the campaign has its maximum number of structures, and those whose seed
     /// structure has.
-    fn end_by_limits(&mut self, in_hand: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> Vec<WalkId> {
-        let campaign = self.is_budget_exhausted();
-        if !campaign && self.settings.max_per_seed_structure.is_none() {
-            return Vec::new();
-        }
-        let end = if campaign { WalkEnd::Budget } else { WalkEnd::Collected };
-        let is_over = |(id, walk): (&WalkId, &Walk)| {
-            let is_idle = walk.is_biased() && !walk.has_ended() && !in_hand.contains_key(id);
-            (is_idle && (campaign || self.has_collected_enough(walk))).then_some(*id)
+    fn end_by_limits(&mut self, in_hand: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> BTreeSet<WalkId> {
+        let is_idle = |id: &WalkId| !in_hand.contains_key(id);
+        let (end, over): (_, BTreeSet<_>) = if self.is_budget_exhausted() {
+            (WalkEnd::Budget, self.walks.unfinished(true).filter(is_idle).collect())
+        } else {
+            let of_full_seeds = self.full_seeds.iter().flat_map(|seed| self.walks.unfinished_of_seed(*seed));
+            (WalkEnd::Collected, of_full_seeds.filter(is_idle).collect())
         };
-        let over: Vec<_> = self.walks.iter().filter_map(is_over).collect();
         over.iter().for_each(|id| self.end_walk(*id, &end, commit));
+        self.full_seeds.retain(|seed| self.walks.unfinished_of_seed(*seed).next().is_some());
         over
     }
 
@@ -373,9 +371,7 @@ impl DecisionState {
         if !self.settings.control {
             return touched;
         }
-        let ended: Vec<_> =
-            self.walks.iter().filter(|(_, walk)| walk.needs_control()).map(|(id, _)| *id).collect();
-        for id in ended {
+        for id in self.walks.without_control() {
             let control_id = self.next_walk_id();
             commit.decisions.push(self.start_control(control_id, id));
             touched.extend([id, control_id]);
@@ -386,9 +382,8 @@ impl DecisionState {
     /// Creates the control walk of the biased walk `of`, which must exist.
     pub fn start_control(&mut self, id: WalkId, of: WalkId) -> Decision {
         let steps_per_assignment = self.settings.steps_per_assignment;
-        let control = self.walk_mut(of).new_control(id, steps_per_assignment);
+        let control = self.walks.insert_control(id, of, steps_per_assignment);
         let detail = json!({ "control_of": of, "wanted": control.state.wanted });
-        self.walks.insert(id, control);
         self.decision("begun", id, detail)
     }
 }

@@ -1,6 +1,6 @@
 //! The state that decisions depend on, and its restoration from the store.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use atoms::MinDistances;
@@ -18,6 +18,7 @@ use super::rules::{ChangeableRules, RULES};
 use super::settings::{SeedStructure, SelectorSnapshot, Settings};
 use super::training_frames::TrainingFrames;
 use super::walk::Walk;
+use super::walk_table::WalkTable;
 use crate::grader::Grader;
 
 /// Name of the value that tells that updates have become additive.
@@ -33,13 +34,15 @@ pub(super) struct DecisionState {
     pub forgetting: Forgetting,
     /// Updates are additive from here on: the mixture had forgotten too much.
     pub switched_to_additive: bool,
-    pub walks: BTreeMap<WalkId, Walk>,
+    pub walks: WalkTable,
     pub known: HashSet<ContentHash>,
     /// Number of started rounds; always 0 in live mode.
     pub round: u64,
     pub accepted: u32,
     /// Number of structures accepted from the biased walks of each seed structure.
     pub accepted_by_seed: HashMap<u32, u32>,
+    /// Seed structures that have their maximum number of structures, but walks that have not ended.
+    pub full_seeds: BTreeSet<u32>,
     pub declined_feature_bytes: u64,
     /// Number of candidates that could not be graded.
     pub left_out: u64,
@@ -80,9 +83,12 @@ impl DecisionState {
         forgetting.update(&original, &mixture, &changed.collect())?;
         let walks = restored_walks(snapshot.walks, seeds.len())?;
         let mut accepted_by_seed = HashMap::new();
-        for Walk { record, .. } in walks.values().filter(|walk| walk.is_biased()) {
+        for Walk { record, .. } in walks.iter().filter(|walk| walk.is_biased()) {
             *accepted_by_seed.entry(record.seed_structure).or_default() += record.accepted;
         }
+        let is_full = |accepted: u32| settings.max_per_seed_structure.is_some_and(|most| accepted >= most);
+        let full = accepted_by_seed.iter().filter(|(_, accepted)| is_full(**accepted));
+        let full_seeds = full.map(|(seed, _)| *seed).collect();
         Ok(Self {
             settings,
             min_distances,
@@ -95,6 +101,7 @@ impl DecisionState {
             round,
             accepted: accepted_by_seed.values().sum(),
             accepted_by_seed,
+            full_seeds,
             declined_feature_bytes,
             left_out,
             staleness,
@@ -105,9 +112,9 @@ impl DecisionState {
         })
     }
 
-    /// A walk that exists: walks are never removed from the table.
+    /// A walk that exists.
     pub fn walk_mut(&mut self, id: WalkId) -> &mut Walk {
-        self.walks.get_mut(&id).expect("walks stay in the table")
+        self.walks.get_mut(id)
     }
 
     /// Adds the current values to a commit.
@@ -150,8 +157,9 @@ fn min_distances(
 }
 
 /// The stored walks, which must be numbered from 0 and start from existing seed structures.
-fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<BTreeMap<WalkId, Walk>, SelectorError> {
-    let restored = records.into_iter().enumerate().map(|(number, record)| {
+fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<WalkTable, SelectorError> {
+    let mut walks = WalkTable::default();
+    for (number, record) in records.into_iter().enumerate() {
         let (id, seed) = (record.walk, record.seed_structure);
         if id.0 as usize != number {
             return Err(SelectorError::Snapshot(format!("found walk {id} in place of walk {number}")));
@@ -160,9 +168,9 @@ fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<BTreeMap<Wal
             let problem = format!("walk {id} starts from seed structure {seed}, but there are only {seeds}");
             return Err(SelectorError::Snapshot(problem));
         }
-        Ok((id, Walk::restore(record)?))
-    });
-    restored.collect()
+        walks.insert(Walk::restore(record)?);
+    }
+    Ok(walks)
 }
 
 /// A value that databases of earlier versions do not have.

@@ -22,6 +22,7 @@ mod settings;
 mod start_walks;
 mod training_frames;
 mod walk;
+mod walk_table;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -85,8 +86,7 @@ impl Selector {
 
     /// Every walk, for display: name of its seed structure, and its step (`last` if it has ended).
     pub fn walk_progress(&self, last: u64) -> Vec<(WalkId, String, u64)> {
-        let varied =
-            VariedConditions::among(self.decisions.walks.values().map(|walk| &walk.record.conditions));
+        let varied = VariedConditions::among(self.decisions.walks.iter().map(|walk| &walk.record.conditions));
         let standing = |walk: &Walk| {
             let name = &self.seeds[walk.record.seed_structure as usize].name;
             let name = varied.name(name, &walk.record.conditions);
@@ -94,12 +94,12 @@ impl Selector {
             let step = if walk.has_ended() { last } else { walk.record.progress.step };
             (walk.record.walk, format!("{name}{control}"), step)
         };
-        self.decisions.walks.values().map(standing).collect()
+        self.decisions.walks.iter().map(standing).collect()
     }
 
     /// The walks that have ended: number, state and reason.
     pub fn ended_walks(&self) -> impl Iterator<Item = (WalkId, &str, &str)> {
-        let walks = self.decisions.walks.values().filter(|walk| walk.has_ended());
+        let walks = self.decisions.walks.iter().filter(|walk| walk.has_ended());
         walks.map(|Walk { record, .. }| (record.walk, record.state.as_str(), record.reason.as_str()))
     }
 
@@ -145,7 +145,7 @@ impl Selector {
 
     /// Ends a walk whose current assignment cannot be completed, as if it had been reported.
     pub fn abandon_walk(&mut self, id: WalkId, reason: String) -> Result<Option<Commit>, SelectorError> {
-        let Some(walk) = self.decisions.walks.get(&id) else { return Ok(None) };
+        let Some(walk) = self.decisions.walks.get(id) else { return Ok(None) };
         let WalkRecord { turn: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::BlewUp { reason }));
@@ -166,10 +166,13 @@ impl Selector {
             Mode::Live => true,
             Mode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
         };
-        let present = |walk: &&mut Walk| in_round && walk.record.turn == number && !walk.has_ended();
-        let Some(walk) = self.decisions.walks.get_mut(&id).filter(present) else { return Ok(None) };
+        let is_current = |walk: &&Walk| in_round && walk.record.turn == number && !walk.has_ended();
+        if self.decisions.walks.get(id).filter(is_current).is_none() {
+            return Ok(None);
+        }
         self.in_hand.remove(&id);
         if matches!(report.outcome, Outcome::Interrupted) {
+            let walk = self.decisions.walk_mut(id);
             walk.interrupt(report);
             return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
         }

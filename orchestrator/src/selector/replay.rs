@@ -238,7 +238,7 @@ impl Replay {
                 Ok(Some(self.decisions.start_walk(id, seed, &name, conditions)))
             }
             Detail::Control { control_of } if self.is_exact() => {
-                let is_there = self.decisions.walks.contains_key(&control_of);
+                let is_there = self.decisions.walks.get(control_of).is_some();
                 Ok(is_there.then(|| self.decisions.start_control(id, control_of)))
             }
             Detail::Control { .. } => Ok(None),
@@ -248,7 +248,7 @@ impl Replay {
     /// A walk that has reached a limit of these rules is not resumed.
     fn resume(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
         let id = walk(recorded)?;
-        let goes_on = self.decisions.walks.contains_key(&id) && self.decisions.can_resume(id);
+        let goes_on = self.decisions.walks.get(id).is_some() && self.decisions.can_resume(id);
         Ok(goes_on.then(|| self.decisions.resume(id)))
     }
 
@@ -285,7 +285,7 @@ impl Replay {
         let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
         let Detail { end, reason, step } = read(recorded)?;
         // Other walks of its seed structure may have collected enough.
-        let enough = self.decisions.has_collected_enough(&self.decisions.walks[&id]);
+        let enough = self.decisions.has_collected_enough(&self.decisions.walks[id]);
         let collected = end == WalkEnd::Collected.name() && !enough;
         if collected && self.is_exact() {
             // The selector itself would have ended the walk.
@@ -302,7 +302,7 @@ impl Replay {
     /// The walk of a decision, if it exists and has not ended.
     fn walk_under_way(&self, recorded: &LoggedDecision) -> Result<Option<WalkId>, ReplayError> {
         let id = walk(recorded)?;
-        Ok(self.decisions.walks.get(&id).filter(|walk| !walk.has_ended()).map(|_| id))
+        Ok(self.decisions.walks.get(id).filter(|walk| !walk.has_ended()).map(|_| id))
     }
 
     /// The first component (element index, slot) in which the mixture differs from the stored one, compared byte by

@@ -3,7 +3,6 @@
 use wire::WalkId;
 use wire::messages::Assignment;
 
-use super::walk::Walk;
 use super::{Mode, Selector};
 
 /// What an idle walker does next.
@@ -33,38 +32,34 @@ impl Selector {
     /// The next walk that is ready. In live mode, control walks get their share of the assignments while biased walks are
     /// ready, too.
     fn next_walk(&self) -> Option<WalkId> {
-        let mode = self.decisions.settings.mode;
-        let is_ready = |(id, walk): &(&WalkId, &Walk)| {
-            let in_turn = match mode {
-                Mode::Live => !walk.has_ended(),
-                Mode::Reproducible => self.in_round.get(id).is_some_and(Option::is_none),
-            };
-            in_turn && !self.in_hand.contains_key(id) && !self.paused.contains(id)
-        };
-        let mut ready = self.decisions.walks.iter().filter(is_ready);
-        let (first, walk) = ready.next()?;
-        // A round has as many control walks as biased ones.
-        let other = match mode {
-            Mode::Live => ready.find(|(_, other)| other.is_biased() != walk.is_biased()),
-            Mode::Reproducible => None,
-        };
-        let Some((second, _)) = other else { return Some(*first) };
-        let (biased, control) = if walk.is_biased() { (*first, *second) } else { (*second, *first) };
-        Some(if self.is_turn_of_controls() { control } else { biased })
+        let is_ready = |id: &WalkId| !self.in_hand.contains_key(id) && !self.paused.contains(id);
+        let walks = &self.decisions.walks;
+        match self.decisions.settings.mode {
+            // A round has as many control walks as biased ones.
+            Mode::Reproducible => {
+                let outstanding = self.in_round.iter().filter(|(_, report)| report.is_none());
+                outstanding.map(|(id, _)| *id).find(is_ready)
+            }
+            Mode::Live => match [true, false].map(|biased| walks.unfinished(biased).find(is_ready)) {
+                [Some(biased), Some(control)] => {
+                    Some(if self.is_turn_of_controls() { control } else { biased })
+                }
+                [biased, control] => biased.or(control),
+            },
+        }
     }
 
     /// Whether the next assignment is one of the share of control walks. It follows from the number of assignments so
     /// far, and is the same after a restart.
     fn is_turn_of_controls(&self) -> bool {
-        let done: u64 = self.decisions.walks.values().map(|walk| walk.record.turn).sum();
-        let number = (done + self.in_hand.len() as u64) as f64;
+        let number = (self.decisions.walks.reported() + self.in_hand.len() as u64) as f64;
         let share = self.decisions.settings.control_share;
         ((number + 1.0) * share).floor() > (number * share).floor()
     }
 
     /// Whether every walk has ended.
     pub fn is_done(&self) -> bool {
-        self.decisions.walks.values().all(Walk::has_ended)
+        self.decisions.walks.have_all_ended()
     }
 
     /// Whether a walker has this walk in hand.
@@ -90,11 +85,9 @@ impl Selector {
     /// Starts a round with the first unfinished biased walks and as many control walks.
     fn start_round(&mut self) {
         for biased in [true, false] {
-            let unfinished =
-                self.decisions.walks.values().filter(|walk| !walk.has_ended() && walk.is_biased() == biased);
-            let taken =
-                unfinished.take(self.decisions.settings.walks_per_round).map(|walk| (walk.record.walk, None));
-            self.in_round.extend(taken);
+            let unfinished = self.decisions.walks.unfinished(biased);
+            let taken = unfinished.take(self.decisions.settings.walks_per_round);
+            self.in_round.extend(taken.map(|id| (id, None)));
         }
         if !self.in_round.is_empty() {
             self.decisions.round += 1;
@@ -102,7 +95,7 @@ impl Selector {
     }
 
     fn assign(&mut self, id: WalkId, walker: u32) -> Assignment {
-        let walk = self.decisions.walks.get_mut(&id).expect("the id comes from this table");
+        let walk = self.decisions.walks.get_mut(id);
         self.in_hand.insert(id, walker);
         walk.record.state = "running".to_owned();
         Assignment {

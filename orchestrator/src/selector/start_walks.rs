@@ -22,11 +22,11 @@ impl DecisionState {
         }
         self.log_rule_changes(&mut commit);
         self.resume_walks(&mut commit);
-        let begun = self.walks.values().filter(|walk| walk.is_biased()).count();
+        let begun = self.walks.iter().filter(|walk| walk.is_biased()).count();
         for (seed, SeedStructure { name, .. }, conditions) in planned_walks(seeds).skip(begun) {
             let id = self.next_walk_id();
             commit.decisions.push(self.start_walk(id, seed, name, conditions.clone()));
-            commit.walks.push(self.walks[&id].to_record());
+            commit.walks.push(self.walks[id].to_record());
         }
         self.add_values(&mut commit);
         commit
@@ -38,7 +38,7 @@ impl DecisionState {
         if self.rules.as_ref() == Some(&rules) {
             return;
         }
-        if !self.walks.is_empty() {
+        if self.walks.len() > 0 {
             commit.decisions.push(self.campaign_decision(CONFIGURATION, json!(rules)));
         }
         commit.values.push((RULES.to_owned(), json!(rules).to_string()));
@@ -59,21 +59,22 @@ impl DecisionState {
         conditions: WalkConditions,
     ) -> Decision {
         let detail = json!({ "seed_structure": name, "conditions": conditions });
-        self.walks.insert(id, Walk::new(id, seed as u32, conditions, self.settings.steps_per_assignment));
+        self.walks.insert(Walk::new(id, seed as u32, conditions, self.settings.steps_per_assignment));
         self.decision("begun", id, detail)
     }
 
     fn resume_walks(&mut self, commit: &mut Commit) {
-        let ended: Vec<_> = self.walks.keys().copied().filter(|id| self.can_resume(*id)).collect();
+        let all = self.walks.iter().map(|walk| walk.record.walk);
+        let ended: Vec<_> = all.filter(|id| self.can_resume(*id)).collect();
         for id in ended {
             commit.decisions.push(self.resume(id));
-            commit.walks.push(self.walks[&id].to_record());
+            commit.walks.push(self.walks[id].to_record());
         }
     }
 
     /// Whether a walk ended only because of a limit that is no longer reached.
     pub fn can_resume(&self, id: WalkId) -> bool {
-        let walk = &self.walks[&id];
+        let walk = &self.walks[id];
         !self.is_budget_exhausted() && walk.ended_by_budget() && !self.has_collected_enough(walk)
     }
 
@@ -86,7 +87,7 @@ impl DecisionState {
 
     /// Resumes a walk that has ended.
     pub fn resume(&mut self, id: WalkId) -> Decision {
-        self.walk_mut(id).record.state = "waiting".to_owned();
+        self.walks.resume(id);
         self.decision("resumed", id, json!({}))
     }
 
