@@ -22,7 +22,7 @@ const FILES: &str = "seed_structures.files";
 /// Bohr and Å changes distances by a factor of 1.89.
 const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
 
-/// Number of skipped seed structures that are listed with their reason.
+/// Number of seed structures that are listed with the same kind of warning.
 const MAX_LISTED: usize = 20;
 
 /// Largest supercell: a walk of a larger one takes weeks.
@@ -203,29 +203,37 @@ impl Loader<'_> {
     pub fn suspicious_seed_structures(&self, seeds: &SeedStructures) -> Vec<Warning> {
         let at = place(self.path, self.text, FILES);
         let warning = |message| Warning { at: at.clone(), key: FILES.to_owned(), message };
-        let mut messages: Vec<_> =
-            seeds.skipped.iter().take(MAX_LISTED).map(SkippedStructure::message).collect();
-        if let Some(more @ 1..) = seeds.skipped.len().checked_sub(MAX_LISTED) {
-            messages.push(format!(
-                "{more} more seed structures are skipped (calmwalk validate --csv FILE lists all)"
-            ));
-        }
-        let mut first = HashMap::new();
+        let (mut same, mut strange, mut first) = (Vec::new(), Vec::new(), HashMap::new());
         for named in &seeds.valid {
             let SourcedStructure { seed: SeedStructure { name, structure, .. }, source, geometry, .. } =
                 named;
             if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
-                messages.push(format!(
+                same.push(format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",
                     other.seed.name, other.source
                 ));
             }
-            if let Some(strange) = suspicious_distances(structure, geometry) {
-                messages.push(format!("seed structure '{name}' ({source}): {strange}"));
+            if let Some(distances) = suspicious_distances(structure, geometry) {
+                strange.push(format!("seed structure '{name}' ({source}): {distances}"));
             }
         }
-        messages.into_iter().map(warning).collect()
+        let skipped = seeds.skipped.iter().map(SkippedStructure::message).collect();
+        let messages = [
+            listed(skipped, "are skipped (calmwalk validate --csv FILE lists all)"),
+            listed(same, "are the same as another one"),
+            listed(strange, "have unusual distances between neighbours"),
+        ];
+        messages.into_iter().flatten().map(warning).collect()
     }
+}
+
+/// The first messages, and how many more seed structures they concern.
+fn listed(mut messages: Vec<String>, what: &str) -> Vec<String> {
+    if let Some(more @ 1..) = messages.len().checked_sub(MAX_LISTED) {
+        messages.truncate(MAX_LISTED);
+        messages.push(format!("{more} more seed structures {what}"));
+    }
+    messages
 }
 
 /// The structure with lengths rounded to the precision of files, Å.

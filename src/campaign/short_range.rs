@@ -8,6 +8,9 @@ use potentials::ZblWindow;
 use super::load::{Loader, SourcedStructure};
 use crate::config::{Config, Warning, place};
 
+/// Number of pairs that a warning names.
+const MAX_SHOWN: usize = 5;
+
 /// A pair of elements that are neighbours in a seed structure.
 #[derive(Clone, Debug)]
 pub struct PairRange {
@@ -23,7 +26,7 @@ pub struct PairRange {
     pub zbl: Option<ZblWindow>,
 }
 
-/// All pairs with a distance within the cutoff of the model, in their order.
+/// All pairs with a distance within the cutoff of the model, those nearest to guard or repulsion first.
 pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure]) -> Vec<PairRange> {
     let mut ranges: BTreeMap<ElementPair, PairRange> = BTreeMap::new();
     for SourcedStructure { seed, geometry, .. } in seeds {
@@ -43,30 +46,48 @@ pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure]) -> Vec<PairRange
             }
         }
     }
-    ranges.into_values().collect()
+    let mut ranges: Vec<_> = ranges.into_values().collect();
+    ranges.sort_by(|a, b| a.relative().total_cmp(&b.relative()));
+    ranges
 }
 
 impl PairRange {
-    /// A warning if the repulsion reaches into bonds.
-    pub fn warning(&self) -> Option<String> {
-        let Self { pair, shortest, seed_structure, zbl, .. } = self;
-        let window = zbl.filter(|window| window.outer > *shortest)?;
-        Some(format!(
-            "the repulsion of {pair} reaches to {:.3} Å and changes distances of {shortest:.3} Å in seed structure \
-             '{seed_structure}'; give this pair a shorter window in guard.zbl.pairs",
-            window.outer
-        ))
+    /// The shortest distance divided by the largest distance at which guard or repulsion acts.
+    pub fn relative(&self) -> f64 {
+        self.shortest / self.zbl.map_or(self.limit, |window| window.outer.max(self.limit))
+    }
+
+    /// Whether the repulsion reaches into bonds.
+    fn is_repelled(&self) -> bool {
+        self.zbl.is_some_and(|window| window.outer > self.shortest)
     }
 }
 
 impl Loader<'_> {
-    /// Warns of pairs of elements whose repulsion reaches into bonds of the seed structures.
-    pub fn repulsion_in_bonds(&self, ranges: &[PairRange]) -> Vec<Warning> {
-        let warning = |message| Warning {
+    /// Warns of pairs of elements whose repulsion reaches into bonds of the seed structures, the worst ones by name.
+    pub fn repulsion_in_bonds(&self, ranges: &[PairRange]) -> Option<Warning> {
+        let mut repelled: Vec<_> = ranges.iter().filter(|range| range.is_repelled()).collect();
+        repelled.sort_by(|a, b| a.relative().total_cmp(&b.relative()));
+        let worst = |range: &&PairRange| {
+            let PairRange { pair, shortest, seed_structure, zbl, .. } = range;
+            let outer = zbl.map_or(0.0, |window| window.outer);
+            format!(
+                "{pair} reaches to {outer:.3} Å and changes distances of {shortest:.3} Å in '{seed_structure}'"
+            )
+        };
+        let shown: Vec<_> = repelled.iter().take(MAX_SHOWN).map(worst).collect();
+        let more = match repelled.len().saturating_sub(MAX_SHOWN) {
+            0 => String::new(),
+            more => format!("; and {more} more pairs (calmwalk validate shows them)"),
+        };
+        (!repelled.is_empty()).then(|| Warning {
             at: place(self.path, self.text, "guard.zbl"),
             key: "guard.zbl".to_owned(),
-            message,
-        };
-        ranges.iter().filter_map(PairRange::warning).map(warning).collect()
+            message: format!(
+                "the repulsion reaches into bonds of seed structures: {}{more}; give these pairs shorter windows in \
+                 guard.zbl.pairs",
+                shown.join("; ")
+            ),
+        })
     }
 }
