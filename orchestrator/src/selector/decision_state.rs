@@ -41,7 +41,7 @@ pub(super) struct DecisionState {
     /// Number of structures accepted from the biased walks of each seed structure.
     pub accepted_by_seed: HashMap<u32, u32>,
     pub declined_feature_bytes: u64,
-    /// Number of candidates that could not be graded.
+    /// Number of candidates that could not be graded, and of control frames with atoms too close.
     pub left_out: u64,
     pub staleness: Staleness,
     /// Number of imported structures: now, and when the log last recorded it.
