@@ -13,7 +13,7 @@ use serde_json::json;
 use store::records::Label;
 use store::{Store, StoreError, unix_milliseconds};
 use wire::ContentHash;
-use workers::labeller::{LabelOutcome, RecordedLabel};
+use workers::labeller::{LabelOutcome, RecordedLabel, give_up_others};
 
 use super::RunContext;
 use crate::campaign::Campaign;
@@ -92,6 +92,9 @@ async fn label_all(
     let (keys, bounds) = (keys(campaign), campaign.config.label.bounds());
     let attempts = campaign.config.label.max_attempts.get();
     write(store, check).await?;
+    let method = campaign.method()?.load(&campaign.protocol)?;
+    give_up_others(store, &method, &format!("{METADATA_KEY}/"), &keys).await?;
+    method.end();
     let (mut made, mut missing) = (Vec::new(), Vec::new());
     for (index, (known, key)) in campaign.known.iter().zip(&keys).enumerate() {
         let request = RecordedLabel { key, structure: &known.structure, bounds: &bounds, attempts };
