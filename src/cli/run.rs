@@ -33,6 +33,7 @@ use crate::forgetting::{ForgettingRule, Measured};
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
 use crate::runtime::notify::{self, Notifier};
+use crate::runtime::reference_check::{self, ANY_CHECK};
 use crate::runtime::{self, time_budget};
 use crate::wording::disk::megabytes;
 use crate::wording::{self, walk_ends};
@@ -55,9 +56,9 @@ pub struct Run {
     adopt: bool,
     /// Go on although labels of the structures of label.check differ from what is known by more than the bounds. The campaign
     /// records that the differences were accepted; the check is repeated when the label protocol, these structures or the
-    /// bounds change
-    #[arg(long)]
-    accept_check: bool,
+    /// bounds change. With CHECK, only the check with this identity is accepted, as in the job of calmwalk launch
+    #[arg(long, value_name = "CHECK", num_args = 0..=1, require_equals = true, default_missing_value = ANY_CHECK)]
+    accept_check: Option<String>,
     /// Run walkers and labellers as threads of this process instead of as separate processes; uses no shared memory
     #[arg(long)]
     in_process: bool,
@@ -88,11 +89,9 @@ impl Run {
         self.log.init("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
-        if self.accept_check && campaign.known.is_empty() {
-            let config = self.config.display();
-            return Err(Failure::Input(format!(
-                "--accept-check: {config} has no label.check.structures, so there is no check to accept"
-            )));
+        // The job of a campaign keeps its command when the configuration changes.
+        if self.accept_check.as_deref() == Some(ANY_CHECK) {
+            reference_check::identity(&campaign)?;
         }
         let directory = match self.directory {
             Some(directory) => directory,
@@ -121,7 +120,7 @@ impl Run {
             let _lock = lock::directory(&directory, &location, wait_timeout).await?;
             listen.iter().try_for_each(runtime::Listen::clear_announcement)?;
             let (in_process, adopt, accept_check) =
-                (self.in_process, self.adopt, self.accept_check);
+                (self.in_process, self.adopt, self.accept_check.as_deref());
             let options =
                 RunOptions { in_process, adopt, accept_check, listen: listen.as_ref(), web, wait_timeout };
             run(&campaign, &directory, &location, options).await
@@ -160,8 +159,8 @@ struct RunOptions<'a> {
     in_process: bool,
     /// Whether the campaign may have been started with another configuration file.
     adopt: bool,
-    /// Whether differences from the reference are accepted.
-    accept_check: bool,
+    /// The check whose differences from the reference are accepted.
+    accept_check: Option<&'a str>,
     listen: Option<&'a runtime::Listen>,
     web: web::BoundListeners,
     wait_timeout: std::time::Duration,
@@ -251,7 +250,7 @@ async fn work(
     surroundings: Surroundings<'_>,
     selector: Selector,
     in_process: bool,
-    accept_check: bool,
+    accept_check: Option<&str>,
 ) -> Result<reactor::RunOutcome, Failure> {
     let runtime::RunContext { campaign, store, stop, .. } = run;
     let Surroundings { location, lock, web } = surroundings;
