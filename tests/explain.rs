@@ -225,7 +225,7 @@ fn a_story_is_told_in_words_also_of_a_copy_and_of_what_failed() {
     assert!(declined.contains("declined: ") && declined.contains("no label job"), "{declined}");
     let control = succeed(here, ["explain", "here", &of_kind("control")]);
     assert!(
-        control.contains("random numbers of walk") && control.contains("no limit for control frames"),
+        control.contains("random numbers of walk") && control.contains("at least the selector's limit"),
         "{control}"
     );
 }

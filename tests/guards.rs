@@ -3,10 +3,12 @@
 use std::fs;
 use std::path::Path;
 
+use atoms::NeighbourList;
+use atoms::extxyz::Frame;
 use serde_json::Value as Json;
 
-use crate::common::campaign::Small;
-use crate::common::{refuse, succeed};
+use crate::common::campaign::{Small, outcome};
+use crate::common::{calmwalk, refuse, stderr, succeed};
 
 fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
     serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
@@ -62,6 +64,57 @@ fn near_duplicates_of_labelled_structures_are_refused() {
     let details = json(here, ["queue", "campaign", "show", &refused[0]]);
     let log = details["attempts_made"][0]["log"].as_str().unwrap();
     assert!(labelled.iter().any(|name| log.contains(name.as_str())), "{log}");
+}
+
+/// The distances of control frames are not limited by any bias.
+#[test]
+fn control_frames_with_atoms_too_close_are_left_out() {
+    const LIMIT: f64 = 2.55;
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let config = Small::default().write(here);
+    let text = fs::read_to_string(&config).unwrap();
+    let pairs = format!("min_distances = {{ rule = \"per_pair\", pairs = {{ \"Al-Al\" = {LIMIT} }} }}");
+    fs::write(&config, text.replace("[guard]", &format!("[guard]\n{pairs}"))).unwrap();
+    let mut outcomes = Vec::new();
+    for (name, walkers) in [("one", "1"), ("two", "2")] {
+        let text = fs::read_to_string(&config).unwrap();
+        fs::write(&config, text.replace("walkers = 2", &format!("walkers = {walkers}"))).unwrap();
+        let output = calmwalk(here, ["run", "campaign.toml", "--directory", name]);
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(0), "{said}");
+        assert!(
+            said.contains("Al-Al atoms at ") && said.contains("closer than the limit of 2.550 Å"),
+            "{said}"
+        );
+        outcomes.push(outcome(&here.join(name)));
+    }
+    assert!(outcomes[0] == outcomes[1]);
+    let status = json(here, ["status", "one"]);
+    let count = |what: &str| status["candidates"][what].as_u64().unwrap();
+    let (accepted, control, left_out) = (count("accepted"), count("control"), count("left_out"));
+    assert!(control > 0 && left_out > 0 && control + left_out <= accepted, "{status}");
+    let told = succeed(here, ["status", "one"]);
+    assert!(told.contains(&format!("{left_out} left out (the decision log has the reasons)")), "{told}");
+    // No label was spent on them.
+    succeed(here, ["export", "one", "--control", "--output", "all.extxyz"]);
+    let frames = atoms::read_extxyz(&here.join("all.extxyz")).unwrap();
+    let shortest = |frame: &Frame| {
+        let mut neighbours = NeighbourList::new(5.0, 0.0);
+        neighbours.update(&frame.structure).unwrap();
+        atoms::shortest_distance(&frame.structure, &neighbours).unwrap().2
+    };
+    let shortest = frames.iter().map(shortest).min_by(f64::total_cmp);
+    assert!(shortest >= Some(LIMIT), "{shortest:?} Å");
+    let replayed = json(here, ["replay", "one"]);
+    assert_eq!(
+        (&replayed["difference"], &replayed["same_mixture"]),
+        (&Json::Null, &true.into()),
+        "{replayed}"
+    );
+    succeed(here, ["report", "one", "--output", "report"]);
+    let page = fs::read_to_string(here.join("report/report.html")).unwrap();
+    assert!(page.contains("control frames with atoms too close"));
 }
 
 #[test]

@@ -88,15 +88,29 @@ fn shown(directory: &Path) -> Vec<Value> {
     status["processes"].as_array().cloned().unwrap_or_default()
 }
 
-/// What the operations log says of ended processes.
-fn endings(directory: &Path) -> Vec<String> {
+/// Details of the operations of this kind.
+fn operations(directory: &Path, kind: &str) -> Vec<Value> {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let operations = runtime.block_on(async {
         let store = Store::open_read_only(directory).await.unwrap();
         store.operations(0, 10_000).await.unwrap()
     });
-    let ended = operations.into_iter().filter(|operation| operation.kind == "process_ended");
-    ended.map(|operation| operation.detail.to_string()).collect()
+    let found = operations.into_iter().filter(|operation| operation.kind == kind);
+    found.map(|operation| operation.detail).collect()
+}
+
+/// What the operations log says of ended processes.
+fn endings(directory: &Path) -> Vec<String> {
+    operations(directory, "process_ended").iter().map(Value::to_string).collect()
+}
+
+/// Checks that a run that has failed is not taken for one that was killed, and that its last end is recorded with the reason.
+fn recorded_as_failed(directory: &Path, reason: &str) {
+    let left = shown(directory);
+    assert!(left.iter().all(|process| process["kind"] == "labeller"), "{left:?}");
+    let ends = operations(directory, "ended");
+    let last = ends.last().expect("the end of the run");
+    assert!(last["how"] == "failed" && last["error"].as_str().unwrap().contains(reason), "{last}");
 }
 
 /// Waits until both walkers are at work.
@@ -214,6 +228,7 @@ fn without_any_walker_the_campaign_fails_and_can_go_on() {
     let message = said(here);
     assert!(message.contains("no walker is left") && message.contains("another content"), "{message}");
     assert_no_leftovers(here);
+    recorded_as_failed(here, "no walker is left");
     fs::write(here.join("model.npz"), model).unwrap();
     ends_as_undisturbed(start(here), here, &small);
 }
@@ -233,6 +248,8 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     running.0.kill().unwrap();
     running.0.wait().unwrap();
     wait_until("walkers are gone", || processes_running(here, "walker").is_empty());
+    let is_killed = |process: &Value| process["kind"] == "orchestrator" && process["state"] == "dead";
+    assert!(shown(here).iter().any(is_killed), "{:?}", shown(here));
     let running = start(here);
     wait_until("there are walkers again", || processes_running(here, "walker").len() == 2);
     // While a labeller is held, the campaign does not end either.
@@ -331,6 +348,7 @@ fn sixteen_megabytes_of_shared_memory_are_enough_or_the_need_is_said() {
     let message = common::stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{message}");
     assert!(message.contains("MB of shared memory") && message.contains("--shm-size"), "{message}");
+    recorded_as_failed(here, "MB of shared memory");
     let Some(mut enough) = with_shared_memory(here, 16, 0) else { return };
     let output = enough.output().unwrap();
     assert_eq!(output.status.code(), Some(0), "{}", common::stderr(&output));

@@ -1,5 +1,6 @@
 //! The check of the reference before the first walk: it passes, refuses, is accepted, and continues after a kill.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
@@ -9,7 +10,7 @@ use tempfile::TempDir;
 
 use crate::common::campaign::{Small, outcome};
 use crate::common::label_campaign::{WRITE_FIXED_LABEL, on_store};
-use crate::common::processes::{assert_no_leftovers, signal, wait_until};
+use crate::common::processes::{assert_no_leftovers, calculation_processes, signal, wait_until};
 use crate::common::{Running, calmwalk, program, refuse, stderr, succeed, write_frames};
 
 const CHECK: &str = "check = { structures = \"known.extxyz\" }";
@@ -54,10 +55,15 @@ fn status(here: &Path) -> Value {
     serde_json::from_str(&succeed(here, ["status", ".", "--json"])).unwrap()
 }
 
+/// The details of the operations of this kind.
+fn operations(here: &Path, kind: &str) -> Vec<Value> {
+    let operations = on_store(here.into(), async |store| store.operations(0, 1000).await.unwrap());
+    operations.into_iter().filter(|one| one.kind == kind).map(|one| one.detail).collect()
+}
+
 /// The details of the checks in the operations log.
 fn logged(here: &Path) -> Vec<Value> {
-    let operations = on_store(here.into(), async |store| store.operations(0, 1000).await.unwrap());
-    operations.into_iter().filter(|one| one.kind == "reference_check").map(|one| one.detail).collect()
+    operations(here, "reference_check")
 }
 
 #[test]
@@ -121,6 +127,13 @@ fn labels_that_differ_stop_the_campaign_until_they_are_accepted() {
     assert_eq!(state["reference_check"]["state"], "failed");
     assert!(state["walks"].as_array().unwrap().iter().all(|walk| walk["step"] == 0), "{state}");
     assert!(succeed(here, ["status", "."]).contains("; reference check failed\n"));
+    // These runs were refused, not killed.
+    assert_eq!(state["processes"], json!([]));
+    let ended = operations(here, "ended");
+    assert_eq!(ended.len(), 2);
+    let is_refusal =
+        |end: &Value| end["error"].as_str().unwrap().starts_with("the labels contradict the reference");
+    assert!(ended.iter().all(|end| end["how"] == "failed" && is_refusal(end)), "{ended:?}");
     let told = succeed(here, ["status", ".", "--all"]);
     assert!(told.contains("root mean square") && told.contains("a force differs by"), "{told}");
     let output = run(here, &["--accept-check"]);
@@ -144,8 +157,8 @@ echo >> HERE/started
 while [ ! -e HERE/go ]; do sleep 0.02; done
 "#;
 
-#[test]
-fn a_killed_check_continues_with_the_calculation_that_is_running() {
+/// A campaign whose labels are made by [`WAITING_SCRIPT`], with the directory `scratch`.
+fn waiting_campaign() -> TempDir {
     let command =
         "{ command = { command = [\"sh\", \"label.sh\"], files = [\"label.sh\"], version = \"1\" } }";
     let directory = campaign(Some(command));
@@ -163,7 +176,46 @@ fn a_killed_check_continues_with_the_calculation_that_is_running() {
         frame.set_labels(&Labels { energy: Some(-3.0), forces, stress: None }, LabelKeys::Ase);
     }
     write_frames(&here.join("known.extxyz"), &frames);
-    let started = || fs::read_to_string(here.join("started")).unwrap_or_default().len();
+    directory
+}
+
+/// Number of calculations that have started.
+fn started(here: &Path) -> usize {
+    fs::read_to_string(here.join("started")).unwrap_or_default().len()
+}
+
+/// The check that was killed had begun to label a structure that the file has no longer.
+#[test]
+fn a_calculation_that_nobody_wants_any_more_is_ended() {
+    let directory = waiting_campaign();
+    let here = directory.path();
+    let mut running =
+        Running(program(here).args(["run", "campaign.toml", "--directory", "."]).spawn().unwrap());
+    wait_until("a calculation has started", || started(here) == 1);
+    running.0.kill().unwrap();
+    running.0.wait().unwrap();
+    let frames = atoms::read_extxyz(&here.join("known.extxyz")).unwrap();
+    write_frames(&here.join("known.extxyz"), &frames[1..]);
+    let mut running =
+        Running(program(here).args(["run", "campaign.toml", "--directory", "."]).spawn().unwrap());
+    wait_until("the other structure is calculated", || started(here) == 2);
+    let scratch = here.join("scratch");
+    let directories: BTreeSet<_> = calculation_processes(&scratch)
+        .into_iter()
+        .filter_map(|(pid, _)| fs::read_link(format!("/proc/{pid}/cwd")).ok())
+        .collect();
+    assert_eq!(directories.len(), 1, "{directories:?}");
+    fs::write(here.join("go"), "").unwrap();
+    assert_eq!(running.0.wait().unwrap().code(), Some(1));
+    assert_eq!(fs::read_dir(&scratch).unwrap().count(), 0);
+    assert_no_leftovers(here);
+}
+
+#[test]
+fn a_killed_check_continues_with_the_calculation_that_is_running() {
+    let directory = waiting_campaign();
+    let (here, scratch) = (directory.path(), directory.path().join("scratch"));
+    let started = || started(here);
     for stop in ["KILL", "TERM"] {
         let said = fs::File::create(here.join("said")).unwrap();
         let mut command = program(here);
@@ -176,6 +228,11 @@ fn a_killed_check_continues_with_the_calculation_that_is_running() {
         signal(running.0.id(), stop);
         let ended = running.0.wait().unwrap();
         assert_eq!(ended.code(), if stop == "TERM" { Some(130) } else { None });
+        // Only the one that was killed is missing.
+        let left = if stop == "TERM" { json!([]) } else { json!(["dead"]) };
+        let processes = status(here)["processes"].clone();
+        let states = processes.as_array().unwrap().iter().map(|process| process["state"].clone());
+        assert_eq!(Value::Array(states.collect()), left, "after {stop}");
     }
     assert_eq!(status(here)["reference_check"]["state"], "running");
     fs::write(here.join("go"), "").unwrap();
@@ -255,10 +312,62 @@ fn validate_warns_of_files_that_show_little() {
     assert!(told.contains("forces that are wrong would not be noticed"), "{told}");
 }
 
+const LAUNCH: [&str; 8] =
+    ["launch", "campaign.toml", "--on", "slurm", "--agents=0", "--directory", ".", "--dry-run"];
+
+/// What `calmwalk launch` prints, with this further option.
+fn launched(here: &Path, further: &[&str]) -> std::process::Output {
+    let mut command = program(here);
+    // Slurm's commands may be installed without a Slurm that answers.
+    command.args(LAUNCH).args(further).env("PATH", "");
+    command.output().unwrap()
+}
+
+/// A requeued job repeats its command, whatever the configuration says by then.
+#[test]
+fn a_launched_campaign_accepts_only_the_check_that_the_user_has_seen() {
+    let directory = campaign(None);
+    let here = directory.path();
+    write_known(here, |number, labels| add_energy(labels, 0.1 * number as f64));
+    let printed = |further: &[&str]| String::from_utf8(launched(here, further).stdout).unwrap();
+    assert!(!printed(&[]).contains("--accept-check"));
+    let scripts = printed(&["--accept-check"]);
+    let accept = scripts.split_whitespace().find(|word| word.starts_with("--accept-check")).unwrap();
+    let identity = accept.strip_prefix("--accept-check=").unwrap();
+    assert!(identity.len() == 64 && identity.chars().all(|c| c.is_ascii_hexdigit()), "{accept}");
+    let configuration = fs::read_to_string(here.join("campaign.toml")).unwrap();
+    let with_check = |check: &str| {
+        let text = configuration.replacen(CHECK, check, 1);
+        fs::write(here.join("campaign.toml"), text).unwrap();
+    };
+    with_check("check = { structures = \"known.extxyz\", max_energy_difference = 0.004 }");
+    let output = run(here, &[accept]);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(
+        said.contains("--accept-check accepts an earlier check")
+            && said.contains("energy_difference = 0.004"),
+        "{said}"
+    );
+    assert_eq!(status(here)["reference_check"]["state"], "failed");
+    with_check(CHECK);
+    let output = run(here, &[accept]);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    assert!(said.contains("WARNING: reference check: accepted, 2 structures"), "{said}");
+    // The job is requeued when there is no check any more.
+    with_check("");
+    assert_eq!(run(here, &[accept]).status.code(), Some(0));
+}
+
 #[test]
 fn a_check_that_is_not_there_cannot_be_accepted() {
     let directory = tempfile::tempdir().unwrap();
-    Small::default().write(directory.path());
-    let told = refuse(directory.path(), ["run", "campaign.toml", "--accept-check"]);
-    assert!(told.contains("--accept-check: campaign.toml has no label.check.structures"), "{told}");
+    let here = directory.path();
+    Small::default().write(here);
+    let expected = "--accept-check: campaign.toml has no label.check.structures";
+    let told = refuse(here, ["run", "campaign.toml", "--accept-check"]);
+    assert!(told.contains(expected), "{told}");
+    let output = launched(here, &["--accept-check"]);
+    assert!(output.status.code() == Some(2) && stderr(&output).contains(expected), "{}", stderr(&output));
 }

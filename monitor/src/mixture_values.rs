@@ -35,7 +35,7 @@ impl MixtureValues {
         self.read(STALENESS)
     }
 
-    /// Number of candidates that could not be graded.
+    /// Number of candidates that could not be graded, and of control frames with atoms too close.
     pub fn left_out(&self) -> u64 {
         self.read(LEFT_OUT).unwrap_or(0)
     }

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
+use atoms::{MinDistanceRule, Uniform};
 use calm::CollectionRule;
 use calm::rules::MaximumGrade;
 use orchestrator::selector::{Mode, Replay, ReplayedDecision, Settings, UpdateProtocol};
@@ -12,8 +13,8 @@ use store::records::{CandidateRecord, ComponentRecord, Fate, LoggedDecision};
 use wire::ContentHash;
 
 use crate::common::eventful::{Campaign, acts, any_settings, scripts};
-use crate::common::scripted::Script;
-use crate::common::{SHORTEST, grader, kinds, mixture, positive, seed, structure};
+use crate::common::scripted::{Event, Script};
+use crate::common::{SHORTEST, grader, kinds, mixture, positive, seed, settings, structure};
 
 /// The decisions of a campaign as restored from a store, each with its candidate.
 fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a CandidateRecord>)> {
@@ -149,6 +150,32 @@ proptest! {
             }
         }
     }
+}
+
+/// Versions without this rule have labelled control frames whatever their distances.
+#[test]
+fn control_frames_that_were_labelled_although_too_close_are_left_out_in_a_replay() {
+    let lax = MinDistanceRule::Uniform(Uniform { min_distance: 0.1, fraction: 0.1 });
+    let never = UpdateProtocol::Never;
+    let strict = Settings { control: true, update: never, ..settings(Mode::Reproducible) };
+    let before = Settings { min_distances: lax, ..strict.clone() };
+    let event = |number: u64| match number {
+        5..8 => Event::Structure { number, z: [0.0, 3.0 * number as f64, 0.0], close: false },
+        _ => Event::Nothing,
+    };
+    let scripts = [(0..30).map(event).collect()];
+    let campaign = Campaign::begin(&before, &scripts, 1).finish(false);
+    let log = log(&campaign);
+    let replayed = follow(&mut open(&campaign, &strict, 1, &[]), &log);
+    let mut changed = 0;
+    for ((recorded, _), now) in log.iter().zip(replayed) {
+        let now = now.unwrap().decision;
+        if recorded.kind != now.kind {
+            assert_eq!((recorded.kind.as_str(), now.kind), ("control", "left_out"));
+            changed += 1;
+        }
+    }
+    assert_eq!(changed, 1, "{log:?}");
 }
 
 /// The campaigns above cover what they should: rules change in the middle of them, and imports are met.

@@ -7,11 +7,13 @@ use orchestrator::selector::{Mode, Settings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
+use store::records::Fate;
 use wire::Origin;
+use wire::messages::DeclineReason;
 
 use crate::common::eventful::{Campaign, acts, any_settings, biased_walks, scripts};
-use crate::common::kinds;
 use crate::common::scripted::Script;
+use crate::common::{SHORTEST, grader, kinds};
 
 /// One walker and no incidents.
 fn calm_run<'a>(settings: &'a Settings, scripts: &'a [Script]) -> Campaign<'a> {
@@ -89,18 +91,56 @@ proptest! {
         };
         prop_assert_eq!(campaign.selector.mixture().version(), steps as u64, "one version an update");
     }
+
+    /// Each step at which a control walk shall provide a frame has a frame that the guard permits, or is left out, or comes
+    /// after the end of the walk.
+    #[test]
+    fn control_frames_are_matched_by_step_or_left_out(
+        settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
+    ) {
+        let mode = if live { Mode::Live } else { Mode::Reproducible };
+        let settings = Settings { mode, control: true, ..settings };
+        let mut campaign = Campaign::begin(&settings, &scripts, walkers);
+        acts.into_iter().for_each(|act| campaign.act(act));
+        let campaign = campaign.finish(false);
+        for candidate in campaign.commits.iter().flat_map(|commit| &commit.candidates) {
+            let shortest = grader().bonds(&candidate.block.view().structure()).unwrap().shortest.shortest();
+            let permitted = shortest >= 0.75 * SHORTEST;
+            prop_assert!(permitted || candidate.fate == Fate::Declined(DeclineReason::Guard), "{} Å", shortest);
+        }
+        for walk in campaign.store.walks.values().filter(|walk| walk.origin == Origin::Control) {
+            let of_walk = |kind: &'static str| {
+                let decisions = campaign.store.decisions.iter().filter(|decision| decision.walk == Some(walk.walk));
+                decisions.filter(move |decision| decision.kind == kind)
+            };
+            let wanted = &of_walk("begun").next().unwrap().detail["wanted"];
+            let wanted = wanted.as_array().unwrap().iter().map(|step| step.as_u64().unwrap());
+            let frames = of_walk("control").map(|decision| decision.candidate.unwrap().step);
+            let left_out = of_walk("left_out").map(|decision| decision.detail["step"].as_u64().unwrap());
+            let mut found: Vec<u64> = frames.chain(left_out).collect();
+            found.sort_unstable();
+            let until = if walk.state == "collected" { u64::MAX } else { walk.progress.step };
+            prop_assert_eq!(found, wanted.filter(|step| *step <= until).collect::<Vec<_>>());
+            prop_assert_eq!(walk.accepted as usize, of_walk("control").count());
+        }
+    }
 }
 
 /// The campaigns above cover what they should: every kind of decision and every reason occurs.
 #[test]
 fn the_scripts_reach_every_kind_of_decision() {
     let mut runner = TestRunner::deterministic();
-    let mut seen = BTreeSet::new();
+    let (mut seen, mut close_frames) = (BTreeSet::new(), false);
     for _ in 0..100 {
         let settings = any_settings().new_tree(&mut runner).unwrap().current();
         let scripts = scripts().new_tree(&mut runner).unwrap().current();
-        seen.extend(calm_run(&settings, &scripts).commits.iter().flat_map(kinds));
+        let campaign = calm_run(&settings, &scripts);
+        seen.extend(campaign.commits.iter().flat_map(kinds));
+        let left_out =
+            campaign.store.decisions.iter().filter_map(|decision| decision.detail["error"].as_str());
+        close_frames |= left_out.into_iter().any(|error| error.contains("closer than the limit"));
     }
+    assert!(close_frames, "no control frame with atoms too close");
     let expected = [
         "accepted",
         "begun",

@@ -301,6 +301,36 @@ fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
     assert_eq!(store.known.len(), 3, "control frames are not what later candidates are compared with");
 }
 
+/// It is not labelled; the walk goes on to its later frames, which are matched by step all the same.
+#[test]
+fn a_control_frame_with_atoms_too_close_is_left_out() {
+    let mut store = MemoryStore::default();
+    let mut selector = with_control(&mut store, &[5, 7, 9]);
+    let least = 0.75 * SHORTEST;
+    for (step, distance, expected) in [
+        (5, least + 1e-6, vec!["control"]),
+        (7, least - 1e-6, vec!["left_out"]),
+        (9, 0.5, vec!["left_out", "ended"]),
+    ] {
+        let assignment = next_assignment(&mut selector);
+        assert_eq!((assignment.origin, assignment.frame_steps[0]), (Origin::Control, step));
+        let report = offer(&selector, &assignment, step, structure(100 + step, distance), [0.1; 3]);
+        let commit = decided(&mut selector, report);
+        assert_eq!(kinds(&commit), expected);
+        if expected[0] == "left_out" {
+            let detail = &commit.decisions[0].detail;
+            let why = detail["error"].as_str().unwrap();
+            let expected = format!("Al-Al atoms at {distance:.3} Å, closer than the limit of {least:.3} Å");
+            assert!(why.contains(&expected) && detail["step"] == step, "{detail}");
+            assert!(commit.candidates.is_empty());
+        }
+        store.commit(&commit);
+    }
+    let control = &store.walks[&WalkId(1)];
+    assert_eq!((control.state.as_str(), control.accepted), ("collected", 1));
+    assert!(matches!(selector.next_assignment(0), Scheduling::Done));
+}
+
 #[test]
 fn a_walk_that_collected_nothing_has_no_control() {
     let mut selector = with_control(&mut MemoryStore::default(), &[]);

@@ -15,7 +15,7 @@ use self::job_specs::JobSpecs;
 use super::{ExitStatus, Failure, block_on, campaign_location};
 use crate::campaign::Campaign;
 use crate::config::Config;
-use crate::output::{count, log_and_print, print};
+use crate::output::{count, log_and_print, log_and_warn, print};
 
 /// How long to wait for one command of Slurm, which itself waits for a busy slurmctld.
 const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
@@ -40,6 +40,11 @@ pub struct Launch {
     /// Resume a campaign that was started with another configuration file, and use CONFIG from now on
     #[arg(long)]
     adopt: bool,
+    /// Go on although labels of the structures of label.check differ from what is known by more than the bounds, as with calmwalk
+    /// run. The orchestrator's job keeps this for as long as the label protocol, these structures and the bounds stay as they
+    /// are now
+    #[arg(long)]
+    accept_check: bool,
     /// Number of agents, one per job
     #[arg(long, value_name = "N", required_unless_present = "stop", value_parser = clap::value_parser!(u32).range(0..=10_000))]
     agents: Option<u32>,
@@ -182,6 +187,12 @@ impl Launch {
         }
         slurm.cancel(&cancel).await.map_err(Failure::failed)?;
         let mut orchestrator = specs.orchestrator_job(&jobs, &cancel);
+        if let Some(id) = orchestrator.filter(|_| self.accept_check) {
+            log_and_warn(format_args!(
+                "WARNING: --accept-check does not reach job {id}, the orchestrator's, which exists already: end it with calmwalk \
+                 launch --stop, then launch again"
+            ));
+        }
         for submission in &submit {
             if orchestrator.is_none() {
                 specs.remove_endpoint()?;

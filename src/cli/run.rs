@@ -1,6 +1,7 @@
 //! `calmwalk run`
 
 mod lock;
+mod registration;
 mod resume;
 
 use std::fs::DirBuilder;
@@ -18,10 +19,7 @@ use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
 use orchestrator::selector::{OnForgetting, Selector, SelectorSnapshot};
 use serde::Deserialize;
-use serde_json::json;
-use store::{
-    DATABASE, Location, ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds,
-};
+use store::{CampaignLock, DATABASE, Location, Store, StoreError, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
 use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
@@ -35,6 +33,7 @@ use crate::forgetting::{ForgettingRule, Measured};
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
 use crate::runtime::notify::{self, Notifier};
+use crate::runtime::reference_check::{self, ANY_CHECK};
 use crate::runtime::{self, time_budget};
 use crate::wording::disk::megabytes;
 use crate::wording::{self, walk_ends};
@@ -57,9 +56,9 @@ pub struct Run {
     adopt: bool,
     /// Go on although labels of the structures of label.check differ from what is known by more than the bounds. The campaign
     /// records that the differences were accepted; the check is repeated when the label protocol, these structures or the
-    /// bounds change
-    #[arg(long)]
-    accept_check: bool,
+    /// bounds change. With CHECK, only the check with this identity is accepted, as in the job of calmwalk launch
+    #[arg(long, value_name = "CHECK", num_args = 0..=1, require_equals = true, default_missing_value = ANY_CHECK)]
+    accept_check: Option<String>,
     /// Run walkers and labellers as threads of this process instead of as separate processes; uses no shared memory
     #[arg(long)]
     in_process: bool,
@@ -90,11 +89,9 @@ impl Run {
         self.log.init("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
-        if self.accept_check && campaign.known.is_empty() {
-            let config = self.config.display();
-            return Err(Failure::Input(format!(
-                "--accept-check: {config} has no label.check.structures, so there is no check to accept"
-            )));
+        // The job of a campaign keeps its command when the configuration changes.
+        if self.accept_check.as_deref() == Some(ANY_CHECK) {
+            reference_check::identity(&campaign)?;
         }
         let directory = match self.directory {
             Some(directory) => directory,
@@ -122,7 +119,8 @@ impl Run {
             let web = self.web.listen().await?;
             let _lock = lock::directory(&directory, &location, wait_timeout).await?;
             listen.iter().try_for_each(runtime::Listen::clear_announcement)?;
-            let (in_process, adopt, accept_check) = (self.in_process, self.adopt, self.accept_check);
+            let (in_process, adopt, accept_check) =
+                (self.in_process, self.adopt, self.accept_check.as_deref());
             let options =
                 RunOptions { in_process, adopt, accept_check, listen: listen.as_ref(), web, wait_timeout };
             run(&campaign, &directory, &location, options).await
@@ -161,8 +159,8 @@ struct RunOptions<'a> {
     in_process: bool,
     /// Whether the campaign may have been started with another configuration file.
     adopt: bool,
-    /// Whether differences from the reference are accepted.
-    accept_check: bool,
+    /// The check whose differences from the reference are accepted.
+    accept_check: Option<&'a str>,
     listen: Option<&'a runtime::Listen>,
     web: web::BoundListeners,
     wait_timeout: std::time::Duration,
@@ -187,7 +185,7 @@ async fn run(
     if pauses && selector.forgetting_level() > 1.0 && !selector.is_done() {
         return Err(paused_by_alarm(campaign, &store).await?);
     }
-    let process = register(&store).await?;
+    let process = registration::register(&store).await?;
     if let Some(idle) = runtime::idle_walkers(campaign) {
         log_and_warn(format_args!("WARNING: {idle}"));
     }
@@ -200,33 +198,11 @@ async fn run(
     let stop = CancellationToken::new();
     let run =
         runtime::RunContext { campaign, store: &store, process: &process, directory, listen, stop: &stop };
-    let (limits, used_up) = (campaign.config.budget(), time_budget::exhausted_time_limit(&store).await?);
-    let work = async {
-        if used_up.is_some() {
-            // The budget allows no further work.
-            return Ok(reactor::RunOutcome::Stopped);
-        }
-        runtime::run(run, selector, in_process, accept_check).await
-    };
-    let serving = web.serve(location, &store, &campaign.artifact).await?;
-    let mut notifier = Notifier::new(&campaign.config, &store, location).await?;
-    let worked = tokio::select! {
-        ended = work => ended,
-        error = time_budget::track(&store, &limits, &stop) => Err(error.into()),
-        error = lock::lost(lock.as_ref()) => Err(error.into()),
-        never = notify::run(&mut notifier) => match never {},
-    };
-    notify::finish(notifier, worked.as_ref().err()).await;
-    serving.end().await;
-    let ended = worked?;
-    // Do not fail after hours of work because the server is unreachable in the last second.
-    let store = store.with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT);
-    loop {
-        match unregister(&store, &process, ended).await {
-            Err(StoreError::Unreachable(_)) => {}
-            result => break result?,
-        }
-    }
+    let surroundings = Surroundings { location, lock: lock.as_ref(), web };
+    let worked = work(run, surroundings, selector, in_process, accept_check).await;
+    let store = registration::unregister(store, &process, worked.as_ref()).await;
+    worked?;
+    let store = store?;
     if !store.status().await?.finished {
         if pauses && MixtureValues(store.values().await?).training_frames()["alarm"] == true {
             return Err(paused_by_alarm(campaign, &store).await?);
@@ -258,6 +234,45 @@ async fn run(
         return Ok(ExitStatus::NoWalkCompleted);
     }
     Ok(ExitStatus::Done)
+}
+
+/// What a run has beside its work.
+struct Surroundings<'a> {
+    location: &'a Location,
+    /// The lock on the server.
+    lock: Option<&'a CampaignLock>,
+    web: web::BoundListeners,
+}
+
+/// Does the work of a run until it is finished or stopped, and meanwhile serves HTTP and notifies.
+async fn work(
+    run: runtime::RunContext<'_>,
+    surroundings: Surroundings<'_>,
+    selector: Selector,
+    in_process: bool,
+    accept_check: Option<&str>,
+) -> Result<reactor::RunOutcome, Failure> {
+    let runtime::RunContext { campaign, store, stop, .. } = run;
+    let Surroundings { location, lock, web } = surroundings;
+    let (limits, used_up) = (campaign.config.budget(), time_budget::exhausted_time_limit(store).await?);
+    let work = async {
+        if used_up.is_some() {
+            // The budget allows no further work.
+            return Ok(reactor::RunOutcome::Stopped);
+        }
+        runtime::run(run, selector, in_process, accept_check).await
+    };
+    let serving = web.serve(location, store, &campaign.artifact).await?;
+    let mut notifier = Notifier::new(&campaign.config, store, location).await?;
+    let worked = tokio::select! {
+        ended = work => ended,
+        error = time_budget::track(store, &limits, stop) => Err(error.into()),
+        error = lock::lost(lock) => Err(error.into()),
+        never = notify::run(&mut notifier) => match never {},
+    };
+    notify::finish(notifier, worked.as_ref().err()).await;
+    serving.end().await;
+    worked
 }
 
 /// Creates the campaign, or opens an existing one and checks that it belongs to this configuration.
@@ -343,33 +358,6 @@ async fn paused_by_alarm(campaign: &Campaign, store: &Store) -> Result<Failure, 
         "the campaign is paused: {}, then run it again",
         ForgettingRule::new(&campaign.config.calm).raised_message(&measured)
     )))
-}
-
-/// Registers this process, and reclaims the leases of dead ones. The caller holds the lock, so there is no other orchestrator.
-async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
-    let now = unix_milliseconds();
-    store.reclaim_leases(now).await?;
-    let record = ProcessRecord::new(ProcessRecord::ORCHESTRATOR, None, std::process::id(), now);
-    store.upsert_process(&record).await?;
-    let detail = json!({ "process": record.id, "program_version": env!("CARGO_PKG_VERSION") });
-    store.log_operation(now, "started", &detail).await?;
-    Ok(record)
-}
-
-/// Releases what this process holds, and removes its registration.
-async fn unregister(
-    store: &Store,
-    process: &ProcessRecord,
-    ended: reactor::RunOutcome,
-) -> Result<(), StoreError> {
-    let now = unix_milliseconds();
-    store.release_all(&process.id, now).await?;
-    store.remove_process(&process.id).await?;
-    let how = match ended {
-        reactor::RunOutcome::Finished => "done",
-        reactor::RunOutcome::Stopped => "stopped",
-    };
-    store.log_operation(now, "ended", &json!({ "process": process.id, "how": how })).await
 }
 
 async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, Failure> {

@@ -212,7 +212,7 @@ fn write_candidates(
     let control = count(*control, "control frame");
     let left_out = match left_out {
         0 => String::new(),
-        left_out => format!("; {left_out} left out (could not be graded: calmwalk log)"),
+        left_out => format!("; {left_out} left out (the decision log has the reasons)"),
     };
     page.titled(out, "", &format!("{control}{shared}; {refused_by_walkers} rejected by guards{left_out}"))
 }

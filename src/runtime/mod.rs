@@ -10,7 +10,7 @@ mod multi_process;
 pub mod notify;
 mod process_manager;
 mod process_records;
-mod reference_check;
+pub mod reference_check;
 pub mod scratch_dir;
 mod single_process;
 mod spawn;
@@ -61,15 +61,15 @@ pub struct RunContext<'a> {
 /// Printed when a campaign is asked to stop.
 const STOP_MESSAGE: &str = "stopping: walks are checkpointed …";
 
-/// Checks the reference, and runs the campaign until it is finished or stopped. `accept`: whether the user accepts
-/// differences from the reference.
+/// Checks the reference, and runs the campaign until it is finished or stopped. `accept`: the check whose differences from
+/// the reference the user accepts.
 ///
 /// Await this on the main thread: the walkers end with the thread that starts them.
 pub async fn run(
     run: RunContext<'_>,
     selector: Selector,
     in_process: bool,
-    accept: bool,
+    accept: Option<&str>,
 ) -> Result<reactor::RunOutcome, Failure> {
     cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
     let go_on = tokio::select! {

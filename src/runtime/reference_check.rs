@@ -13,7 +13,7 @@ use serde_json::json;
 use store::records::Label;
 use store::{Store, StoreError, unix_milliseconds};
 use wire::ContentHash;
-use workers::labeller::{LabelOutcome, RecordedLabel};
+use workers::labeller::{LabelOutcome, RecordedLabel, give_up_others};
 
 use super::RunContext;
 use crate::campaign::Campaign;
@@ -24,18 +24,39 @@ use crate::wording;
 /// Number of faults that the error message lists.
 const MAX_FAULTS: usize = 5;
 
-/// Makes sure that the labels agree with what is known, or that the user accepts (`accept`) or has accepted the differences.
-/// Returns false if it was stopped.
+/// In place of an identity: the user accepts the differences of any check.
+pub const ANY_CHECK: &str = "any";
+
+/// Identity of the check of a campaign, which follows from the label protocol, the known labels and the bounds.
+///
+/// # Errors
+/// There is no check.
+pub fn identity(campaign: &Campaign) -> Result<String, Failure> {
+    if campaign.known.is_empty() {
+        return Err(Failure::Input(format!(
+            "--accept-check: {} has no label.check.structures, so there is no check to accept",
+            campaign.path.display()
+        )));
+    }
+    Ok(begin(campaign).identity)
+}
+
+fn begin(campaign: &Campaign) -> ReferenceCheck {
+    let bounds = campaign.config.label.check.bounds();
+    ReferenceCheck::begin(&campaign.protocol, &campaign.known, bounds)
+}
+
+/// Makes sure that the labels agree with what is known, or that the user accepts or has accepted the differences: `accept`
+/// is the identity of the accepted check, or [`ANY_CHECK`]. Returns false if it was stopped.
 ///
 /// # Errors
 /// A difference above its bound, a label that cannot be made, errors of the database.
-pub async fn run(run: RunContext<'_>, accept: bool) -> Result<bool, Failure> {
+pub async fn run(run: RunContext<'_>, accept: Option<&str>) -> Result<bool, Failure> {
     let RunContext { campaign, store, .. } = run;
     if campaign.known.is_empty() {
         return Ok(true);
     }
-    let bounds = campaign.config.label.check.bounds();
-    let mut check = ReferenceCheck::begin(&campaign.protocol, &campaign.known, bounds);
+    let mut check = begin(campaign);
     let before = ReferenceCheck::read(store).await?.filter(|before| before.identity == check.identity);
     if before.is_some_and(|before| matches!(before.state, CheckState::Passed | CheckState::Accepted)) {
         return Ok(true);
@@ -46,10 +67,20 @@ pub async fn run(run: RunContext<'_>, accept: bool) -> Result<bool, Failure> {
 }
 
 /// Records and prints the result of a check that is complete.
-async fn judge(run: RunContext<'_>, mut check: ReferenceCheck, accept: bool) -> Result<bool, Failure> {
-    let passed = check.state == CheckState::Passed;
-    if !passed && accept {
-        check.state = CheckState::Accepted;
+async fn judge(
+    run: RunContext<'_>,
+    mut check: ReferenceCheck,
+    accept: Option<&str>,
+) -> Result<bool, Failure> {
+    match accept.filter(|_| check.state != CheckState::Passed) {
+        None => {}
+        Some(accepted) if accepted == ANY_CHECK || accepted == check.identity => {
+            check.state = CheckState::Accepted;
+        }
+        Some(_) => log_and_warn(
+            "WARNING: --accept-check accepts an earlier check: the label protocol, the structures or the bounds of label.check \
+             have changed since, so it does not apply",
+        ),
     }
     let RunContext { store, campaign, .. } = run;
     print_stderr(wording::reference_check::table(&check).trim_end());
@@ -78,7 +109,8 @@ fn refusal(config: &Path, faults: &[String]) -> Failure {
     Failure::Failed(format!(
         "the labels contradict the reference of label.check: {shown}. No walk was started. Compare [label.method] with the \
          reference that the potential was trained on (functional, pseudopotentials, cutoff, k-points, smearing, magnetic moments, \
-         which energy), and the units of the file. If the differences are meant, run calmwalk run {} --accept-check",
+         which energy), and the units of the file. If the differences are meant, run calmwalk run {} --accept-check, or \
+         calmwalk launch with this option",
         config.display()
     ))
 }
@@ -92,6 +124,9 @@ async fn label_all(
     let (keys, bounds) = (keys(campaign), campaign.config.label.bounds());
     let attempts = campaign.config.label.max_attempts.get();
     write(store, check).await?;
+    let method = campaign.method()?.load(&campaign.protocol)?;
+    give_up_others(store, &method, &format!("{METADATA_KEY}/"), &keys).await?;
+    method.end();
     let (mut made, mut missing) = (Vec::new(), Vec::new());
     for (index, (known, key)) in campaign.known.iter().zip(&keys).enumerate() {
         let request = RecordedLabel { key, structure: &known.structure, bounds: &bounds, attempts };

@@ -13,7 +13,7 @@ use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkCon
 pub const TRAINING_FRAMES: &str = "training_frames";
 /// Name of the value with the histogram of mixture ages at decisions (JSON of `calm::Staleness`).
 pub const STALENESS: &str = "staleness";
-/// Name of the value with the number of candidates that could not be graded.
+/// Name of the value with the number of candidates that could not be graded or were control frames with atoms too close.
 pub const LEFT_OUT: &str = "left_out";
 
 /// Properties of a campaign, written when it is created.

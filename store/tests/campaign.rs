@@ -341,3 +341,16 @@ async fn conditions_of_walks_are_read_back() {
     assert_eq!(store.walk_conditions().await.unwrap()[&WalkId(0)], conditions);
     assert_eq!(store.status().await.unwrap().walks[0].conditions, Some(conditions));
 }
+
+#[tokio::test]
+async fn metadata_are_found_by_the_beginning_of_their_names() {
+    let home = Home::new();
+    let store = home.create().await;
+    for name in ["a_b/2", "a_b/1", "a_b", "axb/1", "other"] {
+        store.set_metadata(name, &format!("value of {name}")).await.unwrap();
+    }
+    let found = store.metadata_below("a_b/").await.unwrap();
+    let expected = ["a_b/1", "a_b/2"].map(|name| (name.to_owned(), format!("value of {name}")));
+    assert_eq!(found, expected);
+    assert_eq!(store.metadata_below("b").await.unwrap(), []);
+}

@@ -63,7 +63,7 @@ pub enum DeclineReason {
     Budget,
     /// The grade is below the threshold, which was raised because many structures wait for labels.
     Backlog,
-    /// It cannot be graded, or the mixture cannot be updated with it.
+    /// It cannot be graded, or the mixture cannot be updated with it, or it is a control frame with atoms too close.
     LeftOut,
 }
 

@@ -62,7 +62,7 @@ pub struct PairDistance {
     pub shortest: f64,
     /// That in the seed structure, Å.
     pub seed_structure: Option<f64>,
-    /// The selector declines below this distance, Å (`guard.min_distances`). Control frames are exempt.
+    /// The selector declines below this distance, Å (`guard.min_distances`), and leaves control frames out.
     pub limit: Option<f64>,
 }
 

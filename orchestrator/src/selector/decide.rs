@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use atoms::CloseContact;
 use calm::grade::maximum;
 use calm::rules::CovarianceUpdateKind;
 use calm::{UpdateOutcome, UpdateSettings};
@@ -21,7 +22,7 @@ use super::settings::{OnForgetting, UpdateProtocol};
 const BIASED_PRIORITY: i32 = 10;
 const CONTROL_PRIORITY: i32 = 0;
 
-/// Kind of the decision on a candidate that cannot be graded.
+/// Kind of the decision on a candidate that cannot be graded, and on a control frame with atoms too close.
 pub(super) const LEFT_OUT: &str = "left_out";
 /// Kind of the decision that makes updates additive.
 pub(super) const FORGETTING: &str = "forgetting";
@@ -143,6 +144,8 @@ impl DecisionState {
     }
 
     /// Records a requested frame of a control walk: it is labelled like a candidate, but does not update the mixture.
+    /// The limits on distances hold for it as for candidates of biased walks, so that both sides of a comparison
+    /// consist of structures that pass the same guard.
     pub fn keep_control_frame(
         &mut self,
         id: WalkId,
@@ -150,20 +153,30 @@ impl DecisionState {
         commit: &mut Commit,
     ) -> Result<(), SelectorError> {
         let graded = regraded.with_mixture(&self.mixture)?;
-        let step = graded.block.view().id().step;
+        let candidate = graded.block.view().id();
+        if let Some(contact) = self.too_close(id, &graded) {
+            return Err(SelectorError::TooClose { candidate, contact });
+        }
         let detail = json!({ "original": grade_summary(&graded.original.gamma, 0) });
         self.record_decision(id, graded, Fate::Accepted, true, detail, commit);
         let walk = self.walk_mut(id);
         walk.record.accepted += 1;
-        walk.state.wanted.retain(|wanted| *wanted > step);
+        walk.state.wanted.retain(|wanted| *wanted > candidate.step);
         if walk.state.wanted.is_empty() {
             self.end_walk(id, &WalkEnd::Collected, commit);
         }
         Ok(())
     }
 
-    /// Declines a candidate that cannot be graded, or that the mixture cannot be updated with. Its walk goes on. The
-    /// log has the reason; there are no grades to store the candidate with.
+    /// The atoms of a structure that are closer than the limits of its walk.
+    fn too_close(&self, id: WalkId, graded: &RegradedCandidate) -> Option<CloseContact> {
+        let seed_structure = self.walks[id].record.seed_structure as usize;
+        self.min_distances[seed_structure].violation(&graded.bonds.shortest)
+    }
+
+    /// Declines a candidate that cannot be graded, or that the mixture cannot be updated with, or a control frame with
+    /// atoms too close. Its walk goes on: each later frame of a control walk is still matched by step. The log has the
+    /// reason; the candidate is not stored.
     pub fn leave_out(&mut self, id: WalkId, step: u64, error: &str, commit: &mut Commit) {
         self.left_out += 1;
         commit.decisions.push(self.decision(LEFT_OUT, id, json!({ "step": step, "error": error })));
@@ -215,8 +228,7 @@ impl DecisionState {
         graded: &RegradedCandidate,
     ) -> Option<DeclineReason> {
         let walk = &self.walks[id];
-        let min_distances = &self.min_distances[walk.record.seed_structure as usize];
-        if min_distances.violation(&graded.bonds.shortest).is_some() {
+        if self.too_close(id, graded).is_some() {
             Some(DeclineReason::Guard)
         } else if self.known.contains(&content) {
             Some(DeclineReason::Duplicate)

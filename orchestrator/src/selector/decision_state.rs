@@ -44,7 +44,7 @@ pub(super) struct DecisionState {
     /// Seed structures that have their maximum number of structures, but walks that have not ended.
     pub full_seeds: BTreeSet<u32>,
     pub declined_feature_bytes: u64,
-    /// Number of candidates that could not be graded.
+    /// Number of candidates that could not be graded, and of control frames with atoms too close.
     pub left_out: u64,
     pub staleness: Staleness,
     /// Number of imported structures: now, and when the log last recorded it.

@@ -1,5 +1,6 @@
 //! Errors.
 
+use atoms::CloseContact;
 use calm::MixtureError;
 use wire::CandidateId;
 
@@ -15,6 +16,17 @@ pub enum SelectorError {
         candidate: CandidateId,
         /// The error.
         source: GraderError,
+    },
+    /// A control frame that no label is calculated for.
+    #[error(
+        "control frame {candidate}: {} atoms at {:.3} Å, closer than the limit of {:.3} Å",
+        .contact.pair, .contact.distance, .contact.limit
+    )]
+    TooClose {
+        /// The frame.
+        candidate: CandidateId,
+        /// Its atoms that are too close.
+        contact: CloseContact,
     },
     /// The mixture update failed.
     #[error("updating the mixture for candidate {candidate}: {source}")]
@@ -49,6 +61,6 @@ pub enum SelectorError {
 impl SelectorError {
     /// Whether one candidate is at fault, so that the campaign can go on without it.
     pub(super) fn is_of_candidate(&self) -> bool {
-        matches!(self, Self::Grade { .. } | Self::Update { .. })
+        matches!(self, Self::Grade { .. } | Self::TooClose { .. } | Self::Update { .. })
     }
 }

@@ -173,10 +173,15 @@ impl Replay {
             true => self.decisions.decide_candidate(id, regraded, &mut commit),
             false => self.decisions.keep_control_frame(id, regraded, &mut commit),
         };
-        decided.map_err(|source| ReplayError::Selector {
-            sequence: recorded.sequence,
-            source: Box::new(source),
-        })?;
+        match decided {
+            Err(error) if error.is_of_candidate() => {
+                self.decisions.leave_out(id, step, &error.to_string(), &mut commit);
+            }
+            decided => decided.map_err(|source| ReplayError::Selector {
+                sequence: recorded.sequence,
+                source: Box::new(source),
+            })?,
+        }
         let mut decisions = commit.decisions.into_iter();
         let decision = decisions.next();
         self.following = decisions.collect();

@@ -8,6 +8,9 @@ use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
 
 use super::{DIMENSION, SHORTEST, at, block, gamma_max, structure};
 
+/// A distance below the limit of the walks, Å.
+const CLOSE: f64 = 0.7 * SHORTEST;
+
 /// The events of a walk, one per step.
 pub type Script = Vec<Event>;
 
@@ -77,15 +80,16 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
     if assignment.origin == Origin::Control {
         // Without bias, a control walk meets no events of the script; its frames are those of another walk.
         let number = 2_000_000 + 1000 * u64::from(assignment.walk.0) + state.step;
-        // Some of them cannot be graded.
+        // Some of them cannot be graded, and in some the atoms are too close.
         let z = if state.step % 7 == 3 { [f64::NAN; DIMENSION] } else { [0.5; DIMENSION] };
-        let frame = || block(assignment, mixture, &progress(state), structure(number, SHORTEST), z);
+        let distance = if state.step % 5 == 2 { CLOSE } else { SHORTEST };
+        let frame = || block(assignment, mixture, &progress(state), structure(number, distance), z);
         return assignment.frame_steps.contains(&state.step).then(|| Outcome::Candidate(frame()));
     }
     match *event {
         Event::Nothing => None,
         Event::Structure { number, z, close } => {
-            let distance = if close { 0.7 * SHORTEST } else { SHORTEST };
+            let distance = if close { CLOSE } else { SHORTEST };
             let candidate = || block(assignment, mixture, &progress(state), structure(number, distance), z);
             (gamma_max(mixture, z) > 1.5).then(|| Outcome::Candidate(candidate()))
         }

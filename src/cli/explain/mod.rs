@@ -76,7 +76,7 @@ fn write(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> {
         grades::write(out, grades)?;
     }
     if let (Some(found), Some(decision)) = (&details.found, &details.decision) {
-        write_distances(out, &found.distances, decision.kind == "control")?;
+        write_distances(out, &found.distances)?;
         decision::write(out, decision, details.structure.atoms)?;
     }
     write_same(out, details)?;
@@ -132,7 +132,7 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
     }
     let Some(walk) = &found.walk_now else { return Ok(()) };
     let reason = if walk.reason.is_empty() { String::new() } else { format!(" ({})", walk.reason) };
-    // Control walks report frames at requested steps: no guard rejects them, and they never roll back.
+    // Control walks offer frames at requested steps, on which only the selector's guard decides, and never roll back.
     let guard = match found.control_of {
         Some(_) => String::new(),
         None => format!(
@@ -149,12 +149,11 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
     )
 }
 
-fn write_distances(out: &mut dyn Write, distances: &Distances, control: bool) -> io::Result<()> {
+fn write_distances(out: &mut dyn Write, distances: &Distances) -> io::Result<()> {
     let Distances { shortest, atoms, pairs } = distances;
     let pair = atoms.map_or(String::new(), |[i, j]| format!(" (atoms {i} and {j})"));
-    let exempt = if control { "; no limit for control frames" } else { "" };
-    line(out, "guard", &format!("shortest distance {} Å{pair}{exempt}", decimals(*shortest, 3)))?;
-    for PairDistance { pair, shortest, seed_structure, limit } in pairs.iter().filter(|_| !control) {
+    line(out, "guard", &format!("shortest distance {} Å{pair}", decimals(*shortest, 3)))?;
+    for PairDistance { pair, shortest, seed_structure, limit } in pairs {
         let Some(limit) = limit else { continue };
         let position = if shortest < limit { "below" } else { "at least" };
         let seed = decimals(*seed_structure, 3);

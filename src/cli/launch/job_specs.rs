@@ -12,6 +12,7 @@ use super::{FOLDER, Launch, absolute};
 use crate::atomic_file::cannot_write;
 use crate::campaign::Campaign;
 use crate::exit_status::Failure;
+use crate::runtime::reference_check;
 
 /// The file in the campaign's directory to which the orchestrator announces its endpoint.
 const ENDPOINT: &str = "endpoint";
@@ -160,6 +161,8 @@ struct Commands<'a> {
     directory: String,
     endpoint: String,
     store: Option<&'a str>,
+    /// With `--accept-check`: identity of the check that is accepted.
+    accepted_check: Option<String>,
 }
 
 impl<'a> Commands<'a> {
@@ -171,6 +174,8 @@ impl<'a> Commands<'a> {
             directory: text(directory)?,
             endpoint: text(&directory.join(ENDPOINT))?,
             store: campaign.config.run.store.as_deref(),
+            // The job may be requeued after the configuration has changed, with differences that nobody has seen.
+            accepted_check: launch.accept_check.then(|| reference_check::identity(campaign)).transpose()?,
         })
     }
 
@@ -184,6 +189,8 @@ impl<'a> Commands<'a> {
         if self.launch.adopt {
             words.push("--adopt");
         }
+        let accepted = self.accepted_check.as_ref().map(|identity| format!("--accept-check={identity}"));
+        words.extend(accepted.as_deref());
         let tls = self.certificates("orchestrator")?;
         if wanted.agents > 0 {
             let endpoint = if tls.is_some() { "tcp/0.0.0.0:0" } else { "tcp/127.0.0.1:0" };

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use calm::CollectionRule;
 use calm::forgetting::ElementForgetting;
 use serde_json::Value;
+use store::records::LEFT_OUT;
 
 use super::super::report_data::ReportData;
 use super::super::style::grouped;
@@ -31,6 +32,9 @@ pub fn summary(data: &ReportData) -> Table {
         format!("{} seen, {} accepted", grouped(candidates.seen), grouped(candidates.accepted)),
     );
     row("control frames", grouped(candidates.control));
+    if let Some(left_out) = data.values.get(LEFT_OUT).and_then(Value::as_u64) {
+        row("left out (not gradable, or control frames with atoms too close)", grouped(left_out));
+    }
     let labels = &status.labels;
     row(
         "label jobs",

@@ -52,7 +52,7 @@ function about({ kind, structure, found, file, frame, same_structure: same, same
     ["energy of the potential", found && `${decimals(found.energy / atoms, 4, "eV")} per atom`],
     ["control of", found?.control_of != null && element("span", {}, `walk ${found.control_of}`, found.partner && [": ", link(found.partner)])],
     ["shortest distance", near?.shortest && `${decimals(near.shortest, 3, "Å")} (atoms ${near.atoms.join(" and ")})` +
-      (kind === "control" ? "" : near.pairs.map(({ pair, limit }) => limit == null ? "" : `; the selector's guard requires ${decimals(limit, 3, "Å")} of ${pair}`).join(""))],
+      near.pairs.map(({ pair, limit }) => limit == null ? "" : `; the selector's guard requires ${decimals(limit, 3, "Å")} of ${pair}`).join("")],
     ["imported from", file && `${file}, frame ${frame}`],
     ["same structure", (same.length > 0 || imported) && element("span", {}, same.map((named) => [link(named), " "]).flat(),
       imported && element("a", { href: `#candidate/import-${imported}` }, `import-${imported}`))],

@@ -59,6 +59,7 @@ function summary(status) {
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
       `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
       declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`,
+      candidates.left_out > 0 && `${whole(candidates.left_out)} left out (could not be graded, or control frames with atoms too close)`,
       status.shared_structures > 0 && `${whole(status.shared_structures)} of them identical to structures of their biased walks`),
     tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} queued, ${whole(labels.leased)} leased`,
       `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${

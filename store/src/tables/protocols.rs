@@ -87,6 +87,13 @@ impl Store {
         note.fetch_optional(&self.database).await
     }
 
+    /// Metadata whose names begin with `prefix`: names and values.
+    pub async fn metadata_below(&self, prefix: &str) -> Result<Vec<(String, String)>> {
+        let sql =
+            "SELECT substr(key, 6), value FROM campaign WHERE substr(key, 1, length($1)) = $1 ORDER BY key";
+        query(sql).bind(format!("note/{prefix}")).fetch_all(&self.database).await
+    }
+
     /// Stores metadata for other processes.
     pub async fn set_metadata(&self, name: &str, note: &str) -> Result<()> {
         if self.metadata(name).await?.as_deref() == Some(note) {

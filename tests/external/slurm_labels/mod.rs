@@ -6,3 +6,4 @@ mod ends;
 mod found_again;
 mod full_queue;
 mod jobs;
+mod reference_check;

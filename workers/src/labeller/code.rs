@@ -397,6 +397,14 @@ impl CodeMethod {
         self.current().take();
     }
 
+    /// Ends a calculation that was recorded in this form, and removes what is left of it.
+    pub(super) async fn give_up(&self, calculation: &str) -> Result<(), StoreError> {
+        match CalculationHandle::parse(calculation) {
+            Some(handle) => handle.clear(&self.slurm).await,
+            None => Ok(()),
+        }
+    }
+
     /// Ends the current calculation and removes what is left of it.
     pub(super) async fn cancel(&self) -> Result<(), StoreError> {
         let handle = self.current().as_ref().map(|current| current.handle.clone());

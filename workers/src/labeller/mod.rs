@@ -53,7 +53,7 @@ pub use guard::{GUARD, LabelGuard};
 pub use heartbeat::{ExitPolicy, serve};
 pub use label_attempt::SingleLabel;
 pub use method::Method;
-pub use recorded_label::{LabelOutcome, RecordedLabel};
+pub use recorded_label::{LabelOutcome, RecordedLabel, give_up_others};
 pub use reference::ReferenceMethod;
 pub use retry::retry_until_written;
 pub use shutdown::Shutdown;

@@ -64,6 +64,35 @@ pub(super) struct LabelProgress {
     outcome: Option<LabelOutcome>,
 }
 
+/// Ends the calculations of labels whose keys begin with `prefix` and are not among `keys`: nobody wants them any more. What
+/// cannot be ended now is tried again by the next call.
+///
+/// # Errors
+/// Errors of the database.
+pub async fn give_up_others(
+    store: &Store,
+    method: &Method,
+    prefix: &str,
+    keys: &[String],
+) -> Result<(), StoreError> {
+    let Method::Code(method) = method else { return Ok(()) };
+    for (key, text) in store.metadata_below(prefix).await? {
+        if keys.contains(&key) {
+            continue;
+        }
+        let progress = LabelProgress::parse(&key, &text)?;
+        let Some(calculation) = &progress.calculation else { continue };
+        match method.give_up(calculation).await {
+            Ok(()) => {
+                let progress = LabelProgress { calculation: None, ..progress };
+                store.set_metadata(&key, &progress.to_text()).await?;
+            }
+            Err(error) => tracing::warn!("cannot end a calculation that is not wanted any more: {error}"),
+        }
+    }
+    Ok(())
+}
+
 impl RecordedLabel<'_> {
     /// The stored label, if it was made.
     ///
@@ -164,8 +193,7 @@ impl RecordedLabel<'_> {
 
     async fn progress(&self, store: &Store) -> Result<LabelProgress, StoreError> {
         let text = store.metadata(self.key).await?;
-        let progress = text.map(|text| serde_json::from_str(&text)).transpose();
-        Ok(progress.map_err(|error| StoreError::damaged(self.key, error))?.unwrap_or_default())
+        Ok(text.map(|text| LabelProgress::parse(self.key, &text)).transpose()?.unwrap_or_default())
     }
 
     async fn write(
@@ -174,13 +202,20 @@ impl RecordedLabel<'_> {
         progress: &LabelProgress,
         stop: &CancellationToken,
     ) -> Result<(), StoreError> {
-        let text =
-            serde_json::to_string(progress).expect("validated numbers are finite, so they become JSON");
+        let text = progress.to_text();
         retry_until_written(stop, || store.set_metadata(self.key, &text)).await
     }
 }
 
 impl LabelProgress {
+    fn parse(key: &str, text: &str) -> Result<Self, StoreError> {
+        serde_json::from_str(text).map_err(|error| StoreError::damaged(key, error))
+    }
+
+    fn to_text(&self) -> String {
+        serde_json::to_string(self).expect("validated numbers are finite, so they become JSON")
+    }
+
     /// Adds the result of an attempt, whose calculation is recorded as `calculation`.
     fn add(&mut self, result: Result<Results, Failure>, calculation: Option<String>, attempts: u32) {
         self.calculation = None;
