@@ -30,6 +30,7 @@ mod house;
 mod interruption;
 mod label;
 mod log;
+mod lower_states;
 mod metrics;
 mod mutations;
 mod notify;

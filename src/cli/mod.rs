@@ -17,6 +17,7 @@ mod label;
 mod label_file;
 mod labeller;
 mod launch;
+mod lower_states;
 mod md;
 mod queue;
 mod relabel;
@@ -69,6 +70,7 @@ enum Command {
     Queue(queue::Queue),
     Relabel(relabel::Relabel),
     Exclude(exclude::Exclude),
+    LowerStates(lower_states::LowerStates),
     Walks(walks::Walks),
     Explain(explain::Explain),
     Export(export::Export),
@@ -107,6 +109,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, Failure> {
         Command::Queue(command) => command.run(),
         Command::Relabel(command) => command.run(),
         Command::Exclude(command) => command.run(),
+        Command::LowerStates(command) => command.run(),
         Command::Walks(command) => command.run(),
         Command::Explain(command) => command.run(),
         Command::Export(command) => command.run(),

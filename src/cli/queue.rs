@@ -9,6 +9,7 @@ use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_millisecon
 
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
+use crate::wording;
 
 /// List, show, drop, retry or prioritise structures in the label queue
 ///
@@ -238,9 +239,12 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
     }
     writeln!(out, "  atoms     {atoms}, {formula}")?;
     writeln!(out, "  γ_max     {} (original mixture)", decimals(*original_gamma, 3))?;
-    for (status, energy) in &details.energies {
+    for ((status, energy), adjustments) in details.energies.iter().zip(&details.retry_adjustments) {
         let status = format!("{status:?}").to_lowercase();
-        writeln!(out, "  {status:<9} energy {energy:.6} eV, {:.6} eV/atom", energy / f64::from(*atoms))?;
+        let per_atom = energy / f64::from(*atoms);
+        let adjustments = wording::labels::retry_adjustments(adjustments);
+        let adjustments = adjustments.map_or(String::new(), |text| format!(", {text}"));
+        writeln!(out, "  {status:<9} energy {energy:.6} eV, {per_atom:.6} eV/atom{adjustments}")?;
     }
     writeln!(
         out,

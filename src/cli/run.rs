@@ -308,6 +308,7 @@ async fn open_store(
         log_and_print(format_args!("supercells: {supercells}"));
     }
     store.set_budget(&campaign.config.budget()).await?;
+    store.set_lower_state_rule(&campaign.config.label.lower_state_rule()).await?;
     store.set_grade_files(&campaign.grade_files()).await?;
     write_metadata(campaign, &store).await?;
     // Last: labellers that wait for the campaign start as soon as it has a protocol.

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 53] = [
+pub(super) const CHANGEABLE: [&str; 55] = [
     "campaign.control_share",
     "seed_structures",
     "collect.max_per_walk",
@@ -21,6 +21,8 @@ pub(super) const CHANGEABLE: [&str; 53] = [
     "label.max_stress",
     "label.max_energy_per_atom",
     "label.max_energy_difference_per_atom",
+    "label.min_state_difference",
+    "label.on_lower_state",
     "label.cores",
     "label.time_limit",
     "label.memory",

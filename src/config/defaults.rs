@@ -5,6 +5,7 @@ use std::num::{NonZeroU32, NonZeroU64};
 use calm::rules::{Fraction, Positive};
 use md::{LangevinSettings, ThermostatSettings};
 use orchestrator::selector::UpdateProtocol;
+use store::LowerStateRule;
 use workers::labeller::LabelBounds;
 
 use crate::duration::Duration;
@@ -104,6 +105,10 @@ pub fn max_energy_per_atom() -> Positive {
 
 pub fn max_energy_difference_per_atom() -> Positive {
     positive(LabelBounds::default().max_energy_difference_per_atom)
+}
+
+pub fn min_state_difference() -> Positive {
+    positive(LowerStateRule::default().min_difference)
 }
 
 pub fn queue_limit() -> NonZeroU32 {

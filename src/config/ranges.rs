@@ -66,7 +66,7 @@ const fn range(
 }
 
 /// All of them, by table.
-pub static RANGES: [Range; 89] = [
+pub static RANGES: [Range; 90] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -117,6 +117,7 @@ pub static RANGES: [Range; 89] = [
         [0.1, 1e4],
         "it is that of an atom, in eV",
     ),
+    range("label.min_state_difference", "eV/atom", [0.0, 1e3], [1e-5, 0.1], PER_ATOM),
     range("label.cores", "", [0.0, 4096.0], [1.0, 2048.0], ""),
     range("label.time_limit", TIME, [1.0, 30.0 * DAY], [10.0, 7.0 * DAY], ""),
     range("label.memory", "GB", [0.0, 1e6], [0.1, 1e4], "it is in GB"),

@@ -14,6 +14,7 @@ use potentials::ZblWindows;
 use potentials::grace::Precision;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use store::LowerStateRule;
 use toml::Spanned;
 use workers::labeller::{BatchSystem, ExecutionSettings, KeepDirectories, LabelBounds, LabelGuard};
 
@@ -257,6 +258,12 @@ pub struct LabelSection {
     /// Largest difference from the potential's energy that a label may have, eV/atom.
     #[serde(default = "defaults::max_energy_difference_per_atom")]
     pub max_energy_difference_per_atom: Positive,
+    /// Difference in energy above which two results for a structure are different magnetic states, eV/atom.
+    #[serde(default = "defaults::min_state_difference")]
+    pub min_state_difference: Positive,
+    /// What to do when a result has a lower energy than the label by more than that: propose it, or make it the label.
+    #[serde(default)]
+    pub on_lower_state: OnLowerState,
     /// Number of cores of one calculation.
     #[serde(default = "defaults::cores")]
     pub cores: NonZeroU32,
@@ -320,6 +327,17 @@ pub enum QueueFull {
     Raise,
 }
 
+/// What happens when a result for a structure is a lower state than its label.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnLowerState {
+    /// It is proposed; the user decides.
+    #[default]
+    Propose,
+    /// It becomes the label.
+    Supersede,
+}
+
 /// `[budget]`
 #[derive(Clone, Debug, Default, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -381,6 +399,15 @@ impl LabelSection {
             max_energy_per_atom: self.max_energy_per_atom.get(),
             max_energy_difference_per_atom: self.max_energy_difference_per_atom.get(),
         }
+    }
+
+    /// The rule for two states of a structure that the store applies.
+    pub fn lower_state_rule(&self) -> LowerStateRule {
+        let on_lower_state = match self.on_lower_state {
+            OnLowerState::Propose => store::OnLowerState::Propose,
+            OnLowerState::Supersede => store::OnLowerState::Supersede,
+        };
+        LowerStateRule { min_difference: self.min_state_difference.get(), on_lower_state }
     }
 
     /// How programs that calculate labels are run.

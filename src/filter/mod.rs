@@ -35,6 +35,8 @@ pub struct StructureProperties<'a> {
     pub energy: Option<f64>,
     /// Largest force of the label, eV/Å.
     pub max_force: Option<f64>,
+    /// Names of the retry adjustments with which the label was made.
+    pub retry_adjustments: Option<&'a [String]>,
     /// The element of each atom. Empty if unknown.
     pub species: &'a [Species],
     /// `biased`, `control` or `imported`.
@@ -105,7 +107,9 @@ names! {
 
 names! {
     /// Text properties.
-    TextField { Element "element", Kind "kind", Seed "seed", Group "group" }
+    TextField {
+        Element "element", Kind "kind", Seed "seed", Group "group", RetryAdjustment "retry_adjustment"
+    }
 }
 
 impl Filter {
@@ -181,7 +185,7 @@ impl StructureProperties<'_> {
         }
     }
 
-    /// Whether the text equals `value`. An element matches if any atom has it.
+    /// Whether the text equals `value`. An element matches if any atom has it, a retry adjustment if it is one of them.
     fn is_text(&self, field: TextField, value: &str) -> Option<bool> {
         match field {
             TextField::Element if self.species.is_empty() => None,
@@ -189,6 +193,9 @@ impl StructureProperties<'_> {
             TextField::Kind => Some(self.kind == value),
             TextField::Group => self.conditions.map(|conditions| conditions.group == value),
             TextField::Seed => self.seed.map(|seed| seed == value),
+            TextField::RetryAdjustment => {
+                self.retry_adjustments.map(|names| names.iter().any(|name| name == value))
+            }
         }
     }
 }

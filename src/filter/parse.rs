@@ -1,6 +1,7 @@
 //! Parses filters by recursive descent: `or` of `and`s of comparisons, `not` and parentheses.
 
 use atoms::Species;
+use dft::RetryAdjustment;
 
 use super::{Comparison, Filter, NumberField, TextField};
 use crate::config::nearest;
@@ -238,6 +239,11 @@ impl Parser {
             TextField::Kind if !KINDS.contains(&text.as_str()) => {
                 let kinds = KINDS.join(", ").replace(", imported", " or imported");
                 return Err(self.error(format!("{kinds}{}", hint(&text, KINDS.into_iter()))));
+            }
+            TextField::RetryAdjustment if RetryAdjustment::ALL.iter().all(|known| known.name() != text) => {
+                let names = RetryAdjustment::ALL.map(RetryAdjustment::name);
+                let hint = hint(&text, names.into_iter());
+                return Err(self.error(format!("one of {}{hint}", names.join(", "))));
             }
             _ => {}
         }

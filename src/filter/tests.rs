@@ -1,3 +1,5 @@
+use std::sync::LazyLock;
+
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 
@@ -5,11 +7,14 @@ use super::*;
 
 fn properties() -> StructureProperties<'static> {
     static SPECIES: [Species; 0] = [];
+    static RETRY_ADJUSTMENTS: LazyLock<[String; 2]> =
+        LazyLock::new(|| ["more_steps", "other_moments"].map(str::to_owned));
     StructureProperties {
         gamma: Some(2.5),
         step: Some(300),
         kind: "biased",
         seed: Some("fcc 100"),
+        retry_adjustments: Some(&*RETRY_ADJUSTMENTS),
         species: &SPECIES,
         ..StructureProperties::default()
     }
@@ -40,6 +45,9 @@ fn filters_are_evaluated() {
         ("seed = 'fcc 100' AND kind != control", true),
         ("energy_per_atom = -2", true),
         ("energy != -6", false),
+        ("retry_adjustment = other_moments", true),
+        ("retry_adjustment = more_time", false),
+        ("retry_adjustment != more_steps", false),
         // A comparison with a missing property is false.
         ("walk = 0 or walk != 0", false),
         ("not walk = 0", true),
@@ -67,6 +75,7 @@ fn errors_have_positions() {
         ("element > Mo", 9, "'>'", "= or != after element"),
         ("element = Xx", 11, "'Xx'", "the symbol of an element"),
         ("kind = biassed", 8, "'biassed'", "biased, control or imported"),
+        ("retry_adjustment = moments", 20, "'moments'", "other_moments"),
         ("seed = 'fcc", 8, "an unterminated text", "a closing '"),
         ("γ > 2", 1, "'γ'", "one of gamma,"),
         ("gamma > 2 && step = 1", 11, "'&'", "a name"),

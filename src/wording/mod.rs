@@ -4,6 +4,7 @@ pub mod budget;
 pub mod cost;
 pub mod disk;
 pub mod energies;
+pub mod labels;
 pub mod reference_check;
 pub mod unlabelled;
 pub mod walk_ends;

@@ -266,8 +266,8 @@ pub enum StoreError {
         /// The states that permit it.
         allowed: &'static str,
     },
-    /// The structure has no label to exclude or include.
-    #[error("{id} has no label to exclude: {why}")]
+    /// The structure has no label to change.
+    #[error("{id} has no label: {why}")]
     NoLabel {
         /// The candidate or import.
         id: String,

@@ -1,5 +1,7 @@
 //! Views of the label queue and of labels.
 
+use std::fmt;
+
 use serde::Serialize;
 
 use crate::database::{FromRow, Row, from_columns};
@@ -215,6 +217,8 @@ pub struct JobDetails {
     pub attempts_made: Vec<Attempt>,
     /// Energies of its structure's labels and checks, oldest first, eV.
     pub energies: Vec<(LabelStatus, f64)>,
+    /// Names of the retry adjustments with which each of them was computed.
+    pub retry_adjustments: Vec<Vec<String>>,
 }
 
 /// Status of a stored result.
@@ -225,7 +229,7 @@ pub enum LabelStatus {
     Label,
     /// A further result, kept for comparison.
     Check,
-    /// The label until a requested new label replaced it.
+    /// The label until a requested new label, or a lower state, replaced it.
     Superseded,
     /// Taken out of the data set by hand; otherwise it would be the label.
     Excluded,
@@ -267,6 +271,15 @@ pub enum LabelSource {
     },
 }
 
+impl fmt::Display for LabelSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Attempt { job, attempt } => write!(f, "attempt {attempt} of job {job}"),
+            Self::Import { file, frame } => write!(f, "{file}, frame {frame}"),
+        }
+    }
+}
+
 /// A label with its history.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelRecord {
@@ -287,8 +300,8 @@ pub struct LabelRecord {
 /// How a label was superseded.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Supersession {
-    /// When the new label was stored, ms since 1970.
+    /// When another label replaced it, ms since 1970.
     pub time: i64,
-    /// Why it was requested.
+    /// Why: as the new label was requested, or that it is of a lower state.
     pub reason: String,
 }

@@ -22,6 +22,7 @@ mod jobs;
 mod listing;
 mod location;
 mod lock;
+mod lower_states;
 mod migrations;
 mod numbers;
 mod outcomes;
@@ -57,6 +58,7 @@ pub use jobs::{
 pub use listing::{ListCursor, ListOrder, ListedCandidate};
 pub use location::{Location, ServerUrl};
 pub use lock::CampaignLock;
+pub use lower_states::{LowerState, LowerStateChange, LowerStateRule, OnLowerState, StateResult};
 pub use numbers::NumbersError;
 pub use outcomes::{
     FailureCount, FinishedCandidate, LabelCost, LabelUsage, LabelledEnergies, NearDuplicate, PendingJobs,

@@ -68,4 +68,6 @@ pub struct ListedCandidate {
     pub energy: Option<f64>,
     /// Largest force of that label, eV/Å.
     pub max_force: Option<f64>,
+    /// Names of the retry adjustments with which it was made.
+    pub retry_adjustments: Option<Vec<String>>,
 }

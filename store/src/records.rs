@@ -261,7 +261,10 @@ impl Label {
     }
 }
 
-/// Results of a label besides energy, forces and stress.
+/// Name of the retry adjustment that starts a calculation from other magnetic moments.
+pub const OTHER_MOMENTS: &str = "other_moments";
+
+/// Results of a label besides energy, forces and stress, and how its calculation was adjusted.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct LabelDetails {
@@ -277,6 +280,18 @@ pub struct LabelDetails {
     /// Number of electronic (SCF) steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub electronic_steps: Option<u32>,
+    /// Names of the retry adjustments with which its calculation ran, because earlier ones had failed. Empty for imported
+    /// labels and for those of early versions.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub retry_adjustments: Vec<String>,
+}
+
+impl LabelDetails {
+    /// Whether the calculation started from other magnetic moments than the protocol's, and may therefore have found
+    /// another magnetic state.
+    pub fn has_changed_moments(&self) -> bool {
+        self.retry_adjustments.iter().any(|name| name == OTHER_MOMENTS)
+    }
 }
 
 /// The settings that make labels comparable, and their hash.

@@ -96,6 +96,8 @@ pub struct Labels {
     pub failed_again: u64,
     /// Labels excluded from the data set by hand. Their jobs in this campaign count as labelled.
     pub excluded: u64,
+    /// Structures whose label is not the lowest known state ([`crate::Store::lower_states`]).
+    pub lower_states: u64,
 }
 
 /// Where a walk stands.

@@ -350,6 +350,7 @@ async fn a_database_of_an_earlier_version_gets_checksums() {
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
     let mut sql = "DROP TABLE walk_conditions; DROP TRIGGER label_has_checksum; DROP INDEX label_excluded;
+        DROP INDEX label_other;
         ALTER TABLE label DROP COLUMN excluded; ALTER TABLE label DROP COLUMN exclusion; "
         .to_owned();
     for table in [

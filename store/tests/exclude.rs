@@ -121,7 +121,7 @@ async fn either_all_named_structures_are_excluded_or_none() {
     {
         let ids = [candidates[0].clone(), wrong.clone()];
         let error = store.exclude(&ids, "bad", 1).await.unwrap_err().to_string();
-        assert_eq!(error, format!("{wrong} has no label to exclude: {why}"));
+        assert_eq!(error, format!("{wrong} has no label: {why}"));
     }
     for wrong in ["99.0.1", "import-1", "nonsense"] {
         let ids = [candidates[0].clone(), wrong.to_owned()];

@@ -11,6 +11,7 @@ mod crash;
 mod damage;
 mod exclude;
 mod file;
+mod lower_states;
 mod migration;
 mod outcomes;
 mod processes;

@@ -419,6 +419,13 @@ async fn the_cost_of_a_calculation_is_counted_once() {
         magnetic_moments: Some(vec![1.5, -1.5]),
         magnetisation: Some(0.0),
         electronic_steps: Some(12),
+        // They are those of the calculation.
+        retry_adjustments: made
+            .remedies
+            .iter()
+            .flat_map(|names| names.split(','))
+            .map(str::to_owned)
+            .collect(),
     };
     let label = Label { details, ..label(-3.0) };
     store.complete(&second, &label, 5000).await.unwrap();

@@ -7,7 +7,7 @@ use atoms::Vec3;
 use atoms::cell::{norm, sub};
 use serde::Serialize;
 use store::{
-    Exclusion, JobDetails, LabelDetails, LabelRecord, LabelSource, LabelStatus, Operation, Store, StoreError,
+    Exclusion, JobDetails, LabelDetails, LabelRecord, LabelStatus, Operation, Store, StoreError,
     StructureLabel, Supersession,
 };
 use wire::{CandidateView, ContentHash};
@@ -145,7 +145,7 @@ impl CandidateLabel {
             protocol: protocol.name,
             protocol_hash: protocol.hash.to_string(),
             standing,
-            source: describe_source(&source),
+            source: source.to_string(),
             received,
             superseded,
             excluded,
@@ -156,13 +156,6 @@ impl CandidateLabel {
             model,
             details: label.details,
         }
-    }
-}
-
-fn describe_source(source: &LabelSource) -> String {
-    match source {
-        LabelSource::Attempt { job, attempt } => format!("attempt {attempt} of job {job}"),
-        LabelSource::Import { file, frame } => format!("{file}, frame {frame}"),
     }
 }
 

@@ -7,6 +7,7 @@ use store::{Attempt, Exclusion, Job, Supersession, unix_milliseconds};
 
 use super::line;
 use crate::output::count;
+use crate::wording;
 
 /// Lines printed from the end of a log.
 const LOG_LINES: usize = 10;
@@ -83,6 +84,12 @@ fn write_label(out: &mut dyn Write, label: &CandidateLabel, atoms: usize) -> io:
         ),
     )?;
     line(out, "", &format!("protocol '{protocol}' ({}), from {source}", &protocol_hash[..16]))?;
+    if let Some(moment) = label.details.magnetisation {
+        line(out, "", &format!("magnetisation {moment:.4} μ_B"))?;
+    }
+    if let Some(adjustments) = wording::labels::retry_adjustments(&label.details.retry_adjustments) {
+        line(out, "", &adjustments)?;
+    }
     if let Some(Exclusion { time, reason }) = &label.excluded {
         line(
             out,

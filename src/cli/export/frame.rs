@@ -17,6 +17,7 @@ pub fn facts<'a>(
     let of_label = StructureProperties {
         energy: Some(row.label.energy),
         max_force: Some(row.label.max_force()),
+        retry_adjustments: Some(&row.label.details.retry_adjustments),
         species: &row.structure.species,
         kind: "imported",
         ..StructureProperties::default()
@@ -66,6 +67,9 @@ pub fn frame(
         if let Some(number) = number {
             info(key, number.into());
         }
+    }
+    if !details.retry_adjustments.is_empty() {
+        info("retry_adjustments", details.retry_adjustments.join(",").into());
     }
     info("campaign", campaign.into());
     info("protocol", row.protocol_name.into());

@@ -52,7 +52,8 @@ pub struct Export {
     /// Combine comparisons with and, or, not and parentheses. Numbers (= != < <= > >=): gamma, gamma_nbr (largest of the
     /// structure, original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version, atoms, energy (eV, label),
     /// energy_per_atom (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), kind (biased,
-    /// control or imported), seed (name of the seed structure, in quotes if it contains spaces).
+    /// control or imported), seed (name of the seed structure, in quotes if it contains spaces), retry_adjustment (any of those
+    /// with which the label was computed after failures, such as other_moments).
     #[arg(long = "where", value_name = "FILTER")]
     condition: Option<Filter>,
     /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test

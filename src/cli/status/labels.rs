@@ -18,6 +18,14 @@ pub fn write(out: &mut dyn Write, queue: &LabelQueue, page: &Page, status: &Stat
     if let Some(relabelling) = describe_relabelling(&status.labels) {
         page.titled(out, "", &relabelling)?;
     }
+    if status.labels.lower_states > 0 {
+        let structures = count(status.labels.lower_states, "structure");
+        page.titled(
+            out,
+            "",
+            &format!("lower magnetic states are known of {structures} (see calmwalk lower-states)"),
+        )?;
+    }
     if queue.by_protocol.len() > 1 {
         let protocols: Vec<_> = queue.by_protocol.iter().map(describe_protocol).collect();
         page.titled(out, "protocols", &protocols.join("; "))?;

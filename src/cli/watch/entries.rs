@@ -21,9 +21,18 @@ pub const DECISIONS: [&str; 8] =
 
 /// Quantities that are not available in a pane: of walks, of label jobs, of decisions.
 pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
-    &["gamma_nbr", "mixture_version", "atoms", "energy", "energy_per_atom", "max_force", "element"],
-    &["mixture_version", "energy", "energy_per_atom", "max_force"],
-    &["energy", "energy_per_atom", "max_force"],
+    &[
+        "gamma_nbr",
+        "mixture_version",
+        "atoms",
+        "energy",
+        "energy_per_atom",
+        "max_force",
+        "retry_adjustment",
+        "element",
+    ],
+    &["mixture_version", "energy", "energy_per_atom", "max_force", "retry_adjustment"],
+    &["energy", "energy_per_atom", "max_force", "retry_adjustment"],
 ];
 
 /// The entries of walks that match the filter. `led`: whether an orchestrator runs.

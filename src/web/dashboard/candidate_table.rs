@@ -203,6 +203,7 @@ fn properties<'a>(
         mixture_version: Some(row.mixture_version),
         energy: row.energy,
         max_force: row.max_force,
+        retry_adjustments: row.retry_adjustments.as_deref(),
         species,
         kind: &row.origin,
         seed: Some(&row.seed_structure),

@@ -162,11 +162,20 @@ function energyError({ energy_error_per_atom: error, energy_offsets: offsets }) 
   return offsets.structures > 0 ? `not shown: too few labels for this composition; ${offsets.note}` : offsets.note;
 }
 
+/** With what the calculation ran after failures. */
+function adjustments({ retry_adjustments: names = [] }) {
+  if (names.length === 0) return null;
+  return names.join(", ") + (names.includes("other_moments") ? " (started from other magnetic moments)" : "");
+}
+
 function label(made) {
   const { model } = made;
   return facts([
     [made.standing, `protocol ${made.protocol}; ${made.source}; ${time(made.received)}`],
     ["excluded", made.excluded && `${made.excluded.reason}; ${time(made.excluded.time)}`],
+    ["superseded", made.superseded && `${made.superseded.reason}; ${time(made.superseded.time)}`],
+    ["retry adjustments", adjustments(made.details)],
+    ["magnetisation", made.details.magnetisation == null ? null : decimals(made.details.magnetisation, 4, "μ_B")],
     ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} per atom)`],
     ["largest force", decimals(made.max_force, 4, "eV/Å")],
     ["pressure", made.pressure == null ? null : digits(made.pressure, "eV/Å³")],

@@ -64,6 +64,7 @@ function summary(status) {
     tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} queued, ${whole(labels.leased)} leased`,
       `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${
         labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
+      labels.lower_states > 0 && `lower states known of ${whole(labels.lower_states)} structures (calmwalk lower-states)`,
       `${whole(status.labels_last_hour)} in the last hour`),
     tile("Mixture", `version ${whole(version)}`,
       training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",

@@ -23,7 +23,7 @@ use crate::migrations::{Step, migrator};
 use crate::tables::checksums;
 
 /// The newest migration.
-const SCHEMA: i64 = 11;
+const SCHEMA: i64 = 12;
 /// The first version whose rows have checksums.
 const FIRST_WITH_CHECKSUMS: i64 = 9;
 /// Maximum number of connections per process: one writer and some readers.
@@ -41,7 +41,7 @@ const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 pub const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The migrations in order.
-pub(crate) static STEPS: [Step; 10] = [
+pub(crate) static STEPS: [Step; 11] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -52,6 +52,7 @@ pub(crate) static STEPS: [Step; 10] = [
     (9, "checksums", include_str!("../../migrations/postgres/0009_checksums.sql")),
     (10, "exclude", include_str!("../../migrations/postgres/0010_exclude.sql")),
     (11, "walk conditions", include_str!("../../migrations/postgres/0011_walk_conditions.sql")),
+    (12, "lower states", include_str!("../../migrations/postgres/0012_lower_states.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

@@ -8,8 +8,8 @@ use crate::Store;
 use crate::check;
 use crate::records::{Campaign, Commit, ComponentRecord};
 use crate::tables::{
-    attempt_end, candidate_history, exclude, export, job_counts, listing, outcomes, queue, queue_admin,
-    recent, status, structures,
+    attempt_end, candidate_history, exclude, export, job_counts, listing, lower_states, outcomes, queue,
+    queue_admin, recent, status, structures,
 };
 
 /// The store in a directory, and its file.
@@ -60,6 +60,7 @@ async fn frequent_queries_use_indexes() {
         candidate_history::AFTER,
         structures::CURRENT,
         exclude::LABEL_STATUS,
+        lower_states::OF_STRUCTURE,
         listing::NEWEST,
         listing::OLDEST,
         listing::NEWEST_OF_FATE,
@@ -84,6 +85,10 @@ async fn frequent_queries_use_indexes() {
     }
     let by_structure = plan(&file, check::export::CANDIDATES).await;
     assert!(by_structure.contains("SEARCH candidate USING INDEX candidate_structure"), "{by_structure}");
+    for sql in [lower_states::ALL, lower_states::COUNT] {
+        let plan = plan(&file, sql).await;
+        assert!(plan.contains("SCAN other USING INDEX label_other"), "{plan}");
+    }
     for sql in [status::COUNTED_FATES, job_counts::COUNTED_STATES] {
         let plan = plan(&file, sql).await;
         assert!(plan.contains("COVERING INDEX") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");

@@ -74,7 +74,7 @@ const IMPORTED: &str = concat!(
 
 /// Manual changes are in the operations log, which does not grow with the candidates.
 const MANUAL_OPERATIONS: &str = "SELECT number, time, kind, detail FROM operation
-    WHERE kind IN ('drop', 'retry', 'prioritise', 'exclude', 'include') ORDER BY number";
+    WHERE kind IN ('drop', 'retry', 'prioritise', 'exclude', 'include', 'lower_state') ORDER BY number";
 
 from_columns!(CandidateRef { decision, candidate });
 
@@ -199,7 +199,9 @@ impl Store {
         for (number, time, kind, detail) in rows {
             let detail: serde_json::Value = serde_json::from_str(&detail)
                 .map_err(|error| StoreError::damaged("the operations log", error))?;
-            if detail["job"] == job {
+            // The campaign's rule makes lower states labels as well.
+            let is_by_rule = detail.get("by").is_some_and(|by| by != "user");
+            if detail["job"] == job && !is_by_rule {
                 operations.push(Operation { number, time, kind, detail });
             }
         }

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use serde_json::json;
 
 use super::logs::insert_operation;
+use super::structures;
 use crate::Store;
 use crate::database::{Transaction, from_columns, query};
 use crate::error::{Result, StoreError};
@@ -62,9 +63,9 @@ from_columns!(LabelStatusRow { protocol, standing, exclusion });
 from_columns!(ExcludedRow { id, protocol, excluded, exclusion });
 
 /// A structure named by the user.
-struct NamedStructure {
-    structure: i64,
-    id: String,
+pub(super) struct NamedStructure {
+    pub structure: i64,
+    pub id: String,
 }
 
 impl Store {
@@ -106,6 +107,20 @@ impl Store {
         reason: Option<&str>,
         now: i64,
     ) -> Result<Vec<ExclusionChange>> {
+        let named = self.named_structures(ids).await?;
+        let mut transaction = self.database.begin().await?;
+        let now = transaction.time(now).await?;
+        structures::lock(&mut transaction, named.iter().map(|named| named.structure)).await?;
+        let mut changes = Vec::new();
+        for named in named {
+            changes.push(change(&mut transaction, named, reason, now).await?);
+        }
+        transaction.commit().await?;
+        Ok(changes)
+    }
+
+    /// The structures with these names, each once.
+    pub(super) async fn named_structures(&self, ids: &[String]) -> Result<Vec<NamedStructure>> {
         let mut named: Vec<NamedStructure> = Vec::new();
         for id in ids {
             let found = self.named(id).await?;
@@ -113,21 +128,7 @@ impl Store {
                 named.push(found);
             }
         }
-        let mut transaction = self.database.begin().await?;
-        let now = transaction.time(now).await?;
-        // A fixed lock order, so that two of these commands do not deadlock.
-        let mut structures: Vec<_> = named.iter().map(|named| named.structure).collect();
-        structures.sort_unstable();
-        for structure in structures {
-            let sql = "SELECT atoms FROM structure WHERE number = $1";
-            let _: Option<i64> = query(sql).bind(structure).locked().fetch_optional(&mut transaction).await?;
-        }
-        let mut changes = Vec::new();
-        for named in named {
-            changes.push(change(&mut transaction, named, reason, now).await?);
-        }
-        transaction.commit().await?;
-        Ok(changes)
+        Ok(named)
     }
 
     /// The structure with that name.
@@ -160,12 +161,9 @@ async fn change(
 ) -> Result<ExclusionChange> {
     let labels: Vec<LabelStatusRow> =
         query(LABEL_STATUS).bind(structure).fetch_all(&mut *transaction).await?;
-    let job = query(JOB).bind(structure).fetch_optional(&mut *transaction).await?;
-    let job: Option<(i64, String)> = job;
+    let job = newest_job(transaction, structure).await?;
     if labels.is_empty() {
-        let why =
-            job.map_or("it has no label job".to_owned(), |(_, state)| format!("its label job is {state}"));
-        return Err(StoreError::NoLabel { id, why });
+        return Err(no_label(id, job));
     }
     let changed = match reason {
         Some(reason) => query(EXCLUDE).bind(structure).bind(now).bind(reason),
@@ -186,8 +184,33 @@ async fn change(
     Ok(ExclusionChange { id, protocols, changed, excluded })
 }
 
+async fn newest_job(transaction: &mut Transaction, structure: i64) -> Result<Option<(i64, String)>> {
+    query(JOB).bind(structure).fetch_optional(&mut *transaction).await
+}
+
+fn no_label(id: String, job: Option<(i64, String)>) -> StoreError {
+    let why = job.map_or("it has no label job".to_owned(), |(_, state)| format!("its label job is {state}"));
+    StoreError::NoLabel { id, why }
+}
+
+/// Checks that a structure has a label that counts.
+///
+/// # Errors
+/// [`StoreError::NoLabel`].
+pub(super) async fn check_has_label(transaction: &mut Transaction, structure: i64, id: &str) -> Result<()> {
+    let labels: Vec<LabelStatusRow> =
+        query(LABEL_STATUS).bind(structure).fetch_all(&mut *transaction).await?;
+    if labels.is_empty() {
+        return Err(no_label(id.to_owned(), newest_job(transaction, structure).await?));
+    }
+    match labels.iter().any(|label| label.standing == "label") {
+        true => Ok(()),
+        false => Err(StoreError::NoLabel { id: id.to_owned(), why: "its label is excluded".to_owned() }),
+    }
+}
+
 /// Whether the tables have the columns for exclusions; those of an earlier version do not.
-async fn has_exclusion_columns(transaction: &mut Transaction) -> Result<bool> {
+pub(super) async fn has_exclusion_columns(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_column("label", "exclusion").await
 }
 

@@ -1,9 +1,11 @@
 //! Labels: the first valid result is the label, later results are checks, and a requested new label supersedes the
-//! old one. Nothing is overwritten. An excluded label still makes later results checks.
+//! old one. If the campaign's rule says so, a result of a lower state supersedes a label too (`lower_states`). Nothing
+//! is overwritten. An excluded label still makes later results checks.
 
 use atoms::Vec3;
 
 use super::attempt_end::{end_attempt, job_row};
+use super::lower_states;
 use super::relabel::status_of_result;
 use crate::Store;
 use crate::checksum::{LABEL, Names};
@@ -58,8 +60,9 @@ impl Store {
     /// Delivers the result of a leased job. The first valid result for structure and protocol becomes the label,
     /// whether or not the lease is still held; later results are stored as checks. If a new label was requested
     /// ([`Store::relabel`]), the first result of an attempt that began after the request becomes the label and
-    /// supersedes the old one. A job that was dropped or superseded meanwhile stays so. Delivering the result of an
-    /// attempt twice changes nothing.
+    /// supersedes the old one. [`Store::set_lower_state_rule`] may prefer a lower state. A job that was dropped or
+    /// superseded meanwhile stays so. The label's details get the retry adjustments of its calculation
+    /// ([`Store::record_calculation`]). Delivering the result of an attempt twice changes nothing.
     ///
     /// # Errors
     /// [`StoreError::InvalidLabel`] for a wrong number of forces, or for numbers that are not finite.
@@ -82,7 +85,8 @@ impl Store {
             return Ok(if check { CompleteOutcome::KeptAsCheck } else { CompleteOutcome::Label });
         }
         let source = LabelSource::Attempt { job: lease.job, attempt: lease.attempt };
-        let status = add(&mut transaction, job.structure, job.protocol, label, &source, now).await?;
+        let label = with_retry_adjustments(&mut transaction, lease, label).await?;
+        let status = add(&mut transaction, job.structure, job.protocol, &label, &source, now).await?;
         let outcome = if status == LabelStatus::Label { "labelled" } else { "check" };
         let sql = "UPDATE attempt SET ended = $1, outcome = $2 WHERE job = $3 AND attempt = $4";
         let query = query(sql).bind(now).bind(outcome).bind(lease.job).bind(lease.attempt);
@@ -91,6 +95,22 @@ impl Store {
         transaction.commit().await?;
         Ok(if status == LabelStatus::Label { CompleteOutcome::Label } else { CompleteOutcome::KeptAsCheck })
     }
+}
+
+/// The label with the retry adjustments of its calculation.
+async fn with_retry_adjustments(
+    transaction: &mut Transaction,
+    lease: &Lease,
+    label: &Label,
+) -> Result<Label> {
+    let sql = "SELECT remedies FROM attempt WHERE job = $1 AND attempt = $2";
+    let names = query(sql).bind(lease.job).bind(lease.attempt);
+    let names: Option<Option<String>> = names.fetch_optional(&mut *transaction).await?;
+    let mut label = label.clone();
+    if let Some(names) = names.flatten() {
+        label.details.retry_adjustments = names.split(',').map(str::to_owned).collect();
+    }
+    Ok(label)
 }
 
 /// Checks that the label fits the structure. Locks the structure: until the end of the transaction, no other label
@@ -119,7 +139,8 @@ pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: 
     Ok(())
 }
 
-/// Adds a result: the label if there is none or a new one was requested, otherwise a check.
+/// Adds a result: the label if there is none or a new one was requested, otherwise a check. The campaign's rule may make the
+/// lower of two states the label instead. The structure must be locked.
 pub(super) async fn add(
     transaction: &mut Transaction,
     structure: i64,
@@ -139,7 +160,7 @@ pub(super) async fn add(
     let sql =
         "INSERT INTO label (structure, protocol, energy, forces, stress, job, attempt, file, frame, received, details,
                             checksum, standing)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)";
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13) RETURNING number";
     let row = vec![
         structure.into(),
         protocol.into(),
@@ -154,8 +175,9 @@ pub(super) async fn add(
         encode_details(&label.details).into(),
     ];
     let insert = query(sql).bind_all(LABEL.with_checksum(row)).bind(status.name());
-    insert.execute(&mut *transaction).await?;
-    Ok(status)
+    let number: i64 = insert.fetch_one(&mut *transaction).await?;
+    let applied = lower_states::apply_rule(transaction, structure, protocol, number, now).await?;
+    Ok(applied.unwrap_or(status))
 }
 
 /// Marks the structure's job as done, unless it was dropped or waits for another label.
@@ -176,11 +198,6 @@ pub(super) async fn finish_job(
 }
 
 impl LabelRow {
-    /// `None` for an unknown status.
-    pub(super) fn status_and_energy(&self) -> Option<(LabelStatus, f64)> {
-        Some((LabelStatus::named(&self.standing)?, self.energy))
-    }
-
     /// Forces, [n], eV/Å.
     pub(super) fn forces(self) -> Result<Vec<Vec3>> {
         decode_vectors(&self.forces)

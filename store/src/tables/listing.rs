@@ -39,6 +39,7 @@ impl FromRow for ListedCandidate {
             attempts: row.get("attempts")?,
             energy: label.as_ref().map(|label| label.energy),
             max_force: label.as_ref().map(Label::max_force),
+            retry_adjustments: label.map(|label| label.details.retry_adjustments),
         })
     }
 }

@@ -15,6 +15,7 @@ pub mod job_counts;
 pub mod labels;
 pub mod listing;
 pub mod logs;
+pub mod lower_states;
 mod near_duplicates;
 mod new_jobs;
 pub mod outcomes;

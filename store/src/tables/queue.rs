@@ -34,6 +34,10 @@ pub(crate) const HELD: &str = "SELECT number FROM job WHERE state = 'leased'
 /// Leases of exactly this holder, not of its parts.
 pub(crate) const HELD_BY: &str = "SELECT number, attempts FROM job WHERE state = 'leased' AND holder = $1";
 
+/// The adjustments with which an earlier attempt started a calculation, and their effect on its input.
+const STARTED_WITH: &str = "SELECT remedies, difference FROM attempt
+    WHERE job = $1 AND attempt < $2 AND calculation = $3 ORDER BY attempt LIMIT 1";
+
 /// A job that may be leased.
 struct NextJob {
     number: i64,
@@ -143,7 +147,8 @@ impl Store {
 
     /// Records what identifies a calculation (process, id in a batch system) and its properties, before it is
     /// started. The next holder of the job finds it in [`Lease::earlier_calculations`]. A calculation that an
-    /// earlier attempt started belongs to this attempt from now on: its core-seconds count here.
+    /// earlier attempt started belongs to this attempt from now on: its core-seconds count here, with the adjustments
+    /// with which it was started.
     pub async fn record_calculation(
         &self,
         lease: &Lease,
@@ -151,11 +156,15 @@ impl Store {
         made: &CalculationRecord,
     ) -> Result<()> {
         let mut transaction = self.database.begin().await?;
+        let started = query(STARTED_WITH).bind(lease.job).bind(lease.attempt).bind(calculation);
+        let started: Option<(Option<String>, Option<String>)> =
+            started.fetch_optional(&mut transaction).await?;
+        let (remedies, difference) = started.unwrap_or((made.remedies.clone(), made.difference.clone()));
         let sql =
             "UPDATE attempt SET calculation = $1, cores = $2, remedies = $3, difference = $4, atoms = $5,
                    electrons = $6, k_points = $7 WHERE job = $8 AND attempt = $9";
-        let record = query(sql).bind(calculation).bind(made.cores).bind(made.remedies.as_deref());
-        let record = record.bind(made.difference.as_deref()).bind(made.atoms);
+        let record = query(sql).bind(calculation).bind(made.cores).bind(remedies).bind(difference);
+        let record = record.bind(made.atoms);
         let record = record.bind(made.electrons).bind(made.k_points).bind(lease.job).bind(lease.attempt);
         record.execute(&mut transaction).await?;
         let sql = "UPDATE attempt SET core_seconds = 0 WHERE job = $1 AND attempt < $2 AND calculation = $3";

@@ -157,11 +157,16 @@ impl Store {
                    AND protocol = (SELECT protocol FROM job WHERE number = $2) ORDER BY number";
         let labels = query(sql).bind(row.structure).bind(job);
         let labels: Vec<LabelRow> = labels.fetch_all(&self.database).await?;
+        let results: Vec<_> = labels.into_iter().map(LabelRow::into_record).collect::<Result<_>>()?;
         let excluded = exclude::by_job(&mut self.database.begin_read().await?).await?;
         Ok(JobDetails {
             job: row.into_job(&excluded)?,
             attempts_made: attempts,
-            energies: labels.iter().filter_map(LabelRow::status_and_energy).collect(),
+            energies: results.iter().map(|result| (result.status, result.label.energy)).collect(),
+            retry_adjustments: results
+                .into_iter()
+                .map(|result| result.label.details.retry_adjustments)
+                .collect(),
         })
     }
 

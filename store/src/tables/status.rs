@@ -2,7 +2,9 @@
 
 use wire::WalkId;
 
-use super::{budget, exclude, job_counts, pauses, processes, relabel, walk_conditions, walk_progress};
+use super::{
+    budget, exclude, job_counts, lower_states, pauses, processes, relabel, walk_conditions, walk_progress,
+};
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
 use crate::checksum::joined;
@@ -54,6 +56,7 @@ impl Store {
         let states = job_counts::states(&mut transaction).await?;
         let asked = relabel::relabel_requests(&mut transaction).await?;
         let excluded = exclude::count(&mut transaction).await?;
+        let lower_states = lower_states::count(&mut transaction).await?;
         let oldest_lease = job_counts::oldest_lease(&mut transaction).await?;
         let labels_last_hour = job_counts::labels_in_last_hour(&mut transaction, now).await?;
         let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
@@ -77,7 +80,7 @@ impl Store {
             total = walk_progress::total(&mut transaction, now).await?;
         }
         transaction.commit().await?;
-        let labels = Labels { excluded, ..labels(&states, &asked) };
+        let labels = Labels { excluded, lower_states, ..labels(&states, &asked) };
         let time_used_up = limits.time_used_up(&used);
         set_budget_reason(&mut walks, time_used_up, &limits);
         for walk in &mut walks {
@@ -175,6 +178,7 @@ fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> Labels {
         again_in_vain: asked("labelled") + asked("failed"),
         failed_again: asked("failed"),
         excluded: 0,
+        lower_states: 0,
     }
 }
 

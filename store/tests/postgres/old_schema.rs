@@ -13,6 +13,7 @@ const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE candidate DROP COLUMN checksum, DROP COLUMN features_checksum, DROP COLUMN selector_checksum,
         DROP COLUMN original_checksum;
     ALTER TABLE component DROP COLUMN checksum; DROP INDEX label_excluded;
+    DROP INDEX label_other;
     ALTER TABLE label DROP COLUMN checksum, DROP COLUMN excluded, DROP COLUMN exclusion;
     ALTER TABLE walk DROP COLUMN checksum, DROP COLUMN checkpoint_checksum;
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;

@@ -441,6 +441,8 @@ fn label(results: &Results) -> Label {
             magnetic_moments: results.magnetic_moments.clone(),
             magnetisation: results.magnetisation,
             electronic_steps: results.electronic_steps,
+            // The store knows them.
+            retry_adjustments: Vec::new(),
         },
     }
 }

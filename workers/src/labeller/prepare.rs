@@ -46,8 +46,7 @@ pub(super) fn prepare(
     record.electrons = Some(size.electrons).filter(|electrons| electrons.is_finite());
     record.k_points = u32::try_from(size.k_points).ok();
     if !remedies.is_empty() {
-        let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
-        record.remedies = Some(names.join(","));
+        record.remedies = names_of_effective(code, structure, remedies, &input)?;
         record.difference = Some(input_diff(&code.input(structure, &BTreeSet::new())?, &input));
     }
     let twice = |remedy| if remedies.contains(&remedy) { 2.0 } else { 1.0 };
@@ -60,6 +59,22 @@ pub(super) fn prepare(
         memory_limit: memory.map(|bytes| bytes as u64),
         avoids_nodes: remedies.contains(&RetryAdjustment::OtherNode),
     })
+}
+
+/// Names of the adjustments, separated by commas. Other moments are left out where the input has none, since the
+/// calculation then starts as without them. Everything else acts outside the input as well.
+fn names_of_effective(
+    code: &dyn DftBackend,
+    structure: &Structure,
+    adjustments: &BTreeSet<RetryAdjustment>,
+    input: &Input,
+) -> Result<Option<String>, Failure> {
+    let mut effective = adjustments.clone();
+    if effective.remove(&RetryAdjustment::OtherMoments) && code.input(structure, &effective)? != *input {
+        effective = adjustments.clone();
+    }
+    let names: Vec<_> = effective.iter().map(|adjustment| adjustment.name()).collect();
+    Ok((!names.is_empty()).then(|| names.join(",")))
 }
 
 /// Writes the input into the directory of a calculation.
@@ -99,4 +114,65 @@ pub(super) fn read(
         Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode => exit.failure(),
         Exit::Code(_) | Exit::Signal(_) => failure,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use atoms::{Cell, Species};
+    use dft::{SetupError, Size};
+    use store::records::OTHER_MOMENTS;
+
+    use super::*;
+
+    /// A program whose input has a moment, or none.
+    struct Program {
+        moment: Option<f64>,
+    }
+
+    impl DftBackend for Program {
+        fn identity(&self) -> serde_json::Value {
+            serde_json::Value::Null
+        }
+
+        fn supports(&self, _: &BTreeSet<Species>) -> Result<(), SetupError> {
+            Ok(())
+        }
+
+        fn input(&self, _: &Structure, adjustments: &BTreeSet<RetryAdjustment>) -> Result<Input, Failure> {
+            let factor = if adjustments.contains(&RetryAdjustment::OtherMoments) { 0.5 } else { 1.0 };
+            let moment = self.moment.map(|moment| ("input".to_owned(), (factor * moment).to_string().into()));
+            Ok(Input { files: moment.into_iter().collect(), ..Input::default() })
+        }
+
+        fn read(&self, _: &Structure, _: &Path, _: Exit) -> Result<Results, Failure> {
+            Ok(Results::default())
+        }
+
+        fn size(&self, _: &Structure) -> Size {
+            Size::default()
+        }
+    }
+
+    #[test]
+    fn other_moments_are_recorded_where_they_change_the_input() {
+        assert_eq!(RetryAdjustment::OtherMoments.name(), OTHER_MOMENTS);
+        let structure = Structure {
+            species: vec!["Fe".parse().unwrap()],
+            positions: vec![[0.0; 3]],
+            cell: Cell::orthorhombic(3.0, 3.0, 3.0),
+            periodic: [true; 3],
+        };
+        let recorded = |moment: Option<f64>, adjustments: &[RetryAdjustment]| {
+            let adjustments = adjustments.iter().copied().collect();
+            let prepared =
+                prepare(&Program { moment }, &ExecutionSettings::default(), &structure, &adjustments);
+            prepared.unwrap().record.remedies
+        };
+        let both = [RetryAdjustment::MoreTime, RetryAdjustment::OtherMoments];
+        assert_eq!(recorded(Some(1.0), &both).as_deref(), Some("other_moments,more_time"));
+        assert_eq!(recorded(Some(0.0), &both).as_deref(), Some("more_time"));
+        assert_eq!(recorded(None, &both).as_deref(), Some("more_time"));
+        assert_eq!(recorded(None, &both[1..]), None);
+        assert_eq!(recorded(Some(1.0), &both[..1]).as_deref(), Some("more_time"));
+    }
 }

@@ -1,0 +1,131 @@
+//! `calmwalk lower-states`
+
+use std::io::{self, Write};
+
+use store::{LowerState, LowerStateChange, StateResult, Store, unix_milliseconds};
+
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::output::{Table, decimals, print, print_json, warn_if_unencrypted};
+
+/// List structures whose label is not the lowest known magnetic state, or make the lower states the labels
+///
+/// A calculation may converge to another magnetic state, most of all after a failure, when it starts from other initial
+/// moments. A structure is listed if another valid result by the same label protocol has a lower energy than its label, by more
+/// than label.min_state_difference. Excluded results do not count.
+///
+/// With IDs or --all, the lowest result becomes the label of each structure. The label before stays in the store as superseded,
+/// with date and reason. Works while the campaign runs. Changes either all given structures or none.
+#[derive(Debug, clap::Args)]
+pub struct LowerStates {
+    #[command(flatten)]
+    location: CampaignLocation,
+    /// Structures to change. Candidates: ids, unique prefixes of ids, or decision numbers; or imported structures, such as import-3
+    #[arg(value_name = "ID")]
+    ids: Vec<String>,
+    /// Change every listed structure
+    #[arg(long, conflicts_with = "ids")]
+    all: bool,
+    /// Remark, stored with the reason of the superseded labels; needs IDs or --all
+    #[arg(long, value_name = "TEXT")]
+    reason: Option<String>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+impl LowerStates {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        if self.all || !self.ids.is_empty() {
+            let changes = block_on(self.take())??;
+            if self.json {
+                print_json(&changes)?
+            } else {
+                print(|out| write_changes(out, &changes))?
+            }
+            return Ok(ExitStatus::Done);
+        }
+        if self.reason.is_some() {
+            let message = "--reason needs IDs or --all: without them, nothing is changed";
+            return Err(Failure::Input(message.to_owned()));
+        }
+        let states = block_on(self.read())??;
+        if self.json {
+            print_json(&states)?
+        } else {
+            print(|out| write_list(out, &states))?
+        }
+        Ok(ExitStatus::Done)
+    }
+
+    async fn read(&self) -> Result<Vec<LowerState>, Failure> {
+        let store = Store::open_read_only(&self.location.get()?).await?;
+        let states = store.lower_states().await?;
+        store.close().await;
+        Ok(states)
+    }
+
+    async fn take(&self) -> Result<Vec<LowerStateChange>, Failure> {
+        let location = self.location.get()?;
+        warn_if_unencrypted(&location);
+        let store = Store::open(&location).await?;
+        let ids = (!self.all).then_some(self.ids.as_slice());
+        let reason = self.reason.as_deref().map(str::trim).filter(|reason| !reason.is_empty());
+        let changes = store.take_lower_states(ids, reason, unix_milliseconds()).await?;
+        store.close().await;
+        Ok(changes)
+    }
+}
+
+fn write_list(out: &mut dyn Write, states: &[LowerState]) -> io::Result<()> {
+    if states.is_empty() {
+        return writeln!(out, "every label is the lowest known state of its structure");
+    }
+    let mut table = Table::new(&[
+        "id",
+        "result",
+        ">energy (eV/atom)",
+        ">difference",
+        ">magnetisation (μ_B)",
+        "initial moments",
+        "protocol",
+        "from",
+    ]);
+    for state in states {
+        let mut push = |id: &str, result: &str, difference: String, found: &StateResult| {
+            let moments = if found.changed_moments { "changed" } else { "as the protocol" };
+            table.push(vec![
+                id.to_owned(),
+                result.to_owned(),
+                format!("{:.6}", found.energy_per_atom),
+                difference,
+                decimals(found.magnetisation, 4),
+                moments.to_owned(),
+                state.protocol.clone(),
+                found.source.clone(),
+            ]);
+        };
+        push(&state.id, "label", String::new(), &state.label);
+        push("", "lower", format!("{:.6}", state.difference_per_atom), &state.lower);
+    }
+    table.write(out)
+}
+
+fn write_changes(out: &mut dyn Write, changes: &[LowerStateChange]) -> io::Result<()> {
+    if changes.is_empty() {
+        return writeln!(out, "every label is the lowest known state of its structure: nothing was changed");
+    }
+    for LowerStateChange { id, taken } in changes {
+        for LowerState { protocol, difference_per_atom, lower, .. } in taken {
+            let source = &lower.source;
+            writeln!(
+                out,
+                "{id}: label of '{protocol}' is now the result of {source}, lower by {:.6} eV/atom; the label before is superseded",
+                -difference_per_atom
+            )?;
+        }
+        if taken.is_empty() {
+            writeln!(out, "{id}: its label is the lowest known state; nothing was changed")?;
+        }
+    }
+    Ok(())
+}
