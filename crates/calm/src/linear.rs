@@ -127,6 +127,19 @@ pub(crate) fn solve_lower(factor: &Mat<f64>, right: &mut Mat<f64>) {
 /// # Errors
 /// A wrong length, an element that is not finite, or eigenvalues that do not converge.
 pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
+    pseudo_inverse_with_spectrum(matrix, dimension).map(|inverse| inverse.matrix)
+}
+
+/// A pseudo-inverse and the eigenvalues of the matrix, ascending.
+pub(crate) struct Inverse {
+    pub matrix: Vec<f64>,
+    pub eigenvalues: Vec<f64>,
+    /// How many of them it drops.
+    pub truncated: usize,
+}
+
+/// As [`pseudo_inverse`].
+pub(crate) fn pseudo_inverse_with_spectrum(matrix: &[f64], dimension: usize) -> Result<Inverse, LinearError> {
     check(matrix, dimension)?;
     let Eigen { values, vectors } = eigen(view(matrix, dimension, dimension))?;
     let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
@@ -135,7 +148,9 @@ pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, Line
         Some(&value) if kept(value) => vectors[(row, column)] / value,
         _ => 0.0,
     });
-    Ok(symmetrised(product(scaled.as_ref(), vectors.transpose()).as_ref()))
+    let matrix = symmetrised(product(scaled.as_ref(), vectors.transpose()).as_ref());
+    let truncated = values.iter().filter(|value| !kept(**value)).count();
+    Ok(Inverse { matrix, eigenvalues: values, truncated })
 }
 
 /// The regularised inverse (C + εI)⁺ of a covariance, ε = 10⁻⁶ (paper, Methods).
