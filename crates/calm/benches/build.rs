@@ -9,9 +9,7 @@
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-use calm::build::{
-    BuildSettings, BuiltComponent, CalibrationPass, ScatterPass, ShardClustering, components,
-};
+use calm::build::{BuildSettings, BuiltComponent, CalibrationPass, ScatterPass, ShardClustering, components};
 use faer::linalg::matmul::matmul;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::{Accum, Mat, MatMut, MatRef, Par};
@@ -92,17 +90,7 @@ impl Data {
         let rectangular = BlockStructure::Rectangular;
         for (block, sum) in self.blocks().zip((0..CLUSTERS).cycle()) {
             let (left, sum) = (block.transpose(), &mut sums[sum]);
-            triangular::matmul(
-                sum,
-                lower,
-                Accum::Add,
-                left,
-                rectangular,
-                block,
-                rectangular,
-                1.0,
-                Par::Seq,
-            );
+            triangular::matmul(sum, lower, Accum::Add, left, rectangular, block, rectangular, 1.0, Par::Seq);
         }
         black_box(sums);
     }
@@ -156,7 +144,12 @@ fn main() {
     println!("{atoms} atoms, D = {DIMENSION}, {CLUSTERS} components, one thread");
     println!("pass                           10³ atoms/s   share of the product's rate");
     println!("1, K = 1, 2, 4, 8, 16          {:>11.0}", rate(first));
-    println!("2                              {:>11.0}   {:.2} (half), {:.2} (full)", rate(second), half / second, full / second);
+    println!(
+        "2                              {:>11.0}   {:.2} (half), {:.2} (full)",
+        rate(second),
+        half / second,
+        full / second
+    );
     println!("  XᵀX, lower half              {:>11.0}", rate(half));
     println!("  XᵀX, all                     {:>11.0}", rate(full));
     println!("3                              {:>11.0}   {:.2}", rate(third), bare / third);

@@ -36,7 +36,7 @@ pub struct BuiltElement {
 pub struct BuiltMixture {
     symbols: Vec<String>,
     projection: Projection,
-    projection_seed: Option<u64>,
+    projection_seed: Option<i64>,
     settings: BuildSettings,
     elements: Vec<Option<BuiltElement>>,
     /// The largest number of components of an element.
@@ -56,7 +56,7 @@ impl BuiltMixture {
     pub fn new(
         symbols: Vec<String>,
         projection: Projection,
-        projection_seed: Option<u64>,
+        projection_seed: Option<i64>,
         settings: BuildSettings,
         elements: Vec<Option<BuiltElement>>,
     ) -> Result<Self, BuildError> {

@@ -29,9 +29,10 @@ const MIN_SHARE: f64 = 0.01;
 ///
 /// where Σ **x** is the sum of its m atoms nearest to **c**, and n the number of all atoms before them.
 ///
-/// **Reassignment.** At most once in 10 K atoms, each centroid with fewer than 1 % of the atoms of the largest cluster
-/// moves to an atom of the mini-batch, drawn as by k-means++ with a probability proportional to its squared distance from
-/// the nearest centroid. The nearest other cluster gets its count.
+/// **Reassignment.** After each mini-batch, a centroid moves if its cluster has fewer than 1 % of the atoms of the largest
+/// cluster, both of the mini-batch and of all mini-batches. It moves to an atom of the mini-batch, drawn as by k-means++
+/// with a probability proportional to its squared distance from the nearest centroid. The nearest other cluster gets
+/// its count.
 ///
 /// Every atom counts once, whatever its weight: weights change the statistics of components, not the partition.
 #[derive(Debug, Clone)]
@@ -80,8 +81,6 @@ struct Candidate {
     first: usize,
     counts: Vec<f64>,
     inertia: f64,
-    /// Atoms since clusters were checked for reassignment.
-    unchecked: usize,
     /// Of the current mini-batch: sums of features, `[clusters × D]`, and atoms of each cluster.
     sums: Vec<f64>,
     added: Vec<f64>,
@@ -194,7 +193,6 @@ impl ShardClustering {
                 first: all.len() / dimension,
                 counts: vec![0.0; centroids.len() / dimension],
                 inertia: 0.0,
-                unchecked: 0,
                 sums: vec![0.0; centroids.len()],
                 added: vec![0.0; centroids.len() / dimension],
                 squared: Vec::new(),
@@ -232,14 +230,10 @@ impl Candidate {
     }
 
     fn reassign(&mut self, centroids: &mut [f64], batch: &[f64], dimension: usize) {
-        self.unchecked += self.squared.len();
-        if self.unchecked < 10 * self.counts.len() {
-            return;
-        }
-        self.unchecked = 0;
-        let largest = self.counts.iter().copied().fold(0.0, f64::max);
+        let few = |counts: &[f64]| MIN_SHARE * counts.iter().copied().fold(0.0, f64::max);
+        let (few, few_added) = (few(&self.counts), few(&self.added));
         for slot in 0..self.counts.len() {
-            if self.counts[slot] >= MIN_SHARE * largest {
+            if self.counts[slot] >= few || self.added[slot] >= few_added {
                 continue;
             }
             let Some(atom) = self.random.index(&cumulative(self.squared.iter().copied())) else { return };

@@ -1,9 +1,12 @@
 //! The reference's build, reproduced from its features and the centroids of its first pass.
 
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
 
 use calm::Artifact;
 use calm::build::{BuildSettings, BuiltElement, BuiltMixture, read_histograms};
+use npyz::npz::NpzArchive;
 
 use super::{calibrate, scatter};
 use crate::common::{assert_close, indices, numbers, optional, peer};
@@ -106,6 +109,18 @@ fn passes_two_and_three_reproduce_the_reference() {
     }
 }
 
+/// Type and shape of each array.
+fn kinds(path: &Path) -> BTreeMap<String, (String, Vec<u64>)> {
+    let mut file = NpzArchive::open(path).unwrap();
+    let names: Vec<String> = file.array_names().map(str::to_owned).collect();
+    let kind = |name: String| {
+        let array = file.by_name(&name).unwrap().unwrap();
+        let kind = (array.dtype().descr(), array.shape().to_vec());
+        (name, kind)
+    };
+    names.into_iter().map(kind).collect()
+}
+
 #[test]
 fn the_artifact_is_that_of_the_reference() {
     let Some(reference) = Reference::open() else { return };
@@ -116,7 +131,14 @@ fn the_artifact_is_that_of_the_reference() {
     let symbols = expected.symbols.clone();
     let built =
         BuiltMixture::new(symbols, expected.projection.clone(), Some(42), settings, elements).unwrap();
-    let found = built.artifact().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("gmm_artifacts.npz");
+    std::fs::write(&path, built.write(Cursor::new(Vec::new())).unwrap().into_inner()).unwrap();
+    let found = Artifact::load(&path).unwrap();
+    assert_eq!(found, built.artifact().unwrap());
+    for (key, kind) in kinds(&reference.artifact) {
+        assert_eq!(kinds(&path).get(&key), Some(&kind), "{key}");
+    }
     found.check_belongs_to(&expected.symbols, &expected.projection).unwrap();
     assert_eq!(found.unsound_components(), []);
     assert_eq!(found.mixture.iter().count(), expected.mixture.iter().count());
