@@ -1,10 +1,10 @@
 //! How fast the passes of a build are on one thread. Prints a table.
 //!
-//! Passes 2 and 3 are compared with the bare matrix products of the same shapes in the same run: for each block of 256
+//! Passes 2 and 3 are compared with the bare matrix products of the same shapes in the same run: for each block of 128
 //! atoms, XᵀX (its lower half, in pass 2) or XS (in pass 3) of ready matrices, and no assignment, copy or histogram. The
 //! numbers are medians of repeated rounds, in which the passes and their products alternate.
 //!
-//! `cargo bench -p calm --bench build -- 20000` takes another number of atoms than 50,000.
+//! `cargo bench -p calm --bench build -- 50000` takes another number of atoms than 20,000.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -16,12 +16,12 @@ use faer::{Accum, Mat, MatMut, MatRef, Par};
 
 const DIMENSION: usize = 130;
 const CLUSTERS: usize = 8;
-const ATOMS: usize = 50_000;
+const ATOMS: usize = 20_000;
 /// Atoms of a batch, as a caller streams them.
-const BATCH: usize = 2048;
+const BATCH: usize = 512;
 /// Atoms of a block in passes 2 and 3.
-const BLOCK: usize = 256;
-const ROUNDS: usize = 9;
+const BLOCK: usize = 128;
+const ROUNDS: usize = 31;
 
 /// xorshift64*.
 struct Random(u64);

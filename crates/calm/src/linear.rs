@@ -298,7 +298,33 @@ fn panel_products<const W: usize, const N: usize>(
     sums
 }
 
+/// Σ a_i b_i of each row of two `[rows × D]` matrices, with the bits of [`dot`] and the widest available vectors.
+pub(crate) fn row_dots(left: &[f64], right: &[f64], dimension: usize, out: &mut Vec<f64>) {
+    out.resize(left.len() / dimension, 0.0);
+    pulp::Arch::new().dispatch(RowDots { left, right, dimension, out });
+}
+
+struct RowDots<'a> {
+    left: &'a [f64],
+    right: &'a [f64],
+    dimension: usize,
+    out: &'a mut [f64],
+}
+
+impl pulp::WithSimd for RowDots<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let Self { left, right, dimension, out } = self;
+        for (row, out) in out.iter_mut().enumerate() {
+            *out = dot(&left[row * dimension..][..dimension], &right[row * dimension..][..dimension]);
+        }
+    }
+}
+
 /// Σ a_i b_i in order, in four interleaved sums (fixed bits, vectorisable).
+#[inline(always)]
 pub(crate) fn dot(left: &[f64], right: &[f64]) -> f64 {
     let (mut sums, mut rest) = ([0.0; 4], 0.0);
     let (left, right) = (left.chunks_exact(4), right.chunks_exact(4));

@@ -8,7 +8,7 @@ use super::error::{BuildError, expect_length};
 use super::histogram::{ElementHistograms, Grid};
 use super::sorter::{BLOCK_ATOMS, Block, Sorter};
 use crate::grade::DISTANCE_FLOOR;
-use crate::linear::{dot, view};
+use crate::linear::{row_dots, view};
 
 /// Fills, for each component, the raw and the weighted histogram of σ = √(**δ**ᵀS**δ** + 10⁻⁸), where S**δ** of a block of
 /// atoms is one matrix product. The histograms depend on the order of the atoms, not on the batches in which they arrive.
@@ -25,6 +25,8 @@ struct Sums {
     inverses: Vec<Vec<f64>>,
     /// S**δ** of the atoms of a block.
     products: Vec<f64>,
+    /// **δ**ᵀS**δ** of each.
+    squared: Vec<f64>,
     histograms: ElementHistograms,
 }
 
@@ -45,6 +47,7 @@ impl CalibrationPass {
             grid: Grid::default(),
             inverses: components.iter().map(|component| component.inverse.clone()).collect(),
             products: vec![0.0; BLOCK_ATOMS * dimension],
+            squared: Vec::with_capacity(BLOCK_ATOMS),
             histograms: ElementHistograms::empty(components.len()),
         };
         Ok(Self { sorter: Sorter::new(dimension, centroids)?, sums })
@@ -75,9 +78,9 @@ impl Sums {
         let inverse = view(&self.inverses[slot], dimension, dimension);
         matmul(out, Accum::Replace, view(&block.deltas, atoms, dimension), inverse, 1.0, Par::Seq);
         let histogram = &mut self.histograms.components[slot];
-        let rows = block.deltas.chunks_exact(dimension).zip(products.chunks_exact(dimension));
-        for ((delta, product), weight) in rows.zip(&block.weights) {
-            let sigma = (dot(delta, product).max(0.0) + DISTANCE_FLOOR).sqrt();
+        row_dots(&block.deltas, products, dimension, &mut self.squared);
+        for (squared, weight) in self.squared.iter().zip(&block.weights) {
+            let sigma = (squared.max(0.0) + DISTANCE_FLOOR).sqrt();
             let bin = self.grid.bin(sigma);
             histogram.raw[bin] += 1;
             histogram.weighted[bin] += weight;

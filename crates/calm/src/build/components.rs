@@ -44,7 +44,7 @@ pub struct BuiltComponent {
 pub fn components(centroids: &[f64], sums: &ElementSums) -> Result<Vec<BuiltComponent>, BuildError> {
     let dimension = sums.dimension;
     check_dimension(dimension)?;
-    let count = check(centroids, dimension)?;
+    let count = check(centroids, dimension, &mut Vec::new())?;
     if count == 0 {
         return Err(BuildError::NoCentroid);
     }

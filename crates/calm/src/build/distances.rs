@@ -5,10 +5,10 @@ use faer::{Accum, MatMut, Par};
 
 use super::error::{BuildError, expect_length};
 use crate::grade::nearest;
-use crate::linear::{dot, view};
+use crate::linear::{dot, row_dots, view};
 
 /// Atoms of one product: their products with a few dozen centroids fit the second-level cache beside their features.
-const ATOMS_PER_PRODUCT: usize = 256;
+const ATOMS_PER_PRODUCT: usize = 128;
 
 /// Centroids with buffers for distances to them.
 #[derive(Debug, Clone)]
@@ -19,7 +19,7 @@ pub(super) struct Distances {
     squares: Vec<f64>,
     /// **x**·**c**, `[atoms × centroids]`.
     products: Vec<f64>,
-    /// |**x**|² of each atom.
+    /// |**x**|² of each atom of the batch.
     lengths: Vec<f64>,
 }
 
@@ -44,11 +44,6 @@ impl Distances {
         self.squares.len()
     }
 
-    /// Feature dimension D.
-    pub fn dimension(&self) -> usize {
-        self.dimension
-    }
-
     /// The centroids, `[K × D]`.
     pub fn centroids(&self) -> &[f64] {
         &self.centroids
@@ -65,19 +60,28 @@ impl Distances {
         self.squares.extend(self.centroids.chunks_exact(self.dimension).map(|c| dot(c, c)));
     }
 
-    /// Calls `visit` with each chunk of a batch, `[atoms × D]` that [`check`] accepts, in order.
-    pub fn for_each_chunk(&mut self, features: &[f64], mut visit: impl FnMut(&Chunk<'_>)) {
+    /// As [`check`].
+    pub fn check(&mut self, features: &[f64]) -> Result<usize, BuildError> {
+        check(features, self.dimension, &mut self.lengths)
+    }
+
+    /// Calls `visit` with each chunk of a batch of finite features, `[atoms × D]`, in order.
+    pub fn for_each_chunk(&mut self, features: &[f64], visit: impl FnMut(&Chunk<'_>)) {
+        row_dots(features, features, self.dimension, &mut self.lengths);
+        self.for_each_checked_chunk(features, visit);
+    }
+
+    /// Calls `visit` with each chunk of the batch that [`Self::check`] accepted last, in order.
+    pub fn for_each_checked_chunk(&mut self, features: &[f64], mut visit: impl FnMut(&Chunk<'_>)) {
         for (index, chunk) in features.chunks(ATOMS_PER_PRODUCT * self.dimension).enumerate() {
-            self.measure(chunk);
+            self.multiply(chunk);
             visit(&Chunk { first: index * ATOMS_PER_PRODUCT, features: chunk, of: self });
         }
     }
 
-    fn measure(&mut self, features: &[f64]) {
+    fn multiply(&mut self, features: &[f64]) {
         let (dimension, count) = (self.dimension, self.squares.len());
         let atoms = features.len() / dimension;
-        self.lengths.clear();
-        self.lengths.extend(features.chunks_exact(dimension).map(|x| dot(x, x)));
         self.products.resize(atoms * count, 0.0);
         if count > 1 {
             let products = MatMut::from_row_major_slice_mut(&mut self.products, atoms, count);
@@ -90,20 +94,18 @@ impl Distances {
     }
 }
 
-/// Checks a batch of features, `[atoms × D]`, and returns the number of its atoms.
+/// Checks a batch of features, `[atoms × D]`, and returns the number of its atoms. Fills `lengths` with |**x**|².
 ///
 /// # Errors
 /// A length that is no multiple of D, features that are not finite or too large to be squared.
-pub(super) fn check(features: &[f64], dimension: usize) -> Result<usize, BuildError> {
+pub(super) fn check(features: &[f64], dimension: usize, lengths: &mut Vec<f64>) -> Result<usize, BuildError> {
     let atoms = features.len() / dimension;
     expect_length("features", features.len(), atoms * dimension)?;
-    for (atom, row) in features.chunks_exact(dimension).enumerate() {
-        let found = dot(row, row);
-        if !found.is_finite() {
-            return Err(BuildError::Features { atom, found });
-        }
+    row_dots(features, features, dimension, lengths);
+    match lengths.iter().position(|length| !length.is_finite()) {
+        Some(atom) => Err(BuildError::Features { atom, found: lengths[atom] }),
+        None => Ok(atoms),
     }
-    Ok(atoms)
 }
 
 impl Chunk<'_> {
@@ -120,7 +122,7 @@ impl Chunk<'_> {
     /// |**x** − **c**|² of an atom of the chunk to the centroids `first..first + count`, not below zero.
     pub fn squared(&self, atom: usize, first: usize, count: usize) -> impl Iterator<Item = f64> {
         let products = &self.of.products[atom * self.of.count() + first..][..count];
-        let length = self.of.lengths[atom];
+        let length = self.of.lengths[self.first + atom];
         products.iter().zip(&self.of.squares[first..]).map(move |(p, c)| (length - 2.0 * p + c).max(0.0))
     }
 
@@ -142,7 +144,7 @@ impl Chunk<'_> {
         let (mut best, mut least, mut second) = (0, f64::INFINITY, f64::INFINITY);
         let (dimension, count) = (self.of.dimension, self.of.count());
         let products = &self.of.products[atom * count..][..count];
-        let mut largest = self.of.lengths[atom];
+        let mut largest = self.of.lengths[self.first + atom];
         for (slot, (product, square)) in products.iter().zip(&self.of.squares).enumerate() {
             let relative = square - 2.0 * product;
             largest = largest.max(*square);
@@ -225,11 +227,12 @@ mod tests {
 
     #[test]
     fn wrong_features_are_errors() {
-        assert_eq!(check(&[0.0, 1.0, 2.0, 3.0], 2), Ok(2));
-        let found = check(&[0.0, 1.0, 2.0], 2).unwrap_err();
+        let mut lengths = Vec::new();
+        assert_eq!(check(&[0.0, 1.0, 2.0, 3.0], 2, &mut lengths), Ok(2));
+        let found = check(&[0.0, 1.0, 2.0], 2, &mut lengths).unwrap_err();
         assert_eq!(found.to_string(), "features: found 3 numbers, expected 2");
         for wrong in [f64::NAN, f64::INFINITY, 1e200] {
-            let found = check(&[0.0, 1.0, 2.0, wrong], 2).unwrap_err();
+            let found = check(&[0.0, 1.0, 2.0, wrong], 2, &mut lengths).unwrap_err();
             assert!(found.to_string().starts_with("features of atom 1 of the batch"), "{found}");
         }
     }

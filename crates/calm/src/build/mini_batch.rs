@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::distances::{Distances, check};
+use super::distances::Distances;
 use super::error::BuildError;
 use super::kmeans::{Points, cumulative, initial_centroids, lloyd};
 use super::random::Random;
@@ -111,7 +111,7 @@ impl ShardClustering {
     /// # Errors
     /// A length that is no multiple of D, features that are not finite. Nothing is added then.
     pub fn add(&mut self, features: &[f64]) -> Result<(), BuildError> {
-        self.atoms += check(features, self.settings.dimension)? as u64;
+        self.atoms += self.distances.check(features)? as u64;
         let size = self.batch_atoms() * self.settings.dimension;
         let mut rest = features;
         while !rest.is_empty() {

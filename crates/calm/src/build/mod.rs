@@ -13,6 +13,9 @@
 //! 3. [`CalibrationPass`] fills histograms of σ = √(**δ**ᵀ(C + εI)⁺**δ** + 10⁻⁸). [`ElementHistograms::thresholds`] has the
 //!    thresholds θ = median(σ) + 3 · 1.4826 · MAD(σ).
 //!
+//! Batches of some hundred atoms are fastest, since they stay in the cache. Passes 2 and 3 keep up to 128 atoms of each
+//! component until a product of that size is worthwhile.
+//!
 //! [`BuiltMixture`] then is an [`Artifact`](crate::Artifact), and writes its file. An element without atoms has no
 //! centroids, takes no part in passes 2 and 3, and becomes
 //! [`Component::unknown_element`](crate::Component::unknown_element).

@@ -5,7 +5,7 @@ use super::error::{BuildError, expect_length};
 use super::settings::check_dimension;
 
 /// Atoms of a block: enough for a matrix product to reach its full rate, few enough for the second-level cache.
-pub(super) const BLOCK_ATOMS: usize = 256;
+pub(super) const BLOCK_ATOMS: usize = 128;
 
 /// The blocks of one element.
 #[derive(Debug, Clone)]
@@ -27,7 +27,7 @@ impl Sorter {
     /// Centroids, `[K × D]`.
     pub fn new(dimension: usize, centroids: Vec<f64>) -> Result<Self, BuildError> {
         check_dimension(dimension)?;
-        let count = check(&centroids, dimension)?;
+        let count = check(&centroids, dimension, &mut Vec::new())?;
         if count == 0 {
             return Err(BuildError::NoCentroid);
         }
@@ -43,14 +43,14 @@ impl Sorter {
         weights: &[f64],
         mut full: impl FnMut(usize, &mut Block),
     ) -> Result<(), BuildError> {
-        let atoms = check(features, self.distances.dimension())?;
+        let atoms = self.distances.check(features)?;
         expect_length("weights", weights.len(), atoms)?;
         let wrong = weights.iter().position(|weight| !(weight.is_finite() && *weight >= 0.0));
         if let Some(atom) = wrong {
             return Err(BuildError::Weight { atom, found: weights[atom] });
         }
         let Self { distances, blocks } = self;
-        distances.for_each_chunk(features, |chunk| {
+        distances.for_each_checked_chunk(features, |chunk| {
             for (atom, row) in chunk.rows().enumerate() {
                 let slot = chunk.assigned(atom);
                 let block = &mut blocks[slot];
