@@ -1,10 +1,10 @@
 //! Writes archives that NumPy reads.
 
-use std::io::{self, Seek, Write};
+use std::io::{self, Read, Seek, Write};
 
 use npyz::npz::{NpzWriter, file_name_from_array_name};
 use npyz::zip::write::FileOptions;
-use npyz::zip::{CompressionMethod, DateTime};
+use npyz::zip::{CompressionMethod, DateTime, ZipArchive};
 use npyz::{AutoSerialize, WriterBuilder};
 
 /// Writes an archive, uncompressed as `numpy.savez` does. The same arrays give the same bytes at any time.
@@ -59,6 +59,21 @@ impl<W: Write + Seek> Writer<W> {
         for text in strings {
             let padded = text.chars().map(u32::from).chain(std::iter::repeat(0)).take(width);
             zip.write_all(&padded.flat_map(u32::to_le_bytes).collect::<Vec<u8>>())?;
+        }
+        Ok(())
+    }
+
+    /// Adds all arrays of another archive but those that are `left_out`, byte by byte, in their order.
+    ///
+    /// # Errors
+    /// If reading or writing fails, or `source` is no archive.
+    pub fn copy<R: Read + Seek>(&mut self, source: R, left_out: impl Fn(&str) -> bool) -> io::Result<()> {
+        let mut source = ZipArchive::new(source)?;
+        for index in 0..source.len() {
+            let file = source.by_index_raw(index)?;
+            if !left_out(file.name().strip_suffix(".npy").unwrap_or(file.name())) {
+                self.zip.zip_writer().raw_copy_file(file)?;
+            }
         }
         Ok(())
     }

@@ -51,3 +51,18 @@ fn headers_of_strings_are_aligned() {
     assert_eq!((length + 10) % 64, 0);
     assert_eq!(bytes[start + 10 + length - 1], b'\n');
 }
+
+#[test]
+fn arrays_are_copied_from_another_archive() {
+    let mut out = Writer::new(Cursor::new(Vec::new()));
+    out.copy(Cursor::new(written()), |key| key == "matrix" || key == "mode").unwrap();
+    out.scalar("matrix", 3.0).unwrap();
+    let bytes = out.finish().unwrap().into_inner();
+    let archive = Archive::from_bytes("copy.npz", &bytes).unwrap();
+    let names: Vec<&str> = archive.names().collect();
+    assert_eq!(names, ["count", "empty", "flag", "matrix", "names", "none"]);
+    assert_eq!(archive.numbers("matrix").unwrap().data, [3.0]);
+    assert_eq!(archive.strings("names").unwrap(), ["H", "Al", "α"]);
+    assert_eq!(archive.count("count", 0, 9).unwrap(), 7);
+    assert!(Writer::new(Cursor::new(Vec::new())).copy(Cursor::new(b"text"), |_| false).is_err());
+}

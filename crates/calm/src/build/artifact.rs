@@ -17,7 +17,7 @@ use crate::linear::REGULARISATION;
 use crate::mixture::Mixture;
 
 /// Centroids of unused slots are filled with this.
-const UNUSED: f32 = 1e10;
+pub(super) const UNUSED: f32 = 1e10;
 
 /// Largest relative deviation of stored edges of bins from the grid.
 const EDGE_ROUNDING: f64 = 1e-6;
@@ -87,6 +87,20 @@ impl BuiltMixture {
     /// What each pass found for each element.
     pub fn elements(&self) -> &[Option<BuiltElement>] {
         &self.elements
+    }
+
+    /// The largest number of components of an element.
+    pub(super) fn slots(&self) -> usize {
+        self.slots
+    }
+
+    pub(super) fn dimension(&self) -> usize {
+        self.settings.dimension
+    }
+
+    /// Thresholds of each element, one for every slot: as many slots as the largest number of components of an element.
+    pub fn thresholds(&self) -> &[Thresholds] {
+        &self.thresholds
     }
 
     /// The artifact, with all numbers rounded to single precision as in its file, so that it is the one that
@@ -227,6 +241,11 @@ impl BuiltMixture {
         let fill = std::iter::repeat_n(0.0_f32, unused * BINS);
         file.array(&format!("eff_hist_{index}"), &[slots, BINS], weighted.chain(fill))
     }
+}
+
+/// Numbers in single precision, as files have them.
+pub(super) fn single(values: &[f64]) -> impl Iterator<Item = f32> {
+    values.iter().map(|&value| value as f32)
 }
 
 /// The thresholds of every slot; unused ones get those of components without data.

@@ -61,6 +61,14 @@ pub enum BuildError {
         /// The value of the results before it.
         expected: u64,
     },
+    /// A sum over the training data that is too large, or that is no number.
+    #[error(
+        "a sum over the training data is {found:e}, expected a number between ±1.4e17; are weights or features too large?"
+    )]
+    Sum {
+        /// The sum, or the term that makes it so.
+        found: f64,
+    },
     /// A covariance that cannot be inverted.
     #[error("covariance of component {slot}: {source}")]
     Linear {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::error::{BuildError, expect_same};
+use super::error::{BuildError, expect_length, expect_same};
 
 /// Number of bins.
 pub const BINS: usize = 1000;
@@ -34,12 +34,43 @@ impl Histogram {
     pub fn count(&self) -> u64 {
         self.raw.iter().sum()
     }
+
+    /// Number of atoms with σ above `sigma`, where atoms spread evenly inside a bin; not whole.
+    pub fn count_above(&self, sigma: f64) -> f64 {
+        let counts: Vec<f64> = self.raw.iter().map(|&count| count as f64).collect();
+        let grid = Grid::default();
+        let distribution = Distribution::new(&grid, &counts);
+        distribution.map_or(0.0, |found| (1.0 - found.share_below(sigma)) * found.total())
+    }
 }
 
 impl ElementHistograms {
     /// Histograms without atoms.
     pub fn empty(components: usize) -> Self {
         Self { components: vec![Histogram::default(); components] }
+    }
+
+    /// All numbers in one row, for [`ExactSums`](super::ExactSums).
+    pub fn to_row(&self) -> Vec<f64> {
+        let numbers = |histogram: &Histogram| {
+            let mut numbers: Vec<f64> = histogram.raw.iter().map(|&count| count as f64).collect();
+            numbers.extend(&histogram.weighted);
+            numbers
+        };
+        self.components.iter().flat_map(numbers).collect()
+    }
+
+    /// The histograms from their row, which has a whole number of components.
+    ///
+    /// # Errors
+    /// A row of another length.
+    pub fn from_row(row: &[f64]) -> Result<Self, BuildError> {
+        expect_length("histograms of an element", row.len(), row.len().next_multiple_of(2 * BINS))?;
+        let components = row.chunks_exact(2 * BINS).map(|numbers| Histogram {
+            raw: numbers[..BINS].iter().map(|&count| count as u64).collect(),
+            weighted: numbers[BINS..].to_vec(),
+        });
+        Ok(Self { components: components.collect() })
     }
 
     /// Adds the histograms of the next shard; for the order, see [`super::ElementSums::merge`].
@@ -161,6 +192,11 @@ mod tests {
             let found = distribution.share_below(distribution.quantile(share));
             assert!((found - share).abs() < 1e-12, "{share} {found}");
         }
+        let spread =
+            Histogram { raw: counts.iter().map(|&count| count as u64).collect(), ..Histogram::default() };
+        let (median, total) = (distribution.quantile(0.5), spread.count() as f64);
+        assert!((spread.count_above(median) / total - 0.5).abs() < 1e-12);
+        assert_eq!((spread.count_above(2e3), Histogram::default().count_above(1.0)), (0.0, 0.0));
         assert_eq!([distribution.share_below(0.0), distribution.share_below(2e3)], [0.0, 1.0]);
         assert!(Distribution::new(&grid, &[0.0; BINS]).is_none());
     }

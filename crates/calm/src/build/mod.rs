@@ -1,9 +1,10 @@
 //! Builds a mixture from training data in three passes (paper, Methods: Latent features and uncertainty models).
 //!
 //! The caller streams the features **z** of the atoms of each element, `[atoms × D]`, with weights w; it owns files and
-//! threads. The data are divided into *shards* of shuffled structures, each streamed in a fixed order. A pass makes one partial
-//! result for each element and shard; partial results are serialisable, so that a build continues after its last finished
-//! shard, and are combined in the order of the shards, so that the mixture does not depend on who made them.
+//! threads. The data are divided into *shards* of shuffled structures ([`shuffled`]), each streamed in a fixed order. A pass makes
+//! one partial result for each element and shard. Those of pass 1 are combined in the order of the shards, those of passes 2
+//! and 3 by [`ExactSums`] in any order, so the mixture does not depend on who made them. All are serialisable, so that a build
+//! continues with its finished shards.
 //!
 //! 1. [`ShardClustering`] finds clusters by mini-batch k-means for every candidate K. [`partition`] chooses K by the
 //!    [`elbow`] of the within-cluster sum of squares, and the centroids **μ**_k by weighted k-means of those of the shards.
@@ -26,6 +27,8 @@ mod components;
 mod distances;
 mod elbow;
 mod error;
+mod exact;
+mod export;
 mod histogram;
 mod kmeans;
 mod mini_batch;
@@ -42,10 +45,12 @@ pub use calibration::CalibrationPass;
 pub use components::{BuiltComponent, components};
 pub use elbow::elbow;
 pub use error::BuildError;
+pub use exact::ExactSums;
 pub use histogram::{BINS, ElementHistograms, Grid, Histogram};
 pub use mini_batch::{CandidateClusters, ShardClustering, ShardClusters};
 pub use moments::{ComponentSums, ElementSums};
 pub use partition::{ElementPartition, partition};
+pub use random::shuffled;
 pub use scatter::ScatterPass;
 pub use settings::BuildSettings;
 pub use thresholds::Thresholds;

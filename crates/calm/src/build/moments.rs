@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::error::{BuildError, expect_same};
+use super::error::{BuildError, expect_length, expect_same};
 use crate::linear::squared_distance;
 
 /// Counts and scatter of the atoms of one component about its fixed centroid.
@@ -26,6 +26,31 @@ pub struct ElementSums {
 }
 
 impl ElementSums {
+    /// All numbers in one row, for [`ExactSums`](super::ExactSums).
+    pub fn to_row(&self) -> Vec<f64> {
+        let numbers = |sums: &ComponentSums| {
+            let mut numbers = vec![sums.count, sums.effective_count];
+            numbers.extend(&sums.scatter);
+            numbers
+        };
+        self.components.iter().flat_map(numbers).collect()
+    }
+
+    /// The sums from their row, which has a whole number of components.
+    ///
+    /// # Errors
+    /// A row of another length.
+    pub fn from_row(dimension: usize, row: &[f64]) -> Result<Self, BuildError> {
+        let length = 2 + dimension * (dimension + 1) / 2;
+        expect_length("sums of an element", row.len(), row.len().next_multiple_of(length))?;
+        let components = row.chunks_exact(length).map(|numbers| ComponentSums {
+            count: numbers[0],
+            effective_count: numbers[1],
+            scatter: numbers[2..].to_vec(),
+        });
+        Ok(Self { dimension, components: components.collect() })
+    }
+
     /// Adds the sums of the next shard.
     ///
     /// Rounding depends on the order: add each shard's own sums, in the order of the shards, and the result does not

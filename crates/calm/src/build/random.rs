@@ -30,6 +30,19 @@ impl Random {
     }
 }
 
+/// The numbers 0 to `count` − 1 in random order (Fisher–Yates), as a function of random seed and shard.
+pub fn shuffled(seed: u64, shard: u64, count: usize) -> Vec<usize> {
+    let mut random = Random::new(&[seed, shard, SHUFFLE]);
+    let mut order: Vec<usize> = (0..count).collect();
+    for last in (1..count).rev() {
+        order.swap(last, (random.uniform() * (last + 1) as f64) as usize);
+    }
+    order
+}
+
+/// Stands for the order of the structures among the words that choose random numbers.
+const SHUFFLE: u64 = u64::MAX;
+
 /// 2⁶⁴ divided by the golden ratio.
 const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
 
@@ -60,6 +73,23 @@ mod tests {
         }
         first.sort_by(f64::total_cmp);
         assert!(first.windows(2).all(|pair| pair[0] != pair[1]));
+    }
+
+    #[test]
+    fn orders_are_permutations_of_their_own() {
+        let orders = [shuffled(1, 0, 100), shuffled(1, 1, 100), shuffled(2, 0, 100)];
+        for order in &orders {
+            let mut sorted = order.clone();
+            sorted.sort_unstable();
+            assert!(sorted.into_iter().eq(0..100));
+            assert!(order.iter().enumerate().filter(|(place, item)| place == *item).count() < 10);
+        }
+        assert!(orders[0] != orders[1] && orders[0] != orders[2]);
+        assert_eq!((shuffled(1, 0, 100), shuffled(1, 0, 0)), (orders[0].clone(), vec![]));
+        // Each of the six orders of three items, within five standard deviations of a binomial distribution with p = 1/6.
+        let draws = 6000;
+        let first = (0..draws).filter(|&shard| shuffled(9, shard, 3) == [2, 0, 1]).count();
+        assert!((first as f64 - 1000.0).abs() < 5.0 * (draws as f64 * 5.0 / 36.0).sqrt(), "{first}");
     }
 
     #[test]

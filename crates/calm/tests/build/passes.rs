@@ -2,7 +2,8 @@
 
 use calm::Grades;
 use calm::build::{
-    BuildError, BuiltMixture, CalibrationPass, ElementHistograms, ElementSums, ScatterPass, components,
+    BuildError, BuiltMixture, CalibrationPass, ElementHistograms, ElementSums, ExactSums, ScatterPass,
+    components,
 };
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -55,6 +56,46 @@ proptest! {
         prop_assert_eq!(serde_json::to_vec(&one).unwrap(), serde_json::to_vec(&several).unwrap());
         let atoms: u64 = one.components.iter().map(|histogram| histogram.count()).sum();
         prop_assert_eq!(atoms, 1400);
+    }
+}
+
+/// Exact sums do not depend on the order of the shards, and are those of the shards in their order up to rounding.
+#[test]
+fn exact_sums_have_the_same_bits_in_any_order() {
+    let (dimension, shards) = (6, 9);
+    let blobs = Blobs::new(11, dimension, 3, 900, 5.0);
+    let (weights, centroids) = (weights(12, blobs.atoms()), blobs.centres.concat());
+    let part =
+        |k: usize| (&blobs.features[k * 100 * dimension..][..100 * dimension], &weights[k * 100..][..100]);
+    let sums: Vec<ElementSums> =
+        (0..shards).map(|k| scatter(dimension, &centroids, part(k).0, part(k).1, &[64])).collect();
+    let exact = |rows: &mut dyn Iterator<Item = Vec<f64>>| {
+        let mut total: Option<ExactSums> = None;
+        rows.for_each(|row| total.get_or_insert_with(|| ExactSums::new(row.len())).add(&row).unwrap());
+        total.unwrap()
+    };
+    let forward = exact(&mut sums.iter().map(ElementSums::to_row));
+    assert_eq!(forward, exact(&mut sums.iter().rev().map(ElementSums::to_row)));
+    let found = ElementSums::from_row(dimension, &forward.totals()).unwrap();
+    let merged = total(&sums, |all: &mut ElementSums, next| all.merge(next).unwrap());
+    assert_eq!(found.components.len(), merged.components.len());
+    for (found, merged) in found.components.iter().zip(&merged.components) {
+        assert_eq!(found.count, merged.count);
+        assert!((found.effective_count / merged.effective_count - 1.0).abs() < 1e-13);
+        crate::common::assert_close("scatter", &found.scatter, &merged.scatter, 1e-13);
+    }
+    assert!(ElementSums::from_row(dimension, &forward.totals()[1..]).is_err());
+
+    let components = components(&centroids, &merged).unwrap();
+    let histograms: Vec<ElementHistograms> =
+        (0..shards).map(|k| calibrate(&components, part(k).0, part(k).1, &[64])).collect();
+    let forward = exact(&mut histograms.iter().map(ElementHistograms::to_row));
+    assert_eq!(forward, exact(&mut histograms.iter().rev().map(ElementHistograms::to_row)));
+    let found = ElementHistograms::from_row(&forward.totals()).unwrap();
+    let merged = total(&histograms, |all: &mut ElementHistograms, next| all.merge(next).unwrap());
+    for (found, merged) in found.components.iter().zip(&merged.components) {
+        assert_eq!(found.raw, merged.raw);
+        crate::common::assert_close("weights", &found.weighted, &merged.weighted, 1e-13);
     }
 }
 

@@ -72,3 +72,46 @@ fn stored_histograms_give_the_thresholds_again() {
     let message = read_histograms(crate::common::model("al_eam_1l/kokkos.npz")).unwrap_err().to_string();
     assert!(message.contains("no array 'hist_bin_edges'"), "{message}");
 }
+
+#[test]
+fn an_export_with_the_mixture_is_read_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, built) = (folder.path().join("kokkos.npz"), mixture(false, true));
+    let mut model = npz::Writer::new(Cursor::new(Vec::new()));
+    model.array("weights", &[2], [1.5, -2.0]).unwrap();
+    model.strings("element_names", &[3], &["Al", "Si", "O"]).unwrap();
+    // An old mixture with one component.
+    for (key, value) in [
+        ("uq_schema_version", 6_i64),
+        ("uq_n_elements", 3),
+        ("uq_max_clusters", 1),
+        ("uq_feature_dim", 5),
+        ("uq_rp_dim", 5),
+        ("uq_rp_normalize", 1),
+    ] {
+        model.array(key, &[1], [value]).unwrap();
+    }
+    model.array("uq_centroids", &[3, 1, 5], [0.0_f32; 15]).unwrap();
+    model.array("uq_rp_matrix", &[3, 5], projection(5).matrix).unwrap();
+    let model = model.finish().unwrap();
+    let written = built.write_export(model, Cursor::new(Vec::new())).unwrap();
+    std::fs::write(&path, written.into_inner()).unwrap();
+
+    let (found, expected) = (Artifact::load_export(&path).unwrap(), built.artifact().unwrap());
+    assert_eq!((&found.symbols, &found.projection), (&expected.symbols, &expected.projection));
+    for element in 0..3 {
+        let [found, expected] = [&found, &expected].map(|of| of.mixture.components(element).unwrap());
+        assert_eq!(found.len(), expected.len());
+        for (found, expected) in found.iter().zip(expected) {
+            assert_eq!(found.centroid(), expected.centroid());
+            assert_eq!(found.inverse(), expected.inverse());
+            assert_eq!(found.threshold(), expected.threshold());
+            assert!(found.statistics().is_none());
+        }
+    }
+    assert_eq!(numbers(&path, "weights"), [1.5, -2.0]);
+    assert_eq!(numbers(&path, "uq_n_clusters"), [3.0; 3]);
+    assert_eq!(numbers(&path, "uq_missing_elem_inv_cov_diag"), [1e6]);
+    assert_eq!(numbers(&path, "uq_centroids")[15..30], [0.0; 15]);
+    assert_eq!(numbers(&path, "uq_centroids")[35..], [1e10_f32 as f64; 10]);
+}
