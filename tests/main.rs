@@ -31,6 +31,7 @@ mod interruption;
 mod label;
 mod log;
 mod metrics;
+mod mixture_build;
 mod mutations;
 mod notify;
 mod places;
