@@ -32,6 +32,7 @@ mod label;
 mod log;
 mod lower_states;
 mod metrics;
+mod mixture_build;
 mod mutations;
 mod notify;
 mod places;

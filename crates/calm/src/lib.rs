@@ -3,7 +3,8 @@
 //! This crate works on numbers, not atoms: element indices, feature vectors **z** of dimension D, and pairs. An
 //! [`Artifact`] holds a [`Mixture`]; [`Grades`] evaluates σ, γ and ∂γ/∂z; [`neighbourhood`] averages γ over
 //! pairs; [`rules`] decides when a structure is collected and when an update is sufficient; [`search::update`]
-//! finds the update; [`forgetting`] detects whether the mixture still covers its training data.
+//! finds the update; [`forgetting`] detects whether the mixture still covers its training data. [`build`] makes a
+//! mixture from training data.
 //!
 //! Matrices are dense, row-major `f64`; batches of features are `[atoms × D]`, row-major. All sums run in a
 //! fixed order on one thread, so results are bitwise reproducible on one kind of processor (grades on every
@@ -12,6 +13,7 @@
 mod alpha_scan;
 pub mod artifact;
 mod batched_grades;
+pub mod build;
 mod bytes;
 pub mod component;
 pub mod drift;

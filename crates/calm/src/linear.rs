@@ -127,6 +127,19 @@ pub(crate) fn solve_lower(factor: &Mat<f64>, right: &mut Mat<f64>) {
 /// # Errors
 /// A wrong length, an element that is not finite, or eigenvalues that do not converge.
 pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
+    pseudo_inverse_with_spectrum(matrix, dimension).map(|inverse| inverse.matrix)
+}
+
+/// A pseudo-inverse and the eigenvalues of the matrix, ascending.
+pub(crate) struct Inverse {
+    pub matrix: Vec<f64>,
+    pub eigenvalues: Vec<f64>,
+    /// How many of them it drops.
+    pub truncated: usize,
+}
+
+/// As [`pseudo_inverse`].
+pub(crate) fn pseudo_inverse_with_spectrum(matrix: &[f64], dimension: usize) -> Result<Inverse, LinearError> {
     check(matrix, dimension)?;
     let Eigen { values, vectors } = eigen(view(matrix, dimension, dimension))?;
     let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
@@ -135,7 +148,9 @@ pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, Line
         Some(&value) if kept(value) => vectors[(row, column)] / value,
         _ => 0.0,
     });
-    Ok(symmetrised(product(scaled.as_ref(), vectors.transpose()).as_ref()))
+    let matrix = symmetrised(product(scaled.as_ref(), vectors.transpose()).as_ref());
+    let truncated = values.iter().filter(|value| !kept(**value)).count();
+    Ok(Inverse { matrix, eigenvalues: values, truncated })
 }
 
 /// The regularised inverse (C + εI)⁺ of a covariance, ε = 10⁻⁶ (paper, Methods).
@@ -283,7 +298,33 @@ fn panel_products<const W: usize, const N: usize>(
     sums
 }
 
+/// Σ a_i b_i of each row of two `[rows × D]` matrices, with the bits of [`dot`] and the widest available vectors.
+pub(crate) fn row_dots(left: &[f64], right: &[f64], dimension: usize, out: &mut Vec<f64>) {
+    out.resize(left.len() / dimension, 0.0);
+    pulp::Arch::new().dispatch(RowDots { left, right, dimension, out });
+}
+
+struct RowDots<'a> {
+    left: &'a [f64],
+    right: &'a [f64],
+    dimension: usize,
+    out: &'a mut [f64],
+}
+
+impl pulp::WithSimd for RowDots<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let Self { left, right, dimension, out } = self;
+        for (row, out) in out.iter_mut().enumerate() {
+            *out = dot(&left[row * dimension..][..dimension], &right[row * dimension..][..dimension]);
+        }
+    }
+}
+
 /// Σ a_i b_i in order, in four interleaved sums (fixed bits, vectorisable).
+#[inline(always)]
 pub(crate) fn dot(left: &[f64], right: &[f64]) -> f64 {
     let (mut sums, mut rest) = ([0.0; 4], 0.0);
     let (left, right) = (left.chunks_exact(4), right.chunks_exact(4));

@@ -1,4 +1,4 @@
-//! Reads arrays of NumPy `.npz` archives and checks every size against the data before using it.
+//! Reads arrays of NumPy `.npz` archives and checks every size against the data before using it; writes such archives.
 //!
 //! ```no_run
 //! # fn read() -> Result<(), npz::Error> {
@@ -14,7 +14,9 @@ mod array;
 mod checked;
 mod error;
 mod header;
+mod writer;
 
 pub use archive::Archive;
 pub use array::Array;
 pub use error::Error;
+pub use writer::Writer;

@@ -4,3 +4,4 @@ mod common;
 
 mod arrays;
 mod hostile;
+mod written;

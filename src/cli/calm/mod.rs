@@ -1,14 +1,16 @@
 //! `calmwalk calm`: commands for CALM mixtures, without a campaign.
 
+mod build;
 mod info;
 mod score;
 mod scorer;
 
 use super::{ExitStatus, Failure};
 
-/// Inspect a CALM mixture, or grade structures with it
+/// Build or inspect a CALM mixture, or grade structures with it
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
+    Build(build::Build),
     Info(info::Info),
     Score(score::Score),
 }
@@ -16,6 +18,7 @@ pub enum Calm {
 impl Calm {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         match self {
+            Self::Build(command) => command.run(),
             Self::Info(command) => command.run(),
             Self::Score(command) => command.run(),
         }

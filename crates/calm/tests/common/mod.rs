@@ -35,6 +35,7 @@ pub fn optional(path: &Path, key: &str) -> Option<Vec<f64>> {
         "f8" => array.into_vec::<f64>().unwrap(),
         "f4" => array.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect(),
         "i8" => array.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect(),
+        "u8" => array.into_vec::<u64>().unwrap().into_iter().map(|value| value as f64).collect(),
         "i4" => array.into_vec::<i32>().unwrap().into_iter().map(f64::from).collect(),
         other => panic!("{key} has type {other}"),
     })

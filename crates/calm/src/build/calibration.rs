@@ -1,0 +1,89 @@
+//! Pass 3: histograms of σ of the components of an element in one shard.
+
+use faer::linalg::matmul::matmul;
+use faer::{Accum, MatMut, Par};
+
+use super::components::BuiltComponent;
+use super::error::{BuildError, expect_length};
+use super::histogram::{ElementHistograms, Grid};
+use super::sorter::{BLOCK_ATOMS, Block, Sorter};
+use crate::grade::DISTANCE_FLOOR;
+use crate::linear::{row_dots, view};
+
+/// Fills, for each component, the raw and the weighted histogram of σ = √(**δ**ᵀS**δ** + 10⁻⁸), where S**δ** of a block of
+/// atoms is one matrix product. The histograms depend on the order of the atoms, not on the batches in which they arrive.
+#[derive(Debug, Clone)]
+pub struct CalibrationPass {
+    sorter: Sorter,
+    sums: Sums,
+}
+
+#[derive(Debug, Clone)]
+struct Sums {
+    dimension: usize,
+    grid: Grid,
+    inverses: Vec<Vec<f64>>,
+    /// S**δ** of the atoms of a block.
+    products: Vec<f64>,
+    /// **δ**ᵀS**δ** of each.
+    squared: Vec<f64>,
+    histograms: ElementHistograms,
+}
+
+impl CalibrationPass {
+    /// Begins a shard of an element with these components.
+    ///
+    /// # Errors
+    /// No component; centroids or inverses of unequal dimensions.
+    pub fn new(components: &[BuiltComponent]) -> Result<Self, BuildError> {
+        let dimension = components.first().map_or(0, |component| component.centroid.len());
+        for component in components {
+            expect_length("centroid", component.centroid.len(), dimension)?;
+            expect_length("inverse covariance", component.inverse.len(), dimension * dimension)?;
+        }
+        let centroids = components.iter().flat_map(|component| &component.centroid).copied().collect();
+        let sums = Sums {
+            dimension,
+            grid: Grid::default(),
+            inverses: components.iter().map(|component| component.inverse.clone()).collect(),
+            products: vec![0.0; BLOCK_ATOMS * dimension],
+            squared: Vec::with_capacity(BLOCK_ATOMS),
+            histograms: ElementHistograms::empty(components.len()),
+        };
+        Ok(Self { sorter: Sorter::new(dimension, centroids)?, sums })
+    }
+
+    /// Adds atoms of the element: `features` is `[atoms × D]`, `weights` has one number for each atom.
+    ///
+    /// # Errors
+    /// As [`super::ScatterPass::add`].
+    pub fn add(&mut self, features: &[f64], weights: &[f64]) -> Result<(), BuildError> {
+        let Self { sorter, sums } = self;
+        sorter.add(features, weights, |slot, block| sums.add(slot, block))
+    }
+
+    /// Ends the shard.
+    pub fn finish(self) -> ElementHistograms {
+        let Self { sorter, mut sums } = self;
+        sorter.finish(|slot, block| sums.add(slot, block));
+        sums.histograms
+    }
+}
+
+impl Sums {
+    fn add(&mut self, slot: usize, block: &Block) {
+        let (atoms, dimension) = (block.weights.len(), self.dimension);
+        let products = &mut self.products[..atoms * dimension];
+        let out = MatMut::from_row_major_slice_mut(&mut *products, atoms, dimension);
+        let inverse = view(&self.inverses[slot], dimension, dimension);
+        matmul(out, Accum::Replace, view(&block.deltas, atoms, dimension), inverse, 1.0, Par::Seq);
+        let histogram = &mut self.histograms.components[slot];
+        row_dots(&block.deltas, products, dimension, &mut self.squared);
+        for (squared, weight) in self.squared.iter().zip(&block.weights) {
+            let sigma = (squared.max(0.0) + DISTANCE_FLOOR).sqrt();
+            let bin = self.grid.bin(sigma);
+            histogram.raw[bin] += 1;
+            histogram.weighted[bin] += weight;
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! `calmwalk calm build`
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use calm::Projection;
+use calm::build::{BuildSettings, BuiltElement, BuiltMixture};
+use npz::Archive;
+use potentials::grace::GraceModel;
+
+use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::campaign::check_sound;
+use crate::cli::{ExitStatus, Failure};
+use crate::file_hash;
+use crate::mixture_build::{self, Work, data_files};
+use crate::output::{Table, log_and_warn, print, print_stderr};
+use crate::signals::stop_token;
+
+/// Build a CALM mixture from the training data of a model
+///
+/// Goes through all structures three times: pass 1 finds clusters of environments for each element, pass 2 their covariances,
+/// pass 3 the thresholds. The artifact depends on model, data, --candidates, --seed and --shard-size, but not on the number of
+/// threads.
+///
+/// Keeps its state in CALM.npz.build until the artifact is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same
+/// command continues from the last finished shards.
+#[derive(Debug, clap::Args)]
+pub struct Build {
+    /// GRACE model (kokkos.npz) with the projection of its features (uq_rp_matrix)
+    #[arg(long, value_name = "MODEL.npz")]
+    model: PathBuf,
+    /// Training data: extended XYZ (.extxyz, .xyz) or POSCAR, also with .gz or .zst
+    #[arg(value_name = "DATA", required = true)]
+    data: Vec<PathBuf>,
+    /// File for the artifact; an existing file is replaced at the end
+    #[arg(long, short, value_name = "CALM.npz")]
+    output: PathBuf,
+    /// Also write a copy of the model with the new mixture, for LAMMPS and calmwalk
+    #[arg(long, value_name = "MODEL.npz")]
+    embed: Option<PathBuf>,
+    /// Weight of the atoms of a file of DATA, 0 or more [default: 1]; may be repeated
+    #[arg(long, value_name = "FILE=W", value_parser = weight)]
+    weight: Vec<(PathBuf, f64)>,
+    /// Numbers of clusters to choose from for each element, ascending
+    #[arg(long, value_name = "K,…", value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
+    candidates: Vec<usize>,
+    /// Random seed
+    #[arg(long, value_name = "N", default_value_t = 42)]
+    seed: u64,
+    /// Structures of a shard, the unit of work; each thread holds one in memory
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
+    shard_size: u64,
+    /// Threads; each takes whole shards [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+    /// Begin anew, whatever state is there
+    #[arg(long)]
+    restart: bool,
+}
+
+impl Build {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        let outputs: Vec<&Path> =
+            std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path).collect();
+        self.refuse_to_replace_inputs(&outputs)?;
+        // Errors in paths are found before hours of work.
+        outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
+        let files = data_files(&self.data, &self.weight)?;
+        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
+        let (projection, seed) = projection(&self.model, &model)?;
+        let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
+        let settings = BuildSettings {
+            dimension: projection.feature_dimension,
+            seed: self.seed,
+            candidates: self.candidates.clone(),
+            shard_size: self.shard_size,
+        };
+        let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
+        let work = Work {
+            model: Arc::new(model),
+            files,
+            shard_size: self.shard_size,
+            seed: self.seed,
+            threads: self.threads.map_or(cores, usize::from),
+            stop: stop_token()?,
+        };
+        let mut build = mixture_build::Build::open(work, settings, hash, &self.output, self.restart)?;
+        let Some(mixture) = build.run(projection, seed)? else {
+            print_stderr("stopped; the same command continues");
+            return Ok(ExitStatus::Interrupted);
+        };
+        self.write(&mixture)?;
+        build.finish()?;
+        report(&mixture, &self.output)?;
+        Ok(ExitStatus::Done)
+    }
+
+    fn refuse_to_replace_inputs(&self, outputs: &[&Path]) -> Result<(), Failure> {
+        let data = || self.data.iter().map(|path| (path.as_path(), "a file of training data"));
+        let inputs = || std::iter::once((self.model.as_path(), "the model")).chain(data());
+        outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs()))
+    }
+
+    /// Writes the model with the mixture, then the artifact.
+    fn write(&self, mixture: &BuiltMixture) -> Result<(), Failure> {
+        if let Some(path) = &self.embed {
+            let mut file = AtomicFile::create(path)?;
+            let model = File::open(&self.model).map_err(|error| {
+                Failure::Input(format!("{}: cannot be opened: {error}", self.model.display()))
+            })?;
+            mixture
+                .write_export(BufReader::new(model), &mut file)
+                .map_err(|error| cannot_write(path, error))?;
+            file.finish()?;
+        }
+        let mut file = AtomicFile::create(&self.output)?;
+        mixture.write(&mut file).map_err(|error| cannot_write(&self.output, error))?;
+        file.finish()
+    }
+}
+
+/// The projection of the model, and its random seed if the file has it.
+fn projection(path: &Path, model: &GraceModel) -> Result<(Projection, Option<i64>), Failure> {
+    let Some(found) = model.projection() else {
+        return Err(Failure::Input(format!(
+            "{}: the model has no projection of its features (uq_rp_matrix), from which a mixture could be built: export it with              CALM arrays (uq_*), those of any mixture of this model",
+            path.display()
+        )));
+    };
+    let file = Archive::open(path).map_err(Failure::input)?;
+    let key = "uq_rp_seed";
+    let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(Failure::input)?;
+    let projection = Projection {
+        matrix: found.matrix.clone(),
+        rows: found.matrix.len() / found.dimension,
+        columns: found.dimension,
+        feature_dimension: found.feature_dimension(),
+        asinh: found.asinh,
+        normalised: found.normalize,
+        density_channels: found.density_channels,
+        density_scale: found.density_scale,
+    };
+    Ok((projection, seed.and_then(|seed| seed.data.first().copied())))
+}
+
+fn weight(text: &str) -> Result<(PathBuf, f64), String> {
+    let expected = || "expected FILE=W with a number W, 0 or more".to_owned();
+    let (file, weight) = text.rsplit_once('=').ok_or_else(expected)?;
+    let weight = weight.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0);
+    weight.map(|weight| (file.into(), weight)).ok_or_else(expected)
+}
+
+/// A table of the elements.
+fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), Failure> {
+    let artifact = mixture.artifact().map_err(Failure::failed)?;
+    if let Err(fault) = check_sound(&artifact, output) {
+        log_and_warn(format_args!("WARNING: {fault}; campaigns and calm score refuse this artifact"));
+    }
+    let titles = [
+        "element",
+        ">atoms",
+        ">components",
+        ">smallest",
+        ">largest",
+        ">condition number",
+        ">thresholds",
+        ">γ > 1",
+    ];
+    let mut table = Table::new(&titles);
+    for ((symbol, element), thresholds) in
+        artifact.symbols.iter().zip(mixture.elements()).zip(mixture.thresholds())
+    {
+        table.push(row(symbol, element.as_ref(), &thresholds.weighted));
+    }
+    print(|out| {
+        table.write(out)?;
+        writeln!(out, "wrote {}", output.display())
+    })
+}
+
+fn row(symbol: &str, element: Option<&BuiltElement>, thresholds: &[f64]) -> Vec<String> {
+    let Some(BuiltElement { components, histograms }) = element else {
+        let dashes = std::iter::repeat_n("–".to_owned(), 5);
+        return [symbol.to_owned(), "0".into()].into_iter().chain(dashes).chain(["–".to_owned()]).collect();
+    };
+    let counts = || components.iter().map(|component| component.count);
+    let atoms: f64 = counts().sum();
+    let condition = components.iter().map(|component| component.condition_number).fold(0.0, f64::max);
+    let thresholds = &thresholds[..components.len()];
+    let (low, high) = range(thresholds.iter().copied());
+    let (smallest, largest) = range(counts());
+    let above: f64 = histograms
+        .components
+        .iter()
+        .zip(thresholds)
+        .map(|(histogram, &threshold)| histogram.count_above(threshold))
+        .sum();
+    vec![
+        symbol.to_owned(),
+        atoms.to_string(),
+        components.len().to_string(),
+        smallest.to_string(),
+        largest.to_string(),
+        format!("{condition:.1e}"),
+        if low == high { format!("{low:.2}") } else { format!("{low:.2}–{high:.2}") },
+        format!("{:.2} %", 100.0 * above / atoms.max(1.0)),
+    ]
+}
+
+fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
+    values.fold((f64::INFINITY, 0.0), |(low, high), value| (low.min(value), f64::max(high, value)))
+}

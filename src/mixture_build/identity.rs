@@ -1,0 +1,92 @@
+//! What identifies a build: the command that continues it must have the same.
+
+use calm::build::BuildSettings;
+use serde::{Deserialize, Serialize};
+
+use super::stream::DataFile;
+
+/// Changes when the state of an older program cannot be continued.
+const FORMAT: u32 = 1;
+
+/// Model, settings, and names and weights of the data files. Their contents are compared when they are read, shard by shard.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Identity {
+    format: u32,
+    /// BLAKE3 of the model's file.
+    model: String,
+    settings: BuildSettings,
+    files: Vec<FileIdentity>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct FileIdentity {
+    /// As given.
+    path: String,
+    weight: f64,
+}
+
+impl Identity {
+    pub fn new(model: String, settings: BuildSettings, files: &[DataFile]) -> Self {
+        let named =
+            |file: &DataFile| FileIdentity { path: file.path.display().to_string(), weight: file.weight };
+        Self { format: FORMAT, model, settings, files: files.iter().map(named).collect() }
+    }
+
+    /// Compares this build with the one that a state `began` with. An error names the first difference.
+    pub fn check_same(&self, began: &Self) -> Result<(), String> {
+        same("the format of its state", began.format, self.format)?;
+        same("the BLAKE3 hash of its model", &began.model, &self.model)?;
+        let (old, new) = (&began.settings, &self.settings);
+        same("its number of features", old.dimension, new.dimension)?;
+        same("its --seed", old.seed, new.seed)?;
+        same("its --candidates", list(&old.candidates), list(&new.candidates))?;
+        same("its --shard-size", old.shard_size, new.shard_size)?;
+        let names = |files: &[FileIdentity]| -> String {
+            files.iter().map(|file| file.path.as_str()).collect::<Vec<_>>().join(" ")
+        };
+        same("its list of data files", names(&began.files), names(&self.files))?;
+        for (old, new) in began.files.iter().zip(&self.files) {
+            same(&format!("the --weight of {}", old.path), old.weight, new.weight)?;
+        }
+        Ok(())
+    }
+}
+
+fn same<T: PartialEq + std::fmt::Display>(what: &str, began: T, now: T) -> Result<(), String> {
+    if began == now { Ok(()) } else { Err(format!("{what} is {began}, now it is {now}")) }
+}
+
+fn list(candidates: &[usize]) -> String {
+    candidates.iter().map(usize::to_string).collect::<Vec<_>>().join(",")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_difference_is_named() {
+        let settings = BuildSettings { dimension: 3, seed: 42, candidates: vec![1, 2], shard_size: 10 };
+        let file = FileIdentity { path: "a.xyz".into(), weight: 1.0 };
+        let began = Identity { format: FORMAT, model: "abc".into(), settings, files: vec![file] };
+        assert_eq!(began.check_same(&began), Ok(()));
+        let changes: [(fn(&mut Identity), &str); 7] = [
+            (|other| other.format = 0, "format"),
+            (|other| other.model = "x".into(), "model is abc, now it is x"),
+            (|other| other.settings.dimension = 4, "features"),
+            (|other| other.settings.seed = 1, "--seed is 42, now it is 1"),
+            (|other| other.settings.candidates = vec![1], "--candidates is 1,2, now it is 1"),
+            (|other| other.settings.shard_size = 1, "--shard-size"),
+            (|other| other.files[0].weight = 0.5, "--weight of a.xyz is 1, now it is 0.5"),
+        ];
+        for (change, what) in changes {
+            let mut other = began.clone();
+            change(&mut other);
+            let message = other.check_same(&began).unwrap_err();
+            assert!(message.contains(what), "{message}");
+        }
+        let mut other = began.clone();
+        other.files.clear();
+        assert!(other.check_same(&began).unwrap_err().contains("list of data files"));
+    }
+}

@@ -1,0 +1,142 @@
+//! One shard in one pass: the features of its structures, in random order, go to the passes of their elements.
+
+use calm::build::{BuildError, CalibrationPass, ElementHistograms, ElementSums, ScatterPass, shuffled};
+use calm::build::{ShardClustering, ShardClusters};
+use tokio_util::sync::CancellationToken;
+
+use super::stream::{Shard, ShardHash, TrainingStructure};
+use crate::exit_status::Failure;
+use crate::features::FeatureCalculator;
+
+/// Atoms of an element that are passed on together: they stay in the cache.
+const BATCH_ATOMS: usize = 256;
+
+/// What a pass does with the atoms of one element of a shard.
+pub trait ElementPass {
+    /// What it finds.
+    type Partial: Send;
+
+    /// Adds atoms: features `[atoms × D]` and weights.
+    fn add(&mut self, features: &[f64], weights: &[f64]) -> Result<(), BuildError>;
+
+    /// Ends the shard.
+    fn finish(self) -> Self::Partial;
+}
+
+impl ElementPass for ShardClustering {
+    type Partial = ShardClusters;
+
+    fn add(&mut self, features: &[f64], _weights: &[f64]) -> Result<(), BuildError> {
+        self.add(features)
+    }
+
+    fn finish(self) -> ShardClusters {
+        self.finish()
+    }
+}
+
+impl ElementPass for ScatterPass {
+    type Partial = ElementSums;
+
+    fn add(&mut self, features: &[f64], weights: &[f64]) -> Result<(), BuildError> {
+        self.add(features, weights)
+    }
+
+    fn finish(self) -> ElementSums {
+        self.finish()
+    }
+}
+
+impl ElementPass for CalibrationPass {
+    type Partial = ElementHistograms;
+
+    fn add(&mut self, features: &[f64], weights: &[f64]) -> Result<(), BuildError> {
+        self.add(features, weights)
+    }
+
+    fn finish(self) -> ElementHistograms {
+        self.finish()
+    }
+}
+
+/// What a pass found in a shard.
+pub struct ShardResult<T> {
+    pub index: u64,
+    pub hash: ShardHash,
+    /// By element index; `None` for an element that takes no part in the pass.
+    pub elements: Vec<Option<T>>,
+}
+
+/// The atoms of an element that wait to be passed on.
+struct Element<P> {
+    pass: Option<P>,
+    features: Vec<f64>,
+    weights: Vec<f64>,
+}
+
+impl<P: ElementPass> Element<P> {
+    fn flush(&mut self) -> Result<(), BuildError> {
+        if let Some(pass) = &mut self.pass {
+            pass.add(&self.features, &self.weights)?;
+        }
+        self.features.clear();
+        self.weights.clear();
+        Ok(())
+    }
+}
+
+/// Takes the structures of a shard through a pass. `passes` has that of each element, and `each` is called after each structure.
+/// `None` once `stop` is cancelled.
+pub fn run_shard<P: ElementPass>(
+    calculator: &mut FeatureCalculator,
+    shard: &Shard,
+    seed: u64,
+    passes: Vec<Option<P>>,
+    stop: &CancellationToken,
+    each: impl Fn(),
+) -> Result<Option<ShardResult<P::Partial>>, Failure> {
+    let empty = |pass| Element { pass, features: Vec::new(), weights: Vec::new() };
+    let mut elements: Vec<Element<P>> = passes.into_iter().map(empty).collect();
+    let broken = |error: BuildError| Failure::Failed(format!("shard {}: {error}", shard.index));
+    for number in shuffled(seed, shard.index, shard.structures.len()) {
+        if stop.is_cancelled() {
+            return Ok(None);
+        }
+        let structure = &shard.structures[number];
+        add(calculator, structure, &mut elements)?;
+        for element in elements.iter_mut().filter(|element| element.weights.len() >= BATCH_ATOMS) {
+            element.flush().map_err(broken)?;
+        }
+        each();
+    }
+    elements.iter_mut().try_for_each(Element::flush).map_err(broken)?;
+    Ok(Some(ShardResult {
+        index: shard.index,
+        hash: shard.hash,
+        elements: elements.into_iter().map(|element| element.pass.map(P::finish)).collect(),
+    }))
+}
+
+fn add<P>(
+    calculator: &mut FeatureCalculator,
+    structure: &TrainingStructure,
+    elements: &mut [Element<P>],
+) -> Result<(), Failure> {
+    let found = calculator.compute(&structure.structure).map_err(|error| structure.wrong(error))?;
+    let dimension = calculator.grace.model().feature_dimension();
+    let rows = calculator.grace.features().chunks_exact(dimension);
+    for (atom, (row, index)) in rows.zip(found).enumerate() {
+        if !row.iter().map(|value| value * value).sum::<f64>().is_finite() {
+            return Err(structure.wrong(format_args!("the features of atom {atom} are not finite")));
+        }
+        let element = &mut elements[index];
+        if element.pass.is_none() {
+            let message =
+                "pass 1 found no atom of its element; did the file change? Begin anew with --restart";
+            return Err(structure.wrong(format_args!("atom {atom}: {message}")));
+        }
+        element.features.extend_from_slice(row);
+        element.weights.push(structure.weight);
+    }
+    Ok(())
+}

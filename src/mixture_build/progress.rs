@@ -1,0 +1,86 @@
+//! Progress of a pass: a bar on a terminal, otherwise a line now and then.
+
+use std::cell::Cell;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use super::workers::Counters;
+use crate::output::{self, Bar, print_stderr};
+
+/// Time between two lines.
+const LINE_INTERVAL: Duration = Duration::from_secs(30);
+
+const BAR: &str = "{bar:32} {percent} %  {msg}";
+
+/// The bar counts in these parts of the whole.
+const PARTS: u64 = 10_000;
+
+/// The progress of one pass.
+pub struct Progress<'a> {
+    pass: usize,
+    /// Number of structures, if it is known.
+    total: Option<u64>,
+    /// Size of the files.
+    bytes: u64,
+    counters: &'a Counters,
+    bar: Bar,
+    begun: Instant,
+    line: Cell<Instant>,
+}
+
+impl<'a> Progress<'a> {
+    /// Begins a pass of which this many shards are finished.
+    pub fn new(pass: usize, total: Option<u64>, bytes: u64, counters: &'a Counters) -> Self {
+        let now = Instant::now();
+        let bar = Bar::new(Some(PARTS), BAR);
+        Self { pass, total, bytes, counters, bar, begun: now, line: Cell::new(now) }
+    }
+
+    /// Shows where the pass is.
+    pub fn show(&self) {
+        self.bar.set((self.share() * PARTS as f64) as u64, || self.text());
+        if !self.bar.is_shown() && self.line.get().elapsed() > LINE_INTERVAL {
+            self.line.set(Instant::now());
+            print_stderr(self.text());
+        }
+    }
+
+    /// Says that the pass is over.
+    pub fn end(&self, structures: u64) {
+        let (structures, shards) =
+            (output::count(structures, "structure"), self.counters.shards.load(Ordering::Relaxed));
+        let line = format!("pass {} of 3: {structures} in {}", self.pass, output::count(shards, "shard"));
+        self.bar.suspend(|| print_stderr(line));
+    }
+
+    /// Structures that this process went through: computed, and skipped in finished shards.
+    fn structures(&self) -> (f64, f64) {
+        let read = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed) as f64;
+        (read(&self.counters.computed), read(&self.counters.skipped))
+    }
+
+    /// Of the whole pass, from 0 to 1. The number of structures is unknown in pass 1, where the files' bytes count.
+    fn share(&self) -> f64 {
+        let (computed, skipped) = self.structures();
+        let (done, all) = match self.total {
+            Some(total) => (computed + skipped, total as f64),
+            None => (self.counters.bytes.load(Ordering::Relaxed) as f64, self.bytes as f64),
+        };
+        (done / all.max(1.0)).min(1.0)
+    }
+
+    fn text(&self) -> String {
+        let (seconds, (computed, skipped)) = (self.begun.elapsed().as_secs_f64(), self.structures());
+        let (share, shards) =
+            (self.share(), output::count(self.counters.shards.load(Ordering::Relaxed), "shard"));
+        let mut text = format!("pass {} of 3: {shards} done", self.pass);
+        if computed > 0.0 {
+            // Skipped structures take no time.
+            let own = share * computed / (computed + skipped);
+            let left =
+                indicatif::HumanDuration(Duration::from_secs_f64(seconds * (1.0 - share) / own.max(1e-9)));
+            text += &format!(", {:.1} structures/s, {left} left in this pass", computed / seconds.max(1e-9));
+        }
+        text
+    }
+}

@@ -1,0 +1,243 @@
+//! The state of a build on disk, from which it continues after any interruption.
+//!
+//! The directory `A.npz.build` beside the artifact has `build.json`, which identifies the build; a file of the clusters of some
+//! shards for each time that pass 1 was saved; `partition`, which ends pass 1; and one file each for the running sums of passes
+//! 2 and 3. Every file appears complete, by renaming, and carries a checksum.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File, TryLockError};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use calm::build::{ElementPartition, ExactSums, ShardClusters};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use super::identity::Identity;
+use super::stream::ShardHash;
+use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
+use crate::exit_status::Failure;
+
+const IDENTITY: &str = "build.json";
+const LOCK: &str = "lock";
+const PARTITION: &str = "partition";
+const CLUSTERS: &str = "pass-1-";
+
+/// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.
+const PAUSE: u32 = 19;
+
+/// The directory, which this process alone uses.
+pub struct State {
+    directory: PathBuf,
+    _lock: File,
+    /// When it was last saved, and how long that took.
+    saved: Instant,
+    cost: Duration,
+}
+
+/// A shard of pass 1.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct FinishedShard {
+    pub index: u64,
+    pub hash: ShardHash,
+    /// By element index.
+    pub elements: Vec<ShardClusters>,
+}
+
+/// The result of pass 1.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Partition {
+    /// Number of structures in all files.
+    pub structures: u64,
+    /// Of each shard.
+    pub hashes: Vec<ShardHash>,
+    /// By element index.
+    pub elements: Vec<ElementPartition>,
+}
+
+/// The sums of pass 2 or 3 over the finished shards: of bounded size, whatever their number.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct RunningSums {
+    pub finished: BTreeSet<u64>,
+    /// By element index; `None` for an element without atoms. Empty before the first shard.
+    pub elements: Vec<Option<ExactSums>>,
+}
+
+impl State {
+    /// Opens the state of the build of `output`, or begins one. Returns it with whether it existed.
+    ///
+    /// # Errors
+    /// Another process uses it; it belongs to another build (unless `restart`, which removes it first).
+    pub fn open(output: &Path, identity: &Identity, restart: bool) -> Result<(Self, bool), Failure> {
+        let mut name = output.file_name().unwrap_or_default().to_owned();
+        name.push(".build");
+        let directory = output.with_file_name(name);
+        fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
+        let path = directory.join(LOCK);
+        let lock = File::create(&path).map_err(|error| cannot_create(&path, error))?;
+        lock.try_lock().map_err(|error| match error {
+            TryLockError::WouldBlock => {
+                Failure::Failed(format!("another process builds {} now", output.display()))
+            }
+            TryLockError::Error(error) => cannot_write(&path, error),
+        })?;
+        let state = Self { directory, _lock: lock, saved: Instant::now(), cost: Duration::ZERO };
+        let path = state.path(IDENTITY);
+        // Nothing is lost with a state without results.
+        if path.exists() && !restart && state.names()?.iter().any(|name| is_result(name)) {
+            let text = fs::read(&path).map_err(|error| unreadable(&path, error))?;
+            let found: Identity = serde_json::from_slice(&text).map_err(|error| unreadable(&path, error))?;
+            identity.check_same(&found).map_err(|difference| state.other_build(&difference))?;
+            return Ok((state, true));
+        }
+        // Results without an identity are left of a state that was removed.
+        state.clear()?;
+        let mut file = AtomicFile::create(&path)?;
+        let text = serde_json::to_vec_pretty(identity).map_err(Failure::failed)?;
+        file.write_all(&text).map_err(|error| cannot_write(&path, error))?;
+        file.finish()?;
+        Ok((state, false))
+    }
+
+    /// Where it is.
+    pub fn directory(&self) -> &Path {
+        &self.directory
+    }
+
+    /// Whether saving now costs little compared with the time since it was last saved.
+    pub fn is_due(&self) -> bool {
+        self.saved.elapsed() > PAUSE * self.cost
+    }
+
+    /// The shards whose clusters are known, also with other contents than they have now.
+    pub fn clusters(&self) -> Result<Vec<FinishedShard>, Failure> {
+        let mut shards: Vec<FinishedShard> = Vec::new();
+        for name in self.names()?.iter().filter(|name| name.starts_with(CLUSTERS)) {
+            shards.extend(self.read::<Vec<FinishedShard>>(name)?.unwrap_or_default());
+        }
+        Ok(shards)
+    }
+
+    /// Adds finished shards.
+    pub fn save_clusters(&mut self, shards: &[FinishedShard]) -> Result<(), Failure> {
+        if shards.is_empty() {
+            return Ok(());
+        }
+        let names = self.names()?;
+        let numbers = names.iter().filter_map(|name| name.strip_prefix(CLUSTERS)?.parse::<u64>().ok());
+        let next = numbers.max().map_or(0, |last| last + 1);
+        self.write(&format!("{CLUSTERS}{next}"), &shards)
+    }
+
+    /// The result of pass 1, if it is finished.
+    pub fn partition(&self) -> Result<Option<Partition>, Failure> {
+        self.read(PARTITION)
+    }
+
+    /// Ends pass 1.
+    pub fn save_partition(&mut self, partition: &Partition) -> Result<(), Failure> {
+        self.write(PARTITION, partition)
+    }
+
+    /// The sums of pass 2 or 3.
+    pub fn sums(&self, pass: usize) -> Result<RunningSums, Failure> {
+        Ok(self.read(&sums_name(pass))?.unwrap_or_default())
+    }
+
+    /// Replaces the sums of pass 2 or 3.
+    pub fn save_sums(&mut self, pass: usize, sums: &RunningSums) -> Result<(), Failure> {
+        self.write(&sums_name(pass), sums)
+    }
+
+    /// Removes the directory, but leaves files that are none of the state's.
+    pub fn remove(self) -> Result<(), Failure> {
+        self.clear()?;
+        let lock = self.path(LOCK);
+        fs::remove_file(&lock).map_err(|error| cannot_remove(&lock, error))?;
+        match fs::remove_dir(&self.directory) {
+            Err(error) if error.kind() != std::io::ErrorKind::DirectoryNotEmpty => {
+                Err(cannot_remove(&self.directory, error))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Removes the identity first: a directory without it has no state.
+    fn clear(&self) -> Result<(), Failure> {
+        let own = |name: &String| is_result(name) || (name.starts_with('.') && name.ends_with(".part"));
+        let rest = self.names()?.into_iter().filter(own);
+        for name in std::iter::once(IDENTITY.to_owned()).chain(rest) {
+            let path = self.path(&name);
+            match fs::remove_file(&path) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(cannot_remove(&path, error));
+                }
+                _ => (),
+            }
+        }
+        Ok(())
+    }
+
+    fn names(&self) -> Result<Vec<String>, Failure> {
+        let entries = fs::read_dir(&self.directory).map_err(|error| unreadable(&self.directory, error))?;
+        Ok(entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect())
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    fn write(&mut self, name: &str, value: &impl Serialize) -> Result<(), Failure> {
+        let begun = Instant::now();
+        let path = self.path(name);
+        let bytes = postcard::to_stdvec(value).map_err(|error| cannot_write(&path, error))?;
+        let mut file = AtomicFile::create(&path)?;
+        let checksum = blake3::hash(&bytes);
+        file.write_all(checksum.as_bytes())
+            .and_then(|()| file.write_all(&bytes))
+            .map_err(|error| cannot_write(&path, error))?;
+        file.finish()?;
+        self.saved = Instant::now();
+        self.cost = self.saved - begun;
+        Ok(())
+    }
+
+    fn read<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>, Failure> {
+        let path = self.path(name);
+        let bytes = match fs::read(&path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(unreadable(&path, error)),
+        };
+        let damaged = || unreadable(&path, "the file is damaged; begin anew with --restart");
+        let (checksum, content) = bytes.split_at_checked(blake3::OUT_LEN).ok_or_else(damaged)?;
+        if blake3::hash(content).as_bytes() != checksum {
+            return Err(damaged());
+        }
+        postcard::from_bytes(content).map(Some).map_err(|_| damaged())
+    }
+
+    fn other_build(&self, difference: &str) -> Failure {
+        Failure::Input(format!(
+            "{} has the state of another build: {difference}; repeat the command that began it, or begin anew with --restart",
+            self.directory.display()
+        ))
+    }
+}
+
+fn is_result(name: &str) -> bool {
+    name == PARTITION || name.starts_with("pass-")
+}
+
+fn sums_name(pass: usize) -> String {
+    format!("pass-{pass}")
+}
+
+fn unreadable(path: &Path, error: impl std::fmt::Display) -> Failure {
+    Failure::Failed(format!("cannot read {}: {error}", path.display()))
+}
+
+fn cannot_remove(path: &Path, error: impl std::fmt::Display) -> Failure {
+    Failure::Failed(format!("cannot remove {}: {error}", path.display()))
+}

@@ -1,0 +1,170 @@
+//! Threads that take whole shards, in order, through a pass.
+
+use std::panic::resume_unwind;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError, SyncSender};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use calm::build::BuildError;
+use potentials::grace::GraceModel;
+use tokio_util::sync::CancellationToken;
+
+use super::passes::{ElementPass, ShardResult, run_shard};
+use super::stream::{DataFile, Shard, ShardReader};
+use crate::exit_status::Failure;
+use crate::features::FeatureCalculator;
+
+/// Time between two looks at the progress.
+const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
+
+/// What all passes share.
+pub struct Work {
+    pub model: Arc<GraceModel>,
+    pub files: Vec<DataFile>,
+    pub shard_size: u64,
+    pub seed: u64,
+    pub threads: usize,
+    pub stop: CancellationToken,
+}
+
+/// What has been done in a pass since this process began it.
+#[derive(Default)]
+pub struct Counters {
+    /// Bytes of the files that were read.
+    pub bytes: Arc<AtomicU64>,
+    /// Structures whose features were computed.
+    pub computed: AtomicU64,
+    /// Structures of shards that were finished before.
+    pub skipped: AtomicU64,
+    /// Finished shards, those of before included.
+    pub shards: AtomicU64,
+}
+
+/// What the threads of a pass share.
+struct Shared<'a, F, B> {
+    work: &'a Work,
+    reader: Mutex<Option<ShardReader>>,
+    is_finished: F,
+    begin: B,
+    counters: &'a Counters,
+    /// The first of them is the one that a single thread would have met.
+    failures: Mutex<Vec<(u64, Failure)>>,
+}
+
+/// Takes all shards but those that `is_finished` knows through a pass, and gives their results to `receive` in the order in which
+/// they end. Shards that other threads have begun are finished before a failure is returned, but not after the cancellation of
+/// `stop`. Memory holds one shard for each thread.
+///
+/// Returns the number of structures in the files; `None` after a cancellation.
+pub fn run_pass<P: ElementPass>(
+    work: &Work,
+    is_finished: impl Fn(&Shard) -> Result<bool, Failure> + Sync,
+    begin: impl Fn(u64) -> Result<Vec<Option<P>>, BuildError> + Sync,
+    counters: &Counters,
+    mut receive: impl FnMut(ShardResult<P::Partial>) -> Result<(), Failure>,
+    progress: impl Fn(),
+) -> Result<Option<u64>, Failure> {
+    let reader = ShardReader::new(&work.files, work.shard_size, Arc::clone(&counters.bytes));
+    let shared = Shared {
+        work,
+        reader: Mutex::new(Some(reader)),
+        is_finished,
+        begin,
+        counters,
+        failures: Mutex::default(),
+    };
+    let structures = thread::scope(|scope| {
+        let (send, results) = mpsc::sync_channel(work.threads);
+        let threads: Vec<_> = (0..work.threads)
+            .map(|_| {
+                let (send, shared) = (send.clone(), &shared);
+                scope.spawn(move || shared.take_shards(&send))
+            })
+            .collect();
+        drop(send);
+        loop {
+            match results.recv_timeout(PROGRESS_INTERVAL) {
+                Ok(result) => {
+                    let result: ShardResult<P::Partial> = result;
+                    let index = result.index;
+                    counters.shards.fetch_add(1, Ordering::Relaxed);
+                    if let Err(failure) = receive(result) {
+                        shared.fail(index, failure);
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => (),
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            progress();
+        }
+        let ends =
+            threads.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        ends.flatten().max()
+    });
+    let failures = shared.failures.into_inner().unwrap_or_else(PoisonError::into_inner);
+    if let Some((_, failure)) = failures.into_iter().min_by_key(|(shard, _)| *shard) {
+        return Err(failure);
+    }
+    Ok(structures.filter(|_| !work.stop.is_cancelled()))
+}
+
+impl<F, B> Shared<'_, F, B> {
+    /// Returns the number of structures if this thread came to the end of the files.
+    fn take_shards<P>(&self, results: &SyncSender<ShardResult<P::Partial>>) -> Option<u64>
+    where
+        P: ElementPass,
+        F: Fn(&Shard) -> Result<bool, Failure>,
+        B: Fn(u64) -> Result<Vec<Option<P>>, BuildError>,
+    {
+        let mut calculator = FeatureCalculator::new(Arc::clone(&self.work.model));
+        let (work, computed) = (self.work, &self.counters.computed);
+        while !work.stop.is_cancelled() {
+            let shard = {
+                let mut place = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
+                let reader = place.as_mut()?;
+                match reader.next_shard() {
+                    Ok(Some(shard)) => shard,
+                    Ok(None) => return Some(reader.structures()),
+                    Err(failure) => {
+                        let index = reader.next_index();
+                        drop(place);
+                        self.fail(index, failure);
+                        return None;
+                    }
+                }
+            };
+            match (self.is_finished)(&shard) {
+                Ok(false) => (),
+                Ok(true) => {
+                    self.counters.skipped.fetch_add(shard.structures.len() as u64, Ordering::Relaxed);
+                    self.counters.shards.fetch_add(1, Ordering::Relaxed);
+                    continue;
+                }
+                Err(failure) => {
+                    self.fail(shard.index, failure);
+                    return None;
+                }
+            }
+            let each = || {
+                computed.fetch_add(1, Ordering::Relaxed);
+            };
+            let passes = (self.begin)(shard.index).map_err(Failure::failed);
+            let result = passes
+                .and_then(|passes| run_shard(&mut calculator, &shard, work.seed, passes, &work.stop, each));
+            match result {
+                Ok(Some(result)) => results.send(result).ok()?,
+                Ok(None) => return None,
+                Err(failure) => self.fail(shard.index, failure),
+            }
+        }
+        None
+    }
+
+    /// Hands out no more shards.
+    fn fail(&self, shard: u64, failure: Failure) {
+        self.reader.lock().unwrap_or_else(PoisonError::into_inner).take();
+        self.failures.lock().unwrap_or_else(PoisonError::into_inner).push((shard, failure));
+    }
+}

@@ -1,0 +1,304 @@
+//! `calmwalk calm build`: the same bytes however the work is divided and interrupted, and a mixture that grades its own data.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Instant;
+
+use atoms::extxyz::Frame;
+use atoms::read_extxyz;
+use calm::Artifact;
+use npyz::zip::ZipArchive;
+
+use crate::common::processes::{signal, wait_until};
+use crate::common::{Running, calmwalk, config, program, random, refuse, stderr, succeed, write_frames};
+
+const MODEL: &str = "data/al_eam_1l/kokkos.npz";
+
+/// Atoms of the demonstration's training data.
+const ATOMS: usize = 5400;
+
+fn frames() -> Vec<Frame> {
+    read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap()
+}
+
+/// The arguments of a build of `data` with small shards.
+fn arguments(output: &str, data: &[&str], more: &[&str]) -> Vec<String> {
+    let model = config(MODEL).display().to_string();
+    let first = ["calm", "build", "--model", &model, "--output", output, "--shard-size", "3"];
+    first.iter().chain(data).chain(more).map(|text| (*text).to_owned()).collect()
+}
+
+fn build(here: &Path, output: &str, data: &[&str], more: &[&str]) -> (Vec<u8>, String) {
+    let printed = succeed(here, arguments(output, data, more));
+    assert!(!here.join(format!("{output}.build")).exists());
+    (fs::read(here.join(output)).unwrap(), printed)
+}
+
+/// γ of all atoms of `data.extxyz`.
+fn grades(here: &Path, model: &str, artifact: &[&str]) -> Vec<f64> {
+    let start = ["calm", "score", "--model", model, "data.extxyz", "--output", "scored.extxyz"];
+    succeed(here, start.iter().chain(artifact));
+    let scored = read_extxyz(&here.join("scored.extxyz")).unwrap();
+    scored.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect()
+}
+
+#[test]
+fn the_number_of_threads_changes_no_byte_and_the_mixture_grades_its_data() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("data.extxyz"), &frames());
+    let (one, printed) =
+        build(here, "one.npz", &["data.extxyz"], &["--threads", "1", "--embed", "model.npz"]);
+    let (two, _) = build(here, "two.npz", &["data.extxyz"], &["--threads", "2"]);
+    assert!(one == two, "the artifacts differ");
+    // Another seed is another mixture.
+    let (other, _) = build(here, "other.npz", &["data.extxyz"], &["--seed", "7"]);
+    assert!(one != other);
+
+    let model = config(MODEL).display().to_string();
+    let gamma = grades(here, &model, &["--artifact", "one.npz"]);
+    assert_eq!(gamma.len(), ATOMS);
+    let above = gamma.iter().filter(|gamma| **gamma > 1.0).count() as f64 / ATOMS as f64;
+    let row: Vec<&str> = printed.lines().nth(1).unwrap().split_whitespace().collect();
+    assert_eq!(row[..2], ["Al", "5400"]);
+    let shown: f64 = row[row.len() - 2].parse().unwrap();
+    assert!(shown < 10.0 && (shown / 100.0 - above).abs() < 5e-4, "{shown} % {above}");
+    assert!(printed.ends_with("wrote one.npz\n"), "{printed}");
+
+    // The model with the mixture is the model, and grades as the artifact does.
+    assert_eq!(grades(here, "model.npz", &[]), gamma);
+    assert!(grades(here, &model, &[]) != gamma);
+    let (old, new) = (arrays(&config(MODEL)), arrays(&here.join("model.npz")));
+    assert!(old.iter().map(|array| &array.0).eq(new.iter().map(|array| &array.0)));
+    let changed: Vec<_> =
+        old.iter().zip(&new).filter(|(a, b)| a.1 != b.1).map(|(a, _)| a.0.as_str()).collect();
+    assert!(changed.contains(&"uq_centroids.npy"), "{changed:?}");
+    assert!(changed.iter().all(|name| name.starts_with("uq_") && !name.starts_with("uq_rp_")), "{changed:?}");
+}
+
+/// Names and bytes of the files of an archive, by name.
+fn arrays(path: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut archive = ZipArchive::new(fs::File::open(path).unwrap()).unwrap();
+    let read = |index| {
+        let (mut file, mut bytes) = (archive.by_index(index).unwrap(), Vec::new());
+        file.read_to_end(&mut bytes).unwrap();
+        (file.name().to_owned(), bytes)
+    };
+    let mut all: Vec<_> =
+        (0..ZipArchive::new(fs::File::open(path).unwrap()).unwrap().len()).map(read).collect();
+    all.sort();
+    all
+}
+
+#[test]
+fn kills_change_no_byte() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("data.extxyz"), &frames());
+    let begun = Instant::now();
+    let (expected, _) = build(here, "expected.npz", &["data.extxyz"], &["--threads", "2"]);
+    let takes = begun.elapsed();
+    let arguments = arguments("killed.npz", &["data.extxyz"], &["--threads", "2"]);
+    let (mut states, mut kills) = (Vec::new(), 0);
+    loop {
+        let mut command = program(here);
+        let child = command.args(&arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let mut running = Running(child);
+        std::thread::sleep(takes.mul_f64((random(kills) % 1000) as f64 / 1500.0));
+        if kills < 8 && running.0.try_wait().unwrap().is_none() {
+            signal(running.0.id(), "KILL");
+            running.0.wait().unwrap();
+            kills += 1;
+            let files = fs::read_dir(here.join("killed.npz.build")).into_iter().flatten().flatten();
+            states.extend(files.map(|file| file.file_name().to_string_lossy().into_owned()));
+            continue;
+        }
+        assert_eq!(running.0.wait().unwrap().code(), Some(0), "after {kills} kills");
+        break;
+    }
+    assert!(kills > 0 && states.iter().any(|name| name == "pass-1-0"), "{kills} {states:?}");
+    assert!(fs::read(here.join("killed.npz")).unwrap() == expected, "after {kills} kills");
+    assert!(!here.join("killed.npz.build").exists());
+}
+
+#[test]
+fn an_interrupted_build_continues_and_another_is_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let files = ["a.extxyz", "b.extxyz", "c.extxyz"];
+    files.iter().for_each(|file| write_frames(&here.join(file), &frames()));
+    let started = arguments("out.npz", &files, &["--weight", "b.extxyz=0.5", "--threads", "1"]);
+    let mut command = program(here);
+    let child = command.args(&started).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let state = here.join("out.npz.build");
+    wait_until("a shard is finished", || state.join("pass-1-0").exists());
+    assert!(refuse_busy(here, &started).contains("another process builds out.npz"));
+    signal(child.id(), "INT");
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
+    assert!(stderr(&output).contains("the same command continues"));
+    assert!(!here.join("out.npz").exists());
+
+    let refused = |data: &[&str], more: &[&str], difference: &str| {
+        let message = refuse(here, arguments("out.npz", data, more));
+        assert!(message.contains("another build") && message.contains(difference), "{message}");
+        assert!(message.contains("--restart"), "{message}");
+    };
+    let weights = ["--weight", "b.extxyz=0.5"];
+    refused(&files, &[], "--weight of b.extxyz is 0.5, now it is 1");
+    refused(
+        &files[..2],
+        &weights,
+        "list of data files is a.extxyz b.extxyz c.extxyz, now it is a.extxyz b.extxyz",
+    );
+    refused(&files, &["--weight", "b.extxyz=0.5", "--seed", "1"], "--seed is 42, now it is 1");
+    refused(&files, &["--weight", "b.extxyz=0.5", "--candidates", "1,2,4"], "--candidates is 1,2,4,8,16");
+
+    let output = calmwalk(here, &started);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert!(stderr(&output).contains("continuing from out.npz.build"), "{}", stderr(&output));
+    let continued = fs::read(here.join("out.npz")).unwrap();
+    let (anew, _) = build(here, "anew.npz", &files, &weights);
+    assert!(continued == anew);
+    // Weights count in the statistics.
+    let artifact = Artifact::load(here.join("anew.npz")).unwrap();
+    let statistics =
+        artifact.mixture.components(0).unwrap().iter().map(|component| component.statistics().unwrap());
+    let (count, effective) = statistics.fold((0.0, 0.0), |(n, w), of| (n + of.count, w + of.effective_count));
+    assert_eq!((count, effective), (3.0 * ATOMS as f64, 2.5 * ATOMS as f64));
+}
+
+fn refuse_busy(here: &Path, arguments: &[String]) -> String {
+    let output = calmwalk(here, arguments);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    stderr(&output)
+}
+
+#[test]
+fn packed_files_and_several_files_are_the_same_stream() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let frames = frames();
+    let (first, rest) = frames.split_at(20);
+    let (second, last) = rest.split_at(29);
+    write_frames(&here.join("first.extxyz"), first);
+    write_frames(&here.join("second.extxyz"), second);
+    let mut poscar = Vec::new();
+    let [last] = last else { panic!("one frame is left") };
+    atoms::poscar::write_poscar(&mut poscar, &last.structure, "aluminium").unwrap();
+    fs::write(here.join("POSCAR"), &poscar).unwrap();
+    let (plain, _) = build(here, "plain.npz", &["first.extxyz", "second.extxyz", "POSCAR"], &[]);
+
+    let packed = zstd::encode_all(&fs::read(here.join("first.extxyz")).unwrap()[..], 3).unwrap();
+    fs::write(here.join("first.xyz.zst"), packed).unwrap();
+    for (from, to) in [("second.extxyz", "second.extxyz.gz"), ("POSCAR", "POSCAR.gz")] {
+        let file = fs::File::create(here.join(to)).unwrap();
+        let mut encoder = flate2::write::GzEncoder::new(file, flate2::Compression::fast());
+        encoder.write_all(&fs::read(here.join(from)).unwrap()).unwrap();
+        encoder.finish().unwrap();
+    }
+    let (unpacked, _) = build(here, "packed.npz", &["first.xyz.zst", "second.extxyz.gz", "POSCAR.gz"], &[]);
+    assert!(plain == unpacked);
+}
+
+#[test]
+fn a_bad_structure_is_named_and_what_was_finished_is_kept() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let cell = "Lattice=\"4 0 0 0 4 0 0 0 4\" Properties=species:S:1:pos:R:3";
+    write_frames(&here.join("data.extxyz"), &frames());
+    let good = fs::read_to_string(here.join("data.extxyz")).unwrap();
+    let (expected, _) = build(here, "expected.npz", &["data.extxyz"], &[]);
+    let line = good.lines().count() + 1;
+    for (bad, place, reason) in [
+        (format!("1\n{cell}\nSi 0 0 0\n"), line, "atom 0 is Si"),
+        (format!("2\n{cell}\nAl 0 0 0\nAl 0 0 0.1\n"), line, "atoms 0 and 1 are 0.100 Å apart"),
+        (format!("2\n{cell}\nAl 0 0 0\n"), line + 3, "ends after 1 of the 2 atoms"),
+    ] {
+        fs::write(here.join("data.extxyz"), format!("{good}{bad}")).unwrap();
+        let message = refuse(here, arguments("out.npz", &["data.extxyz"], &["--threads", "2"]));
+        assert!(message.contains(&format!("data.extxyz:{place}: ")) && message.contains(reason), "{message}");
+        assert!(here.join("out.npz.build/pass-1-0").exists());
+    }
+    // Shards with the same structures are not computed again.
+    let kept = fs::read(here.join("out.npz.build/pass-1-0")).unwrap();
+    assert!(kept.len() > 1000);
+    fs::write(here.join("data.extxyz"), &good).unwrap();
+    let (mended, _) = build(here, "out.npz", &["data.extxyz"], &[]);
+    assert!(mended == expected);
+}
+
+#[test]
+fn changed_data_and_damaged_states_are_noticed() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let mut frames = frames();
+    write_frames(&here.join("data.extxyz"), &frames);
+    let arguments = arguments("out.npz", &["data.extxyz"], &["--threads", "1"]);
+    let state = here.join("out.npz.build");
+    let mut running = Running(program(here).args(&arguments).stdout(Stdio::null()).spawn().unwrap());
+    wait_until("pass 2 has begun", || state.join("pass-2").exists());
+    signal(running.0.id(), "KILL");
+    running.0.wait().unwrap();
+    assert!(!here.join("out.npz").exists());
+
+    frames[10].structure.positions[0][0] += 1e-9;
+    write_frames(&here.join("data.extxyz"), &frames);
+    let message = refuse(here, &arguments);
+    assert!(message.contains("shard 3 (from data.extxyz:991)"), "{message}");
+    assert!(message.contains("changed since pass 1"), "{message}");
+    frames.truncate(48);
+    frames[10].structure.positions[0][0] -= 1e-9;
+
+    let path = state.join("pass-2");
+    let mut bytes = fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(&path, bytes).unwrap();
+    assert!(refuse_busy(here, &arguments).contains("damaged; begin anew with --restart"));
+    write_frames(&here.join("data.extxyz"), &frames);
+    let (anew, _) = build(here, "out.npz", &["data.extxyz"], &["--threads", "1", "--restart"]);
+    let (other, _) = build(here, "other.npz", &["data.extxyz"], &[]);
+    assert!(anew == other);
+}
+
+#[test]
+fn wrong_arguments_are_refused_before_any_work() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("data.extxyz"), &frames()[..1]);
+    fs::write(here.join("empty.extxyz"), "").unwrap();
+    fs::write(here.join("data.cif"), "").unwrap();
+    fs::write(here.join("broken.xyz.gz"), "no archive").unwrap();
+    let wrong = |data: &[&str], more: &[&str], reason: &str| {
+        let message = refuse(here, arguments("out.npz", data, more));
+        assert!(message.contains(reason), "{message}");
+        assert!(!here.join("out.npz").exists());
+    };
+    let data = &["data.extxyz"];
+    wrong(&["missing.extxyz"], &[], "missing.extxyz: cannot be opened");
+    wrong(&["empty.extxyz"], &[], "empty.extxyz: the file has no structures");
+    wrong(&["data.cif"], &[], "data.cif: unknown format");
+    wrong(&["broken.xyz.gz"], &["--restart"], "broken.xyz.gz:1: ");
+    wrong(&["data.extxyz", "data.extxyz"], &[], "given twice");
+    wrong(data, &["--weight", "other.extxyz=2"], "--weight other.extxyz: expected one of the files");
+    wrong(data, &["--weight", "data.extxyz=-1"], "expected FILE=W with a number W, 0 or more");
+    wrong(data, &["--weight", "data.extxyz"], "expected FILE=W");
+    wrong(data, &["--candidates", "4,2"], "found [4, 2], expected at least one, ascending");
+    wrong(data, &["--shard-size", "0"], "--shard-size");
+    wrong(data, &["--embed", "data.extxyz"], "data.extxyz is a file of training data");
+    wrong(data, &["--embed", "missing/model.npz"], "cannot write missing/model.npz");
+
+    // A model without features.
+    let mut plain = npyz::zip::ZipWriter::new(fs::File::create(here.join("plain.npz")).unwrap());
+    for (name, bytes) in arrays(&config(MODEL)).into_iter().filter(|(name, _)| !name.starts_with("uq_")) {
+        plain.start_file(name, npyz::zip::write::FileOptions::default()).unwrap();
+        plain.write_all(&bytes).unwrap();
+    }
+    plain.finish().unwrap();
+    let arguments = ["calm", "build", "--model", "plain.npz", "data.extxyz", "--output", "out.npz"];
+    let message = refuse(here, arguments);
+    assert!(message.contains("no projection") && message.contains("export it with"), "{message}");
+}
