@@ -1,4 +1,4 @@
-//! What `calmwalk export` writes for gracemaker and MACE, read back by their own loaders. Needs two Pythons, named by
+//! What `calmwalk export` writes for gracemaker and MACE, and the artifact of `calm build`, read back by their own loaders. Needs two Pythons, named by
 //! `CALMWALK_GRACEMAKER_PYTHON` (of PyPI: tensorpotential) and `CALMWALK_MACE_PYTHON` (mace-torch); `.ci/loaders` makes both.
 
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::process::Command;
 use atoms::read_extxyz;
 
 use crate::common::campaign::Small;
-use crate::common::{deviation, stderr, succeed};
+use crate::common::{config, deviation, stderr, succeed};
 
 /// Energy (eV), forces (eV/Å) and stress (eV/Å³) of a frame, as a loader has them.
 type Loaded = (f64, Vec<f64>, Vec<f64>);
@@ -33,6 +33,31 @@ fn mace_loads_what_is_written() {
          _, found = load_from_xyz('out.extxyz', keys)\n\
          frames = [frame.properties for frame in found]",
     );
+}
+
+#[test]
+fn gracemaker_grades_by_an_artifact_that_was_built() {
+    let variable = "CALMWALK_GRACEMAKER_PYTHON";
+    let python = std::env::var_os(variable).unwrap_or_else(|| panic!("{variable} names no Python"));
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let path = |file: &str| config(&format!("data/al_eam_1l/{file}")).display().to_string();
+    let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
+    succeed(here, ["calm", "build", "--model", &model, &data, "--output", "calm.npz", "--shard-size", "9"]);
+    let score =
+        ["calm", "score", "--model", &model, "--artifact", "calm.npz", &data, "--output", "out.extxyz"];
+    succeed(here, score.into_iter().chain(["--features", "z.npy"]));
+    let frames = read_extxyz(&here.join("out.extxyz")).unwrap();
+    let gamma: Vec<f64> = frames.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect();
+    let script = "import json, numpy as np, tensorflow as tf\n\
+                  from tensorpotential.uq.gmmuq import GMMUQModel\n\
+                  z = np.load('z.npy')\n\
+                  model = GMMUQModel('calm.npz', param_dtype=tf.float64)\n\
+                  gamma, _ = model.gamma_from_features(tf.constant(z), tf.zeros(len(z), tf.int32))\n\
+                  print(json.dumps(gamma.tolist()))";
+    let found: Vec<f64> = last_line(here, Path::new(&python), script);
+    assert!(gamma.len() == 5400 && gamma.iter().any(|gamma| *gamma > 1.0));
+    assert!(deviation(&found, &gamma) < 1e-6);
 }
 
 fn loads(keys: &str, variable: &str, load: &str) {
@@ -62,7 +87,12 @@ fn loaded(here: &Path, python: &Path, load: &str) -> Vec<Loaded> {
         "import json, numpy as np\n{load}\n\
          print(json.dumps([[float(f['energy']), np.ravel(f['forces']).tolist(), np.ravel(f['stress']).tolist()] for f in frames]))"
     );
-    let output = Command::new(python).args(["-c", &script]).current_dir(here).output().unwrap();
+    last_line(here, python, &script)
+}
+
+/// Runs a script, and reads the JSON on the last line that it prints.
+fn last_line<T: serde::de::DeserializeOwned>(here: &Path, python: &Path, script: &str) -> T {
+    let output = Command::new(python).args(["-c", script]).current_dir(here).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     let printed = String::from_utf8(output.stdout).unwrap();
     serde_json::from_str(printed.lines().last().unwrap()).unwrap()

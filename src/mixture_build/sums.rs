@@ -1,0 +1,134 @@
+//! Passes 2 and 3: exact sums over the shards, covariances first and then histograms of σ.
+
+use calm::build::{
+    BuildError, BuiltComponent, CalibrationPass, ElementHistograms, ElementPartition, ElementSums, ExactSums,
+    ScatterPass, components,
+};
+
+use super::Build;
+use super::passes::ElementPass;
+use super::progress::Progress;
+use super::state::{Partition, RunningSums};
+use super::stream::Shard;
+use super::workers::{Counters, run_pass};
+use crate::exit_status::Failure;
+use crate::output;
+
+impl Build {
+    /// Pass 2, and the components of each element.
+    pub(super) fn components(
+        &mut self,
+        partition: &Partition,
+    ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, Failure> {
+        let dimension = self.settings.dimension;
+        let begin = |element: usize| {
+            let centroids = &partition.elements[element].centroids;
+            (!centroids.is_empty()).then(|| ScatterPass::new(dimension, centroids)).transpose()
+        };
+        let Some(sums) = self.sums(2, partition, begin, |sums: &ElementSums| sums.to_row())? else {
+            return Ok(None);
+        };
+        let of = |(found, sums): (&ElementPartition, Option<ExactSums>)| {
+            let built = |sums: ExactSums| {
+                let sums = ElementSums::from_row(dimension, &sums.totals())?;
+                components(&found.centroids, &sums)
+            };
+            sums.map(built).transpose().map_err(Failure::failed)
+        };
+        partition.elements.iter().zip(sums).map(of).collect::<Result<_, _>>().map(Some)
+    }
+
+    /// Pass 3: the histograms of each element.
+    pub(super) fn histograms(
+        &mut self,
+        partition: &Partition,
+        components: &[Option<Vec<BuiltComponent>>],
+    ) -> Result<Option<Vec<Option<ElementHistograms>>>, Failure> {
+        let begin = |element: usize| components[element].as_deref().map(CalibrationPass::new).transpose();
+        let Some(sums) = self.sums(3, partition, begin, |found: &ElementHistograms| found.to_row())? else {
+            return Ok(None);
+        };
+        let of = |sums: Option<ExactSums>| {
+            sums.map(|sums| ElementHistograms::from_row(&sums.totals())).transpose().map_err(Failure::failed)
+        };
+        sums.into_iter().map(of).collect::<Result<_, _>>().map(Some)
+    }
+
+    /// Pass 2 or 3: the sums of each element over all shards. `None` once it was stopped.
+    fn sums<P: ElementPass>(
+        &mut self,
+        pass: usize,
+        partition: &Partition,
+        begin: impl Fn(usize) -> Result<Option<P>, BuildError> + Sync,
+        to_row: impl Fn(&P::Partial) -> Vec<f64>,
+    ) -> Result<Option<Vec<Option<ExactSums>>>, Failure> {
+        let Self { work, state, bytes, .. } = self;
+        let mut sums = state.sums(pass)?;
+        if sums.finished.len() == partition.hashes.len() {
+            return Ok(Some(sums.elements));
+        }
+        let elements = partition.elements.len();
+        sums.elements.resize(elements, None);
+        let counters = Counters::default();
+        let progress = Progress::new(pass, Some(partition.structures), *bytes, &counters);
+        let finished = sums.finished.clone();
+        let is_finished = |shard: &Shard| {
+            if partition.hashes.get(shard.index as usize) != Some(&shard.hash) {
+                return Err(changed_since_pass_1(shard));
+            }
+            Ok(finished.contains(&shard.index))
+        };
+        let ended = run_pass(
+            work,
+            is_finished,
+            |_| (0..elements).map(&begin).collect(),
+            &counters,
+            |result| {
+                add(
+                    &mut sums,
+                    result.index,
+                    result.elements.iter().map(|found| found.as_ref().map(&to_row)),
+                )?;
+                if state.is_due() { state.save_sums(pass, &sums) } else { Ok(()) }
+            },
+            || progress.show(),
+        );
+        state.save_sums(pass, &sums)?;
+        let Some(structures) = ended? else { return Ok(None) };
+        if structures != partition.structures {
+            return Err(Failure::Input(format!(
+                "the data files have {} now, pass 1 found {}; begin anew with --restart",
+                output::count(structures, "structure"),
+                partition.structures
+            )));
+        }
+        progress.end(structures);
+        Ok(Some(sums.elements))
+    }
+}
+
+fn changed_since_pass_1(shard: &Shard) -> Failure {
+    let place = shard.structures.first().map_or(String::new(), |first| format!(" (from {})", first.place()));
+    Failure::Input(format!(
+        "the structures of shard {}{place} have changed since pass 1; restore the files, or begin anew with --restart",
+        shard.index
+    ))
+}
+
+/// Adds a shard to the sums, or nothing.
+fn add(
+    sums: &mut RunningSums,
+    shard: u64,
+    rows: impl Iterator<Item = Option<Vec<f64>>>,
+) -> Result<(), Failure> {
+    let mut elements = sums.elements.clone();
+    for (sum, row) in elements.iter_mut().zip(rows) {
+        if let Some(row) = row {
+            let sum = sum.get_or_insert_with(|| ExactSums::new(row.len()));
+            sum.add(&row).map_err(|error| Failure::Failed(format!("shard {shard}: {error}")))?;
+        }
+    }
+    sums.elements = elements;
+    sums.finished.insert(shard);
+    Ok(())
+}
