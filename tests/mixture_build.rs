@@ -317,3 +317,43 @@ fn wrong_arguments_are_refused_before_any_work() {
     let message = refuse(here, arguments);
     assert!(message.contains("no projection") && message.contains("export it with"), "{message}");
 }
+
+#[test]
+fn thresholds_are_set_anew_from_the_histograms() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("data.extxyz"), &frames());
+    build(here, "built.npz", &["data.extxyz"], &["--embed", "model.npz"]);
+    let above = |artifact: &str, model: &str| {
+        let grades = grades(here, model, &["--artifact", artifact]);
+        grades.iter().filter(|gamma| **gamma > 1.0).count() as f64 / grades.len() as f64
+    };
+    // Half of the atoms of each component are above the median, but for the width of a bin.
+    let options = ["--percentile", "50", "--model", "model.npz", "--embed", "half_model.npz"];
+    let first = ["calm", "recalibrate", "built.npz", "--output", "half.npz"];
+    let printed = succeed(here, first.iter().chain(&options));
+    assert!(printed.contains("wrote half.npz"), "{printed}");
+    let half = above("half.npz", "model.npz");
+    assert!((half - 0.5).abs() < 0.02, "{half}");
+    let own = grades(here, "half_model.npz", &[]);
+    assert_eq!(own, grades(here, "model.npz", &["--artifact", "half.npz"]));
+    // Without the option, the artifact is the built one again.
+    succeed(here, ["calm", "recalibrate", "half.npz", "--output", "again.npz"]);
+    assert_eq!(
+        Artifact::load(here.join("again.npz")).unwrap(),
+        Artifact::load(here.join("built.npz")).unwrap()
+    );
+
+    let message = refuse(here, ["calm", "recalibrate", "built.npz", "--output", "built.npz"]);
+    assert!(message.contains("built.npz is the artifact itself: name another file"), "{message}");
+    let message =
+        refuse(here, ["calm", "recalibrate", "built.npz", "--output", "x.npz", "--percentile", "0"]);
+    assert!(message.contains("expected a percentage, above 0 and at most 100"), "{message}");
+    let other = config(MODEL).display().to_string();
+    let message = refuse(
+        here,
+        ["calm", "recalibrate", "built.npz", "--output", "x.npz", "--model", &other, "--embed", "y.npz"],
+    );
+    assert!(message.contains("the model has another mixture than the artifact"), "{message}");
+    assert!(!here.join("x.npz").exists() && !here.join("y.npz").exists());
+}

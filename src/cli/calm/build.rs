@@ -125,7 +125,8 @@ impl Build {
 fn projection(path: &Path, model: &GraceModel) -> Result<(Projection, Option<i64>), Failure> {
     let Some(found) = model.projection() else {
         return Err(Failure::Input(format!(
-            "{}: the model has no projection of its features (uq_rp_matrix), from which a mixture could be built: export it with              CALM arrays (uq_*), those of any mixture of this model",
+            "{}: the model has no projection of its features (uq_rp_matrix), from which a mixture could be built: export it with \
+             CALM arrays (uq_*), those of any mixture of this model",
             path.display()
         )));
     };

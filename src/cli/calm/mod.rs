@@ -2,16 +2,18 @@
 
 mod build;
 mod info;
+mod recalibrate;
 mod score;
 mod scorer;
 
 use super::{ExitStatus, Failure};
 
-/// Build or inspect a CALM mixture, or grade structures with it
+/// Build, recalibrate or inspect a CALM mixture, or grade structures with it
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Build(build::Build),
     Info(info::Info),
+    Recalibrate(recalibrate::Recalibrate),
     Score(score::Score),
 }
 
@@ -20,6 +22,7 @@ impl Calm {
         match self {
             Self::Build(command) => command.run(),
             Self::Info(command) => command.run(),
+            Self::Recalibrate(command) => command.run(),
             Self::Score(command) => command.run(),
         }
     }

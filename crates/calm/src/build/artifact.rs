@@ -10,7 +10,7 @@ use super::components::BuiltComponent;
 use super::error::{BuildError, expect_length};
 use super::histogram::{BINS, ElementHistograms, Grid, Histogram};
 use super::settings::BuildSettings;
-use super::thresholds::Thresholds;
+use super::thresholds::{ThresholdRule, Thresholds};
 use crate::artifact::{Artifact, ArtifactError, Projection};
 use crate::component::{Component, Statistics};
 use crate::linear::REGULARISATION;
@@ -255,7 +255,7 @@ fn thresholds(element: Option<&BuiltElement>, slots: usize, dimension: usize) ->
         None => ElementHistograms::empty(0),
     };
     histograms.components.resize_with(slots, Histogram::default);
-    histograms.thresholds(dimension)
+    histograms.thresholds(ThresholdRule::Robust, dimension)
 }
 
 /// A component as its file has it.

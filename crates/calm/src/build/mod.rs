@@ -35,6 +35,7 @@ mod mini_batch;
 mod moments;
 mod partition;
 mod random;
+mod recalibrate;
 mod scatter;
 mod settings;
 mod sorter;
@@ -51,9 +52,10 @@ pub use mini_batch::{CandidateClusters, ShardClustering, ShardClusters};
 pub use moments::{ComponentSums, ElementSums};
 pub use partition::{ElementPartition, partition};
 pub use random::shuffled;
+pub use recalibrate::Recalibration;
 pub use scatter::ScatterPass;
 pub use settings::BuildSettings;
-pub use thresholds::Thresholds;
+pub use thresholds::{ThresholdRule, Thresholds};
 
 #[cfg(test)]
 mod tests {

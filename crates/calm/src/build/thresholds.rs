@@ -17,6 +17,26 @@ const BISECTIONS: usize = 60;
 /// The threshold of a component without any data in its element.
 const DEFAULT: f64 = 1.0;
 
+/// How the threshold θ of a component follows from the distribution of σ over its training atoms.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ThresholdRule {
+    /// θ = m + 3 · 1.4826 · MAD with the median m of σ and the median MAD of |σ − m| (paper, Methods).
+    Robust,
+    /// The quantile of σ at this percentage, above 0 and at most 100: all but 100 − Q per cent of the component's training
+    /// atoms have γ ≤ 1.
+    Percentile(f64),
+}
+
+impl ThresholdRule {
+    /// Name in artifacts (`threshold_mode`), as the reference writes it.
+    pub fn name(self) -> String {
+        match self {
+            Self::Robust => "robust_mad".to_owned(),
+            Self::Percentile(percentage) => format!("percentile_{percentage}"),
+        }
+    }
+}
+
 /// Thresholds of the components of an element.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Thresholds {
@@ -34,8 +54,7 @@ struct Calibration {
 }
 
 impl ElementHistograms {
-    /// θ = m + 3 · 1.4826 · MAD for each component, with the median m of σ and the median MAD of |σ − m| (paper,
-    /// Methods).
+    /// The threshold of each component by a rule.
     ///
     /// Quantiles come from the distribution F that is linear inside the bins; the MAD is the root of F(m + t) − F(m − t)
     /// = ½ by 60 bisections. A threshold is reliable if the component has at least max(50, D) atoms and the 99 %
@@ -44,7 +63,7 @@ impl ElementHistograms {
     ///
     /// Weights are rounded to single precision first, as artifacts store them, so that stored histograms give the same
     /// thresholds.
-    pub fn thresholds(&self, dimension: usize) -> Thresholds {
+    pub fn thresholds(&self, rule: ThresholdRule, dimension: usize) -> Thresholds {
         let grid = Grid::default();
         let raw = |histogram: &Histogram| histogram.raw.iter().map(|&count| count as f64).collect::<Vec<_>>();
         let weighted = |histogram: &Histogram| {
@@ -52,8 +71,11 @@ impl ElementHistograms {
         };
         let counts: Vec<u64> = self.components.iter().map(Histogram::count).collect();
         let from = |counts_of: &dyn Fn(&Histogram) -> Vec<f64>| {
-            let found: Vec<_> =
-                self.components.iter().map(|histogram| calibrate(&grid, &counts_of(histogram))).collect();
+            let found: Vec<_> = self
+                .components
+                .iter()
+                .map(|histogram| calibrate(rule, &grid, &counts_of(histogram)))
+                .collect();
             with_fallback(&found, &counts, dimension)
         };
         Thresholds { raw: from(&raw), weighted: from(&weighted) }
@@ -61,8 +83,17 @@ impl ElementHistograms {
 }
 
 /// `None` without counts.
-fn calibrate(grid: &Grid, counts: &[f64]) -> Option<Calibration> {
+fn calibrate(rule: ThresholdRule, grid: &Grid, counts: &[f64]) -> Option<Calibration> {
     let distribution = Distribution::new(grid, counts)?;
+    let threshold = match rule {
+        ThresholdRule::Robust => robust(grid, &distribution),
+        ThresholdRule::Percentile(percentage) => distribution.quantile(percentage / 100.0),
+    };
+    Some(Calibration { threshold, percentile_99: distribution.quantile(0.99) })
+}
+
+/// m + 3 · 1.4826 · MAD.
+fn robust(grid: &Grid, distribution: &Distribution<'_>) -> f64 {
     let median = distribution.quantile(0.5);
     let (mut low, mut high) = (0.0, grid.edges().last().copied().unwrap_or_default());
     for _ in 0..BISECTIONS {
@@ -71,10 +102,7 @@ fn calibrate(grid: &Grid, counts: &[f64]) -> Option<Calibration> {
         if inside < 0.5 { low = middle } else { high = middle }
     }
     let deviation = 0.5 * (low + high);
-    Some(Calibration {
-        threshold: median + 3.0 * MAD_SCALE * deviation,
-        percentile_99: distribution.quantile(0.99),
-    })
+    median + 3.0 * MAD_SCALE * deviation
 }
 
 fn with_fallback(found: &[Option<Calibration>], counts: &[u64], dimension: usize) -> Vec<f64> {
@@ -112,7 +140,7 @@ mod tests {
     fn thresholds_are_those_of_the_reference() {
         let (cases, grid) = (unit_cases(), Grid::default());
         for (case, histogram) in cases["robust_threshold"].as_array().unwrap().iter().zip(histograms()) {
-            let Some(found) = calibrate(&grid, &histogram.weighted) else {
+            let Some(found) = calibrate(ThresholdRule::Robust, &grid, &histogram.weighted) else {
                 assert!(case["threshold"].is_null());
                 continue;
             };
@@ -128,13 +156,13 @@ mod tests {
         let all = histograms();
         let of = |slots: &[usize]| slots.iter().map(|&slot| all[slot].clone()).collect();
         for (element, slots) in [(0, [0, 1, 2, 3, 4]), (2, [1, 3, 2, 3, 3]), (1, [3; 5])] {
-            let found = ElementHistograms { components: of(&slots) }.thresholds(4);
+            let found = ElementHistograms { components: of(&slots) }.thresholds(ThresholdRule::Robust, 4);
             assert_near(&found.raw, &rows(&case["raw"])[element], 2e-14);
             assert_near(&found.weighted, &rows(&case["eff"])[element], 2e-14);
         }
         assert_eq!(case["min_atoms"], MIN_ATOMS);
         // 200 atoms are too few for more features.
-        let found = ElementHistograms { components: of(&[0, 4]) }.thresholds(201);
+        let found = ElementHistograms { components: of(&[0, 4]) }.thresholds(ThresholdRule::Robust, 201);
         assert_eq!(found.raw[0], found.raw[1]);
     }
 }

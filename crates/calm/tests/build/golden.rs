@@ -5,7 +5,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use calm::Artifact;
-use calm::build::{BuildSettings, BuiltElement, BuiltMixture, read_histograms};
+use calm::build::{BuildSettings, BuiltElement, BuiltMixture, ThresholdRule, read_histograms};
 use npyz::npz::NpzArchive;
 
 use super::{calibrate, scatter};
@@ -157,7 +157,7 @@ fn the_artifact_is_that_of_the_reference() {
 fn stored_histograms_give_the_stored_thresholds() {
     let Some(reference) = Reference::open() else { return };
     let elements = read_histograms(&reference.artifact).unwrap();
-    let found = elements.iter().flatten().map(|element| element.thresholds(DIMENSION));
+    let found = elements.iter().flatten().map(|element| element.thresholds(ThresholdRule::Robust, DIMENSION));
     let (raw, weighted): (Vec<_>, Vec<_>) = found.map(|found| (found.raw, found.weighted)).unzip();
     let single =
         |values: Vec<Vec<f64>>| values.concat().into_iter().map(|v| f64::from(v as f32)).collect::<Vec<_>>();

@@ -3,7 +3,7 @@
 use calm::Grades;
 use calm::build::{
     BuildError, BuiltMixture, CalibrationPass, ElementHistograms, ElementSums, ExactSums, ScatterPass,
-    components,
+    ThresholdRule, components,
 };
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -203,7 +203,7 @@ fn few_equal_or_weightless_atoms_make_a_mixture() {
     // Atoms without weight count, but have no part in covariance and weighted threshold.
     let element = built(dimension, &mean(&many), &many, &[0.0; 200]);
     assert_eq!((element.components[0].count, element.components[0].effective_count), (200.0, 0.0));
-    assert_eq!(element.histograms.thresholds(dimension).weighted, [1.0]);
+    assert_eq!(element.histograms.thresholds(ThresholdRule::Robust, dimension).weighted, [1.0]);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::io::Cursor;
 
 use calm::Artifact;
-use calm::build::{BuiltMixture, read_histograms};
+use calm::build::{BuiltMixture, Recalibration, ThresholdRule, read_histograms};
 
 use super::{Blobs, built, projection, settings, weights};
 use crate::common::{numbers, optional};
@@ -62,7 +62,7 @@ fn stored_histograms_give_the_thresholds_again() {
         let stored = numbers(&path, key);
         assert_eq!(stored[3..6], [1.0; 3]);
         for element in [0, 2] {
-            let found = elements[element].as_ref().unwrap().thresholds(5);
+            let found = elements[element].as_ref().unwrap().thresholds(ThresholdRule::Robust, 5);
             let found = if weighted { found.weighted } else { found.raw };
             assert_eq!(single(&found), stored[3 * element..][..3]);
         }
@@ -114,4 +114,34 @@ fn an_export_with_the_mixture_is_read_back() {
     assert_eq!(numbers(&path, "uq_missing_elem_inv_cov_diag"), [1e6]);
     assert_eq!(numbers(&path, "uq_centroids")[15..30], [0.0; 15]);
     assert_eq!(numbers(&path, "uq_centroids")[35..], [1e10_f32 as f64; 10]);
+}
+
+#[test]
+fn thresholds_are_set_anew_without_the_data() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, other) = (folder.path().join("gmm_artifacts.npz"), folder.path().join("other.npz"));
+    let bytes = mixture(false, true).write(Cursor::new(Vec::new())).unwrap().into_inner();
+    std::fs::write(&path, &bytes).unwrap();
+    let histograms = read_histograms(&path).unwrap();
+    let write = |rule| {
+        let found = Recalibration::new(rule, 5, &histograms);
+        let written = found.write_artifact(Cursor::new(&bytes), Cursor::new(Vec::new())).unwrap();
+        std::fs::write(&other, written.into_inner()).unwrap();
+        Artifact::load(&other).unwrap()
+    };
+    // The rule of the build gives its thresholds.
+    assert_eq!(write(ThresholdRule::Robust), Artifact::load(&path).unwrap());
+
+    let found = write(ThresholdRule::Percentile(90.0));
+    assert_eq!(numbers(&other, "scatter_2"), numbers(&path, "scatter_2"));
+    assert_eq!(npz::Archive::open(&other).unwrap().strings("threshold_mode").unwrap(), ["percentile_90"]);
+    for (element, slot, component) in found.mixture.iter().filter(|(element, ..)| *element != 1) {
+        let histogram = &histograms[element].as_ref().unwrap().components[slot];
+        let below: f64 = histogram.weighted.iter().sum::<f64>();
+        assert!(below > 0.0);
+        // The threshold is the weighted quantile; the raw one differs by what the weights shift.
+        let above = histogram.count_above(component.threshold()) / histogram.count() as f64;
+        assert!((above - 0.1).abs() < 0.02, "{above}");
+    }
+    assert_eq!(found.mixture.component(1, 0).unwrap().threshold(), 1.0);
 }
