@@ -64,13 +64,15 @@ fn list(candidates: &[usize]) -> String {
 mod tests {
     use super::*;
 
+    type Change = fn(&mut Identity);
+
     #[test]
     fn every_difference_is_named() {
         let settings = BuildSettings { dimension: 3, seed: 42, candidates: vec![1, 2], shard_size: 10 };
         let file = FileIdentity { path: "a.xyz".into(), weight: 1.0 };
         let began = Identity { format: FORMAT, model: "abc".into(), settings, files: vec![file] };
         assert_eq!(began.check_same(&began), Ok(()));
-        let changes: [(fn(&mut Identity), &str); 7] = [
+        let changes: [(Change, &str); 7] = [
             (|other| other.format = 0, "format"),
             (|other| other.model = "x".into(), "model is abc, now it is x"),
             (|other| other.settings.dimension = 4, "features"),

@@ -1,11 +1,11 @@
 //! Reads the training data in shards: structure number i of all files together belongs to shard i / shard size.
 
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::vec;
 
 use atoms::extxyz::{self, Frame};
 use atoms::{FileError, Structure, poscar};
@@ -42,7 +42,7 @@ pub type ShardHash = [u8; 32];
 
 /// Reads one shard after another.
 pub struct ShardReader {
-    files: vec::IntoIter<DataFile>,
+    files: VecDeque<DataFile>,
     current: Option<(DataFile, Frames)>,
     shard_size: u64,
     next: u64,
@@ -67,7 +67,7 @@ impl TrainingStructure {
 impl ShardReader {
     /// Begins with the first file; `bytes` counts what is read of all of them.
     pub fn new(files: &[DataFile], shard_size: u64, bytes: Arc<AtomicU64>) -> Self {
-        let files = files.to_vec().into_iter();
+        let files = files.iter().cloned().collect();
         Self { files, current: None, shard_size, next: 0, structures: 0, bytes }
     }
 
@@ -106,7 +106,7 @@ impl ShardReader {
                 let (weight, file) = (file.weight, Arc::clone(&file.path));
                 return Ok(Some(TrainingStructure { structure, weight, file, line }));
             }
-            let Some(file) = self.files.next() else { return Ok(None) };
+            let Some(file) = self.files.pop_front() else { return Ok(None) };
             let mut frames = open(&file.path, &self.bytes).map_err(Failure::input)?.peekable();
             if frames.peek().is_none() {
                 return Err(Failure::input(FileError::Empty(file.path.to_path_buf())));
