@@ -357,3 +357,45 @@ fn thresholds_are_set_anew_from_the_histograms() {
     assert!(message.contains("the model has another mixture than the artifact"), "{message}");
     assert!(!here.join("x.npz").exists() && !here.join("y.npz").exists());
 }
+
+#[test]
+fn two_artifacts_are_compared_on_the_same_structures() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("data.extxyz"), &frames());
+    build(here, "a.npz", &["data.extxyz"], &["--candidates", "1"]);
+    build(here, "b.npz", &["data.extxyz"], &["--candidates", "4"]);
+    let model = config(MODEL).display().to_string();
+    let compared = |first: &str, second: &str| -> serde_json::Value {
+        let arguments = ["calm", "compare", "--model", &model, first, second, "data.extxyz", "--json"];
+        serde_json::from_str(&succeed(here, arguments)).unwrap()
+    };
+    let same = compared("a.npz", "a.npz");
+    assert_eq!((&same[0]["element"], &same[0]["atoms"]), (&"Al".into(), &ATOMS.into()));
+    assert_eq!(
+        (&same[0]["rank_correlation"], &same[0]["only"]),
+        (&1.0.into(), &serde_json::json!([0.0, 0.0]))
+    );
+    let found = compared("a.npz", "b.npz");
+    for (index, artifact) in ["a.npz", "b.npz"].into_iter().enumerate() {
+        let mut grades = grades(here, &model, &["--artifact", artifact]);
+        grades.sort_by(f64::total_cmp);
+        let above = grades.iter().filter(|gamma| **gamma > 1.0).count() as f64 / ATOMS as f64;
+        assert_eq!(found[0]["above_1"][index].as_f64(), Some(above));
+        // All atoms are in the sample; files have fewer digits.
+        let median = 0.5 * (grades[ATOMS / 2 - 1] + grades[ATOMS / 2]);
+        assert!((found[0]["median"][index].as_f64().unwrap() - median).abs() < 1e-6);
+    }
+    let only: Vec<f64> = serde_json::from_value(found[0]["only"].clone()).unwrap();
+    let above: Vec<f64> = serde_json::from_value(found[0]["above_1"].clone()).unwrap();
+    assert!((above[0] - above[1] - (only[0] - only[1])).abs() < 1e-12);
+    assert!((0.5..1.0).contains(&found[0]["rank_correlation"].as_f64().unwrap()));
+    let printed = succeed(here, ["calm", "compare", "--model", &model, "a.npz", "b.npz", "data.extxyz"]);
+    assert!(printed.contains("only A") && printed.contains("A a.npz"), "{printed}");
+    let silicon = config("data/si_sw_1l/gmm_artifacts.npz").display().to_string();
+    let message = refuse(here, ["calm", "compare", "--model", &model, "a.npz", &silicon, "data.extxyz"]);
+    assert!(
+        message.contains("si_sw_1l/gmm_artifacts.npz") && message.contains("list of elements"),
+        "{message}"
+    );
+}

@@ -20,7 +20,7 @@ use calm::build::{BuildSettings, BuiltElement, BuiltMixture, ShardClustering};
 
 use self::identity::Identity;
 use self::state::State;
-pub use self::stream::data_files;
+pub use self::stream::{ShardReader, data_files, total_bytes};
 pub use self::workers::Work;
 use crate::exit_status::Failure;
 use crate::output::print_stderr;

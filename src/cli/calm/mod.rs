@@ -1,6 +1,7 @@
 //! `calmwalk calm`: commands for CALM mixtures, without a campaign.
 
 mod build;
+mod compare;
 mod info;
 mod recalibrate;
 mod score;
@@ -8,10 +9,11 @@ mod scorer;
 
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate or inspect a CALM mixture, or grade structures with it
+/// Build, recalibrate, compare or inspect CALM mixtures, or grade structures with it
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Build(build::Build),
+    Compare(compare::Compare),
     Info(info::Info),
     Recalibrate(recalibrate::Recalibrate),
     Score(score::Score),
@@ -21,6 +23,7 @@ impl Calm {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         match self {
             Self::Build(command) => command.run(),
+            Self::Compare(command) => command.run(),
             Self::Info(command) => command.run(),
             Self::Recalibrate(command) => command.run(),
             Self::Score(command) => command.run(),

@@ -114,12 +114,22 @@ fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact),
         check_sound(&own, export).map_err(Failure::Input)?;
         return Ok((model, own));
     };
+    let artifact = belonging(path, &own)?;
+    Ok((model, artifact))
+}
+
+/// An artifact that belongs to the model of this export.
+pub(super) fn load_artifact(export: &Path, path: &Path) -> Result<Artifact, Failure> {
+    belonging(path, &Artifact::load_export(export).map_err(Failure::input)?)
+}
+
+fn belonging(path: &Path, own: &Artifact) -> Result<Artifact, Failure> {
     let artifact = Artifact::load(path).map_err(Failure::input)?;
     artifact
         .check_belongs_to(&own.symbols, &own.projection)
         .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
     check_sound(&artifact, path).map_err(Failure::Input)?;
-    Ok((model, artifact))
+    Ok(artifact)
 }
 
 /// Adds the results to the frame, after moving its own labels.

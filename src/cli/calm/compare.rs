@@ -1,0 +1,186 @@
+//! `calmwalk calm compare`
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use analysis::{SystematicSample, quantile, spearman};
+use calm::{Artifact, Grades};
+use potentials::grace::GraceModel;
+use serde::Serialize;
+
+use super::score::load_artifact;
+use crate::cli::{ExitStatus, Failure};
+use crate::features::FeatureCalculator;
+use crate::mixture_build::{ShardReader, data_files, total_bytes};
+use crate::output::{self, Bar, Table, decimals, print, print_json};
+
+/// Atoms of each element whose grades are kept for quantiles and ranks.
+const SAMPLED: usize = 50_000;
+
+const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
+
+/// Compare the grades of two CALM artifacts of one model on the same structures
+///
+/// For each element: median and 99 % quantile of γ under both artifacts, the share of atoms with γ > 1 under each and under only one,
+/// and the rank correlation ρ of the two grades (Spearman). Shares count every atom; quantiles and ρ come from a sample of
+/// 50,000 atoms at most.
+#[derive(Debug, clap::Args)]
+pub struct Compare {
+    /// GRACE model (kokkos.npz) that both artifacts belong to
+    #[arg(long, value_name = "MODEL.npz")]
+    model: PathBuf,
+    /// First CALM artifact
+    #[arg(value_name = "A.npz")]
+    first: PathBuf,
+    /// Second CALM artifact
+    #[arg(value_name = "B.npz")]
+    second: PathBuf,
+    /// Structures: extended XYZ (.extxyz, .xyz) or POSCAR, also with .gz or .zst
+    #[arg(value_name = "DATA", required = true)]
+    data: Vec<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The grades of the atoms of an element.
+struct Grading {
+    sample: SystematicSample<[f64; 2]>,
+    /// Atoms above 1 under the first artifact only, the second only, and both.
+    above: [u64; 3],
+}
+
+/// What is said of an element. Pairs are of the first and the second artifact.
+#[derive(Debug, Serialize)]
+struct Comparison {
+    element: String,
+    atoms: u64,
+    /// Median of γ.
+    median: [f64; 2],
+    /// 99 % quantile of γ.
+    percentile_99: [f64; 2],
+    /// Share of the atoms with γ > 1.
+    above_1: [f64; 2],
+    /// Share of the atoms with γ > 1 under this artifact only.
+    only: [f64; 2],
+    /// Spearman's rank correlation of the two grades; null if it is not defined.
+    rank_correlation: Option<f64>,
+}
+
+impl Compare {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
+        let artifacts = [load_artifact(&self.model, &self.first)?, load_artifact(&self.model, &self.second)?];
+        let symbols = artifacts[0].symbols.clone();
+        let gradings = self.grade(model, &artifacts)?;
+        let found = symbols.iter().zip(&gradings).filter_map(|(symbol, grading)| grading.compare(symbol));
+        let found: Vec<_> = found.collect();
+        if self.json {
+            print_json(&found)?;
+        } else {
+            self.report(&found)?;
+        }
+        Ok(ExitStatus::Done)
+    }
+
+    /// The grades of all atoms, by element.
+    fn grade(&self, model: GraceModel, artifacts: &[Artifact; 2]) -> Result<Vec<Grading>, Failure> {
+        let dimension = model.feature_dimension();
+        let mut gradings: Vec<_> = model.elements().iter().map(|_| Grading::new()).collect();
+        let mut calculator = FeatureCalculator::new(Arc::new(model));
+        let files = data_files(&self.data, &[])?;
+        let read = Arc::new(AtomicU64::new(0));
+        let bar = Bar::new(Some(total_bytes(&files)?), BAR);
+        let mut reader = ShardReader::new(&files, 1, Arc::clone(&read));
+        let mut grades = [Grades::default(), Grades::default()];
+        while let Some(shard) = reader.next_shard()? {
+            for training in &shard.structures {
+                let elements =
+                    calculator.compute(&training.structure).map_err(|error| training.wrong(error))?;
+                let features = &calculator.grace.features()[..elements.len() * dimension];
+                for (grades, artifact) in grades.iter_mut().zip(artifacts) {
+                    grades
+                        .evaluate(&artifact.mixture, &elements, features, None)
+                        .map_err(|error| training.wrong(error))?;
+                }
+                for (atom, element) in elements.into_iter().enumerate() {
+                    gradings[element].add([grades[0].gamma[atom], grades[1].gamma[atom]]);
+                }
+            }
+            bar.set(read.load(Ordering::Relaxed), || output::count(reader.structures(), "structure"));
+        }
+        Ok(gradings)
+    }
+
+    fn report(&self, found: &[Comparison]) -> Result<(), Failure> {
+        let titles = [
+            "element",
+            ">atoms",
+            ">median A",
+            ">median B",
+            ">99 % A",
+            ">99 % B",
+            ">γ > 1 A",
+            ">γ > 1 B",
+            ">only A",
+            ">only B",
+            ">ρ",
+        ];
+        let mut table = Table::new(&titles);
+        for one in found {
+            let mut row = vec![one.element.clone(), one.atoms.to_string()];
+            row.extend(
+                [one.median, one.percentile_99].as_flattened().iter().map(|gamma| format!("{gamma:.2}")),
+            );
+            row.extend(
+                [one.above_1, one.only].as_flattened().iter().map(|share| format!("{:.2} %", 100.0 * share)),
+            );
+            row.push(decimals(one.rank_correlation, 3));
+            table.push(row);
+        }
+        print(|out| {
+            writeln!(out, "A {}", self.first.display())?;
+            writeln!(out, "B {}", self.second.display())?;
+            table.write(out)
+        })
+    }
+}
+
+impl Grading {
+    fn new() -> Self {
+        Self { sample: SystematicSample::new(SAMPLED), above: [0; 3] }
+    }
+
+    fn add(&mut self, gamma: [f64; 2]) {
+        match gamma.map(|gamma| gamma > 1.0) {
+            [true, false] => self.above[0] += 1,
+            [false, true] => self.above[1] += 1,
+            [true, true] => self.above[2] += 1,
+            [false, false] => {}
+        }
+        self.sample.add(gamma);
+    }
+
+    /// `None` without atoms.
+    fn compare(&self, symbol: &str) -> Option<Comparison> {
+        let column = |index: usize| self.sample.items().map(|pair| pair[index]).collect::<Vec<_>>();
+        let columns = [column(0), column(1)];
+        let ascending = columns.clone().map(|mut values| {
+            values.sort_by(f64::total_cmp);
+            values
+        });
+        let quantiles = |q: f64| Some([quantile(&ascending[0], q)?, quantile(&ascending[1], q)?]);
+        let share = |number: u64| number as f64 / self.sample.total() as f64;
+        let [first, second, both] = self.above;
+        Some(Comparison {
+            element: symbol.to_owned(),
+            atoms: self.sample.total(),
+            median: quantiles(0.5)?,
+            percentile_99: quantiles(0.99)?,
+            above_1: [share(first + both), share(second + both)],
+            only: [share(first), share(second)],
+            rank_correlation: spearman(&columns[0], &columns[1]),
+        })
+    }
+}
