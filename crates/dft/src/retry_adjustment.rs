@@ -48,6 +48,11 @@ impl RetryAdjustment {
             Self::OtherNode => "other_node",
         }
     }
+
+    /// Whether it changes what the calculation may use or where it runs, not the calculation itself.
+    pub fn is_of_resources(self) -> bool {
+        matches!(self, Self::MoreMemory | Self::MoreTime | Self::OtherNode)
+    }
 }
 
 /// The adjustments that each further failure of a class adds.

@@ -3,10 +3,19 @@
 use std::collections::BTreeMap;
 
 use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, Value};
+use dft::RetryAdjustment;
 use store::{ExportRow, ExportSource};
 use wire::{WalkConditions, WalkId};
 
 use crate::filter::StructureProperties;
+
+/// The retry adjustments without those of memory, time and nodes: they depend on the machine and change no label, and an export has
+/// the same bytes whatever was killed.
+fn of_calculation(names: &[String]) -> Vec<&str> {
+    let of_resources =
+        |name: &str| RetryAdjustment::ALL.iter().any(|known| known.is_of_resources() && known.name() == name);
+    names.iter().map(String::as_str).filter(|name| !of_resources(name)).collect()
+}
 
 /// The quantities of a structure for a filter.
 pub fn facts<'a>(
@@ -68,8 +77,9 @@ pub fn frame(
             info(key, number.into());
         }
     }
-    if !details.retry_adjustments.is_empty() {
-        info("retry_adjustments", details.retry_adjustments.join(",").into());
+    let adjustments = of_calculation(&details.retry_adjustments);
+    if !adjustments.is_empty() {
+        info("retry_adjustments", adjustments.join(",").into());
     }
     info("campaign", campaign.into());
     info("protocol", row.protocol_name.into());
@@ -115,4 +125,19 @@ pub fn frame(
 
 fn integer(number: u64) -> Value {
     Value::Int(i64::try_from(number).unwrap_or(i64::MAX))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn adjustments_of_resources_are_left_out() {
+        let names = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+        let all: Vec<String> = RetryAdjustment::ALL.iter().map(|one| one.name().to_owned()).collect();
+        let kept = ["more_steps", "slower_mixing", "other_algorithm", "other_moments"];
+        assert_eq!(of_calculation(&all), kept);
+        assert!(of_calculation(&names(&["other_node"])).is_empty());
+        assert_eq!(of_calculation(&names(&["of_a_later_version"])), ["of_a_later_version"]);
+    }
 }
