@@ -6,6 +6,7 @@ pub mod cell;
 mod covalent_radius;
 mod element_pair;
 pub mod extxyz;
+pub mod lammps_dump;
 mod min_distances;
 mod neighbours;
 pub mod poscar;

@@ -5,7 +5,7 @@ use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 
 use crate::extxyz::{self, Frame, Reader};
-use crate::poscar;
+use crate::{lammps_dump, poscar};
 
 /// Extensions of other programs' formats that `ase convert` reads.
 const OTHER_FORMATS: [&str; 14] =
@@ -56,6 +56,17 @@ pub enum FileError {
         /// What is wrong with it.
         #[source]
         fault: poscar::PoscarErrorKind,
+    },
+    /// Invalid dump of LAMMPS.
+    #[error("{}:{line}: {fault}", path.display())]
+    LammpsDump {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+        /// What is wrong with it.
+        #[source]
+        fault: lammps_dump::DumpErrorKind,
     },
 }
 
