@@ -68,7 +68,7 @@ fn a_job_that_slurm_kills_for_its_memory_was_out_of_memory() {
     let labels = jobs.finish(run, label);
     once_each(&jobs, labels + 1);
     let ended = only(&jobs, "out_of_memory");
-    assert!(ended["log"].as_str().unwrap().contains("the job's log ends with"), "{ended}");
+    assert!(ended["log"].as_str().unwrap().contains("the job's log says"), "{ended}");
 }
 
 #[test]

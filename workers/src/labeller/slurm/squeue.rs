@@ -123,6 +123,12 @@ impl Traces {
         }
         speaks_of(&["DUE TO TIME LIMIT"]).then_some(Exit::TimeLimit)
     }
+
+    /// What the log says of the end: Slurm's last line, or the last line of all. The shell may write `Terminated` after Slurm.
+    fn last_words(&self) -> Option<&str> {
+        let of_slurm = self.log.lines().rfind(|line| line.starts_with("slurmstepd"));
+        of_slurm.or_else(|| self.log.lines().next_back())
+    }
 }
 
 /// Infers how a calculation ended whose job is over or unknown to Slurm and whose runner recorded no end.
@@ -131,8 +137,8 @@ pub(super) fn infer_end(reported: Option<&SqueueJob>, traces: &Traces) -> Calcul
         Some(reported) => format!("Slurm reports: {reported}; its runner did not record an end"),
         None => "Slurm no longer knows its job, and its runner did not record an end".to_owned(),
     };
-    if let Some(last) = traces.log.lines().next_back() {
-        remark += &format!("; the job's log ends with: {last}");
+    if let Some(line) = traces.last_words() {
+        remark += &format!("; the job's log says: {line}");
     }
     let exit = reported.and_then(SqueueJob::exit).or_else(|| traces.exit());
     CalculationEnd {
@@ -219,7 +225,14 @@ mod tests {
                 (forgotten.how, forgotten.seconds, forgotten.node),
                 (EndReason::Ended(exit), 7.0, None)
             );
-            assert!(forgotten.remark.unwrap().ends_with(log.lines().last().unwrap_or("an end")));
+            let remark = forgotten.remark.unwrap();
+            assert!(remark.ends_with(log.lines().last().unwrap_or("an end")), "{remark}");
+            // The shell speaks after Slurm.
+            let ended = Traces { log: format!("{log}\nTerminated"), seconds: 7.0 };
+            let forgotten = infer_end(None, &ended);
+            assert_eq!(forgotten.how, EndReason::Ended(exit));
+            let remark = forgotten.remark.unwrap();
+            assert!(remark.ends_with(log.lines().last().unwrap_or("Terminated")), "{remark}");
             // Cases without a state of their own in Slurm.
             assert_eq!(infer_end(Some(&reported("FAILED")), &traces).how, EndReason::Ended(exit), "{log}");
             assert_eq!(
