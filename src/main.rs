@@ -28,6 +28,7 @@ mod replay;
 mod report;
 mod runtime;
 mod signals;
+mod structure_files;
 mod summary;
 mod web;
 mod wording;

@@ -1,5 +1,8 @@
 //! `calmwalk calm build`: the same bytes however the work is divided and interrupted, and a mixture that grades its own data.
 
+mod data;
+mod parts;
+
 use std::fs;
 use std::io::{Read, Write};
 use std::path::Path;

@@ -1,21 +1,25 @@
 //! What identifies a build: the command that continues it must have the same.
 
+use atoms::Species;
 use calm::build::BuildSettings;
 use serde::{Deserialize, Serialize};
 
-use super::stream::DataFile;
+use crate::structure_files::{StructureFile, StructureFiles};
 
 /// Changes when the state of an older program cannot be continued.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
-/// Model, settings, and names and weights of the data files. Their contents are compared when they are read, shard by shard.
+/// Model, settings, names and weights of the data files, and how they are read. Their contents are compared when they are read, shard by shard.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Identity {
     format: u32,
     /// BLAKE3 of the model's file.
     model: String,
-    settings: BuildSettings,
+    pub settings: BuildSettings,
     files: Vec<FileIdentity>,
+    /// `--where`
+    filter: Option<String>,
+    dump_elements: Vec<Species>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,10 +30,25 @@ struct FileIdentity {
 }
 
 impl Identity {
-    pub fn new(model: String, settings: BuildSettings, files: &[DataFile]) -> Self {
-        let named =
-            |file: &DataFile| FileIdentity { path: file.path.display().to_string(), weight: file.weight };
-        Self { format: FORMAT, model, settings, files: files.iter().map(named).collect() }
+    pub fn new(model: String, settings: BuildSettings, data: &StructureFiles) -> Self {
+        let named = |file: &StructureFile| FileIdentity {
+            path: file.path.display().to_string(),
+            weight: file.weight,
+        };
+        Self {
+            format: FORMAT,
+            model,
+            settings,
+            files: data.files.iter().map(named).collect(),
+            filter: data.filter.as_ref().map(ToString::to_string),
+            dump_elements: data.dump_elements.clone(),
+        }
+    }
+
+    /// Whether the model's file has this BLAKE3 hash.
+    pub fn check_model(&self, hash: &str) -> Result<(), String> {
+        same("the format of its state", self.format, FORMAT)?;
+        same("the BLAKE3 hash of its model", self.model.as_str(), hash)
     }
 
     /// Compares this build with the one that a state `began` with. An error names the first difference.
@@ -48,7 +67,11 @@ impl Identity {
         for (old, new) in began.files.iter().zip(&self.files) {
             same(&format!("the --weight of {}", old.path), old.weight, new.weight)?;
         }
-        Ok(())
+        let text = |filter: &Option<String>| filter.clone().unwrap_or_else(|| "absent".to_owned());
+        same("its --where", text(&began.filter), text(&self.filter))?;
+        let symbols =
+            |species: &[Species]| species.iter().map(|one| one.symbol()).collect::<Vec<_>>().join(",");
+        same("its --dump-elements", symbols(&began.dump_elements), symbols(&self.dump_elements))
     }
 }
 
@@ -70,9 +93,16 @@ mod tests {
     fn every_difference_is_named() {
         let settings = BuildSettings { dimension: 3, seed: 42, candidates: vec![1, 2], shard_size: 10 };
         let file = FileIdentity { path: "a.xyz".into(), weight: 1.0 };
-        let began = Identity { format: FORMAT, model: "abc".into(), settings, files: vec![file] };
+        let began = Identity {
+            format: FORMAT,
+            model: "abc".into(),
+            settings,
+            files: vec![file],
+            filter: None,
+            dump_elements: Vec::new(),
+        };
         assert_eq!(began.check_same(&began), Ok(()));
-        let changes: [(Change, &str); 7] = [
+        let changes: [(Change, &str); 9] = [
             (|other| other.format = 0, "format"),
             (|other| other.model = "x".into(), "model is abc, now it is x"),
             (|other| other.settings.dimension = 4, "features"),
@@ -80,6 +110,8 @@ mod tests {
             (|other| other.settings.candidates = vec![1], "--candidates is 1,2, now it is 1"),
             (|other| other.settings.shard_size = 1, "--shard-size"),
             (|other| other.files[0].weight = 0.5, "--weight of a.xyz is 1, now it is 0.5"),
+            (|other| other.filter = Some("atoms < 9".into()), "--where is absent, now it is atoms < 9"),
+            (|other| other.dump_elements = vec!["Al".parse().unwrap()], "--dump-elements is , now it is Al"),
         ];
         for (change, what) in changes {
             let mut other = began.clone();

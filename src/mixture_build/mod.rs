@@ -6,6 +6,8 @@
 
 mod clustering;
 mod identity;
+mod merge;
+mod part;
 mod passes;
 mod progress;
 mod state;
@@ -16,11 +18,15 @@ mod workers;
 use std::path::Path;
 
 use calm::Projection;
-use calm::build::{BuildSettings, BuiltElement, BuiltMixture, ShardClustering};
+use calm::build::{
+    BuildSettings, BuiltComponent, BuiltElement, BuiltMixture, ElementHistograms, ShardClustering,
+};
+use potentials::grace::GraceModel;
 
 use self::identity::Identity;
-use self::state::State;
-pub use self::stream::{ShardReader, data_files, total_bytes};
+pub use self::merge::{Merge, Merged};
+pub use self::part::Part;
+use self::state::{PartEnd, State};
 pub use self::workers::Work;
 use crate::exit_status::Failure;
 use crate::output::print_stderr;
@@ -35,12 +41,12 @@ pub struct Build {
 }
 
 impl Build {
-    /// Begins a build, or continues the one whose state lies beside `output`.
+    /// Begins a build, or continues the one whose state lies beside `output`. Of a part of the work, other parts may be under way.
     ///
     /// `model_hash` is the BLAKE3 hash of the model's file.
     ///
     /// # Errors
-    /// Invalid settings; the state of another build.
+    /// Invalid settings; the state of another build (unless `restart`, which is for the whole).
     pub fn open(
         work: Work,
         settings: BuildSettings,
@@ -50,11 +56,14 @@ impl Build {
     ) -> Result<Self, Failure> {
         ShardClustering::new(&settings, 0, 0).map_err(Failure::input)?;
         let identity = Identity::new(model_hash, settings.clone(), &work.files);
-        let (state, exists) = State::open(output, &identity, restart)?;
+        let (state, exists) = match work.part {
+            Part::WHOLE => State::open(output, &identity, restart)?,
+            part => State::open_part(output, &identity, part)?,
+        };
         if exists {
             print_stderr(format_args!("continuing from {}", state.directory().display()));
         }
-        Ok(Self { bytes: stream::total_bytes(&work.files)?, work, settings, state })
+        Ok(Self { bytes: work.files.total_bytes()?, work, settings, state })
     }
 
     /// Takes the passes that are left. `None` if it was stopped; the same build then continues.
@@ -66,17 +75,53 @@ impl Build {
         let Some(partition) = self.partition()? else { return Ok(None) };
         let Some(components) = self.components(&partition)? else { return Ok(None) };
         let Some(histograms) = self.histograms(&partition, &components)? else { return Ok(None) };
-        let elements = components.into_iter().zip(histograms).map(|(components, histograms)| {
-            Some(BuiltElement { components: components?, histograms: histograms? })
-        });
-        let symbols = self.work.model.elements().iter().map(|element| element.symbol().to_owned()).collect();
-        BuiltMixture::new(symbols, projection, projection_seed, self.settings.clone(), elements.collect())
-            .map(Some)
-            .map_err(Failure::failed)
+        let settings = self.settings.clone();
+        mixture(&self.work.model, projection, projection_seed, settings, components, histograms).map(Some)
+    }
+
+    /// Takes the part through one pass, from 1 to 3. Returns whether it came to the end; otherwise it was stopped, and the same
+    /// command continues.
+    ///
+    /// # Errors
+    /// The pass before is not merged yet.
+    pub fn run_part(&mut self, pass: u8) -> Result<bool, Failure> {
+        let not_merged = |pass: u8| {
+            Failure::Failed(format!(
+                "pass {pass} is not merged yet: when all its parts are done, run calmwalk calm merge"
+            ))
+        };
+        if pass == 1 {
+            let Some(found) = self.cluster()? else { return Ok(false) };
+            self.state.save_part_end(&PartEnd { structures: found.structures, hashes: found.hashes })?;
+            return Ok(true);
+        }
+        let partition = self.state.partition()?.ok_or_else(|| not_merged(1))?;
+        if pass == 2 {
+            return Ok(self.sums_of_pass_2(&partition)?.is_some());
+        }
+        let components = self.merged_components(&partition)?.ok_or_else(|| not_merged(2))?;
+        Ok(self.sums_of_pass_3(&partition, &components)?.is_some())
     }
 
     /// Removes the state, which a written artifact no longer needs.
     pub fn finish(self) -> Result<(), Failure> {
         self.state.remove()
     }
+}
+
+/// The mixture of the results of all passes, by element index.
+fn mixture(
+    model: &GraceModel,
+    projection: Projection,
+    projection_seed: Option<i64>,
+    settings: BuildSettings,
+    components: Vec<Option<Vec<BuiltComponent>>>,
+    histograms: Vec<Option<ElementHistograms>>,
+) -> Result<BuiltMixture, Failure> {
+    let elements = components.into_iter().zip(histograms).map(|(components, histograms)| {
+        Some(BuiltElement { components: components?, histograms: histograms? })
+    });
+    let symbols = model.elements().iter().map(|element| element.symbol().to_owned()).collect();
+    BuiltMixture::new(symbols, projection, projection_seed, settings, elements.collect())
+        .map_err(Failure::failed)
 }

@@ -122,18 +122,18 @@ fn add<P>(
     structure: &TrainingStructure,
     elements: &mut [Element<P>],
 ) -> Result<(), Failure> {
-    let found = calculator.compute(&structure.structure).map_err(|error| structure.wrong(error))?;
+    let found = calculator.compute(&structure.structure).map_err(|error| structure.place.wrong(error))?;
     let dimension = calculator.grace.model().feature_dimension();
     let rows = calculator.grace.features().chunks_exact(dimension);
     for (atom, (row, index)) in rows.zip(found).enumerate() {
         if !row.iter().map(|value| value * value).sum::<f64>().is_finite() {
-            return Err(structure.wrong(format_args!("the features of atom {atom} are not finite")));
+            return Err(structure.place.wrong(format_args!("the features of atom {atom} are not finite")));
         }
         let element = &mut elements[index];
         if element.pass.is_none() {
             let message =
                 "pass 1 found no atom of its element; did the file change? Begin anew with --restart";
-            return Err(structure.wrong(format_args!("atom {atom}: {message}")));
+            return Err(structure.place.wrong(format_args!("atom {atom}: {message}")));
         }
         element.features.extend_from_slice(row);
         element.weights.push(structure.weight);

@@ -18,7 +18,7 @@ const PARTS: u64 = 10_000;
 /// The progress of one pass.
 pub struct Progress<'a> {
     pass: usize,
-    /// Number of structures, if it is known.
+    /// Number of structures, if it is known and all are this process's.
     total: Option<u64>,
     /// Size of the files.
     bytes: u64,
@@ -49,7 +49,11 @@ impl<'a> Progress<'a> {
     pub fn end(&self, structures: u64) {
         let (structures, shards) =
             (output::count(structures, "structure"), self.counters.shards.load(Ordering::Relaxed));
-        let line = format!("pass {} of 3: {structures} in {}", self.pass, output::count(shards, "shard"));
+        let mut line = format!("pass {} of 3: {structures} in {}", self.pass, output::count(shards, "shard"));
+        let left_out = self.counters.left_out.load(Ordering::Relaxed);
+        if left_out > 0 {
+            line += &format!(", {left_out} left out by --where");
+        }
         self.bar.suspend(|| print_stderr(line));
     }
 

@@ -2,9 +2,10 @@
 //!
 //! The directory `A.npz.build` beside the artifact has `build.json`, which identifies the build; a file of the clusters of some
 //! shards for each time that pass 1 was saved; `partition`, which ends pass 1; and one file each for the running sums of passes
-//! 2 and 3. Every file appears complete, by renaming, and carries a checksum.
+//! 2 and 3. Each part of a build by several processes has its own files, with its name (`pass-2-3of8`), and an `end-1-3of8` when it
+//! is through pass 1. Every file appears complete, by renaming, and carries a checksum.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, TryLockError};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -15,6 +16,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::identity::Identity;
+use super::part::Part;
 use super::stream::ShardHash;
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::exit_status::Failure;
@@ -23,14 +25,16 @@ const IDENTITY: &str = "build.json";
 const LOCK: &str = "lock";
 const PARTITION: &str = "partition";
 const CLUSTERS: &str = "pass-1-";
+const END: &str = "end-1-";
 
 /// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.
 const PAUSE: u32 = 19;
 
-/// The directory, which this process alone uses.
+/// The directory, which this process alone uses; or the files of a part in it.
 pub struct State {
     directory: PathBuf,
-    _lock: File,
+    part: Part,
+    _locks: Vec<File>,
     /// When it was last saved, and how long that took.
     saved: Instant,
     cost: Duration,
@@ -43,6 +47,15 @@ pub struct FinishedShard {
     pub hash: ShardHash,
     /// By element index.
     pub elements: Vec<ShardClusters>,
+}
+
+/// That a part is through pass 1.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct PartEnd {
+    /// Number of structures in all files.
+    pub structures: u64,
+    /// Of its shards, by index.
+    pub hashes: BTreeMap<u64, ShardHash>,
 }
 
 /// The result of pass 1.
@@ -70,34 +83,84 @@ impl State {
     /// # Errors
     /// Another process uses it; it belongs to another build (unless `restart`, which removes it first).
     pub fn open(output: &Path, identity: &Identity, restart: bool) -> Result<(Self, bool), Failure> {
-        let mut name = output.file_name().unwrap_or_default().to_owned();
-        name.push(".build");
-        let directory = output.with_file_name(name);
+        let directory = directory(output);
         fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
-        let path = directory.join(LOCK);
-        let lock = File::create(&path).map_err(|error| cannot_create(&path, error))?;
-        lock.try_lock().map_err(|error| match error {
-            TryLockError::WouldBlock => {
-                Failure::Failed(format!("another process builds {} now", output.display()))
-            }
-            TryLockError::Error(error) => cannot_write(&path, error),
-        })?;
-        let state = Self { directory, _lock: lock, saved: Instant::now(), cost: Duration::ZERO };
+        let lock = lock(&directory.join(LOCK), output, File::try_lock)?;
+        let state = Self::new(directory, Part::WHOLE, vec![lock]);
         let path = state.path(IDENTITY);
         // Nothing is lost with a state without results.
         if path.exists() && !restart && state.names()?.iter().any(|name| is_result(name)) {
-            let text = fs::read(&path).map_err(|error| unreadable(&path, error))?;
-            let found: Identity = serde_json::from_slice(&text).map_err(|error| unreadable(&path, error))?;
+            let found = state.identity()?;
             identity.check_same(&found).map_err(|difference| state.other_build(&difference))?;
             return Ok((state, true));
         }
         // Results without an identity are left of a state that was removed.
         state.clear()?;
+        state.write_identity(identity)?;
+        Ok((state, false))
+    }
+
+    /// Opens a part of the state of the build of `output`, or begins it. Other processes may use other parts.
+    ///
+    /// # Errors
+    /// A process uses this part or the whole; the state belongs to another build.
+    pub fn open_part(output: &Path, identity: &Identity, part: Part) -> Result<(Self, bool), Failure> {
+        let directory = directory(output);
+        fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
+        let whole = lock(&directory.join(LOCK), output, File::try_lock_shared)?;
+        let own = lock(&directory.join(format!("{LOCK}-{}", part.file_name())), output, File::try_lock)?;
+        let state = Self::new(directory, part, vec![whole, own]);
+        if !state.path(IDENTITY).exists() {
+            if state.names()?.iter().any(|name| is_result(name)) {
+                return Err(unreadable(
+                    &state.directory,
+                    format_args!("it has results but no {IDENTITY}; remove it and begin anew"),
+                ));
+            }
+            // Parts that begin together write the same.
+            state.write_identity(identity)?;
+        }
+        let found = state.identity()?;
+        identity.check_same(&found).map_err(|difference| state.other_build(&difference))?;
+        let names = state.names()?;
+        let exists = names.iter().any(|name| is_result(name) && name.contains(&part.file_name()));
+        Ok((state, exists))
+    }
+
+    /// Opens the state that parts have left, to merge them.
+    ///
+    /// # Errors
+    /// There is none; a process uses it.
+    pub fn open_existing(output: &Path) -> Result<(Self, Identity), Failure> {
+        let directory = directory(output);
+        if !directory.join(IDENTITY).is_file() {
+            return Err(Failure::Input(format!(
+                "{}: expected the directory of a build in parts (calmwalk calm build … --pass 1 --part 1/2)",
+                directory.display()
+            )));
+        }
+        let lock = lock(&directory.join(LOCK), output, File::try_lock)?;
+        let state = Self::new(directory, Part::WHOLE, vec![lock]);
+        let identity = state.identity()?;
+        Ok((state, identity))
+    }
+
+    fn new(directory: PathBuf, part: Part, locks: Vec<File>) -> Self {
+        Self { directory, part, _locks: locks, saved: Instant::now(), cost: Duration::ZERO }
+    }
+
+    fn identity(&self) -> Result<Identity, Failure> {
+        let path = self.path(IDENTITY);
+        let text = fs::read(&path).map_err(|error| unreadable(&path, error))?;
+        serde_json::from_slice(&text).map_err(|error| unreadable(&path, error))
+    }
+
+    fn write_identity(&self, identity: &Identity) -> Result<(), Failure> {
+        let path = self.path(IDENTITY);
         let mut file = AtomicFile::create(&path)?;
         let text = serde_json::to_vec_pretty(identity).map_err(Failure::failed)?;
         file.write_all(&text).map_err(|error| cannot_write(&path, error))?;
-        file.finish()?;
-        Ok((state, false))
+        file.finish()
     }
 
     /// Where it is.
@@ -124,10 +187,42 @@ impl State {
         if shards.is_empty() {
             return Ok(());
         }
+        let own = match self.part {
+            Part::WHOLE => CLUSTERS.to_owned(),
+            part => format!("{CLUSTERS}{}-", part.file_name()),
+        };
         let names = self.names()?;
-        let numbers = names.iter().filter_map(|name| name.strip_prefix(CLUSTERS)?.parse::<u64>().ok());
+        let numbers = names.iter().filter_map(|name| name.strip_prefix(&own)?.parse::<u64>().ok());
         let next = numbers.max().map_or(0, |last| last + 1);
-        self.write(&format!("{CLUSTERS}{next}"), &shards)
+        self.write(&format!("{own}{next}"), &shards)
+    }
+
+    /// Ends pass 1 of the part.
+    pub fn save_part_end(&mut self, end: &PartEnd) -> Result<(), Failure> {
+        self.write(&format!("{END}{}", self.part.file_name()), end)
+    }
+
+    /// The parts that are through pass 1.
+    pub fn part_ends(&self) -> Result<BTreeMap<Part, PartEnd>, Failure> {
+        self.parts(END)
+    }
+
+    /// The sums of all parts in pass 2 or 3.
+    pub fn part_sums(&self, pass: usize) -> Result<BTreeMap<Part, RunningSums>, Failure> {
+        self.parts(&format!("pass-{pass}-"))
+    }
+
+    /// The files of parts whose names begin with `prefix`.
+    fn parts<T: DeserializeOwned>(&self, prefix: &str) -> Result<BTreeMap<Part, T>, Failure> {
+        let mut found = BTreeMap::new();
+        for name in self.names()? {
+            if let Some(part) = name.strip_prefix(prefix).and_then(Part::from_file_name)
+                && let Some(value) = self.read(&name)?
+            {
+                found.insert(part, value);
+            }
+        }
+        Ok(found)
     }
 
     /// The result of pass 1, if it is finished.
@@ -140,21 +235,35 @@ impl State {
         self.write(PARTITION, partition)
     }
 
-    /// The sums of pass 2 or 3.
+    /// The sums of pass 2 or 3 over the shards of this process.
     pub fn sums(&self, pass: usize) -> Result<RunningSums, Failure> {
-        Ok(self.read(&sums_name(pass))?.unwrap_or_default())
+        Ok(self.read(&self.sums_name(pass))?.unwrap_or_default())
+    }
+
+    /// The sums of pass 2 or 3 over all shards, or over those that are merged.
+    pub fn merged_sums(&self, pass: usize) -> Result<RunningSums, Failure> {
+        Ok(self.read(&format!("pass-{pass}"))?.unwrap_or_default())
     }
 
     /// Replaces the sums of pass 2 or 3.
     pub fn save_sums(&mut self, pass: usize, sums: &RunningSums) -> Result<(), Failure> {
-        self.write(&sums_name(pass), sums)
+        self.write(&self.sums_name(pass), sums)
+    }
+
+    fn sums_name(&self, pass: usize) -> String {
+        match self.part {
+            Part::WHOLE => format!("pass-{pass}"),
+            part => format!("pass-{pass}-{}", part.file_name()),
+        }
     }
 
     /// Removes the directory, but leaves files that are none of the state's.
     pub fn remove(self) -> Result<(), Failure> {
         self.clear()?;
-        let lock = self.path(LOCK);
-        fs::remove_file(&lock).map_err(|error| cannot_remove(&lock, error))?;
+        for name in self.names()?.iter().filter(|name| name.starts_with(LOCK)) {
+            let lock = self.path(name);
+            fs::remove_file(&lock).map_err(|error| cannot_remove(&lock, error))?;
+        }
         match fs::remove_dir(&self.directory) {
             Err(error) if error.kind() != std::io::ErrorKind::DirectoryNotEmpty => {
                 Err(cannot_remove(&self.directory, error))
@@ -218,7 +327,8 @@ impl State {
         postcard::from_bytes(content).map(Some).map_err(|_| damaged())
     }
 
-    fn other_build(&self, difference: &str) -> Failure {
+    /// The failure to continue the state of another build.
+    pub fn other_build(&self, difference: &str) -> Failure {
         Failure::Input(format!(
             "{} has the state of another build: {difference}; repeat the command that began it, or begin anew with --restart",
             self.directory.display()
@@ -227,11 +337,29 @@ impl State {
 }
 
 fn is_result(name: &str) -> bool {
-    name == PARTITION || name.starts_with("pass-")
+    name == PARTITION || name.starts_with("pass-") || name.starts_with(END)
 }
 
-fn sums_name(pass: usize) -> String {
-    format!("pass-{pass}")
+/// Where the state of the build of `output` is.
+fn directory(output: &Path) -> PathBuf {
+    let mut name = output.file_name().unwrap_or_default().to_owned();
+    name.push(".build");
+    output.with_file_name(name)
+}
+
+fn lock(
+    path: &Path,
+    output: &Path,
+    lock: impl Fn(&File) -> Result<(), TryLockError>,
+) -> Result<File, Failure> {
+    let file = File::create(path).map_err(|error| cannot_create(path, error))?;
+    match lock(&file) {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            Err(Failure::Failed(format!("another process builds {} now", output.display())))
+        }
+        Err(TryLockError::Error(error)) => Err(cannot_write(path, error)),
+    }
 }
 
 fn unreadable(path: &Path, error: impl std::fmt::Display) -> Failure {

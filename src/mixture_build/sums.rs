@@ -6,6 +6,7 @@ use calm::build::{
 };
 
 use super::Build;
+use super::part::Part;
 use super::passes::ElementPass;
 use super::progress::Progress;
 use super::state::{Partition, RunningSums};
@@ -14,28 +15,17 @@ use super::workers::{Counters, run_pass};
 use crate::exit_status::Failure;
 use crate::output;
 
+/// The sums of each element, by element index.
+type ElementTotals = Vec<Option<ExactSums>>;
+
 impl Build {
     /// Pass 2, and the components of each element.
     pub(super) fn components(
         &mut self,
         partition: &Partition,
     ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, Failure> {
-        let dimension = self.settings.dimension;
-        let begin = |element: usize| {
-            let centroids = &partition.elements[element].centroids;
-            (!centroids.is_empty()).then(|| ScatterPass::new(dimension, centroids)).transpose()
-        };
-        let Some(sums) = self.sums(2, partition, begin, |sums: &ElementSums| sums.to_row())? else {
-            return Ok(None);
-        };
-        let of = |(found, sums): (&ElementPartition, Option<ExactSums>)| {
-            let built = |sums: ExactSums| {
-                let sums = ElementSums::from_row(dimension, &sums.totals())?;
-                components(&found.centroids, &sums)
-            };
-            sums.map(built).transpose().map_err(Failure::failed)
-        };
-        partition.elements.iter().zip(sums).map(of).collect::<Result<_, _>>().map(Some)
+        let Some(sums) = self.sums_of_pass_2(partition)? else { return Ok(None) };
+        components_from_sums(self.settings.dimension, partition, sums).map(Some)
     }
 
     /// Pass 3: the histograms of each element.
@@ -44,33 +34,60 @@ impl Build {
         partition: &Partition,
         components: &[Option<Vec<BuiltComponent>>],
     ) -> Result<Option<Vec<Option<ElementHistograms>>>, Failure> {
-        let begin = |element: usize| components[element].as_deref().map(CalibrationPass::new).transpose();
-        let Some(sums) = self.sums(3, partition, begin, |found: &ElementHistograms| found.to_row())? else {
-            return Ok(None);
-        };
-        let of = |sums: Option<ExactSums>| {
-            sums.map(|sums| ElementHistograms::from_row(&sums.totals())).transpose().map_err(Failure::failed)
-        };
-        sums.into_iter().map(of).collect::<Result<_, _>>().map(Some)
+        let Some(sums) = self.sums_of_pass_3(partition, components)? else { return Ok(None) };
+        histograms_from_sums(sums).map(Some)
     }
 
-    /// Pass 2 or 3: the sums of each element over all shards. `None` once it was stopped.
+    /// The components of each element, if pass 2 of all parts is merged.
+    pub(super) fn merged_components(
+        &self,
+        partition: &Partition,
+    ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, Failure> {
+        let sums = self.state.merged_sums(2)?;
+        if sums.finished.len() != partition.hashes.len() {
+            return Ok(None);
+        }
+        components_from_sums(self.settings.dimension, partition, sums.elements).map(Some)
+    }
+
+    /// Counts and scatter of this process's shards.
+    pub(super) fn sums_of_pass_2(&mut self, partition: &Partition) -> Result<Option<ElementTotals>, Failure> {
+        let dimension = self.settings.dimension;
+        let begin = |element: usize| {
+            let centroids = &partition.elements[element].centroids;
+            (!centroids.is_empty()).then(|| ScatterPass::new(dimension, centroids)).transpose()
+        };
+        self.sums(2, partition, begin, |sums: &ElementSums| sums.to_row())
+    }
+
+    /// Histograms of σ of this process's shards.
+    pub(super) fn sums_of_pass_3(
+        &mut self,
+        partition: &Partition,
+        components: &[Option<Vec<BuiltComponent>>],
+    ) -> Result<Option<ElementTotals>, Failure> {
+        let begin = |element: usize| components[element].as_deref().map(CalibrationPass::new).transpose();
+        self.sums(3, partition, begin, |found: &ElementHistograms| found.to_row())
+    }
+
+    /// Pass 2 or 3: the sums of each element over this process's shards. `None` once it was stopped.
     fn sums<P: ElementPass>(
         &mut self,
         pass: usize,
         partition: &Partition,
         begin: impl Fn(usize) -> Result<Option<P>, BuildError> + Sync,
         to_row: impl Fn(&P::Partial) -> Vec<f64>,
-    ) -> Result<Option<Vec<Option<ExactSums>>>, Failure> {
+    ) -> Result<Option<ElementTotals>, Failure> {
         let Self { work, state, bytes, .. } = self;
         let mut sums = state.sums(pass)?;
-        if sums.finished.len() == partition.hashes.len() {
+        if sums.finished.len() as u64 == work.part.count(partition.hashes.len() as u64) {
             return Ok(Some(sums.elements));
         }
         let elements = partition.elements.len();
         sums.elements.resize(elements, None);
         let counters = Counters::default();
-        let progress = Progress::new(pass, Some(partition.structures), *bytes, &counters);
+        let total = (work.part == Part::WHOLE).then_some(partition.structures);
+        let progress = Progress::new(pass, total, *bytes, &counters);
         let finished = sums.finished.clone();
         let is_finished = |shard: &Shard| {
             if partition.hashes.get(shard.index as usize) != Some(&shard.hash) {
@@ -107,8 +124,32 @@ impl Build {
     }
 }
 
+/// The components of each element, from the sums of pass 2 over all shards.
+pub(super) fn components_from_sums(
+    dimension: usize,
+    partition: &Partition,
+    sums: ElementTotals,
+) -> Result<Vec<Option<Vec<BuiltComponent>>>, Failure> {
+    let of = |(found, sums): (&ElementPartition, Option<ExactSums>)| {
+        let built = |sums: ExactSums| {
+            let sums = ElementSums::from_row(dimension, &sums.totals())?;
+            components(&found.centroids, &sums)
+        };
+        sums.map(built).transpose().map_err(Failure::failed)
+    };
+    partition.elements.iter().zip(sums).map(of).collect()
+}
+
+/// The histograms of each element, from the sums of pass 3 over all shards.
+pub(super) fn histograms_from_sums(sums: ElementTotals) -> Result<Vec<Option<ElementHistograms>>, Failure> {
+    let of = |sums: Option<ExactSums>| {
+        sums.map(|sums| ElementHistograms::from_row(&sums.totals())).transpose().map_err(Failure::failed)
+    };
+    sums.into_iter().map(of).collect()
+}
+
 fn changed_since_pass_1(shard: &Shard) -> Failure {
-    let place = shard.structures.first().map_or(String::new(), |first| format!(" (from {})", first.place()));
+    let place = shard.structures.first().map_or(String::new(), |first| format!(" (from {})", first.place));
     Failure::Input(format!(
         "the structures of shard {}{place} have changed since pass 1; restore the files, or begin anew with --restart",
         shard.index

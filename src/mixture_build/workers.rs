@@ -11,10 +11,12 @@ use calm::build::BuildError;
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
+use super::part::Part;
 use super::passes::{ElementPass, ShardResult, run_shard};
-use super::stream::{DataFile, Shard, ShardReader};
+use super::stream::{Shard, ShardReader};
 use crate::exit_status::Failure;
 use crate::features::FeatureCalculator;
+use crate::structure_files::StructureFiles;
 
 /// Time between two looks at the progress.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
@@ -22,8 +24,10 @@ const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
 /// What all passes share.
 pub struct Work {
     pub model: Arc<GraceModel>,
-    pub files: Vec<DataFile>,
+    pub files: StructureFiles,
     pub shard_size: u64,
+    /// The shards of this process.
+    pub part: Part,
     pub seed: u64,
     pub threads: usize,
     pub stop: CancellationToken,
@@ -40,6 +44,8 @@ pub struct Counters {
     pub skipped: AtomicU64,
     /// Finished shards, those of before included.
     pub shards: AtomicU64,
+    /// Structures that the filter left out, once all files were read.
+    pub left_out: AtomicU64,
 }
 
 /// What the threads of a pass share.
@@ -53,7 +59,7 @@ struct Shared<'a, F, B> {
     failures: Mutex<Vec<(u64, Failure)>>,
 }
 
-/// Takes all shards but those that `is_finished` knows through a pass, and gives their results to `receive` in the order in which
+/// Takes all shards of the part but those that `is_finished` knows through a pass, and gives their results to `receive` in the order in which
 /// they end. Shards that other threads have begun are finished before a failure is returned, but not after the cancellation of
 /// `stop`. Memory holds one shard for each thread.
 ///
@@ -66,7 +72,7 @@ pub fn run_pass<P: ElementPass>(
     mut receive: impl FnMut(ShardResult<P::Partial>) -> Result<(), Failure>,
     progress: impl Fn(),
 ) -> Result<Option<u64>, Failure> {
-    let reader = ShardReader::new(&work.files, work.shard_size, Arc::clone(&counters.bytes));
+    let reader = ShardReader::new(&work.files, work.shard_size, work.part, Arc::clone(&counters.bytes));
     let shared = Shared {
         work,
         reader: Mutex::new(Some(reader)),
@@ -126,7 +132,10 @@ impl<F, B> Shared<'_, F, B> {
                 let reader = place.as_mut()?;
                 match reader.next_shard() {
                     Ok(Some(shard)) => shard,
-                    Ok(None) => return Some(reader.structures()),
+                    Ok(None) => {
+                        self.counters.left_out.store(reader.left_out(), Ordering::Relaxed);
+                        return Some(reader.count());
+                    }
                     Err(failure) => {
                         let index = reader.next_index();
                         drop(place);

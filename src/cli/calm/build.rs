@@ -14,15 +14,18 @@ use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
 use crate::file_hash;
-use crate::mixture_build::{self, Work, data_files};
+use crate::mixture_build::{self, Part, Work};
 use crate::output::{Table, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
+use crate::structure_files::{StructureArguments, StructureFiles};
 
 /// Build a CALM mixture from the training data of a model
 ///
 /// Goes through all structures three times: pass 1 finds clusters of environments for each element, pass 2 their covariances,
 /// pass 3 the thresholds. The artifact depends on model, data, --candidates, --seed and --shard-size, but not on the number of
 /// threads.
+///
+/// Several hosts can share the work (--pass, --part, `calmwalk calm merge`); the artifact is the same.
 ///
 /// Keeps its state in CALM.npz.build until the artifact is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same
 /// command continues from the last finished shards.
@@ -31,9 +34,8 @@ pub struct Build {
     /// GRACE model (kokkos.npz) with the projection of its features (uq_rp_matrix)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
-    /// Training data: extended XYZ (.extxyz, .xyz) or POSCAR, also with .gz or .zst
-    #[arg(value_name = "DATA", required = true)]
-    data: Vec<PathBuf>,
+    #[command(flatten)]
+    data: StructureArguments,
     /// File for the artifact; an existing file is replaced at the end
     #[arg(long, short, value_name = "CALM.npz")]
     output: PathBuf,
@@ -58,16 +60,24 @@ pub struct Build {
     /// Begin anew, whatever state is there
     #[arg(long)]
     restart: bool,
+    /// On a cluster: take only the shards of --part through this pass
+    #[arg(long, value_name = "1|2|3", requires = "part", conflicts_with = "restart", value_parser = clap::value_parser!(u8).range(1..=3))]
+    pass: Option<u8>,
+    /// The part of this process: every n-th shard, from shard i. When all parts of a pass are done, run `calmwalk calm merge`
+    #[arg(long, value_name = "i/n", requires = "pass")]
+    part: Option<Part>,
 }
 
 impl Build {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let outputs: Vec<&Path> =
             std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path).collect();
-        self.refuse_to_replace_inputs(&outputs)?;
+        let files = self.weighted_files()?;
+        let data = files.paths().map(|path| (path, "a file of training data"));
+        let inputs: Vec<_> = std::iter::once((self.model.as_path(), "the model")).chain(data).collect();
+        outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
         // Errors in paths are found before hours of work.
         outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
-        let files = data_files(&self.data, &self.weight)?;
         let model = GraceModel::load(&self.model).map_err(Failure::input)?;
         let (projection, seed) = projection(&self.model, &model)?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
@@ -82,47 +92,73 @@ impl Build {
             model: Arc::new(model),
             files,
             shard_size: self.shard_size,
+            part: self.part.unwrap_or(Part::WHOLE),
             seed: self.seed,
             threads: self.threads.map_or(cores, usize::from),
             stop: stop_token()?,
         };
         let mut build = mixture_build::Build::open(work, settings, hash, &self.output, self.restart)?;
+        if let (Some(pass), Some(part)) = (self.pass, self.part) {
+            return end_part(pass, part, build.run_part(pass)?);
+        }
         let Some(mixture) = build.run(projection, seed)? else {
             print_stderr("stopped; the same command continues");
             return Ok(ExitStatus::Interrupted);
         };
-        self.write(&mixture)?;
+        write_mixture(&mixture, &self.model, self.embed.as_deref(), &self.output)?;
         build.finish()?;
         report(&mixture, &self.output)?;
         Ok(ExitStatus::Done)
     }
 
-    fn refuse_to_replace_inputs(&self, outputs: &[&Path]) -> Result<(), Failure> {
-        let data = || self.data.iter().map(|path| (path.as_path(), "a file of training data"));
-        let inputs = || std::iter::once((self.model.as_path(), "the model")).chain(data());
-        outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs()))
-    }
-
-    /// Writes the model with the mixture, then the artifact.
-    fn write(&self, mixture: &BuiltMixture) -> Result<(), Failure> {
-        if let Some(path) = &self.embed {
-            let mut file = AtomicFile::create(path)?;
-            let model = File::open(&self.model).map_err(|error| {
-                Failure::Input(format!("{}: cannot be opened: {error}", self.model.display()))
-            })?;
-            mixture
-                .write_export(BufReader::new(model), &mut file)
-                .map_err(|error| cannot_write(path, error))?;
-            file.finish()?;
+    /// The training data with their weights.
+    fn weighted_files(&self) -> Result<StructureFiles, Failure> {
+        let mut data = self.data.files()?;
+        for (number, (path, weight)) in self.weight.iter().enumerate() {
+            if self.weight[..number].iter().any(|(other, _)| other == path) {
+                return Err(Failure::Input(format!("--weight {}: given twice", path.display())));
+            }
+            let file = data.files.iter_mut().find(|file| *file.path == **path);
+            let unknown =
+                || Failure::Input(format!("--weight {}: expected one of the files of DATA", path.display()));
+            file.ok_or_else(unknown)?.weight = *weight;
         }
-        let mut file = AtomicFile::create(&self.output)?;
-        mixture.write(&mut file).map_err(|error| cannot_write(&self.output, error))?;
-        file.finish()
+        Ok(data)
     }
 }
 
+fn end_part(pass: u8, part: Part, done: bool) -> Result<ExitStatus, Failure> {
+    if !done {
+        print_stderr("stopped; the same command continues");
+        return Ok(ExitStatus::Interrupted);
+    }
+    print(|out| {
+        writeln!(out, "part {part} of pass {pass} is done; when all parts are, run calmwalk calm merge")
+    })?;
+    Ok(ExitStatus::Done)
+}
+
+/// Writes the model with the mixture, if asked for, then the artifact.
+pub(super) fn write_mixture(
+    mixture: &BuiltMixture,
+    model: &Path,
+    embed: Option<&Path>,
+    output: &Path,
+) -> Result<(), Failure> {
+    if let Some(path) = embed {
+        let mut file = AtomicFile::create(path)?;
+        let model = File::open(model)
+            .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", model.display())))?;
+        mixture.write_export(BufReader::new(model), &mut file).map_err(|error| cannot_write(path, error))?;
+        file.finish()?;
+    }
+    let mut file = AtomicFile::create(output)?;
+    mixture.write(&mut file).map_err(|error| cannot_write(output, error))?;
+    file.finish()
+}
+
 /// The projection of the model, and its random seed if the file has it.
-fn projection(path: &Path, model: &GraceModel) -> Result<(Projection, Option<i64>), Failure> {
+pub(super) fn projection(path: &Path, model: &GraceModel) -> Result<(Projection, Option<i64>), Failure> {
     let Some(found) = model.projection() else {
         return Err(Failure::Input(format!(
             "{}: the model has no projection of its features (uq_rp_matrix), from which a mixture could be built: export it with \
@@ -154,7 +190,7 @@ fn weight(text: &str) -> Result<(PathBuf, f64), String> {
 }
 
 /// A table of the elements.
-fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), Failure> {
+pub(super) fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), Failure> {
     let artifact = mixture.artifact().map_err(Failure::failed)?;
     if let Err(fault) = check_sound(&artifact, output) {
         log_and_warn(format_args!("WARNING: {fault}; campaigns and calm score refuse this artifact"));

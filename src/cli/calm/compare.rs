@@ -12,8 +12,8 @@ use serde::Serialize;
 use super::score::load_artifact;
 use crate::cli::{ExitStatus, Failure};
 use crate::features::FeatureCalculator;
-use crate::mixture_build::{ShardReader, data_files, total_bytes};
 use crate::output::{self, Bar, Table, decimals, print, print_json};
+use crate::structure_files::{Place, StructureArguments};
 
 /// Atoms of each element whose grades are kept for quantiles and ranks.
 const SAMPLED: usize = 50_000;
@@ -36,9 +36,8 @@ pub struct Compare {
     /// Second CALM artifact
     #[arg(value_name = "B.npz")]
     second: PathBuf,
-    /// Structures: extended XYZ (.extxyz, .xyz) or POSCAR, also with .gz or .zst
-    #[arg(value_name = "DATA", required = true)]
-    data: Vec<PathBuf>,
+    #[command(flatten)]
+    data: StructureArguments,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -89,26 +88,26 @@ impl Compare {
         let dimension = model.feature_dimension();
         let mut gradings: Vec<_> = model.elements().iter().map(|_| Grading::new()).collect();
         let mut calculator = FeatureCalculator::new(Arc::new(model));
-        let files = data_files(&self.data, &[])?;
+        let files = self.data.files()?;
         let read = Arc::new(AtomicU64::new(0));
-        let bar = Bar::new(Some(total_bytes(&files)?), BAR);
-        let mut reader = ShardReader::new(&files, 1, Arc::clone(&read));
+        let bar = Bar::new(Some(files.total_bytes()?), BAR);
+        let mut structures = files.reader(Arc::clone(&read));
         let mut grades = [Grades::default(), Grades::default()];
-        while let Some(shard) = reader.next_shard()? {
-            for training in &shard.structures {
-                let elements =
-                    calculator.compute(&training.structure).map_err(|error| training.wrong(error))?;
-                let features = &calculator.grace.features()[..elements.len() * dimension];
-                for (grades, artifact) in grades.iter_mut().zip(artifacts) {
-                    grades
-                        .evaluate(&artifact.mixture, &elements, features, None)
-                        .map_err(|error| training.wrong(error))?;
-                }
-                for (atom, element) in elements.into_iter().enumerate() {
-                    gradings[element].add([grades[0].gamma[atom], grades[1].gamma[atom]]);
-                }
+        let mut count = 0;
+        while let Some((frame, file)) = structures.next()? {
+            let place = Place { file: file.path, line: frame.line };
+            let elements = calculator.compute(&frame.structure).map_err(|error| place.wrong(error))?;
+            let features = &calculator.grace.features()[..elements.len() * dimension];
+            for (grades, artifact) in grades.iter_mut().zip(artifacts) {
+                grades
+                    .evaluate(&artifact.mixture, &elements, features, None)
+                    .map_err(|error| place.wrong(error))?;
             }
-            bar.set(read.load(Ordering::Relaxed), || output::count(reader.structures(), "structure"));
+            for (atom, element) in elements.into_iter().enumerate() {
+                gradings[element].add([grades[0].gamma[atom], grades[1].gamma[atom]]);
+            }
+            count += 1;
+            bar.set(read.load(Ordering::Relaxed), || output::count(count, "structure"));
         }
         Ok(gradings)
     }

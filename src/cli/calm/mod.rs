@@ -3,6 +3,7 @@
 mod build;
 mod compare;
 mod info;
+mod merge;
 mod recalibrate;
 mod score;
 mod scorer;
@@ -15,6 +16,7 @@ pub enum Calm {
     Build(build::Build),
     Compare(compare::Compare),
     Info(info::Info),
+    Merge(merge::Merge),
     Recalibrate(recalibrate::Recalibrate),
     Score(score::Score),
 }
@@ -25,6 +27,7 @@ impl Calm {
             Self::Build(command) => command.run(),
             Self::Compare(command) => command.run(),
             Self::Info(command) => command.run(),
+            Self::Merge(command) => command.run(),
             Self::Recalibrate(command) => command.run(),
             Self::Score(command) => command.run(),
         }

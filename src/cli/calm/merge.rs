@@ -1,0 +1,53 @@
+//! `calmwalk calm merge`
+
+use std::path::{Path, PathBuf};
+
+use potentials::grace::GraceModel;
+
+use super::build::{projection, report, write_mixture};
+use crate::atomic_file::{AtomicFile, refuse_to_replace};
+use crate::cli::{ExitStatus, Failure};
+use crate::file_hash;
+use crate::mixture_build::{Merge as PartsMerge, Merged};
+use crate::output::print;
+
+/// Merge the parts of a pass of `calmwalk calm build --part`
+///
+/// Run it when all parts of a pass are done: after pass 1 it finds the components, after pass 2 their covariances, and after pass 3
+/// it writes the artifact. The result is that of a build by one process, whatever the number of parts.
+#[derive(Debug, clap::Args)]
+pub struct Merge {
+    /// GRACE model (kokkos.npz) of the build
+    #[arg(long, value_name = "MODEL.npz")]
+    model: PathBuf,
+    /// The --output of the parts
+    #[arg(long, short, value_name = "CALM.npz")]
+    output: PathBuf,
+    /// After pass 3, also write a copy of the model with the new mixture, for LAMMPS and calmwalk
+    #[arg(long, value_name = "MODEL.npz")]
+    embed: Option<PathBuf>,
+}
+
+impl Merge {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        for output in std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path) {
+            refuse_to_replace(output, [(self.model.as_path(), "the model")].into_iter())?;
+            AtomicFile::create(output)?;
+        }
+        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
+        let (projection, seed) = projection(&self.model, &model)?;
+        let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
+        let mut merge = PartsMerge::open(&self.output, &hash)?;
+        match merge.run(&model, projection, seed)? {
+            Merged::Pass(pass) => {
+                print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;
+            }
+            Merged::Mixture(mixture) => {
+                write_mixture(&mixture, &self.model, self.embed.as_deref().map(Path::new), &self.output)?;
+                merge.finish()?;
+                report(&mixture, &self.output)?;
+            }
+        }
+        Ok(ExitStatus::Done)
+    }
+}

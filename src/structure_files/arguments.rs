@@ -1,0 +1,64 @@
+//! The arguments of a command that reads structures from files.
+
+use std::path::PathBuf;
+
+use atoms::Species;
+
+use super::format::check_format;
+use super::{StructureFile, StructureFiles};
+use crate::exit_status::Failure;
+use crate::filter::Filter;
+
+/// Properties that structures of files have.
+const PROPERTIES: [&str; 5] = ["atoms", "element", "energy", "energy_per_atom", "max_force"];
+
+/// Where structures come from.
+#[derive(Debug, Clone, clap::Args)]
+pub struct StructureArguments {
+    /// Structures: extended XYZ (.extxyz, .xyz), POSCAR (.poscar, .vasp, POSCAR*, CONTCAR*) or text dumps of LAMMPS (.dump,
+    /// .lammpstrj, dump.*), each also with .gz or .zst
+    #[arg(value_name = "DATA", required = true)]
+    data: Vec<PathBuf>,
+    /// Leave out structures that do not match a condition, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
+    /// and of labels energy, energy_per_atom (eV), max_force (eV/Å)
+    #[arg(long = "where", value_name = "FILTER")]
+    filter: Option<Filter>,
+    /// Elements of the atom types 1, 2, … of LAMMPS dumps without the column 'element'
+    #[arg(long, value_name = "SYMBOL,…", value_delimiter = ',')]
+    dump_elements: Vec<Species>,
+}
+
+impl StructureArguments {
+    /// The files in the order given, all with weight 1.
+    ///
+    /// # Errors
+    /// A file that is no regular file, has an unknown format or is given twice; a filter by a property that structures of files do
+    /// not have.
+    pub fn files(&self) -> Result<StructureFiles, Failure> {
+        if let Some(filter) = &self.filter
+            && let Some(name) = filter.names().into_iter().find(|name| !PROPERTIES.contains(name))
+        {
+            return Err(Failure::Input(format!(
+                "--where: structures of files have no '{name}'; expected one of {}",
+                PROPERTIES.join(", ")
+            )));
+        }
+        let mut files: Vec<StructureFile> = Vec::new();
+        for path in &self.data {
+            check_format(path)?;
+            let found = std::fs::metadata(path)
+                .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", path.display())))?;
+            if !found.is_file() {
+                return Err(Failure::Input(format!(
+                    "{}: expected a regular file, which can be read several times",
+                    path.display()
+                )));
+            }
+            if files.iter().any(|file| *file.path == **path) {
+                return Err(Failure::Input(format!("{} is given twice", path.display())));
+            }
+            files.push(StructureFile { path: path.as_path().into(), weight: 1.0 });
+        }
+        Ok(StructureFiles { files, filter: self.filter.clone(), dump_elements: self.dump_elements.clone() })
+    }
+}

@@ -1,0 +1,117 @@
+//! Formats and compressions, which the names of files show.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Read};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use atoms::extxyz::{self, Frame};
+use atoms::{FileError, Species, lammps_dump, poscar};
+use flate2::read::MultiGzDecoder;
+
+use crate::exit_status::Failure;
+
+/// The structures of a file, in order.
+pub enum Structures {
+    Extxyz(Box<extxyz::Reader<Input>>),
+    /// One structure.
+    Poscar(Option<Input>),
+    LammpsDump(Box<lammps_dump::Reader<Input>>),
+}
+
+type Input = Box<dyn BufRead + Send>;
+
+/// Format of a file.
+enum Format {
+    Extxyz,
+    Poscar,
+    LammpsDump,
+}
+
+/// The format that the name shows, with or without the extension of a compression.
+fn format(path: &Path) -> Option<Format> {
+    let name = path.file_name()?.to_string_lossy().to_lowercase();
+    let name = name.strip_suffix(".gz").or_else(|| name.strip_suffix(".zst")).unwrap_or(&name);
+    let ends = |endings: &[&str]| endings.iter().any(|ending| name.ends_with(ending));
+    let begins = |beginnings: &[&str]| beginnings.iter().any(|beginning| name.starts_with(beginning));
+    match () {
+        () if ends(&[".xyz", ".extxyz"]) => Some(Format::Extxyz),
+        () if ends(&[".poscar", ".vasp"]) || begins(&["poscar", "contcar"]) => Some(Format::Poscar),
+        () if ends(&[".dump", ".lammpstrj"]) || begins(&["dump."]) => Some(Format::LammpsDump),
+        () => None,
+    }
+}
+
+/// Checks that the name of a file shows a format that can be read.
+pub fn check_format(path: &Path) -> Result<(), Failure> {
+    if format(path).is_some() {
+        return Ok(());
+    }
+    Err(Failure::Input(format!(
+        "{}: unknown format: expected a name that ends in .extxyz, .xyz, .poscar, .vasp, .dump or .lammpstrj or begins with \
+         POSCAR, CONTCAR or dump., each with or without .gz or .zst",
+        path.display()
+    )))
+}
+
+impl Structures {
+    /// Opens a file; `bytes` counts what is read of it.
+    pub fn open(path: &Path, dump_elements: &[Species], bytes: &Arc<AtomicU64>) -> Result<Self, FileError> {
+        let input =
+            unpacked(path, bytes).map_err(|source| FileError::Open { path: path.to_path_buf(), source })?;
+        match format(path) {
+            Some(Format::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::Reader::new(input)))),
+            Some(Format::Poscar) => Ok(Self::Poscar(Some(input))),
+            Some(Format::LammpsDump) => {
+                Ok(Self::LammpsDump(Box::new(lammps_dump::Reader::new(input, dump_elements.to_vec()))))
+            }
+            None => Err(FileError::Format(path.to_path_buf())),
+        }
+    }
+
+    /// The next structure. Errors name `path`, that of the file.
+    pub fn next(&mut self, path: &Path) -> Option<Result<Frame, FileError>> {
+        let path = || path.to_path_buf();
+        match self {
+            Self::Extxyz(reader) => reader.next().map(|frame| {
+                frame.map_err(|error| FileError::Extxyz { path: path(), line: error.line, fault: error.kind })
+            }),
+            Self::Poscar(input) => input.take().map(|input| {
+                poscar::read_poscar(input).map_err(|error| FileError::Poscar {
+                    path: path(),
+                    line: error.line,
+                    fault: error.kind,
+                })
+            }),
+            Self::LammpsDump(reader) => reader.next().map(|frame| {
+                frame.map_err(|error| FileError::LammpsDump {
+                    path: path(),
+                    line: error.line,
+                    fault: error.kind,
+                })
+            }),
+        }
+    }
+}
+
+fn unpacked(path: &Path, bytes: &Arc<AtomicU64>) -> io::Result<Input> {
+    let file = BufReader::new(Counting(File::open(path)?, Arc::clone(bytes)));
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    Ok(match extension.as_str() {
+        "gz" => Box::new(BufReader::new(MultiGzDecoder::new(file))),
+        "zst" => Box::new(BufReader::new(zstd::Decoder::with_buffer(file)?)),
+        _ => Box::new(file),
+    })
+}
+
+/// Counts the bytes read.
+struct Counting(File, Arc<AtomicU64>);
+
+impl Read for Counting {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.0.read(buffer)?;
+        self.1.fetch_add(count as u64, Ordering::Relaxed);
+        Ok(count)
+    }
+}

@@ -1,0 +1,115 @@
+//! Reads the structures of all files, one after another.
+
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+
+use atoms::FileError;
+use atoms::extxyz::Frame;
+
+use super::format::Structures;
+use super::{StructureFile, StructureFiles};
+use crate::exit_status::Failure;
+use crate::filter::{Filter, StructureProperties};
+
+/// Reads one structure after another.
+pub struct StructureReader {
+    given: StructureFiles,
+    files: VecDeque<StructureFile>,
+    current: Option<(StructureFile, Structures)>,
+    bytes: Arc<AtomicU64>,
+    /// Structures of the current file.
+    in_file: u64,
+    matching: u64,
+    left_out: u64,
+}
+
+/// Where a structure stands.
+#[derive(Debug, Clone)]
+pub struct Place {
+    pub file: Arc<Path>,
+    /// From 1.
+    pub line: usize,
+}
+
+impl std::fmt::Display for Place {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}:{}", self.file.display(), self.line)
+    }
+}
+
+impl Place {
+    /// Wrong input, which names file and line.
+    pub fn wrong(&self, reason: impl std::fmt::Display) -> Failure {
+        Failure::Input(format!("{self}: {reason}"))
+    }
+}
+
+impl StructureReader {
+    pub(super) fn new(given: StructureFiles, bytes: Arc<AtomicU64>) -> Self {
+        let files = given.files.iter().cloned().collect();
+        Self { given, files, current: None, bytes, in_file: 0, matching: 0, left_out: 0 }
+    }
+
+    /// The next structure that matches the filter, with its file; `None` at the end of the last file.
+    ///
+    /// # Errors
+    /// A file that cannot be read or has no structures; labels that the filter cannot read; a filter that no structure of all files
+    /// matches.
+    pub fn next(&mut self) -> Result<Option<(Frame, StructureFile)>, Failure> {
+        while self.current.is_some() || self.open_next()? {
+            let Some((file, structures)) = &mut self.current else { continue };
+            let Some(frame) = structures.next(&file.path) else {
+                if self.in_file == 0 {
+                    return Err(Failure::input(FileError::Empty(file.path.to_path_buf())));
+                }
+                self.current = None;
+                continue;
+            };
+            let frame = frame.map_err(Failure::input)?;
+            self.in_file += 1;
+            if matches(self.given.filter.as_ref(), &frame, file)? {
+                self.matching += 1;
+                return Ok(Some((frame, file.clone())));
+            }
+            self.left_out += 1;
+        }
+        match &self.given.filter {
+            Some(filter) if self.matching == 0 => {
+                Err(Failure::Input(format!("no structure of the files matches --where '{filter}'")))
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// Number of structures that did not match the filter.
+    pub fn left_out(&self) -> u64 {
+        self.left_out
+    }
+
+    /// Opens the next file; false after the last one.
+    fn open_next(&mut self) -> Result<bool, Failure> {
+        let Some(file) = self.files.pop_front() else { return Ok(false) };
+        self.in_file = 0;
+        let structures =
+            Structures::open(&file.path, &self.given.dump_elements, &self.bytes).map_err(Failure::input)?;
+        self.current = Some((file, structures));
+        Ok(true)
+    }
+}
+
+/// Whether a structure matches the filter.
+fn matches(filter: Option<&Filter>, frame: &Frame, file: &StructureFile) -> Result<bool, Failure> {
+    let Some(filter) = filter else { return Ok(true) };
+    let labels =
+        frame.labels().map_err(|error| Failure::Input(format!("{}: {error}", file.path.display())))?;
+    let norm = |force: &[f64; 3]| force.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let properties = StructureProperties {
+        species: &frame.structure.species,
+        energy: labels.energy,
+        max_force: labels.forces.map(|forces| forces.iter().map(norm).fold(0.0, f64::max)),
+        ..StructureProperties::default()
+    };
+    Ok(filter.matches(&properties))
+}

@@ -1,0 +1,114 @@
+//! A build that several processes share.
+
+use super::*;
+
+/// The arguments of a part of a pass.
+fn part(output: &str, pass: usize, part: usize, of: usize) -> Vec<String> {
+    let share = [pass.to_string(), format!("{part}/{of}")];
+    arguments(output, &["data.extxyz"], &["--threads", "1", "--pass", &share[0], "--part", &share[1]])
+}
+
+/// Runs all parts of a pass at once.
+fn run_parts(here: &Path, output: &str, pass: usize, of: usize) {
+    let parts = 1..=of;
+    let children: Vec<_> = parts
+        .map(|number| {
+            let mut command = program(here);
+            let command = command.args(part(output, pass, number, of));
+            command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+        })
+        .collect();
+    for (number, child) in children.into_iter().enumerate() {
+        let output = child.wait_with_output().unwrap();
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        let said = format!("part {}/{of} of pass {pass} is done", number + 1);
+        assert!(String::from_utf8_lossy(&output.stdout).contains(&said), "{output:?}");
+    }
+}
+
+fn merge(output: &str) -> Vec<String> {
+    let model = config(MODEL).display().to_string();
+    ["calm", "merge", "--model", &model, "--output", output].map(str::to_owned).to_vec()
+}
+
+#[test]
+fn any_number_of_parts_gives_the_same_bytes() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    // 17 shards.
+    write_frames(&here.join("data.extxyz"), &frames());
+    let (whole, printed) = build(here, "whole.npz", &["data.extxyz"], &["--embed", "whole_model.npz"]);
+    for of in [2, 7, 20] {
+        let output = format!("of_{of}.npz");
+        for pass in 1..=3 {
+            run_parts(here, &output, pass, of);
+            let mut merge = merge(&output);
+            if pass == 3 {
+                merge.extend(["--embed", "model.npz"].map(str::to_owned));
+            }
+            let said = succeed(here, merge);
+            let expected = match pass {
+                3 => printed.replace("whole.npz", &output),
+                pass => format!("pass {pass} of 3 is merged; continue with --pass {}\n", pass + 1),
+            };
+            assert_eq!(said, expected);
+        }
+        assert!(fs::read(here.join(&output)).unwrap() == whole, "{of} parts");
+        assert!(fs::read(here.join("model.npz")).unwrap() == fs::read(here.join("whole_model.npz")).unwrap());
+        assert!(!here.join(format!("{output}.build")).exists());
+    }
+}
+
+#[test]
+fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("data.extxyz"), &frames());
+    let (whole, _) = build(here, "whole.npz", &["data.extxyz"], &[]);
+    let message = refuse(here, merge("out.npz"));
+    assert!(message.contains("out.npz.build: expected the directory of a build in parts"), "{message}");
+
+    // A part that is killed continues, and the others do not wait for it.
+    let mut command = program(here);
+    let child = command.args(part("out.npz", 1, 1, 2)).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let mut running = Running(child.unwrap());
+    let state = here.join("out.npz.build");
+    wait_until("a shard is finished", || state.join("pass-1-1of2-0").exists());
+    signal(running.0.id(), "STOP");
+    let message = fail(here, &part("out.npz", 1, 1, 2));
+    assert!(message.contains("another process builds out.npz"), "{message}");
+    assert!(fail(here, &arguments("out.npz", &["data.extxyz"], &[])).contains("another process builds"));
+    succeed(here, part("out.npz", 1, 2, 2));
+    signal(running.0.id(), "KILL");
+    running.0.wait().unwrap();
+    let message = fail(here, &merge("out.npz"));
+    assert!(message.contains("pass 1 is not done: missing are the parts 1/2"), "{message}");
+    let message = fail(here, &part("out.npz", 2, 1, 2));
+    assert!(message.contains("pass 1 is not merged yet"), "{message}");
+    succeed(here, part("out.npz", 1, 1, 2));
+    succeed(here, merge("out.npz"));
+
+    // Another number of parts is possible after each merge.
+    let message = fail(here, &part("out.npz", 3, 1, 2));
+    assert!(message.contains("pass 2 is not merged yet"), "{message}");
+    succeed(here, part("out.npz", 2, 3, 3));
+    let message = fail(here, &merge("out.npz"));
+    assert!(message.contains("pass 2 is not done: missing are the parts 1/3, 2/3"), "{message}");
+    let other = [part("out.npz", 2, 1, 3), vec!["--seed".into(), "7".into()]].concat();
+    let message = refuse(here, other);
+    assert!(message.contains("its --seed is 42, now it is 7"), "{message}");
+    run_parts(here, "out.npz", 2, 3);
+    succeed(here, merge("out.npz"));
+    // One process takes what is left.
+    let (rest, _) = build(here, "out.npz", &["data.extxyz"], &[]);
+    assert!(rest == whole);
+
+    for (wrong, reason) in
+        [("3/2", "expected i/n with 1 ≤ i ≤ n"), ("0/2", "expected i/n"), ("2", "expected i/n")]
+    {
+        let message = refuse(here, arguments("x.npz", &["data.extxyz"], &["--pass", "1", "--part", wrong]));
+        assert!(message.contains(reason), "{message}");
+    }
+    refuse(here, arguments("x.npz", &["data.extxyz"], &["--pass", "1"]));
+    refuse(here, arguments("x.npz", &["data.extxyz"], &["--pass", "4", "--part", "1/2"]));
+}
