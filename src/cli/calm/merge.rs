@@ -31,7 +31,7 @@ pub struct Merge {
 impl Merge {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         for output in std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path) {
-            refuse_to_replace(output, [(self.model.as_path(), "the model")].into_iter())?;
+            refuse_to_replace(output, [(self.model.as_path(), "the model")])?;
             AtomicFile::create(output)?;
         }
         let model = GraceModel::load(&self.model).map_err(Failure::input)?;
