@@ -31,6 +31,7 @@ use crate::exit_status::Failure;
 use crate::label_method::MethodConfig;
 use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
+use crate::process_config::{HashedFile, ModelFiles};
 use load::Loader;
 pub use load::{SourcedStructure, check_sound};
 pub use seed_structures::SkippedStructure;
@@ -165,6 +166,24 @@ impl Campaign {
         let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
         let files = files.into_iter().filter_map(|(key, file)| Some((key, absolute(file?.get_ref()))));
         files.map(|(key, path)| (key.to_owned(), json!(path.to_string_lossy()))).collect()
+    }
+
+    /// The files that walkers load the model from.
+    pub fn model_files(&self) -> Result<ModelFiles, Failure> {
+        let Config { potential, calm, .. } = &self.config;
+        let file = |key: &str, path: &Path| -> Result<HashedFile, Failure> {
+            let path = std::path::absolute(path).map_err(Failure::failed)?;
+            Ok(HashedFile { path, hash: self.hash_of(key) })
+        };
+        let export = potential.model.get_ref();
+        // The campaign's own model has the projection already.
+        let projected = GraceModel::has_projection(export).map_err(Failure::input)?;
+        let artifact = calm.artifact.as_ref().filter(|_| !projected);
+        Ok(ModelFiles {
+            export: file("potential.model", export)?,
+            artifact: artifact.map(|path| file("calm.artifact", path.get_ref())).transpose()?,
+            precision: potential.precision,
+        })
     }
 
     /// Hash of the file that the configuration names under this key.

@@ -24,6 +24,7 @@ mod notify;
 mod output;
 mod process_config;
 mod progress;
+mod projection;
 mod replay;
 mod report;
 mod runtime;

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use calm::Projection;
 use potentials::grace::{GraceModel, Precision, RadialPath};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -19,6 +20,29 @@ use crate::file_hash::verify_hash;
 use crate::label_method::MethodConfig;
 use crate::label_setup::LabelSetup;
 use crate::log;
+use crate::projection::with_projection;
+
+/// The files of a model.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelFiles {
+    /// The exported model.
+    pub export: HashedFile,
+    /// The artifact, if the model has no projection of its features but that of the artifact.
+    pub artifact: Option<HashedFile>,
+    /// Precision of the model's evaluation.
+    pub precision: Precision,
+}
+
+/// A file whose content must not change.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct HashedFile {
+    /// Where it is.
+    pub path: PathBuf,
+    /// Its BLAKE3 hash.
+    pub hash: String,
+}
 
 /// Configuration of a walker process.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -28,12 +52,8 @@ pub struct WalkerConfig {
     pub parent: u32,
     /// How to connect to the orchestrator.
     pub door: ConnectInfo,
-    /// The exported model.
-    pub model: PathBuf,
-    /// BLAKE3 hash of that file.
-    pub model_hash: String,
-    /// Precision of the model's evaluation.
-    pub precision: Precision,
+    /// The model.
+    pub model: ModelFiles,
     /// Threads that evaluate it.
     pub threads: usize,
     /// Dynamics, bias and guards.
@@ -46,12 +66,8 @@ pub struct WalkerConfig {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AgentConfig {
-    /// The exported model, at its path on the orchestrator's host.
-    pub model: PathBuf,
-    /// BLAKE3 hash of that file.
-    pub model_hash: String,
-    /// Precision of the model's evaluation.
-    pub precision: Precision,
+    /// The model, with paths of the orchestrator's host.
+    pub model: ModelFiles,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
     /// Largest message of a walker, bytes.
@@ -128,11 +144,22 @@ impl LabellerConfig {
     }
 }
 
-impl WalkerConfig {
+impl ModelFiles {
     /// Loads the model and checks that it is the one of the run.
-    pub fn load_model(&self) -> Result<Arc<GraceModel>, Failure> {
-        verify_hash(&self.model, &self.model_hash)?;
-        let model = GraceModel::load_in(&self.model, self.precision, RadialPath::default());
-        Ok(Arc::new(model.map_err(Failure::input)?))
+    pub fn load(&self) -> Result<Arc<GraceModel>, Failure> {
+        verify_hash(&self.export.path, &self.export.hash)?;
+        let model = GraceModel::load_in(&self.export.path, self.precision, RadialPath::default());
+        let mut model = model.map_err(Failure::input)?;
+        if let Some(artifact) = &self.artifact {
+            verify_hash(&artifact.path, &artifact.hash)?;
+            let projection = Projection::load(&artifact.path).map_err(Failure::input)?;
+            model = with_projection(model, &projection).map_err(Failure::input)?;
+        }
+        Ok(Arc::new(model))
+    }
+
+    /// All files.
+    pub fn files(&self) -> impl Iterator<Item = &HashedFile> {
+        std::iter::once(&self.export).chain(&self.artifact)
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use atoms::{NeighbourList, Repetition, Structure};
 use calm::forgetting::grade_distribution;
-use calm::{Artifact, ArtifactError, Mixture};
+use calm::{Artifact, ArtifactError, Mixture, Projection};
 use orchestrator::selector::{SeedStructure, TrainingFrames, UpdateProtocol};
 use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
@@ -16,6 +16,7 @@ use super::geometry::Geometry;
 use super::training_sample;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_method::{self, REFERENCE_FILE};
+use crate::projection::{check_belongs_to, with_projection};
 use crate::xyz_reader::XyzReader;
 
 /// A seed structure and its source.
@@ -57,20 +58,15 @@ pub(super) struct Loader<'a> {
 }
 
 impl Loader<'_> {
-    /// Loads the model, which must have a feature projection and support the configured settings.
+    /// Loads the model, which must support the configured settings. Without a projection of its features, it gets that of the
+    /// artifact.
     pub fn model(&self) -> Result<Arc<GraceModel>, ConfigError> {
         let file = &self.config.potential.model;
         let wrong = |message: String| self.file_error("potential.model", file, message);
         let precision = self.config.potential.precision;
         let model = GraceModel::load_in(file.get_ref(), precision, RadialPath::default())
             .map_err(|error| wrong(error.to_string()))?;
-        if model.projection().is_none() {
-            let shown = file.get_ref().display();
-            return Err(wrong(format!(
-                "{shown}: no feature projection (uq_* arrays), so nothing can be graded; export the model with its \
-                 CALM artifact"
-            )));
-        }
+        let model = if model.projection().is_some() { model } else { self.projected(model)? };
         let widest = self.config.guard.zbl.as_ref().and_then(|windows| windows.widest(model.elements()));
         if let Some((pair, window)) = widest
             && window.outer > model.cutoff()
@@ -81,6 +77,23 @@ impl Loader<'_> {
             return Err(ConfigError::Value { at, key, found, expected });
         }
         Ok(Arc::new(model))
+    }
+
+    /// The model with the projection of the artifact.
+    fn projected(&self, model: GraceModel) -> Result<GraceModel, ConfigError> {
+        let Some(file) = &self.config.calm.artifact else {
+            let file = &self.config.potential.model;
+            let message = format!(
+                "{}: no feature projection (uq_* arrays), so nothing can be graded; set calm.artifact, which has one, or \
+                 build a mixture (calmwalk calm build)",
+                file.get_ref().display()
+            );
+            return Err(self.file_error("potential.model", file, message));
+        };
+        let path = file.get_ref();
+        let wrong = |message: String| self.file_error("calm.artifact", file, message);
+        let projection = Projection::load(path).map_err(|error| wrong(explain_artifact_error(path, &error)))?;
+        with_projection(model, &projection).map_err(|error| wrong(format!("{}: {error}", path.display())))
     }
 
     /// Checks that an update ends what made a seed structure's atoms a candidate. Otherwise its walks would offer the
@@ -109,9 +122,9 @@ impl Loader<'_> {
     /// Loads the initial mixture: that of the artifact, or else that of the export.
     pub fn artifact(&self, model: &GraceModel) -> Result<Artifact, ConfigError> {
         let model_file = &self.config.potential.model;
-        let export = Artifact::load_export(model_file.get_ref())
-            .map_err(|error| self.file_error("potential.model", model_file, error))?;
         let Some(file) = &self.config.calm.artifact else {
+            let export = Artifact::load_export(model_file.get_ref())
+                .map_err(|error| self.file_error("potential.model", model_file, error))?;
             check_sound(&export, model_file.get_ref())
                 .map_err(|message| self.file_error("potential.model", model_file, message))?;
             return Ok(export);
@@ -119,8 +132,7 @@ impl Loader<'_> {
         let path = file.get_ref();
         let wrong = |message: String| self.file_error("calm.artifact", file, message);
         let artifact = Artifact::load(path).map_err(|error| wrong(explain_artifact_error(path, &error)))?;
-        let symbols: Vec<_> = model.elements().iter().map(|species| species.symbol().to_owned()).collect();
-        artifact.check_belongs_to(&symbols, &export.projection).map_err(|error| {
+        check_belongs_to(&artifact, model).map_err(|error| {
             wrong(format!("{}: {error} ({})", path.display(), model_file.get_ref().display()))
         })?;
         check_sound(&artifact, path).map_err(wrong)?;

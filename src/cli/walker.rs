@@ -26,7 +26,7 @@ impl Walker {
         launcher::end_with_parent(setup.parent).map_err(Failure::failed)?;
         let stopping = signals::stop_token()?;
         let threads = Threads::new(setup.threads).map_err(Failure::failed)?;
-        let context = WalkContext { model: setup.load_model()?, threads, settings: Arc::new(setup.settings) };
+        let context = WalkContext { model: setup.model.load()?, threads, settings: Arc::new(setup.settings) };
         let mut transport = IpcWalker::connect(&setup.door, stopping).map_err(Failure::failed)?;
         let ended = walker::run(&context, &mut transport);
         match (ended, transport.failure()) {

@@ -1,13 +1,16 @@
 //! What identifies a build: the command that continues it must have the same.
 
 use atoms::Species;
+use calm::Projection;
 use calm::build::BuildSettings;
 use serde::{Deserialize, Serialize};
 
 use crate::structure_files::{StructureFile, StructureFiles};
 
 /// Changes when the state of an older program cannot be continued.
-const FORMAT: u32 = 2;
+const FORMAT: u32 = 3;
+
+const PROJECTION: &str = "the BLAKE3 hash of its projection";
 
 /// Model, settings, names and weights of the data files, and how they are read. Their contents are compared when they are read, shard by shard.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -15,6 +18,8 @@ pub struct Identity {
     format: u32,
     /// BLAKE3 of the model's file.
     model: String,
+    /// BLAKE3 of the projection of the features, which a model without one gets from the random seed.
+    projection: String,
     pub settings: BuildSettings,
     files: Vec<FileIdentity>,
     /// `--where`
@@ -30,7 +35,12 @@ struct FileIdentity {
 }
 
 impl Identity {
-    pub fn new(model: String, settings: BuildSettings, data: &StructureFiles) -> Self {
+    pub fn new(
+        model: String,
+        projection: &Projection,
+        settings: BuildSettings,
+        data: &StructureFiles,
+    ) -> Self {
         let named = |file: &StructureFile| FileIdentity {
             path: file.path.display().to_string(),
             weight: file.weight,
@@ -38,6 +48,7 @@ impl Identity {
         Self {
             format: FORMAT,
             model,
+            projection: hash(projection),
             settings,
             files: data.files.iter().map(named).collect(),
             filter: data.filter.as_ref().map(ToString::to_string),
@@ -51,6 +62,11 @@ impl Identity {
         same("the BLAKE3 hash of its model", self.model.as_str(), hash)
     }
 
+    /// Whether features have this projection.
+    pub fn check_projection(&self, projection: &Projection) -> Result<(), String> {
+        same(PROJECTION, self.projection.as_str(), &hash(projection))
+    }
+
     /// Compares this build with the one that a state `began` with. An error names the first difference.
     pub fn check_same(&self, began: &Self) -> Result<(), String> {
         same("the format of its state", began.format, self.format)?;
@@ -58,6 +74,7 @@ impl Identity {
         let (old, new) = (&began.settings, &self.settings);
         same("its number of features", old.dimension, new.dimension)?;
         same("its --seed", old.seed, new.seed)?;
+        same(PROJECTION, &began.projection, &self.projection)?;
         same("its --candidates", list(&old.candidates), list(&new.candidates))?;
         same("its --shard-size", old.shard_size, new.shard_size)?;
         let names = |files: &[FileIdentity]| -> String {
@@ -73,6 +90,10 @@ impl Identity {
             |species: &[Species]| species.iter().map(|one| one.symbol()).collect::<Vec<_>>().join(",");
         same("its --dump-elements", symbols(&began.dump_elements), symbols(&self.dump_elements))
     }
+}
+
+fn hash(projection: &Projection) -> String {
+    blake3::hash(&projection.to_bytes()).to_string()
 }
 
 fn same<T: PartialEq + std::fmt::Display>(what: &str, began: T, now: T) -> Result<(), String> {
@@ -96,15 +117,17 @@ mod tests {
         let began = Identity {
             format: FORMAT,
             model: "abc".into(),
+            projection: "def".into(),
             settings,
             files: vec![file],
             filter: None,
             dump_elements: Vec::new(),
         };
         assert_eq!(began.check_same(&began), Ok(()));
-        let changes: [(Change, &str); 9] = [
+        let changes: [(Change, &str); 10] = [
             (|other| other.format = 0, "format"),
             (|other| other.model = "x".into(), "model is abc, now it is x"),
+            (|other| other.projection = "y".into(), "projection is def, now it is y"),
             (|other| other.settings.dimension = 4, "features"),
             (|other| other.settings.seed = 1, "--seed is 42, now it is 1"),
             (|other| other.settings.candidates = vec![1], "--candidates is 1,2, now it is 1"),

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use calm::Projection;
-use calm::build::BuiltMixture;
+use calm::build::{BuildSettings, BuiltMixture};
 use potentials::grace::GraceModel;
 
 use super::clustering::{Clustered, known};
@@ -40,16 +40,23 @@ impl Merge {
         Ok(Self { state, identity })
     }
 
+    /// The settings of the build.
+    pub fn settings(&self) -> &BuildSettings {
+        &self.identity.settings
+    }
+
     /// Merges the first pass that is not merged yet.
     ///
     /// # Errors
-    /// One of its parts is not done.
+    /// One of its parts is not done; the parts had another projection.
     pub fn run(
         &mut self,
         model: &GraceModel,
         projection: Projection,
         projection_seed: Option<i64>,
     ) -> Result<Merged, Failure> {
+        let same = self.identity.check_projection(&projection);
+        same.map_err(|difference| self.state.other_build(&difference))?;
         let Some(partition) = self.state.partition()? else {
             let partition = self.pass_1()?.combine(&self.identity.settings, model.elements().len())?;
             self.state.save_partition(&partition)?;

@@ -43,7 +43,7 @@ pub struct Build {
 impl Build {
     /// Begins a build, or continues the one whose state lies beside `output`. Of a part of the work, other parts may be under way.
     ///
-    /// `model_hash` is the BLAKE3 hash of the model's file.
+    /// `model_hash` is the BLAKE3 hash of the model's file, `projection` that of its features.
     ///
     /// # Errors
     /// Invalid settings; the state of another build (unless `restart`, which is for the whole).
@@ -51,11 +51,12 @@ impl Build {
         work: Work,
         settings: BuildSettings,
         model_hash: String,
+        projection: &Projection,
         output: &Path,
         restart: bool,
     ) -> Result<Self, Failure> {
         ShardClustering::new(&settings, 0, 0).map_err(Failure::input)?;
-        let identity = Identity::new(model_hash, settings.clone(), &work.files);
+        let identity = Identity::new(model_hash, projection, settings.clone(), &work.files);
         let (state, exists) = match work.part {
             Part::WHOLE => State::open(output, &identity, restart)?,
             part => State::open_part(output, &identity, part)?,

@@ -27,7 +27,7 @@ use crate::exit_status::{ExitStatus, Failure};
 use crate::file_hash::verify_hash;
 use crate::log;
 use crate::output::{count, log_and_print, log_and_warn};
-use crate::process_config::{self, AgentConfig, WalkerConfig};
+use crate::process_config::{self, AgentConfig, HashedFile, ModelFiles, WalkerConfig};
 use crate::signals::cancel_on_signal;
 use crate::web::agent_metrics::AgentState;
 
@@ -103,26 +103,44 @@ async fn join(
                 "the orchestrator's configuration: {error}: run the same version of calmwalk on all hosts"
             ))
         })?;
-        match model(&joined, &setup, directory).await? {
+        match model(&joined, &setup.model, directory).await? {
             Some(model) => return Ok((uplink, joined, AgentConfig { model, ..setup })),
             None => log_and_print("the orchestrator has restarted: joining again"),
         }
     }
 }
 
-/// Path of the model: the orchestrator's file if this host can read it, otherwise a downloaded copy. `None` if this
-/// agent lost its membership before the download finished.
+/// The files of the model: the orchestrator's if this host can read them, otherwise downloaded copies. `None` if this agent
+/// lost its membership before the download finished.
 async fn model(
     joined: &Membership,
-    setup: &AgentConfig,
+    model: &ModelFiles,
     directory: &Path,
-) -> Result<Option<PathBuf>, Failure> {
-    let hash = &setup.model_hash;
-    if verify_hash(&setup.model, hash).is_ok() {
-        return Ok(Some(setup.model.clone()));
+) -> Result<Option<ModelFiles>, Failure> {
+    let Some(export) = file(joined, &model.export, directory.join("kokkos.npz")).await? else {
+        return Ok(None);
+    };
+    let mut found = ModelFiles { export, ..model.clone() };
+    if let Some(artifact) = &mut found.artifact {
+        let Some(copy) = file(joined, artifact, directory.join("gmm_artifacts.npz")).await? else {
+            return Ok(None);
+        };
+        *artifact = copy;
+    }
+    Ok(Some(found))
+}
+
+/// A file of the orchestrator, or its copy, which is downloaded to `path`.
+async fn file(
+    joined: &Membership,
+    file: &HashedFile,
+    path: PathBuf,
+) -> Result<Option<HashedFile>, Failure> {
+    let hash = &file.hash;
+    if verify_hash(&file.path, hash).is_ok() {
+        return Ok(Some(file.clone()));
     }
     log_and_print("the orchestrator's model file is not on this host: downloading the model …");
-    let path = directory.join("kokkos.npz");
     let bytes = match joined.fetch_file(hash).await {
         Err(LinkError::RejoinRequired(_)) => return Ok(None),
         bytes => bytes.map_err(Failure::failed)?,
@@ -130,7 +148,7 @@ async fn model(
     fs::write(&path, bytes)
         .map_err(|error| Failure::Failed(format!("cannot write {}: {error}", path.display())))?;
     verify_hash(&path, hash).map_err(Failure::failed)?;
-    Ok(Some(path))
+    Ok(Some(HashedFile { path, hash: hash.clone() }))
 }
 
 /// The walkers of this host and the task that dispatches assignments to them.
@@ -191,8 +209,6 @@ fn launch(
             parent,
             door: line.connect_info(number, incarnation),
             model: setup.model.clone(),
-            model_hash: setup.model_hash.clone(),
-            precision: setup.precision,
             threads,
             settings: setup.settings.clone(),
             log: log::child_config(),

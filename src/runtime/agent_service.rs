@@ -32,12 +32,10 @@ impl AgentService {
             (run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT), Arc::clone(mixture));
         let Some(listen) = run.listen else { return Ok(Self { hub: None, store, mixture }) };
         let config = &run.campaign.config;
-        let model = std::path::absolute(config.potential.model.get_ref()).map_err(Failure::failed)?;
-        let model_hash = run.campaign.hash_of("potential.model");
+        let model = run.campaign.model_files()?;
+        let files = model.files().map(|file| (file.hash.clone(), file.path.clone())).collect();
         let setup = AgentConfig {
-            model: model.clone(),
-            model_hash: model_hash.clone(),
-            precision: config.potential.precision,
+            model,
             settings: run.campaign.walk_settings(),
             message_bytes: run.campaign.largest_message(),
             heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
@@ -45,7 +43,7 @@ impl AgentService {
         };
         let welcome = AgentBootstrap {
             setup: process_config::to_bytes(&setup),
-            files: BTreeMap::from([(model_hash, model)]),
+            files,
         };
         let patience = config.run.agent_heartbeat_timeout.get();
         let hub = AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;

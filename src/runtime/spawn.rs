@@ -21,10 +21,8 @@ pub fn walker_launcher(
     campaign: &Campaign,
     line: ServerHandle,
 ) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, Failure> {
-    let (model, model_hash) =
-        (absolute(campaign.config.potential.model.get_ref())?, campaign.hash_of("potential.model"));
+    let model = campaign.model_files()?;
     let (parent, settings) = (std::process::id(), campaign.walk_settings());
-    let precision = campaign.config.potential.precision;
     let threads = campaign.config.run.threads_per_walker.get();
     Ok(move |number, incarnation| {
         line.expect(number, incarnation);
@@ -32,8 +30,6 @@ pub fn walker_launcher(
             parent,
             door: line.connect_info(number, incarnation),
             model: model.clone(),
-            model_hash: model_hash.clone(),
-            precision,
             threads,
             settings: settings.clone(),
             log: log::child_config(),

@@ -175,16 +175,7 @@ impl Artifact {
         }
         let unknown = || vec![Arc::new(Component::unknown_element(dimension))];
         let elements = elements.into_iter().map(|element| element.unwrap_or_else(unknown)).collect();
-        let transform = match file.contains("uq_feature_transform") {
-            true => file.strings("uq_feature_transform")?.concat(),
-            false => String::new(),
-        };
-        let asinh = match transform.as_str() {
-            "" | "none" | "linear" | "identity" => false,
-            "asinh" => true,
-            _ => return Err(invalid(file, "uq_feature_transform", transform, "none or asinh")),
-        };
-        finish(path, file, symbols, elements, asinh)
+        finish(path, file, symbols, elements, asinh(file)?)
     }
 
     /// Loads the CALM arrays (`uq_*`) of an exported model: a mixture that can grade but cannot be updated.
@@ -243,6 +234,52 @@ impl Artifact {
 }
 
 impl Projection {
+    /// Loads the projection of `gmm_artifacts.npz` alone.
+    ///
+    /// # Errors
+    /// As [`Artifact::load`].
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
+        let file = &Archive::open(path.as_ref())?;
+        check_schema(file, "__schema_version__")?;
+        let elements = file.numbers("elements")?.data;
+        let first = elements.first().ok_or_else(|| invalid(file, "elements", "no element", "at least one"))?;
+        let centroids = file.numbers(&format!("centroids_{}", as_count(file, "elements", *first)?))?;
+        let dimension = centroids.shape.last().copied().unwrap_or_default();
+        Self::read(file, dimension, asinh(file)?)
+    }
+
+    /// Reads the keys that both file formats share.
+    fn read(file: &Archive, feature_dimension: usize, asinh: bool) -> Result<Self, ArtifactError> {
+        let matrix = file.numbers("uq_rp_matrix")?;
+        let [rows, columns] = matrix.shape[..] else {
+            let found = format!("shape {:?}", matrix.shape);
+            return Err(invalid(file, "uq_rp_matrix", found, "shape [D_basis, d]"));
+        };
+        let announced = count(file, "uq_rp_dim")?;
+        if announced != columns {
+            let expected = format!("{columns}, the columns of uq_rp_matrix");
+            return Err(invalid(file, "uq_rp_dim", announced, expected));
+        }
+        let projection = Self {
+            matrix: matrix.data.iter().map(|&value| value as f32).collect(),
+            rows,
+            columns,
+            feature_dimension,
+            asinh,
+            normalised: file.scalar_or("uq_rp_normalize", 0.0)? != 0.0,
+            density_channels: file.scalar_or("uq_rp_add_density_channel", 0.0)? != 0.0,
+            density_scale: file.scalar_or("uq_rp_density_scale", 1.0)? as f32,
+        };
+        let extra = feature_dimension.checked_sub(columns);
+        let fits = if projection.density_channels { extra >= Some(2) } else { extra == Some(0) };
+        if fits {
+            return Ok(projection);
+        }
+        let found = format!("{columns} columns for {feature_dimension} features");
+        let expected = "as many, or at least two less with density channels";
+        Err(invalid(file, "uq_rp_matrix", found, expected))
+    }
+
     /// Checks that both artifacts describe the same features.
     ///
     /// # Errors
@@ -413,7 +450,20 @@ impl ElementComponents {
     }
 }
 
-/// Reads the projection, whose keys both file formats share, and assembles the artifact.
+/// Whether the features of an artifact go through asinh.
+fn asinh(file: &Archive) -> Result<bool, ArtifactError> {
+    let transform = match file.contains("uq_feature_transform") {
+        true => file.strings("uq_feature_transform")?.concat(),
+        false => String::new(),
+    };
+    match transform.as_str() {
+        "" | "none" | "linear" | "identity" => Ok(false),
+        "asinh" => Ok(true),
+        _ => Err(invalid(file, "uq_feature_transform", transform, "none or asinh")),
+    }
+}
+
+/// Assembles the artifact.
 fn finish(
     path: &Path,
     file: &Archive,
@@ -423,34 +473,6 @@ fn finish(
 ) -> Result<Artifact, ArtifactError> {
     let mixture = Mixture::new(0, elements)
         .map_err(|source| ArtifactError::Mixture { path: path.to_path_buf(), source })?;
-    let matrix = file.numbers("uq_rp_matrix")?;
-    let [rows, columns] = matrix.shape[..] else {
-        return Err(invalid(file, "uq_rp_matrix", format!("shape {:?}", matrix.shape), "shape [D_basis, d]"));
-    };
-    let announced = count(file, "uq_rp_dim")?;
-    if announced != columns {
-        return Err(invalid(file, "uq_rp_dim", announced, format!("{columns}, the columns of uq_rp_matrix")));
-    }
-    let projection = Projection {
-        matrix: matrix.data.iter().map(|&value| value as f32).collect(),
-        rows,
-        columns,
-        feature_dimension: mixture.dimension(),
-        asinh,
-        normalised: file.scalar_or("uq_rp_normalize", 0.0)? != 0.0,
-        density_channels: file.scalar_or("uq_rp_add_density_channel", 0.0)? != 0.0,
-        density_scale: file.scalar_or("uq_rp_density_scale", 1.0)? as f32,
-    };
-    let extra = projection.feature_dimension.checked_sub(columns);
-    let fits = if projection.density_channels { extra >= Some(2) } else { extra == Some(0) };
-    if !fits {
-        let found = format!("{columns} columns for {} features", projection.feature_dimension);
-        return Err(invalid(
-            file,
-            "uq_rp_matrix",
-            found,
-            "as many, or at least two less with density channels",
-        ));
-    }
+    let projection = Projection::read(file, mixture.dimension(), asinh)?;
     Ok(Artifact { symbols, mixture, projection })
 }

@@ -19,4 +19,4 @@ mod writer;
 pub use archive::Archive;
 pub use array::Array;
 pub use error::Error;
-pub use writer::Writer;
+pub use writer::{Writer, names};

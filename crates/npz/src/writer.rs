@@ -71,7 +71,7 @@ impl<W: Write + Seek> Writer<W> {
         let mut source = ZipArchive::new(source)?;
         for index in 0..source.len() {
             let file = source.by_index_raw(index)?;
-            if !left_out(file.name().strip_suffix(".npy").unwrap_or(file.name())) {
+            if !left_out(key(file.name())) {
                 self.zip.zip_writer().raw_copy_file(file)?;
             }
         }
@@ -85,6 +85,20 @@ impl<W: Write + Seek> Writer<W> {
     pub fn finish(mut self) -> io::Result<W> {
         Ok(self.zip.zip_writer().finish()?)
     }
+}
+
+/// Names of the arrays of an archive, in their order.
+///
+/// # Errors
+/// If reading fails, or `source` is no archive.
+pub fn names<R: Read + Seek>(source: R) -> io::Result<Vec<String>> {
+    let archive = ZipArchive::new(source)?;
+    Ok(archive.file_names().map(|name| key(name).to_owned()).collect())
+}
+
+/// The key of an array in a file of this name.
+fn key(name: &str) -> &str {
+    name.strip_suffix(".npy").unwrap_or(name)
 }
 
 fn options() -> FileOptions {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use calm::Projection;
-use calm::build::{BuildSettings, BuiltElement, BuiltMixture};
+use calm::build::{BuildSettings, BuiltElement, BuiltMixture, random_projection};
 use npz::Archive;
 use potentials::grace::GraceModel;
 
@@ -16,8 +16,12 @@ use crate::cli::{ExitStatus, Failure};
 use crate::file_hash;
 use crate::mixture_build::{self, Part, Work};
 use crate::output::{Table, log_and_warn, print, print_stderr};
+use crate::projection;
 use crate::signals::stop_token;
 use crate::structure_files::{StructureArguments, StructureFiles};
+
+/// Projected features of a model without a projection, as in the paper.
+const PROJECTED: usize = 128;
 
 /// Build a CALM mixture from the training data of a model
 ///
@@ -25,13 +29,15 @@ use crate::structure_files::{StructureArguments, StructureFiles};
 /// pass 3 the thresholds. The artifact depends on model, data, --candidates, --seed and --shard-size, but not on the number of
 /// threads.
 ///
+/// A model without a projection of its features (uq_rp_matrix) gets a random one, which the artifact stores.
+///
 /// Several hosts can share the work (--pass, --part, `calmwalk calm merge`); the artifact is the same.
 ///
 /// Keeps its state in CALM.npz.build until the artifact is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same
 /// command continues from the last finished shards.
 #[derive(Debug, clap::Args)]
 pub struct Build {
-    /// GRACE model (kokkos.npz) with the projection of its features (uq_rp_matrix)
+    /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
     #[command(flatten)]
@@ -51,6 +57,9 @@ pub struct Build {
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 42)]
     seed: u64,
+    /// Projected features of a model that has no projection yet; the norms of its basis are added to them [default: 128]
+    #[arg(long, value_name = "D", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    projection_dimension: Option<u32>,
     /// Structures of a shard, the unit of work; each thread holds one in memory
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     shard_size: u64,
@@ -79,7 +88,15 @@ impl Build {
         // Errors in paths are found before hours of work.
         outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
         let model = GraceModel::load(&self.model).map_err(Failure::input)?;
-        let (projection, seed) = projection(&self.model, &model)?;
+        if let (Some(found), Some(_)) = (model.projection(), self.projection_dimension) {
+            return Err(Failure::Input(format!(
+                "--projection-dimension: {} has a projection with {} features; expected a model without one",
+                self.model.display(),
+                found.dimension
+            )));
+        }
+        let dimension = self.projection_dimension.map_or(PROJECTED, |dimension| dimension as usize);
+        let (model, projection, seed) = projected(&self.model, model, self.seed, dimension)?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let settings = BuildSettings {
             dimension: projection.feature_dimension,
@@ -97,7 +114,8 @@ impl Build {
             threads: self.threads.map_or(cores, usize::from),
             stop: stop_token()?,
         };
-        let mut build = mixture_build::Build::open(work, settings, hash, &self.output, self.restart)?;
+        let mut build =
+            mixture_build::Build::open(work, settings, hash, &projection, &self.output, self.restart)?;
         if let (Some(pass), Some(part)) = (self.pass, self.part) {
             return end_part(pass, part, build.run_part(pass)?);
         }
@@ -157,29 +175,25 @@ pub(super) fn write_mixture(
     file.finish()
 }
 
-/// The projection of the model, and its random seed if the file has it.
-pub(super) fn projection(path: &Path, model: &GraceModel) -> Result<(Projection, Option<i64>), Failure> {
-    let Some(found) = model.projection() else {
-        return Err(Failure::Input(format!(
-            "{}: the model has no projection of its features (uq_rp_matrix), from which a mixture could be built: export it with \
-             CALM arrays (uq_*), those of any mixture of this model",
-            path.display()
-        )));
-    };
-    let file = Archive::open(path).map_err(Failure::input)?;
-    let key = "uq_rp_seed";
-    let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(Failure::input)?;
-    let projection = Projection {
-        matrix: found.matrix.clone(),
-        rows: found.matrix.len() / found.dimension,
-        columns: found.dimension,
-        feature_dimension: found.feature_dimension(),
-        asinh: found.asinh,
-        normalised: found.normalize,
-        density_channels: found.density_channels,
-        density_scale: found.density_scale,
-    };
-    Ok((projection, seed.and_then(|seed| seed.data.first().copied())))
+/// The model with its projection, and the random seed of that if it is known. A model without a projection gets a random
+/// one with `dimension` projected features.
+pub(super) fn projected(
+    path: &Path,
+    model: GraceModel,
+    seed: u64,
+    dimension: usize,
+) -> Result<(GraceModel, Projection, Option<i64>), Failure> {
+    if let Some(own) = projection::of_model(&model) {
+        let file = Archive::open(path).map_err(Failure::input)?;
+        let key = "uq_rp_seed";
+        let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(Failure::input)?;
+        return Ok((model, own, seed.and_then(|seed| seed.data.first().copied())));
+    }
+    let description = model.description();
+    let (rows, layers) = (description.basis_dimension, description.architecture.layers());
+    let drawn = random_projection(seed, rows, dimension, layers);
+    let model = projection::with_projection(model, &drawn).map_err(Failure::failed)?;
+    Ok((model, drawn, i64::try_from(seed).ok()))
 }
 
 fn weight(text: &str) -> Result<(PathBuf, f64), String> {

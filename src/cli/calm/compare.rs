@@ -9,10 +9,10 @@ use calm::{Artifact, Grades};
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
-use super::score::load_artifact;
 use crate::cli::{ExitStatus, Failure};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, Table, decimals, print, print_json};
+use crate::projection::load_artifact;
 use crate::structure_files::{Place, StructureArguments};
 
 /// Atoms of each element whose grades are kept for quantiles and ranks.
@@ -70,7 +70,9 @@ struct Comparison {
 impl Compare {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let model = GraceModel::load(&self.model).map_err(Failure::input)?;
-        let artifacts = [load_artifact(&self.model, &self.first)?, load_artifact(&self.model, &self.second)?];
+        let (model, first) = load_artifact(model, &self.first).map_err(Failure::Input)?;
+        let (model, second) = load_artifact(model, &self.second).map_err(Failure::Input)?;
+        let artifacts = [first, second];
         let symbols = artifacts[0].symbols.clone();
         let gradings = self.grade(model, &artifacts)?;
         let found = symbols.iter().zip(&gradings).filter_map(|(symbol, grading)| grading.compare(symbol));

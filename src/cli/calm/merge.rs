@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use calm::build::BuildSettings;
 use potentials::grace::GraceModel;
 
-use super::build::{projection, report, write_mixture};
+use super::build::{projected, report, write_mixture};
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{ExitStatus, Failure};
 use crate::file_hash;
@@ -35,9 +36,11 @@ impl Merge {
             AtomicFile::create(output)?;
         }
         let model = GraceModel::load(&self.model).map_err(Failure::input)?;
-        let (projection, seed) = projection(&self.model, &model)?;
         let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
         let mut merge = PartsMerge::open(&self.output, &hash)?;
+        let BuildSettings { seed, dimension, .. } = *merge.settings();
+        let norms = 1 + model.description().architecture.layers();
+        let (model, projection, seed) = projected(&self.model, model, seed, dimension.saturating_sub(norms))?;
         match merge.run(&model, projection, seed)? {
             Merged::Pass(pass) => {
                 print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;

@@ -15,6 +15,7 @@ use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
 use crate::output::{self, Bar, print};
+use crate::projection::load_artifact;
 use crate::xyz_reader::XyzReader;
 
 /// Keys of labels in a frame.
@@ -102,34 +103,19 @@ impl Score {
 }
 
 /// The model and the mixture that grades its features.
-fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact), Failure> {
+pub(super) fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact), Failure> {
     let export = model;
     let model = GraceModel::load(export).map_err(Failure::input)?;
+    if let Some(path) = artifact {
+        return load_artifact(model, path).map_err(Failure::Input);
+    }
     if model.projection().is_none() {
-        let message = "the model has no CALM arrays (uq_*): export it with its CALM artifact";
+        let message = "the model has no mixture (uq_*): give its artifact with --artifact, or build one with calmwalk calm build";
         return Err(Failure::Input(format!("{}: {message}", export.display())));
     }
     let own = Artifact::load_export(export).map_err(Failure::input)?;
-    let Some(path) = artifact else {
-        check_sound(&own, export).map_err(Failure::Input)?;
-        return Ok((model, own));
-    };
-    let artifact = belonging(path, &own)?;
-    Ok((model, artifact))
-}
-
-/// An artifact that belongs to the model of this export.
-pub(super) fn load_artifact(export: &Path, path: &Path) -> Result<Artifact, Failure> {
-    belonging(path, &Artifact::load_export(export).map_err(Failure::input)?)
-}
-
-fn belonging(path: &Path, own: &Artifact) -> Result<Artifact, Failure> {
-    let artifact = Artifact::load(path).map_err(Failure::input)?;
-    artifact
-        .check_belongs_to(&own.symbols, &own.projection)
-        .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
-    check_sound(&artifact, path).map_err(Failure::Input)?;
-    Ok(artifact)
+    check_sound(&own, export).map_err(Failure::Input)?;
+    Ok((model, own))
 }
 
 /// Adds the results to the frame, after moving its own labels.

@@ -94,6 +94,10 @@ impl BuiltMixture {
         self.slots
     }
 
+    pub(super) fn projection(&self) -> (&Projection, Option<i64>) {
+        (&self.projection, self.projection_seed)
+    }
+
     pub(super) fn dimension(&self) -> usize {
         self.settings.dimension
     }
@@ -150,12 +154,7 @@ impl BuiltMixture {
 
     fn write_header<W: Write + Seek>(&self, file: &mut Writer<W>) -> io::Result<()> {
         let Self { projection, settings, symbols, .. } = self;
-        let schema: i64 = match projection {
-            Projection { normalised: true, .. } | Projection { density_channels: true, .. } => 6,
-            Projection { asinh: true, .. } => 4,
-            _ => 3,
-        };
-        file.scalar("__schema_version__", schema)?;
+        file.scalar("__schema_version__", schema(projection))?;
         let present: Vec<i32> =
             (0..).zip(&self.elements).filter(|(_, found)| found.is_some()).map(|(index, _)| index).collect();
         file.array("elements", &[present.len()], present)?;
@@ -240,6 +239,15 @@ impl BuiltMixture {
         let weighted = histograms().flat_map(|histogram| histogram.weighted.iter().map(single));
         let fill = std::iter::repeat_n(0.0_f32, unused * BINS);
         file.array(&format!("eff_hist_{index}"), &[slots, BINS], weighted.chain(fill))
+    }
+}
+
+/// The version of the format that the features need.
+pub(super) fn schema(projection: &Projection) -> i64 {
+    match projection {
+        Projection { normalised: true, .. } | Projection { density_channels: true, .. } => 6,
+        Projection { asinh: true, .. } => 4,
+        _ => 3,
     }
 }
 

@@ -97,6 +97,15 @@ pub(super) fn expect_length(what: &'static str, found: usize, expected: usize) -
     if found == expected { Ok(()) } else { Err(BuildError::Length { what, found, expected }) }
 }
 
+/// Checks the weights of a batch.
+pub(super) fn expect_weights(weights: &[f64], atoms: usize) -> Result<(), BuildError> {
+    expect_length("weights", weights.len(), atoms)?;
+    match weights.iter().position(|weight| !(weight.is_finite() && *weight >= 0.0)) {
+        Some(atom) => Err(BuildError::Weight { atom, found: weights[atom] }),
+        None => Ok(()),
+    }
+}
+
 /// Checks that a partial result belongs to those before it.
 pub(super) fn expect_same(what: &'static str, found: u64, expected: u64) -> Result<(), BuildError> {
     if found == expected { Ok(()) } else { Err(BuildError::Partial { what, found, expected }) }

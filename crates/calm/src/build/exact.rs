@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::error::BuildError;
+use super::error::{BuildError, expect_same};
 
 /// 2⁷⁰: the unit is 2⁻⁷⁰ ≈ 8.5·10⁻²², far below ε, the least variance of a feature. Sums reach ±2⁵⁷ ≈ 1.4·10¹⁷.
 const UNITS: f64 = (1_u128 << 70) as f64;
@@ -33,26 +33,35 @@ impl ExactSums {
         self.units.is_empty()
     }
 
+    /// Whether a term can be added to each sum.
+    ///
+    /// # Errors
+    /// Another number of terms, or a term or sum that is not finite or beyond ±2⁵⁷.
+    pub fn check(&self, terms: &[f64]) -> Result<(), BuildError> {
+        expect_same("the number of its sums", terms.len() as u64, self.len() as u64)?;
+        let mut pairs = self.units.iter().zip(terms);
+        pairs.try_for_each(|(&sum, &term)| checked_sum(sum, fixed(term)?).map(drop))
+    }
+
     /// Adds a term to each sum.
     ///
     /// # Errors
-    /// Another number of terms, or a term or sum that is not finite or beyond ±2⁵⁷. Nothing is added then.
+    /// As [`ExactSums::check`]. Nothing is added then.
     pub fn add(&mut self, terms: &[f64]) -> Result<(), BuildError> {
-        let terms = terms.iter().map(|&term| fixed(term)).collect::<Result<_, _>>()?;
-        self.merge(&Self { units: terms })
+        self.check(terms)?;
+        self.units.iter_mut().zip(terms).for_each(|(sum, &term)| *sum += units(term));
+        Ok(())
     }
 
     /// Adds other sums.
     ///
     /// # Errors
-    /// As [`ExactSums::add`].
+    /// As [`ExactSums::check`]. Nothing is added then.
     pub fn merge(&mut self, other: &Self) -> Result<(), BuildError> {
-        super::error::expect_same("the number of its sums", other.len() as u64, self.len() as u64)?;
-        let sums = self.units.iter().zip(&other.units).map(|(&sum, &term)| {
-            let beyond = BuildError::Sum { found: to_float(sum) + to_float(term) };
-            sum.checked_add(term).ok_or(beyond)
-        });
-        self.units = sums.collect::<Result<_, _>>()?;
+        expect_same("the number of its sums", other.len() as u64, self.len() as u64)?;
+        let mut pairs = self.units.iter().zip(&other.units);
+        pairs.try_for_each(|(&sum, &term)| checked_sum(sum, term).map(drop))?;
+        self.units.iter_mut().zip(&other.units).for_each(|(sum, &term)| *sum += term);
         Ok(())
     }
 
@@ -63,11 +72,17 @@ impl ExactSums {
 }
 
 fn fixed(term: f64) -> Result<i128, BuildError> {
-    if term.is_finite() && term.abs() < LIMIT {
-        // A product with a power of two, which is exact but for numbers that vanish.
-        return Ok((term * UNITS).round_ties_even() as i128);
-    }
-    Err(BuildError::Sum { found: term })
+    let fits = term.is_finite() && term.abs() < LIMIT;
+    if fits { Ok(units(term)) } else { Err(BuildError::Sum { found: term }) }
+}
+
+/// A product with a power of two, which is exact but for numbers that vanish.
+fn units(term: f64) -> i128 {
+    (term * UNITS).round_ties_even() as i128
+}
+
+fn checked_sum(sum: i128, term: i128) -> Result<i128, BuildError> {
+    sum.checked_add(term).ok_or(BuildError::Sum { found: to_float(sum) + to_float(term) })
 }
 
 fn to_float(units: i128) -> f64 {

@@ -4,11 +4,11 @@ use std::io::{self, Read, Seek, Write};
 
 use npz::Writer;
 
-use super::artifact::{BuiltMixture, UNUSED, single};
+use super::artifact::{BuiltMixture, UNUSED, schema, single};
 use super::components::BuiltComponent;
 use crate::linear::REGULARISATION;
 
-/// The arrays of an export that describe a mixture. Those of the projection stay those of the model.
+/// The arrays of an export that describe a mixture.
 const MIXTURE: [&str; 7] = [
     "uq_n_elements",
     "uq_max_clusters",
@@ -19,18 +19,39 @@ const MIXTURE: [&str; 7] = [
     "uq_interp_thresholds",
 ];
 
+/// The arrays of an export that describe its features.
+const FEATURES: [&str; 8] = [
+    SCHEMA,
+    "uq_rp_dim",
+    "uq_rp_matrix",
+    "uq_rp_seed",
+    "uq_rp_normalize",
+    "uq_rp_add_density_channel",
+    "uq_rp_density_scale",
+    "uq_feature_transform",
+];
+
+/// Without it, an export has no features.
+const SCHEMA: &str = "uq_schema_version";
+
 /// Diagonal of the inverse covariance of an element without atoms.
 const MISSING_ELEMENT: &str = "uq_missing_elem_inv_cov_diag";
 
 impl BuiltMixture {
     /// Writes a copy of the model's export with this mixture, which [`Artifact::load_export`](crate::Artifact::load_export)
-    /// reads. All other arrays, which include the projection, are copied byte by byte.
+    /// reads. All other arrays are copied byte by byte. They include the projection, unless the model has none.
     ///
     /// # Errors
     /// If reading or writing fails.
-    pub fn write_export<R: Read + Seek, W: Write + Seek>(&self, model: R, out: W) -> io::Result<W> {
+    pub fn write_export<R: Read + Seek, W: Write + Seek>(&self, mut model: R, out: W) -> io::Result<W> {
         let mut file = Writer::new(out);
-        file.copy(model, |key| key == MISSING_ELEMENT || MIXTURE.contains(&key))?;
+        let has_features = npz::names(&mut model)?.iter().any(|key| key == SCHEMA);
+        file.copy(model, |key| {
+            key == MISSING_ELEMENT || MIXTURE.contains(&key) || (!has_features && FEATURES.contains(&key))
+        })?;
+        if !has_features {
+            self.write_features(&mut file)?;
+        }
         let (elements, slots, dimension) = (self.elements().len(), self.slots(), self.dimension());
         for (key, number) in
             [MIXTURE[0], MIXTURE[1], MIXTURE[2]].into_iter().zip([elements, slots, dimension])
@@ -61,6 +82,23 @@ impl BuiltMixture {
         });
         file.array("uq_inv_cov", &[elements, slots, dimension, dimension], inverses)?;
         file.finish()
+    }
+
+    /// The arrays of the projection, with the types of a model's export.
+    fn write_features<W: Write + Seek>(&self, file: &mut Writer<W>) -> io::Result<()> {
+        let (projection, seed) = self.projection();
+        let flags = [projection.normalised, projection.density_channels, projection.asinh].map(i64::from);
+        file.array(SCHEMA, &[1], [schema(projection)])?;
+        file.array("uq_rp_dim", &[1], [projection.columns as i64])?;
+        let matrix = projection.matrix.iter().copied();
+        file.array("uq_rp_matrix", &[projection.rows, projection.columns], matrix)?;
+        if let Some(seed) = seed {
+            file.array("uq_rp_seed", &[1], [seed])?;
+        }
+        file.array("uq_rp_normalize", &[1], [flags[0]])?;
+        file.array("uq_rp_add_density_channel", &[1], [flags[1]])?;
+        file.array("uq_rp_density_scale", &[1], [projection.density_scale])?;
+        file.array("uq_feature_transform", &[1], [flags[2]])
     }
 
     /// Each slot of each element, with the element's components unless it has no atoms.

@@ -17,15 +17,19 @@ pub(super) struct Points<'a> {
     pub features: &'a [f64],
     /// `[points]`, finite, not negative.
     pub weights: &'a [f64],
+    /// Atoms that each point stands for, `[points]`.
+    pub counts: &'a [f64],
 }
 
 /// A partition of points.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Clusters {
     /// `[clusters × D]`.
     pub centroids: Vec<f64>,
-    /// Total weight of each cluster, above zero.
+    /// Atoms of each cluster.
     pub counts: Vec<f64>,
+    /// Total weight of each cluster, above zero.
+    pub weights: Vec<f64>,
     /// Σ w |**x** − **c**|².
     pub inertia: f64,
 }
@@ -99,7 +103,7 @@ pub(super) fn weighted_kmeans(points: &Points<'_>, k: usize, random: &mut Random
             best = Some(clusters);
         }
     }
-    best.unwrap_or(Clusters { centroids: vec![], counts: vec![], inertia: 0.0 })
+    best.unwrap_or_default()
 }
 
 /// Lloyd's algorithm until no point changes its cluster, for at most `iterations`. Clusters without weight are dropped.
@@ -108,18 +112,22 @@ pub(super) fn lloyd(points: &Points<'_>, initial: Vec<f64>, iterations: usize) -
     let mut distances = Distances::new(dimension, initial);
     let count = distances.count();
     let mut assigned = vec![usize::MAX; points.weights.len()];
-    let (mut sums, mut counts, mut inertia) = (vec![0.0; count * dimension], vec![0.0; count], 0.0);
+    let (mut sums, mut inertia) = (vec![0.0; count * dimension], 0.0);
+    let (mut counts, mut weights) = (vec![0.0; count], vec![0.0; count]);
     for _ in 0..iterations {
-        sums.fill(0.0);
-        counts.fill(0.0);
+        for of in [&mut sums, &mut counts, &mut weights] {
+            of.fill(0.0);
+        }
         inertia = 0.0;
         let mut changed = false;
         distances.for_each_chunk(points.features, |chunk| {
             for (atom, row) in chunk.rows().enumerate() {
                 let (slot, squared) = chunk.nearest(atom, 0, count);
-                let weight = points.weights[chunk.first + atom];
-                changed |= std::mem::replace(&mut assigned[chunk.first + atom], slot) != slot;
-                counts[slot] += weight;
+                let point = chunk.first + atom;
+                let weight = points.weights[point];
+                changed |= std::mem::replace(&mut assigned[point], slot) != slot;
+                counts[slot] += points.counts[point];
+                weights[slot] += weight;
                 inertia += weight * squared;
                 let sums = &mut sums[slot * dimension..][..dimension];
                 sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += weight * value);
@@ -130,13 +138,17 @@ pub(super) fn lloyd(points: &Points<'_>, initial: Vec<f64>, iterations: usize) -
         }
         distances.change(|centroids| {
             let clusters = centroids.chunks_exact_mut(dimension).zip(sums.chunks_exact(dimension));
-            for ((centroid, sums), count) in clusters.zip(&counts).filter(|(_, count)| **count > 0.0) {
-                centroid.iter_mut().zip(sums).for_each(|(c, sum)| *c = sum / count);
+            for ((centroid, sums), weight) in clusters.zip(&weights).filter(|(_, weight)| **weight > 0.0) {
+                centroid.iter_mut().zip(sums).for_each(|(c, sum)| *c = sum / weight);
             }
         });
     }
-    let rows = distances.centroids().chunks_exact(dimension).zip(&counts);
-    let kept = rows.filter(|(_, count)| **count > 0.0);
-    let (centroids, counts): (Vec<&[f64]>, Vec<f64>) = kept.map(|(row, count)| (row, *count)).unzip();
-    Clusters { centroids: centroids.concat(), counts, inertia }
+    let mut kept = Clusters { inertia, ..Clusters::default() };
+    let rows = distances.centroids().chunks_exact(dimension).zip(counts.into_iter().zip(weights));
+    for (centroid, (count, weight)) in rows.filter(|(_, (_, weight))| *weight > 0.0) {
+        kept.centroids.extend_from_slice(centroid);
+        kept.counts.push(count);
+        kept.weights.push(weight);
+    }
+    kept
 }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::distances::Distances;
-use super::error::BuildError;
+use super::error::{BuildError, expect_weights};
 use super::kmeans::{Points, cumulative, initial_centroids, lloyd};
 use super::random::Random;
 use super::settings::BuildSettings;
@@ -15,7 +15,7 @@ const MIN_BATCH: usize = 1024;
 /// Iterations of Lloyd's algorithm that improve the initial centroids.
 const REFINEMENTS: usize = 3;
 
-/// Least share of the largest cluster's atoms that lets a cluster keep its centroid.
+/// Least share of the largest cluster's weight that lets a cluster keep its centroid.
 const MIN_SHARE: f64 = 0.01;
 
 /// Mini-batch k-means (Sculley, WWW 2010) of the atoms of one element and shard.
@@ -25,24 +25,27 @@ const MIN_SHARE: f64 = 0.01;
 /// The first mini-batch gives the initial centroids by k-means++ and three iterations of Lloyd's algorithm; if it has
 /// fewer distinct atoms than K, there are as many centroids. Each mini-batch then moves the centroids:
 ///
-/// **c** ← **c** + (Σ **x** − m **c**) / (n + m),  n ← n + m,
+/// **c** ← **c** + (Σ w **x** − m **c**) / (n + m),  n ← n + m,
 ///
-/// where Σ **x** is the sum of its m atoms nearest to **c**, and n the number of all atoms before them.
+/// where the sum is over its atoms nearest to **c**, m is their weight, and n the weight of all atoms before them.
 ///
-/// **Reassignment.** After each mini-batch, a centroid moves if its cluster has fewer than 1 % of the atoms of the largest
+/// **Reassignment.** After each mini-batch, a centroid moves if its cluster has less than 1 % of the weight of the largest
 /// cluster, both of the mini-batch and of all mini-batches. It moves to an atom of the mini-batch, drawn as by k-means++
-/// with a probability proportional to its squared distance from the nearest centroid. The nearest other cluster gets
-/// its count.
+/// with a probability proportional to its weight times its squared distance from the nearest centroid. The nearest other
+/// cluster gets its atoms and weight.
 ///
-/// Every atom counts once, whatever its weight: weights change the statistics of components, not the partition.
+/// Atoms without weight are left out.
 #[derive(Debug, Clone)]
 pub struct ShardClustering {
     settings: BuildSettings,
     shard: u64,
     element: usize,
-    /// Atoms of the next mini-batch, `[atoms × D]`.
+    /// Atoms of the next mini-batch, `[atoms × D]`, and their weights.
     pending: Vec<f64>,
+    weights: Vec<f64>,
+    /// Of all mini-batches.
     atoms: u64,
+    weight: f64,
     /// One for each candidate once the first mini-batch has been seen.
     candidates: Vec<Candidate>,
     /// The centroids of all candidates.
@@ -57,8 +60,10 @@ pub struct ShardClusters {
     pub shard: u64,
     /// Element index.
     pub element: usize,
-    /// Atoms of the element in the shard.
+    /// Atoms of the element in the shard that have a weight.
     pub atoms: u64,
+    /// Sum of their weights.
+    pub weight: f64,
     /// The clusters for each candidate K; empty without atoms.
     pub candidates: Vec<CandidateClusters>,
 }
@@ -70,7 +75,9 @@ pub struct CandidateClusters {
     pub centroids: Vec<f64>,
     /// Atoms of each cluster, `[clusters]`.
     pub counts: Vec<f64>,
-    /// Σ |**x** − **c**|² over the atoms, each to the nearest centroid when its mini-batch was assigned.
+    /// Sum of their weights, `[clusters]`.
+    pub weights: Vec<f64>,
+    /// Σ w |**x** − **c**|² over the atoms, each to the nearest centroid when its mini-batch was assigned.
     pub inertia: f64,
 }
 
@@ -80,11 +87,12 @@ struct Candidate {
     /// Index of its first centroid among those of all candidates.
     first: usize,
     counts: Vec<f64>,
+    weights: Vec<f64>,
     inertia: f64,
-    /// Of the current mini-batch: sums of features, `[clusters × D]`, and atoms of each cluster.
+    /// Of the current mini-batch: weighted sums of features, `[clusters × D]`, and weight of each cluster.
     sums: Vec<f64>,
     added: Vec<f64>,
-    /// Squared distance of each of its atoms to the nearest centroid.
+    /// Weighted squared distance of each of its atoms to the nearest centroid.
     squared: Vec<f64>,
 }
 
@@ -99,26 +107,27 @@ impl ShardClustering {
             shard,
             element,
             pending: Vec::new(),
+            weights: Vec::new(),
             atoms: 0,
+            weight: 0.0,
             candidates: Vec::new(),
             distances: Distances::new(settings.dimension, Vec::new()),
             settings: settings.clone(),
         })
     }
 
-    /// Adds atoms of the element, `[atoms × D]`.
+    /// Adds atoms of the element: `features` is `[atoms × D]`, `weights` has one number for each atom.
     ///
     /// # Errors
-    /// A length that is no multiple of D, features that are not finite. Nothing is added then.
-    pub fn add(&mut self, features: &[f64]) -> Result<(), BuildError> {
-        self.atoms += self.distances.check(features)? as u64;
-        let size = self.batch_atoms() * self.settings.dimension;
-        let mut rest = features;
-        while !rest.is_empty() {
-            let (now, later) = rest.split_at(rest.len().min(size - self.pending.len()));
-            self.pending.extend_from_slice(now);
-            rest = later;
-            if self.pending.len() == size {
+    /// Wrong lengths, features that are not finite, weights that are negative or not finite. Nothing is added then.
+    pub fn add(&mut self, features: &[f64], weights: &[f64]) -> Result<(), BuildError> {
+        let atoms = self.distances.check(features)?;
+        expect_weights(weights, atoms)?;
+        let rows = features.chunks_exact(self.settings.dimension).zip(weights);
+        for (row, &weight) in rows.filter(|(_, weight)| **weight > 0.0) {
+            self.pending.extend_from_slice(row);
+            self.weights.push(weight);
+            if self.weights.len() == self.batch_atoms() {
                 self.step();
             }
         }
@@ -130,7 +139,7 @@ impl ShardClustering {
         if !self.pending.is_empty() {
             self.step();
         }
-        let Self { shard, element, atoms, candidates, distances, settings, .. } = self;
+        let Self { shard, element, atoms, weight, candidates, distances, settings, .. } = self;
         let centroids = distances.centroids().chunks_exact(settings.dimension);
         let clusters = candidates.into_iter().map(|candidate| CandidateClusters {
             centroids: centroids
@@ -141,9 +150,10 @@ impl ShardClustering {
                 .copied()
                 .collect(),
             counts: candidate.counts,
+            weights: candidate.weights,
             inertia: candidate.inertia,
         });
-        ShardClusters { shard, element, atoms, candidates: clusters.collect() }
+        ShardClusters { shard, element, atoms, weight, candidates: clusters.collect() }
     }
 
     fn batch_atoms(&self) -> usize {
@@ -152,17 +162,22 @@ impl ShardClustering {
 
     /// Moves the centroids by the pending mini-batch.
     fn step(&mut self) {
-        let batch = std::mem::take(&mut self.pending);
+        let (batch, weights) = (std::mem::take(&mut self.pending), std::mem::take(&mut self.weights));
+        self.atoms += weights.len() as u64;
+        weights.iter().for_each(|weight| self.weight += weight);
         if self.candidates.is_empty() {
-            self.initialise(&batch);
+            self.initialise(&batch, &weights);
         }
         let Self { candidates, distances, .. } = self;
         candidates.iter_mut().for_each(Candidate::begin_batch);
+        let mut weighted = vec![0.0; self.settings.dimension];
         distances.for_each_chunk(&batch, |chunk| {
             for (atom, row) in chunk.rows().enumerate() {
+                let weight = weights[chunk.first + atom];
+                weighted.iter_mut().zip(row).for_each(|(out, value)| *out = weight * value);
                 for candidate in &mut *candidates {
                     let (slot, squared) = chunk.nearest(atom, candidate.first, candidate.counts.len());
-                    candidate.assign(row, slot, squared);
+                    candidate.assign(&weighted, weight, slot, squared);
                 }
             }
         });
@@ -171,17 +186,17 @@ impl ShardClustering {
             for candidate in candidates {
                 let own = &mut centroids[candidate.first * dimension..][..candidate.sums.len()];
                 candidate.advance(own, dimension);
-                candidate.reassign(own, &batch, dimension);
+                candidate.reassign(own, (&batch, &weights), dimension);
             }
         });
-        self.pending = batch;
+        (self.pending, self.weights) = (batch, weights);
         self.pending.clear();
+        self.weights.clear();
     }
 
-    fn initialise(&mut self, batch: &[f64]) {
+    fn initialise(&mut self, batch: &[f64], weights: &[f64]) {
         let dimension = self.settings.dimension;
-        let weights = vec![1.0; batch.len() / dimension];
-        let points = Points { dimension, features: batch, weights: &weights };
+        let points = Points { dimension, features: batch, weights, counts: &vec![1.0; weights.len()] };
         let mut all = Vec::new();
         for &k in &self.settings.candidates {
             let words = [self.settings.seed, self.shard, self.element as u64, k as u64];
@@ -192,6 +207,7 @@ impl ShardClustering {
                 random,
                 first: all.len() / dimension,
                 counts: vec![0.0; centroids.len() / dimension],
+                weights: vec![0.0; centroids.len() / dimension],
                 inertia: 0.0,
                 sums: vec![0.0; centroids.len()],
                 added: vec![0.0; centroids.len() / dimension],
@@ -210,39 +226,43 @@ impl Candidate {
         self.squared.clear();
     }
 
-    fn assign(&mut self, row: &[f64], slot: usize, squared: f64) {
-        let sums = &mut self.sums[slot * row.len()..][..row.len()];
-        sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
-        self.added[slot] += 1.0;
-        self.inertia += squared;
-        self.squared.push(squared);
+    /// `weighted` is the weight times the features of an atom.
+    fn assign(&mut self, weighted: &[f64], weight: f64, slot: usize, squared: f64) {
+        let sums = &mut self.sums[slot * weighted.len()..][..weighted.len()];
+        sums.iter_mut().zip(weighted).for_each(|(sum, value)| *sum += value);
+        self.counts[slot] += 1.0;
+        self.added[slot] += weight;
+        self.inertia += weight * squared;
+        self.squared.push(weight * squared);
     }
 
     fn advance(&mut self, centroids: &mut [f64], dimension: usize) {
         let clusters = centroids.chunks_exact_mut(dimension).zip(self.sums.chunks_exact(dimension));
-        for ((centroid, sums), (count, &added)) in clusters.zip(self.counts.iter_mut().zip(&self.added)) {
+        for ((centroid, sums), (total, &added)) in clusters.zip(self.weights.iter_mut().zip(&self.added)) {
             if added > 0.0 {
-                *count += added;
+                *total += added;
                 let moves = centroid.iter_mut().zip(sums);
-                moves.for_each(|(c, sum)| *c += (sum - added * *c) / *count);
+                moves.for_each(|(c, sum)| *c += (sum - added * *c) / *total);
             }
         }
     }
 
-    fn reassign(&mut self, centroids: &mut [f64], batch: &[f64], dimension: usize) {
-        let few = |counts: &[f64]| MIN_SHARE * counts.iter().copied().fold(0.0, f64::max);
-        let (few, few_added) = (few(&self.counts), few(&self.added));
-        for slot in 0..self.counts.len() {
-            if self.counts[slot] >= few || self.added[slot] >= few_added {
+    fn reassign(&mut self, centroids: &mut [f64], (batch, weights): (&[f64], &[f64]), dimension: usize) {
+        let few = |of: &[f64]| MIN_SHARE * of.iter().copied().fold(0.0, f64::max);
+        let (few, few_added) = (few(&self.weights), few(&self.added));
+        for slot in 0..self.weights.len() {
+            if self.weights[slot] >= few || self.added[slot] >= few_added {
                 continue;
             }
             let Some(atom) = self.random.index(&cumulative(self.squared.iter().copied())) else { return };
             let row = &batch[atom * dimension..][..dimension];
             // The next cluster goes elsewhere.
-            let distances = batch.chunks_exact(dimension).map(|other| squared_distance(other, row));
+            let distances = batch.chunks_exact(dimension).zip(weights);
+            let distances = distances.map(|(other, weight)| weight * squared_distance(other, row));
             self.squared.iter_mut().zip(distances).for_each(|(least, squared)| *least = least.min(squared));
             if let Some(heir) = nearest_other(centroids, slot, dimension) {
                 self.counts[heir] += std::mem::take(&mut self.counts[slot]);
+                self.weights[heir] += std::mem::take(&mut self.weights[slot]);
             }
             centroids[slot * dimension..][..dimension].copy_from_slice(row);
         }

@@ -6,7 +6,7 @@
 //! and 3 by [`ExactSums`] in any order, so the mixture does not depend on who made them. All are serialisable, so that a build
 //! continues with its finished shards.
 //!
-//! 1. [`ShardClustering`] finds clusters by mini-batch k-means for every candidate K. [`partition`] chooses K by the
+//! 1. [`ShardClustering`] finds clusters by mini-batch k-means for every candidate K. [`Partitioner`] chooses K by the
 //!    [`elbow`] of the within-cluster sum of squares, and the centroids **μ**_k by weighted k-means of those of the shards.
 //! 2. [`ScatterPass`] assigns each atom to its nearest centroid, k* = argmin_k |**z** − **μ**_k|², and sums n = Σ 1,
 //!    n_eff = Σ w and S_k = Σ w **δδ**ᵀ with **δ** = **z** − **μ**_k. [`components`] merges components with fewer than D + 1
@@ -29,11 +29,13 @@ mod elbow;
 mod error;
 mod exact;
 mod export;
+mod groups;
 mod histogram;
 mod kmeans;
 mod mini_batch;
 mod moments;
 mod partition;
+mod projection;
 mod random;
 mod recalibrate;
 mod scatter;
@@ -50,7 +52,8 @@ pub use exact::ExactSums;
 pub use histogram::{BINS, ElementHistograms, Grid, Histogram};
 pub use mini_batch::{CandidateClusters, ShardClustering, ShardClusters};
 pub use moments::{ComponentSums, ElementSums};
-pub use partition::{ElementPartition, partition};
+pub use partition::{ElementPartition, Partitioner};
+pub use projection::random_projection;
 pub use random::shuffled;
 pub use recalibrate::Recalibration;
 pub use scatter::ScatterPass;

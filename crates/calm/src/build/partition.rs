@@ -4,14 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use super::elbow::elbow;
 use super::error::{BuildError, expect_length, expect_same};
-use super::kmeans::{Points, weighted_kmeans};
-use super::mini_batch::ShardClusters;
+use super::groups::Groups;
+use super::mini_batch::{CandidateClusters, ShardClusters};
 use super::moments::{ComponentSums, Moments, merge_small};
-use super::random::Random;
 use super::settings::BuildSettings;
-
-/// Stands for all shards among the words that choose random numbers.
-const ALL_SHARDS: u64 = u64::MAX;
 
 /// The centroids of an element, about which pass 2 accumulates scatter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -20,7 +16,7 @@ pub struct ElementPartition {
     pub element: usize,
     /// Its atoms in all shards.
     pub atoms: u64,
-    /// Within-cluster sum of squares per atom for each candidate K; empty without atoms.
+    /// Weighted within-cluster sum of squares per weight for each candidate K; empty without atoms.
     pub inertia: Vec<f64>,
     /// The candidate K at the elbow; 0 without atoms.
     pub chosen: usize,
@@ -30,71 +26,108 @@ pub struct ElementPartition {
     pub counts: Vec<f64>,
 }
 
-/// Combines the clusters that the shards found for an element.
+/// Combines the clusters that the shards found for an element, one shard after another.
 ///
 /// The elbow of the inertia over all shards chooses K. Weighted k-means (k-means++, Lloyd's algorithm, best of ten
-/// runs) of the shards' centroids for this K, with their counts as weights, gives the centroids. Clusters with fewer
-/// than D + 1 atoms are merged into their nearest neighbour, with **c** = (n_A **c**_A + n_B **c**_B)/(n_A + n_B).
+/// runs) of the shards' centroids for this K, with the weights of their atoms, gives the centroids. Clusters with fewer
+/// than D + 1 atoms are merged into their nearest neighbour, with **c** = (w_A **c**_A + w_B **c**_B)/(w_A + w_B).
 ///
-/// # Errors
-/// Invalid settings; shards that are not in ascending order, or of another element or build.
-pub fn partition(
-    settings: &BuildSettings,
+/// Memory does not grow with the number of shards: 128 of them at a time, in their order, become a group with at most K
+/// centroids in the same way, 128 groups a group of groups, and so on (Guha, Meyerson, Mishra, Motwani & O'Callaghan, IEEE
+/// Trans. Knowl. Data Eng. 15, 515 (2003)).
+#[derive(Debug, Clone)]
+pub struct Partitioner {
+    settings: BuildSettings,
     element: usize,
-    shards: &[ShardClusters],
-) -> Result<ElementPartition, BuildError> {
-    settings.check()?;
-    check(settings, element, shards)?;
-    let filled = || shards.iter().filter(|shard| shard.atoms > 0);
-    let atoms: u64 = filled().map(|shard| shard.atoms).sum();
-    if atoms == 0 {
-        let (inertia, centroids, counts) = (vec![], vec![], vec![]);
-        return Ok(ElementPartition { element, atoms, inertia, chosen: 0, centroids, counts });
-    }
-    let total = |k: usize| filled().map(|shard| shard.candidates[k].inertia).sum::<f64>();
-    let inertia: Vec<f64> = (0..settings.candidates.len()).map(|k| total(k) / atoms as f64).collect();
-    let chosen = elbow(&settings.candidates, &inertia).unwrap_or_default();
-    let index = settings.candidates.iter().position(|&k| k == chosen).unwrap_or_default();
-
-    let clusters = || filled().map(|shard| &shard.candidates[index]);
-    let features: Vec<f64> = clusters().flat_map(|found| found.centroids.iter().copied()).collect();
-    let weights: Vec<f64> = clusters().flat_map(|found| found.counts.iter().copied()).collect();
-    let points = Points { dimension: settings.dimension, features: &features, weights: &weights };
-    let mut random = Random::new(&[settings.seed, ALL_SHARDS, element as u64, chosen as u64]);
-    let found = weighted_kmeans(&points, chosen, &mut random);
-
-    let rows = found.centroids.chunks_exact(settings.dimension).zip(found.counts);
-    let mut merged: Vec<Moments> = rows.map(|(centroid, count)| populated(centroid, count)).collect();
-    merge_small(&mut merged, settings.min_atoms());
-    let counts = merged.iter().map(|cluster| cluster.sums.count).collect();
-    let centroids = merged.into_iter().flat_map(|cluster| cluster.centroid).collect();
-    Ok(ElementPartition { element, atoms, inertia, chosen, centroids, counts })
+    /// The least index of the next shard.
+    next: u64,
+    atoms: u64,
+    weight: f64,
+    /// Σ w |**x** − **c**|² of each candidate.
+    inertia: Vec<f64>,
+    /// Of each candidate.
+    groups: Vec<Groups>,
 }
 
-fn populated(centroid: &[f64], count: f64) -> Moments {
-    let sums = ComponentSums { count, effective_count: count, scatter: Vec::new() };
+impl Partitioner {
+    /// Begins an element.
+    ///
+    /// # Errors
+    /// Invalid settings.
+    pub fn new(settings: &BuildSettings, element: usize) -> Result<Self, BuildError> {
+        settings.check()?;
+        let groups = settings.candidates.iter().map(|&k| Groups::new(settings, element, k));
+        Ok(Self {
+            element,
+            next: 0,
+            atoms: 0,
+            weight: 0.0,
+            inertia: vec![0.0; settings.candidates.len()],
+            groups: groups.collect(),
+            settings: settings.clone(),
+        })
+    }
+
+    /// Adds a shard.
+    ///
+    /// # Errors
+    /// A shard that is not behind those before it, or of another element or build. Nothing is added then.
+    pub fn add(&mut self, shard: &ShardClusters) -> Result<(), BuildError> {
+        self.check(shard)?;
+        self.next = shard.shard + 1;
+        self.atoms += shard.atoms;
+        self.weight += shard.weight;
+        for ((found, inertia), groups) in shard.candidates.iter().zip(&mut self.inertia).zip(&mut self.groups)
+        {
+            *inertia += found.inertia;
+            groups.add(found);
+        }
+        Ok(())
+    }
+
+    /// The partition of all shards.
+    pub fn finish(mut self) -> ElementPartition {
+        let Self { element, atoms, weight, .. } = self;
+        if atoms == 0 {
+            let (inertia, centroids, counts) = (vec![], vec![], vec![]);
+            return ElementPartition { element, atoms, inertia, chosen: 0, centroids, counts };
+        }
+        let inertia: Vec<f64> = self.inertia.iter().map(|sum| sum / weight).collect();
+        let candidates = &self.settings.candidates;
+        let chosen = elbow(candidates, &inertia).unwrap_or_default();
+        let index = candidates.iter().position(|&k| k == chosen).unwrap_or_default();
+        let found = self.groups.swap_remove(index).finish();
+
+        let rows = found.centroids.chunks_exact(self.settings.dimension);
+        let numbers = found.counts.into_iter().zip(found.weights);
+        let clusters = rows.zip(numbers).map(|(centroid, (count, weight))| cluster(centroid, count, weight));
+        let mut merged: Vec<Moments> = clusters.collect();
+        merge_small(&mut merged, self.settings.min_atoms());
+        let counts = merged.iter().map(|cluster| cluster.sums.count).collect();
+        let centroids = merged.into_iter().flat_map(|cluster| cluster.centroid).collect();
+        ElementPartition { element, atoms, inertia, chosen, centroids, counts }
+    }
+
+    fn check(&self, shard: &ShardClusters) -> Result<(), BuildError> {
+        expect_same("the index of its element", shard.element as u64, self.element as u64)?;
+        if shard.shard < self.next {
+            return expect_same("its index", shard.shard, self.next);
+        }
+        let (found, expected) = (shard.candidates.len(), self.settings.candidates.len());
+        if shard.atoms > 0 {
+            expect_same("the number of candidates", found as u64, expected as u64)?;
+        }
+        for CandidateClusters { centroids, counts, weights, .. } in &shard.candidates {
+            expect_length("centroids of a shard", centroids.len(), counts.len() * self.settings.dimension)?;
+            expect_length("weights of a shard", weights.len(), counts.len())?;
+        }
+        Ok(())
+    }
+}
+
+fn cluster(centroid: &[f64], count: f64, effective_count: f64) -> Moments {
+    let sums = ComponentSums { count, effective_count, scatter: Vec::new() };
     Moments { centroid: centroid.to_vec(), sums }
-}
-
-fn check(settings: &BuildSettings, element: usize, shards: &[ShardClusters]) -> Result<(), BuildError> {
-    let mut next = 0;
-    for shard in shards {
-        expect_same("the index of its element", shard.element as u64, element as u64)?;
-        if shard.shard < next {
-            return expect_same("its index", shard.shard, next);
-        }
-        next = shard.shard + 1;
-        if shard.atoms == 0 {
-            continue;
-        }
-        let (found, expected) = (shard.candidates.len(), settings.candidates.len());
-        expect_same("the number of candidates", found as u64, expected as u64)?;
-        for clusters in &shard.candidates {
-            let expected = clusters.counts.len() * settings.dimension;
-            expect_length("centroids of a shard", clusters.centroids.len(), expected)?;
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -111,7 +144,7 @@ mod tests {
         let mut clusters: Vec<_> = clusters
             .iter()
             .zip(numbers("counts"))
-            .map(|(centroid, count)| populated(centroid, count))
+            .map(|(centroid, count)| cluster(centroid, count, count))
             .collect();
         merge_small(&mut clusters, case["min_atoms"].as_u64().unwrap() as usize);
         let counts: Vec<f64> = clusters.iter().map(|cluster| cluster.sums.count).collect();

@@ -1,7 +1,7 @@
 //! Sorts the atoms of a stream into blocks by their nearest centroid, so that one matrix product serves many of them.
 
 use super::distances::{Distances, check};
-use super::error::{BuildError, expect_length};
+use super::error::{BuildError, expect_weights};
 use super::settings::check_dimension;
 
 /// Atoms of a block: enough for a matrix product to reach its full rate, few enough for the second-level cache.
@@ -44,11 +44,7 @@ impl Sorter {
         mut full: impl FnMut(usize, &mut Block),
     ) -> Result<(), BuildError> {
         let atoms = self.distances.check(features)?;
-        expect_length("weights", weights.len(), atoms)?;
-        let wrong = weights.iter().position(|weight| !(weight.is_finite() && *weight >= 0.0));
-        if let Some(atom) = wrong {
-            return Err(BuildError::Weight { atom, found: weights[atom] });
-        }
+        expect_weights(weights, atoms)?;
         let Self { distances, blocks } = self;
         distances.for_each_checked_chunk(features, |chunk| {
             for (atom, row) in chunk.rows().enumerate() {

@@ -3,12 +3,14 @@
 use atoms::Species;
 use npz::Archive;
 
+use super::basis::BasisLayout;
 use super::description::{Architecture, GraceDescription};
 use super::error::{GraceError, mismatch};
 use super::layer::LayerDraft;
+use super::load::has_projection;
 use super::network::Network;
 use super::networks::readout;
-use super::projection::{FeatureMap, Projection, ProjectionMaps, rows_of_projection};
+use super::projection::{FeatureMap, Projection};
 use super::shared_reader::reject_unread_arrays;
 use super::vector::Vector;
 
@@ -41,9 +43,10 @@ impl<V: Vector> ModelBuilder<'_, V> {
         let blocks = self.layers.iter().map(|layer| layer.block.clone()).collect();
         let readout = readout(archive, blocks, self.n_densities, self.elements.len(), &mut self.weights)?;
         let sources: Vec<_> = self.layers.iter().map(|layer| layer.graph.sources.clone()).collect();
-        let feature_map = feature_map(archive, &sources, &self.block_order)?;
+        let basis = BasisLayout::new::<V>(&sources, &self.block_order);
+        let feature_map = feature_map(archive, &basis)?;
         reject_unread_arrays(archive, self.architecture.number_of_layers())?;
-        let description = self.describe(basis_dimension(&sources), feature_map.as_ref())?;
+        let description = self.describe(basis.dimension, feature_map.as_ref())?;
         let pairs = 0..self.elements.len() * self.elements.len();
         let radial = self.layers.iter().map(|layer| &layer.radial);
         let cutoff = |pair| radial.clone().map(|radial| radial.cutoff(pair)).fold(0.0, f64::max);
@@ -53,7 +56,7 @@ impl<V: Vector> ModelBuilder<'_, V> {
             let message = drafts.peek_mut().and_then(|next| next.message.from.as_mut());
             layers.push(draft.finish(message));
         }
-        let network = Network { layers, readout, feature_map };
+        let network = Network { layers, readout, basis, feature_map };
         Ok(ModelParts { network, pair_cutoffs, description })
     }
 
@@ -84,35 +87,18 @@ impl<V: Vector> ModelBuilder<'_, V> {
     }
 }
 
-/// D_basis
-fn basis_dimension(sources: &[Vec<(usize, usize)>]) -> usize {
-    sources.iter().flatten().map(|(components, channels)| components * channels).sum()
-}
-
-/// The row of the projection matrix for each index of each layer's padded basis.
-fn places<V: Vector>(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> Vec<Vec<Option<usize>>> {
-    let (mut firsts, mut first) = (vec![0; sources.len()], 0);
-    for layer in block_order {
-        firsts[*layer] = first;
-        first += basis_dimension(&sources[*layer..=*layer]);
-    }
-    firsts.into_iter().zip(sources).map(|(first, sources)| rows_of_projection::<V>(first, sources)).collect()
-}
-
-/// The feature map, if the file has one. `sources` describes each layer's basis, `block_order` gives the order
-/// of the layers' blocks in the file.
+/// The feature map, if the file has one.
 fn feature_map<V: Vector>(
     archive: &Archive,
-    sources: &[Vec<(usize, usize)>],
-    block_order: &[usize],
+    basis: &BasisLayout,
 ) -> Result<Option<FeatureMap<V>>, GraceError> {
-    if !archive.contains("uq_schema_version") {
+    if !has_projection(archive) {
         return Ok(None);
     }
     let version = archive.count("uq_schema_version", 0, usize::MAX)?;
     let dimension = archive.count("uq_rp_dim", 1, 1 << 16)?;
     let matrix =
-        archive.floats_f32("uq_rp_matrix")?.finite()?.with_shape(&[basis_dimension(sources), dimension])?;
+        archive.floats_f32("uq_rp_matrix")?.finite()?.with_shape(&[basis.dimension, dimension])?;
     let normalize = archive.flag_or("uq_rp_normalize", false)?;
     let density_channels = archive.flag_or("uq_rp_add_density_channel", false)?;
     let asinh = archive.flag_or("uq_feature_transform", false)?;
@@ -129,12 +115,10 @@ fn feature_map<V: Vector>(
             format!("{expected}, as its flags imply"),
         ));
     }
-    let layers = places::<V>(sources, block_order);
-    let maps = layers.iter().map(|rows| ProjectionMaps::new(&matrix, dimension, rows)).collect();
-    let blocks = block_order.to_vec();
+    let layers = basis.blocks.len();
     let density_scale = archive.scalar_or("uq_rp_density_scale", 1.0)? as f32;
     let projection =
-        Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, blocks };
+        Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, layers };
     archive.expect_count("uq_feature_dim", projection.feature_dimension())?;
-    Ok(Some(FeatureMap { projection, maps }))
+    Ok(Some(FeatureMap::new(projection, basis)))
 }

@@ -14,6 +14,15 @@ pub enum Architecture {
 }
 
 impl Architecture {
+    /// The number of layers.
+    pub fn layers(self) -> usize {
+        match self {
+            Self::OneLayer => 1,
+            Self::TwoLayer => 2,
+            Self::ThreeLayer => 3,
+        }
+    }
+
     /// The number of layers in words.
     pub(super) fn number_of_layers(self) -> &'static str {
         match self {
@@ -55,7 +64,7 @@ pub struct GraceDescription {
     pub basis_functions: Vec<String>,
     /// D_basis, the number of invariants.
     pub basis_dimension: usize,
-    /// D, the dimension of z; 0 without feature arrays.
+    /// D, the dimension of z; 0 without a projection.
     pub feature_dimension: usize,
     /// Number of trained weights.
     pub weights: usize,

@@ -59,6 +59,18 @@ pub enum GraceError {
     },
 }
 
+/// A projection that does not fit the basis of a model.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the projection of the features has {found} {what}, the model has {expected}: it belongs to another model")]
+pub struct UnfitProjection {
+    /// What there is another number of.
+    pub what: &'static str,
+    /// The projection's number.
+    pub found: usize,
+    /// The model's number.
+    pub expected: usize,
+}
+
 impl From<Error> for GraceError {
     fn from(error: Error) -> Self {
         match error {

@@ -45,6 +45,14 @@ impl GraceModel {
         }
     }
 
+    /// Whether a file has a projection of the features.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn has_projection(path: &Path) -> Result<bool, GraceError> {
+        Ok(has_projection(&Archive::open(path)?))
+    }
+
     fn read<V: Vector>(
         archive: &Archive,
         path: RadialPath,
@@ -62,6 +70,11 @@ impl GraceModel {
             _ => require_invariance(archive, model),
         }
     }
+}
+
+/// Whether an export has a projection of the features.
+pub(super) fn has_projection(archive: &Archive) -> bool {
+    archive.contains("uq_schema_version")
 }
 
 /// Detects the depth by the lists of single-particle basis functions that only deeper models have.

@@ -22,6 +22,7 @@
 //! # }
 //! ```
 
+mod basis;
 mod batch_passes;
 mod batches;
 mod block_aliases;
@@ -73,7 +74,7 @@ mod vector;
 mod weights;
 
 pub use description::{Architecture, GraceDescription};
-pub use error::GraceError;
+pub use error::{GraceError, UnfitProjection};
 pub use evaluate::{Grade, PullBack};
 pub use instructions::Instructions;
 pub(crate) use instructions::Pass;

@@ -3,6 +3,7 @@
 use atoms::{PotentialError, Species};
 
 use super::description::GraceDescription;
+use super::error::UnfitProjection;
 use super::network::AnyNetwork;
 use super::precision::Precision;
 use super::projection::Projection;
@@ -47,7 +48,23 @@ impl GraceModel {
         self.projection().map_or(0, Projection::feature_dimension)
     }
 
-    /// The feature map, if the file has one.
+    /// The model with this projection of its features, in place of its own if it has one.
+    ///
+    /// # Errors
+    /// A matrix that has not D_basis rows; another number of layers.
+    pub fn with_projection(mut self, projection: Projection) -> Result<Self, UnfitProjection> {
+        let fits = |what, found, expected| {
+            if found == expected { Ok(()) } else { Err(UnfitProjection { what, found, expected }) }
+        };
+        let (basis, layers) = (self.description.basis_dimension, self.description.architecture.layers());
+        fits("layers", projection.layers, layers)?;
+        fits("numbers in its matrix", projection.matrix.len(), basis * projection.dimension)?;
+        self.description.feature_dimension = projection.feature_dimension();
+        self.network.set_projection(projection);
+        Ok(self)
+    }
+
+    /// The feature map, if the model has one.
     pub fn projection(&self) -> Option<&Projection> {
         self.network.projection()
     }

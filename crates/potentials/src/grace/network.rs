@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::basis::BasisLayout;
 use super::layer::Layer;
 use super::precision::Precision;
 use super::projection::{FeatureMap, Projection};
@@ -13,7 +14,8 @@ use super::vector::{Double, Single, Vector};
 pub(super) struct Network<V: Vector> {
     pub layers: Vec<Layer<V>>,
     pub readout: Readout<V>,
-    /// `None` if the file has no feature arrays.
+    pub basis: BasisLayout,
+    /// `None` without a projection.
     pub feature_map: Option<FeatureMap<V>>,
 }
 
@@ -27,6 +29,10 @@ impl<V: Vector> Network<V> {
 
     pub fn projection(&self) -> Option<&Projection> {
         self.feature_map.as_ref().map(|map| &map.projection)
+    }
+
+    fn set_projection(&mut self, projection: Projection) {
+        self.feature_map = Some(FeatureMap::new(projection, &self.basis));
     }
 }
 
@@ -49,6 +55,14 @@ impl AnyNetwork {
         match self {
             Self::Double(network) => network.projection(),
             Self::Mixed(network) => network.projection(),
+        }
+    }
+
+    /// `projection` must fit the basis.
+    pub fn set_projection(&mut self, projection: Projection) {
+        match self {
+            Self::Double(network) => Arc::make_mut(network).set_projection(projection),
+            Self::Mixed(network) => Arc::make_mut(network).set_projection(projection),
         }
     }
 

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use super::basis::BasisLayout;
 use super::batches::Chunk;
 use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
 use super::instructions::Instructions;
@@ -17,7 +18,7 @@ const SQUARE_FLOOR: f64 = 1e-30;
 
 /// The feature map of a model: z = (T(B̂ R), s log(‖B‖ + ε_0), s log(‖B_1‖ + ε_0), …) with
 /// B̂ = B / (‖B‖ + ε_0), ‖B‖ = √(Σ B² + 10⁻³⁰) and ε_0 = 10⁻¹².
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Projection {
     /// R as stored, row-major `[D_basis, d]`.
     pub matrix: Vec<f32>,
@@ -31,8 +32,8 @@ pub struct Projection {
     pub density_scale: f32,
     /// Whether T is asinh (identity otherwise).
     pub asinh: bool,
-    /// The layers in the order of their norms in z.
-    pub(super) blocks: Vec<usize>,
+    /// Number of layers, each of which has a norm.
+    pub layers: usize,
 }
 
 /// The rows of R for the basis of one layer, and their transpose.
@@ -109,20 +110,9 @@ impl Projection {
         self.dimension + if self.density_channels { self.n_norms() } else { 0 }
     }
 
-    /// Number of norms: that of the whole basis and those of the blocks.
+    /// Number of norms: that of the whole basis and those of the layers.
     fn n_norms(&self) -> usize {
-        1 + self.blocks.len()
-    }
-
-    /// Replaces ‖B_k‖ with the factor of layer k's basis in its cotangent.
-    #[inline(always)]
-    fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {
-        let (scale, density) = (f64::from(self.density_scale), |k: usize| of_norms.get(k).copied());
-        let factor = |norm: f64, cotangent: f64| cotangent / (norm + NORM_FLOOR) / norm;
-        let of_all = factor(norms[0], scale * density(0).unwrap_or(0.0) - along);
-        for (k, layer) in self.blocks.iter().enumerate() {
-            norms[layer + 1] = of_all + factor(norms[layer + 1], scale * density(k + 1).unwrap_or(0.0));
-        }
+        1 + self.layers
     }
 }
 
@@ -131,10 +121,31 @@ impl Projection {
 pub(super) struct FeatureMap<V> {
     pub projection: Projection,
     /// For the basis of each layer.
-    pub maps: Vec<ProjectionMaps<V>>,
+    maps: Vec<ProjectionMaps<V>>,
+    /// The layers in the order of their norms in z.
+    blocks: Vec<usize>,
 }
 
 impl<V: Vector> FeatureMap<V> {
+    /// `projection` must fit the basis.
+    pub fn new(projection: Projection, basis: &BasisLayout) -> Self {
+        let Projection { matrix, dimension, .. } = &projection;
+        let maps = basis.rows.iter().map(|rows| ProjectionMaps::new(matrix, *dimension, rows)).collect();
+        Self { maps, blocks: basis.blocks.clone(), projection }
+    }
+
+    /// Replaces ‖B_k‖ with the factor of layer k's basis in its cotangent.
+    #[inline(always)]
+    fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {
+        let scale = f64::from(self.projection.density_scale);
+        let density = |k: usize| of_norms.get(k).copied();
+        let factor = |norm: f64, cotangent: f64| cotangent / (norm + NORM_FLOOR) / norm;
+        let of_all = factor(norms[0], scale * density(0).unwrap_or(0.0) - along);
+        for (k, layer) in self.blocks.iter().enumerate() {
+            norms[layer + 1] = of_all + factor(norms[layer + 1], scale * density(k + 1).unwrap_or(0.0));
+        }
+    }
+
     /// z of the atoms at these places from the bases of each layer, `[places, lanes]`.
     #[inline(always)]
     pub fn forward<'a>(
@@ -169,7 +180,7 @@ impl<V: Vector> FeatureMap<V> {
                 let p: f64 = (*p).into();
                 *z = if map.asinh { p.asinh() } else { p };
             }
-            let norms = std::iter::once(norms[0]).chain(map.blocks.iter().map(|layer| norms[layer + 1]));
+            let norms = std::iter::once(norms[0]).chain(self.blocks.iter().map(|layer| norms[layer + 1]));
             for (z, norm) in z[map.dimension..].iter_mut().zip(norms) {
                 *z = f64::from(map.density_scale) * (norm + NORM_FLOOR).ln();
             }
@@ -196,7 +207,7 @@ impl<V: Vector> FeatureMap<V> {
                 along += cotangent * of_z;
                 *p = V::Number::round(scale * cotangent);
             }
-            map.norm_cotangents(norms, if map.normalize { along } else { 0.0 }, of_norms);
+            self.norm_cotangents(norms, if map.normalize { along } else { 0.0 }, of_norms);
         }
     }
 
@@ -231,21 +242,4 @@ fn dot<V: Vector>(a: &[V], b: &[V]) -> f64 {
         sum.add_product(a, b);
     }
     sum.horizontal_sum().into()
-}
-
-/// Components and channels of each source of a layer's basis.
-pub(super) type Sources = [(usize, usize)];
-
-/// The row of R for each index of a layer's padded basis, whose first row is `first`. Sources follow one
-/// another; the file is channel-major (row n · components + c), the evaluation \[component\]\[padded channel\].
-pub(super) fn rows_of_projection<V: Vector>(mut first: usize, sources: &Sources) -> Vec<Option<usize>> {
-    let mut rows = Vec::new();
-    for (components, channels) in sources {
-        let padded = channels.next_multiple_of(V::LANES);
-        for c in 0..*components {
-            rows.extend((0..padded).map(|n| (n < *channels).then_some(first + n * components + c)));
-        }
-        first += components * channels;
-    }
-    rows
 }
