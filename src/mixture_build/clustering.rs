@@ -3,27 +3,25 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Mutex, PoisonError};
 
-use calm::build::{BuildSettings, ShardClustering, ShardClusters, partition};
+use calm::build::{BuildSettings, Partitioner, ShardClustering};
 
 use super::Build;
+use super::cluster_log::KnownShards;
 use super::passes::ShardResult;
 use super::progress::Progress;
-use super::state::{FinishedShard, Partition, State};
+use super::state::Partition;
 use super::stream::{Shard, ShardHash};
 use super::workers::{Counters, run_pass};
 use crate::exit_status::Failure;
 
-/// The clusters of each element, by index and hash of the shard.
-pub(super) type Clusters = BTreeMap<(u64, ShardHash), Vec<ShardClusters>>;
-
-/// What pass 1 found in the shards of this process.
+/// What pass 1 found.
 pub(super) struct Clustered {
     /// Number of structures in all files.
     pub structures: u64,
     /// Of the shards.
     pub hashes: BTreeMap<u64, ShardHash>,
-    /// Of the shards, and of shards with other contents.
-    pub clusters: Clusters,
+    /// The clusters of the shards.
+    pub known: KnownShards,
 }
 
 impl Build {
@@ -41,8 +39,8 @@ impl Build {
     /// Clusters the shards of this process. `None` once it was stopped.
     pub(super) fn cluster(&mut self) -> Result<Option<Clustered>, Failure> {
         let Self { work, settings, state, bytes } = self;
-        let mut clusters = known(state)?;
-        let finished: BTreeSet<(u64, ShardHash)> = clusters.keys().copied().collect();
+        let mut known = state.known_shards()?;
+        let finished: BTreeSet<(u64, ShardHash)> = known.shards().collect();
         let hashes = Mutex::new(BTreeMap::new());
         let is_finished = |shard: &Shard| {
             hashes.lock().unwrap_or_else(PoisonError::into_inner).insert(shard.index, shard.hash);
@@ -53,48 +51,44 @@ impl Build {
             (0..elements).map(|element| ShardClustering::new(settings, shard, element).map(Some)).collect()
         };
         let counters = Counters::default();
-        let progress = Progress::new(1, None, *bytes, &counters);
-        let mut unsaved = Vec::new();
+        let progress = Progress::new(1, work.part, None, *bytes, &counters);
         let ended = run_pass(
             work,
             is_finished,
             begin,
             &counters,
-            |result| {
-                let ShardResult { index, hash, elements } = result;
-                let elements: Vec<_> = elements.into_iter().flatten().collect();
-                clusters.insert((index, hash), elements.clone());
-                unsaved.push(FinishedShard { index, hash, elements });
-                if state.is_due() {
-                    state.save_clusters(&std::mem::take(&mut unsaved))?;
-                }
-                Ok(())
+            |ShardResult { index, hash, elements }| {
+                known.append(index, hash, &elements.into_iter().flatten().collect::<Vec<_>>())?;
+                if state.is_due() { state.save_known_shards(&known) } else { Ok(()) }
             },
             || progress.show(),
         );
-        state.save_clusters(&unsaved)?;
+        state.save_known_shards(&known)?;
         let Some(structures) = ended? else { return Ok(None) };
         progress.end(structures);
         let hashes = hashes.into_inner().unwrap_or_else(PoisonError::into_inner);
-        Ok(Some(Clustered { structures, hashes, clusters }))
+        Ok(Some(Clustered { structures, hashes, known }))
     }
-}
-
-/// The clusters of all shards that are known.
-pub(super) fn known(state: &State) -> Result<Clusters, Failure> {
-    Ok(state.clusters()?.into_iter().map(|shard| ((shard.index, shard.hash), shard.elements)).collect())
 }
 
 impl Clustered {
     /// Combines the clusters of the shards in their order.
     pub(super) fn combine(self, settings: &BuildSettings, elements: usize) -> Result<Partition, Failure> {
-        let Self { structures, hashes, clusters } = self;
-        let of = |element: usize| {
-            let shards = hashes.iter().filter_map(|(&index, &hash)| clusters.get(&(index, hash)));
-            let shards: Vec<_> = shards.map(|elements| elements[element].clone()).collect();
-            partition(settings, element, &shards).map_err(Failure::failed)
-        };
-        let elements = (0..elements).map(of).collect::<Result<_, _>>()?;
+        let Self { structures, hashes, known } = self;
+        let partitioners = (0..elements).map(|element| Partitioner::new(settings, element));
+        let mut partitioners: Vec<_> = partitioners.collect::<Result<_, _>>().map_err(Failure::failed)?;
+        for (&index, &hash) in &hashes {
+            let found = known.read(index, hash)?.ok_or_else(|| {
+                let path = known.path().display();
+                Failure::Failed(format!(
+                    "{path}: the clusters of shard {index} are missing; remove the directory and begin anew"
+                ))
+            })?;
+            for (partitioner, of_element) in partitioners.iter_mut().zip(&found) {
+                partitioner.add(of_element).map_err(Failure::failed)?;
+            }
+        }
+        let elements = partitioners.into_iter().map(Partitioner::finish).collect();
         Ok(Partition { structures, hashes: hashes.into_values().collect(), elements })
     }
 }

@@ -5,10 +5,14 @@ use calm::Projection;
 use calm::build::BuildSettings;
 use serde::{Deserialize, Serialize};
 
+use crate::campaign::instructions;
 use crate::structure_files::{StructureFile, StructureFiles};
 
 /// Changes when the state of an older program cannot be continued.
 const FORMAT: u32 = 3;
+
+/// Others round matrix products differently.
+const INSTRUCTIONS: &str = "the list of the instruction sets of its processors";
 
 const PROJECTION: &str = "the BLAKE3 hash of its projection";
 
@@ -16,6 +20,8 @@ const PROJECTION: &str = "the BLAKE3 hash of its projection";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Identity {
     format: u32,
+    /// The instruction sets of the processor, on which the last digits of matrix products depend.
+    instructions: String,
     /// BLAKE3 of the model's file.
     model: String,
     /// BLAKE3 of the projection of the features, which a model without one gets from the random seed.
@@ -47,6 +53,7 @@ impl Identity {
         };
         Self {
             format: FORMAT,
+            instructions: instructions(),
             model,
             projection: hash(projection),
             settings,
@@ -56,9 +63,10 @@ impl Identity {
         }
     }
 
-    /// Whether the model's file has this BLAKE3 hash.
+    /// Whether this processor can continue the build, whose model's file has this BLAKE3 hash.
     pub fn check_model(&self, hash: &str) -> Result<(), String> {
         same("the format of its state", self.format, FORMAT)?;
+        same(INSTRUCTIONS, &self.instructions, &instructions())?;
         same("the BLAKE3 hash of its model", self.model.as_str(), hash)
     }
 
@@ -70,6 +78,7 @@ impl Identity {
     /// Compares this build with the one that a state `began` with. An error names the first difference.
     pub fn check_same(&self, began: &Self) -> Result<(), String> {
         same("the format of its state", began.format, self.format)?;
+        same(INSTRUCTIONS, &began.instructions, &self.instructions)?;
         same("the BLAKE3 hash of its model", &began.model, &self.model)?;
         let (old, new) = (&began.settings, &self.settings);
         same("its number of features", old.dimension, new.dimension)?;
@@ -116,6 +125,7 @@ mod tests {
         let file = FileIdentity { path: "a.xyz".into(), weight: 1.0 };
         let began = Identity {
             format: FORMAT,
+            instructions: "x86_64 avx2".into(),
             model: "abc".into(),
             projection: "def".into(),
             settings,
@@ -124,8 +134,12 @@ mod tests {
             dump_elements: Vec::new(),
         };
         assert_eq!(began.check_same(&began), Ok(()));
-        let changes: [(Change, &str); 10] = [
+        let changes: [(Change, &str); 11] = [
             (|other| other.format = 0, "format"),
+            (
+                |other| other.instructions += " fma",
+                "processors is x86_64 avx2, now it is x86_64 avx2 fma",
+            ),
             (|other| other.model = "x".into(), "model is abc, now it is x"),
             (|other| other.projection = "y".into(), "projection is def, now it is y"),
             (|other| other.settings.dimension = 4, "features"),

@@ -7,7 +7,7 @@ use calm::Projection;
 use calm::build::{BuildSettings, BuiltMixture};
 use potentials::grace::GraceModel;
 
-use super::clustering::{Clustered, known};
+use super::clustering::Clustered;
 use super::identity::Identity;
 use super::mixture;
 use super::part::Part;
@@ -86,7 +86,6 @@ impl Merge {
         let ends = self.state.part_ends()?;
         let done = |part: Part| ends.contains_key(&part);
         let parts = complete(1, ends.keys().copied(), done)?;
-        let clusters = known(&self.state)?;
         let (mut structures, mut hashes) = (None, BTreeMap::new());
         for part in parts {
             let PartEnd { structures: found, hashes: own } = &ends[&part];
@@ -101,15 +100,8 @@ impl Merge {
             structures = Some(*found);
             hashes.extend(own.iter().map(|(index, hash)| (*index, *hash)));
         }
-        if let Some((index, _)) =
-            hashes.iter().find(|(index, hash)| !clusters.contains_key(&(**index, **hash)))
-        {
-            return Err(Failure::Failed(format!(
-                "{}: the clusters of shard {index} are missing; remove the directory and begin anew",
-                self.state.directory().display()
-            )));
-        }
-        Ok(Clustered { structures: structures.unwrap_or_default(), hashes, clusters })
+        let known = self.state.known_shards()?;
+        Ok(Clustered { structures: structures.unwrap_or_default(), hashes, known })
     }
 
     /// The sums of all parts in pass 2 or 3.

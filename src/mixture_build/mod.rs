@@ -4,6 +4,7 @@
 //! shard is always computed in the same order, the clusters of pass 1 are combined in the order of the shards, and the sums of
 //! passes 2 and 3 are exact.
 
+mod cluster_log;
 mod clustering;
 mod identity;
 mod merge;

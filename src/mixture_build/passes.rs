@@ -26,8 +26,8 @@ pub trait ElementPass {
 impl ElementPass for ShardClustering {
     type Partial = ShardClusters;
 
-    fn add(&mut self, features: &[f64], _weights: &[f64]) -> Result<(), BuildError> {
-        self.add(features)
+    fn add(&mut self, features: &[f64], weights: &[f64]) -> Result<(), BuildError> {
+        self.add(features, weights)
     }
 
     fn finish(self) -> ShardClusters {
@@ -130,6 +130,10 @@ fn add<P>(
             return Err(structure.place.wrong(format_args!("the features of atom {atom} are not finite")));
         }
         let element = &mut elements[index];
+        if element.pass.is_none() && structure.weight == 0.0 {
+            // Pass 1 leaves atoms without weight out.
+            continue;
+        }
         if element.pass.is_none() {
             let message =
                 "pass 1 found no atom of its element; did the file change? Begin anew with --restart";

@@ -4,6 +4,7 @@ use std::cell::Cell;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use super::part::Part;
 use super::workers::Counters;
 use crate::output::{self, Bar, print_stderr};
 
@@ -12,12 +13,17 @@ const LINE_INTERVAL: Duration = Duration::from_secs(30);
 
 const BAR: &str = "{bar:32} {percent} %  {msg}";
 
+/// Passes of a build.
+const PASSES: usize = 3;
+
 /// The bar counts in these parts of the whole.
 const PARTS: u64 = 10_000;
 
 /// The progress of one pass.
 pub struct Progress<'a> {
     pass: usize,
+    /// Passes that this process takes after it.
+    later: usize,
     /// Number of structures, if it is known and all are this process's.
     total: Option<u64>,
     /// Size of the files.
@@ -29,11 +35,13 @@ pub struct Progress<'a> {
 }
 
 impl<'a> Progress<'a> {
-    /// Begins a pass of which this many shards are finished.
-    pub fn new(pass: usize, total: Option<u64>, bytes: u64, counters: &'a Counters) -> Self {
+    /// Begins a pass. A part of the work ends with it, and has no `total`.
+    pub fn new(pass: usize, part: Part, total: Option<u64>, bytes: u64, counters: &'a Counters) -> Self {
         let now = Instant::now();
         let bar = Bar::new(Some(PARTS), BAR);
-        Self { pass, total, bytes, counters, bar, begun: now, line: Cell::new(now) }
+        let whole = part == Part::WHOLE;
+        let (later, total) = (if whole { PASSES - pass } else { 0 }, total.filter(|_| whole));
+        Self { pass, later, total, bytes, counters, bar, begun: now, line: Cell::new(now) }
     }
 
     /// Shows where the pass is.
@@ -79,12 +87,19 @@ impl<'a> Progress<'a> {
             (self.share(), output::count(self.counters.shards.load(Ordering::Relaxed), "shard"));
         let mut text = format!("pass {} of 3: {shards} done", self.pass);
         if computed > 0.0 {
-            // Skipped structures take no time.
-            let own = share * computed / (computed + skipped);
-            let left =
-                indicatif::HumanDuration(Duration::from_secs_f64(seconds * (1.0 - share) / own.max(1e-9)));
-            text += &format!(", {:.1} structures/s, {left} left in this pass", computed / seconds.max(1e-9));
+            let rate = computed / seconds.max(1e-9);
+            // Skipped structures take no time. Later passes compute all, and take as long as this one.
+            let whole = seconds * (computed + skipped) / (share * computed).max(1e-9);
+            let left = whole * (1.0 - share);
+            text += &format!(", {rate:.1} structures/s, {} left in this pass", duration(left));
+            if self.later > 0 {
+                text += &format!(", {} in all", duration(left + self.later as f64 * whole));
+            }
         }
         text
     }
+}
+
+fn duration(seconds: f64) -> indicatif::HumanDuration {
+    indicatif::HumanDuration(Duration::from_secs_f64(seconds.clamp(0.0, 1e10)))
 }

@@ -1,9 +1,9 @@
 //! The state of a build on disk, from which it continues after any interruption.
 //!
-//! The directory `A.npz.build` beside the artifact has `build.json`, which identifies the build; a file of the clusters of some
-//! shards for each time that pass 1 was saved; `partition`, which ends pass 1; and one file each for the running sums of passes
-//! 2 and 3. Each part of a build by several processes has its own files, with its name (`pass-2-3of8`), and an `end-1-3of8` when it
-//! is through pass 1. Every file appears complete, by renaming, and carries a checksum.
+//! The directory `A.npz.build` beside the artifact has `build.json`, which identifies the build; the log `pass-1` of the clusters
+//! of shards; `partition`, which ends pass 1; and one file each for the running sums of passes 2 and 3. Each part of a build by
+//! several processes has its own files, with its name (`pass-2-3of8`), and an `end-1-3of8` when it is through pass 1. Every file but
+//! the log appears complete, by renaming; all carry checksums.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, TryLockError};
@@ -11,10 +11,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use calm::build::{ElementPartition, ExactSums, ShardClusters};
+use calm::build::{ElementPartition, ExactSums};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::cluster_log::KnownShards;
 use super::identity::Identity;
 use super::part::Part;
 use super::stream::ShardHash;
@@ -24,7 +25,7 @@ use crate::exit_status::Failure;
 const IDENTITY: &str = "build.json";
 const LOCK: &str = "lock";
 const PARTITION: &str = "partition";
-const CLUSTERS: &str = "pass-1-";
+const CLUSTERS: &str = "pass-1";
 const END: &str = "end-1-";
 
 /// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.
@@ -38,15 +39,6 @@ pub struct State {
     /// When it was last saved, and how long that took.
     saved: Instant,
     cost: Duration,
-}
-
-/// A shard of pass 1.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct FinishedShard {
-    pub index: u64,
-    pub hash: ShardHash,
-    /// By element index.
-    pub elements: Vec<ShardClusters>,
 }
 
 /// That a part is through pass 1.
@@ -173,28 +165,23 @@ impl State {
         self.saved.elapsed() > PAUSE * self.cost
     }
 
-    /// The shards whose clusters are known, also with other contents than they have now.
-    pub fn clusters(&self) -> Result<Vec<FinishedShard>, Failure> {
-        let mut shards: Vec<FinishedShard> = Vec::new();
-        for name in self.names()?.iter().filter(|name| name.starts_with(CLUSTERS)) {
-            shards.extend(self.read::<Vec<FinishedShard>>(name)?.unwrap_or_default());
-        }
-        Ok(shards)
-    }
-
-    /// Adds finished shards.
-    pub fn save_clusters(&mut self, shards: &[FinishedShard]) -> Result<(), Failure> {
-        if shards.is_empty() {
-            return Ok(());
-        }
-        let own = match self.part {
-            Part::WHOLE => CLUSTERS.to_owned(),
-            part => format!("{CLUSTERS}{}-", part.file_name()),
+    /// The shards whose clusters are known.
+    pub fn known_shards(&self) -> Result<KnownShards, Failure> {
+        let is_log = |name: &&String| {
+            let of_part = || Part::from_file_name(name.strip_prefix(CLUSTERS)?.strip_prefix('-')?);
+            name.as_str() == CLUSTERS || of_part().is_some()
         };
         let names = self.names()?;
-        let numbers = names.iter().filter_map(|name| name.strip_prefix(&own)?.parse::<u64>().ok());
-        let next = numbers.max().map_or(0, |last| last + 1);
-        self.write(&format!("{own}{next}"), &shards)
+        let logs: Vec<PathBuf> = names.iter().filter(is_log).map(|name| self.path(name)).collect();
+        KnownShards::open(self.path(&self.own_name(CLUSTERS)), &logs)
+    }
+
+    /// Saves the log of this process.
+    pub fn save_known_shards(&mut self, known: &KnownShards) -> Result<(), Failure> {
+        let begun = Instant::now();
+        known.sync().map_err(|error| cannot_write(known.path(), error))?;
+        self.has_saved(begun);
+        Ok(())
     }
 
     /// Ends pass 1 of the part.
@@ -237,7 +224,7 @@ impl State {
 
     /// The sums of pass 2 or 3 over the shards of this process.
     pub fn sums(&self, pass: usize) -> Result<RunningSums, Failure> {
-        Ok(self.read(&self.sums_name(pass))?.unwrap_or_default())
+        Ok(self.read(&self.own_name(&format!("pass-{pass}")))?.unwrap_or_default())
     }
 
     /// The sums of pass 2 or 3 over all shards, or over those that are merged.
@@ -247,13 +234,14 @@ impl State {
 
     /// Replaces the sums of pass 2 or 3.
     pub fn save_sums(&mut self, pass: usize, sums: &RunningSums) -> Result<(), Failure> {
-        self.write(&self.sums_name(pass), sums)
+        self.write(&self.own_name(&format!("pass-{pass}")), sums)
     }
 
-    fn sums_name(&self, pass: usize) -> String {
+    /// The name of a file of this process.
+    fn own_name(&self, name: &str) -> String {
         match self.part {
-            Part::WHOLE => format!("pass-{pass}"),
-            part => format!("pass-{pass}-{}", part.file_name()),
+            Part::WHOLE => name.to_owned(),
+            part => format!("{name}-{}", part.file_name()),
         }
     }
 
@@ -307,9 +295,13 @@ impl State {
             .and_then(|()| file.write_all(&bytes))
             .map_err(|error| cannot_write(&path, error))?;
         file.finish()?;
+        self.has_saved(begun);
+        Ok(())
+    }
+
+    fn has_saved(&mut self, begun: Instant) {
         self.saved = Instant::now();
         self.cost = self.saved - begun;
-        Ok(())
     }
 
     fn read<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>, Failure> {

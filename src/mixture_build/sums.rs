@@ -6,7 +6,6 @@ use calm::build::{
 };
 
 use super::Build;
-use super::part::Part;
 use super::passes::ElementPass;
 use super::progress::Progress;
 use super::state::{Partition, RunningSums};
@@ -86,8 +85,7 @@ impl Build {
         let elements = partition.elements.len();
         sums.elements.resize(elements, None);
         let counters = Counters::default();
-        let total = (work.part == Part::WHOLE).then_some(partition.structures);
-        let progress = Progress::new(pass, total, *bytes, &counters);
+        let progress = Progress::new(pass, work.part, Some(partition.structures), *bytes, &counters);
         let finished = sums.finished.clone();
         let is_finished = |shard: &Shard| {
             if partition.hashes.get(shard.index as usize) != Some(&shard.hash) {
@@ -162,14 +160,18 @@ fn add(
     shard: u64,
     rows: impl Iterator<Item = Option<Vec<f64>>>,
 ) -> Result<(), Failure> {
-    let mut elements = sums.elements.clone();
-    for (sum, row) in elements.iter_mut().zip(rows) {
+    let wrong = |error: BuildError| Failure::Failed(format!("shard {shard}: {error}"));
+    let rows: Vec<Option<Vec<f64>>> = rows.collect();
+    for (sum, row) in sums.elements.iter_mut().zip(&rows) {
         if let Some(row) = row {
-            let sum = sum.get_or_insert_with(|| ExactSums::new(row.len()));
-            sum.add(&row).map_err(|error| Failure::Failed(format!("shard {shard}: {error}")))?;
+            sum.get_or_insert_with(|| ExactSums::new(row.len())).check(row).map_err(wrong)?;
         }
     }
-    sums.elements = elements;
+    for (sum, row) in sums.elements.iter_mut().zip(&rows) {
+        if let (Some(sum), Some(row)) = (sum, row) {
+            sum.add(row).map_err(wrong)?;
+        }
+    }
     sums.finished.insert(shard);
     Ok(())
 }

@@ -4,10 +4,12 @@
 use std::path::Path;
 use std::process::Command;
 
+use atoms::extxyz::Frame;
 use atoms::read_extxyz;
+use calm::Artifact;
 
 use crate::common::campaign::Small;
-use crate::common::{config, deviation, stderr, succeed};
+use crate::common::{config, deviation, stderr, succeed, write_frames};
 
 /// Energy (eV), forces (eV/Å) and stress (eV/Å³) of a frame, as a loader has them.
 type Loaded = (f64, Vec<f64>, Vec<f64>);
@@ -37,27 +39,88 @@ fn mace_loads_what_is_written() {
 
 #[test]
 fn gracemaker_grades_by_an_artifact_that_was_built() {
-    let variable = "CALMWALK_GRACEMAKER_PYTHON";
-    let python = std::env::var_os(variable).unwrap_or_else(|| panic!("{variable} names no Python"));
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let path = |file: &str| config(&format!("data/al_eam_1l/{file}")).display().to_string();
     let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
     succeed(here, ["calm", "build", "--model", &model, &data, "--output", "calm.npz", "--shard-size", "9"]);
-    let score =
-        ["calm", "score", "--model", &model, "--artifact", "calm.npz", &data, "--output", "out.extxyz"];
+    let grades = both_grades(here, &model, "calm.npz", &data);
+    assert!(grades.len() == 5400 && grades.iter().any(|[gamma, _]| *gamma > 1.0));
+}
+
+/// Several elements with several components, without atoms of hydrogen, and a projection of our own.
+#[test]
+fn gracemaker_grades_by_an_artifact_of_several_elements() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let path = |file: &str| config(&format!("data/ni_al_h_eam_1l/{file}")).display().to_string();
+    let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
+    let frames = read_extxyz(Path::new(&data)).unwrap();
+    let has_hydrogen = |frame: &Frame| frame.structure.species.iter().any(|element| element.symbol() == "H");
+    let metals: Vec<Frame> = frames.iter().filter(|frame| !has_hydrogen(frame)).take(150).cloned().collect();
+    write_frames(&here.join("metals.extxyz"), &metals);
+    write_frames(&here.join("all.extxyz"), &frames[..frames.len().min(60)]);
+    let plain = without_mixture(Path::new(&model));
+    std::fs::write(here.join("plain.npz"), plain).unwrap();
+    let build = ["calm", "build", "--shard-size", "10", "--candidates", "2,4", "metals.extxyz"];
+    succeed(here, build.iter().chain(&["--model", &model, "--output", "calm.npz"]));
+    succeed(here, build.iter().chain(&["--model", "plain.npz", "--output", "own.npz", "--embed", "own_model.npz"]));
+    let artifact = Artifact::load(here.join("calm.npz")).unwrap();
+    assert!(artifact.mixture.iter().any(|(_, slot, _)| slot > 0));
+    for (model, artifact) in [(model.as_str(), "calm.npz"), ("plain.npz", "own.npz"), ("own_model.npz", "own.npz")] {
+        let grades = both_grades(here, model, artifact, "all.extxyz");
+        assert!(grades.iter().any(|[gamma, _]| *gamma > 1.0), "{model}");
+    }
+}
+
+#[test]
+fn artifacts_of_gracemaker_give_its_grades() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    for name in ["al_eam_1l", "ni_al_h_eam_1l", "si_sw_1l"] {
+        let path = |file: &str| config(&format!("data/{name}/{file}")).display().to_string();
+        let frames = read_extxyz(Path::new(&path("seed_frames.extxyz"))).unwrap();
+        write_frames(&here.join("some.extxyz"), &frames[..frames.len().min(40)]);
+        both_grades(here, &path("kokkos.npz"), &path("gmm_artifacts.npz"), "some.extxyz");
+    }
+}
+
+/// γ of all atoms of `data`, by this program and by gracemaker, which agree to 10⁻⁶.
+fn both_grades(here: &Path, model: &str, artifact: &str, data: &str) -> Vec<[f64; 2]> {
+    let variable = "CALMWALK_GRACEMAKER_PYTHON";
+    let python = std::env::var_os(variable).unwrap_or_else(|| panic!("{variable} names no Python"));
+    let score = ["calm", "score", "--model", model, "--artifact", artifact, data, "--output", "out.extxyz"];
     succeed(here, score.into_iter().chain(["--features", "z.npy"]));
     let frames = read_extxyz(&here.join("out.extxyz")).unwrap();
-    let gamma: Vec<f64> = frames.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect();
-    let script = "import json, numpy as np, tensorflow as tf\n\
-                  from tensorpotential.uq.gmmuq import GMMUQModel\n\
-                  z = np.load('z.npy')\n\
-                  model = GMMUQModel('calm.npz', param_dtype=tf.float64)\n\
-                  gamma, _ = model.gamma_from_features(tf.constant(z), tf.zeros(len(z), tf.int32))\n\
-                  print(json.dumps(gamma.tolist()))";
-    let found: Vec<f64> = last_line(here, Path::new(&python), script);
-    assert!(gamma.len() == 5400 && gamma.iter().any(|gamma| *gamma > 1.0));
-    assert!(deviation(&found, &gamma) < 1e-6);
+    let own: Vec<f64> = frames.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect();
+    let symbols = Artifact::load(here.join(artifact)).unwrap().symbols;
+    let species = frames.iter().flat_map(|frame| &frame.structure.species);
+    let elements: Vec<usize> = species
+        .map(|element| symbols.iter().position(|symbol| symbol == element.symbol()).unwrap())
+        .collect();
+    std::fs::write(here.join("elements.json"), serde_json::to_vec(&elements).unwrap()).unwrap();
+    let script = format!(
+        "import json, numpy as np, tensorflow as tf\n\
+         from tensorpotential.uq.gmmuq import GMMUQModel\n\
+         z = np.load('z.npy')\n\
+         model = GMMUQModel({artifact:?}, param_dtype=tf.float64)\n\
+         elements = tf.constant(json.load(open('elements.json')), tf.int32)\n\
+         gamma, _ = model.gamma_from_features(tf.constant(z), elements)\n\
+         print(json.dumps(gamma.tolist()))"
+    );
+    let found: Vec<f64> = last_line(here, Path::new(&python), &script);
+    assert_eq!(found.len(), own.len());
+    for (found, own) in found.iter().zip(&own) {
+        assert!((found / own - 1.0).abs() < 1e-6, "{found} {own}");
+    }
+    own.into_iter().zip(found).map(|(own, found)| [own, found]).collect()
+}
+
+/// A model's export without the arrays of features and mixture.
+fn without_mixture(model: &Path) -> Vec<u8> {
+    let mut out = npz::Writer::new(std::io::Cursor::new(Vec::new()));
+    out.copy(std::fs::File::open(model).unwrap(), |key| key.starts_with("uq_")).unwrap();
+    out.finish().unwrap().into_inner()
 }
 
 fn loads(keys: &str, variable: &str, load: &str) {

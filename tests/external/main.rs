@@ -13,5 +13,6 @@ mod loaders;
 mod pictures;
 mod postgres_faults;
 mod slurm;
+mod slurm_build;
 mod slurm_labels;
 mod watch;

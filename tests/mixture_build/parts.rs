@@ -4,17 +4,21 @@ use super::*;
 
 /// The arguments of a part of a pass.
 fn part(output: &str, pass: usize, part: usize, of: usize) -> Vec<String> {
+    part_with(output, pass, (part, of), "1")
+}
+
+fn part_with(output: &str, pass: usize, (part, of): (usize, usize), threads: &str) -> Vec<String> {
     let share = [pass.to_string(), format!("{part}/{of}")];
-    arguments(output, &["data.extxyz"], &["--threads", "1", "--pass", &share[0], "--part", &share[1]])
+    arguments(output, &["data.extxyz"], &["--threads", threads, "--pass", &share[0], "--part", &share[1]])
 }
 
 /// Runs all parts of a pass at once.
-fn run_parts(here: &Path, output: &str, pass: usize, of: usize) {
+fn run_parts(here: &Path, output: &str, pass: usize, of: usize, threads: &str) {
     let parts = 1..=of;
     let children: Vec<_> = parts
         .map(|number| {
             let mut command = program(here);
-            let command = command.args(part(output, pass, number, of));
+            let command = command.args(part_with(output, pass, (number, of), threads));
             command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
         })
         .collect();
@@ -38,10 +42,10 @@ fn any_number_of_parts_gives_the_same_bytes() {
     // 17 shards.
     write_frames(&here.join("data.extxyz"), &frames());
     let (whole, printed) = build(here, "whole.npz", &["data.extxyz"], &["--embed", "whole_model.npz"]);
-    for of in [2, 7, 20] {
-        let output = format!("of_{of}.npz");
+    for (of, threads) in [(2, "1"), (2, "2"), (7, "1"), (7, "2"), (20, "1")] {
+        let output = format!("of_{of}_{threads}.npz");
         for pass in 1..=3 {
-            run_parts(here, &output, pass, of);
+            run_parts(here, &output, pass, of, threads);
             let mut merge = merge(&output);
             if pass == 3 {
                 merge.extend(["--embed", "model.npz"].map(str::to_owned));
@@ -73,7 +77,7 @@ fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
     let child = command.args(part("out.npz", 1, 1, 2)).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
     let mut running = Running(child.unwrap());
     let state = here.join("out.npz.build");
-    wait_until("a shard is finished", || state.join("pass-1-1of2-0").exists());
+    wait_until("a shard is finished", || state.join("pass-1-1of2").exists());
     signal(running.0.id(), "STOP");
     let message = fail(here, &part("out.npz", 1, 1, 2));
     assert!(message.contains("another process builds out.npz"), "{message}");
@@ -97,7 +101,7 @@ fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
     let other = [part("out.npz", 2, 1, 3), vec!["--seed".into(), "7".into()]].concat();
     let message = refuse(here, other);
     assert!(message.contains("its --seed is 42, now it is 7"), "{message}");
-    run_parts(here, "out.npz", 2, 3);
+    run_parts(here, "out.npz", 2, 3, "2");
     succeed(here, merge("out.npz"));
     // One process takes what is left.
     let (rest, _) = build(here, "out.npz", &["data.extxyz"], &[]);

@@ -67,7 +67,7 @@ impl Data {
 
     fn clustering(&self, settings: &BuildSettings) {
         let mut pass = ShardClustering::new(settings, 0, 0).expect("settings");
-        self.batches().for_each(|(features, _)| pass.add(features).expect("features"));
+        self.batches().for_each(|(features, weights)| pass.add(features, weights).expect("features"));
         black_box(pass.finish());
     }
 

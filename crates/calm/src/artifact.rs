@@ -242,7 +242,8 @@ impl Projection {
         let file = &Archive::open(path.as_ref())?;
         check_schema(file, "__schema_version__")?;
         let elements = file.numbers("elements")?.data;
-        let first = elements.first().ok_or_else(|| invalid(file, "elements", "no element", "at least one"))?;
+        let first =
+            elements.first().ok_or_else(|| invalid(file, "elements", "no element", "at least one"))?;
         let centroids = file.numbers(&format!("centroids_{}", as_count(file, "elements", *first)?))?;
         let dimension = centroids.shape.last().copied().unwrap_or_default();
         Self::read(file, dimension, asinh(file)?)

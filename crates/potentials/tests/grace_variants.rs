@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Structure};
-use potentials::grace::{Grace, GraceModel, PullBack};
+use potentials::grace::{Grace, GraceModel, Projection, PullBack};
 
 use crate::common;
 use crate::common::model_file::{BYTES, array, changed, changed_of, deep, floats, strings};
@@ -212,4 +212,47 @@ fn check_older_schemas(model: &[u8], d: usize, norms: usize) {
     let (found, expected): (PullBack, PullBack) = (of_asinh, of_linear);
     common::assert_close("gradient", found.gradient.as_flattened(), expected.gradient.as_flattened(), 1e-12);
     common::assert_close("virial", found.virial.as_flattened(), expected.virial.as_flattened(), 1e-12);
+}
+
+#[test]
+fn a_given_projection_replaces_that_of_the_file() {
+    for bytes in [BYTES.clone(), deep("two_layers.npz"), deep("three_layers.npz")] {
+        let own = changed_of(&bytes, &[]).unwrap();
+        let projection = own.projection().unwrap().clone();
+        let expected = forward(own.clone());
+        let plain = changed_of(&bytes, &[("uq_schema_version", None)]).unwrap();
+        assert_eq!(plain.feature_dimension(), 0);
+        let given = plain.with_projection(projection.clone()).unwrap();
+        assert_eq!(given.description(), own.description());
+        let found = forward(given);
+        assert_eq!(found.features(), expected.features());
+        assert_eq!(found.atomic_energies(), expected.atomic_energies());
+
+        // Other features of the same model: half as many, linear.
+        let half = projection.dimension / 2;
+        let matrix = projection.matrix.chunks(projection.dimension).flat_map(|row| row[..half].to_vec());
+        let linear = Projection {
+            matrix: matrix.collect(),
+            dimension: half,
+            normalize: false,
+            density_channels: false,
+            ..projection.clone()
+        };
+        let linear = forward(own.clone().with_projection(linear).unwrap());
+        assert_eq!(linear.model().description().feature_dimension, half);
+        let rows = linear.features().chunks(half).zip(expected.features().chunks(own.feature_dimension()));
+        for (p, z) in rows {
+            let norm = z[projection.dimension].exp() - 1e-12;
+            let near = |(p, z): (&f64, &f64)| (p - z * norm).abs() < 1e-12 * norm.max(1.0);
+            assert!(p.iter().zip(z).all(near));
+        }
+
+        let other = Projection { layers: projection.layers + 1, ..projection.clone() };
+        let message = own.clone().with_projection(other).unwrap_err().to_string();
+        assert!(message.contains("layers, the model has"), "{message}");
+        let mut short = projection.clone();
+        short.matrix.pop();
+        let message = own.with_projection(short).unwrap_err().to_string();
+        assert!(message.contains("numbers in its matrix, the model has"), "{message}");
+    }
 }

@@ -99,6 +99,10 @@ struct ComponentInfo {
     effective_count: Option<f64>,
     /// Condition number of the covariance matrix when the mixture was built.
     condition_number: Option<f64>,
+    /// Rank of the covariance matrix then, without the regularisation.
+    effective_rank: Option<u32>,
+    /// Eigenvalues that its pseudo-inverse dropped.
+    truncated: Option<u32>,
 }
 
 impl Info {
@@ -248,8 +252,17 @@ impl MixtureInfo {
             line(out, "UNUSABLE", fault)?;
         }
         writeln!(out)?;
-        let mut table =
-            Table::new(&["element", ">component", ">θ", ">environments", ">weighted", ">condition"]);
+        let mut table = Table::new(&[
+            "element",
+            ">component",
+            ">θ",
+            ">environments",
+            ">weighted",
+            ">condition",
+            ">rank",
+            ">truncated",
+        ]);
+        let count = |count: Option<u32>| count.map_or("–".into(), |count| count.to_string());
         for component in self.components.iter().take(SHOWN) {
             table.push(vec![
                 component.element.clone(),
@@ -258,6 +271,8 @@ impl MixtureInfo {
                 decimals(component.count, 0),
                 decimals(component.effective_count, 1),
                 component.condition_number.map_or("–".into(), |condition| format!("{condition:.1e}")),
+                count(component.effective_rank),
+                count(component.truncated),
             ]);
         }
         table.write(out)?;
@@ -274,18 +289,25 @@ fn text(archive: &Archive, key: &str) -> Option<String> {
 }
 
 fn components(symbols: &[String], mixture: &Mixture, archive: &Archive) -> Vec<ComponentInfo> {
-    let condition_numbers: Vec<_> = (0..symbols.len())
-        .map(|element| archive.numbers(&format!("cond_number_{element}")))
-        .map(|numbers| numbers.map_or_else(|_| Vec::new(), |numbers| numbers.data))
-        .collect();
+    // By element and slot; not in exports.
+    let stored = |name: &str| -> Vec<Vec<f64>> {
+        let of = |element| archive.numbers(&format!("{name}_{element}"));
+        (0..symbols.len()).map(|element| of(element).map_or(Vec::new(), |numbers| numbers.data)).collect()
+    };
+    let [conditions, ranks, truncated] = ["cond_number", "effective_rank", "n_truncated"].map(stored);
     let component =
-        |(element, slot, component): (usize, usize, &std::sync::Arc<calm::Component>)| ComponentInfo {
-            element: symbols.get(element).cloned().unwrap_or_default(),
-            component: slot,
-            threshold: component.threshold(),
-            count: component.statistics().map(|statistics| statistics.count),
-            effective_count: component.statistics().map(|statistics| statistics.effective_count),
-            condition_number: condition_numbers.get(element).and_then(|numbers| numbers.get(slot)).copied(),
+        |(element, slot, component): (usize, usize, &std::sync::Arc<calm::Component>)| {
+            let of = |numbers: &[Vec<f64>]| numbers.get(element)?.get(slot).copied();
+            ComponentInfo {
+                element: symbols.get(element).cloned().unwrap_or_default(),
+                component: slot,
+                threshold: component.threshold(),
+                count: component.statistics().map(|statistics| statistics.count),
+                effective_count: component.statistics().map(|statistics| statistics.effective_count),
+                condition_number: of(&conditions),
+                effective_rank: of(&ranks).map(|rank| rank as u32),
+                truncated: of(&truncated).map(|count| count as u32),
+            }
         };
     mixture.iter().map(component).collect()
 }

@@ -56,7 +56,8 @@ impl Groups {
                 return;
             }
             let words = [&self.words[..], &[number as u64, level.groups]].concat();
-            let group = weighted_kmeans(&points(self.dimension, &level.clusters), self.k, &mut Random::new(&words));
+            let group =
+                weighted_kmeans(&points(self.dimension, &level.clusters), self.k, &mut Random::new(&words));
             *level = Level { groups: level.groups + 1, ..Level::default() };
             next = group;
         }
@@ -82,4 +83,48 @@ impl Clusters {
 fn points(dimension: usize, clusters: &Clusters) -> Points<'_> {
     let Clusters { centroids, counts, weights, .. } = clusters;
     Points { dimension, features: centroids, weights, counts }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_is_bounded_and_nothing_is_lost() {
+        let settings = BuildSettings { dimension: 2, seed: 1, candidates: vec![3], shard_size: 1 };
+        let mut groups = Groups::new(&settings, 0, 3);
+        let mut random = Random::new(&[5]);
+        let shards = 2 * MEMBERS * MEMBERS + 3 * MEMBERS + 5;
+        let mut weight = 0.0;
+        for shard in 0..shards {
+            let centroids: Vec<f64> =
+                (0..3).flat_map(|blob| [10.0 * blob as f64 + random.uniform(), random.uniform()]).collect();
+            let weights = vec![0.5, 1.0 + (shard % 3) as f64, 2.0];
+            weight += weights.iter().sum::<f64>();
+            groups.add(&CandidateClusters { centroids, counts: vec![1.0; 3], weights, inertia: 0.0 });
+            assert!(groups.levels.iter().all(|level| level.clusters.counts.len() <= 3 * MEMBERS));
+        }
+        let members: Vec<usize> = groups.levels.iter().map(|level| level.members).collect();
+        assert_eq!(members, [5, 3, 2]);
+        let found = groups.finish();
+        assert_eq!(found.counts, [shards as f64; 3]);
+        assert_eq!(found.weights.iter().sum::<f64>(), weight);
+        for (centroid, blob) in found.centroids.chunks_exact(2).zip(blobs(&found.centroids)) {
+            // The mean of the blob, within five standard deviations of that of uniform numbers.
+            let tolerance = 5.0 / (12.0 * shards as f64).sqrt();
+            assert!(
+                (centroid[0] - 10.0 * blob - 0.5).abs() < tolerance && (centroid[1] - 0.5).abs() < tolerance
+            );
+        }
+    }
+
+    /// The blob of each centroid; all differ.
+    fn blobs(centroids: &[f64]) -> Vec<f64> {
+        let blobs: Vec<f64> =
+            centroids.chunks_exact(2).map(|centroid| (centroid[0] / 10.0).floor()).collect();
+        let mut all = blobs.clone();
+        all.sort_by(f64::total_cmp);
+        assert_eq!(all, [0.0, 1.0, 2.0]);
+        blobs
+    }
 }

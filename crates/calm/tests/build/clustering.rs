@@ -1,15 +1,38 @@
 //! Pass 1: the quality of the clusters, and streams with few atoms.
 
-use calm::build::{BuildError, BuildSettings, ShardClustering, ShardClusters, partition};
+use calm::build::{BuildError, BuildSettings, ElementPartition, Partitioner, ShardClustering, ShardClusters};
 
-use super::{Blobs, settings};
+use super::{Blobs, batches, settings, weights};
 use crate::common::Random;
 
 /// Pass 1 over one shard, in batches of these many atoms.
 fn clusters(settings: &BuildSettings, shard: u64, features: &[f64], batch: usize) -> ShardClusters {
+    let weights = vec![1.0; features.len() / settings.dimension];
+    weighted_clusters(settings, shard, (features, &weights), batch)
+}
+
+fn weighted_clusters(
+    settings: &BuildSettings,
+    shard: u64,
+    (features, weights): (&[f64], &[f64]),
+    batch: usize,
+) -> ShardClusters {
     let mut pass = ShardClustering::new(settings, shard, 0).unwrap();
-    features.chunks(batch * settings.dimension).for_each(|batch| pass.add(batch).unwrap());
+    for (features, weights) in batches(settings.dimension, features, weights, &[batch]) {
+        pass.add(features, weights).unwrap();
+    }
     pass.finish()
+}
+
+/// The global step.
+fn partition(
+    settings: &BuildSettings,
+    element: usize,
+    shards: &[ShardClusters],
+) -> Result<ElementPartition, BuildError> {
+    let mut all = Partitioner::new(settings, element)?;
+    shards.iter().try_for_each(|shard| all.add(shard))?;
+    Ok(all.finish())
 }
 
 /// The shards of a data set.
@@ -160,8 +183,11 @@ fn wrong_settings_and_shards_are_errors() {
     assert_eq!(ShardClustering::new(&settings(0, &[1]), 0, 0).unwrap_err(), BuildError::NoFeature);
     let settings = settings(2, &[1, 2]);
     let mut pass = ShardClustering::new(&settings, 0, 0).unwrap();
-    let found = pass.add(&[0.0, 1.0, f64::INFINITY, 0.0]).unwrap_err();
+    let found = pass.add(&[0.0, 1.0, f64::INFINITY, 0.0], &[1.0; 2]).unwrap_err();
     assert!(found.to_string().starts_with("features of atom 1 of the batch"), "{found}");
+    let found = pass.add(&[0.0; 4], &[1.0, -1.0]).unwrap_err();
+    assert!(found.to_string().starts_with("weight of atom 1 of the batch: found -1"), "{found}");
+    assert!(matches!(pass.add(&[0.0; 4], &[1.0]), Err(BuildError::Length { .. })));
     assert_eq!(pass.finish().atoms, 0);
 
     let shard = |index| clusters(&settings, index, &[0.0, 1.0, 2.0, 3.0], 9);
@@ -175,4 +201,136 @@ fn wrong_settings_and_shards_are_errors() {
     let mut damaged = shard(0);
     damaged.candidates[0].centroids.pop();
     assert!(message(&[damaged]).contains("centroids of a shard: found 1 numbers, expected 2"));
+}
+
+/// Σ w and Σ w x / Σ w of the atoms of each blob, and their number.
+fn weighted_means(data: &Blobs, dimension: usize, weights: &[f64]) -> Vec<(f64, Vec<f64>, f64)> {
+    let mut sums = vec![(0.0, vec![0.0; dimension], 0.0); data.centres.len()];
+    for ((row, &label), &weight) in data.features.chunks_exact(dimension).zip(&data.labels).zip(weights) {
+        let (total, sum, count) = &mut sums[label];
+        *total += weight;
+        *count += 1.0;
+        sum.iter_mut().zip(row).for_each(|(sum, value)| *sum += weight * value);
+    }
+    for (total, sum, _) in &mut sums {
+        sum.iter_mut().for_each(|value| *value /= *total);
+    }
+    sums
+}
+
+#[test]
+fn centroids_of_blobs_are_the_weighted_means_of_their_atoms() {
+    let (dimension, atoms) = (4, 6000);
+    let data = Blobs::new(5, dimension, 4, atoms, 200.0);
+    let weights = weights(6, atoms);
+    let settings = settings(dimension, &[4]);
+    let expected = weighted_means(&data, dimension, &weights);
+    // One shard, in which mini-batches move the centroids, and the combination of five.
+    let one = weighted_clusters(&settings, 0, (&data.features, &weights), 77);
+    assert_eq!(one.atoms, atoms as u64);
+    assert!((one.weight - weights.iter().sum::<f64>()).abs() < 1e-9);
+    let parts = data.features.chunks(1300 * dimension).zip(weights.chunks(1300)).zip(0..);
+    let parts: Vec<_> = parts.map(|(part, shard)| weighted_clusters(&settings, shard, part, 1000)).collect();
+    let all = partition(&settings, 0, &parts).unwrap();
+    let found = &one.candidates[0];
+    for centroids in [&found.centroids, &all.centroids] {
+        for (total, mean, count) in &expected {
+            let slot = calm::grade::nearest(centroids.chunks_exact(dimension), mean);
+            let centroid = &centroids[slot * dimension..][..dimension];
+            let away = centroid.iter().zip(mean).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(away < 1e-10, "{away:e}");
+            let counts = if centroids == &all.centroids { &all.counts } else { &found.counts };
+            assert_eq!(counts[slot], *count);
+            if centroids == &found.centroids {
+                assert!((found.weights[slot] / total - 1.0).abs() < 1e-12);
+            }
+        }
+    }
+    // Σ w |x − c|² per weight; the centroids of the pass still moved.
+    let rows = data.features.chunks_exact(dimension).zip(&data.labels).zip(&weights);
+    let squares = rows.map(|((row, &label), weight)| weight * inertia(dimension, row, &expected[label].1));
+    let mean = squares.sum::<f64>() / weights.iter().sum::<f64>();
+    assert!((all.inertia[0] / mean - 1.0).abs() < 0.01, "{} {mean}", all.inertia[0]);
+}
+
+#[test]
+fn a_weight_is_a_number_of_copies() {
+    // Whole numbers, whose sums are exact, in one mini-batch.
+    let dimension = 3;
+    let data: Vec<f64> = Random(8).take(200 * dimension).iter().map(|x| (20.0 * x).round()).collect();
+    let weights: Vec<f64> = Random(9).take(200).iter().map(|x| (2.0 + 2.4 * x).round()).collect();
+    let rows = data.chunks_exact(dimension).zip(&weights);
+    let copies: Vec<f64> = rows.flat_map(|(row, weight)| row.repeat(*weight as usize)).collect();
+    assert!(copies.len() / dimension < 1024 && weights.contains(&0.0) && weights.contains(&4.0));
+    let settings = settings(dimension, &[1, 2, 4, 8]);
+    let weighted = weighted_clusters(&settings, 0, (&data, &weights), 50);
+    let copied = clusters(&settings, 0, &copies, 50);
+    assert_eq!(weighted.weight, copied.weight);
+    for (a, b) in weighted.candidates.iter().zip(&copied.candidates) {
+        assert_eq!((&a.centroids, &a.weights, &b.weights), (&b.centroids, &b.counts, &b.counts));
+        assert!((a.inertia / b.inertia - 1.0).abs() < 1e-12);
+    }
+    assert_eq!(weighted.atoms as usize, weights.iter().filter(|weight| **weight > 0.0).count());
+}
+
+#[test]
+fn weights_count_relative_to_each_other_and_atoms_without_weight_do_not() {
+    let (dimension, atoms) = (5, 5000);
+    let data = Random(4).take(atoms * dimension);
+    let own = weights(3, atoms);
+    let settings = settings(dimension, &[1, 2, 4]);
+    let shards = |factor: f64| {
+        let own: Vec<f64> = own.iter().map(|weight| factor * weight).collect();
+        let parts = data.chunks(1700 * dimension).zip(own.chunks(1700)).zip(0..);
+        parts.map(|(part, shard)| weighted_clusters(&settings, shard, part, 100)).collect::<Vec<_>>()
+    };
+    // A power of two changes no digit.
+    assert_eq!(partition(&settings, 0, &shards(1.0)), partition(&settings, 0, &shards(0.25)));
+    let ones = vec![1.0; atoms];
+    assert_ne!(clusters(&settings, 0, &data, 10), weighted_clusters(&settings, 0, (&data, &own), 10));
+
+    let (mut more, mut weights) = (data.clone(), ones);
+    for _ in 0..300 {
+        more.splice(0..0, [100.0; 5]);
+        weights.insert(0, 0.0);
+    }
+    let found = weighted_clusters(&settings, 0, (&more, &weights), 64);
+    assert_eq!(found, clusters(&settings, 0, &data, 64));
+    let none = weighted_clusters(&settings, 0, (&data, &vec![0.0; atoms]), 64);
+    assert_eq!((none.atoms, none.candidates.len()), (0, 0));
+}
+
+#[test]
+fn clusters_merge_by_their_number_of_atoms_whatever_their_weight() {
+    // D + 1 = 4 atoms are needed: 3 heavy ones are too few, 5 light ones are enough.
+    let dimension = 3;
+    let blob = |centre: f64, atoms: usize| -> Vec<f64> {
+        (0..atoms).flat_map(|atom| [centre, centre, centre + 0.01 * atom as f64]).collect()
+    };
+    let data = [blob(0.0, 40), blob(50.0, 3), blob(-90.0, 5)].concat();
+    let weights = [vec![1.0; 40], vec![1e6; 3], vec![1e-2; 5]].concat();
+    let settings = settings(dimension, &[3]);
+    let shard = weighted_clusters(&settings, 0, (&data, &weights), 48);
+    let found = partition(&settings, 0, &[shard]).unwrap();
+    let mut counts = found.counts.clone();
+    counts.sort_by(f64::total_cmp);
+    assert_eq!(counts, [5.0, 43.0]);
+    // The heavy atoms draw the centroid of the merged cluster to themselves.
+    let slot = calm::grade::nearest(found.centroids.chunks_exact(dimension), &[50.0; 3]);
+    assert!((found.centroids[slot * dimension] - 50.0).abs() < 1e-3, "{:?}", found.centroids);
+}
+
+#[test]
+fn many_shards_are_combined_in_groups() {
+    let (dimension, per_shard, count) = (4, 200, 300);
+    let data = Blobs::new(7, dimension, 4, per_shard * count, 12.0);
+    let settings = settings(dimension, &[1, 2, 4, 8]);
+    let all = shards(&settings, &data.features, per_shard);
+    let found = partition(&settings, 0, &all).unwrap();
+    assert_eq!((found.chosen, found.atoms), (4, (per_shard * count) as u64));
+    assert_eq!(found.counts.iter().sum::<f64>(), (per_shard * count) as f64);
+    let reached = inertia(dimension, &data.features, &found.centroids);
+    let best = lloyd(dimension, &data.features, found.centroids.clone());
+    let best = inertia(dimension, &data.features, &best);
+    assert!(reached < 1.01 * best, "{reached} {best}");
 }

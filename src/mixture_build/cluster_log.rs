@@ -1,0 +1,206 @@
+//! The clusters of finished shards in pass 1, on disk: memory has only the places where they are.
+//!
+//! Each process appends its shards to a log of its own, one record each: the length of the content, index and hash of the
+//! shard, and the BLAKE3 hash of the content. A crash can leave an incomplete record at the end, which is cut off when the
+//! process continues.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufReader, Read};
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+
+use calm::build::ShardClusters;
+
+use super::stream::ShardHash;
+use crate::atomic_file::{cannot_create, cannot_write};
+use crate::exit_status::Failure;
+
+/// Length of content, index and hash of the shard, hash of the content.
+const HEADER: usize = 8 + 8 + 32 + 32;
+
+/// The clusters of all shards that are known, also of shards with contents that they no longer have.
+pub struct KnownShards {
+    logs: Vec<Log>,
+    /// Path of the log of this process, and its number among the logs once it exists.
+    own: (PathBuf, Option<usize>),
+    /// The number of the log and the record's position.
+    places: BTreeMap<(u64, ShardHash), (usize, u64)>,
+}
+
+struct Log {
+    path: PathBuf,
+    file: File,
+    /// Where the next record begins.
+    end: u64,
+}
+
+impl KnownShards {
+    /// Reads the logs of other processes and that of this one.
+    pub fn open(own: PathBuf, logs: &[PathBuf]) -> Result<Self, Failure> {
+        let mut known = Self { logs: Vec::new(), own: (own, None), places: BTreeMap::new() };
+        for path in logs {
+            let is_own = *path == known.own.0;
+            let file = File::options().read(true).write(is_own).open(path);
+            known.read_log(Log {
+                file: file.map_err(|error| unreadable(path, error))?,
+                path: path.clone(),
+                end: 0,
+            })?;
+            if is_own {
+                let log = &known.logs[known.logs.len() - 1];
+                log.file.set_len(log.end).map_err(|error| cannot_write(path, error))?;
+                known.own.1 = Some(known.logs.len() - 1);
+            }
+        }
+        Ok(known)
+    }
+
+    /// Adds a log up to its first incomplete record.
+    fn read_log(&mut self, mut log: Log) -> Result<(), Failure> {
+        let cannot = |error| unreadable(&log.path, error);
+        let length = log.file.metadata().map_err(cannot)?.len();
+        let mut file = BufReader::new(&log.file);
+        let (mut header, mut content) = ([0; HEADER], Vec::new());
+        while length - log.end >= HEADER as u64 {
+            file.read_exact(&mut header).map_err(cannot)?;
+            let (size, index, shard, checksum) = fields(&header);
+            if size > length - log.end - HEADER as u64 {
+                break;
+            }
+            content.resize(size as usize, 0);
+            file.read_exact(&mut content).map_err(cannot)?;
+            if blake3::hash(&content) != checksum {
+                break;
+            }
+            self.places.insert((index, shard), (self.logs.len(), log.end));
+            log.end += (HEADER + content.len()) as u64;
+        }
+        self.logs.push(log);
+        Ok(())
+    }
+
+    /// The shards.
+    pub fn shards(&self) -> impl Iterator<Item = (u64, ShardHash)> {
+        self.places.keys().copied()
+    }
+
+    /// The clusters of a shard by element index, if they are known.
+    pub fn read(&self, index: u64, hash: ShardHash) -> Result<Option<Vec<ShardClusters>>, Failure> {
+        let Some(&(number, position)) = self.places.get(&(index, hash)) else { return Ok(None) };
+        let log = &self.logs[number];
+        let damaged = || unreadable(&log.path, "the file is damaged; begin anew with --restart");
+        let mut header = [0; HEADER];
+        log.file.read_exact_at(&mut header, position).map_err(|error| unreadable(&log.path, error))?;
+        let (size, .., checksum) = fields(&header);
+        if size > log.end - position {
+            return Err(damaged());
+        }
+        let mut content = vec![0; size as usize];
+        let read = log.file.read_exact_at(&mut content, position + HEADER as u64);
+        read.map_err(|error| unreadable(&log.path, error))?;
+        if blake3::hash(&content) != checksum {
+            return Err(damaged());
+        }
+        postcard::from_bytes(&content).map(Some).map_err(|_| damaged())
+    }
+
+    /// Adds a finished shard, which has a record in the log of this process then.
+    pub fn append(
+        &mut self,
+        index: u64,
+        hash: ShardHash,
+        elements: &[ShardClusters],
+    ) -> Result<(), Failure> {
+        let number = self.own_log()?;
+        let log = &mut self.logs[number];
+        let content = postcard::to_stdvec(elements).map_err(|error| cannot_write(&log.path, error))?;
+        let mut record = Vec::with_capacity(HEADER + content.len());
+        record.extend((content.len() as u64).to_le_bytes());
+        record.extend(index.to_le_bytes());
+        record.extend(hash);
+        record.extend(blake3::hash(&content).as_bytes());
+        record.extend(content);
+        log.file.write_all_at(&record, log.end).map_err(|error| cannot_write(&log.path, error))?;
+        self.places.insert((index, hash), (number, log.end));
+        log.end += record.len() as u64;
+        Ok(())
+    }
+
+    fn own_log(&mut self) -> Result<usize, Failure> {
+        let (path, number) = &mut self.own;
+        if let Some(number) = number {
+            return Ok(*number);
+        }
+        let file = File::options().read(true).write(true).create(true).truncate(true).open(&*path);
+        let file = file.map_err(|error| cannot_create(path, error))?;
+        self.logs.push(Log { path: path.clone(), file, end: 0 });
+        *number = Some(self.logs.len() - 1);
+        Ok(self.logs.len() - 1)
+    }
+
+    /// Has the operating system write the log to the disk, so that it outlives a failure of the host.
+    pub fn sync(&self) -> io::Result<()> {
+        self.own.1.map_or(Ok(()), |number| self.logs[number].file.sync_data())
+    }
+
+    /// Where this process appends.
+    pub fn path(&self) -> &Path {
+        &self.own.0
+    }
+}
+
+fn fields(header: &[u8; HEADER]) -> (u64, u64, ShardHash, blake3::Hash) {
+    let number = |at: usize| u64::from_le_bytes(std::array::from_fn(|byte| header[at + byte]));
+    let hash = |at: usize| -> [u8; 32] { std::array::from_fn(|byte| header[at + byte]) };
+    (number(0), number(8), hash(16), blake3::Hash::from_bytes(hash(48)))
+}
+
+fn unreadable(path: &Path, error: impl std::fmt::Display) -> Failure {
+    Failure::Failed(format!("cannot read {}: {error}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    fn clusters(shard: u64) -> Vec<ShardClusters> {
+        vec![ShardClusters { shard, element: 0, atoms: 7, weight: 3.5, candidates: vec![] }]
+    }
+
+    #[test]
+    fn shards_are_read_back_up_to_an_incomplete_record() {
+        let directory = tempfile::tempdir().unwrap();
+        let (own, other) = (directory.path().join("own"), directory.path().join("other"));
+        let mut known = KnownShards::open(own.clone(), &[]).unwrap();
+        assert!(!own.exists());
+        for shard in [4, 2, 9] {
+            known.append(shard, [shard as u8; 32], &clusters(shard)).unwrap();
+        }
+        known.sync().unwrap();
+        assert_eq!(known.read(2, [2; 32]).unwrap(), Some(clusters(2)));
+        assert_eq!(known.read(2, [3; 32]).unwrap(), None);
+        fs::copy(&own, &other).unwrap();
+        let whole = fs::read(&own).unwrap();
+        let record = whole.len() / 3;
+        // Any part of the last record, and one with another content.
+        let mut changed = whole.clone();
+        *changed.last_mut().unwrap() ^= 1;
+        let cuts = (0..record).map(|length| whole[..2 * record + length].to_vec());
+        for left in cuts.chain([changed]) {
+            fs::write(&own, left).unwrap();
+            let mut known = KnownShards::open(own.clone(), std::slice::from_ref(&own)).unwrap();
+            assert_eq!(known.shards().collect::<Vec<_>>(), [(2, [2; 32]), (4, [4; 32])]);
+            known.append(9, [9; 32], &clusters(9)).unwrap();
+            assert_eq!(fs::read(&own).unwrap(), whole);
+        }
+        // A log of another process is left as it is.
+        fs::write(&other, &whole[..record + 5]).unwrap();
+        let both = KnownShards::open(own.clone(), &[other.clone(), own]).unwrap();
+        assert_eq!(both.shards().count(), 3);
+        assert_eq!(both.read(4, [4; 32]).unwrap(), Some(clusters(4)));
+        assert_eq!(fs::read(&other).unwrap().len(), record + 5);
+    }
+}
