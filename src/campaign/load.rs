@@ -92,7 +92,8 @@ impl Loader<'_> {
         };
         let path = file.get_ref();
         let wrong = |message: String| self.file_error("calm.artifact", file, message);
-        let projection = Projection::load(path).map_err(|error| wrong(explain_artifact_error(path, &error)))?;
+        let projection =
+            Projection::load(path).map_err(|error| wrong(explain_artifact_error(path, &error)))?;
         with_projection(model, &projection).map_err(|error| wrong(format!("{}: {error}", path.display())))
     }
 

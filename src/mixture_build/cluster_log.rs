@@ -106,12 +106,7 @@ impl KnownShards {
     }
 
     /// Adds a finished shard, which has a record in the log of this process then.
-    pub fn append(
-        &mut self,
-        index: u64,
-        hash: ShardHash,
-        elements: &[ShardClusters],
-    ) -> Result<(), Failure> {
+    pub fn append(&mut self, index: u64, hash: ShardHash, elements: &[ShardClusters]) -> Result<(), Failure> {
         let number = self.own_log()?;
         let log = &mut self.logs[number];
         let content = postcard::to_stdvec(elements).map_err(|error| cannot_write(&log.path, error))?;

@@ -136,10 +136,7 @@ mod tests {
         assert_eq!(began.check_same(&began), Ok(()));
         let changes: [(Change, &str); 11] = [
             (|other| other.format = 0, "format"),
-            (
-                |other| other.instructions += " fma",
-                "processors is x86_64 avx2, now it is x86_64 avx2 fma",
-            ),
+            (|other| other.instructions += " fma", "processors is x86_64 avx2, now it is x86_64 avx2 fma"),
             (|other| other.model = "x".into(), "model is abc, now it is x"),
             (|other| other.projection = "y".into(), "projection is def, now it is y"),
             (|other| other.settings.dimension = 4, "features"),

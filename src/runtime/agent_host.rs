@@ -131,11 +131,7 @@ async fn model(
 }
 
 /// A file of the orchestrator, or its copy, which is downloaded to `path`.
-async fn file(
-    joined: &Membership,
-    file: &HashedFile,
-    path: PathBuf,
-) -> Result<Option<HashedFile>, Failure> {
+async fn file(joined: &Membership, file: &HashedFile, path: PathBuf) -> Result<Option<HashedFile>, Failure> {
     let hash = &file.hash;
     if verify_hash(&file.path, hash).is_ok() {
         return Ok(Some(file.clone()));

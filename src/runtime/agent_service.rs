@@ -41,10 +41,7 @@ impl AgentService {
             heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
             restarts: config.run.max_restarts,
         };
-        let welcome = AgentBootstrap {
-            setup: process_config::to_bytes(&setup),
-            files,
-        };
+        let welcome = AgentBootstrap { setup: process_config::to_bytes(&setup), files };
         let patience = config.run.agent_heartbeat_timeout.get();
         let hub = AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
         let hub = hub.map_err(|error| match error {

@@ -64,10 +64,15 @@ fn gracemaker_grades_by_an_artifact_of_several_elements() {
     std::fs::write(here.join("plain.npz"), plain).unwrap();
     let build = ["calm", "build", "--shard-size", "10", "--candidates", "2,4", "metals.extxyz"];
     succeed(here, build.iter().chain(&["--model", &model, "--output", "calm.npz"]));
-    succeed(here, build.iter().chain(&["--model", "plain.npz", "--output", "own.npz", "--embed", "own_model.npz"]));
+    succeed(
+        here,
+        build.iter().chain(&["--model", "plain.npz", "--output", "own.npz", "--embed", "own_model.npz"]),
+    );
     let artifact = Artifact::load(here.join("calm.npz")).unwrap();
     assert!(artifact.mixture.iter().any(|(_, slot, _)| slot > 0));
-    for (model, artifact) in [(model.as_str(), "calm.npz"), ("plain.npz", "own.npz"), ("own_model.npz", "own.npz")] {
+    for (model, artifact) in
+        [(model.as_str(), "calm.npz"), ("plain.npz", "own.npz"), ("own_model.npz", "own.npz")]
+    {
         let grades = both_grades(here, model, artifact, "all.extxyz");
         assert!(grades.iter().any(|[gamma, _]| *gamma > 1.0), "{model}");
     }

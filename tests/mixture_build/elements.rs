@@ -16,7 +16,8 @@ fn an_element_without_atoms_has_no_components() {
     write_frames(&here.join("metals.extxyz"), &of(false));
     write_frames(&here.join("data.extxyz"), &of(true)[..5]);
     let model = config("data/ni_al_h_eam_1l/kokkos.npz").display().to_string();
-    let first = ["calm", "build", "--model", &model, "metals.extxyz", "--shard-size", "7", "--embed", "model.npz"];
+    let first =
+        ["calm", "build", "--model", &model, "metals.extxyz", "--shard-size", "7", "--embed", "model.npz"];
     let printed = succeed(here, first.iter().chain(&["--output", "out.npz"]));
     let row = |symbol: &str| -> Vec<&str> {
         let mut rows = printed.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());

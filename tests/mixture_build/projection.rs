@@ -27,7 +27,17 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
     let names = |path: &Path| arrays(path).into_iter().map(|(name, _)| name).collect::<Vec<_>>();
     assert_eq!(names(&here.join("model.npz")), names(&config(MODEL)));
     assert_eq!(grades(here, "model.npz", &[]), gamma);
-    let again = ["calm", "build", "--model", "model.npz", "data.extxyz", "--shard-size", "3", "--output", "again.npz"];
+    let again = [
+        "calm",
+        "build",
+        "--model",
+        "model.npz",
+        "data.extxyz",
+        "--shard-size",
+        "3",
+        "--output",
+        "again.npz",
+    ];
     succeed(here, again);
     assert!(fs::read(here.join("again.npz")).unwrap() == whole);
 
@@ -42,8 +52,7 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
 
     let other = [&["--projection-dimension", "16", "--candidates", "1,2,4"][..], &["--seed", "3"]].concat();
     succeed(here, arguments("small.npz", &other));
-    let info: Value =
-        serde_json::from_str(&succeed(here, ["calm", "info", "--json", "small.npz"])).unwrap();
+    let info: Value = serde_json::from_str(&succeed(here, ["calm", "info", "--json", "small.npz"])).unwrap();
     assert_eq!((&info["projected_dimension"], &info["feature_dimension"]), (&16.into(), &18.into()));
     succeed(here, ["calm", "compare", "--model", "plain.npz", "out.npz", "out.npz", "data.extxyz"]);
     let message =
@@ -53,7 +62,8 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
     let message = refuse(here, ["calm", "score", "--model", "plain.npz", "data.extxyz", "--output", "x.xyz"]);
     assert!(message.contains("plain.npz: the model has no mixture (uq_*): give its artifact"), "{message}");
     let silicon = config("data/si_sw_1l/gmm_artifacts.npz").display().to_string();
-    let wrong = ["calm", "score", "--model", "plain.npz", "--artifact", &silicon, "data.extxyz", "--output", "x.xyz"];
+    let wrong =
+        ["calm", "score", "--model", "plain.npz", "--artifact", &silicon, "data.extxyz", "--output", "x.xyz"];
     let message = refuse(here, wrong);
     assert!(message.contains("its list of elements is Si, the model's is Al"), "{message}");
     let own = config(MODEL).display().to_string();
@@ -61,7 +71,10 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
         here,
         ["calm", "build", "--model", &own, "data.extxyz", "--output", "x.npz", "--projection-dimension", "9"],
     );
-    assert!(message.contains("has a projection with 128 features; expected a model without one"), "{message}");
+    assert!(
+        message.contains("has a projection with 128 features; expected a model without one"),
+        "{message}"
+    );
 }
 
 #[test]
@@ -78,10 +91,15 @@ fn a_campaign_takes_the_projection_of_its_artifact() {
         fs::write(campaign.join("campaign.toml"), &text).unwrap();
         succeed(&campaign, ["run", "campaign.toml"]);
         if path != model {
-            let without = text.replace(&format!("artifact = \"{}\"\n", artifact.display()), "update = \"never\"\n");
+            let without =
+                text.replace(&format!("artifact = \"{}\"\n", artifact.display()), "update = \"never\"\n");
             fs::write(campaign.join("without.toml"), without).unwrap();
             let message = refuse(&campaign, ["validate", "without.toml"]);
-            assert!(message.contains("no feature projection (uq_* arrays)") && message.contains("set calm.artifact"), "{message}");
+            assert!(
+                message.contains("no feature projection (uq_* arrays)")
+                    && message.contains("set calm.artifact"),
+                "{message}"
+            );
         }
         outcome(&campaign.join("campaign"))
     });

@@ -295,20 +295,19 @@ fn components(symbols: &[String], mixture: &Mixture, archive: &Archive) -> Vec<C
         (0..symbols.len()).map(|element| of(element).map_or(Vec::new(), |numbers| numbers.data)).collect()
     };
     let [conditions, ranks, truncated] = ["cond_number", "effective_rank", "n_truncated"].map(stored);
-    let component =
-        |(element, slot, component): (usize, usize, &std::sync::Arc<calm::Component>)| {
-            let of = |numbers: &[Vec<f64>]| numbers.get(element)?.get(slot).copied();
-            ComponentInfo {
-                element: symbols.get(element).cloned().unwrap_or_default(),
-                component: slot,
-                threshold: component.threshold(),
-                count: component.statistics().map(|statistics| statistics.count),
-                effective_count: component.statistics().map(|statistics| statistics.effective_count),
-                condition_number: of(&conditions),
-                effective_rank: of(&ranks).map(|rank| rank as u32),
-                truncated: of(&truncated).map(|count| count as u32),
-            }
-        };
+    let component = |(element, slot, component): (usize, usize, &std::sync::Arc<calm::Component>)| {
+        let of = |numbers: &[Vec<f64>]| numbers.get(element)?.get(slot).copied();
+        ComponentInfo {
+            element: symbols.get(element).cloned().unwrap_or_default(),
+            component: slot,
+            threshold: component.threshold(),
+            count: component.statistics().map(|statistics| statistics.count),
+            effective_count: component.statistics().map(|statistics| statistics.effective_count),
+            condition_number: of(&conditions),
+            effective_rank: of(&ranks).map(|rank| rank as u32),
+            truncated: of(&truncated).map(|count| count as u32),
+        }
+    };
     mixture.iter().map(component).collect()
 }
 

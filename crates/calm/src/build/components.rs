@@ -137,6 +137,11 @@ mod tests {
             let real: Vec<usize> =
                 (0..5).filter(|&slot| numbers(&expected["out_counts"])[slot] > 0.0).collect();
             assert_eq!(clusters.len(), real.len());
+            // The empty slot disappears as well.
+            assert_eq!(
+                case["n_merged"],
+                numbers(&case["counts"]).iter().filter(|n| **n > 0.0).count() - real.len()
+            );
             for (cluster, &slot) in clusters.iter().zip(&real) {
                 assert_eq!(cluster.sums.count, numbers(&expected["out_counts"])[slot]);
                 assert_eq!(cluster.sums.effective_count, numbers(&expected["out_effective"])[slot]);
@@ -151,6 +156,7 @@ mod tests {
     fn components_are_compacted_sorted_and_inverted_as_in_the_reference() {
         let cases = unit_cases();
         let case = &cases["merge_step2"];
+        let mut most = 0;
         for (element, kept) in [("0", vec![0, 1, 2]), ("1", vec![1])] {
             let expected = &cases["finalize"][element];
             let mut clusters = merged(case, &numbers(&case["counts"]), 5);
@@ -159,6 +165,7 @@ mod tests {
             let sums = clusters.into_iter().map(|cluster| cluster.sums).collect();
             let found = components(&centroids, &ElementSums { dimension: 4, components: sums }).unwrap();
             assert_eq!(found.len(), kept.len());
+            most = most.max(found.len());
             for (slot, component) in found.iter().enumerate() {
                 assert_near(&component.centroid, &rows(&cases["compact"]["centroids"][element])[slot], 1e-14);
                 assert_eq!(component.count, numbers(&cases["compact"]["counts"][element])[slot]);
@@ -168,6 +175,22 @@ mod tests {
                 assert_eq!(component.effective_rank as f64, numbers(&expected["effective_rank"])[slot]);
             }
         }
+        assert_eq!(cases["compact"]["K_max"], most);
+    }
+
+    #[test]
+    fn deficient_covariances_lose_eigenvalues_as_in_the_reference() {
+        let case = &unit_cases()["safe_invert_rank2"];
+        let covariance = rows(&case["cov"]).concat();
+        let found = pseudo_inverse_with_spectrum(&covariance, 4).unwrap();
+        assert_eq!(case["n_truncated"], found.truncated);
+        assert_eq!(case["rank"], 4 - found.truncated);
+        assert_near(&found.matrix, &rows(&case["inv"]).concat(), 1e-9);
+        // With ε on the diagonal nothing is dropped, and the rank is the same.
+        let scatter = packed(&rows(&case["cov"])).iter().map(|value| 9.0 * value).collect();
+        let sums = ComponentSums { count: 9.0, effective_count: 9.0, scatter };
+        let found = components(&[0.0; 4], &ElementSums { dimension: 4, components: vec![sums] }).unwrap();
+        assert_eq!((found[0].truncated, found[0].effective_rank), (0, 2));
     }
 
     #[test]

@@ -146,7 +146,9 @@ mod tests {
             .zip(numbers("counts"))
             .map(|(centroid, count)| cluster(centroid, count, count))
             .collect();
+        let before = clusters.len();
         merge_small(&mut clusters, case["min_atoms"].as_u64().unwrap() as usize);
+        assert_eq!(case["n_merged"], before - clusters.len());
         let counts: Vec<f64> = clusters.iter().map(|cluster| cluster.sums.count).collect();
         assert_eq!(counts, numbers("out_counts"));
         let found = clusters.iter().flat_map(|cluster| &cluster.centroid);

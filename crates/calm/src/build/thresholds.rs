@@ -159,6 +159,20 @@ mod tests {
             let found = ElementHistograms { components: of(&slots) }.thresholds(ThresholdRule::Robust, 4);
             assert_near(&found.raw, &rows(&case["raw"])[element], 2e-14);
             assert_near(&found.weighted, &rows(&case["eff"])[element], 2e-14);
+            // Slots with too few atoms, and those with other thresholds than their own.
+            for few in rows(&case["underpopulated"]).iter().filter(|few| few[0] == element as f64) {
+                let count = all[slots[few[1] as usize]].count();
+                assert!(count as f64 == few[2] && count < MIN_ATOMS as u64);
+            }
+            for other in rows(&case["elementwise_fallback"]).iter().filter(|of| of[0] == element as f64) {
+                assert_near(&[found.raw[other[1] as usize]], &[other[2]], 2e-14);
+                let own = calibrate(
+                    ThresholdRule::Robust,
+                    &Grid::default(),
+                    &all[slots[other[1] as usize]].weighted,
+                );
+                assert!(own.is_none_or(|own| own.threshold != other[2]));
+            }
         }
         assert_eq!(case["min_atoms"], MIN_ATOMS);
         // 200 atoms are too few for more features.

@@ -24,7 +24,8 @@ impl BasisLayout {
             firsts[*layer] = dimension;
             dimension += size(&sources[*layer]);
         }
-        let rows = firsts.into_iter().zip(sources).map(|(first, sources)| rows::<V>(first, sources)).collect();
+        let rows =
+            firsts.into_iter().zip(sources).map(|(first, sources)| rows::<V>(first, sources)).collect();
         Self { dimension, blocks: blocks.to_vec(), rows }
     }
 }

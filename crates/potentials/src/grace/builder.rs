@@ -97,8 +97,7 @@ fn feature_map<V: Vector>(
     }
     let version = archive.count("uq_schema_version", 0, usize::MAX)?;
     let dimension = archive.count("uq_rp_dim", 1, 1 << 16)?;
-    let matrix =
-        archive.floats_f32("uq_rp_matrix")?.finite()?.with_shape(&[basis.dimension, dimension])?;
+    let matrix = archive.floats_f32("uq_rp_matrix")?.finite()?.with_shape(&[basis.dimension, dimension])?;
     let normalize = archive.flag_or("uq_rp_normalize", false)?;
     let density_channels = archive.flag_or("uq_rp_add_density_channel", false)?;
     let asinh = archive.flag_or("uq_feature_transform", false)?;

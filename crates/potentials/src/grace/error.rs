@@ -61,7 +61,9 @@ pub enum GraceError {
 
 /// A projection that does not fit the basis of a model.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the projection of the features has {found} {what}, the model has {expected}: it belongs to another model")]
+#[error(
+    "the projection of the features has {found} {what}, the model has {expected}: it belongs to another model"
+)]
 pub struct UnfitProjection {
     /// What there is another number of.
     pub what: &'static str,
