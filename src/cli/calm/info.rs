@@ -201,9 +201,7 @@ impl Model {
         }
         match &self.mixture {
             Some(mixture) => mixture.write(out),
-            None => {
-                line(out, "mixture", "none: exported without CALM arrays (uq_*), cannot grade structures")
-            }
+            None => line(out, "mixture", "none: no CALM arrays (uq_*); calmwalk calm build makes one"),
         }
     }
 }
