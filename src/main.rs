@@ -20,6 +20,7 @@ mod label_method;
 mod label_setup;
 mod log;
 mod mixture_build;
+mod nearest_name;
 mod notify;
 mod output;
 mod process_config;

@@ -14,7 +14,7 @@ use toml::Spanned;
 
 use super::geometry::Geometry;
 use super::training_sample;
-use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
+use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, location, location_of_offset};
 use crate::label_method::{self, REFERENCE_FILE};
 use crate::xyz_reader::XyzReader;
 
@@ -75,7 +75,7 @@ impl Loader<'_> {
         if let Some((pair, window)) = widest
             && window.outer > model.cutoff()
         {
-            let (at, key) = (place(self.path, self.text, "guard.zbl"), "guard.zbl".to_owned());
+            let (at, key) = (location(self.path, self.text, "guard.zbl"), "guard.zbl".to_owned());
             let found = format!("outer {} Å of {pair}", window.outer);
             let expected = format!("at most the cutoff of the model, {} Å", model.cutoff());
             return Err(ConfigError::Value { at, key, found, expected });
@@ -99,7 +99,7 @@ impl Loader<'_> {
             criterion.condition(atoms)
         );
         Err(ConfigError::Value {
-            at: place(self.path, self.text, &key),
+            at: location(self.path, self.text, &key),
             key,
             found: rule.condition(atoms),
             expected,
@@ -242,7 +242,7 @@ impl Loader<'_> {
     /// Protocol settings of a program, which must be installed with all it needs for every seed structure.
     fn code(&self, settings: &dft::Settings, seeds: &[SourcedStructure]) -> Result<Value, ConfigError> {
         let key = format!("label.method.{}", settings.name());
-        let at = || place(self.path, self.text, &key);
+        let at = || location(self.path, self.text, &key);
         let wrong = |message: String| ConfigError::File { at: at(), key: key.clone(), message };
         let code = settings.prepare(&self.config.label.pass_environment);
         let code = code.map_err(|error| wrong(error.to_string()))?;
@@ -269,12 +269,16 @@ impl Loader<'_> {
         file: &Spanned<PathBuf>,
         message: impl ToString,
     ) -> ConfigError {
-        let at = place_of_offset(self.path, self.text, file.span().start);
+        let at = location_of_offset(self.path, self.text, file.span().start);
         ConfigError::File { at, key: key.to_owned(), message: message.to_string() }
     }
 
     pub(super) fn warning(&self, key: &str, file: &Spanned<PathBuf>, message: String) -> Warning {
-        Warning { at: place_of_offset(self.path, self.text, file.span().start), key: key.to_owned(), message }
+        Warning {
+            at: location_of_offset(self.path, self.text, file.span().start),
+            key: key.to_owned(),
+            message,
+        }
     }
 }
 

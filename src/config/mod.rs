@@ -31,9 +31,9 @@ use workers::labeller::LabelGuard;
 pub use changes::{Change, Refused, changed_keys, compare, without_changeable};
 pub use check::wrong_thermostat;
 pub use document::Document;
-pub use error::{ConfigError, in_plain_words, place, place_of_offset, read_text};
+pub use error::{ConfigError, location, location_of_offset, read_text, user_message};
 pub use files::{PotentialFile, PotentialKind};
-pub use hints::{KnownKeys, nearest};
+pub use hints::KnownKeys;
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};
 pub use ranges::impossible;
@@ -72,13 +72,13 @@ pub struct Config {
     /// Processes and rounds.
     #[serde(default)]
     pub run: RunSection,
-    /// Who is told what happens.
+    /// Notifications about events of the campaign.
     #[serde(default)]
     pub notify: NotifySection,
 }
 
-/// Values that stand in for keys that must be there and are wrong, so that the rest can be read.
-const STAND_INS: &str = r#"
+/// Placeholders for required keys that are missing or invalid, so that the rest can be checked.
+const PLACEHOLDERS: &str = r#"
 potential = { model = "-" }
 calm = {}
 seed_structures = { files = ["-"] }
@@ -93,7 +93,7 @@ pub struct Loaded {
     pub config: Config,
     /// Its text.
     pub text: String,
-    /// What is possible but hardly meant.
+    /// Values that are probably not intended.
     pub warnings: Vec<Warning>,
 }
 
@@ -105,7 +105,7 @@ impl Config {
     pub fn load(path: &Path) -> Result<Loaded, ConfigError> {
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
-        let config: Option<Self> = document.read(STAND_INS, &Self::known_keys());
+        let config: Option<Self> = document.read(PLACEHOLDERS, &Self::known_keys());
         let warnings = document.check_ranges("walk");
         document.check_rules(|| config.as_ref().map(check::check).unwrap_or_default());
         document.finish()?;
@@ -123,7 +123,7 @@ impl Config {
         }
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
-        let labels: Option<Labels> = document.read(STAND_INS, &Self::known_keys());
+        let labels: Option<Labels> = document.read(PLACEHOLDERS, &Self::known_keys());
         document.check_ranges("walk");
         document
             .check_rules(|| labels.as_ref().map(|all| check::check_label(&all.label)).unwrap_or_default());
@@ -162,7 +162,7 @@ impl Config {
     }
 
     /// Checks it as a whole; everything that is wrong.
-    pub fn check(&self) -> Vec<error::Wrong> {
+    pub fn check(&self) -> Vec<error::InvalidValue> {
         check::check(self)
     }
 

@@ -4,7 +4,7 @@ use atoms::Species;
 use dft::RetryAdjustment;
 
 use super::{Comparison, Filter, NumberField, TextField};
-use crate::config::nearest;
+use crate::nearest_name::nearest;
 
 /// Maximum nesting of parentheses and `not`, which limits recursion.
 const MAX_DEPTH: usize = 100;

@@ -22,7 +22,7 @@ pub struct RelocatedFiles {
 }
 
 /// Sets the paths in `config`, from the options or from where the campaign last found them (`found`, paths by key).
-/// Checks that the contents are those that the campaign began with.
+/// Checks that the contents are those with which the campaign started.
 pub fn find(
     config: &mut Config,
     resolved: &Value,

@@ -58,9 +58,9 @@ fn is_abinit(command: &str) -> bool {
     command.starts_with("abinit ")
 }
 
-/// Labeller, keeper and code are killed at random moments: each label is made once, none is lost and nothing is left.
+/// Labeller, runner and code are killed at random moments: each label is made once, none is lost and nothing is left.
 #[test]
-fn labels_survive_kills_of_labeller_keeper_and_code() {
+fn labels_survive_kills_of_labeller_runner_and_code() {
     let directory = tempfile::tempdir().unwrap();
     let (here, scratch) = (directory.path(), directory.path().join("scratch"));
     fs::create_dir(&scratch).unwrap();

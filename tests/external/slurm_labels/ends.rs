@@ -41,7 +41,7 @@ fn a_job_whose_time_is_over_gets_twice_as_much() {
     wait_until("a job is at work", || jobs.begun().len() == 1);
     end_its_time(&jobs.jobs()[0][0]);
     wait_until("it is begun again", || jobs.begun().len() == 2);
-    // A minute more than the keeper gives it.
+    // A minute more than the runner gives it.
     let times: Vec<_> = jobs.told("%j|%l|%r").into_iter().skip(1).map(|[_, limit, _]| limit).collect();
     assert_eq!(times, ["21:00"]);
     jobs.go();
