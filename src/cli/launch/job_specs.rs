@@ -174,7 +174,7 @@ impl<'a> Commands<'a> {
             directory: text(directory)?,
             endpoint: text(&directory.join(ENDPOINT))?,
             store: campaign.config.run.store.as_deref(),
-            // The job may be requeued after the configuration has changed, with differences that nobody has seen.
+            // The job may be requeued after the configuration has changed, with differences that the user has not seen.
             accepted_check: launch
                 .accept_reference_check
                 .then(|| reference_check::identity(campaign))
