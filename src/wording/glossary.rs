@@ -6,7 +6,7 @@ use monitor::walk_ends::EarlyEndCause;
 use serde::Serialize;
 use store::words::shown;
 use store::{JobState, LabelStatus};
-use wire::{DeclineReason, WalkEnd};
+use wire::messages::{DeclineReason, WalkEnd};
 
 use crate::config::NotifyEvent;
 
