@@ -68,7 +68,7 @@ pub struct Campaign {
     pub training: Option<TrainingFrames>,
     /// The label protocol.
     pub protocol: Protocol,
-    /// The structures of `label.check`.
+    /// The structures of `label.reference_check`.
     pub known: Vec<KnownStructure>,
     /// Name and hash of every file whose content must not change.
     pub file_hashes: Vec<(String, String)>,
@@ -214,7 +214,7 @@ impl Campaign {
         value
     }
 
-    /// Hash of the structures of `label.check` and what is known of them; `None` without the check.
+    /// Hash of the structures of `label.reference_check` and what is known of them; `None` without the check.
     fn known_hash(&self) -> Option<String> {
         (!self.known.is_empty()).then(|| reference_check::hash(&self.known).to_string())
     }

@@ -27,7 +27,10 @@ fn campaign(directory: &Path, name: &str, walks: usize, least: f64) -> Vec<Frame
     let biased: Vec<_> = walks.iter().filter(|walk| walk["origin"] == "biased").collect();
     let collected = biased.iter().filter(|walk| walk["accepted"].as_u64() > Some(0)).count();
     assert!(2 * collected > biased.len(), "most walks find something: {status}");
-    assert!(biased.iter().all(|walk| walk["state"] == "collected" || walk["state"] == "steps"), "{status}");
+    assert!(
+        biased.iter().all(|walk| walk["state"] == "quota_reached" || walk["state"] == "completed"),
+        "{status}"
+    );
     let accepted = status["candidates"]["accepted"].as_u64().unwrap();
     let control = status["candidates"]["control"].as_u64().unwrap();
 

@@ -127,13 +127,13 @@ fn check_table(live: &Live) {
     let mut ascending = all_lines(address, "ascending=true", 7);
     ascending.reverse();
     assert_eq!(ascending, all);
-    for (order, key) in [("gamma", "gamma"), ("volume", "relative_volume")] {
+    for (order, key) in [("gamma", "gamma"), ("relative_volume", "relative_volume")] {
         let falling = column(&all_lines(address, &format!("order={order}"), 2), key);
         assert!(falling.len() == all.len() && falling.is_sorted_by(|a, b| a >= b), "{falling:?}");
         let rising = column(&all_lines(address, &format!("order={order}&ascending=true"), 5), key);
         assert!(rising.len() == all.len() && rising.is_sorted(), "{rising:?}");
     }
-    for fate in ["accepted", "covered", "duplicate", "guard", "budget", "control"] {
+    for fate in ["accepted", "covered", "duplicate", "too_close", "budget", "control"] {
         let wanted = |line: &&Value| match line["origin"].as_str() {
             Some("control") => fate == "control",
             _ => line["fate"] == fate,
@@ -303,7 +303,7 @@ fn the_table_and_exports_speak_one_language() {
         format!("energy <= {energy} and max_force > 0"),
         format!("energy_per_atom < {per_atom}"),
         format!("not gamma >= {gamma} and mixture_version != 3 and energy < 1e9"),
-        format!("gamma > {gamma} and energy < 1e9 or kind = control and energy < 1e9 and step > 100"),
+        format!("gamma > {gamma} and energy < 1e9 or origin = control and energy < 1e9 and step > 100"),
     ] {
         succeed(here, ["export", "campaign", "--output", "set.extxyz", "--control", "--where", &condition]);
         let frames = fs::File::open(here.join("set.extxyz")).unwrap();

@@ -148,7 +148,7 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
     let directory = finished();
     let here = directory.path();
     let before = walks(here);
-    assert!(before.iter().all(|walk| walk.0 == "control" || walk.2 == "steps"), "{before:?}");
+    assert!(before.iter().all(|walk| walk.0 == "control" || walk.2 == "completed"), "{before:?}");
     replace(here, "max_per_walk = 4", "max_per_walk = 6\nmax_structures = 20");
     replace(here, "walkers = 2", "walkers = 1");
     replace(here, "[label]", "[label]\nconcurrency = 2");
@@ -182,7 +182,7 @@ fn a_larger_budget_lets_walks_go_on() {
         biased.map(|(_, name, state, accepted)| (name, state, accepted)).collect()
     };
     let collected =
-        |accepted: u32| ["fcc-100", "vacancy"].map(|n| (n.to_owned(), "collected".to_owned(), accepted));
+        |accepted: u32| ["fcc-100", "vacancy"].map(|n| (n.to_owned(), "quota_reached".to_owned(), accepted));
     assert_eq!(accepted(), collected(1));
     replace(here, "max_per_walk = 1", "max_per_walk = 2");
     assert_eq!(resume_processes(here), "configuration: collect.max_per_walk is now 2 (was 1)");

@@ -17,7 +17,7 @@ volume_ramps = [{ from = 1.0, to = 1.25 }, { from = 1.0, to = 0.9 }]
 
 [[walks]]
 name = "hole"
-seed_structures = "seed = vacancy"
+seed_structures = "seed_structure = vacancy"
 temperatures = [600.0]
 tau_values = [0.2, 0.4]
 repeats = 2
@@ -109,7 +109,7 @@ fn walks_of_one_seed_structure_end_together_at_its_limit() {
         ends.push(walk["state"].as_str().unwrap());
     }
     assert_eq!(accepted, 2, "one of each seed structure");
-    assert!(ends.iter().all(|end| *end == "collected"), "{ends:?}");
+    assert!(ends.iter().all(|end| *end == "quota_reached"), "{ends:?}");
 }
 
 #[test]
@@ -133,8 +133,8 @@ fn wrong_groups_are_refused() {
         ),
         ("[[walks]]\nname = \"a\"\nrepeats = 5000\n", "walks.0.repeats is 5000; expected at most 1000"),
         (
-            "[[walks]]\nname = \"a\"\nseed_structures = \"seed = bcc\"\n",
-            "no seed structure is selected by 'seed = bcc'; expected at least one",
+            "[[walks]]\nname = \"a\"\nseed_structures = \"seed_structure = bcc\"\n",
+            "no seed structure is selected by 'seed_structure = bcc'; expected at least one",
         ),
         (
             "[[walks]]\nname = \"a\"\nseed_structures = \"gamma > 1\"\n",
@@ -148,7 +148,7 @@ fn wrong_groups_are_refused() {
         assert!(message.contains("campaign.toml:"), "{message}");
     }
     // A seed structure that no group selects gets no walk.
-    write(here, "[[walks]]\nname = \"a\"\nseed_structures = \"seed = vacancy\"\n", 1, "");
+    write(here, "[[walks]]\nname = \"a\"\nseed_structures = \"seed_structure = vacancy\"\n", 1, "");
     let output = crate::common::calmwalk(here, ["validate", "campaign.toml"]);
     let said = crate::common::stderr(&output);
     assert!(output.status.success() && said.contains("seed structure 'fcc-100'"), "{said}");

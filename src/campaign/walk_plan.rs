@@ -62,7 +62,7 @@ impl Loader<'_> {
             if structure.periodic == [false; 3] && conditions.iter().any(WalkConditions::changes_volume) {
                 let message = format!(
                     "group '{}' changes the volume, but seed structure '{name}' ({}) has no periodic direction; leave it out \
-                     (seed_structures = \"seed != '{name}'\"), or give the group volume_ramps = [{{ from = 1.0, to = 1.0 }}]",
+                     (seed_structures = \"seed_structure != '{name}'\"), or give the group volume_ramps = [{{ from = 1.0, to = 1.0 }}]",
                     group.name, named.source
                 );
                 return Err(self.walks_error(&format!("walks.{number}"), message));
@@ -100,7 +100,7 @@ impl Loader<'_> {
 fn is_selected(filter: &Filter, name: &str, structure: &Structure) -> bool {
     let properties = StructureProperties {
         species: &structure.species,
-        seed: Some(name),
+        seed_structure: Some(name),
         ..StructureProperties::default()
     };
     filter.matches(&properties)

@@ -33,7 +33,7 @@ pub struct Validate {
     /// List every pair of elements and every seed structure instead of the first 20
     #[arg(long)]
     all: bool,
-    /// Write what is known of every seed structure to this file, also of those that are skipped
+    /// Write a table of all seed structures, including skipped ones, to this file
     #[arg(long, value_name = "FILE.csv")]
     csv: Option<PathBuf>,
 }

@@ -147,7 +147,7 @@ impl Config {
             .with::<GuardSection>("guard")
             .with::<LabelSection>("label")
             .with::<LabelGuard>("label.guard")
-            .with::<CheckSection>("label.check")
+            .with::<ReferenceCheckSection>("label.reference_check")
             .with::<BudgetSection>("budget")
             .with::<RunSection>("run")
             .with::<NotifySection>("notify")
@@ -169,7 +169,7 @@ impl Config {
     /// Every path in it.
     fn paths(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         let optional = self.calm.artifact.iter_mut().chain(&mut self.calm.training_frames);
-        let optional = optional.chain(&mut self.label.check.structures);
+        let optional = optional.chain(&mut self.label.reference_check.structures);
         let others =
             [&mut self.potential.model].into_iter().chain(optional).chain(&mut self.seed_structures.files);
         others.map(Spanned::get_mut).chain(self.label.method.paths())
@@ -212,11 +212,11 @@ impl Config {
 
     /// The limits that the store holds labellers to.
     pub fn budget(&self) -> store::Budget {
-        let BudgetSection { labels, core_hours, wall_hours } = self.budget.clone();
+        let BudgetSection { labels, core_hours, wall_time } = self.budget.clone();
         store::Budget {
             labels: labels.map(|labels| labels.get().into()),
             core_hours: core_hours.map(Positive::get),
-            wall_hours: wall_hours.map(Positive::get),
+            wall_hours: wall_time.map(|time| time.seconds() / 3600.0),
             structures_by: self.limit_of_structures().map(|(_, key)| key.to_owned()),
         }
     }

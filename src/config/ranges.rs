@@ -37,6 +37,7 @@ pub struct RangedNumber {
 /// The unit of wall-clock times, which are text with a unit in a file and seconds here.
 const TIME: &str = "time";
 const DAY: f64 = 86_400.0;
+const YEAR: f64 = 365.25 * DAY;
 
 /// Upper limit of numbers of steps; no campaign has more.
 const STEPS: f64 = 1e12;
@@ -66,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 90] = [
+pub static RANGES: [Range; 91] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -127,9 +128,9 @@ pub static RANGES: [Range; 90] = [
     range("label.guard.min_volume_per_atom", "Å³", [0.0, 1e3], [1.0, 50.0], "it is that of an atom, in Å³"),
     range("label.guard.max_volume_per_atom", "Å³", [0.0, 1e6], [5.0, 1e3], "it is that of an atom, in Å³"),
     range("label.guard.max_atoms", "", [0.0, 1e9], [1.0, 1e5], ""),
-    range("label.check.max_energy_difference", "eV/atom", [0.0, 1e3], [1e-4, 0.1], PER_ATOM),
-    range("label.check.max_force_difference", "eV/Å", [0.0, 1e3], [1e-3, 0.5], ""),
-    range("label.check.max_stress_difference", "eV/Å³", [0.0, 1e3], [1e-4, 0.1], STRESS),
+    range("label.reference_check.max_energy_difference", "eV/atom", [0.0, 1e3], [1e-4, 0.1], PER_ATOM),
+    range("label.reference_check.max_force_difference", "eV/Å", [0.0, 1e3], [1e-3, 0.5], ""),
+    range("label.reference_check.max_stress_difference", "eV/Å³", [0.0, 1e3], [1e-4, 0.1], STRESS),
     range("label.method.abinit.cutoff", "eV", [20.0, 1e5], [100.0, 1e4], CUTOFF),
     range("label.method.abinit.fine_cutoff", "eV", [20.0, 1e6], [100.0, 5e4], CUTOFF),
     range("label.method.abinit.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
@@ -155,6 +156,7 @@ pub static RANGES: [Range; 90] = [
     range("label.method.cp2k.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
     range("label.method.cp2k.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
     range("label.method.cp2k.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("budget.wall_time", TIME, [0.001, 10.0 * YEAR], [60.0, YEAR], ""),
     range("run.walkers", "", [0.0, 1024.0], [0.0, 512.0], ""),
     range("run.threads_per_walker", "", [0.0, 256.0], [1.0, 128.0], ""),
     range("run.heartbeat_timeout", TIME, [5.0, 10.0 * DAY], [10.0, DAY], ""),

@@ -10,13 +10,13 @@ use crate::exit_status::Failure;
 /// Files that are not where the campaign last found them.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct RelocatedFiles {
-    /// Path of the model, if it has moved since the last run
+    /// Path of the model file, if it is no longer where the last run found it
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// Path of the artifact, if it has moved
+    /// Path of the artifact, likewise
     #[arg(long, value_name = "FILE")]
     artifact: Option<PathBuf>,
-    /// Path of the training frames, if they have moved
+    /// Path of the training frames, likewise
     #[arg(long, value_name = "FILE")]
     training_frames: Option<PathBuf>,
 }

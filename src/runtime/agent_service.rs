@@ -121,7 +121,7 @@ async fn record_event(
         AgentEvent::Left(agent) => (agent, "left", "left"),
         AgentEvent::MessageRejected(why) => {
             log_and_warn(format_args!("rejected a message from another host: {why}"));
-            return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
+            return store.log_operation(now, "messages_rejected", &json!({ "remark": why })).await;
         }
     };
     let walkers = count(agent.walkers, "walker");

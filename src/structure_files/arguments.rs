@@ -19,7 +19,7 @@ pub struct StructureArguments {
     /// .lammpstrj, dump.*), each also with .gz or .zst
     #[arg(value_name = "DATA", required = true)]
     data: Vec<PathBuf>,
-    /// Leave out structures that do not match a condition, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
+    /// Use only structures that match FILTER, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
     /// and of labels energy, energy_per_atom (eV), max_force (eV/Å)
     #[arg(long = "where", value_name = "FILTER")]
     filter: Option<Filter>,

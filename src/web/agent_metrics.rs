@@ -116,12 +116,12 @@ fn link_metrics(text: &mut Text, metrics: &AgentMetrics) {
     );
     let places = metrics.joins as f64;
     text.counter(
-        "calmwalk_agent_places_total",
+        "calmwalk_agent_joins_total",
         "Number of times that this agent has joined.",
         &[(&[], places)],
     );
     text.gauge(
-        "calmwalk_agent_untold_reports",
+        "calmwalk_agent_unsent_reports",
         "Reports that the orchestrator has not acknowledged yet.",
         &[(&[], metrics.unsent as f64)],
     );

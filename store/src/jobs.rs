@@ -8,6 +8,7 @@ use crate::database::{FromRow, Row, from_columns};
 use crate::error::Result;
 use crate::exclude::Exclusion;
 use crate::records::{JobState, Label};
+use crate::words;
 
 /// The running label attempt that started first.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -192,7 +193,7 @@ impl FromRow for Attempt {
             started: row.get("started")?,
             ended: row.get("ended")?,
             outcome: row.get("outcome")?,
-            class: row.get("class")?,
+            class: row.get::<Option<String>>("class")?.map(|class| words::shown(&class).to_owned()),
             log: row.get("log")?,
             made: CalculationRecord {
                 cores: row.get_or_default("cores")?,

@@ -131,7 +131,11 @@ fn attempts(here: &Path, candidate: &str) -> Vec<Value> {
 /// Checks that a guard has refused a candidate for this reason, and ABINIT has not been started.
 fn is_refused(here: &Path, candidate: &str, reason: &str) {
     let [attempt] = &attempts(here, candidate)[..] else { panic!("{candidate}: more than one attempt") };
-    assert_eq!((&attempt["class"], &attempt["calculation"]), (&"refused".into(), &Value::Null), "{attempt}");
+    assert_eq!(
+        (&attempt["class"], &attempt["calculation"]),
+        (&"rejected_by_label_guard".into(), &Value::Null),
+        "{attempt}"
+    );
     assert!(attempt["log"].as_str().unwrap().contains(reason), "{attempt}");
 }
 

@@ -404,7 +404,7 @@ impl DecisionState {
 fn describe_end(end: &WalkEnd) -> String {
     match end {
         WalkEnd::Steps | WalkEnd::Collected | WalkEnd::Budget => String::new(),
-        WalkEnd::Trapped { guard } => format!("refused by the {guard} guard again and again"),
+        WalkEnd::Trapped { guard } => format!("rejected by the {guard} guard again and again"),
         WalkEnd::BlewUp { reason } | WalkEnd::BadStart { reason } => reason.clone(),
     }
 }

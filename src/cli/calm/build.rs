@@ -22,7 +22,7 @@ use crate::structure_files::{StructureArguments, StructureFiles};
 /// Build a CALM mixture from the training data of a model
 ///
 /// Goes through all structures three times: pass 1 finds clusters of environments for each element, pass 2 their covariances,
-/// pass 3 the thresholds. The artifact depends on model, data, --candidates, --seed and --shard-size, but not on the number of
+/// pass 3 the thresholds. The artifact depends on model, data, --candidates, --rng-seed and --shard-size, but not on the number of
 /// threads.
 ///
 /// Several hosts can share the work (--pass, --part, `calmwalk calm merge`); the artifact is the same.
@@ -45,22 +45,22 @@ pub struct Build {
     /// Weight of the atoms of a file of DATA, 0 or more [default: 1]; may be repeated
     #[arg(long, value_name = "FILE=W", value_parser = weight)]
     weight: Vec<(PathBuf, f64)>,
-    /// Numbers of clusters to choose from for each element, ascending
+    /// Candidate numbers of components per element, ascending; the build chooses one for each element
     #[arg(long, value_name = "K,…", value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
     candidates: Vec<usize>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 42)]
-    seed: u64,
-    /// Structures of a shard, the unit of work; each thread holds one in memory
+    rng_seed: u64,
+    /// Number of structures per shard. Each thread keeps one shard in memory
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     shard_size: u64,
     /// Threads; each takes whole shards [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Begin anew, whatever state is there
+    /// Discard the saved state and start from pass 1
     #[arg(long)]
     restart: bool,
-    /// On a cluster: take only the shards of --part through this pass
+    /// Run only this pass, on the shards of --part (to share a build between hosts)
     #[arg(long, value_name = "1|2|3", requires = "part", conflicts_with = "restart", value_parser = clap::value_parser!(u8).range(1..=3))]
     pass: Option<u8>,
     /// The part of this process: every n-th shard, from shard i. When all parts of a pass are done, run `calmwalk calm merge`
@@ -83,7 +83,7 @@ impl Build {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let settings = BuildSettings {
             dimension: projection.feature_dimension,
-            seed: self.seed,
+            seed: self.rng_seed,
             candidates: self.candidates.clone(),
             shard_size: self.shard_size,
         };
@@ -93,7 +93,7 @@ impl Build {
             files,
             shard_size: self.shard_size,
             part: self.part.unwrap_or(Part::WHOLE),
-            seed: self.seed,
+            seed: self.rng_seed,
             threads: self.threads.map_or(cores, usize::from),
             stop: stop_token()?,
         };

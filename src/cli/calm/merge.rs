@@ -20,7 +20,7 @@ pub struct Merge {
     /// GRACE model (kokkos.npz) of the build
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
-    /// The --output of the parts
+    /// The value of --output that the parts were run with
     #[arg(long, short, value_name = "CALM.npz")]
     output: PathBuf,
     /// After pass 3, also write a copy of the model with the new mixture, for LAMMPS and calmwalk

@@ -10,7 +10,7 @@ mod scorer;
 
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare or inspect CALM mixtures, or grade structures with it
+/// Build, recalibrate, compare and inspect CALM mixtures; grade structures
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Build(build::Build),
