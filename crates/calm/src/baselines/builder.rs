@@ -15,6 +15,7 @@ use crate::mixture::Mixture;
 /// [`Builder::finish`]. Structures must come in the same order each time.
 #[derive(Debug, Clone)]
 pub struct Builder {
+    kind: Kind,
     dimension: usize,
     state: State,
     is_done: bool,
@@ -66,7 +67,12 @@ impl Builder {
             Kind::Euclidean => State::Ready(Baseline::Euclidean(Euclidean::new(needed()?))),
             Kind::Likelihood => State::Ready(Baseline::Likelihood(Likelihood::new(needed()?)?)),
         };
-        Ok(Self { dimension, is_done: !kind.needs_data(), state })
+        Ok(Self { kind, dimension, is_done: !kind.needs_data(), state })
+    }
+
+    /// What is built.
+    pub fn kind(&self) -> Kind {
+        self.kind
     }
 
     /// Whether a sweep over the data is needed.

@@ -35,6 +35,11 @@ impl DOptimality {
         self.sets.iter().map(ActiveSet::rank).collect()
     }
 
+    /// The active rows of a group, `[r × D]`, centred where the construction is; `None` beyond the last group.
+    pub fn active_rows(&self, group: usize) -> Option<&[f64]> {
+        self.sets.get(group).map(ActiveSet::rows)
+    }
+
     /// Whether no coefficient of a training atom exceeds 1 by more than the tolerance; otherwise the sweeps ran out.
     pub fn is_converged(&self) -> bool {
         self.converged

@@ -1,7 +1,6 @@
 //! What can be wrong with the input of a baseline.
 
 use crate::linear::{LinearError, row_dots};
-use crate::mixture::MixtureError;
 
 /// Why a baseline cannot be built or cannot score.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -71,22 +70,6 @@ pub enum BaselineError {
     /// Linear algebra that failed.
     #[error(transparent)]
     Linear(#[from] LinearError),
-}
-
-/// Why a file of baselines cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum BaselineFileError {
-    /// An archive without the right arrays.
-    #[error(transparent)]
-    Archive(#[from] npz::Error),
-    /// Components that are not a valid mixture.
-    #[error("{}: {source}", path.display())]
-    Mixture {
-        /// The file.
-        path: std::path::PathBuf,
-        /// What is wrong.
-        source: MixtureError,
-    },
 }
 
 /// Why a baseline does not belong to a model.

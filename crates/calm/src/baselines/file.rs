@@ -3,9 +3,9 @@
 use std::io::{self, Read, Seek, Write};
 use std::path::Path;
 
-use npz::{Archive, Writer};
+use npz::{Archive, Error, Writer};
 
-use super::error::{BaselineFileError, OriginMismatch};
+use super::error::OriginMismatch;
 use super::settings::BaselineSettings;
 use super::{Baseline, Kind, stored};
 
@@ -60,9 +60,7 @@ impl BaselineFile {
     /// If writing fails.
     pub fn write<W: Write + Seek>(&self, out: W) -> io::Result<W> {
         let mut file = Writer::new(out);
-        let strings = |texts: &[String]| texts.iter().map(String::clone).collect::<Vec<_>>();
-        let names = strings(&self.origin.symbols);
-        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let names: Vec<&str> = self.origin.symbols.iter().map(String::as_str).collect();
         file.scalar("baseline_schema", SCHEMA as i64)?;
         file.strings("element_names", &[names.len()], &names)?;
         file.strings("feature_variant", &[], &[&self.origin.variant])?;
@@ -81,15 +79,15 @@ impl BaselineFile {
     ///
     /// # Errors
     /// Missing or ill-shaped arrays, with file, key, what was found and what was expected.
-    pub fn load(path: impl AsRef<Path>) -> Result<Self, BaselineFileError> {
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, Error> {
         Self::read(&Archive::open(path.as_ref())?)
     }
 
     /// Reads an open archive.
     ///
     /// # Errors
-    /// As [`BaselineFile::load`].
-    pub fn read<R: Read + Seek>(file: &Archive<R>) -> Result<Self, BaselineFileError> {
+    /// As [`Self::load`].
+    pub fn read<R: Read + Seek>(file: &Archive<R>) -> Result<Self, Error> {
         file.expect_count("baseline_schema", SCHEMA)?;
         let text = |key: &str| file.strings(key).map(|texts| texts.concat());
         let origin = FeatureOrigin {
@@ -99,17 +97,17 @@ impl BaselineFile {
             dimension: file.count("feature_dimension", 1, 1 << 16)?,
         };
         if origin.symbols.is_empty() {
-            return Err(file.invalid("element_names", "no element", "at least one").into());
+            return Err(file.invalid("element_names", "no element", "at least one"));
         }
         let settings = stored::read_settings(file)?;
         let mut baselines = Vec::new();
         for (number, name) in file.strings("kinds")?.into_iter().enumerate() {
             let kind = name.parse::<Kind>();
             let kind = kind.map_err(|expected| file.invalid("kinds", format!("'{name}'"), expected))?;
-            baselines.push(stored::read(file, number, kind, &origin, &settings)?);
+            baselines.push(stored::read(file, number, kind, &origin)?);
         }
         if baselines.is_empty() {
-            return Err(file.invalid("kinds", "no baseline", "at least one").into());
+            return Err(file.invalid("kinds", "no baseline", "at least one"));
         }
         Ok(Self { origin, settings, baselines })
     }

@@ -33,7 +33,7 @@ mod stored;
 pub use builder::Builder;
 pub use d_optimality::DOptimality;
 pub use distances::{Euclidean, KNearest};
-pub use error::{BaselineError, BaselineFileError, OriginMismatch};
+pub use error::{BaselineError, OriginMismatch};
 pub use file::{BaselineFile, FeatureOrigin};
 pub use likelihood::Likelihood;
 pub use llpr::Llpr;

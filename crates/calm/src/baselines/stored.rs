@@ -9,7 +9,7 @@ use super::groups::Groups;
 use super::likelihood::{Gaussian, Likelihood};
 use super::max_vol::ActiveSet;
 use super::settings::BaselineSettings;
-use super::{Baseline, BaselineFileError, DOptimality, FeatureOrigin, Kind, Llpr};
+use super::{Baseline, DOptimality, FeatureOrigin, Kind, Llpr};
 
 pub(super) fn write_settings<W: Write + Seek>(
     file: &mut Writer<W>,
@@ -22,7 +22,7 @@ pub(super) fn write_settings<W: Write + Seek>(
     file.scalar("force_weight", settings.force_weight)?;
     file.scalar("neighbours", settings.neighbours as i64)?;
     file.scalar("sample", settings.sample as i64)?;
-    // NumPy has no scalar of 64 bits that both sides read.
+    // The archive reads integers as signed.
     file.strings("seed", &[], &[&settings.seed.to_string()])
 }
 
@@ -119,8 +119,7 @@ pub(super) fn read<R: Read + Seek>(
     number: usize,
     kind: Kind,
     origin: &FeatureOrigin,
-    _settings: &BaselineSettings,
-) -> Result<Baseline, BaselineFileError> {
+) -> Result<Baseline, Error> {
     let found = Stored { file, number, dimension: origin.dimension, elements: origin.symbols.len() };
     Ok(match kind {
         Kind::DOptimalityElement | Kind::DOptimalityCentred | Kind::DOptimalityComponent => {
