@@ -72,12 +72,14 @@ impl FeatureModel {
     /// if none fits.
     pub fn for_artifact(path: &Path, artifact: &Projection) -> Result<Self, Failure> {
         let own = Self::load(path, None)?;
-        let forms = [FeatureForm::Normalised, FeatureForm::Linear];
-        let others = forms.into_iter().filter_map(|form| own.model.with_features(form));
-        let others = others.map(|model| Self { model: model.into(), is_hidden: false });
-        let mut all = std::iter::once(own.clone()).chain(others);
         let fits = |found: &Self| found.projection().is_some_and(|found| artifact.check_same(&found).is_ok());
-        Ok(all.find(fits).unwrap_or(own))
+        if fits(&own) {
+            return Ok(own);
+        }
+        let others = [FeatureForm::Normalised, FeatureForm::Linear].map(|form| own.model.with_features(form));
+        let mut others =
+            others.into_iter().flatten().map(|model| Self { model: model.into(), is_hidden: false });
+        Ok(others.find(fits).unwrap_or(own))
     }
 
     /// The model of a file of baselines, with their variant.

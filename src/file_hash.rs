@@ -25,7 +25,9 @@ pub fn model_hash(path: &Path) -> Result<String, Failure> {
         match file.numbers(key) {
             Ok(found) => {
                 hasher.update(format!("{:?}\n", found.shape).as_bytes());
-                found.data.iter().for_each(|number| drop(hasher.update(&number.to_le_bytes())));
+                for number in found.data {
+                    hasher.update(&number.to_le_bytes());
+                }
             }
             Err(_) => {
                 let texts = file.strings(key).map_err(Failure::input)?;

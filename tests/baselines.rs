@@ -86,7 +86,7 @@ fn atoms_are_scored_by_every_kind() {
             assert!(largest(&outside) > largest(&inside), "{name}: {outside:?} {}", largest(&inside));
         }
         if name.starts_with("d_opt") {
-            assert!(largest(&inside) <= 1.01 + 1e-6, "{name}: {}", largest(&inside));
+            assert!(largest(&inside) <= 1.01 + 1e-4, "{name}: {}", largest(&inside));
         }
         // The average over the same neighbours as γ's, of which each crystal site has equal ones.
         let average = column(&frames, &format!("{name}_nbr"));
@@ -116,7 +116,7 @@ fn check_by_features(here: &Path, frames: &[Frame]) {
         active.ranks()
     );
     let scores = stored.baselines[0].score(&vec![0; expected.len()], &features).unwrap();
-    assert!(deviation(&column(frames, "d_optimality_element"), &scores) < 1e-12);
+    assert!(deviation(&column(frames, "d_optimality_element"), &scores) < 1e-6);
 }
 
 #[test]
@@ -155,7 +155,7 @@ fn mixtures_and_baselines_have_other_features() {
     // The features follow from the artifact.
     baseline(here, &["l.npz", "--artifact", "linear.npz", "--kind", "d-optimality-centred,likelihood"]);
     let scored = score(here, "in.extxyz", &["--artifact", "linear.npz", "--baseline", "l.npz"]);
-    assert!(largest(&column(&scored, "d_optimality_centred")) <= 1.01 + 1e-6);
+    assert!(largest(&column(&scored, "d_optimality_centred")) <= 1.01 + 1e-4);
     assert!(column(&scored, "likelihood").iter().all(|x| x.is_finite()));
     // Beside γ of the normalised features, those of the linear ones carry their name.
     baseline(
@@ -163,8 +163,8 @@ fn mixtures_and_baselines_have_other_features() {
         &["h.npz", "--feature-variant", "hidden", "--kind", "llpr", "--kind", "d-optimality-element"],
     );
     let scored = score(here, "in.extxyz", &["--baseline", "l.npz", "--baseline", "h.npz"]);
-    assert!(largest(&column(&scored, "linear_d_optimality_centred")) <= 1.01 + 1e-6);
-    assert!(largest(&column(&scored, "hidden_d_optimality_element")) <= 1.01 + 1e-6);
+    assert!(largest(&column(&scored, "linear_d_optimality_centred")) <= 1.01 + 1e-4);
+    assert!(largest(&column(&scored, "hidden_d_optimality_element")) <= 1.01 + 1e-4);
     assert!(column(&scored, "hidden_llpr").iter().all(|u| *u > 0.0));
 }
 

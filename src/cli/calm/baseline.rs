@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use calm::baselines::{Baseline as Score, BaselineFile, BaselineSettings, Builder, Kind};
 use calm::{Artifact, Mixture};
+use tokio_util::sync::CancellationToken;
 
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::campaign::check_sound;
@@ -102,14 +103,16 @@ impl Baseline {
         let mixture = artifact.as_ref().map(|artifact| &artifact.mixture);
         let mut builders = self.builders(&features, &settings, mixture)?;
         let mut calculator = features.calculator();
-        let mut sweep = 0;
+        let (stop, mut sweep) = (stop_token()?, 0);
         while builders.iter().any(Builder::needs_sweep) {
             sweep += 1;
-            if !read(&files, &mut calculator, &mut builders, sweep)? {
+            if !read(&files, &mut calculator, &mut builders, sweep, &stop)? {
                 print_stderr("stopped; nothing was written");
                 return Ok(ExitStatus::Interrupted);
             }
-            builders.iter_mut().for_each(|builder| drop(builder.end_sweep()));
+            for builder in builders.iter_mut().filter(|builder| builder.needs_sweep()) {
+                builder.end_sweep();
+            }
         }
         let finished = builders.into_iter().map(Builder::finish).collect::<Result<_, _>>();
         let baselines = finished.map_err(Failure::input)?;
@@ -134,8 +137,11 @@ impl Baseline {
     fn load(&self) -> Result<(FeatureModel, Option<Artifact>), Failure> {
         let Some(path) = &self.artifact else {
             let features = FeatureModel::load(&self.model, self.feature_variant)?;
-            let Some(projection) = features.projection() else { return Ok((features, None)) };
+            let projection =
+                features.projection().filter(|_| self.kind.iter().any(|kind| kind.needs_mixture()));
+            let Some(projection) = projection else { return Ok((features, None)) };
             let own = Artifact::load_export(&self.model).map_err(Failure::input)?;
+            check_sound(&own, &self.model).map_err(Failure::Input)?;
             let fits = own.projection.check_same(&projection).is_ok();
             return Ok((features, fits.then_some(own)));
         };
@@ -183,8 +189,8 @@ fn read(
     calculator: &mut FeatureCalculator,
     builders: &mut [Builder],
     sweep: usize,
+    stop: &CancellationToken,
 ) -> Result<bool, Failure> {
-    let stop = stop_token()?;
     let bytes = Arc::new(AtomicU64::new(0));
     let bar = Bar::new(Some(files.total_bytes()?), BAR);
     let mut structures = files.reader(Arc::clone(&bytes));
