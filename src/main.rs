@@ -11,6 +11,7 @@ mod csv;
 mod disk_forecast;
 mod duration;
 mod exit_status;
+mod feature_variant;
 mod features;
 mod file_hash;
 mod filter;

@@ -6,6 +6,7 @@
 mod common;
 
 mod backup;
+mod baselines;
 mod budgets;
 mod calculations;
 mod certificates;

@@ -3,6 +3,7 @@
 mod common;
 
 mod artifact;
+mod baselines;
 mod build;
 mod forgetting;
 mod grade;

@@ -13,6 +13,7 @@ use potentials::grace::GraceModel;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
+use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::file_hash;
 use crate::mixture_build::{self, Part, Work};
 use crate::output::{Table, log_and_warn, print, print_stderr};
@@ -40,8 +41,12 @@ pub struct Build {
     #[arg(long, short, value_name = "CALM.npz")]
     output: PathBuf,
     /// Also write a copy of the model with the new mixture, for LAMMPS and calmwalk
-    #[arg(long, value_name = "MODEL.npz")]
+    #[arg(long, value_name = "MODEL.npz", conflicts_with = "feature_variant")]
     embed: Option<PathBuf>,
+    /// Features of the mixture, with the projection matrix of the model file: normalised or linear [default: as the file says].
+    /// Mixtures of other features serve comparisons (`calm score`, `calm baseline`), not campaigns
+    #[arg(long, value_name = "VARIANT")]
+    feature_variant: Option<FeatureVariant>,
     /// Weight of the atoms of a file of DATA, 0 or more [default: 1]; may be repeated
     #[arg(long, value_name = "FILE=W", value_parser = weight)]
     weight: Vec<(PathBuf, f64)>,
@@ -78,8 +83,7 @@ impl Build {
         outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
         // Errors in paths are found before hours of work.
         outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
-        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
-        let (projection, seed) = projection(&self.model, &model)?;
+        let (model, projection, seed) = load_model(&self.model, self.feature_variant)?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let settings = BuildSettings {
             dimension: projection.feature_dimension,
@@ -89,7 +93,7 @@ impl Build {
         };
         let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
         let work = Work {
-            model: Arc::new(model),
+            model,
             files,
             shard_size: self.shard_size,
             part: self.part.unwrap_or(Part::WHOLE),
@@ -157,29 +161,22 @@ pub(super) fn write_mixture(
     file.finish()
 }
 
-/// The projection of the model, and its random seed if the file has it.
-pub(super) fn projection(path: &Path, model: &GraceModel) -> Result<(Projection, Option<i64>), Failure> {
-    let Some(found) = model.projection() else {
-        return Err(Failure::Input(format!(
-            "{}: the model has no projection of its features (uq_rp_matrix), from which a mixture could be built: export it with \
-             CALM arrays (uq_*), those of any mixture of this model",
-            path.display()
-        )));
+/// The model with these features, their projection, and its random seed if the file has it.
+pub(super) fn load_model(
+    path: &Path,
+    variant: Option<FeatureVariant>,
+) -> Result<(Arc<GraceModel>, Projection, Option<i64>), Failure> {
+    let found = FeatureModel::load(path, variant)?;
+    let Some(projection) = found.projection() else {
+        return Err(Failure::Input(
+            "--feature-variant hidden: a mixture needs projected features; expected normalised or linear"
+                .into(),
+        ));
     };
     let file = Archive::open(path).map_err(Failure::input)?;
     let key = "uq_rp_seed";
     let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(Failure::input)?;
-    let projection = Projection {
-        matrix: found.matrix.clone(),
-        rows: found.matrix.len() / found.dimension,
-        columns: found.dimension,
-        feature_dimension: found.feature_dimension(),
-        asinh: found.asinh,
-        normalised: found.normalize,
-        density_channels: found.density_channels,
-        density_scale: found.density_scale,
-    };
-    Ok((projection, seed.and_then(|seed| seed.data.first().copied())))
+    Ok((found.model, projection, seed.and_then(|seed| seed.data.first().copied())))
 }
 
 fn weight(text: &str) -> Result<(PathBuf, f64), String> {

@@ -2,11 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use potentials::grace::GraceModel;
-
-use super::build::{projection, report, write_mixture};
+use super::build::{load_model, report, write_mixture};
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{ExitStatus, Failure};
+use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
 use crate::mixture_build::{Merge as PartsMerge, Merged};
 use crate::output::print;
@@ -24,8 +23,11 @@ pub struct Merge {
     #[arg(long, short, value_name = "CALM.npz")]
     output: PathBuf,
     /// After pass 3, also write a copy of the model with the new mixture, for LAMMPS and calmwalk
-    #[arg(long, value_name = "MODEL.npz")]
+    #[arg(long, value_name = "MODEL.npz", conflicts_with = "feature_variant")]
     embed: Option<PathBuf>,
+    /// The --feature-variant of the parts
+    #[arg(long, value_name = "VARIANT")]
+    feature_variant: Option<FeatureVariant>,
 }
 
 impl Merge {
@@ -34,8 +36,7 @@ impl Merge {
             refuse_to_replace(output, [(self.model.as_path(), "the model")])?;
             AtomicFile::create(output)?;
         }
-        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
-        let (projection, seed) = projection(&self.model, &model)?;
+        let (model, projection, seed) = load_model(&self.model, self.feature_variant)?;
         let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
         let mut merge = PartsMerge::open(&self.output, &hash)?;
         match merge.run(&model, projection, seed)? {

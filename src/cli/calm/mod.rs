@@ -1,18 +1,21 @@
 //! `calmwalk calm`: commands for CALM mixtures, without a campaign.
 
+mod baseline;
 mod build;
 mod compare;
 mod info;
 mod merge;
+mod other_scores;
 mod recalibrate;
 mod score;
 mod scorer;
 
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare and inspect CALM mixtures; grade structures
+/// Build, recalibrate, compare and inspect CALM mixtures and baselines; grade structures
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
+    Baseline(baseline::Baseline),
     Build(build::Build),
     Compare(compare::Compare),
     Info(info::Info),
@@ -24,6 +27,7 @@ pub enum Calm {
 impl Calm {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         match self {
+            Self::Baseline(command) => command.run(),
             Self::Build(command) => command.run(),
             Self::Compare(command) => command.run(),
             Self::Info(command) => command.run(),

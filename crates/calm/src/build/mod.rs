@@ -51,6 +51,7 @@ pub use histogram::{BINS, ElementHistograms, Grid, Histogram};
 pub use mini_batch::{CandidateClusters, ShardClustering, ShardClusters};
 pub use moments::{ComponentSums, ElementSums};
 pub use partition::{ElementPartition, partition};
+pub(crate) use random::random_key;
 pub use random::shuffled;
 pub use recalibrate::Recalibration;
 pub use scatter::ScatterPass;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::layer::Layer;
 use super::precision::Precision;
-use super::projection::{FeatureMap, Projection};
+use super::projection::{FeatureForm, FeatureMap, Projection};
 use super::readout::Readout;
 use super::vector::{Double, Single, Vector};
 
@@ -28,6 +28,13 @@ impl<V: Vector> Network<V> {
     pub fn projection(&self) -> Option<&Projection> {
         self.feature_map.as_ref().map(|map| &map.projection)
     }
+
+    fn with_features(mut self, form: FeatureForm) -> Self {
+        if let Some(map) = &mut self.feature_map {
+            map.projection = map.projection.with_form(form);
+        }
+        self
+    }
 }
 
 /// A network in either precision.
@@ -49,6 +56,24 @@ impl AnyNetwork {
         match self {
             Self::Double(network) => network.projection(),
             Self::Mixed(network) => network.projection(),
+        }
+    }
+
+    /// As [`super::GraceModel::hidden_dimension`].
+    pub fn hidden_dimension(&self) -> usize {
+        match self {
+            Self::Double(network) => network.readout.hidden_dimension(),
+            Self::Mixed(network) => network.readout.hidden_dimension(),
+        }
+    }
+
+    /// The same network with other features.
+    pub fn with_features(self, form: FeatureForm) -> Self {
+        match self {
+            Self::Double(network) => {
+                Self::Double(Arc::new(Arc::unwrap_or_clone(network).with_features(form)))
+            }
+            Self::Mixed(network) => Self::Mixed(Arc::new(Arc::unwrap_or_clone(network).with_features(form))),
         }
     }
 
