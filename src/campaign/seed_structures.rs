@@ -1,6 +1,7 @@
 //! Reads the seed structures and checks that walks can start from them.
 
 use std::collections::HashMap;
+use std::mem;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
@@ -45,6 +46,21 @@ pub struct SkippedStructure {
     pub source: String,
     /// Why no walk can start from it.
     pub reason: String,
+}
+
+impl SeedStructures {
+    /// Leaves out the structures for which there is a reason.
+    pub fn skip(&mut self, reason: impl Fn(&SourcedStructure) -> Option<String>) {
+        for named in mem::take(&mut self.valid) {
+            match reason(&named) {
+                None => self.valid.push(named),
+                Some(reason) => {
+                    let SourcedStructure { seed, source, .. } = named;
+                    self.skipped.push(SkippedStructure { seed, source, reason });
+                }
+            }
+        }
+    }
 }
 
 impl SkippedStructure {
@@ -228,7 +244,7 @@ impl Loader<'_> {
 }
 
 /// The first messages, and how many more seed structures they concern.
-fn listed(mut messages: Vec<String>, what: &str) -> Vec<String> {
+pub(super) fn listed(mut messages: Vec<String>, what: &str) -> Vec<String> {
     if let Some(more @ 1..) = messages.len().checked_sub(MAX_LISTED) {
         messages.truncate(MAX_LISTED);
         messages.push(format!("{more} more seed structures {what}"));
