@@ -16,7 +16,7 @@ use crate::common::{Running, program, succeed};
 fn control_walks_do_not_wait_for_the_last_biased_walk() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let seeds = &["fcc-100", "vacancy", "fcc-103", "fcc-097"];
+    let seeds = &["fcc-100", "vacancy", "fcc-103", "fcc-097", "bcc", "sheared"];
     Small { mode: "live", walkers: 1, steps: 120, max_per_walk: 1, seeds, ..Small::default() }.write(here);
     succeed(here, ["run", "campaign.toml"]);
     let (decisions, walks) = on_store(Location::from(&*here.join("campaign")), async |store| {
@@ -31,7 +31,7 @@ fn control_walks_do_not_wait_for_the_last_biased_walk() {
     let control = decisions.iter().find(|decision| decision.kind == "control").unwrap().sequence;
     // The one walker begins the last biased walk when the one before it has ended.
     let [.., before_last, _] = ends[..] else { panic!("{ends:?}") };
-    assert!(ends.len() == 4 && control < before_last, "{control}, {ends:?}");
+    assert!(ends.len() == 6 && control < before_last, "{control}, {ends:?}");
 }
 
 #[test]
