@@ -90,9 +90,9 @@ impl Campaign {
             Ok((artifact, training))
         });
         let labels = loader.seed_structures(&model).and_then(|mut seeds| {
-            warnings.extend(loader.plan_walks(&mut seeds.valid)?);
+            let protocol = loader.protocol(&mut seeds)?;
+            warnings.extend(loader.plan_walks(&mut seeds)?);
             loader.check_update_target(&seeds.valid)?;
-            let protocol = loader.protocol(&seeds.valid)?;
             Ok((seeds, protocol))
         });
         let ((artifact, training), (seeds, (protocol, mut file_hashes))) =

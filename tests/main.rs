@@ -41,6 +41,7 @@ mod processes;
 mod reference_check;
 mod relabel;
 mod replay;
+mod scheduling;
 mod schema;
 mod status;
 mod triage;

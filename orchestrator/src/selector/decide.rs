@@ -275,7 +275,7 @@ impl DecisionState {
         if let Some(training) = state.training {
             detail["training_frames"] = json!(training);
         }
-        detail["forgetting"] = json!({ "level": state.level, "elements": state.elements });
+        detail["forgetting"] = state.in_decision();
         detail["forgetting_alarm"] = json!(state.is_alarming());
         commit.values.push((TRAINING_FRAMES.to_owned(), state.to_json().to_string()));
         Ok(state.is_alarming())
