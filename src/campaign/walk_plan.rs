@@ -9,7 +9,7 @@ use wire::WalkConditions;
 use super::load::{Loader, SourcedStructure};
 use super::seed_structures::{SeedStructures, listed};
 use crate::config::{
-    ConfigError, OnInvalid, VolumeRampSection, WalkGroupSection, WalkSection, Warning, place,
+    ConfigError, OnInvalid, VolumeRampSection, WalkGroupSection, WalkSection, Warning, location,
 };
 use crate::filter::{Filter, StructureProperties};
 
