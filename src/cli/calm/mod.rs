@@ -8,6 +8,7 @@ mod recalibrate;
 mod score;
 mod scorer;
 
+pub(super) use self::score::load;
 use super::{ExitStatus, Failure};
 
 /// Build, recalibrate, compare or inspect CALM mixtures, or grade structures with it
