@@ -41,6 +41,7 @@ mod reference_check;
 mod relabel;
 mod replay;
 mod schema;
+mod select;
 mod status;
 mod triage;
 mod walk_groups;
