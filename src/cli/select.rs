@@ -107,7 +107,7 @@ impl Select {
         let own = own.chain(self.artifact.as_deref().map(|path| (path, "the artifact")));
         refuse_to_replace(&self.output, own.chain(inputs))?;
         // Errors in paths are found before hours of work.
-        AtomicFile::create(&self.output)?;
+        AtomicFile::create(&self.output).map(drop)?;
         let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
         let (model, mixture) = (Arc::new(model), Arc::new(artifact.mixture));
         if parts.iter().any(|part| part.strategy == Strategy::Greedy) && !mixture.can_be_updated() {

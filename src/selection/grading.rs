@@ -111,11 +111,12 @@ impl Grading {
             }
             graded
         };
+        let share = &share;
         let mut graded: Vec<_> = match workers {
             [worker] => share(worker),
             workers => thread::scope(|scope| {
                 let threads: Vec<_> =
-                    workers.iter_mut().map(|worker| scope.spawn(|| share(worker))).collect();
+                    workers.iter_mut().map(|worker| scope.spawn(move || share(worker))).collect();
                 let results = threads.into_iter();
                 results
                     .flat_map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)))

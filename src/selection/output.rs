@@ -93,7 +93,10 @@ fn candidate(files: &PoolFiles, campaign: u32, decision: i64) -> Result<Frame, F
     info("campaign", campaign.id.clone().into());
     info("candidate_id", view.id().to_string().into());
     info("fate", fate.into());
-    info("temperature", view.temperature().into());
-    info("relative_volume", view.relative_volume().into());
+    for (key, value) in [("temperature", view.temperature()), ("relative_volume", view.relative_volume())] {
+        if value.is_finite() {
+            info(key, value.into());
+        }
+    }
     Ok(frame)
 }

@@ -17,10 +17,10 @@ const WINDOW: Window = Window { above: 1.0, up_to: 60.0 };
 /// Two elements with two and one components, whose covariances are those of random atoms.
 fn mixture(random: &mut Random) -> Mixture {
     let mut component = |centre: f64| {
-        let rows = random.take(40 * D);
         let mut scatter = vec![0.0; D * D];
-        for row in rows.chunks(D) {
-            (0..D * D).for_each(|k| scatter[k] += row[k / D] * row[k % D] * (1.0 + (k / D + k % D) as f64));
+        for row in random.take(40 * D).chunks(D) {
+            let row: Vec<f64> = row.iter().zip(1..).map(|(x, k)| x * f64::from(k)).collect();
+            (0..D * D).for_each(|k| scatter[k] += row[k / D] * row[k % D]);
         }
         let covariance: Vec<f64> = scatter.iter().map(|value| value / 40.0).collect();
         let inverse = regularised_inverse(&covariance, D).unwrap();

@@ -76,7 +76,7 @@ mod tests {
         let of = |s: usize, e: usize| atoms[s][e];
         let picked = [(0, true), (1, true), (2, true)];
         let found = meet(5, 2, of, &picked, 5);
-        // Of the second element 2 atoms are picked. Structure 2 cannot be exchanged for a gain of 5 - 2 and then lacks nothing.
+        // Of the second element 2 atoms are picked, and structure 4 has 5.
         assert_eq!(found, Exchanges { removed: vec![2], added: vec![4], short: vec![] });
         assert_eq!(meet(5, 2, of, &picked, 2), Exchanges::default());
         let fixed = [(0, false), (1, false)];
