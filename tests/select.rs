@@ -167,13 +167,15 @@ fn what_was_selected_is_labelled_by_a_campaign() {
     assert_eq!(own["pool"]["features_computed"], 0);
     let candidate = read_extxyz(&here.join("out.extxyz")).unwrap();
     assert!(candidate[0].info["candidate_id"].text().is_some());
-    // It has its label.
-    assert_eq!(queued(here), "queued 0 structures for labelling; 1 already known\n");
+    // Accepted candidates have their labels.
+    let accepted = read_extxyz(&here.join("own.extxyz")).unwrap().len();
+    let known = format!("queued 0 structures for labelling; {accepted} already known\n");
+    assert_eq!(queue(here, "own.extxyz"), known);
 
     pool(&here.join("pool.extxyz"), 8);
     select(here, &["pool.extxyz", "-n", "2"]);
-    assert_eq!(queued(here), "queued 2 structures for labelling; 0 already known\n");
-    assert_eq!(queued(here), "queued 0 structures for labelling; 2 already known\n");
+    assert_eq!(queue(here, "out.extxyz"), "queued 2 structures for labelling; 0 already known\n");
+    assert_eq!(queue(here, "out.extxyz"), "queued 0 structures for labelling; 2 already known\n");
     let jobs: Json = serde_json::from_str(&succeed(here, ["queue", "campaign", "list", "--json"])).unwrap();
     let waiting = jobs.as_array().unwrap().iter().filter(|job| job["state"] == "queued");
     let waiting: Vec<_> = waiting.map(|job| (job["candidate"].clone(), job["origin"].clone())).collect();
@@ -201,6 +203,6 @@ fn what_was_selected_is_labelled_by_a_campaign() {
     succeed(here, ["store", "check", "campaign"]);
 }
 
-fn queued(here: &Path) -> String {
-    succeed(here, ["import", "campaign", "out.extxyz", "--queue"])
+fn queue(here: &Path, file: &str) -> String {
+    succeed(here, ["import", "campaign", file, "--queue"])
 }

@@ -1,6 +1,5 @@
 //! `calmwalk select`
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
