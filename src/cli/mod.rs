@@ -3,7 +3,7 @@
 mod agent;
 mod calculation_runner;
 mod calm;
-pub mod campaign_location;
+mod campaign_location;
 mod clean;
 mod dashboard;
 mod estimate;
@@ -158,7 +158,7 @@ fn duration_between(
 }
 
 /// Runs a future that uses the database to its end.
-pub fn block_on<T>(future: impl Future<Output = T>) -> Result<T, Failure> {
+fn block_on<T>(future: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime =
         tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
     let output = runtime.block_on(future);

@@ -10,7 +10,7 @@ use potentials::grace::GraceModel;
 use serde_json::{Value, json};
 
 use super::calm::load;
-use super::{ExitStatus, Failure};
+use super::{ExitStatus, Failure, campaign_location};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::file_hash;
 use crate::output::{Table, count, decimals, print, print_json, print_stderr};
@@ -215,7 +215,10 @@ impl Select {
         }
         let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
         let campaigns = self.campaign.iter().zip(0..);
-        campaigns.map(|(path, number)| CampaignCandidates::open(path, number, &hash, self.declined)).collect()
+        let open = |(path, number): (&PathBuf, u32)| {
+            CampaignCandidates::open(&campaign_location::parse(path)?, number, &hash, self.declined)
+        };
+        campaigns.map(open).collect()
     }
 
     fn write(&self, files: &PoolFiles, pool: &GradedPool, picks: &[Pick]) -> Result<(), Failure> {

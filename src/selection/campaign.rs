@@ -1,7 +1,5 @@
 //! The candidates of a campaign as a pool.
 
-use std::path::Path;
-
 use serde_json::Value;
 use store::records::{Fate, StoredCandidate};
 use store::{Location, Store};
@@ -33,16 +31,15 @@ impl CampaignCandidates {
     /// Opens campaign `number` of the pool for reading. Its stored features are used if its model has the BLAKE3 hash
     /// `model_hash`.
     pub fn open(
-        location: &Path,
+        location: &Location,
         number: u32,
         model_hash: &str,
         declined_only: bool,
     ) -> Result<Self, Failure> {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
-        let location: Location = crate::cli::campaign_location::parse(location)?;
         let (store, campaign) = runtime.block_on(async {
-            let store = Store::open_read_only(&location).await?;
+            let store = Store::open_read_only(location).await?;
             let campaign = store.campaign().await?;
             Ok::<_, Failure>((store, campaign))
         })?;
