@@ -29,6 +29,7 @@ mod progress;
 mod replay;
 mod report;
 mod runtime;
+mod selection;
 mod signals;
 mod structure_files;
 mod summary;

@@ -43,6 +43,7 @@ mod relabel;
 mod replay;
 mod scheduling;
 mod schema;
+mod select;
 mod status;
 mod triage;
 mod walk_groups;

@@ -54,7 +54,8 @@ pub use file_names::{DATABASE, LOCK};
 pub use filesystem::{check_directory, free_space, network_file_system};
 pub use jobs::{
     Archive, Attempt, CalculationRecord, CompleteOutcome, FailOutcome, ImportCounts, Job, JobDetails,
-    LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, Supersession,
+    LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, QueuedImports,
+    Supersession,
 };
 pub use listing::{ListCursor, ListOrder, ListedCandidate};
 pub use location::{Location, ServerUrl};

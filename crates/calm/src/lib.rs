@@ -25,6 +25,7 @@ pub mod mixture;
 pub mod neighbourhood;
 pub mod rules;
 pub mod search;
+pub mod selection;
 pub mod soundness;
 pub mod staleness;
 mod storage;

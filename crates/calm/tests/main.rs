@@ -9,5 +9,6 @@ mod forgetting;
 mod grade;
 mod properties;
 mod rules;
+mod selection;
 mod soundness;
 mod update;

@@ -10,6 +10,7 @@ mod recalibrate;
 mod score;
 mod scorer;
 
+pub(super) use self::score::load;
 use super::{ExitStatus, Failure};
 
 /// Build, recalibrate, compare and inspect CALM mixtures and baselines; grade structures

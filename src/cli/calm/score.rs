@@ -118,7 +118,10 @@ impl Score {
 }
 
 /// The model with the features of the artifact, and the mixture that grades them.
-fn load(export: &Path, artifact: Option<&Path>) -> Result<(FeatureModel, Artifact), Failure> {
+pub(in crate::cli) fn load(
+    export: &Path,
+    artifact: Option<&Path>,
+) -> Result<(FeatureModel, Artifact), Failure> {
     let model = FeatureModel::load(export, None)?;
     let Some(path) = artifact else {
         let own = Artifact::load_export(export).map_err(Failure::input)?;

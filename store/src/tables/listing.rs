@@ -111,10 +111,11 @@ pub(crate) const SMALLEST_VOLUME: &str =
 /// Candidates of a walk, ordered by name.
 pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2");
 
-/// The index gives the jobs; only those of the page are read.
+/// The index gives the jobs; only those of the page are read. Jobs of imported structures, whose numbers are above all
+/// decisions, are left out.
 pub(crate) const QUEUE: &str = lines!(
     "FROM (SELECT number AS place FROM job WHERE state = $1 AND priority <= $2
-              AND (priority < $2 OR decision > $3) ORDER BY priority DESC, decision LIMIT $4) AS page
+              AND (priority < $2 OR decision > $3) AND decision < 1099511627776 ORDER BY priority DESC, decision LIMIT $4) AS page
         CROSS JOIN job ON job.number = place
         CROSS JOIN candidate ON candidate.decision = job.decision
         CROSS JOIN decision ON sequence = candidate.decision
