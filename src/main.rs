@@ -4,6 +4,7 @@
 
 mod all_cores;
 mod atomic_file;
+mod calm_validation;
 mod campaign;
 mod cli;
 mod config;
@@ -22,6 +23,7 @@ mod log;
 mod mixture_build;
 mod notify;
 mod output;
+mod page;
 mod process_config;
 mod progress;
 mod replay;

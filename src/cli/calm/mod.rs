@@ -7,10 +7,11 @@ mod merge;
 mod recalibrate;
 mod score;
 mod scorer;
+mod validate;
 
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare or inspect CALM mixtures, or grade structures with it
+/// Build, recalibrate, compare, inspect or test CALM mixtures, or grade structures with them
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Build(build::Build),
@@ -19,6 +20,7 @@ pub enum Calm {
     Merge(merge::Merge),
     Recalibrate(recalibrate::Recalibrate),
     Score(score::Score),
+    Validate(validate::Validate),
 }
 
 impl Calm {
@@ -30,6 +32,7 @@ impl Calm {
             Self::Merge(command) => command.run(),
             Self::Recalibrate(command) => command.run(),
             Self::Score(command) => command.run(),
+            Self::Validate(command) => command.run(),
         }
     }
 }

@@ -102,7 +102,7 @@ impl Score {
 }
 
 /// The model and the mixture that grades its features.
-fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact), Failure> {
+pub(super) fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact), Failure> {
     let export = model;
     let model = GraceModel::load(export).map_err(Failure::input)?;
     if model.projection().is_none() {

@@ -76,6 +76,15 @@ impl Facet {
     }
 }
 
+impl Slab {
+    /// Depth of each atom below the nearer surface, its outermost layer, `[n]`, Å.
+    pub fn depths(&self) -> Vec<f64> {
+        let heights = self.structure.positions.iter().map(|r| r[2]);
+        let top = heights.clone().fold(0.0, f64::max);
+        heights.map(|z| z.min(top - z)).collect()
+    }
+}
+
 /// A slab of `facet.layers(prototype)` layers and 3 × 3 surface cells with 12 Å of vacuum. `distance` of nearest neighbours in Å.
 pub fn slab(prototype: Prototype, species: Species, distance: f64, facet: Facet) -> Slab {
     const TIMES: usize = 3;
