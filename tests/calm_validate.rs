@@ -82,7 +82,7 @@ fn a_model_of_one_element_is_tested_completely() {
     let page = &files.iter().find(|(name, _)| name == "validation.html").unwrap().1;
     let page = std::str::from_utf8(page).unwrap();
     assert!(
-        page.contains("Table 1.") && page.contains("no two elements") && page.matches("<svg").count() == 4
+        page.contains("Table 1.") && page.contains("no two elements") && page.matches("<svg").count() == 5
     );
     validate(here, "al_eam_1l", "second", &quick);
     assert!(files == contents(&here.join("second")), "the same bytes");
@@ -103,8 +103,15 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
         "--pairs",
         "Ni-Al",
     ];
-    validate(here, "ni_al_h_eam_1l", "out", &only);
+    validate(here, "ni_al_h_eam_1l", "out", &[&only[..], &ensemble[..]].concat());
     let found = json(&here.join("out"));
+    // A model agrees with itself everywhere.
+    let spread = &found["scores"][1];
+    assert_eq!(
+        (&spread["name"], &spread["detection"]["at_equilibrium"]),
+        (&"energy spread".into(), &0.0.into())
+    );
+    assert_eq!(spread["detection"]["compression"], Value::Bool(false));
     let solution = &found["solutions"][0];
     assert_eq!(
         (&solution["elements"], &solution["prototype"]),
@@ -136,6 +143,9 @@ fn wrong_arguments_are_named() {
     );
     assert!(refused(&["--output", "out", "--pairs", "Al-Al"]).contains("two different elements"));
     assert!(refused(&["--output", "out", "--scan-steps", "1"]).contains("at least 2"));
+    let silicon = config("data/si_sw_1l/kokkos.npz");
+    let silicon = silicon.to_str().unwrap();
+    assert!(refused(&["--output", "out", "--ensemble", silicon]).contains("does not support Al"));
     assert!(refused(&["--output", "file"]).contains("file is no directory"));
     assert!(!here.join("out").exists());
     assert_eq!(std::fs::read_to_string(here.join("file")).unwrap(), "kept");

@@ -10,11 +10,14 @@ use super::detection::{COMPRESSION, Detection, LONGEST, detect};
 use super::{Grader, Progress, Settings, Subject, minimum};
 use crate::all_cores;
 
-/// Shortest distance of a scan, Å; half the equilibrium distance if that leaves too little compression.
+/// Shortest distance of a scan, Å; half the equilibrium distance if that leaves too little compression, but at least
+/// [`DENSEST`].
 const SHORTEST: f64 = 1.5;
+/// Atoms that are closer have thousands of neighbours, Å.
+const DENSEST: f64 = 1.0;
 /// Where the equilibrium is searched, ln(d / expected d), and grid points of the search.
 const SEARCHED: ([f64; 2], usize) = ([-0.5, 0.5], 41);
-/// The same for a prototype in the place of the element's structure, whose distance is a guess.
+/// The same for a prototype in the place of the element's structure, whose distance is a guess, at least [`SHORTEST`].
 const SEARCHED_WIDELY: ([f64; 2], usize) = ([-0.5, 1.1], 65);
 
 /// A scan of one prototype.
@@ -24,10 +27,10 @@ pub struct BondScan {
     pub element: String,
     /// The crystal.
     pub prototype: String,
-    /// Whether this is the element's ground state, or the prototype in its place; only these decide on detection. The others show
-    /// the grade of a crystal that the element does not form.
+    /// Whether this is the element's ground state, or the prototype in its place; the others show the grade of a
+    /// crystal that the element does not form.
     pub is_ground_state: bool,
-    /// Whether the element really forms this crystal.
+    /// Whether the element really forms this crystal; only these decide on detection.
     pub is_own: bool,
     /// Atoms of the supercell.
     pub atoms: usize,
@@ -35,6 +38,8 @@ pub struct BondScan {
     pub equilibrium: f64,
     /// Whether it is the model's; otherwise the model has no minimum near the published distance, which is given.
     pub is_relaxed: bool,
+    /// Energy per atom at that distance, eV; `None` if it is not finite.
+    pub energy: Option<f64>,
     /// The scan.
     pub points: Vec<ScanPoint>,
     /// What each score tells.
@@ -94,15 +99,16 @@ fn scan(
 ) -> BondScan {
     let prototype = expected.prototype;
     let (range, grid) = if expected.is_own { SEARCHED } else { SEARCHED_WIDELY };
-    let relaxed = minimum::nearest(expected.distance, range, grid, |distance| {
+    let guess = if expected.is_own { expected.distance } else { expected.distance.max(SHORTEST) };
+    let relaxed = minimum::nearest(guess, range, grid, |distance| {
         let is_stopped = progress.is_stopped();
         if is_stopped { None } else { grader.energy(&prototype.structure(species, distance)) }
     });
-    let equilibrium = relaxed.unwrap_or(expected.distance);
+    let equilibrium = relaxed.unwrap_or(guess);
     let enough = 0.9 * COMPRESSION * equilibrium;
-    let shortest = if enough < SHORTEST { 0.5 * equilibrium } else { SHORTEST };
-    let cell = prototype.structure(species, shortest);
-    // Opposite faces are at least as far apart as the cutoff, and so are all lattice points.
+    let shortest = if enough < SHORTEST { DENSEST.max(0.5 * equilibrium) } else { SHORTEST };
+    // At equilibrium, opposite faces are at least a cutoff apart.
+    let cell = prototype.structure(species, equilibrium);
     let repetition = Repetition::for_size(&cell, 1, subject.model.cutoff());
     let steps = settings.scan_steps;
     let distance = |k: usize| shortest + (LONGEST - shortest) * k as f64 / (steps - 1) as f64;
@@ -110,12 +116,14 @@ fn scan(
     let points: Vec<_> = (0..steps)
         .map(distance)
         .take_while(|_| !progress.is_stopped())
-        .map(|distance| ScanPoint::new(grader, &scaled(&cell, distance / shortest), distance, subject))
+        .map(|distance| ScanPoint::new(grader, &scaled(&cell, distance / equilibrium), distance, subject))
         .collect();
+    let at_equilibrium =
+        ScanPoint::new(grader, &prototype.structure(species, equilibrium), equilibrium, subject);
     let rules = subject.scores().into_iter().map(|(_, rule)| rule).enumerate();
     let detection = rules.map(|(k, rule)| {
         let scores: Vec<_> = points.iter().map(|point| (point.distance, point.scores[k])).collect();
-        detect(&scores, equilibrium, rule)
+        detect(&scores, equilibrium, at_equilibrium.scores[k], rule)
     });
     BondScan {
         element: species.to_string(),
@@ -125,6 +133,7 @@ fn scan(
         atoms: cell.len(),
         equilibrium,
         is_relaxed: relaxed.is_some(),
+        energy: at_equilibrium.energy,
         detection: detection.collect(),
         points,
     }

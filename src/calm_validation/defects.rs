@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use atoms::cell::{norm, sub};
 use atoms::prototypes::{Facet, Prototype, grain_boundary, slab, vacancy};
-use atoms::{Species, Structure};
+use atoms::{Species, Structure, Vec3};
 use serde::Serialize;
 
 use super::grader::Graded;
@@ -25,7 +25,7 @@ pub struct Defect {
     pub kind: DefectKind,
     /// Its name: the facet of a surface.
     pub name: &'static str,
-    /// The relaxation of its positions, if there was one.
+    /// The relaxation of its positions; `None` if positions are ideal, because nothing else was asked for or atoms collapse.
     pub relaxation: Option<Relaxation>,
     /// Scores of the perfect crystal, as [`Shell::scores`].
     pub crystal: Vec<f64>,
@@ -33,6 +33,8 @@ pub struct Defect {
     pub shells: Vec<Shell>,
     /// Why it has no scores.
     pub error: Option<String>,
+    /// Where the missing atom of a vacancy was, Å.
+    pub centre: Option<Vec3>,
     /// The graded structure, with γ and γ_nbr of its atoms.
     #[serde(skip)]
     pub graded: Option<(Structure, Vec<f64>, Vec<f64>)>,
@@ -76,6 +78,7 @@ pub struct Shell {
 /// A defect to be built.
 type Task = (Species, Prototype, f64, DefectKind, Option<Facet>);
 
+/// The defects of the crystals that elements really form.
 fn tasks(settings: &Settings, distance: impl Fn(Species) -> f64) -> Vec<Task> {
     let of = |species: &Species| {
         let (species, prototype) = (*species, species.ground_state().prototype);
@@ -86,7 +89,7 @@ fn tasks(settings: &Settings, distance: impl Fn(Species) -> f64) -> Vec<Task> {
         let all = [(DefectKind::Vacancy, None)].into_iter().chain(facets).chain(boundary);
         all.map(move |(kind, facet)| (species, prototype, d, kind, facet))
     };
-    settings.elements.iter().flat_map(of).collect()
+    settings.elements.iter().filter(|species| species.ground_state().is_own).flat_map(of).collect()
 }
 
 /// Number of defects.
@@ -120,8 +123,14 @@ impl Defect {
         progress: &Progress,
         (species, prototype, distance, kind, facet): Task,
     ) -> Self {
-        let (ideal, distances) = ideal(species, prototype, distance, kind, facet);
-        let (structure, relaxation) = relaxed(grader, settings, progress, &ideal);
+        let (ideal, distances, centre) = ideal(species, prototype, distance, kind, facet);
+        let (mut structure, mut relaxation) = relaxed(grader, settings, progress, &ideal);
+        let mut graded = grader.grade(&structure);
+        if graded.is_err() && relaxation.is_some() {
+            // The model lets atoms collapse.
+            (structure, relaxation) = (ideal, None);
+            graded = grader.grade(&structure);
+        }
         let crystal = grader.grade(&prototype.structure(species, distance));
         let mut defect = Self {
             element: species.to_string(),
@@ -132,9 +141,10 @@ impl Defect {
             crystal: crystal.map_or(Vec::new(), |graded| graded.scores.iter().map(|of| of[0]).collect()),
             shells: Vec::new(),
             error: None,
+            centre,
             graded: None,
         };
-        match grader.grade(&structure) {
+        match graded {
             Ok(graded) => {
                 defect.shells = shells(&distances, &graded);
                 let [gamma, averages] = [graded.scores, graded.averages].map(|mut of| of.swap_remove(0));
@@ -157,29 +167,29 @@ impl DefectKind {
     }
 }
 
-/// The unrelaxed structure, and the distance of its atoms to the defect, Å.
+/// The unrelaxed structure, the distance of its atoms to the defect and the centre of a vacancy, Å.
 fn ideal(
     species: Species,
     prototype: Prototype,
     distance: f64,
     kind: DefectKind,
     facet: Option<Facet>,
-) -> (Structure, Vec<f64>) {
+) -> (Structure, Vec<f64>, Option<Vec3>) {
     if let Some(facet) = facet {
         let slab = slab(prototype, species, distance, facet);
         let depths = slab.depths();
-        return (slab.structure, depths);
+        return (slab.structure, depths, None);
     }
     let boundary = || grain_boundary(prototype, species, distance);
     match Some(kind).filter(|kind| *kind == DefectKind::GrainBoundary).and_then(|_| boundary()) {
         Some(found) => {
             let distances = found.distances();
-            (found.structure, distances)
+            (found.structure, distances, None)
         }
         None => {
             let found = vacancy(prototype, species, distance);
             let distances = found.distances();
-            (found.structure, distances)
+            (found.structure, distances, Some(found.centre))
         }
     }
 }
@@ -240,7 +250,7 @@ mod tests {
 
     #[test]
     fn every_crystal_has_its_defects() {
-        let elements = ["Al", "W", "Si", "Ti"].map(|symbol| symbol.parse().unwrap()).to_vec();
+        let elements = ["Al", "W", "Si", "H", "Ti"].map(|symbol| symbol.parse().unwrap()).to_vec();
         let settings = Settings {
             elements,
             pairs: Vec::new(),
@@ -251,7 +261,7 @@ mod tests {
         };
         assert_eq!(count(&settings), 5 + 5 + 4 + 2);
         for (species, prototype, distance, kind, facet) in tasks(&settings, |_| 2.5) {
-            let (structure, distances) = ideal(species, prototype, distance, kind, facet);
+            let (structure, distances, _) = ideal(species, prototype, distance, kind, facet);
             assert_eq!(structure.len(), distances.len());
             let nearest = distances.iter().copied().fold(f64::INFINITY, f64::min);
             let expected = if kind == DefectKind::Vacancy { 2.5 } else { 0.0 };

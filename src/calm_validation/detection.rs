@@ -30,18 +30,26 @@ pub struct Detection {
     pub compression: Option<bool>,
     /// Stretching is detected.
     pub stretching: Option<bool>,
-    /// Nothing is detected within 5 % of equilibrium.
+    /// The crystal at equilibrium is not detected.
     pub interpolation: Option<bool>,
     /// The largest value under compression.
     pub largest_in_compression: Option<f64>,
     /// The largest value under stretching.
     pub largest_in_stretching: Option<f64>,
+    /// The value at equilibrium.
+    pub at_equilibrium: Option<f64>,
     /// The median within 5 % of equilibrium.
     pub median_near_equilibrium: Option<f64>,
 }
 
-/// Applies the rule to a scan of distances, Å, and scores. `None` where a structure could not be scored.
-pub fn detect(scan: &[(f64, Option<f64>)], equilibrium: f64, rule: Option<Rule>) -> Detection {
+/// Applies the rule to a scan of distances, Å, and scores. `at_equilibrium` is the score there. `None` where a structure could not be
+/// scored.
+pub fn detect(
+    scan: &[(f64, Option<f64>)],
+    equilibrium: f64,
+    at_equilibrium: Option<f64>,
+    rule: Option<Rule>,
+) -> Detection {
     let within = |is_inside: &dyn Fn(f64) -> bool| -> Vec<f64> {
         scan.iter().filter(|(d, _)| is_inside(*d)).filter_map(|(_, score)| *score).collect()
     };
@@ -60,18 +68,22 @@ pub fn detect(scan: &[(f64, Option<f64>)], equilibrium: f64, rule: Option<Rule>)
     Detection {
         compression: is_above(compressed),
         stretching: is_above(stretched),
-        interpolation: is_above(largest(&near)).map(|above| !above),
+        interpolation: is_above(at_equilibrium).map(|above| !above),
         largest_in_compression: compressed,
         largest_in_stretching: stretched,
+        at_equilibrium,
         median_near_equilibrium: median,
     }
 }
 
-/// Detection in the scans of all ground states: yes only if it is yes in every scan that has the regime. The values are the smallest
-/// of the largest, and the largest median.
+/// Detection in the scans of all ground states, without crystals that stand in: yes only if it is yes in every scan that has the regime. The values are the smallest
+/// of the largest, and the others the largest.
 pub fn of_all(scans: &[BondScan], score: usize) -> Detection {
-    let all: Vec<_> =
-        scans.iter().filter(|scan| scan.is_ground_state).map(|scan| scan.detection[score]).collect();
+    let all: Vec<_> = scans
+        .iter()
+        .filter(|scan| scan.is_ground_state && scan.is_own)
+        .map(|scan| scan.detection[score])
+        .collect();
     let every = |of: fn(&Detection) -> Option<bool>| all.iter().filter_map(of).reduce(|a, b| a && b);
     let extreme =
         |of: fn(&Detection) -> Option<f64>, pick: fn(f64, f64) -> f64| all.iter().filter_map(of).reduce(pick);
@@ -81,6 +93,7 @@ pub fn of_all(scans: &[BondScan], score: usize) -> Detection {
         interpolation: every(|found| found.interpolation),
         largest_in_compression: extreme(|found| found.largest_in_compression, f64::min),
         largest_in_stretching: extreme(|found| found.largest_in_stretching, f64::min),
+        at_equilibrium: extreme(|found| found.at_equilibrium, f64::max),
         median_near_equilibrium: extreme(|found| found.median_near_equilibrium, f64::max),
     }
 }
@@ -95,7 +108,7 @@ mod tests {
     }
 
     fn verdicts(score: impl Fn(f64) -> Option<f64>, rule: Rule) -> [Option<bool>; 3] {
-        let found = detect(&scan(score), 2.5, Some(rule));
+        let found = detect(&scan(&score), 2.5, score(2.5), Some(rule));
         [found.compression, found.interpolation, found.stretching]
     }
 
@@ -126,13 +139,13 @@ mod tests {
 
     #[test]
     fn what_is_not_in_the_scan_is_unknown() {
-        let found = detect(&scan(|_| Some(2.0)), 1.6, Some(Rule::Threshold(1.0)));
+        let found = detect(&scan(|_| Some(2.0)), 1.6, None, Some(Rule::Threshold(1.0)));
         assert_eq!((found.compression, found.stretching), (None, Some(true)));
-        let found = detect(&scan(|_| Some(2.0)), 5.0, Some(Rule::Threshold(1.0)));
+        let found = detect(&scan(|_| Some(2.0)), 5.0, None, Some(Rule::Threshold(1.0)));
         assert_eq!((found.compression, found.stretching), (Some(true), None));
-        let found = detect(&scan(|d| (d > 2.0).then_some(2.0)), 2.5, Some(Rule::Threshold(1.0)));
+        let found = detect(&scan(|d| (d > 2.0).then_some(2.0)), 2.5, None, Some(Rule::Threshold(1.0)));
         assert_eq!((found.compression, found.largest_in_compression), (None, None));
-        let found = detect(&scan(|_| Some(2.0)), 2.5, None);
+        let found = detect(&scan(|_| Some(2.0)), 2.5, None, None);
         assert_eq!((found.compression, found.largest_in_compression), (None, Some(2.0)));
     }
 }

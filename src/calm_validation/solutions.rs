@@ -106,7 +106,7 @@ pub fn run(
         },
     );
     let mut graded = graded.into_iter();
-    let solution = |pair: &[Species; 2]| {
+    let solution = |pair: &[Species; 2]| -> Result<Solution, Failure> {
         let of_pair: Vec<_> = graded.by_ref().take(COMPOSITIONS).collect::<Result<_, _>>()?;
         let (compositions, atoms): (Vec<_>, Vec<_>) = of_pair.into_iter().unzip();
         let (prototype, _, shell) = lattice(*pair);

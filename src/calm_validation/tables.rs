@@ -32,8 +32,8 @@ pub fn both(detection: &Detection) -> String {
 }
 
 fn detection(validation: &Validation) -> Table {
-    let caption = "Whether each score detects compression and stretching in the bond scans of all elements, and calls nothing within \
-                   5 % of equilibrium an extrapolation. The largest value of each regime is that of the element where it is smallest.";
+    let caption = "Whether each score detects compression and stretching in the bond scans of all elements, but not \
+                   the crystals at equilibrium. The largest value of each regime is that of the element where it is smallest.";
     let titles = [
         "score",
         "detected when",
@@ -41,7 +41,7 @@ fn detection(validation: &Validation) -> Table {
         "equilibrium inside",
         "largest, compressed",
         "largest, stretched",
-        "largest median at equilibrium",
+        "largest at equilibrium",
     ];
     let mut table = Table::new("detection", caption, &titles).whole();
     for score in &validation.scores {
@@ -57,7 +57,7 @@ fn detection(validation: &Validation) -> Table {
             text(verdict(found.interpolation)),
             significant(found.largest_in_compression),
             significant(found.largest_in_stretching),
-            significant(found.median_near_equilibrium),
+            significant(found.at_equilibrium),
         ]);
     }
     table
@@ -77,7 +77,7 @@ fn significant(x: Option<f64>) -> Cell {
 
 fn bond_scans(validation: &Validation) -> Table {
     let caption = "Bond scans. The equilibrium distance is that of the model’s lowest energy near the published one, unless it has none \
-                   there. Only ground states count for detection.";
+                   there. Only ground states count for detection, and no crystals that stand in.";
     let titles = [
         "element",
         "crystal",
@@ -87,7 +87,7 @@ fn bond_scans(validation: &Validation) -> Table {
         "score",
         "compression/stretching",
         "largest, compressed",
-        "median at d_{eq}",
+        "at d_{eq}",
         "largest, stretched",
     ];
     let mut table = Table::new("bond-scans", caption, &titles);
@@ -107,7 +107,7 @@ fn bond_scans(validation: &Validation) -> Table {
                 text(&*score.name),
                 text(both(found)),
                 significant(found.largest_in_compression),
-                significant(found.median_near_equilibrium),
+                significant(found.at_equilibrium),
                 significant(found.largest_in_stretching),
             ]);
         }

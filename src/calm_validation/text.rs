@@ -52,6 +52,7 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::Table]) -> Ve
                 figure("vacancies"),
                 figure("surfaces"),
                 figure("grain-boundaries"),
+                figure("structures"),
                 table("defects"),
             ]),
         ),

@@ -1,14 +1,16 @@
 //! Energy and scores along bond scans (the paper's Figs. 3a, S1 and S10).
 
-use figures::{Anchor, Axis, Colour, Figure, LegendKey, Panel, Rectangle, Scale};
+use figures::{Axis, Colour, Figure, LegendKey, Panel, Rectangle, Scale};
 
 use super::super::detection::{COMPRESSION, LONGEST, Rule, STRETCHING};
 use super::super::{BondScan, Validation};
-use super::layout::{Grid, legend_height, legend_rows, letter, line};
+use super::layout::{Grid, axis, legend_height, legend_rows, letter, line, panel_name};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
-use crate::page::style::{WIDTH, axis};
+use crate::page::style::WIDTH;
 
+/// Largest energy per atom that is drawn, eV.
+const MAX_ENERGY: f64 = 12.0;
 /// Height of the panel of energies and the gap below it, points.
 const ENERGIES: f64 = 44.0;
 const GAP: f64 = 6.0;
@@ -56,18 +58,16 @@ fn distances(title: &str, scan: &BondScan) -> Axis {
 
 fn draw_energies(figure: &mut Figure, scan: &BondScan, place: Rectangle, letter: char) {
     let energies: Vec<_> = scan.points.iter().filter_map(|p| Some([p.distance, p.energy?])).collect();
-    let lowest = energies.iter().filter(|[d, _]| *d > COMPRESSION * scan.equilibrium).map(|[_, e]| *e);
-    let lowest = lowest.fold(f64::INFINITY, f64::min);
-    let depth = energies.last().map_or(1.0, |[_, last]| (last - lowest).max(0.1));
-    let y = Axis::new("ΔE (eV)", Scale::Linear, -0.15 * depth, 1.4 * depth).with_ticks(2);
+    let lowest = scan.energy.unwrap_or(0.0);
+    let stretched = energies.iter().filter(|[d, _]| *d > scan.equilibrium).map(|[_, energy]| energy - lowest);
+    let depth = stretched.fold(0.1, f64::max).min(MAX_ENERGY);
+    let y = Axis::new("ΔE (eV)", Scale::Linear, -0.15 * depth, 1.25 * depth).with_ticks(3);
     let mut panel = Panel::new(place, distances("", scan).without_ticks(), y);
     panel.vertical_line(scan.equilibrium);
     panel.line(energies.iter().map(|[d, energy]| [*d, energy - lowest]), Colour::INK.line(1.0));
     panel.panel_letter(letter);
-    let name = format!("{}, {}", scan.element, scan.prototype);
-    let corner = [panel.x.high, panel.y.high];
-    panel.text(corner, [-5.0, 11.0], &name, Anchor::End).bold = true;
     panel.draw(figure);
+    panel_name(figure, place, &scan.element, &scan.prototype);
 }
 
 /// What the scores of a scan are divided by, so that 1 is the limit of detection.
@@ -78,10 +78,14 @@ fn limit(validation: &Validation, scan: &BondScan, score: usize) -> Option<f64> 
     }
 }
 
+/// The largest values of a score along a scan, with that at equilibrium, divided by `limit`.
 fn points(scan: &BondScan, score: usize, limit: f64) -> Vec<[f64; 2]> {
-    let point =
-        |point: &super::super::bond_scans::ScanPoint| Some([point.distance, point.scores[score]? / limit]);
-    scan.points.iter().filter_map(point).filter(|[_, y]| y.is_finite() && *y > 0.0).collect()
+    let of_scan = scan.points.iter().map(|point| (point.distance, point.scores[score]));
+    let all = of_scan.chain([(scan.equilibrium, scan.detection[score].at_equilibrium)]);
+    let mut points: Vec<_> = all.filter_map(|(distance, score)| Some([distance, score? / limit])).collect();
+    points.retain(|[_, y]| y.is_finite() && *y > 0.0);
+    points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    points
 }
 
 fn draw_scores(
@@ -97,14 +101,9 @@ fn draw_scores(
         others.iter().map(|other| (Colour::GREY.dashed(1.2), points(other, 0, 1.0))).collect();
     let own: Vec<_> = drawn.collect();
     lines.extend(own.into_iter().rev());
-    let values: Vec<_> = lines.iter().flat_map(|(_, points)| points.iter().map(|[_, y]| *y)).collect();
+    let values = lines.iter().flat_map(|(_, points)| points.iter().map(|[_, y]| *y));
     let x = distances("nearest-neighbour distance (Å)", scan);
-    let y = axis(
-        if validation.scores.len() == 1 { "γ" } else { "score" },
-        Scale::Logarithmic,
-        &values,
-        Some(1.0),
-    );
+    let y = axis(if validation.scores.len() == 1 { "γ" } else { "score" }, values);
     let (first, shade) = (x.low, Colour::GREY.faint(0.1));
     let mut panel = Panel::new(place, x, y);
     let (low, high) = (panel.y.low, panel.y.high);
@@ -162,8 +161,8 @@ fn caption(validation: &Validation) -> String {
         }
     };
     format!(
-        "Energy per atom relative to the lowest (above) and largest score of an atom (below) of the elements’ ground-state crystals, scaled \
-         over {} distances of nearest neighbours. Dotted, the distance with the lowest energy; dashed, the limit 1. Shaded, compression \
+        "Energy per atom relative to that at equilibrium (above) and largest score of an atom (below) of the elements’ ground-state crystals, scaled \
+         over {} distances of nearest neighbours. Dashed, the distance with the lowest energy and the limit 1. Shaded, compression \
          (d < {COMPRESSION} d_{{eq}}) and stretching ({STRETCHING} d_{{eq}} < d < {LONGEST} Å), which a grade should flag.{relative}{without}{guessed}{stand_in}",
         validation.settings.scan_steps
     )

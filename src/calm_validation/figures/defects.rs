@@ -1,13 +1,13 @@
 //! γ and γ_nbr by the distance to a defect (the paper's Figs. 3b–d and S8).
 
-use figures::{Anchor, Axis, Colour, Figure, LegendKey, Marker, Panel, Rectangle, Scale, Stroke};
+use figures::{Axis, Colour, Figure, LegendKey, Marker, Panel, Rectangle, Scale, Stroke};
 
 use super::super::defects::{DefectKind, Shell};
 use super::super::{Defect, Validation};
-use super::layout::{Grid, legend_height, legend_rows, letter, line};
+use super::layout::{Grid, axis, legend_height, legend_rows, letter, line, panel_name};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
-use crate::page::style::{WIDTH, axis};
+use crate::page::style::WIDTH;
 
 pub fn draw(validation: &Validation, name: &'static str, kind: DefectKind) -> Result<FigureContent, String> {
     let all: Vec<_> = validation.defects.iter().filter(|defect| defect.kind == kind).collect();
@@ -62,8 +62,7 @@ fn place(name: &str) -> usize {
 
 fn draw_panel(figure: &mut Figure, kind: DefectKind, defects: &[&Defect], place: Rectangle, letter: char) {
     let shells = || defects.iter().flat_map(|defect| &defect.shells);
-    let values: Vec<_> =
-        shells().flat_map(|shell| [shell.scores[0], shell.largest[0], shell.averages[0]]).collect();
+    let values = shells().flat_map(|shell| [shell.scores[0], shell.largest[0], shell.averages[0]]);
     let farthest = shells().map(|shell| shell.distance).fold(0.0, f64::max);
     let title = match kind {
         DefectKind::Vacancy => "distance to the vacancy (Å)",
@@ -71,7 +70,7 @@ fn draw_panel(figure: &mut Figure, kind: DefectKind, defects: &[&Defect], place:
         DefectKind::GrainBoundary => "distance to the boundary (Å)",
     };
     let x = Axis::new(title, Scale::Linear, -0.02 * farthest, 1.02 * farthest);
-    let mut panel = Panel::new(place, x, axis("γ", Scale::Logarithmic, &values, Some(1.0)));
+    let mut panel = Panel::new(place, x, axis("γ", values));
     let (low, high) = (panel.x.low, panel.x.high);
     panel.line([[low, 1.0], [high, 1.0]], Colour::GREY.dashed(0.7));
     if let Some(crystal) = defects.iter().find_map(|defect| defect.crystal.first()) {
@@ -86,11 +85,9 @@ fn draw_panel(figure: &mut Figure, kind: DefectKind, defects: &[&Defect], place:
         panel.line(points(|shell| shell.scores[0]), solid);
         panel.dots(points(|shell| shell.scores[0]), Marker::Disc, 1.6, solid.paint, None);
     }
-    let name = format!("{}, {}", defects[0].element, defects[0].prototype);
-    let corner = [panel.x.high, panel.y.high];
-    panel.text(corner, [-5.0, 11.0], &name, Anchor::End).bold = true;
     panel.panel_letter(letter);
     panel.draw(figure);
+    panel_name(figure, place, &defects[0].element, &defects[0].prototype);
 }
 
 fn caption(kind: DefectKind, defects: &[&Defect]) -> String {

@@ -1,6 +1,6 @@
 //! Places of panels, and how scores look.
 
-use figures::{Colour, Figure, LegendKey, Rectangle, Stroke, Text, legend, width};
+use figures::{Anchor, Axis, Colour, Figure, LegendKey, Rectangle, Scale, Stroke, Text, legend, width};
 
 use crate::page::style::WIDTH;
 
@@ -46,9 +46,22 @@ impl Grid {
     }
 }
 
+/// A logarithmic axis over all positive values and 1.
+pub fn axis(title: &str, values: impl IntoIterator<Item = f64>) -> Axis {
+    let usable = values.into_iter().filter(|x| x.is_finite() && *x > 0.0);
+    let (low, high) = usable.fold((1.0, 1.0), |(low, high): (f64, f64), x| (low.min(x), high.max(x)));
+    let margin = (high / low).powf(0.05).max(1.1);
+    Axis::new(title, Scale::Logarithmic, low / margin, high * margin)
+}
+
 /// Letter of panel `k`: a to z, then none.
 pub fn letter(k: usize) -> char {
     u8::try_from(k).ok().filter(|k| *k < 26).map_or(' ', |k| char::from(b'a' + k))
+}
+
+/// Writes element and crystal above a panel, behind its letter.
+pub fn panel_name(figure: &mut Figure, place: Rectangle, element: &str, prototype: &str) {
+    figure.text([place.x - 8.0, place.y - 6.0], &format!("{element}, {prototype}"), Anchor::Start);
 }
 
 /// The line of score `k`, γ first. The colours are those of Okabe and Ito (2008).

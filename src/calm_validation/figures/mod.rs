@@ -4,6 +4,7 @@ mod bond_scans;
 mod defects;
 mod layout;
 mod solutions;
+mod structures;
 
 use super::Validation;
 use super::defects::DefectKind;
@@ -18,6 +19,7 @@ pub fn all(validation: &Validation) -> Vec<FigureEntry> {
         part("vacancies", "Vacancies", defects("vacancies", DefectKind::Vacancy)),
         part("surfaces", "Surfaces", defects("surfaces", DefectKind::Surface)),
         part("grain-boundaries", "Grain boundaries", defects("grain-boundaries", DefectKind::GrainBoundary)),
+        part("structures", "Atoms at defects", structures::draw(validation)),
         part("solutions", "Solid solutions", solutions::draw(validation)),
     ]
 }

@@ -4,10 +4,10 @@ use figures::{Axis, Colour, Figure, LegendKey, Marker, Panel, Scale};
 
 use super::super::solutions::{Composition, FirstShell};
 use super::super::{Solution, Validation};
-use super::layout::{Grid, legend_rows, letter, line};
+use super::layout::{Grid, axis, legend_rows, letter, line};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
-use crate::page::style::{WIDTH, axis};
+use crate::page::style::WIDTH;
 
 /// Groups of fewer atoms are not drawn.
 const MIN_ATOMS: usize = 10;
@@ -46,9 +46,8 @@ fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &Grid, first: u
     };
     let share = format!("{b} in {a}–{b} (%)");
     let [gamma, average] = [curve(|of| of.scores[0]), curve(|of| of.averages[0])];
-    let values: Vec<_> = gamma.iter().chain(&average).map(|[_, y]| *y).collect();
-    let mut panel =
-        Panel::new(grid.place(first), shares(&share), axis("mean γ", Scale::Logarithmic, &values, Some(1.0)));
+    let values = gamma.iter().chain(&average).map(|[_, y]| *y);
+    let mut panel = Panel::new(grid.place(first), shares(&share), axis("mean γ", values));
     panel.line([[0.0, 1.0], [100.0, 1.0]], Colour::GREY.dashed(0.7));
     panel.line(average, Colour::VERMILLION.dashed(1.2));
     panel.line(gamma.clone(), line(0));
@@ -71,8 +70,8 @@ fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &Grid, first: u
         solution.first_shells.iter().filter(is_shown).map(point).collect()
     };
     let [of_a, of_b] = [groups(a), groups(b)];
-    let values: Vec<_> = of_a.iter().chain(&of_b).map(|[_, y]| *y).collect();
-    let y = axis("mean γ", Scale::Logarithmic, &values, Some(1.0));
+    let values = of_a.iter().chain(&of_b).map(|[_, y]| *y);
+    let y = axis("mean γ", values);
     let mut panel = Panel::new(grid.place(first + 2), shares(&format!("{b} in the first shell (%)")), y);
     panel.line([[0.0, 1.0], [100.0, 1.0]], Colour::GREY.dashed(0.7));
     for (points, marker, colour) in [(of_a, Marker::Disc, Colour::BLUE), (of_b, Marker::Square, Colour::INK)]

@@ -10,7 +10,9 @@ use md::Fire;
 use potentials::grace::GraceModel;
 
 use super::score::load;
-use crate::calm_validation::{self, PAGE, Progress, Settings, Subject, Validation, both, verdict};
+use crate::calm_validation::{
+    self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, verdict,
+};
 use crate::cli::{ExitStatus, Failure};
 use crate::output::{self, Bar, Table, decimals, print, print_stderr};
 use crate::page::{create_directory, write_files};
@@ -37,6 +39,10 @@ pub struct Validate {
     /// CALM artifact (gmm_artifacts.npz) [default: mixture in the model file]
     #[arg(long, value_name = "CALM.npz")]
     artifact: Option<PathBuf>,
+    /// Another model of the same elements, trained independently; may be repeated. The spread of the energies of all models is compared
+    /// with γ
+    #[arg(long, value_name = "MODEL.npz")]
+    ensemble: Vec<PathBuf>,
     /// Directory for the files, created if it does not exist; files of an earlier validation are replaced
     #[arg(long, short, value_name = "DIR")]
     output: PathBuf,
@@ -64,11 +70,12 @@ impl Validate {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
         let settings = self.settings(&model)?;
+        let (model, mixture) = (Arc::new(model), Arc::new(artifact.mixture));
+        let others = self.ensemble(&model)?.into_iter().collect();
         // Fail before the long computation.
         create_directory(&self.output)?;
         let progress = Progress::new(Bar::new(Some(1), BAR), stop_token()?);
-        let (model, mixture) = (Arc::new(model), Arc::new(artifact.mixture));
-        let subject = Subject { model, mixture, others: Arc::new([]) };
+        let subject = Subject { model, mixture, others };
         let Some(validation) = calm_validation::run(&subject, settings, &progress)? else {
             print_stderr("stopped; nothing was written");
             return Ok(ExitStatus::Interrupted);
@@ -85,6 +92,21 @@ impl Validate {
             writeln!(out, "\nwrote {} and {others} in the same directory", page.display())
         })?;
         Ok(ExitStatus::Done)
+    }
+
+    /// The spread of the energies, if there are further models.
+    fn ensemble(&self, model: &Arc<GraceModel>) -> Result<Option<Box<dyn Score>>, Failure> {
+        let mut models = vec![Arc::clone(model)];
+        for path in &self.ensemble {
+            let other = GraceModel::load(path).map_err(Failure::input)?;
+            if let Some(missing) = model.elements().iter().find(|species| !other.elements().contains(species))
+            {
+                let message = format!("{}: does not support {missing}, as the model does", path.display());
+                return Err(Failure::Input(message));
+            }
+            models.push(Arc::new(other));
+        }
+        Ok((models.len() > 1).then(|| Box::new(EnergySpread::new(models)) as Box<dyn Score>))
     }
 
     fn settings(&self, model: &GraceModel) -> Result<Settings, Failure> {
@@ -164,8 +186,7 @@ fn bond_scans(validation: &Validation) -> Table {
     for (names, score, found) in rows.chain(totals) {
         let mut row = names.to_vec();
         row.extend([score.name.clone(), both(found), verdict(found.interpolation).to_owned()]);
-        let values =
-            [found.largest_in_compression, found.median_near_equilibrium, found.largest_in_stretching];
+        let values = [found.largest_in_compression, found.at_equilibrium, found.largest_in_stretching];
         row.extend(values.map(|value| decimals(value, 2)));
         table.push(row);
     }
