@@ -92,6 +92,8 @@ fn a_model_of_one_element_is_tested_completely() {
 fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
+    let model = config("data/ni_al_h_eam_1l/kokkos.npz");
+    let ensemble = ["--ensemble", model.to_str().unwrap()];
     let only = [
         "--elements",
         "Ni",
