@@ -4,6 +4,7 @@
 
 mod all_cores;
 mod atomic_file;
+mod calm_validation;
 mod campaign;
 mod cli;
 mod config;
@@ -24,6 +25,7 @@ mod mixture_build;
 mod nearest_name;
 mod notify;
 mod output;
+mod page;
 mod process_config;
 mod progress;
 mod replay;

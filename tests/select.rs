@@ -114,7 +114,7 @@ fn several_strategies_pick_from_what_is_left() {
         "random-all:3",
     ];
     assert_eq!(select(here, &[&["pool.extxyz"], &same[..]].concat()), found);
-    let other = select(here, &[&["pool.extxyz", "--seed", "1", "--strategy"], &parts[..]].concat());
+    let other = select(here, &[&["pool.extxyz", "--rng-seed", "1", "--strategy"], &parts[..]].concat());
     assert_ne!(other["picks"], found["picks"]);
     // With a window, what is above is not seen.
     let within = select(here, &["pool.extxyz", "--gamma-max", "1.5", "--gamma-min", "1.1", "-n", "1"]);

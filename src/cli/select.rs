@@ -82,7 +82,7 @@ pub struct Select {
     no_element_floors: bool,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 42)]
-    seed: u64,
+    rng_seed: u64,
     /// Threads [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
@@ -133,7 +133,7 @@ impl Select {
         };
         let Some(graded) = grading.run(&mut pool)? else { return interrupted() };
         let floor = self.floor(&parts, mixture.dimension());
-        let rules = Rules { parts, update_target: target, floor, seed: self.seed };
+        let rules = Rules { parts, update_target: target, floor, seed: self.rng_seed };
         let Some(picks) = pick(&graded, &mixture, &rules, &grading.stop)? else { return interrupted() };
         self.write(&pool, &graded, &picks.picks)?;
         let report = Report {

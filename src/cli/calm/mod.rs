@@ -9,11 +9,12 @@ mod other_scores;
 mod recalibrate;
 mod score;
 mod scorer;
+mod validate;
 
 pub(super) use self::score::load;
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare and inspect CALM mixtures and baselines; grade structures
+/// Build, recalibrate, compare, inspect and test CALM mixtures and baselines; grade structures
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Baseline(baseline::Baseline),
@@ -23,6 +24,7 @@ pub enum Calm {
     Merge(merge::Merge),
     Recalibrate(recalibrate::Recalibrate),
     Score(score::Score),
+    Validate(validate::Validate),
 }
 
 impl Calm {
@@ -35,6 +37,7 @@ impl Calm {
             Self::Merge(command) => command.run(),
             Self::Recalibrate(command) => command.run(),
             Self::Score(command) => command.run(),
+            Self::Validate(command) => command.run(),
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use atoms::{Evaluation, Structure};
-use calm::neighbourhood::{Pair, PairError};
+use calm::neighbourhood::PairError;
 use calm::{GradeError, Grades, Mixture, neighbourhood_average};
 use potentials::grace::{GraceModel, PullBack};
 
@@ -70,25 +70,11 @@ impl Scorer {
         self.cotangent.resize(features.len(), 0.0);
         let cotangent = gradient.then_some(self.cotangent.as_mut_slice());
         self.grades.evaluate(&self.mixture, &elements, features, cotangent)?;
-        self.pairs = self.bonds(structure, &elements);
+        self.pairs = self.features.pairs(structure, &elements);
         self.elements = elements;
         self.gamma_nbr = neighbourhood_average(&self.grades.gamma, self.pairs.iter().copied())?;
         let cotangent = gradient.then_some(self.cotangent.as_slice());
         self.features.grace.backward(cotangent, &mut self.evaluation, &mut self.pull_back);
         Ok(())
-    }
-
-    /// Directed bonds within the pair cutoffs.
-    fn bonds(&self, structure: &Structure, elements: &[usize]) -> Vec<Pair> {
-        let FeatureCalculator { grace, neighbours, .. } = &self.features;
-        let (model, mut bonds, mut pairs) = (grace.model(), Vec::new(), Vec::new());
-        for (i, centre) in elements.iter().enumerate() {
-            neighbours.bonds_within(structure, i, model.cutoff(), &mut bonds);
-            pairs.extend(bonds.iter().map(|bond| {
-                let j = bond.atom as usize;
-                Pair::new(i, j, bond.r, model.pair_cutoff(*centre, elements[j]))
-            }));
-        }
-        pairs
     }
 }
