@@ -4,10 +4,12 @@
 
 mod all_cores;
 mod atomic_file;
+mod calm_validation;
 mod campaign;
 mod cli;
 mod config;
 mod csv;
+mod csv_reader;
 mod disk_forecast;
 mod duration;
 mod exit_status;
@@ -24,6 +26,7 @@ mod notify;
 mod output;
 mod process_config;
 mod progress;
+mod reliability_filter;
 mod replay;
 mod report;
 mod runtime;

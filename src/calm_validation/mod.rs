@@ -1,0 +1,3 @@
+//! Tests of the grades of a model.
+
+pub mod labelled;
