@@ -31,6 +31,7 @@ mod hosts;
 mod house;
 mod interruption;
 mod label;
+mod labelled;
 mod log;
 mod lower_states;
 mod metrics;

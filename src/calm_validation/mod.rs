@@ -11,6 +11,7 @@ mod detection;
 mod ensemble;
 mod figures;
 mod grader;
+pub mod labelled;
 mod minimum;
 mod progress;
 mod random;

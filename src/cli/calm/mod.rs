@@ -3,23 +3,27 @@
 mod baseline;
 mod build;
 mod compare;
+mod filter;
 mod info;
 mod merge;
 mod other_scores;
 mod recalibrate;
 mod score;
+mod score_labels;
+mod score_table;
 mod scorer;
 mod validate;
 
 pub(super) use self::score::load;
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare, inspect and test CALM mixtures and baselines; grade structures
+/// Build, recalibrate, compare, inspect and test CALM mixtures and baselines; grade structures, and judge grades by errors
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Baseline(baseline::Baseline),
     Build(build::Build),
     Compare(compare::Compare),
+    Filter(filter::Filter),
     Info(info::Info),
     Merge(merge::Merge),
     Recalibrate(recalibrate::Recalibrate),
@@ -33,6 +37,7 @@ impl Calm {
             Self::Baseline(command) => command.run(),
             Self::Build(command) => command.run(),
             Self::Compare(command) => command.run(),
+            Self::Filter(command) => command.run(),
             Self::Info(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Recalibrate(command) => command.run(),

@@ -11,6 +11,7 @@ use calm::neighbourhood_average;
 use potentials::grace::{GraceModel, PullBack};
 
 use super::scorer::Scorer;
+use crate::calm_validation::labelled::ScoreColumn;
 use crate::cli::Failure;
 use crate::feature_variant::FeatureModel;
 use crate::features::{FeatureCalculator, FeatureError};
@@ -68,6 +69,23 @@ impl OtherScores {
             |path: &PathBuf| GraceModel::load(path).map(|model| FeatureCalculator::new(Arc::new(model)));
         let ensemble = ensemble.iter().map(load).collect::<Result<_, _>>().map_err(Failure::input)?;
         Ok(Self { files, ensemble })
+    }
+
+    /// The columns of [`Self::columns`], in the same order. D-optimality has the limit 1, as γ has.
+    pub fn score_columns(&self) -> Vec<ScoreColumn> {
+        let baselines = self.files.iter().flat_map(|file| &file.baselines);
+        let limited =
+            baselines.map(|(name, baseline)| (name.as_str(), matches!(baseline, Baseline::DOptimality(_))));
+        let deviation = (!self.ensemble.is_empty()).then_some(("force_deviation", false));
+        let columns: Vec<_> = limited.chain(deviation).collect();
+        let averages = columns.iter().map(|(name, limited)| (format!("{name}_nbr"), *limited));
+        let own = columns.iter().map(|(name, limited)| ((*name).to_owned(), *limited));
+        own.chain(averages)
+            .map(|(name, limited)| ScoreColumn {
+                name: name.replace('_', "-"),
+                limit: limited.then_some(1.0),
+            })
+            .collect()
     }
 
     /// Names and values of the columns for a structure that was just scored: of each score, also its average over the

@@ -10,8 +10,9 @@ use calm::Artifact;
 use npyz::{NpyWriter, WriterBuilder};
 
 use super::other_scores::OtherScores;
+use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
-use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
 use crate::feature_variant::FeatureModel;
@@ -36,6 +37,9 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 ///
 /// Keeps all other data of the frame. Renames its energy, forces, stress and virial to REF_energy, REF_forces and so on, unless
 /// it already has reference labels; then it replaces the plain ones, which come from another model.
+///
+/// If frames have labels, also prints the errors of the model, and how well γ and γ_nbr of an atom tell large force errors:
+/// Spearman's ρ, ROC-AUC, what γ ≤ 1 keeps, and quantiles by bins of γ, with intervals by bootstrap over structures.
 #[derive(Debug, clap::Args)]
 pub struct Score {
     /// GRACE model (kokkos.npz)
@@ -62,10 +66,26 @@ pub struct Score {
     /// Also write the disagreement of the forces with those of this model; may be repeated
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
+    /// Also write the statistics of labelled structures to this file, with all thresholds of the force error
+    #[arg(long, value_name = "FILE.json")]
+    json: Option<PathBuf>,
+    /// Also draw the statistics of labelled structures into this directory: force errors by grade, contamination and ROC-AUC by
+    /// threshold of the force error, as SVG, PNG and CSV
+    #[arg(long, value_name = "DIR")]
+    figures: Option<PathBuf>,
+    /// Also write a table with one row for each structure, for calm filter: line of the input, largest γ and γ_nbr, energy per
+    /// atom of the model and of the label (eV), mean and largest force error (eV/Å)
+    #[arg(long, value_name = "FILE.csv")]
+    table: Option<PathBuf>,
 }
 
 impl Score {
     pub fn run(self) -> Result<ExitStatus, Failure> {
+        for output in self.json.iter().chain(&self.table) {
+            let inputs = [(self.model.as_path(), "the model"), (self.input.as_path(), "the input")];
+            let artifact = self.artifact.as_deref().map(|path| (path, "the artifact"));
+            refuse_to_replace(output, inputs.into_iter().chain(artifact))?;
+        }
         let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
         let mut others = OtherScores::load(&self.model, &model, &self.baseline, &self.ensemble)?;
         let dimension = artifact.mixture.dimension();
@@ -77,12 +97,14 @@ impl Score {
         let mut feature_file = self.features.as_deref().map(AtomicFile::create).transpose()?;
         let matrix = feature_file.as_mut().map(|file| feature_matrix(file, dimension));
         let mut matrix = matrix.transpose().map_err(cannot)?;
+        let mut labels = ScoreLabels::new(others.score_columns(), self.table.as_deref())?;
         let mut count = 0_u64;
         while let Some(frame) = frames.next() {
             let mut frame = frame.map_err(Failure::input)?;
             let line = frame.line;
             scorer.score(&frame.structure, self.gradient).map_err(|error| self.at(line, error))?;
             let columns = others.columns(&frame.structure, &scorer).map_err(|error| self.at(line, error))?;
+            labels.add(&frame, &scorer, &columns)?;
             write_scores(&mut frame, &scorer, self.gradient);
             for (name, values) in columns {
                 frame.arrays.insert(name, scalars(&values));
@@ -109,6 +131,7 @@ impl Score {
                 self.output.display()
             )
         })?;
+        labels.finish(self.json.as_deref(), self.figures.as_deref(), &self.input)?;
         Ok(ExitStatus::Done)
     }
 
