@@ -65,7 +65,8 @@ fn features_in_another_form_are_those_of_a_file_that_says_so() {
     for form in [FeatureForm::Normalised, FeatureForm::Linear] {
         let mut found = Grace::new(own.with_features(form).unwrap().into());
         let mut expected = Grace::new(changed(&flags(form)).unwrap().into());
-        [&mut found, &mut expected].map(|grace| forward(grace, &structure));
+        forward(&mut found, &structure);
+        forward(&mut expected, &structure);
         assert_eq!(found.features(), expected.features());
         assert_eq!(found.features().len(), 4 * found.model().feature_dimension());
         assert_eq!(found.model().description(), expected.model().description());

@@ -96,7 +96,7 @@ pub(super) fn check(dimension: usize, elements: &[usize], features: &[f64]) -> R
 /// Checks rows of D numbers.
 pub(super) fn check_rows(dimension: usize, multiple: usize, rows: &[f64]) -> Result<(), BaselineError> {
     let of_atom = dimension * multiple;
-    if rows.len() % of_atom != 0 {
+    if !rows.len().is_multiple_of(of_atom) {
         let expected = rows.len().next_multiple_of(of_atom);
         return Err(BaselineError::Length { what: "rows of force components", found: rows.len(), expected });
     }

@@ -102,8 +102,8 @@ impl BaselineFile {
         let settings = stored::read_settings(file)?;
         let mut baselines = Vec::new();
         for (number, name) in file.strings("kinds")?.into_iter().enumerate() {
-            let kind = name.parse::<Kind>();
-            let kind = kind.map_err(|expected| file.invalid("kinds", format!("'{name}'"), expected))?;
+            let kind = Kind::named(&name);
+            let kind = kind.ok_or_else(|| file.invalid("kinds", format!("'{name}'"), Kind::names()))?;
             baselines.push(stored::read(file, number, kind, &origin)?);
         }
         if baselines.is_empty() {

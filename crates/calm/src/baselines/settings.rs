@@ -57,6 +57,15 @@ impl Kind {
         }
     }
 
+    pub(super) fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
+    }
+
+    /// All names, for messages.
+    pub(super) fn names() -> String {
+        format!("one of {}", Self::ALL.map(Self::name).join(", "))
+    }
+
     /// Whether the mixture's components divide the atoms, so that a [`super::Builder`] needs the mixture.
     pub fn needs_mixture(self) -> bool {
         matches!(
@@ -86,11 +95,7 @@ impl FromStr for Kind {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let names = || Self::ALL.map(Self::name).join(", ");
-        Self::ALL
-            .into_iter()
-            .find(|kind| kind.name() == text)
-            .ok_or_else(|| format!("expected one of {}", names()))
+        Self::named(text).ok_or_else(|| format!("expected {}", Self::names()))
     }
 }
 
