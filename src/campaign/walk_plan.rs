@@ -11,7 +11,7 @@ use crate::filter::{Filter, StructureProperties};
 const MAX_WALKS: usize = 1_000_000;
 
 /// Properties of seed structures that a filter may name.
-const PROPERTIES: [&str; 3] = ["atoms", "element", "seed"];
+const PROPERTIES: [&str; 3] = ["atoms", "element", "seed_structure"];
 
 impl Loader<'_> {
     /// Sets the walks of each seed structure. Warns of seed structures without walks.
