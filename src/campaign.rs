@@ -199,8 +199,8 @@ impl Campaign {
             value["potential"].as_object_mut().map(|potential| potential.remove("precision"));
         }
         match self.known_hash() {
-            Some(hash) => value["label"]["check"]["structures"] = json!(hash),
-            None => drop(value["label"].as_object_mut().map(|label| label.remove("check"))),
+            Some(hash) => value["label"]["reference_check"]["structures"] = json!(hash),
+            None => drop(value["label"].as_object_mut().map(|label| label.remove("reference_check"))),
         }
         // The location of the store is not part of the campaign's identity.
         value["run"].as_object_mut().map(|run| run.remove("store"));

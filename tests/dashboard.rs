@@ -152,7 +152,7 @@ fn check_table(live: &Live) {
     let listed: Vec<Value> = serde_json::from_str(&shown).unwrap();
     let names = |lines: &[Value], key: &str| lines.iter().map(|line| line[key].clone()).collect::<Vec<_>>();
     assert_eq!(names(&queue, "id"), names(&listed, "candidate"));
-    let found = all_lines(address, "where=gamma+%3E+1.1+and+element+%3D+Al+and+kind+%3D+biased", 4);
+    let found = all_lines(address, "where=gamma+%3E+1.1+and+element+%3D+Al+and+origin+%3D+biased", 4);
     let expected = |line: &&Value| line["gamma"].as_f64() > Some(1.1) && line["origin"] == "biased";
     assert_eq!(found, all.iter().filter(expected).cloned().collect::<Vec<_>>());
     assert_eq!(all_lines(address, "where=energy+%3C+1", 4), Vec::<Value>::new(), "there is no label");

@@ -78,7 +78,7 @@ fn walks_that_find_nothing_are_a_result() {
     fs::write(&path, fs::read_to_string(&path).unwrap().replace("threshold = 1.0", "threshold = 1e6"))
         .unwrap();
     let summary = succeed(here, ["run", "campaign.toml"]);
-    assert!(summary.contains("ended: 4 steps\n") && !summary.contains("what to change"), "{summary}");
+    assert!(summary.contains("ended: 4 completed\n") && !summary.contains("what to change"), "{summary}");
     let events = fs::read_to_string(here.join("events")).unwrap();
     assert!(!events.contains("failing_walks"), "{events}");
 }

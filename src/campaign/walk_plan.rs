@@ -17,7 +17,7 @@ use crate::filter::{Filter, StructureProperties};
 const MAX_WALKS: usize = 1_000_000;
 
 /// Properties of seed structures that a filter may name.
-const PROPERTIES: [&str; 3] = ["atoms", "element", "seed"];
+const PROPERTIES: [&str; 3] = ["atoms", "element", "seed_structure"];
 
 impl Loader<'_> {
     /// Sets the walks of each seed structure. A structure without a volume gets no walk that would change it: without

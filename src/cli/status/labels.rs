@@ -112,5 +112,5 @@ fn describe_rate(status: &Status) -> String {
 fn describe_failure(failure: &FailureCount) -> String {
     let FailureCount { class, labelled, failed, unfinished } = failure;
     let (class, jobs) = (class.replace('_', " "), labelled + failed + unfinished);
-    format!("{class} in {jobs}: {labelled} labelled later, {failed} failed, {unfinished} unfinished")
+    format!("{class} in {jobs}: {labelled} labelled, {failed} failed, {unfinished} unfinished")
 }
