@@ -8,6 +8,7 @@ mod common;
 mod backup;
 mod budgets;
 mod calculations;
+mod calm_export;
 mod certificates;
 mod cli_calm;
 mod cli_campaign;

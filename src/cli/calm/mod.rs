@@ -2,6 +2,7 @@
 
 mod build;
 mod compare;
+mod export;
 mod info;
 mod merge;
 mod recalibrate;
@@ -10,11 +11,12 @@ mod scorer;
 
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare or inspect CALM mixtures, or grade structures with it
+/// Build, recalibrate, compare, export or inspect CALM mixtures, or grade structures with them
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Build(build::Build),
     Compare(compare::Compare),
+    Export(export::Export),
     Info(info::Info),
     Merge(merge::Merge),
     Recalibrate(recalibrate::Recalibrate),
@@ -26,6 +28,7 @@ impl Calm {
         match self {
             Self::Build(command) => command.run(),
             Self::Compare(command) => command.run(),
+            Self::Export(command) => command.run(),
             Self::Info(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Recalibrate(command) => command.run(),
