@@ -102,8 +102,10 @@ fn every_version_grades_as_the_selector_did() {
     for (version, candidate) in (0..newest).zip(accepted) {
         export(here, version);
         let found = deviation_of_grades(candidate, &here.join(format!("{version}.npz")));
-        assert!(found < 1e-5, "version {version}: {found}");
-        assert!(deviation_of_grades(candidate, &here.join("newest.npz")) > 1e-3);
+        // Directions that the training data do not span have the variance 10⁻⁶, and single precision resolves the inverses
+        // only relative to them.
+        assert!(found < 1e-3, "version {version}: {found}");
+        assert!(deviation_of_grades(candidate, &here.join("newest.npz")) > 1e-2);
     }
     export(here, newest);
     assert_eq!(

@@ -165,7 +165,7 @@ impl Store {
     /// The first decision with this version of the mixture after it, `None` if there is none.
     pub async fn first_decision_of(&self, version: u64) -> Result<Option<i64>> {
         let sql = "SELECT * FROM decision WHERE mixture_version = $1 ORDER BY sequence LIMIT 1";
-        let rows = query(sql).bind(version).rows(&self.database).await?;
+        let rows = query(sql).bind(version as i64).rows(&self.database).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         DECISION.verify(row, Names::Plain)?;
         Ok(Some(row.get("sequence")?))

@@ -56,6 +56,8 @@ pub struct UpdatedMixture {
     elements: Vec<Option<Element>>,
     /// θ that grade, `[elements × K]`.
     thresholds: Vec<f32>,
+    /// θ from the raw histograms, `[elements × K]`.
+    raw_thresholds: Vec<f32>,
     histograms: bool,
 }
 
@@ -93,12 +95,17 @@ impl UpdatedMixture {
         let weighted = file.contains(WEIGHTED_THRESHOLDS);
         let key = if weighted { WEIGHTED_THRESHOLDS } else { RAW_THRESHOLDS };
         let ([count, slots], thresholds) = file.numbers(key)?.tensor()?;
+        let raw_thresholds = match file.contains(RAW_THRESHOLDS) {
+            true => file.numbers(RAW_THRESHOLDS)?.with_shape(&[count, slots])?,
+            false => thresholds.clone(),
+        };
         let mut updated = Self {
             version: mixture.version(),
             dimension: mixture.dimension(),
             slots,
             elements: (0..count).map(|_| None).collect(),
             thresholds: single(&thresholds).collect(),
+            raw_thresholds: single(&raw_thresholds).collect(),
             histograms: file.contains(EDGES),
         };
         let held = file.indices("elements", count)?;
@@ -122,8 +129,10 @@ impl UpdatedMixture {
             (0..components.len()).filter(|&slot| before.get(slot) != components.get(slot)).collect();
         let (slots, dimension) = (self.slots, self.dimension);
         if !held {
-            let row = self.thresholds.chunks_exact_mut(slots).nth(element).unwrap_or_default();
-            row.fill(components.first().map_or(1.0, |component| component.threshold() as f32));
+            let threshold = components.first().map_or(1.0, |component| component.threshold() as f32);
+            for thresholds in [&mut self.thresholds, &mut self.raw_thresholds] {
+                thresholds.chunks_exact_mut(slots).nth(element).unwrap_or_default().fill(threshold);
+            }
             if changed.is_empty() {
                 return Ok(());
             }
@@ -185,10 +194,9 @@ impl UpdatedMixture {
             let held = (0..).zip(&self.elements).filter(|(_, element)| element.is_some());
             let held: Vec<i32> = held.map(|(index, _)| index).collect();
             file.array("elements", &[held.len()], held)?;
-            // Only a file without weights has other raw thresholds, which nothing reads beside weighted ones.
-            for key in [RAW_THRESHOLDS, WEIGHTED_THRESHOLDS] {
-                file.array(key, &[self.elements.len(), self.slots], self.thresholds.iter().copied())?;
-            }
+            let shape = [self.elements.len(), self.slots];
+            file.array(RAW_THRESHOLDS, &shape, self.raw_thresholds.iter().copied())?;
+            file.array(WEIGHTED_THRESHOLDS, &shape, self.thresholds.iter().copied())?;
         }
         for (index, element, changed) in changed() {
             self.write_element(&mut file, index, element, changed)?;
