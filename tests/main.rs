@@ -9,6 +9,7 @@ mod backup;
 mod baselines;
 mod budgets;
 mod calculations;
+mod calm_export;
 mod calm_validate;
 mod certificates;
 mod cli_calm;

@@ -1,5 +1,5 @@
-//! What `calmwalk export` writes for gracemaker and MACE, and the artifact of `calm build`, read back by their own loaders. Needs two Pythons, named by
-//! `CALMWALK_GRACEMAKER_PYTHON` (of PyPI: tensorpotential) and `CALMWALK_MACE_PYTHON` (mace-torch); `.ci/loaders` makes both.
+//! What `calmwalk export` writes for gracemaker and MACE, and the artifacts of `calm build` and `calm export`, read back by their own
+//! loaders. Needs two Pythons, named by `CALMWALK_GRACEMAKER_PYTHON` (of PyPI: tensorpotential) and `CALMWALK_MACE_PYTHON` (mace-torch); `.ci/loaders` makes both.
 
 use std::path::Path;
 use std::process::Command;
@@ -44,20 +44,49 @@ fn gracemaker_grades_by_an_artifact_that_was_built() {
     let path = |file: &str| config(&format!("data/al_eam_1l/{file}")).display().to_string();
     let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
     succeed(here, ["calm", "build", "--model", &model, &data, "--output", "calm.npz", "--shard-size", "9"]);
-    let score =
-        ["calm", "score", "--model", &model, "--artifact", "calm.npz", &data, "--output", "out.extxyz"];
+    let gamma = grades(here, &model, "calm.npz", &data);
+    assert!(gamma.len() == 5400 && gamma.iter().any(|gamma| *gamma > 1.0));
+    assert!(deviation(&gracemaker_grades(here, Path::new(&python), "calm.npz"), &gamma) < 1e-6);
+}
+
+#[test]
+fn gracemaker_grades_by_the_mixture_of_a_campaign() {
+    let variable = "CALMWALK_GRACEMAKER_PYTHON";
+    let python = std::env::var_os(variable).unwrap_or_else(|| panic!("{variable} names no Python"));
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small::default().write(here);
+    succeed(here, ["run", "campaign.toml"]);
+    let path = |file: &str| config(&format!("data/al_eam_1l/{file}")).display().to_string();
+    let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
+    let original = grades(here, &model, &path("gmm_artifacts.npz"), &data);
+    for version in [["--version", "1"].as_slice(), &[]] {
+        succeed(here, ["calm", "export", "campaign", "--output", "calm.npz"].iter().chain(version));
+        let gamma = grades(here, &model, "calm.npz", &data);
+        assert!(deviation(&gamma, &original) > 1e-2);
+        assert!(deviation(&gracemaker_grades(here, Path::new(&python), "calm.npz"), &gamma) < 1e-6);
+    }
+}
+
+/// γ of all atoms; their features go to `z.npy`.
+fn grades(here: &Path, model: &str, artifact: &str, data: &str) -> Vec<f64> {
+    let score = ["calm", "score", "--model", model, "--artifact", artifact, data, "--output", "out.extxyz"];
     succeed(here, score.into_iter().chain(["--features", "z.npy"]));
     let frames = read_extxyz(&here.join("out.extxyz")).unwrap();
-    let gamma: Vec<f64> = frames.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect();
-    let script = "import json, numpy as np, tensorflow as tf\n\
-                  from tensorpotential.uq.gmmuq import GMMUQModel\n\
-                  z = np.load('z.npy')\n\
-                  model = GMMUQModel('calm.npz', param_dtype=tf.float64)\n\
-                  gamma, _ = model.gamma_from_features(tf.constant(z), tf.zeros(len(z), tf.int32))\n\
-                  print(json.dumps(gamma.tolist()))";
-    let found: Vec<f64> = last_line(here, Path::new(&python), script);
-    assert!(gamma.len() == 5400 && gamma.iter().any(|gamma| *gamma > 1.0));
-    assert!(deviation(&found, &gamma) < 1e-6);
+    frames.iter().flat_map(|frame| frame.arrays["gamma"].reals().unwrap()).collect()
+}
+
+/// γ of the features in `z.npy`.
+fn gracemaker_grades(here: &Path, python: &Path, artifact: &str) -> Vec<f64> {
+    let script = format!(
+        "import json, numpy as np, tensorflow as tf\n\
+         from tensorpotential.uq.gmmuq import GMMUQModel\n\
+         z = np.load('z.npy')\n\
+         model = GMMUQModel('{artifact}', param_dtype=tf.float64)\n\
+         gamma, _ = model.gamma_from_features(tf.constant(z), tf.zeros(len(z), tf.int32))\n\
+         print(json.dumps(gamma.tolist()))"
+    );
+    last_line(here, python, &script)
 }
 
 fn loads(keys: &str, variable: &str, load: &str) {

@@ -346,7 +346,8 @@ impl DecisionState {
         let seed_structure = walk.is_biased().then_some(walk.record.seed_structure);
         if seed_structure.is_some_and(|seed| self.restarts_mixture_after(seed)) {
             let next_version = self.mixture.version() + 1;
-            self.mixture = Arc::new(self.regrader.original.at_version(next_version));
+            let restarted = Arc::new(self.regrader.original.at_version(next_version));
+            self.before_restart = Some(std::mem::replace(&mut self.mixture, restarted));
             commit.components.clear();
             commit.restart_mixture = true;
             self.forgetting.restart();

@@ -3,6 +3,7 @@
 mod baseline;
 mod build;
 mod compare;
+mod export;
 mod filter;
 mod info;
 mod merge;
@@ -17,12 +18,13 @@ mod validate;
 pub(super) use self::score::load;
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare, inspect and test CALM mixtures and baselines; grade structures, and judge grades by errors
+/// Build, recalibrate, compare, export, inspect and test CALM mixtures and baselines; grade structures, and judge grades by errors
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Baseline(baseline::Baseline),
     Build(build::Build),
     Compare(compare::Compare),
+    Export(export::Export),
     Filter(filter::Filter),
     Info(info::Info),
     Merge(merge::Merge),
@@ -37,6 +39,7 @@ impl Calm {
             Self::Baseline(command) => command.run(),
             Self::Build(command) => command.run(),
             Self::Compare(command) => command.run(),
+            Self::Export(command) => command.run(),
             Self::Filter(command) => command.run(),
             Self::Info(command) => command.run(),
             Self::Merge(command) => command.run(),

@@ -4,7 +4,7 @@ use std::io::{self, Read, Seek, Write};
 
 use npz::Writer;
 
-use super::artifact::{BuiltMixture, UNUSED, single};
+use super::artifact::{BuiltMixture, UNUSED, single, unused_inverse};
 use super::components::BuiltComponent;
 use crate::linear::REGULARISATION;
 
@@ -22,6 +22,29 @@ const MIXTURE: [&str; 7] = [
 /// Diagonal of the inverse covariance of an element without atoms.
 const MISSING_ELEMENT: &str = "uq_missing_elem_inv_cov_diag";
 
+/// Writes a copy of a model's export with a mixture of `[elements, K slots, D features]`; all other arrays are copied byte by
+/// byte. Unused slots count, with centroids that are never the nearest.
+pub(super) fn embed<R: Read + Seek, W: Write + Seek>(
+    model: R,
+    out: W,
+    [elements, slots, dimension]: [usize; 3],
+    thresholds: impl IntoIterator<Item = f32>,
+    centroids: impl IntoIterator<Item = f32>,
+    inverses: impl IntoIterator<Item = f32>,
+) -> io::Result<W> {
+    let mut file = Writer::new(out);
+    file.copy(model, |key| key == MISSING_ELEMENT || MIXTURE.contains(&key))?;
+    for (key, number) in [MIXTURE[0], MIXTURE[1], MIXTURE[2]].into_iter().zip([elements, slots, dimension]) {
+        file.array(key, &[1], [number as i64])?;
+    }
+    file.array(MISSING_ELEMENT, &[1], [(1.0 / REGULARISATION) as f32])?;
+    file.array("uq_n_clusters", &[elements], vec![slots as i32; elements])?;
+    file.array("uq_interp_thresholds", &[elements, slots], thresholds)?;
+    file.array("uq_centroids", &[elements, slots, dimension], centroids)?;
+    file.array("uq_inv_cov", &[elements, slots, dimension, dimension], inverses)?;
+    file.finish()
+}
+
 impl BuiltMixture {
     /// Writes a copy of the model's export with this mixture, which [`Artifact::load_export`](crate::Artifact::load_export)
     /// reads. All other arrays, which include the projection, are copied byte by byte.
@@ -29,38 +52,22 @@ impl BuiltMixture {
     /// # Errors
     /// If reading or writing fails.
     pub fn write_export<R: Read + Seek, W: Write + Seek>(&self, model: R, out: W) -> io::Result<W> {
-        let mut file = Writer::new(out);
-        file.copy(model, |key| key == MISSING_ELEMENT || MIXTURE.contains(&key))?;
         let (elements, slots, dimension) = (self.elements().len(), self.slots(), self.dimension());
-        for (key, number) in
-            [MIXTURE[0], MIXTURE[1], MIXTURE[2]].into_iter().zip([elements, slots, dimension])
-        {
-            file.array(key, &[1], [number as i64])?;
-        }
-        let missing = 1.0 / REGULARISATION;
-        file.array(MISSING_ELEMENT, &[1], [missing as f32])?;
-        // Unused slots count, with centroids that are never the nearest.
-        file.array("uq_n_clusters", &[elements], vec![slots as i32; elements])?;
         let thresholds = self.thresholds().iter().flat_map(|thresholds| single(&thresholds.weighted));
-        file.array("uq_interp_thresholds", &[elements, slots], thresholds)?;
-
         let centroids = self.slots_of_all().flat_map(|(of, slot)| match of {
             None => vec![0.0; dimension],
             Some(components) => components
                 .get(slot)
                 .map_or(vec![UNUSED; dimension], |component| single(&component.centroid).collect()),
         });
-        file.array("uq_centroids", &[elements, slots, dimension], centroids)?;
-        let empty = || {
-            (0..dimension * dimension).map(|at| if at % (dimension + 1) == 0 { missing as f32 } else { 0.0 })
-        };
         let inverses = self.slots_of_all().flat_map(|(of, slot)| {
             let component = of.and_then(|components| components.get(slot));
-            component
-                .map_or_else(|| empty().collect::<Vec<_>>(), |component| single(&component.inverse).collect())
+            component.map_or_else(
+                || unused_inverse(dimension).collect::<Vec<_>>(),
+                |component| single(&component.inverse).collect(),
+            )
         });
-        file.array("uq_inv_cov", &[elements, slots, dimension, dimension], inverses)?;
-        file.finish()
+        embed(model, out, [elements, slots, dimension], thresholds, centroids, inverses)
     }
 
     /// Each slot of each element, with the element's components unless it has no atoms.

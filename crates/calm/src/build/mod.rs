@@ -40,6 +40,7 @@ mod scatter;
 mod settings;
 mod sorter;
 mod thresholds;
+mod updated;
 
 pub use artifact::{BuiltElement, BuiltMixture, read_histograms};
 pub use calibration::CalibrationPass;
@@ -57,6 +58,7 @@ pub use recalibrate::Recalibration;
 pub use scatter::ScatterPass;
 pub use settings::BuildSettings;
 pub use thresholds::{ThresholdRule, Thresholds};
+pub use updated::{UpdatedMixture, UpdatedMixtureError};
 
 #[cfg(test)]
 mod tests {
