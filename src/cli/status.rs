@@ -168,7 +168,7 @@ pub fn expected_end(end: &ExpectedEnd) -> Option<String> {
     let parts =
         [part("walks", end.walks_hours), part("labels", end.labels_hours), part("budget", end.budget_hours)];
     let parts: Vec<_> = parts.into_iter().flatten().collect();
-    Some(format!("expected within {hours} h at the current rate ({})", parts.join(", ")))
+    Some(format!("expected within {hours} h ({})", parts.join(", ")))
 }
 
 fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
@@ -179,8 +179,8 @@ fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
         ended => format!("{ended} ended ({})", walk_ends::without_causes(ends)),
     };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
-    let speed = speed.map_or(String::new(), |speed| format!("; {} steps/s", decimals(Some(speed), 1)));
-    format!("{under_way} {state}, {ended}{speed}")
+    let speed = speed.map_or(String::new(), |speed| format!(" ({} steps/s)", decimals(Some(speed), 1)));
+    format!("{under_way} {state}{speed}, {ended}")
 }
 
 fn write_candidates(
