@@ -3,11 +3,12 @@
 //! machine; a simulated clock that advances by the processor time of each assignment gives the time they would
 //! take in parallel.
 //!
-//! `cargo bench --bench rounds`; a number after `--` sets the steps per assignment. The results are in
-//! `docs/benchmarks.md`.
+//! `cargo bench --bench rounds`; a number after `--` sets the steps per assignment. `-- controls` compares how busy 16 walkers
+//! are, with control walks and five walks of each seed structure, and when the first control frame is decided. The results
+//! are in `docs/benchmarks.md`.
 
 use std::cmp::Reverse;
-use std::collections::BinaryHeap;
+use std::collections::{BTreeSet, BinaryHeap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,21 +25,57 @@ use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use rustix::time::{ClockId, clock_gettime};
 use wire::messages::{Outcome, Report};
-use wire::{CampaignId, CandidateBlock, WalkConditions};
+use wire::{CampaignId, CandidateBlock, Origin, WalkConditions};
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
 /// Default steps per assignment, as in `configs/`.
 const STEPS_PER_ASSIGNMENT: u64 = 250;
 
+/// Walkers of the comparison with control walks.
+const WALKERS: usize = 16;
+
+/// Temperatures of its walks from each seed structure, K.
+const TEMPERATURES: [f64; 5] = [300.0, 450.0, 600.0, 750.0, 900.0];
+
 fn main() {
-    let assignment_steps =
+    if std::env::args().any(|argument| argument == "controls") {
+        return compare_schedules();
+    }
+    let steps_per_assignment =
         std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(STEPS_PER_ASSIGNMENT);
-    println!("assignments of {assignment_steps} steps");
+    println!("assignments of {steps_per_assignment} steps");
     println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
-    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| Campaign::run(mode, assignment_steps));
+    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| {
+        // As many walkers as walks, so that every assignment starts at once.
+        let walks = seeds(&[600.0]);
+        let settings = Settings { mode, walks_per_round: walks.len(), steps_per_assignment, ..settings() };
+        let campaign = Campaign::run(settings, walks.len(), walks);
+        let Campaign { candidates, accepted, time, .. } = campaign;
+        let (seconds, busy) = (time.as_secs_f64(), 100.0 * campaign.busy);
+        println!("{:<16} {candidates:>10} {accepted:>10} {seconds:>12.1} {busy:>12.0} %", mode.name());
+        campaign
+    });
     let rate = |campaign: &Campaign| f64::from(campaign.candidates) / campaign.time.as_secs_f64();
     println!("candidates an hour, live over rounds: {:.2}", rate(&live) / rate(&rounds));
+}
+
+/// Rounds of several sizes, and live mode with several shares of control walks.
+fn compare_schedules() {
+    let base = Settings { control: true, max_per_walk: 3, ..settings() };
+    let rounds = [1, 8, 32].map(|walks_per_round| {
+        let settings = Settings { mode: Mode::Reproducible, walks_per_round, ..base.clone() };
+        (format!("reproducible, walks_per_round = {walks_per_round}"), settings)
+    });
+    let live = [0.25, 0.5].map(|control_share| {
+        (format!("live, control_share = {control_share}"), Settings { control_share, ..base.clone() })
+    });
+    println!("{:<36} {:>8} {:>14} {:>32}", "", "seconds", "walkers busy", "begun before the first control");
+    for (name, settings) in rounds.into_iter().chain(live) {
+        let campaign = Campaign::run(settings, WALKERS, seeds(&TEMPERATURES));
+        let [busy, begun] = [campaign.busy, campaign.begun_before_control].map(|share| 100.0 * share);
+        println!("{name:<36} {:>8.1} {busy:>12.0} % {begun:>30.0} %", campaign.time.as_secs_f64());
+    }
 }
 
 /// Result of a campaign.
@@ -48,51 +85,52 @@ struct Campaign {
     accepted: u32,
     /// Time on the simulated clock of parallel walkers.
     time: Duration,
-    /// Total processor time of all walkers.
-    work: Duration,
+    /// Processor time of all walkers, divided by the time that they were there.
+    busy: f64,
+    /// Share of the biased walks that had begun when the first control frame was decided.
+    begun_before_control: f64,
 }
 
 /// A running assignment: when it ends, the order of start for ties, and its report.
 struct RunningAssignment(Duration, u64, Report);
 
 impl Campaign {
-    fn run(mode: Mode, assignment_steps: u64) -> Self {
+    fn run(settings: Settings, walkers: usize, seeds: Vec<SeedStructure>) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
         let context = WalkContext {
             model: Arc::clone(&model),
             threads: Threads::default(),
             settings: Arc::new(walk_settings()),
         };
-        let mut selector = selector(mode, assignment_steps, &model);
+        let walks: usize = seeds.iter().map(|seed| seed.walks.len()).sum();
+        let mut selector = selector(settings, seeds, &model);
         selector.start_walks();
-        let (mut campaign, mut running, mut begun) = (Self::default(), BinaryHeap::new(), 0);
+        let (mut campaign, mut running, mut number) = (Self::default(), BinaryHeap::new(), 0);
+        let (mut work, mut begun, mut has_control) = (Duration::ZERO, BTreeSet::new(), false);
         loop {
-            // There are as many walkers as walks, so every assignment starts at once.
-            while let Scheduling::Assign(assignment) = selector.next_assignment(0) {
+            while running.len() < walkers {
+                let Scheduling::Assign(assignment) = selector.next_assignment(0) else { break };
+                if assignment.origin == Origin::Biased && !has_control {
+                    begun.insert(assignment.walk);
+                }
                 let used = processor_time();
                 let report = advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {});
                 let taken = processor_time() - used;
-                campaign.work += taken;
-                begun += 1;
+                work += taken;
+                number += 1;
                 let report = report.map_candidate(|candidate| CandidateBlock::encode(&candidate));
-                running.push(Reverse(RunningAssignment(campaign.time + taken, begun, report)));
+                running.push(Reverse(RunningAssignment(campaign.time + taken, number, report)));
             }
             let Some(Reverse(RunningAssignment(ended, _, report))) = running.pop() else { break };
             campaign.time = ended;
             campaign.candidates += u32::from(matches!(report.outcome, Outcome::Candidate(_)));
             let commit = selector.report(report).unwrap().unwrap_or_default();
-            let accepted = commit.decisions.iter().filter(|decision| decision.kind == "accepted");
-            campaign.accepted += accepted.count() as u32;
+            let of_kind = |kind| commit.decisions.iter().filter(|decision| decision.kind == kind).count();
+            campaign.accepted += of_kind("accepted") as u32;
+            has_control |= of_kind("control") > 0;
         }
-        let busy = campaign.work.as_secs_f64() / (seeds().len() as f64 * campaign.time.as_secs_f64());
-        println!(
-            "{:<16} {:>10} {:>10} {:>12.1} {:>12.0} %",
-            mode.name(),
-            campaign.candidates,
-            campaign.accepted,
-            campaign.time.as_secs_f64(),
-            100.0 * busy
-        );
+        campaign.busy = work.as_secs_f64() / (walkers as f64 * campaign.time.as_secs_f64());
+        campaign.begun_before_control = begun.len() as f64 / walks as f64;
         campaign
     }
 }
@@ -102,12 +140,13 @@ fn processor_time() -> Duration {
     Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap()
 }
 
-fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
+/// Live mode without control walks.
+fn settings() -> Settings {
     let rule = "rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3\n";
-    let settings = Settings {
-        mode,
-        walks_per_round: seeds().len(),
-        steps_per_assignment: assignment_steps,
+    Settings {
+        mode: Mode::Live,
+        walks_per_round: 1,
+        steps_per_assignment: STEPS_PER_ASSIGNMENT,
         update: UpdateProtocol::Cumulative,
         search: UpdateSettings {
             covariance_update: calm::CovarianceUpdateKind::Convex,
@@ -124,13 +163,16 @@ fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
         control_share: 0.5,
         min_distances: MinDistanceRule::default(),
         declined_feature_bytes: 0,
-    };
+    }
+}
+
+fn selector(settings: Settings, seeds: Vec<SeedStructure>, model: &GraceModel) -> Selector {
     let n = model.elements().len();
     let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
     let grader = Grader::new(model.elements().to_vec(), cutoffs);
     let original = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
     let (campaign, snapshot) = (CampaignId([1; 16]), SelectorSnapshot::default());
-    Selector::restore(settings, campaign, seeds(), grader, original, None, snapshot).unwrap()
+    Selector::restore(settings, campaign, seeds, grader, original, None, snapshot).unwrap()
 }
 
 fn walk_settings() -> WalkSettings {
@@ -159,17 +201,19 @@ fn walk_settings() -> WalkSettings {
     }
 }
 
-fn seeds() -> Vec<SeedStructure> {
+/// The seed structures, with a walk at each of these temperatures, K.
+fn seeds(temperatures: &[f64]) -> Vec<SeedStructure> {
     let frames = atoms::read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
+    let conditions = |temperature: &f64| WalkConditions {
+        temperature: *temperature,
+        tau: 0.15,
+        volume_ramp: Some((1.0, 1.4)),
+        ..WalkConditions::default()
+    };
     let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedStructure {
         name: number.to_string(),
         structure: frame.structure,
-        walks: vec![WalkConditions {
-            temperature: 600.0,
-            tau: 0.15,
-            volume_ramp: Some((1.0, 1.4)),
-            ..WalkConditions::default()
-        }],
+        walks: temperatures.iter().map(conditions).collect(),
     };
     frames.into_iter().enumerate().map(seed).collect()
 }

@@ -69,7 +69,7 @@ pub struct Campaign {
     pub training: Option<TrainingFrames>,
     /// The label protocol.
     pub protocol: Protocol,
-    /// The structures of `label.check`.
+    /// The structures of `label.reference_check`.
     pub known: Vec<KnownStructure>,
     /// Name and hash of every file whose content must not change.
     pub file_hashes: Vec<(String, String)>,
@@ -91,9 +91,9 @@ impl Campaign {
             Ok((artifact, training))
         });
         let labels = loader.seed_structures(&model).and_then(|mut seeds| {
-            warnings.extend(loader.plan_walks(&mut seeds.valid)?);
+            let protocol = loader.protocol(&mut seeds)?;
+            warnings.extend(loader.plan_walks(&mut seeds)?);
             loader.check_update_target(&seeds.valid)?;
-            let protocol = loader.protocol(&seeds.valid)?;
             Ok((seeds, protocol))
         });
         let ((artifact, training), (seeds, (protocol, mut file_hashes))) =
@@ -218,8 +218,8 @@ impl Campaign {
             value["potential"].as_object_mut().map(|potential| potential.remove("precision"));
         }
         match self.known_hash() {
-            Some(hash) => value["label"]["check"]["structures"] = json!(hash),
-            None => drop(value["label"].as_object_mut().map(|label| label.remove("check"))),
+            Some(hash) => value["label"]["reference_check"]["structures"] = json!(hash),
+            None => drop(value["label"].as_object_mut().map(|label| label.remove("reference_check"))),
         }
         // The location of the store is not part of the campaign's identity.
         value["run"].as_object_mut().map(|run| run.remove("store"));
@@ -233,7 +233,7 @@ impl Campaign {
         value
     }
 
-    /// Hash of the structures of `label.check` and what is known of them; `None` without the check.
+    /// Hash of the structures of `label.reference_check` and what is known of them; `None` without the check.
     fn known_hash(&self) -> Option<String> {
         (!self.known.is_empty()).then(|| reference_check::hash(&self.known).to_string())
     }

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use atoms::{NeighbourList, PotentialError, Structure, StructureError, shortest_distance};
-use potentials::grace::{Grace, GraceModel};
+use atoms::{Evaluation, NeighbourList, PotentialError, Structure, StructureError, shortest_distance};
+use calm::Pair;
+use potentials::grace::{Grace, GraceModel, PullBack};
 
 /// Shortest accepted distance, Å; the shortest bond, that of H₂, is 0.74 Å. Label programs apply the same limit.
 const MIN_DISTANCE: f64 = 0.4;
@@ -12,6 +13,8 @@ const MIN_DISTANCE: f64 = 0.4;
 pub struct FeatureCalculator {
     pub grace: Grace,
     pub neighbours: NeighbourList,
+    /// The hidden layer of the readout, if it is the feature.
+    hidden: Option<Vec<f64>>,
 }
 
 /// Why a structure has no features.
@@ -36,7 +39,23 @@ pub enum FeatureError {
 impl FeatureCalculator {
     /// Computes on the calling thread.
     pub fn new(model: Arc<GraceModel>) -> Self {
-        Self { neighbours: NeighbourList::new(model.cutoff(), 0.0), grace: Grace::new(model) }
+        Self { neighbours: NeighbourList::new(model.cutoff(), 0.0), grace: Grace::new(model), hidden: None }
+    }
+
+    /// The same with the hidden layer of the readout as features.
+    pub fn of_hidden_layer(model: Arc<GraceModel>) -> Self {
+        Self { hidden: Some(Vec::new()), ..Self::new(model) }
+    }
+
+    /// D
+    pub fn dimension(&self) -> usize {
+        let model = self.grace.model();
+        if self.hidden.is_some() { model.hidden_dimension() } else { model.feature_dimension() }
+    }
+
+    /// Features of the last structure, [n × D].
+    pub fn features(&self) -> &[f64] {
+        self.hidden.as_deref().unwrap_or_else(|| self.grace.features())
     }
 
     /// Computes energies and features of `structure`, which [`Grace`] then has. Returns the element index of each atom.
@@ -52,6 +71,42 @@ impl FeatureCalculator {
         if !energy.is_finite() {
             return Err(FeatureError::NotFinite(energy));
         }
+        if let Some(hidden) = &mut self.hidden {
+            self.grace.hidden_layer(hidden);
+        }
         Ok(elements)
+    }
+
+    /// Gradient of the sum of the last structure's features with respect to the coordinates of its atoms, [3n × D], 1/Å. Takes D
+    /// reverse sweeps.
+    pub fn force_rows(&mut self) -> Vec<f64> {
+        let (dimension, numbers) = (self.dimension(), self.features().len());
+        let mut rows = vec![0.0; 3 * numbers];
+        let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+        for feature in 0..dimension {
+            let mut cotangent = vec![0.0; numbers];
+            cotangent.iter_mut().skip(feature).step_by(dimension).for_each(|c| *c = 1.0);
+            match self.hidden {
+                Some(_) => self.grace.pull_back_hidden_layer(&cotangent, &mut pull_back),
+                None => self.grace.backward(Some(&cotangent), &mut energy, &mut pull_back),
+            }
+            let column = rows.iter_mut().skip(feature).step_by(dimension);
+            column.zip(pull_back.gradient.as_flattened()).for_each(|(row, gradient)| *row = *gradient);
+        }
+        rows
+    }
+
+    /// Directed bonds of the last structure within the pair cutoffs, to average over neighbourhoods. `elements` are those that
+    /// [`Self::compute`] returned.
+    pub fn pairs(&self, structure: &Structure, elements: &[usize]) -> Vec<Pair> {
+        let (model, mut bonds, mut pairs) = (self.grace.model(), Vec::new(), Vec::new());
+        for (i, centre) in elements.iter().enumerate() {
+            self.neighbours.bonds_within(structure, i, model.cutoff(), &mut bonds);
+            pairs.extend(bonds.iter().map(|bond| {
+                let j = bond.atom as usize;
+                Pair::new(i, j, bond.r, model.pair_cutoff(*centre, elements[j]))
+            }));
+        }
+        pairs
     }
 }

@@ -157,7 +157,8 @@ mod tests {
     };
 
     fn element(element: &str, mean_square_growth: f64, share_above_one: Option<f64>) -> ElementForgetting {
-        ElementForgetting { element: element.to_owned(), mean_square_growth, share_above_one }
+        let (element, components) = (element.to_owned(), Vec::new());
+        ElementForgetting { element, mean_square_growth, share_above_one, components }
     }
 
     #[test]

@@ -147,6 +147,11 @@ impl Bar {
         io::stderr().is_terminal()
     }
 
+    /// Sets a length that was not known at first.
+    pub fn set_length(&self, length: u64) {
+        self.bar.set_length(length);
+    }
+
     /// Hides the bar while `write` runs.
     pub fn suspend(&self, write: impl FnOnce()) {
         self.bar.suspend(write);

@@ -45,19 +45,20 @@ impl fmt::Display for Summary {
         writeln!(f, "                 ended: {}", walk_ends::all(&ends))?;
         walk_ends::early_ends(&ends).iter().try_for_each(|line| writeln!(f, "                 {line}"))?;
         let declined = &candidates.declined;
-        let all = declined.covered + declined.duplicate + declined.guard + declined.budget + declined.backlog;
+        let all =
+            declined.covered + declined.duplicate + declined.too_close + declined.budget + declined.backlog;
         writeln!(
             f,
-            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, guard {}, budget {}, backlog {})",
+            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, too close {}, budget {}, backlog {})",
             candidates.seen,
             candidates.accepted,
             declined.covered,
             declined.duplicate,
-            declined.guard,
+            declined.too_close,
             declined.budget,
             declined.backlog
         )?;
-        writeln!(f, "                 {} refused by walkers' guards", candidates.refused_by_walkers)?;
+        writeln!(f, "                 {} rejected by guards", candidates.rejected_by_guards)?;
         let superseded = match labels.superseded {
             0 => String::new(),
             jobs => format!(", {jobs} superseded"),

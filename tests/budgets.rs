@@ -108,19 +108,19 @@ fn a_limit_of_time_stops_walks_where_they_stand() {
     // Seconds of work, so that the clock is looked at before it is done.
     let small = Small { steps: 3000, max_per_walk: 1000, ..Small::default() };
     let expected = uninterrupted_outcome(&small);
-    let directory = write(&small, "[budget]\nwall_hours = 1e-6\n");
+    let directory = write(&small, "[budget]\nwall_time = \"4ms\"\n");
     let here = directory.path();
     let summary = succeed(here, RUN);
-    assert!(summary.contains("walks were ended by budget.wall_hours"), "{summary}");
+    assert!(summary.contains("walks were ended by budget.wall_time"), "{summary}");
     let stopped = status(here);
     assert_eq!(
         (&stopped["finished"], &stopped["budget"]["used_up"]),
-        (&true.into(), &"budget.wall_hours".into())
+        (&true.into(), &"budget.wall_time".into())
     );
     // The clock is looked at now and then: some walks may have come to their end before.
     let walks = walks(&stopped);
     assert!(walks.iter().all(|(state, _)| !["waiting", "running"].contains(&state.as_str())), "{walks:?}");
-    assert!(walks.contains(&("budget".into(), "budget.wall_hours".into())), "{walks:?}");
+    assert!(walks.contains(&("budget".into(), "budget.wall_time".into())), "{walks:?}");
     assert!(stopped["budget"]["used"]["wall_hours"].as_f64() > Some(1e-6));
     let so_far = decisions(here);
     let all: Vec<_> = expected.decisions.lines().map(str::to_owned).collect();
@@ -131,7 +131,7 @@ fn a_limit_of_time_stops_walks_where_they_stand() {
     // Nothing is begun as long as nothing is left.
     succeed(here, RUN);
     assert_eq!(decisions(here), so_far);
-    change(here, "wall_hours = 1e-6", "wall_hours = 10.0");
+    change(here, "\"4ms\"", "\"10h\"");
     succeed(here, RUN);
     assert_eq!(outcome(&here.join("here")), expected);
 }
@@ -184,7 +184,12 @@ fn wrong_budgets_and_queues_are_refused() {
         &["budget.labels is 1; expected at least 2: a structure and its control"],
     );
     tester.refused_with("# labels = 1000", "labels = 0", &["expected a whole number above 0"]);
-    tester.refused_with("# wall_hours = 24.0", "wall_hours = -1.0", &["expected a finite number above 0"]);
+    tester.refused_with("# wall_time = \"24h\"", "wall_time = 24.0", &["a time with its unit"]);
+    tester.refused_with(
+        "# wall_time = \"24h\"",
+        "wall_time = \"0s\"",
+        &["budget.wall_time", "1ms to 10years"],
+    );
     tester.refused_with("# core_hours = 100.0", "core_hour = 100.0", &["did you mean `core_hours`?"]);
     tester.refused_with(
         "# on_queue_full = \"wait\"",

@@ -92,7 +92,7 @@ fn a_finished_campaign_is_shown() {
         assert_eq!(status["labels"][state], count);
     }
     let walks = status["walks"].as_array().unwrap();
-    assert!(walks.len() == 4 && walks.iter().all(|walk| walk["state"] == "collected"));
+    assert!(walks.len() == 4 && walks.iter().all(|walk| walk["state"] == "quota_reached"));
 
     assert_eq!((&status["disk"]["at_the_end"], &status["led"]), (&Json::Null, &false.into()));
     let shown = succeed(here, ["status", "small"]);

@@ -1,11 +1,12 @@
 //! Every file of `configs/` runs as it stands, and what comes of it can be read.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
 use atoms::extxyz::Frame;
-use atoms::{Evaluation, NeighbourList, Potential, read_extxyz, shortest_distance};
+use atoms::{Evaluation, NeighbourList, Potential, ShortestDistances, read_extxyz, shortest_distance};
 use potentials::{Eam, EamStyle, StillingerWeber};
 use serde_json::Value;
 
@@ -27,7 +28,10 @@ fn campaign(directory: &Path, name: &str, walks: usize, least: f64) -> Vec<Frame
     let biased: Vec<_> = walks.iter().filter(|walk| walk["origin"] == "biased").collect();
     let collected = biased.iter().filter(|walk| walk["accepted"].as_u64() > Some(0)).count();
     assert!(2 * collected > biased.len(), "most walks find something: {status}");
-    assert!(biased.iter().all(|walk| walk["state"] == "collected" || walk["state"] == "steps"), "{status}");
+    assert!(
+        biased.iter().all(|walk| walk["state"] == "quota_reached" || walk["state"] == "completed"),
+        "{status}"
+    );
     let accepted = status["candidates"]["accepted"].as_u64().unwrap();
     let control = status["candidates"]["control"].as_u64().unwrap();
 
@@ -134,6 +138,26 @@ fn nickel_aluminium_hydrogen_runs_as_it_stands() {
     let frames = campaign(directory.path(), "nickel-aluminium-hydrogen.toml", 38, 0.6);
     let mut potential = Eam::load_as(config("data/NiAlH_jea.eam.alloy"), EamStyle::Alloy).unwrap();
     check_labels(&frames, &mut potential);
+    check_conditions(&frames);
+}
+
+/// All temperatures, both directions of the ramp and the bonds of hydrogen are in what came out.
+fn check_conditions(frames: &[Frame]) {
+    let numbers =
+        |key: &str| frames.iter().map(|frame| frame.info[key].number().unwrap()).collect::<Vec<_>>();
+    let temperatures: BTreeSet<_> = numbers("temperature").into_iter().map(|t| t as u32).collect();
+    assert_eq!(temperatures, BTreeSet::from([300, 450, 600, 750, 900]));
+    let volumes = numbers("relative_volume");
+    assert!(volumes.iter().any(|v| *v < 0.99) && volumes.iter().any(|v| *v > 1.01), "{volumes:?}");
+    let mut neighbours = NeighbourList::new(3.0, 0.0);
+    let mut bonded = BTreeSet::new();
+    for Frame { structure, .. } in frames {
+        neighbours.update(structure).unwrap();
+        let shortest = ShortestDistances::from_neighbours(structure, &neighbours);
+        let bonds = shortest.iter().filter(|(pair, distance)| *distance < 1.3 * pair.covalent_radii());
+        bonded.extend(bonds.map(|(pair, _)| pair.to_string()));
+    }
+    assert!(["H-H", "H-Ni"].iter().all(|pair| bonded.contains(*pair)), "{bonded:?}");
 }
 
 #[test]

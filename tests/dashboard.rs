@@ -127,13 +127,13 @@ fn check_table(live: &Live) {
     let mut ascending = all_lines(address, "ascending=true", 7);
     ascending.reverse();
     assert_eq!(ascending, all);
-    for (order, key) in [("gamma", "gamma"), ("volume", "relative_volume")] {
+    for (order, key) in [("gamma", "gamma"), ("relative_volume", "relative_volume")] {
         let falling = column(&all_lines(address, &format!("order={order}"), 2), key);
         assert!(falling.len() == all.len() && falling.is_sorted_by(|a, b| a >= b), "{falling:?}");
         let rising = column(&all_lines(address, &format!("order={order}&ascending=true"), 5), key);
         assert!(rising.len() == all.len() && rising.is_sorted(), "{rising:?}");
     }
-    for fate in ["accepted", "covered", "duplicate", "guard", "budget", "control"] {
+    for fate in ["accepted", "covered", "duplicate", "too_close", "budget", "control"] {
         let wanted = |line: &&Value| match line["origin"].as_str() {
             Some("control") => fate == "control",
             _ => line["fate"] == fate,
@@ -152,7 +152,7 @@ fn check_table(live: &Live) {
     let listed: Vec<Value> = serde_json::from_str(&shown).unwrap();
     let names = |lines: &[Value], key: &str| lines.iter().map(|line| line[key].clone()).collect::<Vec<_>>();
     assert_eq!(names(&queue, "id"), names(&listed, "candidate"));
-    let found = all_lines(address, "where=gamma+%3E+1.1+and+element+%3D+Al+and+kind+%3D+biased", 4);
+    let found = all_lines(address, "where=gamma+%3E+1.1+and+element+%3D+Al+and+origin+%3D+biased", 4);
     let expected = |line: &&Value| line["gamma"].as_f64() > Some(1.1) && line["origin"] == "biased";
     assert_eq!(found, all.iter().filter(expected).cloned().collect::<Vec<_>>());
     assert_eq!(all_lines(address, "where=energy+%3C+1", 4), Vec::<Value>::new(), "there is no label");
@@ -303,7 +303,7 @@ fn the_table_and_exports_speak_one_language() {
         format!("energy <= {energy} and max_force > 0"),
         format!("energy_per_atom < {per_atom}"),
         format!("not gamma >= {gamma} and mixture_version != 3 and energy < 1e9"),
-        format!("gamma > {gamma} and energy < 1e9 or kind = control and energy < 1e9 and step > 100"),
+        format!("gamma > {gamma} and energy < 1e9 or origin = control and energy < 1e9 and step > 100"),
     ] {
         succeed(here, ["export", "campaign", "--output", "set.extxyz", "--control", "--where", &condition]);
         let frames = fs::File::open(here.join("set.extxyz")).unwrap();

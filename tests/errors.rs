@@ -136,7 +136,9 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     assert_eq!(of_bin("completion_by_relative_volume", "failed"), lost.len());
     let text = succeed(here, ["force-errors", "strict"]);
     assert!(
-        text.contains("ROC-AUC(γ_nbr)") && text.contains("above 1 eV/Å (%)") && text.contains("censored"),
+        text.contains("ROC-AUC(γ_nbr)")
+            && text.contains("above 1 eV/Å (%)")
+            && text.contains("failed (without label)"),
         "{text}"
     );
 

@@ -51,16 +51,16 @@ fn conditions_choose_what_they_say() {
     type Choice<'a> = &'a dyn Fn(&Frame) -> bool;
     let choices: [(String, Choice); 5] = [
         (format!("gamma > {middle:?} and element = Al"), &high),
-        (format!("not gamma > {middle:?} or kind = control"), &|frame| {
+        (format!("not gamma > {middle:?} or origin = control"), &|frame| {
             !high(frame) || text(frame, "origin") == "control"
         }),
-        ("seed = 'slab-111' or seed = vacancy".into(), &|frame| {
+        ("seed_structure = 'slab-111' or seed_structure = vacancy".into(), &|frame| {
             ["slab-111", "vacancy"].contains(&text(frame, "seed_structure"))
         }),
         ("max_force >= 1.5 and atoms < 40".into(), &|frame| {
             force(frame) >= 1.5 && frame.structure.len() < 40
         }),
-        ("volume <= 1.1 and step > 60".into(), &|frame| {
+        ("relative_volume <= 1.1 and step > 60".into(), &|frame| {
             frame.info["relative_volume"].number() <= Some(1.1) && frame.info["step"].number() > Some(60.0)
         }),
     ];

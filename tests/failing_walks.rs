@@ -43,7 +43,7 @@ fn a_campaign_whose_walks_all_diverge_has_failed() {
     let output = calmwalk(here, ["run", "campaign.toml"]);
     let (summary, said) = (String::from_utf8_lossy(&output.stdout), stderr(&output));
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(summary.contains("ended: 4 blew up (too hot)"), "{summary}");
+    assert!(summary.contains("ended: 4 diverged (too hot)"), "{summary}");
     assert!(
         summary.contains("4 too hot, such as walk ") && summary.contains(" is above the allowed 2 K"),
         "{summary}"
@@ -54,12 +54,12 @@ fn a_campaign_whose_walks_all_diverge_has_failed() {
     assert!(said.contains("the campaign has failed: 4 of 4 finished walks"), "{said}");
 
     let shown = succeed(here, ["status", "campaign"]);
-    assert!(shown.contains("4 ended (4 blew up)") && shown.contains("too hot: try a smaller"), "{shown}");
+    assert!(shown.contains("4 ended (4 diverged)") && shown.contains("too hot: try a smaller"), "{shown}");
     let all = succeed(here, ["status", "campaign", "--all"]);
     assert!(all.contains("4 too hot, such as walk ") && all.contains("what to change: "), "{all}");
     let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
     let ends = status["ends"].as_array().unwrap();
-    assert_eq!((ends.len(), &ends[0]["end"], &ends[0]["cause"]), (1, &"blew_up".into(), &"too_hot".into()));
+    assert_eq!((ends.len(), &ends[0]["end"], &ends[0]["cause"]), (1, &"diverged".into(), &"too_hot".into()));
     assert_eq!(ends[0]["walks"], 4);
 
     // The same command once more comes to the same end, and tells nothing twice.
@@ -78,7 +78,7 @@ fn walks_that_find_nothing_are_a_result() {
     fs::write(&path, fs::read_to_string(&path).unwrap().replace("threshold = 1.0", "threshold = 1e6"))
         .unwrap();
     let summary = succeed(here, ["run", "campaign.toml"]);
-    assert!(summary.contains("ended: 4 steps\n") && !summary.contains("what to change"), "{summary}");
+    assert!(summary.contains("ended: 4 completed\n") && !summary.contains("what to change"), "{summary}");
     let events = fs::read_to_string(here.join("events")).unwrap();
     assert!(!events.contains("failing_walks"), "{events}");
 }

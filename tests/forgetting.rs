@@ -4,8 +4,10 @@ use std::fs;
 use std::path::Path;
 
 use serde_json::Value as Json;
+use store::Location;
 
 use crate::common::campaign::Small;
+use crate::common::label_campaign::on_store;
 use crate::common::{calmwalk, stderr, succeed};
 
 /// A campaign whose updates replace the covariance by that of the collected structure.
@@ -55,4 +57,51 @@ fn updates_become_additive_and_a_replay_agrees() {
     assert!(succeed(here, ["replay", "campaign"]).contains("all reproduced bit by bit"));
     let text = succeed(here, ["status", "campaign", "--all"]);
     assert!(text.contains("of its training data, Al is forgotten most: σ² × "), "{text}");
+    let training = &status(here)["training_frames"];
+    let growth = check_elements(here, training);
+    assert!(text.contains(&format!("component 0 of Al is forgotten most: σ² × {growth:.2}")), "{text}");
+    assert_eq!(training["elements"][0]["share_above_one"], training["share_above_one"]);
+    // The log has what earlier versions wrote.
+    let decisions = on_store(Location::from(&*here.join("campaign")), async |store| {
+        store.decisions(1..=i64::MAX).await.unwrap()
+    });
+    let logged = decisions.iter().filter_map(|decision| decision.detail["forgetting"]["elements"].get(0));
+    let without = |element: &Json| element["mean_square_growth"].is_f64() && element["components"].is_null();
+    assert!(logged.map(without).reduce(|all, one| all && one).unwrap());
+}
+
+/// The forgetting of aluminium, which has one component, in JSON and in the report. Returns the growth of its mean σ².
+fn check_elements(here: &Path, training: &Json) -> f64 {
+    let [element] = training["elements"].as_array().unwrap().as_slice() else { panic!("{training}") };
+    let growth = element["mean_square_growth"].as_f64().unwrap();
+    let [component] = element["components"].as_array().unwrap().as_slice() else { panic!("{training}") };
+    assert_eq!((&element["element"], &component["component"]), (&"Al".into(), &0.into()));
+    assert!((component["mean_square_growth"].as_f64().unwrap() / growth - 1.0).abs() < 1e-12, "{training}");
+    succeed(here, ["report", "campaign", "--output", "report"]);
+    let table = fs::read_to_string(here.join("report/tables/summary.csv")).unwrap();
+    let row = table.lines().find(|line| line.contains("mean σ² of training atoms")).unwrap();
+    assert!(row.contains(&format!("Al × {growth:.2} (")), "{row}");
+    assert!(row.contains(&format!("component 0 × {growth:.2})")), "{row}");
+    growth
+}
+
+#[test]
+fn the_covariances_raise_the_alarm_without_training_frames() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, "warn", 0.1);
+    let path = here.join("campaign.toml");
+    let text = fs::read_to_string(&path).unwrap();
+    let limit = "max_mean_square_growth = 1.05\n# training_frames = ";
+    fs::write(&path, text.replace("training_frames = ", limit)).unwrap();
+    let run = calmwalk(here, ["run", "campaign.toml"]);
+    let said = stderr(&run);
+    assert_eq!(run.status.code(), Some(0), "{said}");
+    let alarm = "ALARM: the mixture forgets its training data: the mean σ² of the training atoms of Al is ";
+    assert!(said.contains(alarm) && said.contains("(calm.max_mean_square_growth: 1.05)"), "{said}");
+    let training = &status(here)["training_frames"];
+    assert_eq!((&training["alarm"], &training["share_above_one"]), (&true.into(), &Json::Null));
+    let growth = check_elements(here, training);
+    assert!((training["level"].as_f64().unwrap() / (growth / 1.05) - 1.0).abs() < 1e-12, "{training}");
+    assert!(training["elements"][0]["share_above_one"].is_null());
 }

@@ -73,30 +73,35 @@ fn other_physics_is_refused_with_old_and_new_value() {
     let line = |of: &str| 1 + original.lines().position(|line| line.starts_with(of)).unwrap();
     let database = fs::read(here.join("here/campaign.sqlite")).unwrap();
     for (key, from, to, words) in [
-        ("tau", "tau = 0.3", "tau = 0.4", "walk.tau is 0.4, but this campaign began with 0.3: its walks"),
+        (
+            "tau",
+            "tau = 0.3",
+            "tau = 0.4",
+            "walk.tau is 0.4, but this campaign started with 0.3: a started campaign",
+        ),
         (
             "rng_seed",
             "rng_seed = 7",
             "rng_seed = 8",
-            "campaign.rng_seed is 8, but this campaign began with 7",
+            "campaign.rng_seed is 8, but this campaign started with 7",
         ),
         (
             "walks_per_round",
             "round = 2",
             "round = 1",
-            "run.walks_per_round is 1, but this campaign began with 2",
+            "run.walks_per_round is 1, but this campaign started with 2",
         ),
         (
             "mode",
             "reproducible",
             "live",
-            "campaign.mode is \"live\", but this campaign began with \"reproducible\"",
+            "campaign.mode is \"live\", but this campaign started with \"reproducible\"",
         ),
         (
             "[walk]",
             "volume_ramp",
             "# volume_ramp",
-            "walk.volume_ramp is left out, but this campaign began with {",
+            "walk.volume_ramp is left out, but this campaign started with {",
         ),
         (
             "[calm]",
@@ -110,7 +115,7 @@ fn other_physics_is_refused_with_old_and_new_value() {
         assert!(message.contains(&format!("campaign.toml:{}: ", line(key))), "{message}");
         assert!(message.contains(words), "{message}\nexpected {words}");
         assert!(
-            message.contains("Put the old value back, or start another campaign with --directory"),
+            message.contains("Restore the old value, or start another campaign with --directory"),
             "{message}"
         );
         fs::write(here.join("campaign.toml"), &original).unwrap();
@@ -132,10 +137,10 @@ fn files_may_move_but_not_change() {
     fs::write(here.join("label.eam.fs"), format!("another comment{content}")).unwrap();
     let message = refuse(here, RUN);
     assert!(
-        message.contains("label.method.potential.file: the file has another content (BLAKE3 "),
+        message.contains("label.method.potential.file: the contents of the file changed (BLAKE3 "),
         "{message}"
     );
-    assert!(message.contains("Put the old file back"), "{message}");
+    assert!(message.contains("Restore the old file"), "{message}");
 }
 
 #[test]
@@ -143,7 +148,7 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
     let directory = finished();
     let here = directory.path();
     let before = walks(here);
-    assert!(before.iter().all(|walk| walk.0 == "control" || walk.2 == "steps"), "{before:?}");
+    assert!(before.iter().all(|walk| walk.0 == "control" || walk.2 == "completed"), "{before:?}");
     replace(here, "max_per_walk = 4", "max_per_walk = 6\nmax_structures = 20");
     replace(here, "walkers = 2", "walkers = 1");
     replace(here, "[label]", "[label]\nconcurrency = 2");
@@ -177,7 +182,7 @@ fn a_larger_budget_lets_walks_go_on() {
         biased.map(|(_, name, state, accepted)| (name, state, accepted)).collect()
     };
     let collected =
-        |accepted: u32| ["fcc-100", "vacancy"].map(|n| (n.to_owned(), "collected".to_owned(), accepted));
+        |accepted: u32| ["fcc-100", "vacancy"].map(|n| (n.to_owned(), "quota_reached".to_owned(), accepted));
     assert_eq!(accepted(), collected(1));
     replace(here, "max_per_walk = 1", "max_per_walk = 2");
     assert_eq!(resume_processes(here), "configuration: collect.max_per_walk is now 2 (was 1)");
@@ -233,7 +238,7 @@ fn seed_structures_cannot_be_changed_moved_or_taken_away() {
         other.write(here);
         let message = refuse(here, RUN);
         assert!(message.contains("seed_structures.files: ") && message.contains(words), "{message}");
-        assert!(message.contains("can be added behind those that it has"), "{message}");
+        assert!(message.contains("append new seed structures after the existing ones"), "{message}");
     }
     small().write(here);
     let path = here.join("seeds.extxyz");
@@ -276,7 +281,7 @@ fn precision_is_part_of_what_a_campaign_is() {
     replace(processes.path(), "\"mixed\"", "\"double\"");
     let message = refuse(processes.path(), RUN);
     assert!(
-        message.contains("potential.precision is left out, but this campaign began with \"mixed\""),
+        message.contains("potential.precision is left out, but this campaign started with \"mixed\""),
         "{message}"
     );
 }

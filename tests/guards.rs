@@ -36,11 +36,11 @@ fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
     assert!(refused.len() > 1 && summary.contains("structures failed"), "{summary}");
     let details = json(here, ["queue", "campaign", "show", &refused[0]]);
     let attempt = &details["attempts_made"][0];
-    assert_eq!(attempt["class"], "refused");
+    assert_eq!(attempt["class"], "rejected_by_label_guard");
     let log = attempt["log"].as_str().unwrap();
     assert!(log.contains("Å apart, where label.guard.min_bond_lengths of Al-Al is 3.5"), "{log}");
     let status = json(here, ["status", "campaign"]);
-    assert_eq!(status["failures"][0]["class"], "refused");
+    assert_eq!(status["failures"][0]["class"], "rejected_by_label_guard");
     assert_eq!(status["failures"][0]["failed"], refused.len());
 
     // Overruled, one is labelled by the same labellers; the others stay refused.

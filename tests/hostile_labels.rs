@@ -193,7 +193,7 @@ fn a_scratch_directory_that_others_can_write_to_is_refused() {
 #[test]
 fn programs_get_the_environment_that_they_need_and_no_password() {
     let once = Once::new(
-        "env > $HERE/program; tr '\\0' '\\n' < /proc/$PPID/environ > $HERE/keeper\n",
+        "env > $HERE/program; tr '\\0' '\\n' < /proc/$PPID/environ > $HERE/runner\n",
         "pass_environment = [\"MYSITE_*\", \"MY_TOKEN\"]",
     );
     let mut command = once.command();
@@ -209,7 +209,7 @@ fn programs_get_the_environment_that_they_need_and_no_password() {
         ("LD_LIBRARY_PATH", "/none"),
     ];
     label(command.envs(given).output().unwrap());
-    for who in ["program", "keeper"] {
+    for who in ["program", "runner"] {
         let environment = once.read(who);
         let lines: Vec<_> = environment.lines().collect();
         for line in ["MYSITE_A=1", "MY_TOKEN=2", "SLURM_JOB_ID=3", "LD_LIBRARY_PATH=/none"] {
@@ -258,7 +258,7 @@ fn daemons_end_with_the_calculation() {
     once.assert_no_leftovers();
 }
 
-/// What loses its parent becomes a child of the calculation's keeper, which has to take note of its end.
+/// What loses its parent becomes a child of the calculation's runner, which has to take note of its end.
 #[test]
 fn no_dead_process_is_left_while_a_calculation_goes_on() {
     let once = Once::new(

@@ -144,7 +144,7 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     let number = |name: &str| metrics[name].1[""];
     are_documented(&metrics);
     assert_eq!(number("calmwalk_agent_link_up"), 1.0);
-    assert_eq!(number("calmwalk_agent_places_total"), 1.0);
+    assert_eq!(number("calmwalk_agent_joins_total"), 1.0);
     let came: f64 = metrics["calmwalk_agent_assignments_total"].1.values().sum();
     let taken = number("calmwalk_agent_assignments_received_total");
     assert!(

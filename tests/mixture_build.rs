@@ -66,7 +66,7 @@ fn the_number_of_threads_changes_no_byte_and_the_mixture_grades_its_data() {
     let (two, _) = build(here, "two.npz", &["data.extxyz"], &["--threads", "2"]);
     assert!(one == two, "the artifacts differ");
     // Another seed is another mixture.
-    let (other, _) = build(here, "other.npz", &["data.extxyz"], &["--seed", "7"]);
+    let (other, _) = build(here, "other.npz", &["data.extxyz"], &["--rng-seed", "7"]);
     assert!(one != other);
 
     let model = config(MODEL).display().to_string();
@@ -136,7 +136,7 @@ fn an_interrupted_build_continues_and_another_is_refused() {
         &weights,
         "list of data files is a.extxyz b.extxyz c.extxyz, now it is a.extxyz b.extxyz",
     );
-    refused(&files, &["--weight", "b.extxyz=0.5", "--seed", "1"], "--seed is 42, now it is 1");
+    refused(&files, &["--weight", "b.extxyz=0.5", "--rng-seed", "1"], "--rng-seed is 42, now it is 1");
     refused(&files, &["--weight", "b.extxyz=0.5", "--candidates", "1,2,4"], "--candidates is 1,2,4,8,16");
 
     let output = calmwalk(here, &started);

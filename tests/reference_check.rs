@@ -13,7 +13,7 @@ use crate::common::label_campaign::{WRITE_FIXED_LABEL, on_store};
 use crate::common::processes::{assert_no_leftovers, calculation_processes, signal, wait_until};
 use crate::common::{Running, calmwalk, program, refuse, stderr, succeed, write_frames};
 
-const CHECK: &str = "check = { structures = \"known.extxyz\" }";
+const CHECK: &str = "reference_check = { structures = \"known.extxyz\" }";
 
 /// A campaign in `campaign.toml` with a check, whose label method has this text instead of that of the small campaign.
 fn campaign(method: Option<&str>) -> TempDir {
@@ -100,7 +100,7 @@ fn labels_that_agree_start_the_campaign() {
     write_known(here, |_, labels| add_energy(labels, -200.0));
     let said = stderr(&run(here, &[]));
     assert!(
-        said.contains("label.check.structures is now") && said.contains("reference check: passed"),
+        said.contains("label.reference_check.structures is now") && said.contains("reference check: passed"),
         "{said}"
     );
     assert!(!said.contains("labelled "), "the labels were there: {said}");
@@ -118,9 +118,9 @@ fn labels_that_differ_stop_the_campaign_until_they_are_accepted() {
         let output = run(here, &[]);
         let said = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{said}");
-        let expected = "the energy differs by 0.0500 eV/atom, more than label.check.max_energy_difference = 0.005 eV/atom";
+        let expected = "the energy differs by 0.0500 eV/atom, more than label.reference_check.max_energy_difference = 0.005 eV/atom";
         assert!(said.contains("known.extxyz:1 ") && said.contains(expected), "{said}");
-        assert!(said.contains("No walk was started") && said.contains("--accept-check"), "{said}");
+        assert!(said.contains("No walk was started") && said.contains("--accept-reference-check"), "{said}");
         assert_eq!(said.contains("labelled "), !again, "{said}");
     }
     let state = status(here);
@@ -136,7 +136,7 @@ fn labels_that_differ_stop_the_campaign_until_they_are_accepted() {
     assert!(ended.iter().all(|end| end["how"] == "failed" && is_refusal(end)), "{ended:?}");
     let told = succeed(here, ["status", ".", "--all"]);
     assert!(told.contains("root mean square") && told.contains("a force differs by"), "{told}");
-    let output = run(here, &["--accept-check"]);
+    let output = run(here, &["--accept-reference-check"]);
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(0), "{said}");
     assert!(
@@ -276,7 +276,7 @@ fn a_file_that_cannot_be_compared_is_refused_with_its_line() {
         let told = refused(&frame(&content));
         assert!(
             told.contains("campaign.toml:")
-                && told.contains("label.check.structures: ")
+                && told.contains("label.reference_check.structures: ")
                 && told.contains(message),
             "{told}"
         );
@@ -299,7 +299,7 @@ fn validate_warns_of_files_that_show_little() {
     assert!(!told.contains("energies cannot be compared"), "{told}");
     write_known(here, |_, _| ());
     let told = warnings();
-    assert!(!told.contains("label.check"), "{told}");
+    assert!(!told.contains("label.reference_check"), "{told}");
     let mut frames = atoms::read_extxyz(&here.join("known.extxyz")).unwrap();
     frames.truncate(1);
     write_frames(&here.join("known.extxyz"), &frames);
@@ -330,22 +330,23 @@ fn a_launched_campaign_accepts_only_the_check_that_the_user_has_seen() {
     let here = directory.path();
     write_known(here, |number, labels| add_energy(labels, 0.1 * number as f64));
     let printed = |further: &[&str]| String::from_utf8(launched(here, further).stdout).unwrap();
-    assert!(!printed(&[]).contains("--accept-check"));
-    let scripts = printed(&["--accept-check"]);
-    let accept = scripts.split_whitespace().find(|word| word.starts_with("--accept-check")).unwrap();
-    let identity = accept.strip_prefix("--accept-check=").unwrap();
+    assert!(!printed(&[]).contains("--accept-reference-check"));
+    let scripts = printed(&["--accept-reference-check"]);
+    let accept =
+        scripts.split_whitespace().find(|word| word.starts_with("--accept-reference-check")).unwrap();
+    let identity = accept.strip_prefix("--accept-reference-check=").unwrap();
     assert!(identity.len() == 64 && identity.chars().all(|c| c.is_ascii_hexdigit()), "{accept}");
     let configuration = fs::read_to_string(here.join("campaign.toml")).unwrap();
     let with_check = |check: &str| {
         let text = configuration.replacen(CHECK, check, 1);
         fs::write(here.join("campaign.toml"), text).unwrap();
     };
-    with_check("check = { structures = \"known.extxyz\", max_energy_difference = 0.004 }");
+    with_check("reference_check = { structures = \"known.extxyz\", max_energy_difference = 0.004 }");
     let output = run(here, &[accept]);
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(
-        said.contains("--accept-check accepts an earlier check")
+        said.contains("--accept-reference-check accepts an earlier check")
             && said.contains("energy_difference = 0.004"),
         "{said}"
     );
@@ -365,9 +366,9 @@ fn a_check_that_is_not_there_cannot_be_accepted() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     Small::default().write(here);
-    let expected = "--accept-check: campaign.toml has no label.check.structures";
-    let told = refuse(here, ["run", "campaign.toml", "--accept-check"]);
+    let expected = "--accept-reference-check: campaign.toml has no label.reference_check.structures";
+    let told = refuse(here, ["run", "campaign.toml", "--accept-reference-check"]);
     assert!(told.contains(expected), "{told}");
-    let output = launched(here, &["--accept-check"]);
+    let output = launched(here, &["--accept-reference-check"]);
     assert!(output.status.code() == Some(2) && stderr(&output).contains(expected), "{}", stderr(&output));
 }

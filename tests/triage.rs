@@ -8,7 +8,8 @@ use std::path::Path;
 use atoms::read_extxyz;
 
 use crate::common::campaign::Small;
-use crate::common::{calmwalk, config, refuse, stderr, succeed};
+use crate::common::npz::with_changed_arrays;
+use crate::common::{calmwalk, config, demo, refuse, stderr, succeed};
 
 /// `n`³ atoms of simple cubic aluminium with the edge `a`, Å, whose first atom is displaced.
 fn cubic(name: &str, n: u8, a: f64, displacement: f64) -> String {
@@ -135,6 +136,39 @@ fn the_worst_seed_structures_come_first() {
     let is_candidate: Vec<_> =
         all.iter().map(|row| row.ends_with("a candidate before its walk starts")).collect();
     assert!(is_candidate.is_sorted_by(|a, b| a >= b) && is_candidate[0] && !is_candidate[31], "{all:?}");
+}
+
+/// Nickel, aluminium and hydrogen under a mixture that was built without hydrogen.
+#[test]
+fn elements_that_the_mixture_has_no_data_of_are_shown() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let artifact = config("data/ni_al_h_eam_1l/gmm_artifacts.npz");
+    let without_hydrogen = with_changed_arrays(&artifact, |name, numbers| match name {
+        "counts_1" | "effective_count_1" | "scatter_1" => numbers.fill(0.0),
+        "inv_cov_1" => {
+            // The inverse of the regularisation, of each component.
+            let dimension = (numbers.len() / 3).isqrt();
+            let diagonal = |k: usize| (k % (dimension * dimension)).is_multiple_of(dimension + 1);
+            numbers.iter_mut().enumerate().for_each(|(k, x)| *x = if diagonal(k) { 1e6 } else { 0.0 });
+        }
+        _ => {}
+    });
+    fs::write(here.join("artifact.npz"), without_hydrogen).unwrap();
+    let text = demo("nickel-aluminium-hydrogen.toml");
+    fs::write(here.join("c.toml"), text.replace(&artifact.display().to_string(), "artifact.npz")).unwrap();
+    let shown = succeed(here, ["validate", "c.toml", "--csv", "seeds.csv"]);
+    assert!(
+        shown.contains("7 of 8 seed structures have an element that the mixture has no data of"),
+        "{shown}"
+    );
+    for (name, row) in rows(&here.join("seeds.csv")) {
+        let expected = if row["formula"].contains('H') { "not_in_mixture" } else { "ready" };
+        assert_eq!(row["state"], expected, "{name}: {row:?}");
+        assert!((expected == "ready") != row["remark"].contains('H'), "{row:?}");
+        let gamma: f64 = row["gamma_max"].parse().unwrap();
+        assert!((gamma > 10.0) == (expected != "ready"), "{name}: {gamma}");
+    }
 }
 
 #[test]

@@ -3,11 +3,12 @@
 use std::fs;
 use std::path::Path;
 
+use atoms::extxyz::Value;
 use atoms::read_extxyz;
 use serde_json::{Value as Json, json};
 
 use crate::common::campaign::{Outcome, Small, outcome};
-use crate::common::{refuse, succeed};
+use crate::common::{calmwalk, refuse, stderr, succeed, write_frames};
 
 const GROUPS: &str = r#"
 [[walks]]
@@ -17,7 +18,7 @@ volume_ramps = [{ from = 1.0, to = 1.25 }, { from = 1.0, to = 0.9 }]
 
 [[walks]]
 name = "hole"
-seed_structures = "seed = vacancy"
+seed_structures = "seed_structure = vacancy"
 temperatures = [600.0]
 tau_values = [0.2, 0.4]
 repeats = 2
@@ -109,7 +110,7 @@ fn walks_of_one_seed_structure_end_together_at_its_limit() {
         ends.push(walk["state"].as_str().unwrap());
     }
     assert_eq!(accepted, 2, "one of each seed structure");
-    assert!(ends.iter().all(|end| *end == "collected"), "{ends:?}");
+    assert!(ends.iter().all(|end| *end == "quota_reached"), "{ends:?}");
 }
 
 #[test]
@@ -133,8 +134,8 @@ fn wrong_groups_are_refused() {
         ),
         ("[[walks]]\nname = \"a\"\nrepeats = 5000\n", "walks.0.repeats is 5000; expected at most 1000"),
         (
-            "[[walks]]\nname = \"a\"\nseed_structures = \"seed = bcc\"\n",
-            "no seed structure is selected by 'seed = bcc'; expected at least one",
+            "[[walks]]\nname = \"a\"\nseed_structures = \"seed_structure = bcc\"\n",
+            "no seed structure is selected by 'seed_structure = bcc'; expected at least one",
         ),
         (
             "[[walks]]\nname = \"a\"\nseed_structures = \"gamma > 1\"\n",
@@ -148,9 +149,101 @@ fn wrong_groups_are_refused() {
         assert!(message.contains("campaign.toml:"), "{message}");
     }
     // A seed structure that no group selects gets no walk.
-    write(here, "[[walks]]\nname = \"a\"\nseed_structures = \"seed = vacancy\"\n", 1, "");
-    let output = crate::common::calmwalk(here, ["validate", "campaign.toml"]);
-    let said = crate::common::stderr(&output);
+    write(here, "[[walks]]\nname = \"a\"\nseed_structures = \"seed_structure = vacancy\"\n", 1, "");
+    let output = calmwalk(here, ["validate", "campaign.toml"]);
+    let said = stderr(&output);
     assert!(output.status.success() && said.contains("seed structure 'fcc-100'"), "{said}");
     assert!(said.contains("is in no group: no walk starts from it"), "{said}");
+}
+
+/// A small campaign with these groups, whose seed structures are a crystal and `clusters` without a cell.
+fn write_with_clusters(here: &Path, groups: &str, clusters: usize) {
+    write(here, groups, 1, "");
+    let seeds = here.join("seeds.extxyz");
+    let mut frames = read_extxyz(&seeds).unwrap();
+    frames.truncate(1);
+    for number in 0..clusters {
+        let mut cluster = frames[0].clone();
+        cluster.structure.periodic = [false; 3];
+        cluster.info.insert("name".to_owned(), Value::Text(format!("cluster-{number}")));
+        frames.push(cluster);
+    }
+    write_frames(&seeds, &frames);
+}
+
+/// Standard error of a command that succeeds.
+fn warnings(here: &Path, command: &str) -> String {
+    let output = calmwalk(here, [command, "campaign.toml"]);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    said
+}
+
+fn biased_walks(here: &Path) -> Vec<(String, Json)> {
+    let status = json(here, ["status", "campaign"]);
+    let walks = status["walks"].as_array().unwrap().iter().filter(|walk| walk["origin"] == "biased");
+    let walk = |walk: &Json| {
+        (walk["seed_structure"].as_str().unwrap().to_owned(), walk["conditions"]["volume_ramp"].clone())
+    };
+    walks.map(walk).collect()
+}
+
+const DENSE: &str = "[[walks]]\nname = \"dense\"\nvolume_ramps = [{ from = 1.0, to = 0.9 }]\n";
+
+#[test]
+fn a_structure_without_a_volume_is_skipped_where_all_its_walks_would_change_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let alone = "[[walks]]\nname = \"alone\"\nseed_structures = \"seed_structure = cluster-0\"\n";
+    write_with_clusters(here, &format!("{DENSE}{alone}"), 1);
+    let said = warnings(here, "run");
+    let expected = [
+        "seed structure 'cluster-0' (seeds.extxyz:",
+        ") is skipped: group 'dense' changes the volume, but the structure has no periodic direction",
+        "group 'alone' has no walk: none can start from the seed structures that it selects",
+    ];
+    assert!(expected.iter().all(|words| said.contains(words)), "{said}");
+    assert_eq!(biased_walks(here), [("fcc-100".to_owned(), json!([1.0, 0.9]))]);
+    succeed(here, ["validate", "campaign.toml", "--csv", "seeds.csv"]);
+    let csv = fs::read_to_string(here.join("seeds.csv")).unwrap();
+    assert!(csv.lines().nth(1).unwrap().starts_with("cluster-0,") && csv.contains(",skipped,"), "{csv}");
+
+    // All must be able to walk, if that is wanted, and at least one.
+    let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
+    let strict = text.replace("[seed_structures]", "[seed_structures]\non_invalid = \"error\"");
+    fs::write(here.join("strict.toml"), strict).unwrap();
+    let message = refuse(here, ["validate", "strict.toml"]);
+    assert!(message.contains("walks.0") && message.contains("group 'dense' changes the volume"), "{message}");
+    write_with_clusters(here, alone, 1);
+    let message = refuse(here, ["validate", "campaign.toml"]);
+    assert!(message.contains("no walk can start: group 'alone' changes the volume"), "{message}");
+}
+
+#[test]
+fn a_structure_without_a_volume_keeps_the_walks_that_do_not_change_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let both =
+        "[[walks]]\nname = \"both\"\nvolume_ramps = [{ from = 1.0, to = 0.9 }, { from = 1.0, to = 1.0 }]\n";
+    write_with_clusters(here, both, 1);
+    let said = warnings(here, "run");
+    assert!(said.contains("walks at its own volume only: group 'both' changes the volume"), "{said}");
+    let own = json!([1.0, 1.0]);
+    let expected = [("fcc-100", json!([1.0, 0.9])), ("fcc-100", own.clone()), ("cluster-0", own)];
+    assert_eq!(biased_walks(here), expected.map(|(name, ramp)| (name.to_owned(), ramp)));
+}
+
+#[test]
+fn long_lists_of_structures_without_walks_are_cut() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_with_clusters(here, DENSE, 22);
+    let said = warnings(here, "validate");
+    assert_eq!(said.matches(") is skipped: group").count(), 20, "{said}");
+    assert!(said.contains("2 more seed structures are skipped"), "{said}");
+    let crystal = "[[walks]]\nname = \"crystal\"\nseed_structures = \"seed_structure = fcc-100\"\n";
+    write_with_clusters(here, crystal, 22);
+    let said = warnings(here, "validate");
+    assert_eq!(said.matches("is in no group: no walk starts from it").count(), 20, "{said}");
+    assert!(said.contains("2 more seed structures are in no group"), "{said}");
 }

@@ -271,6 +271,9 @@ fn training_frames_and_label_potentials_must_fit() {
     tester.refused_with(&frames, "absent.extxyz", &["calm.training_frames: absent.extxyz"]);
     let silicon = path("data/si_sw_1l/seed_frames.extxyz");
     tester.refused_with(&frames, &silicon, &[&format!("{silicon}:1: atom 0 is Si"), "(it supports Al)"]);
+    tester.write("empty.extxyz", "");
+    let expected = "empty.extxyz: found no frames with atoms, expected at least one";
+    tester.refused_with(&frames, "empty.extxyz", &["calm.training_frames: ", expected]);
     tester.refused_with(
         &label,
         "absent.eam",

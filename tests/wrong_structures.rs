@@ -312,3 +312,41 @@ fn the_good_structure_is_good() {
     let valid = succeed(seeds.tester.path(), ["validate", "c.toml"]);
     assert!(valid.contains("seed structures  1, with 27 to 27 atoms"), "{valid}");
 }
+
+/// The window of aluminium, 2.42 times the fractions, reaches into the bonds of 2.8 Å.
+#[test]
+fn a_repulsion_that_reaches_into_bonds_is_shown_and_warned_of() {
+    let seeds = Seeds::new();
+    seeds.tester.write("good.extxyz", good());
+    let validate = |inner: f64, outer: f64| {
+        let windows = format!("zbl = {{ rule = \"per_pair\", inner = {inner}, outer = {outer} }} #");
+        let text = changed(&seeds.files, "good.extxyz").replace("zbl = ", &windows);
+        seeds.tester.write("c.toml", text);
+        let output = calmwalk(seeds.tester.path(), ["validate", "c.toml"]);
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        let shown = String::from_utf8(output.stdout.clone()).unwrap();
+        let mut rows = shown.lines().skip_while(|line| !line.starts_with("pair "));
+        let titles = rows.next().unwrap().split("  ").map(str::trim).filter(|title| !title.is_empty());
+        let expected = [
+            "pair",
+            "sum of radii (Å)",
+            "shortest (Å)",
+            "guard (Å)",
+            "ZBL full below (Å)",
+            "ZBL zero above (Å)",
+        ];
+        assert_eq!(titles.collect::<Vec<_>>(), expected, "{shown}");
+        let cells = rows.next().unwrap().split_whitespace().map(str::to_owned);
+        (cells.collect::<Vec<_>>(), stderr(&output))
+    };
+    let (cells, said) = validate(0.9, 1.25);
+    assert_eq!(cells, ["Al-Al", "2.42", "2.800", "2.100", "2.178", "3.025"]);
+    let expected = [
+        "guard.zbl: the repulsion reaches into bonds of seed structures: ",
+        "Al-Al reaches to 3.025 Å and changes distances of 2.800 Å in 'good-0'",
+        "give these pairs shorter windows in guard.zbl.pairs",
+    ];
+    assert!(expected.iter().all(|words| said.contains(words)), "{said}");
+    let (cells, said) = validate(0.55, 0.75);
+    assert_eq!((cells[4].as_str(), cells[5].as_str(), said.as_str()), ("1.331", "1.815", ""));
+}

@@ -1,4 +1,4 @@
-"""Makes a synthetic foundation model and seed structures for the measurements of `measure.sh`.
+"""Makes a synthetic foundation model and seed structures for the measurements of `measure.py`.
 
     python make_model.py WORK
 
@@ -6,6 +6,7 @@ The Python has ASE and gracemaker (tensorpotential 0.6.2.1), whose programs are 
 
     model.npz     GRACE-2L "medium" with random weights, 89 elements, and a mixture of 16 components an element
     seeds.extxyz  1,000 seed structures of 1 to 200 atoms, of one to six elements
+    training.extxyz   the 1,068 structures of 60 atoms that the mixture is built from
 
 The weights are those that gracemaker starts a training from, so energies mean nothing; costs are those of a trained
 model. The components of an element are where gracemaker's k-means puts them for the structures of `mixture.pkl.gz`.
@@ -85,6 +86,7 @@ def make_structures(work):
         elements = [symbol, *random.choice([other for other in ELEMENTS if other != symbol], 2, replace=False)]
         frames.append(structure(60, random, elements))
     pd.DataFrame({"ase_atoms": frames}).to_pickle(work / "mixture.pkl.gz")
+    write(work / "training.extxyz", frames)
 
 
 def gracemaker(name, *words):

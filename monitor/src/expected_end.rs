@@ -13,7 +13,7 @@ pub struct ExpectedEnd {
     pub walks_hours: Option<f64>,
     /// Time until the queued labels are computed, h.
     pub labels_hours: Option<f64>,
-    /// Time until `budget.wall_hours` is used up, h.
+    /// Time until `budget.wall_time` is used up, h.
     pub budget_hours: Option<f64>,
     /// Expected end, ms since 1970. `None` if it is unknown or the campaign is finished.
     pub time: Option<i64>,
@@ -57,7 +57,7 @@ mod tests {
     fn campaign() -> (Status, Value, QueueCost) {
         let walk = |state: &str, step| WalkStatus { state: state.into(), step, ..WalkStatus::default() };
         let status = Status {
-            walks: vec![walk("running", 4_000), walk("waiting", 0), walk("collected", 7)],
+            walks: vec![walk("running", 4_000), walk("waiting", 0), walk("quota_reached", 7)],
             steps_per_second: Some(10.0),
             led: true,
             ..Status::default()

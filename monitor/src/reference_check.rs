@@ -150,7 +150,7 @@ impl ReferenceCheck {
                 let found = found.filter(|found| found.abs() > bound)?;
                 let FrameDifference { frame, formula, .. } = frame;
                 Some(format!(
-                    "{frame} ({formula}): {what} differs by {found:.4} {unit}, more than label.check.{key} = {bound} {unit}"
+                    "{frame} ({formula}): {what} differs by {found:.4} {unit}, more than label.reference_check.{key} = {bound} {unit}"
                 ))
             };
             let failed = frame.failure.as_ref().map(|why| format!("{}: no label: {why}", frame.frame));
@@ -359,7 +359,7 @@ mod tests {
         assert_eq!(energy.len(), 2, "{energy:?}");
         assert!(
             energy[1].starts_with(
-                "known.extxyz:3 (O3): the energy differs by 0.0200 eV/atom, more than label.check."
+                "known.extxyz:3 (O3): the energy differs by 0.0200 eV/atom, more than label.reference_check."
             ),
             "{energy:?}"
         );
@@ -367,7 +367,7 @@ mod tests {
         assert_eq!(
             force,
             [
-                "known.extxyz:3 (O3): a force differs by 0.5000 eV/Å, more than label.check.max_force_difference = 0.05 eV/Å"
+                "known.extxyz:3 (O3): a force differs by 0.5000 eV/Å, more than label.reference_check.max_force_difference = 0.05 eV/Å"
             ]
         );
         let stress = faults(&|label| label.stress = Some([[0.01, 0.01, -0.01], [0.01; 3], [0.01; 3]]));

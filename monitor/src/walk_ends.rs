@@ -1,7 +1,7 @@
 //! Counts how walks ended and why, and gives advice on early ends.
 
 use serde::Serialize;
-use store::WalkStatus;
+use store::{WalkStatus, words};
 
 /// Fewer early ends are not a pattern yet.
 const MIN_EARLY_ENDS: u64 = 3;
@@ -18,10 +18,10 @@ pub enum EarlyEndCause {
     LostAtom,
     /// The walk crashed several walkers.
     Crashed,
-    /// The shortest-bond guard refused its structures repeatedly.
+    /// The shortest-bond guard rejected its structures repeatedly.
     Trapped,
     /// No walk can start from the seed structure.
-    BadStart,
+    InvalidStart,
     /// Any other cause.
     Other,
 }
@@ -29,7 +29,7 @@ pub enum EarlyEndCause {
 /// The walks that ended in one way.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EndCount {
-    /// As stored: `steps`, `collected`, `budget`, `trapped`, `blew_up` or `bad_start`.
+    /// `completed`, `quota_reached`, `budget`, `trapped`, `diverged` or `invalid_start`.
     pub end: String,
     /// `None` if the walks did not end early.
     pub cause: Option<EarlyEndCause>,
@@ -48,15 +48,15 @@ pub struct EndCount {
 #[serde(transparent)]
 pub struct WalkEnds(Vec<EndCount>);
 
-/// Why a walk with this state and reason ended early. `None` for a walk that is running, made all its steps,
+/// Why a walk with this state, as views show it, and reason ended early. `None` for a walk that is running, made all its steps,
 /// collected all it may, or ended with a budget.
 pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
     let has = |words: &str| reason.contains(words);
     match state {
-        "waiting" | "running" | "steps" | "collected" | "budget" => None,
+        "waiting" | "running" | "completed" | "quota_reached" | "budget" => None,
         "trapped" => Some(EarlyEndCause::Trapped),
         _ if has("walkers crashed") || has("walker crashed") => Some(EarlyEndCause::Crashed),
-        "bad_start" => Some(EarlyEndCause::BadStart),
+        "invalid_start" => Some(EarlyEndCause::InvalidStart),
         _ if has("is above the allowed") => Some(EarlyEndCause::TooHot),
         _ if has("not finite") => Some(EarlyEndCause::NotFinite),
         _ if has("has no neighbour") => Some(EarlyEndCause::LostAtom),
@@ -80,7 +80,7 @@ impl EarlyEndCause {
                 "nothing in the configuration: check the walkers' last output in the log, and the free memory"
             }
             Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.min_distances says what is too close",
-            Self::BadStart => "the seed structure: the reason says what is wrong with it",
+            Self::InvalidStart => "the seed structure: the reason says what is wrong with it",
             Self::Other => "a smaller walk.time_step or walk.tau, or guard.zbl",
         }
     }
@@ -96,8 +96,9 @@ impl WalkEnds {
         ends
     }
 
-    /// Counts a walk that has ended.
+    /// Counts a walk that has ended; `end` as stored or as shown.
     pub fn add(&mut self, walk: u32, end: &str, reason: &str) {
+        let end = words::shown(end);
         let cause = early_end_cause(end, reason);
         if let Some(count) = self.0.iter_mut().find(|count| count.end == end && count.cause == cause) {
             count.walks += 1;
@@ -150,12 +151,12 @@ mod tests {
     #[test]
     fn ends_are_counted_by_cause() {
         let walks = [
-            walk(0, "collected", ""),
+            walk(0, "quota_reached", ""),
             walk(1, "running", ""),
-            walk(2, "blew_up", "at step 5: 9000 K is above the allowed 800 K"),
-            walk(3, "blew_up", "at step 7: 9999 K is above the allowed 800 K"),
-            walk(4, "trapped", "refused by the shortest-bond guard again and again"),
-            walk(5, "collected", ""),
+            walk(2, "diverged", "at step 5: 9000 K is above the allowed 800 K"),
+            walk(3, "diverged", "at step 7: 9999 K is above the allowed 800 K"),
+            walk(4, "trapped", "rejected by the shortest-bond guard again and again"),
+            walk(5, "quota_reached", ""),
         ];
         let ends = WalkEnds::from_walks(&walks);
         assert_eq!((ends.ended(), ends.early(), ends.all_early()), (5, 3, false));
@@ -168,10 +169,10 @@ mod tests {
 
     #[test]
     fn causes_other_than_reasons_of_the_guard() {
-        let crashed = early_end_cause("blew_up", "4 walkers crashed in this assignment");
+        let crashed = early_end_cause("diverged", "4 walkers crashed in this assignment");
         assert_eq!(crashed, Some(EarlyEndCause::Crashed));
-        let start = early_end_cause("bad_start", "an element that the model does not know");
-        assert_eq!(start, Some(EarlyEndCause::BadStart));
+        let start = early_end_cause("invalid_start", "an element that the model does not know");
+        assert_eq!(start, Some(EarlyEndCause::InvalidStart));
         assert_eq!(early_end_cause("running", ""), None);
     }
 

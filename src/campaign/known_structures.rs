@@ -1,4 +1,4 @@
-//! Reads the structures of `label.check`, and warns if their labels are unlikely to be those of the reference.
+//! Reads the structures of `label.reference_check`, and warns if their labels are unlikely to be those of the reference.
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::PathBuf;
@@ -17,7 +17,7 @@ use crate::label_method;
 use crate::output::count;
 use crate::xyz_reader::{XyzReader, label};
 
-const STRUCTURES: &str = "label.check.structures";
+const STRUCTURES: &str = "label.reference_check.structures";
 
 /// Forces of the reference that are larger or smaller than the potential's by more than this factor may have other units:
 /// 1 Ha/Bohr is 51.4 eV/Å, 1 eV/Å is 23.1 kcal/mol/Å.
@@ -29,7 +29,9 @@ impl Loader<'_> {
         &self,
         model: &Arc<GraceModel>,
     ) -> Result<(Vec<KnownStructure>, Vec<Warning>), ConfigError> {
-        let Some(file) = &self.config.label.check.structures else { return Ok((Vec::new(), Vec::new())) };
+        let Some(file) = &self.config.label.reference_check.structures else {
+            return Ok((Vec::new(), Vec::new()));
+        };
         let wrong = |message: String| self.file_error(STRUCTURES, file, message);
         let frames = XyzReader::open(file.get_ref()).map_err(|error| wrong(error.to_string()))?;
         let (mut known, mut sources) = (Vec::new(), HashMap::new());
@@ -68,7 +70,7 @@ impl Loader<'_> {
         known: &[KnownStructure],
         model: &Arc<GraceModel>,
     ) -> Vec<Warning> {
-        let (needed, bounds) = (elements(known).len() + 1, self.config.label.check.bounds());
+        let (needed, bounds) = (elements(known).len() + 1, self.config.label.reference_check.bounds());
         let few = (known.len() < needed).then(|| {
             format!(
                 "{} with {}: energies cannot be compared, since the offsets of the elements absorb every \
@@ -81,7 +83,7 @@ impl Loader<'_> {
         let largest = forces.map(|force| norm(*force)).fold(0.0, f64::max);
         let small = (largest <= bounds.force).then(|| {
             format!(
-                "the largest force is {largest:.4} eV/Å, within label.check.max_force_difference: forces that are wrong would not \
+                "the largest force is {largest:.4} eV/Å, within label.reference_check.max_force_difference: forces that are wrong would not \
                  be noticed; add structures with displaced atoms"
             )
         });

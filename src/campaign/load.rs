@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::{NeighbourList, Repetition, Structure};
-use calm::forgetting::grade_distribution;
-use calm::{Artifact, ArtifactError, Mixture, Projection};
+use calm::forgetting::GradeDistribution;
+use calm::{Artifact, ArtifactError, Grades, Mixture, Projection};
 use orchestrator::selector::{SeedStructure, TrainingFrames, UpdateProtocol};
 use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
@@ -13,11 +13,14 @@ use store::Protocol;
 use toml::Spanned;
 
 use super::geometry::Geometry;
-use super::training_sample;
-use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
+use super::seed_structures::SeedStructures;
+use super::training_sample::{self, SampledFrame};
+use crate::all_cores;
+use crate::config::{
+    Config, ConfigError, LabelMethod, OnInvalid, PotentialFile, Warning, location, location_of_offset,
+};
 use crate::label_method::{self, REFERENCE_FILE};
 use crate::projection::{check_belongs_to, with_projection};
-use crate::xyz_reader::XyzReader;
 
 /// A seed structure and its source.
 pub struct SourcedStructure {
@@ -71,7 +74,7 @@ impl Loader<'_> {
         if let Some((pair, window)) = widest
             && window.outer > model.cutoff()
         {
-            let (at, key) = (place(self.path, self.text, "guard.zbl"), "guard.zbl".to_owned());
+            let (at, key) = (location(self.path, self.text, "guard.zbl"), "guard.zbl".to_owned());
             let found = format!("outer {} Å of {pair}", window.outer);
             let expected = format!("at most the cutoff of the model, {} Å", model.cutoff());
             return Err(ConfigError::Value { at, key, found, expected });
@@ -113,7 +116,7 @@ impl Loader<'_> {
             criterion.condition(atoms)
         );
         Err(ConfigError::Value {
-            at: place(self.path, self.text, &key),
+            at: location(self.path, self.text, &key),
             key,
             found: rule.condition(atoms),
             expected,
@@ -149,19 +152,17 @@ impl Loader<'_> {
         let Some(file) = &self.config.calm.training_frames else { return Ok(None) };
         let wrong = |message: String| self.file_error(TRAINING_FRAMES, file, message);
         let path = file.get_ref();
-        let selected = training_sample::select(path).map_err(wrong)?;
-        let mut features = Features::new(model);
-        for (frame, _) in XyzReader::open(path)
-            .map_err(|error| wrong(error.to_string()))?
-            .zip(&selected)
-            .filter(|(_, selected)| **selected)
-        {
-            let frame = frame.map_err(|error| wrong(error.to_string()))?;
-            let place = || format!("{}:{}", path.display(), frame.line);
-            features.add(&frame.structure).map_err(|error| wrong(format!("{}: {error}", place())))?;
+        let sample = training_sample::read(path).map_err(wrong)?;
+        let features = all_cores::map(sample.iter(), || Features::new(model), Features::of_sample);
+        let (mut elements, mut values) = (Vec::new(), Vec::new());
+        for (frame, features) in sample.iter().zip(features) {
+            let in_frame = |error: String| wrong(format!("{}:{}: {error}", path.display(), frame.line));
+            let (frame_elements, frame_values) = features.map_err(in_frame)?;
+            elements.extend(frame_elements);
+            values.extend(frame_values);
         }
-        let training = TrainingFrames::new(&features.elements, &features.values, original)
-            .map_err(|error| wrong(error.to_string()))?;
+        let training =
+            TrainingFrames::new(&elements, &values, original).map_err(|error| wrong(error.to_string()))?;
         let median = training.original().median;
         if !(MIN_MEDIAN_GRADE..=1.0).contains(&median) {
             return Err(wrong(format!(
@@ -195,17 +196,30 @@ impl Loader<'_> {
         let file = self.config.calm.artifact.as_ref().unwrap_or(&self.config.potential.model);
         let key = if self.config.calm.artifact.is_some() { "calm.artifact" } else { "potential.model" };
         let wrong = |message: String| self.file_error(key, file, message);
-        let mut features = Features::new(model);
-        for named in seeds {
-            let of_seed =
-                |error| wrong(format!("seed structure '{}' ({}): {error}", named.seed.name, named.source));
-            features.add(&named.seed.structure).map_err(of_seed)?;
-            if features.elements.len() >= MAX_GRADED_ATOMS {
+        let (mut features, mut grades) = (Features::new(model), Grades::default());
+        let (mut gamma, mut first_error) = (Vec::new(), None);
+        for SourcedStructure { seed, source, .. } in seeds {
+            let graded = features.compute(&seed.structure).and_then(|elements| {
+                let values = features.grace.features();
+                let graded = grades.evaluate(&artifact.mixture, &elements, values, None);
+                graded.map_err(|error| error.to_string())
+            });
+            match graded {
+                Ok(()) => gamma.extend_from_slice(&grades.gamma),
+                // Triage lists those that cannot be graded.
+                Err(error) => {
+                    let of_seed = || wrong(format!("seed structure '{}' ({source}): {error}", seed.name));
+                    first_error.get_or_insert_with(of_seed);
+                }
+            }
+            if gamma.len() >= MAX_GRADED_ATOMS {
                 break;
             }
         }
-        let grades = grade_distribution(&artifact.mixture, &features.elements, &features.values)
-            .map_err(|error| wrong(error.to_string()))?;
+        if let Some(error) = first_error.filter(|_| gamma.is_empty()) {
+            return Err(error);
+        }
+        let grades = GradeDistribution::from_grades(&gamma);
         Ok((grades.median < MIN_MEDIAN_GRADE).then(|| {
             let message = format!(
                 "the median of γ over the seed structures is {:.1e}, where 0.1 to 2 is usual: with such a mixture nothing \
@@ -216,14 +230,15 @@ impl Loader<'_> {
         }))
     }
 
-    /// The label protocol and the hashes of its files.
+    /// The label protocol and the hashes of its files. Seed structures with elements that a label potential does not know
+    /// are left out if the configuration allows it and others remain.
     pub fn protocol(
         &self,
-        seeds: &[SourcedStructure],
+        seeds: &mut SeedStructures,
     ) -> Result<(Protocol, Vec<(String, String)>), ConfigError> {
         let (settings, hashes) = match &self.config.label.method {
             LabelMethod::Potential(reference) => self.reference(reference, seeds)?,
-            LabelMethod::Code(settings) => (self.code(settings, seeds)?, Vec::new()),
+            LabelMethod::Code(settings) => (self.code(settings, &seeds.valid)?, Vec::new()),
         };
         Ok((label_method::protocol(self.config.label.protocol_name(), settings), hashes))
     }
@@ -231,23 +246,33 @@ impl Loader<'_> {
     fn reference(
         &self,
         reference: &PotentialFile,
-        seeds: &[SourcedStructure],
+        seeds: &mut SeedStructures,
     ) -> Result<(Value, Vec<(String, String)>), ConfigError> {
         let wrong = |message: String| self.file_error(REFERENCE_FILE, &reference.file, message);
         let potential = reference.load().map_err(wrong)?;
-        for named in seeds {
-            if let Some(species) =
-                named.seed.structure.species.iter().find(|s| !potential.species().contains(s))
-            {
-                let (shown, name) = (reference.file.get_ref().display(), &named.seed.name);
-                let known: Vec<_> = potential.species().iter().map(|species| species.symbol()).collect();
-                let known = known.join(", ");
-                return Err(wrong(format!(
-                    "{shown}: the label potential knows {known}, but seed structure '{name}' ({}) has {species}",
-                    named.source
-                )));
-            }
+        let unknown = |named: &SourcedStructure| {
+            named
+                .seed
+                .structure
+                .species
+                .iter()
+                .find(|species| !potential.species().contains(species))
+                .copied()
+        };
+        let known: Vec<_> = potential.species().iter().map(|species| species.symbol()).collect();
+        let knows = format!("the label potential knows {}", known.join(", "));
+        let first = seeds.valid.iter().find_map(|named| Some((named, unknown(named)?)));
+        if let Some((SourcedStructure { seed, source, .. }, species)) = first
+            && (self.config.seed_structures.on_invalid == OnInvalid::Error
+                || seeds.valid.iter().all(|named| unknown(named).is_some()))
+        {
+            return Err(wrong(format!(
+                "{}: {knows}, but seed structure '{}' ({source}) has {species}",
+                reference.file.get_ref().display(),
+                seed.name
+            )));
         }
+        seeds.skip(|named| unknown(named).map(|species| format!("{knows}, but the structure has {species}")));
         let hash = self.hash(REFERENCE_FILE, &reference.file)?;
         Ok((label_method::potential_identity(reference.kind, &hash.1), vec![hash]))
     }
@@ -255,7 +280,7 @@ impl Loader<'_> {
     /// Protocol settings of a program, which must be installed with all it needs for every seed structure.
     fn code(&self, settings: &dft::Settings, seeds: &[SourcedStructure]) -> Result<Value, ConfigError> {
         let key = format!("label.method.{}", settings.name());
-        let at = || place(self.path, self.text, &key);
+        let at = || location(self.path, self.text, &key);
         let wrong = |message: String| ConfigError::File { at: at(), key: key.clone(), message };
         let code = settings.prepare(&self.config.label.pass_environment);
         let code = code.map_err(|error| wrong(error.to_string()))?;
@@ -282,12 +307,16 @@ impl Loader<'_> {
         file: &Spanned<PathBuf>,
         message: impl ToString,
     ) -> ConfigError {
-        let at = place_of_offset(self.path, self.text, file.span().start);
+        let at = location_of_offset(self.path, self.text, file.span().start);
         ConfigError::File { at, key: key.to_owned(), message: message.to_string() }
     }
 
     pub(super) fn warning(&self, key: &str, file: &Spanned<PathBuf>, message: String) -> Warning {
-        Warning { at: place_of_offset(self.path, self.text, file.span().start), key: key.to_owned(), message }
+        Warning {
+            at: location_of_offset(self.path, self.text, file.span().start),
+            key: key.to_owned(),
+            message,
+        }
     }
 }
 
@@ -295,25 +324,29 @@ impl Loader<'_> {
 struct Features {
     grace: Grace,
     neighbours: NeighbourList,
-    /// Element index of each atom.
-    elements: Vec<usize>,
-    /// [atoms × D]
-    values: Vec<f64>,
 }
 
 impl Features {
     fn new(model: &Arc<GraceModel>) -> Self {
-        let (grace, neighbours) = (Grace::new(Arc::clone(model)), NeighbourList::new(model.cutoff(), 0.0));
-        Self { grace, neighbours, elements: Vec::new(), values: Vec::new() }
+        Self { grace: Grace::new(Arc::clone(model)), neighbours: NeighbourList::new(model.cutoff(), 0.0) }
     }
 
-    fn add(&mut self, structure: &Structure) -> Result<(), String> {
+    /// Computes the features of all atoms. Returns their element indices.
+    fn compute(&mut self, structure: &Structure) -> Result<Vec<usize>, String> {
+        let elements = self.grace.model().element_indices(&structure.species);
+        let elements = elements.map_err(|error| error.to_string())?;
         self.neighbours.update(structure).map_err(|error| error.to_string())?;
         self.grace.forward(structure, &self.neighbours).map_err(|error| error.to_string())?;
-        let elements = self.grace.model().element_indices(&structure.species);
-        self.elements.extend(elements.map_err(|error| error.to_string())?);
-        self.values.extend_from_slice(self.grace.features());
-        Ok(())
+        Ok(elements)
+    }
+
+    /// Element indices and features, [n × D], of the atoms of a frame that belong to the sample.
+    fn of_sample(&mut self, frame: &SampledFrame) -> Result<(Vec<usize>, Vec<f64>), String> {
+        let elements = self.compute(&frame.structure)?;
+        let features = self.grace.features();
+        let dimension = features.len() / elements.len().max(1);
+        let rows = frame.atoms.iter().flat_map(|atom| &features[atom * dimension..][..dimension]);
+        Ok((frame.atoms.iter().map(|atom| elements[*atom]).collect(), rows.copied().collect()))
     }
 }
 

@@ -1,6 +1,7 @@
 //! Reads the seed structures and checks that walks can start from them.
 
 use std::collections::HashMap;
+use std::mem;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
@@ -14,7 +15,7 @@ use wire::ContentHash;
 use super::geometry::Geometry;
 use super::load::{Loader, SourcedStructure};
 use crate::all_cores;
-use crate::config::{ConfigError, OnInvalid, Warning, place};
+use crate::config::{ConfigError, OnInvalid, Warning, location};
 
 const FILES: &str = "seed_structures.files";
 
@@ -45,6 +46,21 @@ pub struct SkippedStructure {
     pub source: String,
     /// Why no walk can start from it.
     pub reason: String,
+}
+
+impl SeedStructures {
+    /// Leaves out the structures for which there is a reason.
+    pub fn skip(&mut self, reason: impl Fn(&SourcedStructure) -> Option<String>) {
+        for named in mem::take(&mut self.valid) {
+            match reason(&named) {
+                None => self.valid.push(named),
+                Some(reason) => {
+                    let SourcedStructure { seed, source, .. } = named;
+                    self.skipped.push(SkippedStructure { seed, source, reason });
+                }
+            }
+        }
+    }
 }
 
 impl SkippedStructure {
@@ -201,7 +217,7 @@ impl Loader<'_> {
     /// Warns of skipped structures, and of likely mistakes: duplicate structures and distances that do not match the
     /// elements.
     pub fn suspicious_seed_structures(&self, seeds: &SeedStructures) -> Vec<Warning> {
-        let at = place(self.path, self.text, FILES);
+        let at = location(self.path, self.text, FILES);
         let warning = |message| Warning { at: at.clone(), key: FILES.to_owned(), message };
         let (mut same, mut strange, mut first) = (Vec::new(), Vec::new(), HashMap::new());
         for named in &seeds.valid {
@@ -228,7 +244,7 @@ impl Loader<'_> {
 }
 
 /// The first messages, and how many more seed structures they concern.
-fn listed(mut messages: Vec<String>, what: &str) -> Vec<String> {
+pub(super) fn listed(mut messages: Vec<String>, what: &str) -> Vec<String> {
     if let Some(more @ 1..) = messages.len().checked_sub(MAX_LISTED) {
         messages.truncate(MAX_LISTED);
         messages.push(format!("{more} more seed structures {what}"));

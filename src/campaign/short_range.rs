@@ -6,7 +6,7 @@ use atoms::ElementPair;
 use potentials::ZblWindow;
 
 use super::load::{Loader, SourcedStructure};
-use crate::config::{Config, Warning, place};
+use crate::config::{Config, Warning, location};
 
 /// Number of pairs that a warning names.
 const MAX_SHOWN: usize = 5;
@@ -81,7 +81,7 @@ impl Loader<'_> {
             more => format!("; and {more} more pairs (calmwalk validate shows them)"),
         };
         (!repelled.is_empty()).then(|| Warning {
-            at: place(self.path, self.text, "guard.zbl"),
+            at: location(self.path, self.text, "guard.zbl"),
             key: "guard.zbl".to_owned(),
             message: format!(
                 "the repulsion reaches into bonds of seed structures: {}{more}; give these pairs shorter windows in \

@@ -1,9 +1,9 @@
-//! Chooses the frames of a data set of any size whose atoms are monitored.
+//! Chooses the atoms of a data set of any size that are monitored.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use atoms::Species;
+use atoms::{Species, Structure};
 
 use crate::xyz_reader::XyzReader;
 
@@ -13,26 +13,56 @@ const ATOMS_PER_ELEMENT: usize = 500;
 /// Number of atoms in all that are always taken, if the data set has them.
 const MIN_ATOMS: usize = 4000;
 
-/// Whether each frame of a file belongs to the sample. Reads the file frame by frame. Frames with rare elements come
-/// first; those of an element are spread evenly over the file.
-pub fn select(path: &Path) -> Result<Vec<bool>, String> {
-    let mut frames = Vec::new();
-    for frame in XyzReader::open(path).map_err(|error| error.to_string())? {
-        let frame = frame.map_err(|error| error.to_string())?;
-        let mut counts: BTreeMap<Species, usize> = BTreeMap::new();
-        for species in frame.structure.species {
-            *counts.entry(species).or_default() += 1;
-        }
-        frames.push(counts.into_iter().collect::<Vec<_>>());
-    }
-    if frames.iter().all(Vec::is_empty) {
-        return Err(format!("{}: found no frames with atoms, expected at least one", path.display()));
-    }
-    Ok(select_from(&frames))
+/// A frame with atoms of the sample.
+pub struct SampledFrame {
+    /// Its first line in the file.
+    pub line: usize,
+    /// All its atoms.
+    pub structure: Structure,
+    /// Those that are monitored, in order.
+    pub atoms: Vec<usize>,
 }
 
-/// The same for frames with these numbers of atoms of each element.
-fn select_from(frames: &[Vec<(Species, usize)>]) -> Vec<bool> {
+/// Species of the atoms of a frame, with their numbers.
+type Counts = Vec<(Species, usize)>;
+
+/// The sample of a file, which is read frame by frame, twice. Each element has the same number of atoms, or all there
+/// are, spread evenly over the file.
+pub fn read(path: &Path) -> Result<Vec<SampledFrame>, String> {
+    let frames = || XyzReader::open(path).map_err(|error| error.to_string());
+    let mut counts = Vec::new();
+    for frame in frames()? {
+        counts.push(count(&frame.map_err(|error| error.to_string())?.structure));
+    }
+    if counts.iter().all(Vec::is_empty) {
+        return Err(format!("{}: found no frames with atoms, expected at least one", path.display()));
+    }
+    let selected = select(&counts);
+    let mut thinning = Thinning::new(&counts, &selected);
+    let mut sample = Vec::new();
+    for (frame, _) in frames()?.zip(&selected).filter(|(_, selected)| **selected) {
+        let frame = frame.map_err(|error| error.to_string())?;
+        let species = frame.structure.species.iter().enumerate();
+        let atoms = species.filter(|(_, species)| thinning.keeps(**species)).map(|(atom, _)| atom);
+        sample.push(SampledFrame { line: frame.line, atoms: atoms.collect(), structure: frame.structure });
+    }
+    Ok(sample)
+}
+
+fn count(structure: &Structure) -> Counts {
+    let mut counts: BTreeMap<Species, usize> = BTreeMap::new();
+    structure.species.iter().for_each(|species| *counts.entry(*species).or_default() += 1);
+    counts.into_iter().collect()
+}
+
+/// Number of atoms of each element in the sample, for this number of elements.
+fn wanted(elements: usize) -> usize {
+    ATOMS_PER_ELEMENT.max(MIN_ATOMS / elements.max(1))
+}
+
+/// Whether each frame has atoms of the sample. Frames with rare elements come first; those of an element are spread evenly
+/// over the file.
+fn select(frames: &[Counts]) -> Vec<bool> {
     let mut with: BTreeMap<Species, (usize, Vec<usize>)> = BTreeMap::new();
     for (frame, counts) in frames.iter().enumerate() {
         for &(species, count) in counts {
@@ -41,7 +71,7 @@ fn select_from(frames: &[Vec<(Species, usize)>]) -> Vec<bool> {
             frames.push(frame);
         }
     }
-    let wanted = ATOMS_PER_ELEMENT.max(MIN_ATOMS / with.len().max(1));
+    let wanted = wanted(with.len());
     let mut by_abundance: Vec<_> = with.into_iter().collect();
     by_abundance.sort_by_key(|(species, (atoms, _))| (*atoms, *species));
     let mut selected = vec![false; frames.len()];
@@ -66,6 +96,32 @@ fn select_from(frames: &[Vec<(Species, usize)>]) -> Vec<bool> {
     selected
 }
 
+/// Takes atoms of an element at even intervals: frames with rare elements have too many of the frequent ones.
+struct Thinning {
+    wanted: usize,
+    /// Atoms of each element in the selected frames: number, and how many were seen.
+    atoms: BTreeMap<Species, (usize, usize)>,
+}
+
+impl Thinning {
+    fn new(frames: &[Counts], selected: &[bool]) -> Self {
+        let mut atoms: BTreeMap<Species, (usize, usize)> = BTreeMap::new();
+        for (frame, _) in frames.iter().zip(selected).filter(|(_, selected)| **selected) {
+            frame.iter().for_each(|(species, count)| atoms.entry(*species).or_default().0 += count);
+        }
+        // Every element has a selected frame.
+        Self { wanted: wanted(atoms.len()), atoms }
+    }
+
+    /// Whether the next atom, of this element, belongs to the sample.
+    fn keeps(&mut self, species: Species) -> bool {
+        let Some((all, seen)) = self.atoms.get_mut(&species) else { return false };
+        let taken = |seen: usize| seen * self.wanted.min(*all) / *all;
+        *seen += 1;
+        taken(*seen) > taken(*seen - 1)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -74,10 +130,22 @@ mod tests {
         symbol.parse().unwrap()
     }
 
-    fn atoms_of(frames: &[Vec<(Species, usize)>], selected: &[bool], symbol: &str) -> usize {
-        let taken =
-            frames.iter().zip(selected).filter(|(_, selected)| **selected).flat_map(|(frame, _)| frame);
-        taken.filter(|(other, _)| *other == species(symbol)).map(|(_, count)| count).sum()
+    /// Number of sampled atoms of each element in each frame.
+    fn sampled(frames: &[Counts]) -> Vec<Counts> {
+        let selected = select(frames);
+        let mut thinning = Thinning::new(frames, &selected);
+        let mut sampled = |(frame, selected): (&Counts, bool)| {
+            let count = |&(species, count): &(Species, usize)| {
+                let atoms = if selected { count } else { 0 };
+                (species, (0..atoms).filter(|_| thinning.keeps(species)).count())
+            };
+            frame.iter().map(count).collect()
+        };
+        frames.iter().zip(selected).map(|pair| sampled(pair)).collect()
+    }
+
+    fn atoms_of(frames: &[Counts], symbol: &str) -> usize {
+        frames.iter().flatten().filter(|(other, _)| *other == species(symbol)).map(|(_, count)| count).sum()
     }
 
     #[test]
@@ -90,21 +158,21 @@ mod tests {
             counts
         };
         let frames: Vec<_> = (0..20_000).map(frame).collect();
-        let selected = select_from(&frames);
-        let atoms = ["O", "H", "U"].map(|symbol| atoms_of(&frames, &selected, symbol));
-        assert_eq!(atoms[2], 6, "all there are");
-        assert!((1333..1400).contains(&atoms[1]), "{atoms:?}");
-        assert!(atoms[0] < 40 * 140 + 100, "{atoms:?}");
+        let sampled = sampled(&frames);
+        assert_eq!(["O", "H", "U"].map(|symbol| atoms_of(&sampled, symbol)), [1333, 1333, 6]);
         // Spread over the file.
-        let places: Vec<_> = (0..frames.len()).filter(|frame| selected[*frame]).collect();
-        assert!(places[places.len() / 2].abs_diff(10_000) < 2000, "{places:?}");
+        for symbol in ["O", "H"] {
+            let half = atoms_of(&sampled[..10_000], symbol);
+            assert!(half.abs_diff(1333 / 2) < 20, "{symbol}: {half}");
+        }
     }
 
     #[test]
     fn a_small_data_set_is_taken_whole() {
         let frames = vec![vec![(species("Al"), 108)]; 30];
-        assert_eq!(select_from(&frames), [true; 30]);
+        assert_eq!(sampled(&frames), frames);
         let frames = vec![vec![(species("Al"), 108)]; 50];
-        assert_eq!(select_from(&frames).iter().filter(|selected| **selected).count(), 38, "4000 atoms");
+        assert_eq!(select(&frames).iter().filter(|selected| **selected).count(), 38);
+        assert_eq!(atoms_of(&sampled(&frames), "Al"), 4000);
     }
 }

@@ -1,81 +1,124 @@
 //! The walks of a campaign: from each seed structure one under every combination of conditions that the groups name.
 
+use std::collections::BTreeMap;
+
 use atoms::Structure;
+use orchestrator::selector::SeedStructure;
 use wire::WalkConditions;
 
 use super::load::{Loader, SourcedStructure};
-use crate::config::{ConfigError, VolumeRampSection, WalkGroupSection, WalkSection, Warning, place};
+use super::seed_structures::{SeedStructures, listed};
+use crate::config::{
+    ConfigError, OnInvalid, VolumeRampSection, WalkGroupSection, WalkSection, Warning, location,
+};
 use crate::filter::{Filter, StructureProperties};
 
 /// Largest number of biased walks.
 const MAX_WALKS: usize = 1_000_000;
 
 /// Properties of seed structures that a filter may name.
-const PROPERTIES: [&str; 3] = ["atoms", "element", "seed"];
+const PROPERTIES: [&str; 3] = ["atoms", "element", "seed_structure"];
 
 impl Loader<'_> {
-    /// Sets the walks of each seed structure. Warns of seed structures without walks.
-    pub fn plan_walks(&self, seeds: &mut [SourcedStructure]) -> Result<Vec<Warning>, ConfigError> {
+    /// Sets the walks of each seed structure. A structure without a volume gets no walk that would change it: without
+    /// any other walk it is skipped. Warns of this, of groups without walks, and of structures in no group.
+    pub fn plan_walks(&self, seeds: &mut SeedStructures) -> Result<Vec<Warning>, ConfigError> {
         let groups = &self.config.walks;
         if groups.is_empty() {
             let conditions = combinations(&self.config.walk, &WalkGroupSection::default());
-            seeds.iter_mut().for_each(|named| named.seed.walks.clone_from(&conditions));
+            seeds.valid.iter_mut().for_each(|named| named.seed.walks.clone_from(&conditions));
             return Ok(Vec::new());
         }
+        let (mut without_volume, mut messages) = (BTreeMap::new(), Vec::new());
         for (number, group) in groups.iter().enumerate() {
-            self.add_group(number, group, seeds)?;
+            messages.extend(self.add_group(number, group, seeds, &mut without_volume)?);
         }
-        let walks: usize = seeds.iter().map(|named| named.seed.walks.len()).sum();
-        if walks > MAX_WALKS {
-            return Err(self.walks_error("walks", format!("{walks} walks; expected at most {MAX_WALKS}")));
+        match seeds.valid.iter().map(|named| named.seed.walks.len()).sum::<usize>() {
+            1..=MAX_WALKS => {}
+            0 => {
+                let reason = without_volume.values().chain(&messages).next().map_or("", String::as_str);
+                return Err(self.walks_error("walks", format!("no walk can start: {reason}")));
+            }
+            walks => {
+                let message = format!("{walks} walks; expected at most {MAX_WALKS}");
+                return Err(self.walks_error("walks", message));
+            }
         }
-        let without = seeds.iter().filter(|named| named.seed.walks.is_empty());
-        let warning = |named: &SourcedStructure| Warning {
-            at: place(self.path, self.text, "walks"),
-            key: "walks".to_owned(),
-            message: format!(
-                "seed structure '{}' ({}) is in no group: no walk starts from it",
-                named.seed.name, named.source
-            ),
-        };
-        Ok(without.map(warning).collect())
+        seeds.skip(|SourcedStructure { seed, .. }| {
+            without_volume.get(&seed.name).filter(|_| seed.walks.is_empty()).cloned()
+        });
+        let (mut fewer, mut no_group) = (Vec::new(), Vec::new());
+        for SourcedStructure { seed: SeedStructure { name, walks, .. }, source, .. } in &seeds.valid {
+            if let Some(reason) = without_volume.get(name) {
+                let message =
+                    format!("seed structure '{name}' ({source}) walks at its own volume only: {reason}");
+                fewer.push(message);
+            }
+            if walks.is_empty() {
+                let message =
+                    format!("seed structure '{name}' ({source}) is in no group: no walk starts from it");
+                no_group.push(message);
+            }
+        }
+        messages.extend(listed(fewer, "walk at their own volume only"));
+        messages.extend(listed(no_group, "are in no group"));
+        let (at, key) = (location(self.path, self.text, "walks"), "walks".to_owned());
+        let warning = |message| Warning { at: at.clone(), key: key.clone(), message };
+        Ok(messages.into_iter().map(warning).collect())
     }
 
-    /// Adds the walks of one group to the seed structures that it selects.
+    /// Adds the walks of one group to the seed structures that it selects. `without_volume` has the reason for each
+    /// structure that does not get all of them, by name. Returns a warning if the group has no walks.
     fn add_group(
         &self,
         number: usize,
         group: &WalkGroupSection,
-        seeds: &mut [SourcedStructure],
-    ) -> Result<(), ConfigError> {
+        seeds: &mut SeedStructures,
+        without_volume: &mut BTreeMap<String, String>,
+    ) -> Result<Option<String>, ConfigError> {
         let filter = match &group.seed_structures {
             Some(text) => Some(self.seed_filter(number, text)?),
             None => None,
         };
+        let selects = |SeedStructure { name, structure, .. }: &SeedStructure| {
+            filter.as_ref().is_none_or(|filter| is_selected(filter, name, structure))
+        };
         let conditions = combinations(&self.config.walk, group);
-        let mut selected = 0;
-        for named in seeds {
-            let (name, structure) = (&named.seed.name, &named.seed.structure);
-            if filter.as_ref().is_some_and(|filter| !is_selected(filter, name, structure)) {
+        let (mut selected, mut walks) = (seeds.skipped.iter().any(|skipped| selects(&skipped.seed)), 0);
+        for SourcedStructure { seed, source, .. } in &mut seeds.valid {
+            if !selects(seed) {
                 continue;
             }
-            if structure.periodic == [false; 3] && conditions.iter().any(WalkConditions::changes_volume) {
-                let message = format!(
-                    "group '{}' changes the volume, but seed structure '{name}' ({}) has no periodic direction; leave it out \
-                     (seed_structures = \"seed != '{name}'\"), or give the group volume_ramps = [{{ from = 1.0, to = 1.0 }}]",
-                    group.name, named.source
+            selected = true;
+            let (name, has_volume) = (&seed.name, seed.structure.periodic != [false; 3]);
+            if !has_volume && conditions.iter().any(WalkConditions::changes_volume) {
+                let reason = format!(
+                    "group '{}' changes the volume, but the structure has no periodic direction; leave it out \
+                     (seed_structures = \"seed_structure != '{name}'\"), or give the group volume_ramps = [{{ from = 1.0, to = 1.0 }}]",
+                    group.name
                 );
-                return Err(self.walks_error(&format!("walks.{number}"), message));
+                if self.config.seed_structures.on_invalid == OnInvalid::Error {
+                    let message = format!("seed structure '{name}' ({source}): {reason}");
+                    return Err(self.walks_error(&format!("walks.{number}"), message));
+                }
+                without_volume.entry(name.clone()).or_insert(reason);
             }
-            named.seed.walks.extend(conditions.iter().cloned());
-            selected += 1;
+            let possible = |conditions: &&WalkConditions| has_volume || !conditions.changes_volume();
+            let before = seed.walks.len();
+            seed.walks.extend(conditions.iter().filter(possible).cloned());
+            walks += seed.walks.len() - before;
         }
-        match (&group.seed_structures, selected) {
-            (Some(text), 0) => {
+        match &group.seed_structures {
+            Some(text) if !selected => {
                 let message = format!("no seed structure is selected by '{text}'; expected at least one");
                 Err(self.walks_error(&format!("walks.{number}.seed_structures"), message))
             }
-            _ => Ok(()),
+            _ => Ok((walks == 0).then(|| {
+                format!(
+                    "group '{}' has no walk: none can start from the seed structures that it selects",
+                    group.name
+                )
+            })),
         }
     }
 
@@ -93,14 +136,14 @@ impl Loader<'_> {
     }
 
     fn walks_error(&self, key: &str, message: String) -> ConfigError {
-        ConfigError::File { at: place(self.path, self.text, key), key: key.to_owned(), message }
+        ConfigError::File { at: location(self.path, self.text, key), key: key.to_owned(), message }
     }
 }
 
 fn is_selected(filter: &Filter, name: &str, structure: &Structure) -> bool {
     let properties = StructureProperties {
         species: &structure.species,
-        seed: Some(name),
+        seed_structure: Some(name),
         ..StructureProperties::default()
     };
     filter.matches(&properties)

@@ -19,12 +19,12 @@ use crate::web::{self, agent_metrics::AgentState};
 ///
 /// Starts walkers that share one copy of the mixture, and sends the candidates they find to the orchestrator. Waits for an
 /// orchestrator that has not started yet, and keeps working through connection losses. Exits when the campaign has no more
-/// work (exit code 0), or on Ctrl-C or SIGTERM after it has checkpointed its walks (exit code 130). The signal that a batch
-/// system sends before it ends a job is enough notice. See docs/hosts.md.
+/// work (exit code 0), or on Ctrl-C or SIGTERM (exit code 130). Walks are checkpointed within seconds of SIGTERM, so the notice
+/// of a batch system suffices. See docs/hosts.md.
 #[derive(Debug, clap::Args)]
 pub struct Agent {
-    /// Endpoint of the orchestrator, such as tcp/head:7447; or @FILE, the file that it writes with --announce, which is read
-    /// again whenever the orchestrator does not answer
+    /// Address of the orchestrator, such as tcp/head:7447, or @FILE as written by `run --announce`. FILE is read again when the
+    /// orchestrator stops answering
     #[arg(long, value_name = "ENDPOINT")]
     join: Address,
     /// Number of walkers on this host [default: number of cores divided by --threads]

@@ -7,7 +7,7 @@ use super::{ExitStatus, Failure};
 
 /// Internal: run one calculation for a labeller
 ///
-/// Reads what to do from standard input, and outlives the labeller that started it.
+/// Reads its settings from standard input, and outlives the labeller that started it.
 #[derive(Debug, clap::Args)]
 pub struct CalculationRunner {}
 

@@ -22,9 +22,8 @@ const SHOWN: usize = 20;
 /// Estimate the cost of a campaign before it starts
 ///
 /// Shows the largest number of labels that the configuration allows, their expected cost, the time of the walks and the disk use.
-/// Walks are estimated from a few steps that are measured on this host. The cost of a label
-/// is extrapolated from the labels of another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk
-/// label-file`).
+/// The time of the walks follows from a few steps measured on this host. The cost of a label is extrapolated from the labels of
+/// another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk label-file`). `calmwalk validate` shows the seed structures: elements, distances, grades, those that are skipped.
 #[derive(Debug, clap::Args)]
 pub struct Estimate {
     /// Configuration of the campaign (TOML)

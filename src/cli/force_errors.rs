@@ -18,7 +18,7 @@ const NAMES: usize = 3;
 /// Relates the force error |F_model − F_label| of each labelled atom to its grades γ and γ_nbr under the original mixture:
 /// median and percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic
 /// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these
-/// structures are counted as censored and listed in their bins. Energy errors exclude a fitted offset per element, because
+/// structures are counted separately ('without label') in their bins. Energy errors exclude a fitted offset per element, because
 /// labels and potential have different zeros of energy. Works while the campaign runs.
 #[derive(Debug, clap::Args)]
 pub struct ForceErrors {
@@ -169,7 +169,7 @@ fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<
 
 fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<String>]) -> io::Result<()> {
     let mut table =
-        Table::new(&[name, ">attempted", ">labelled", ">share (%)", ">95 %", "failed (censored)"]);
+        Table::new(&[name, ">attempted", ">labelled", ">share (%)", ">95 %", "failed (without label)"]);
     for bin in bins {
         let percent = |share: f64| format!("{:.0}", 100.0 * share);
         let interval = bin.interval.map(|(low, high)| format!("{} to {}", percent(low), percent(high)));

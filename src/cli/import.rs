@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::{FileError, Structure};
 use store::records::{Label, Protocol};
-use store::{CampaignLock, ImportCounts, Store, unix_milliseconds};
+use store::{CampaignLock, ImportCounts, QueuedImports, Store, unix_milliseconds};
 use wire::ContentHash;
 use workers::labeller::LabelBounds;
 
@@ -13,9 +13,12 @@ use crate::label_setup;
 use crate::output::{count, print};
 use crate::xyz_reader::{XyzReader, label};
 
-/// Import labelled structures
+/// Import labelled structures, or structures for labelling
 ///
-/// Each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one frame
+/// With --queue, structures wait for a label under the protocol in force, behind candidates of the same priority; frames need no labels.
+/// Their labels are made as all others, and exported with --imported. Structures that have a label or wait for one stay as they are.
+///
+/// Otherwise, each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one frame
 /// is invalid or exceeds label.max_force, max_stress or max_energy_per_atom, nothing is imported from any file. Importing
 /// again is safe: known structures are not changed, and a different label for a labelled structure is stored as a check beside
 /// it.
@@ -32,6 +35,12 @@ pub struct Import {
     /// Label protocol of the structures; a new name creates a protocol [default: current protocol of the campaign]
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
+    /// Queue the structures for labelling, such as those of calmwalk select
+    #[arg(long, conflicts_with = "protocol")]
+    queue: bool,
+    /// Priority in the queue, higher first; that of candidates is 0 unless it was changed
+    #[arg(long, value_name = "N", requires = "queue", default_value_t = 0, allow_negative_numbers = true)]
+    priority: i32,
 }
 
 /// The frames of one file with their numbers in it.
@@ -60,6 +69,15 @@ impl File {
 
 impl Import {
     pub fn run(self) -> Result<ExitStatus, Failure> {
+        if self.queue {
+            let structures: Vec<_> =
+                self.files.iter().map(|path| read_unlabelled(path)).collect::<Result<_, _>>()?;
+            let QueuedImports { queued, known } = block_on(self.queue_structures(&structures.concat()))??;
+            print(|out| {
+                writeln!(out, "queued {} for labelling; {known} already known", count(queued, "structure"))
+            })?;
+            return Ok(ExitStatus::Done);
+        }
         let files: Vec<_> = self.files.iter().map(|path| read(path)).collect::<Result<_, _>>()?;
         let (protocol, imported) = block_on(self.import(&files))??;
         let ImportCounts { labels, checks, known } = imported;
@@ -69,6 +87,20 @@ impl Import {
             writeln!(out, "imported {labels} and {checks} of protocol '{name}'; {known} already known")
         })?;
         Ok(ExitStatus::Done)
+    }
+
+    async fn queue_structures(
+        &self,
+        structures: &[(String, u64, Structure)],
+    ) -> Result<QueuedImports, Failure> {
+        let location = self.location.get()?;
+        let store = Store::open(&location).await?;
+        // Imported structures change which candidates are duplicates: exclude a run.
+        let _lock = CampaignLock::acquire_at(&location, "calmwalk import").await?;
+        current_protocol(&store).await?;
+        let queued = store.queue_imports(structures, self.priority, unix_milliseconds()).await?;
+        store.close().await;
+        Ok(queued)
     }
 
     async fn import(&self, files: &[File]) -> Result<(Protocol, ImportCounts), Failure> {
@@ -108,6 +140,22 @@ fn read(path: &Path) -> Result<File, Failure> {
         return Err(Failure::input(FileError::Empty(path.to_owned())));
     }
     Ok(File { name, frames, lines })
+}
+
+/// The structures of a file with its name and their numbers in it.
+fn read_unlabelled(path: &Path) -> Result<Vec<(String, u64, Structure)>, Failure> {
+    let name = path.display().to_string();
+    let mut structures = Vec::new();
+    for (number, frame) in XyzReader::open(path).map_err(Failure::input)?.enumerate() {
+        let frame = frame.map_err(Failure::input)?;
+        let wrong = |error| Failure::Input(format!("{name}:{}: {error}", frame.line));
+        frame.structure.validate().map_err(wrong)?;
+        structures.push((name.clone(), number as u64, frame.structure));
+    }
+    if structures.is_empty() {
+        return Err(Failure::input(FileError::Empty(path.to_owned())));
+    }
+    Ok(structures)
 }
 
 /// The current protocol of the campaign.

@@ -9,7 +9,7 @@ use crate::output::print;
 
 /// Create a small runnable example with a commented campaign.toml
 ///
-/// Writes campaign.schema.json beside it, with which editors complete and check campaign.toml.
+/// Also writes campaign.schema.json, which lets an editor complete and check campaign.toml.
 #[derive(Debug, clap::Args)]
 pub struct Init {
     /// Directory for the files; created if it does not exist

@@ -34,12 +34,11 @@ pub struct Label {
     /// Exit with an error unless the campaign uses this label method, such as vasp [default: accept any method]
     #[arg(long, value_name = "NAME")]
     method: Option<String>,
-    /// Configuration whose [label] section says how to call the method's program on this host and where its files are. Its
-    /// label protocol must be the campaign's [default: as on the host of `calmwalk run`]
+    /// Take the program's command and the file paths for this host from the [label] section of FILE; its protocol must equal the
+    /// campaign's [default: as on the host of `calmwalk run`]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// File that the method needs, if its path differs from that on the host of `calmwalk run`; identified by its content. May
-    /// be repeated
+    /// Path on this host of a file that the method needs (pseudopotential, potential); matched by content. Repeatable
     #[arg(long = "file", value_name = "PATH")]
     files: Vec<PathBuf>,
     /// Exit when the queue is empty and no run is active

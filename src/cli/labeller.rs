@@ -14,7 +14,7 @@ use crate::process_config::{self, LabellerConfig};
 
 /// Internal: a labeller process, started by `calmwalk run` and `calmwalk label`
 ///
-/// Reads what to do from standard input. If the `calmwalk run` that started it is killed, it continues until the queue is empty
+/// Reads its settings from standard input. If the `calmwalk run` that started it is killed, it continues until the queue is empty
 /// or the next run takes it over; if `calmwalk label` is killed, it exits. On SIGTERM it exits after the current label. A
 /// calculation of an external program that needs more than a few seconds keeps running and is left to the next labeller.
 #[derive(Debug, clap::Args)]

@@ -37,14 +37,13 @@ pub struct Launch {
     /// extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
-    /// Resume a campaign that was started with another configuration file, and use CONFIG from now on
+    /// Accept CONFIG for a campaign that was started with another configuration file (calmwalk refuses it otherwise)
     #[arg(long)]
     adopt: bool,
-    /// Go on although labels of the structures of label.check differ from what is known by more than the bounds, as with calmwalk
-    /// run. The orchestrator's job keeps this for as long as the label protocol, these structures and the bounds stay as they
-    /// are now
+    /// As `calmwalk run --accept-reference-check`, for the check as it is now; if the protocol, the structures or the bounds
+    /// change later, it must pass again
     #[arg(long)]
-    accept_check: bool,
+    accept_reference_check: bool,
     /// Number of agents, one per job
     #[arg(long, value_name = "N", required_unless_present = "stop", value_parser = clap::value_parser!(u32).range(0..=10_000))]
     agents: Option<u32>,
@@ -187,9 +186,9 @@ impl Launch {
         }
         slurm.cancel(&cancel).await.map_err(Failure::failed)?;
         let mut orchestrator = specs.orchestrator_job(&jobs, &cancel);
-        if let Some(id) = orchestrator.filter(|_| self.accept_check) {
+        if let Some(id) = orchestrator.filter(|_| self.accept_reference_check) {
             log_and_warn(format_args!(
-                "WARNING: --accept-check does not reach job {id}, the orchestrator's, which exists already: end it with calmwalk \
+                "WARNING: --accept-reference-check does not reach job {id}, the orchestrator's, which exists already: end it with calmwalk \
                  launch --stop, then launch again"
             ));
         }

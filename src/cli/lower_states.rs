@@ -7,13 +7,13 @@ use store::{LowerState, LowerStateChange, StateResult, Store, unix_milliseconds}
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::output::{Table, decimals, print, print_json, warn_if_unencrypted};
 
-/// List structures whose label is not the lowest known magnetic state, or make the lower states the labels
+/// List labels for which a lower magnetic state is known, or replace them by it
 ///
 /// A calculation may converge to another magnetic state, most of all after a failure, when it starts from other initial
 /// moments. A structure is listed if another valid result by the same label protocol has a lower energy than its label, by more
 /// than label.min_state_difference. Excluded results do not count.
 ///
-/// With IDs or --all, the lowest result becomes the label of each structure. The label before stays in the store as superseded,
+/// With IDs or --all, the lowest result becomes the label of each structure. The old label stays in the store as superseded,
 /// with date and reason. Works while the campaign runs. Changes either all given structures or none.
 #[derive(Debug, clap::Args)]
 pub struct LowerStates {

@@ -25,6 +25,7 @@ mod replay;
 mod report;
 mod run;
 mod schema;
+mod select;
 pub mod status;
 mod store;
 mod validate;
@@ -78,6 +79,7 @@ enum Command {
     Replay(replay::Replay),
     #[command(subcommand)]
     Calm(calm::Calm),
+    Select(select::Select),
     Import(import::Import),
     Store(store::StoreCommand),
     Md(md::Md),
@@ -116,6 +118,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, Failure> {
         Command::Report(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Calm(command) => command.run(),
+        Command::Select(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Store(command) => command.run(),
         Command::Md(command) => command.run(),

@@ -281,7 +281,7 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     let outcome = outcome.as_deref().unwrap_or("running");
     let lasted = ended.map(|ended| (ended - started) as f64 / 1000.0);
     let lasted = lasted.map_or(String::new(), |seconds| format!(" after {seconds:.1} s"));
-    let class = class.as_ref().map_or(String::new(), |class| format!(" ({class})"));
+    let class = class.as_ref().map_or(String::new(), |class| format!(" ({})", class.replace('_', " ")));
     writeln!(out, "    {number}: {outcome}{class}{lasted}, by {holder}")?;
     if let Some(calculation) = calculation {
         writeln!(out, "       calculation {calculation}")?;

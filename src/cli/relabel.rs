@@ -21,8 +21,8 @@ use crate::wording;
 
 /// Compute labels again, or switch the campaign to another label protocol
 ///
-/// Use it for doubtful or inaccurate labels. Queues the structures again, bypassing the guard. The old label stays valid until
-/// the new one exists; then it is kept as superseded, with date and reason. If the new label fails, the old one stays.
+/// Queues the structures again, bypassing the label guard. Use it for doubtful or inaccurate labels. The old label stays valid
+/// until the new one exists; then it is kept as superseded, with date and reason. If the new label fails, the old one stays.
 /// Structures that already wait for a new label are not queued twice.
 ///
 /// With --config, the campaign switches to the label protocol of that file: structures without a label move to it, and running

@@ -1,15 +1,13 @@
 //! `calmwalk report`
 
-use std::fs;
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use store::Store;
 
 use super::{CampaignLocation, ExitStatus, Failure, block_on};
-use crate::atomic_file::{AtomicFile, cannot_create};
 use crate::output::{count, print};
-use crate::report::{self, File, PAGE};
+use crate::page::{create_directory, write_files};
+use crate::report::{self, PAGE};
 
 /// Write a report of a campaign: figures, tables, settings and provenance
 ///
@@ -37,13 +35,7 @@ impl Report {
             store.close().await;
             files
         })??;
-        for File { path, bytes } in &files {
-            let path = self.output.join(path);
-            path.parent().map_or(Ok(()), create_directory)?;
-            let mut file = AtomicFile::create(&path)?;
-            file.write_all(bytes).map_err(|error| crate::atomic_file::cannot_write(&path, error))?;
-            file.finish()?;
-        }
+        write_files(&self.output, &files)?;
         let page = self.output.join(PAGE);
         print(|out| {
             writeln!(
@@ -55,8 +47,4 @@ impl Report {
         })?;
         Ok(ExitStatus::Done)
     }
-}
-
-fn create_directory(directory: &Path) -> Result<(), Failure> {
-    fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))
 }

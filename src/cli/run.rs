@@ -51,14 +51,14 @@ pub struct Run {
     /// Directory of the campaign, created if it does not exist [default: path of the configuration without its extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
-    /// Resume a campaign that was started with another configuration file, and use CONFIG from now on
+    /// Accept CONFIG for a campaign that was started with another configuration file (calmwalk refuses it otherwise)
     #[arg(long)]
     adopt: bool,
-    /// Go on although labels of the structures of label.check differ from what is known by more than the bounds. The campaign
-    /// records that the differences were accepted; the check is repeated when the label protocol, these structures or the
-    /// bounds change. With CHECK, only the check with this identity is accepted, as in the job of calmwalk launch
-    #[arg(long, value_name = "CHECK", num_args = 0..=1, require_equals = true, default_missing_value = ANY_CHECK)]
-    accept_check: Option<String>,
+    /// Start the walks even if the reference check failed (label.reference_check): labels differ from the known values by more
+    /// than the bounds. calmwalk records this, and repeats the check when the protocol, the structures or the bounds change. =ID
+    /// accepts only the check with this identity
+    #[arg(long, value_name = "ID", num_args = 0..=1, require_equals = true, default_missing_value = ANY_CHECK)]
+    accept_reference_check: Option<String>,
     /// Run walkers and labellers as threads of this process instead of as separate processes; uses no shared memory
     #[arg(long)]
     in_process: bool,
@@ -68,8 +68,8 @@ pub struct Run {
     /// Directory with authority.pem, certificate.pem and key.pem; required unless the endpoint is a loopback address
     #[arg(long, value_name = "DIR", requires = "listen")]
     tls: Option<PathBuf>,
-    /// Write the endpoint of this process to FILE, where agents read it (calmwalk agent --join @FILE). At the end the file
-    /// tells them that the campaign is finished
+    /// Write the address of this process to FILE, for agents on other hosts (agent --join @FILE). When the campaign is finished,
+    /// FILE says so and the agents exit
     #[arg(long, value_name = "FILE", requires = "listen")]
     announce: Option<PathBuf>,
     /// Host name or address to announce to agents [default: host name of this host]
@@ -90,7 +90,7 @@ impl Run {
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
         // The job of a campaign keeps its command when the configuration changes.
-        if self.accept_check.as_deref() == Some(ANY_CHECK) {
+        if self.accept_reference_check.as_deref() == Some(ANY_CHECK) {
             reference_check::identity(&campaign)?;
         }
         let directory = match self.directory {
@@ -119,10 +119,16 @@ impl Run {
             let web = self.web.listen().await?;
             let _lock = lock::directory(&directory, &location, wait_timeout).await?;
             listen.iter().try_for_each(runtime::Listen::clear_announcement)?;
-            let (in_process, adopt, accept_check) =
-                (self.in_process, self.adopt, self.accept_check.as_deref());
-            let options =
-                RunOptions { in_process, adopt, accept_check, listen: listen.as_ref(), web, wait_timeout };
+            let (in_process, adopt, accept_reference_check) =
+                (self.in_process, self.adopt, self.accept_reference_check.as_deref());
+            let options = RunOptions {
+                in_process,
+                adopt,
+                accept_reference_check,
+                listen: listen.as_ref(),
+                web,
+                wait_timeout,
+            };
             run(&campaign, &directory, &location, options).await
         })?
         .map_err(|failure| failure.in_campaign(&directory))?;
@@ -160,7 +166,7 @@ struct RunOptions<'a> {
     /// Whether the campaign may have been started with another configuration file.
     adopt: bool,
     /// The check whose differences from the reference are accepted.
-    accept_check: Option<&'a str>,
+    accept_reference_check: Option<&'a str>,
     listen: Option<&'a runtime::Listen>,
     web: web::BoundListeners,
     wait_timeout: std::time::Duration,
@@ -172,7 +178,7 @@ async fn run(
     location: &Location,
     options: RunOptions<'_>,
 ) -> Result<ExitStatus, Failure> {
-    let RunOptions { in_process, adopt, accept_check, listen, web, wait_timeout } = options;
+    let RunOptions { in_process, adopt, accept_reference_check, listen, web, wait_timeout } = options;
     let lock = lock::server(location, wait_timeout).await?;
     let origin = Provenance::new(&campaign.path, &campaign.text, directory);
     let store = open_store(campaign, location, &origin, adopt).await?;
@@ -199,7 +205,7 @@ async fn run(
     let run =
         runtime::RunContext { campaign, store: &store, process: &process, directory, listen, stop: &stop };
     let surroundings = Surroundings { location, lock: lock.as_ref(), web };
-    let worked = work(run, surroundings, selector, in_process, accept_check).await;
+    let worked = work(run, surroundings, selector, in_process, accept_reference_check).await;
     let store = registration::unregister(store, &process, worked.as_ref()).await;
     worked?;
     let store = store?;
@@ -250,7 +256,7 @@ async fn work(
     surroundings: Surroundings<'_>,
     selector: Selector,
     in_process: bool,
-    accept_check: Option<&str>,
+    accept_reference_check: Option<&str>,
 ) -> Result<reactor::RunOutcome, Failure> {
     let runtime::RunContext { campaign, store, stop, .. } = run;
     let Surroundings { location, lock, web } = surroundings;
@@ -260,7 +266,7 @@ async fn work(
             // The budget allows no further work.
             return Ok(reactor::RunOutcome::Stopped);
         }
-        runtime::run(run, selector, in_process, accept_check).await
+        runtime::run(run, selector, in_process, accept_reference_check).await
     };
     let serving = web.serve(location, store, &campaign.artifact).await?;
     let mut notifier = Notifier::new(&campaign.config, store, location).await?;

@@ -168,19 +168,19 @@ pub fn expected_end(end: &ExpectedEnd) -> Option<String> {
     let parts =
         [part("walks", end.walks_hours), part("labels", end.labels_hours), part("budget", end.budget_hours)];
     let parts: Vec<_> = parts.into_iter().flatten().collect();
-    Some(format!("expected within {hours} h at the current rate ({})", parts.join(", ")))
+    Some(format!("expected within {hours} h ({})", parts.join(", ")))
 }
 
 fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
-    let state = if status.led { "active" } else { "not finished" };
+    let state = if status.led { "running" } else { "unfinished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),
         ended => format!("{ended} ended ({})", walk_ends::without_causes(ends)),
     };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
-    let speed = speed.map_or(String::new(), |speed| format!("; {} steps/s", decimals(Some(speed), 1)));
-    format!("{under_way} {state}, {ended}{speed}")
+    let speed = speed.map_or(String::new(), |speed| format!(" ({} steps/s)", decimals(Some(speed), 1)));
+    format!("{under_way} {state}{speed}, {ended}")
 }
 
 fn write_candidates(
@@ -190,11 +190,11 @@ fn write_candidates(
     left_out: u64,
     shared: Option<u64>,
 ) -> io::Result<()> {
-    let Candidates { seen, accepted, declined, control, refused_by_walkers } = candidates;
+    let Candidates { seen, accepted, declined, control, rejected_by_guards } = candidates;
     let reasons = [
         ("covered", declined.covered),
         ("duplicate", declined.duplicate),
-        ("guard", declined.guard),
+        ("too close", declined.too_close),
         ("budget", declined.budget),
         ("backlog", declined.backlog),
     ];
@@ -214,5 +214,5 @@ fn write_candidates(
         0 => String::new(),
         left_out => format!("; {left_out} left out (the decision log has the reasons)"),
     };
-    page.titled(out, "", &format!("{control}{shared}; {refused_by_walkers} rejected by guards{left_out}"))
+    page.titled(out, "", &format!("{control}{shared}; {rejected_by_guards} rejected by guards{left_out}"))
 }

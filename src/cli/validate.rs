@@ -13,6 +13,7 @@ use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::campaign::{Campaign, PairRange, Remark, SeedTriage, StepTimes, triage};
 use crate::disk_forecast;
 use crate::output::{Bar, Table, count, decimals, print};
+use crate::runtime;
 use crate::wording;
 
 /// Number of pairs of elements, and of seed structures, that are shown.
@@ -33,7 +34,7 @@ pub struct Validate {
     /// List every pair of elements and every seed structure instead of the first 20
     #[arg(long)]
     all: bool,
-    /// Write what is known of every seed structure to this file, also of those that are skipped
+    /// Write a table of all seed structures, including skipped ones, to this file
     #[arg(long, value_name = "FILE.csv")]
     csv: Option<PathBuf>,
 }
@@ -53,7 +54,7 @@ impl Validate {
         let shown = if self.all { usize::MAX } else { SHOWN };
         print(|out| {
             write(out, &self.config, &campaign)?;
-            write_seeds(out, &seeds, &times)?;
+            write_seeds(out, &campaign, &seeds, &times)?;
             write_short_range(out, &campaign.pair_ranges, shown)?;
             writeln!(out)?;
             seed_table::write(out, &seeds, &times, shown)
@@ -68,8 +69,13 @@ fn graded(campaign: &Campaign) -> Vec<SeedTriage<'_>> {
     triage(campaign, || bar.set(done.fetch_add(1, Ordering::Relaxed) + 1, || "seed structures".to_owned()))
 }
 
-/// How many seed structures are noteworthy, and how long walks take.
-fn write_seeds(out: &mut dyn Write, seeds: &[SeedTriage<'_>], times: &StepTimes) -> io::Result<()> {
+/// How many seed structures are noteworthy, how long walks take, and whether walkers wait.
+fn write_seeds(
+    out: &mut dyn Write,
+    campaign: &Campaign,
+    seeds: &[SeedTriage<'_>],
+    times: &StepTimes,
+) -> io::Result<()> {
     let number = |is: fn(&Remark) -> bool| seeds.iter().filter(|found| is(&found.remark)).count();
     let remarks = [
         (number(|remark| *remark == Remark::Candidate), "meet the collection rule before their walks start"),
@@ -83,11 +89,12 @@ fn write_seeds(out: &mut dyn Write, seeds: &[SeedTriage<'_>], times: &StepTimes)
         writeln!(out, "  at the start     {number} of {} {words}", count(seeds.len(), "seed structure"))?;
     }
     let walks = times.total(seeds.iter().map(|found| found.seed));
-    writeln!(
-        out,
-        "  walks            {}",
-        walks.map_or("no step could be measured".to_owned(), wording::cost::walks)
-    )
+    let walks = walks.map_or("no step could be measured".to_owned(), wording::cost::walks);
+    writeln!(out, "  walks            {walks}")?;
+    match runtime::idle_walkers(campaign) {
+        Some(idle) => writeln!(out, "  walkers          {idle}"),
+        None => Ok(()),
+    }
 }
 
 fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()> {

@@ -14,7 +14,7 @@ use crate::{log, signals};
 
 /// Internal: a walker process, started by `calmwalk run` and `calmwalk agent`
 ///
-/// Reads what to do from standard input. Exits with the process that started it, and on SIGTERM after the current step.
+/// Reads its settings from standard input. Exits with the process that started it, and on SIGTERM after the current step.
 #[derive(Debug, clap::Args)]
 pub struct Walker {}
 

@@ -1,10 +1,10 @@
-//! What may change while a campaign lasts, and what may not.
+//! Changes of the configuration of a started campaign: which keys may change and which may not.
 
 use std::fmt;
 
 use serde_json::{Value, json};
 
-/// Keys that may have another value when a campaign is continued; everything else is what it began with.
+/// Keys that may change when a campaign is resumed; all others keep their first values.
 pub(super) const CHANGEABLE: [&str; 55] = [
     "campaign.control_share",
     "seed_structures",
@@ -42,13 +42,13 @@ pub(super) const CHANGEABLE: [&str; 55] = [
     "label.guard.max_atoms",
     "label.guard.duplicate_tolerance",
     "label.guard.max_cost",
-    "label.check.structures",
-    "label.check.max_energy_difference",
-    "label.check.max_force_difference",
-    "label.check.max_stress_difference",
+    "label.reference_check.structures",
+    "label.reference_check.max_energy_difference",
+    "label.reference_check.max_force_difference",
+    "label.reference_check.max_stress_difference",
     "budget.labels",
     "budget.core_hours",
-    "budget.wall_hours",
+    "budget.wall_time",
     "run.walkers",
     "run.threads_per_walker",
     "run.heartbeat_timeout",
@@ -65,21 +65,21 @@ pub(super) const CHANGEABLE: [&str; 55] = [
 
 const BONDS: &str = "label.guard.min_bond_lengths";
 
-/// Something that is not as the campaign has it, and that holds from now on.
+/// A change that takes effect when the campaign is resumed.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Change {
-    /// One key with another value than before.
+    /// A key with a new value.
     Key {
         /// Dotted key.
         key: String,
-        /// The value that the campaign has.
+        /// The value in the campaign.
         before: Value,
         /// The value in the file now.
         after: Value,
     },
-    /// Seed structures behind those that the campaign has.
+    /// New seed structures after the existing ones.
     SeedStructures {
-        /// How many it has.
+        /// Number of existing ones.
         before: usize,
         /// Names and contents of the new ones.
         added: Vec<String>,
@@ -91,79 +91,78 @@ pub enum Change {
 pub enum Refused {
     /// A key that cannot change.
     #[error(
-        "{key} is {}, but this campaign {}: {}. Put the old value back{}",
+        "{key} is {}, but this campaign {}: {}. Restore the old value{}",
         shown(after),
         campaign_has(key, before),
         reason(key),
-        way_out(key)
+        remedy(key)
     )]
     Key {
         /// Dotted key.
         key: String,
-        /// The value that the campaign has.
+        /// The value in the campaign.
         before: Value,
         /// The value in the file now.
         after: Value,
     },
-    /// A file with other content.
+    /// A file whose contents changed.
     #[error(
-        "{key}: the file has another content (BLAKE3 {after}) than this campaign has ({before}): {}. Put the old file back{}",
+        "{key}: the contents of the file changed (BLAKE3 {after}; this campaign started with {before}): {}. Restore the old file{}",
         reason(key),
-        way_out(key)
+        remedy(key)
     )]
     File {
         /// Dotted key of the configuration that names the file.
         key: String,
-        /// The hash that the campaign has.
+        /// The hash in the campaign.
         before: String,
         /// The hash now.
         after: String,
     },
-    /// A seed structure that is gone or changed.
+    /// A seed structure that was removed or changed.
     #[error(
-        "seed_structures.files: seed structure {number} is {after}, but this campaign has {before} there: seed structures can be \
-         added behind those that it has, but not changed, moved or taken away. Put it back, and seed_structures.min_atoms and min_height \
-         as they were"
+        "seed_structures.files: seed structure {number} is {after}, but this campaign has {before}: append new seed structures \
+         after the existing ones; do not change, move or remove any. Restore it, and the old seed_structures.min_atoms and \
+         min_height"
     )]
     SeedStructure {
         /// Its number, from 0.
         number: usize,
-        /// Name and content that the campaign has.
+        /// Name and contents in the campaign.
         before: String,
-        /// Name and content now.
+        /// Name and contents now.
         after: String,
     },
 }
 
 const OTHER_PHYSICS: &str =
-    "its walks, decisions and labels so far would not belong together with what follows";
+    "a started campaign cannot change it, because earlier and later results would not be comparable";
 
 fn reason(key: &str) -> &'static str {
     match key {
         "instructions" => {
-            "this machine's processor gives other last digits than the one on which it began, which mode = \
-             \"reproducible\" promises not to happen"
+            "the processor of this host gives slightly different floating-point results than that of the start, which \
+             mode = \"reproducible\" excludes"
         }
-        key if is_label(key) => "labels of two protocols do not belong in one data set",
+        key if is_label(key) => "one data set must not mix labels of two protocols",
         _ => OTHER_PHYSICS,
     }
 }
 
-/// Whether it is a part of how labels are made.
+/// Whether the key is a part of the label method.
 fn is_label(key: &str) -> bool {
     key.starts_with("label.method")
 }
 
-fn way_out(key: &str) -> &'static str {
+fn remedy(key: &str) -> &'static str {
     if !is_label(key) {
         return "";
     }
-    ", have the labels made by the new protocol from now on (calmwalk relabel --config with this file; --dry-run tells what that \
-     may cost)"
+    ", or switch to the new protocol (calmwalk relabel --config with this file; --dry-run estimates the cost)"
 }
 
 impl Refused {
-    /// The key of the configuration that is at fault.
+    /// The key of the configuration that must be restored.
     pub fn key(&self) -> &str {
         match self {
             Self::Key { key, .. } | Self::File { key, .. } => key,
@@ -192,19 +191,22 @@ impl fmt::Display for Change {
             }
             Self::SeedStructures { before, added } => {
                 let added: Vec<_> = added.iter().map(|seed| short(seed)).collect();
-                write!(f, "seed structures added to the {before} that it has: {}", added.join(", "))
+                write!(f, "seed structures added to the existing {before}: {}", added.join(", "))
             }
         }
     }
 }
 
-/// What differs between the configuration a campaign has and the one it is continued with.
+/// Compares the configuration of a campaign with the one with which it is resumed.
+///
+/// # Errors
+/// The first change that is not possible.
 pub fn compare(before: &Value, after: &Value) -> Result<Vec<Change>, Refused> {
     let changes = changed_keys(before, after).into_iter();
-    changes.map(|(key, before, after)| judge(key, before, after)).collect()
+    changes.map(|(key, before, after)| classify(key, before, after)).collect()
 }
 
-fn judge(key: String, before: Value, after: Value) -> Result<Change, Refused> {
+fn classify(key: String, before: Value, after: Value) -> Result<Change, Refused> {
     if key == "seed_structures" {
         return seed_structures(&before, &after);
     }
@@ -239,7 +241,7 @@ fn seed_structures(before: &Value, after: &Value) -> Result<Change, Refused> {
     Ok(Change::SeedStructures { before: before.len(), added })
 }
 
-/// A configuration without the keys that may change.
+/// The configuration with all changeable keys set to null.
 pub fn without_changeable(configuration: &Value) -> Value {
     let mut fixed = configuration.clone();
     for key in CHANGEABLE {
@@ -251,29 +253,29 @@ pub fn without_changeable(configuration: &Value) -> Value {
     fixed
 }
 
-/// A value as a configuration has it.
+/// A value in the form of a configuration.
 fn shown(value: &Value) -> String {
     if value.is_null() { "left out".to_owned() } else { value.to_string() }
 }
 
-/// What a campaign does with a key.
+/// The value of a key in the campaign, in words.
 fn campaign_has(key: &str, value: &Value) -> String {
-    let verb = if is_label(key) { "labels" } else { "began" };
+    let verb = if is_label(key) { "labels" } else { "started" };
     if value.is_null() { format!("{verb} without it") } else { format!("{verb} with {value}") }
 }
 
-/// Name and content of a seed structure.
+/// Name and short hash of a seed structure.
 fn short(seed: &str) -> String {
     let (name, hash) = seed.rsplit_once(' ').unwrap_or((seed, ""));
     format!("'{name}' (content {})", excerpt(hash))
 }
 
-/// As much of a hash as tells it from others.
+/// The first digits of a hash, enough to distinguish it.
 fn excerpt(hash: &str) -> &str {
     hash.get(..12).unwrap_or(hash)
 }
 
-/// Whether some of its keys may change.
+/// Whether `key` is a section with changeable keys.
 fn is_section(key: &str) -> bool {
     CHANGEABLE.iter().any(|changeable| changeable.strip_prefix(key).is_some_and(|rest| rest.starts_with('.')))
 }
@@ -300,7 +302,7 @@ pub(super) fn differences(
             differences(&key, &of(old), &of(new), changes);
         }
     } else if before.is_null() && is_section(key) {
-        // A section that an earlier version did not know.
+        // A section that an earlier version of calmwalk did not have.
         differences(key, &json!({}), after, changes);
     } else if after.is_null() && is_section(key) {
         differences(key, before, &json!({}), changes);
@@ -321,7 +323,7 @@ mod tests {
         let shown: Vec<_> = changes.iter().map(Change::to_string).collect();
         assert_eq!(
             shown,
-            ["run.walkers is now 2 (was 1)", "seed structures added to the 1 that it has: 'b' (content 2)"]
+            ["run.walkers is now 2 (was 1)", "seed structures added to the existing 1: 'b' (content 2)"]
         );
         assert_eq!(changes[0].detail(), json!({ "key": "run.walkers", "before": 1, "after": 2 }));
         assert_eq!(
@@ -341,13 +343,13 @@ mod tests {
             (refused.key().to_owned(), refused.to_string())
         };
         let (key, message) = refused("/walk/tau", json!(0.2));
-        assert!(message.starts_with("walk.tau is 0.2, but this campaign began with 0.15"), "{message}");
+        assert!(message.starts_with("walk.tau is 0.2, but this campaign started with 0.15"), "{message}");
         assert_eq!(key, "walk.tau");
         let added = json!({ "walk": { "tau": 0.15, "volume_ramp": { "to": 1.1 } }, "seed_structures": [] });
         let message = compare(&json!({ "walk": { "tau": 0.15 }, "seed_structures": [] }), &added)
             .unwrap_err()
             .to_string();
-        assert!(message.contains("{\"to\":1.1}, but this campaign began without it: "), "{message}");
+        assert!(message.contains("{\"to\":1.1}, but this campaign started without it: "), "{message}");
         let (key, message) = refused("/files/potential.model", json!("cd"));
         assert!(message.contains("(BLAKE3 cd)") && message.contains("(ab)"), "{message}");
         assert_eq!(key, "potential.model");

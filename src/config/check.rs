@@ -1,4 +1,4 @@
-//! The rules of a configuration that no single value can check.
+//! Rules between keys, which the types and ranges of single keys cannot express.
 
 use std::collections::HashSet;
 
@@ -8,18 +8,18 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
 
-use super::error::Wrong;
+use super::error::InvalidValue;
 use super::ranges;
 use super::{Config, LabelSection, NotifySection, QueueFull};
 
-/// Largest shortest distance of a pair of elements, Å.
+/// Upper limit of the smallest allowed distance of a pair of elements, Å.
 const MAX_MIN_DISTANCE: f64 = 10.0;
 
 /// Largest number of walks under the same conditions.
 const MAX_REPEATS: u32 = 1000;
 
-/// Checks a configuration as a whole; everything that is wrong.
-pub fn check(config: &Config) -> Vec<Wrong> {
+/// Checks a configuration as a whole and returns all invalid values.
+pub fn check(config: &Config) -> Vec<InvalidValue> {
     let checks = [
         check_mixture(config),
         check_thermostat(config),
@@ -36,30 +36,30 @@ pub fn check(config: &Config) -> Vec<Wrong> {
     checks.into_iter().filter_map(Result::err).chain(check_label(&config.label)).collect()
 }
 
-fn check_seeds(config: &Config) -> Result<(), Wrong> {
+fn check_seeds(config: &Config) -> Result<(), InvalidValue> {
     if config.seed_structures.files.is_empty() {
         return wrong("seed_structures.files", "an empty list", "at least one file with seed structures");
     }
     Ok(())
 }
 
-fn check_notify(notify: &NotifySection) -> Result<(), Wrong> {
+fn check_notify(notify: &NotifySection) -> Result<(), InvalidValue> {
     if notify.command.as_ref().is_some_and(|command| command.first().is_none_or(String::is_empty)) {
         return wrong("notify.command", "an empty command", "a program, and its arguments");
     }
     Ok(())
 }
 
-fn wrong(key: &str, found: impl ToString, expected: impl ToString) -> Result<(), Wrong> {
+fn wrong(key: &str, found: impl ToString, expected: impl ToString) -> Result<(), InvalidValue> {
     Err((key.to_owned(), found.to_string(), expected.to_string()))
 }
 
-/// The text of a configuration is kept in the database, where no password belongs.
-fn check_store(config: &Config) -> Result<(), Wrong> {
+/// The URL must not contain a password, because the text of the configuration is stored in the database.
+fn check_store(config: &Config) -> Result<(), InvalidValue> {
     let Some(store) = &config.run.store else { return Ok(()) };
     match store.parse::<ServerUrl>() {
         Ok(url) if url.has_password() => {
-            let expected = "a URL without its password: that is taken from PGPASSWORD or ~/.pgpass";
+            let expected = "a URL without its password: set PGPASSWORD or use ~/.pgpass";
             wrong("run.store", format!("{url} with a password"), expected)
         }
         Ok(_) => Ok(()),
@@ -67,8 +67,8 @@ fn check_store(config: &Config) -> Result<(), Wrong> {
     }
 }
 
-/// Fewer labels than one structure takes are no campaign.
-fn check_budget(config: &Config) -> Result<(), Wrong> {
+/// The budget must suffice for the labels of one structure.
+fn check_budget(config: &Config) -> Result<(), InvalidValue> {
     let least = config.labels_of_each();
     match config.budget.labels {
         Some(labels) if labels.get() < least => {
@@ -79,51 +79,50 @@ fn check_budget(config: &Config) -> Result<(), Wrong> {
     }
 }
 
-/// How long the queue is depends on how fast labels are made, which is not the same twice.
-fn check_queue(config: &Config) -> Result<(), Wrong> {
+/// The length of the queue depends on the speed of the labellers, which is not reproducible.
+fn check_queue(config: &Config) -> Result<(), InvalidValue> {
     if config.label.on_queue_full == QueueFull::Raise && config.campaign.mode == Mode::Reproducible {
-        let expected = "\"wait\", or mode = \"live\": what is collected would depend on how fast labels are made, and a \
-                        reproducible campaign must not";
+        let expected = "\"wait\", or mode = \"live\": with \"raise\", the collected structures depend on the speed of the labellers, \
+                        which is not reproducible";
         return wrong("label.on_queue_full", "\"raise\"", expected);
     }
     Ok(())
 }
 
-/// What can be said of labels without the rest; everything that is wrong.
-pub fn check_label(label: &LabelSection) -> Vec<Wrong> {
+/// Checks the keys of `[label]` alone and returns all invalid values.
+pub fn check_label(label: &LabelSection) -> Vec<InvalidValue> {
     let guard =
         label.guard.fault().map(|(key, found, expected)| (key.to_owned(), found, expected.to_owned()));
     let checks = [check_pass_environment(label), check_batch_options(label), check_scratch(label)];
     guard.into_iter().chain(checks.into_iter().filter_map(Result::err)).collect()
 }
 
-fn check_pass_environment(label: &LabelSection) -> Result<(), Wrong> {
+fn check_pass_environment(label: &LabelSection) -> Result<(), InvalidValue> {
     let Some(pattern) = label.pass_environment.invalid_pattern() else { return Ok(()) };
-    let expected = "names of environment variables, or their beginnings with a * behind them: [\"MYCODE_*\"]";
+    let expected = "names of environment variables, or prefixes followed by *, such as [\"MYCODE_*\"]";
     wrong("label.pass_environment", format!("{pattern:?}"), expected)
 }
 
-fn check_batch_options(label: &LabelSection) -> Result<(), Wrong> {
+fn check_batch_options(label: &LabelSection) -> Result<(), InvalidValue> {
     if let Some(option) = label.batch_options.iter().find(|option| !is_option(option)) {
-        let expected = "options of sbatch, each with its value in one piece: \"--partition=long\"";
+        let expected = "options of sbatch, each with its value in one string, such as \"--partition=long\"";
         return wrong("label.batch_options", format!("{option:?}"), expected);
     }
     let another = |option: &&String| option.starts_with("--cluster") || option.starts_with("-M");
     if let Some(option) = label.batch_options.iter().find(another) {
-        let expected =
-            "jobs in the cluster of the host where labels are made: they would not be found in another";
+        let expected = "no option for another cluster: submit jobs to the cluster of the labeller's host, which cannot query others";
         return wrong("label.batch_options", format!("{option:?}"), expected);
     }
     Ok(())
 }
 
-fn check_scratch(label: &LabelSection) -> Result<(), Wrong> {
+fn check_scratch(label: &LabelSection) -> Result<(), InvalidValue> {
     match &label.scratch {
         None if label.batch_system.is_some() => {
-            let expected = "with label.batch_system, a directory that every node sees by the same name";
+            let expected = "a directory that has the same path on every node: label.batch_system requires it";
             wrong("label.scratch", "left out", expected)
         }
-        // Labellers may be on other hosts, where the directory of the configuration is not.
+        // Labellers may run on other hosts, which do not have the directory of the configuration.
         Some(scratch) if !scratch.is_absolute() => {
             wrong("label.scratch", scratch.display(), "an absolute path, such as \"/scratch\"")
         }
@@ -131,12 +130,12 @@ fn check_scratch(label: &LabelSection) -> Result<(), Wrong> {
     }
 }
 
-/// It becomes a line of a script.
+/// Whether the text is an option that can be a line of a job script.
 fn is_option(text: &str) -> bool {
     text.starts_with('-') && !text.chars().any(char::is_control)
 }
 
-fn check_mixture(config: &Config) -> Result<(), Wrong> {
+fn check_mixture(config: &Config) -> Result<(), InvalidValue> {
     let Config { campaign, calm, run, .. } = config;
     let one_by_one = campaign.mode == Mode::Reproducible && run.walks_per_round.get() == 1;
     if calm.update == UpdateProtocol::PerSeedStructure && !one_by_one {
@@ -152,7 +151,7 @@ fn check_mixture(config: &Config) -> Result<(), Wrong> {
     Ok(())
 }
 
-fn check_thermostat(config: &Config) -> Result<(), Wrong> {
+fn check_thermostat(config: &Config) -> Result<(), InvalidValue> {
     let thermostat = &config.walk.thermostat;
     if *thermostat == (ThermostatSettings::None {}) {
         let expected = "a thermostat: the bias heats a walk at constant energy";
@@ -162,12 +161,12 @@ fn check_thermostat(config: &Config) -> Result<(), Wrong> {
 }
 
 /// The first impossible setting of a thermostat in the table `section`.
-pub fn wrong_thermostat(thermostat: &ThermostatSettings, section: &str) -> Option<Wrong> {
+pub fn wrong_thermostat(thermostat: &ThermostatSettings, section: &str) -> Option<InvalidValue> {
     let WrongSetting { key, found, expected } = thermostat.wrong()?;
     Some((format!("{section}.thermostat.{key}"), found.to_string(), expected.to_owned()))
 }
 
-fn check_min_distances(config: &Config) -> Result<(), Wrong> {
+fn check_min_distances(config: &Config) -> Result<(), InvalidValue> {
     let MinDistanceRule::PerPair(rule) = &config.guard.min_distances else { return Ok(()) };
     let is_wrong = |limit: f64| !(limit > 0.0 && limit <= MAX_MIN_DISTANCE);
     match rule.pairs.iter().find(|(_, limit)| is_wrong(**limit)) {
@@ -180,7 +179,7 @@ fn check_min_distances(config: &Config) -> Result<(), Wrong> {
     }
 }
 
-fn check_zbl(config: &Config) -> Result<(), Wrong> {
+fn check_zbl(config: &Config) -> Result<(), InvalidValue> {
     let expected = "inner below outer, both 0 or above";
     let is_wrong = |inner: f64, outer: f64| !(0.0 <= inner && inner < outer && outer.is_finite());
     let found = |inner: f64, outer: f64| format!("inner {inner} and outer {outer}");
@@ -203,8 +202,8 @@ fn check_zbl(config: &Config) -> Result<(), Wrong> {
     }
 }
 
-/// Names, and numbers that have the ranges of `[walk]`.
-fn check_groups(config: &Config) -> Result<(), Wrong> {
+/// Checks the names of the groups, and their numbers against the ranges of `[walk]`.
+fn check_groups(config: &Config) -> Result<(), InvalidValue> {
     let mut names = HashSet::new();
     for (number, group) in config.walks.iter().enumerate() {
         let key = |name: &str| format!("walks.{number}.{name}");
@@ -231,7 +230,7 @@ fn check_groups(config: &Config) -> Result<(), Wrong> {
     Ok(())
 }
 
-fn check_temperature(config: &Config) -> Result<(), Wrong> {
+fn check_temperature(config: &Config) -> Result<(), InvalidValue> {
     let Config { walk, walks, guard, .. } = config;
     let highest = guard.max_temperature.get();
     let of_groups = walks.iter().enumerate().flat_map(|(number, group)| {
@@ -243,7 +242,10 @@ fn check_temperature(config: &Config) -> Result<(), Wrong> {
     let mut all = [("walk.temperature".to_owned(), &walk.temperature)].into_iter().chain(of_groups);
     match all.find(|(_, temperature)| highest <= temperature.get()) {
         Some((key, temperature)) => {
-            let expected = format!("more than {key} = {} K: every walk would end at once", temperature.get());
+            let expected = format!(
+                "more than {key} = {} K; otherwise every walk ends at its first step",
+                temperature.get()
+            );
             wrong("guard.max_temperature", highest, expected)
         }
         None => Ok(()),

@@ -1,7 +1,7 @@
-//! A TOML file as it is read: everything that is wrong with it, told at once.
+//! Reads a TOML file and collects all of its errors, so that users see them together.
 //!
-//! serde stops at the first error. So the entry that it stops at is noted and taken out of the parsed file, or replaced by a
-//! stand-in where it has to be there, and the rest is read again, until nothing is left to complain about.
+//! serde stops at the first error. The reader then records the entry at which serde stopped, removes it from the parsed table, or
+//! replaces it by a placeholder if it is required, and deserializes the rest again, until no error is left.
 
 use std::path::Path;
 
@@ -9,34 +9,34 @@ use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue, Deserializer, Error};
 
-use super::error::{ConfigError, Wrong, line_and_column, nearest, translated};
+use super::error::{ConfigError, InvalidValue, line_and_column, offset_of_key, translated};
 use super::hints::{self, KnownKeys};
-use super::ranges::{self, Found};
+use super::ranges::{self, RangedNumber};
 use super::warning::Warning;
 
-/// More errors than this are not what a person made.
-const MOST_ERRORS: usize = 100;
+/// Largest number of errors that are collected: no user makes more.
+const MAX_ERRORS: usize = 100;
 
-/// Errors of syntax that are told: a quote or a bracket too few makes one of every line behind it.
-const MOST_SYNTAX_ERRORS: usize = 3;
+/// Largest number of syntax errors that are shown: one missing quote or bracket makes an error of every later line.
+const MAX_SYNTAX_ERRORS: usize = 3;
 
-/// A parsed file, and what was found wrong with it.
+/// A parsed file and its errors.
 pub struct Document<'a> {
     path: &'a Path,
     text: &'a str,
-    /// As it stands in the file.
+    /// The contents of the file.
     table: Spanned<DeTable<'a>>,
-    /// With where they are, to be told in the order of the file.
+    /// Errors with their offsets in the file.
     problems: Vec<(usize, ConfigError)>,
-    /// Paths of what was wrong or missing: nothing more is to be said of them.
-    noted: Vec<Vec<String>>,
+    /// Paths of the entries that already have an error; further errors of them are not reported.
+    reported: Vec<Vec<String>>,
 }
 
 impl<'a> Document<'a> {
     /// Parses the text of a file.
     ///
     /// # Errors
-    /// What is no TOML, a line each.
+    /// Invalid TOML, with one message for each faulty line.
     pub fn parse(path: &'a Path, text: &'a str) -> Result<Self, ConfigError> {
         let (table, errors) = DeTable::parse_recoverable(text);
         let mut problems: Vec<_> = errors
@@ -44,21 +44,21 @@ impl<'a> Document<'a> {
             .map(|error| (offset(error), ConfigError::parse(path, text, error.span(), plain(error), "")))
             .collect();
         problems.sort_by_key(|(offset, _)| *offset);
-        // What follows on the same line follows from the first, and so does most of what comes behind.
+        // Later errors of a line, and most of those behind it, are consequences of its first.
         problems.dedup_by_key(|(offset, _)| line_and_column(text, *offset).0);
-        problems.truncate(MOST_SYNTAX_ERRORS);
+        problems.truncate(MAX_SYNTAX_ERRORS);
         match ConfigError::all(path, problems) {
             Some(error) => Err(error),
-            None => Ok(Self { path, text, table, problems: Vec::new(), noted: Vec::new() }),
+            None => Ok(Self { path, text, table, problems: Vec::new(), reported: Vec::new() }),
         }
     }
 
-    /// Reads it, with values from `stand_ins`, a valid file, for those that have to be there and are wrong or missing. Notes
-    /// everything that is wrong; `None` if so much is that nothing can be read.
-    pub fn read<T: DeserializeOwned>(&mut self, stand_ins: &str, known: &KnownKeys) -> Option<T> {
-        let stand_ins = DeTable::parse(stand_ins).ok();
+    /// Deserializes the file and collects all errors. Required entries that are missing or invalid get their values from
+    /// `placeholders`, the text of a valid file. Returns `None` if nothing can be deserialized.
+    pub fn read<T: DeserializeOwned>(&mut self, placeholders: &str, known: &KnownKeys) -> Option<T> {
+        let placeholders = DeTable::parse(placeholders).ok();
         let mut table = self.table.clone();
-        for _ in 0..MOST_ERRORS {
+        for _ in 0..MAX_ERRORS {
             let error = match T::deserialize(Deserializer::from(table.clone())) {
                 Ok(value) => return Some(value),
                 Err(error) => error,
@@ -68,16 +68,16 @@ impl<'a> Document<'a> {
                 Some(key) => {
                     let mut path = error.span().and_then(|span| holder(root, span)).unwrap_or_default();
                     path.push(key.to_owned());
-                    self.note_missing(&path, &error);
-                    let stand_in = stand_ins.as_ref().and_then(|all| entry(all.get_ref(), &path));
-                    match stand_in {
+                    self.report_missing(&path, &error);
+                    let placeholder = placeholders.as_ref().and_then(|all| entry(all.get_ref(), &path));
+                    match placeholder {
                         Some(found) => insert(root, &path, found),
                         None => path.pop().is_some() && remove(root, &path),
                     }
                 }
                 None => {
                     let path = innermost(root, offset(&error)).unwrap_or_default();
-                    self.note_wrong(&path, &error, known);
+                    self.report_wrong(&path, &error, known);
                     remove(root, &path)
                 }
             };
@@ -88,32 +88,32 @@ impl<'a> Document<'a> {
         None
     }
 
-    fn note_missing(&mut self, path: &[String], error: &Error) {
-        if !self.is_noted(path) {
-            self.noted.push(path.to_vec());
+    fn report_missing(&mut self, path: &[String], error: &Error) {
+        if !self.is_reported(path) {
+            self.reported.push(path.to_vec());
             let problem = ConfigError::parse(self.path, self.text, error.span(), plain(error), "");
             self.problems.push((offset(error), problem));
         }
     }
 
-    /// An entry is taken out with what is in it, and may then be wrong for that.
-    fn note_wrong(&mut self, path: &[String], error: &Error, known: &KnownKeys) {
+    /// Records an invalid entry. An entry that is invalid only because one of its own entries was removed is not reported.
+    fn report_wrong(&mut self, path: &[String], error: &Error, known: &KnownKeys) {
         if !path.is_empty() {
-            let follows = self.noted.iter().any(|noted| noted.starts_with(path));
-            self.noted.push(path.to_vec());
+            let follows = self.reported.iter().any(|reported| reported.starts_with(path));
+            self.reported.push(path.to_vec());
             if follows {
                 return;
             }
         }
         let (mut message, mut key) = (plain(error), path.join("."));
-        if let Some(unknown) = hints::Unknown::of(&message) {
+        if let Some(unknown) = hints::Unknown::from_message(&message) {
             let (holder, hint) = unknown.hint(path, known);
-            // What is spelt wrongly is not missing as well.
-            self.noted.extend(hint.instead.map(|name| [holder.as_slice(), &[name]].concat()));
+            // A key that is misspelt is not reported as missing too.
+            self.reported.extend(hint.replacement.map(|name| [holder.as_slice(), &[name]].concat()));
             let is_key = unknown.is_key();
-            // A message that says what to do needs no more.
+            // The message already says what to do.
             if !message.contains("; ") {
-                message += &hint.words;
+                message += &hint.text;
             }
             if is_key {
                 key.clear();
@@ -123,30 +123,32 @@ impl<'a> Document<'a> {
         self.problems.push((offset(error), problem));
     }
 
-    fn is_noted(&self, path: &[String]) -> bool {
-        self.noted.iter().any(|noted| path.starts_with(noted))
+    fn is_reported(&self, path: &[String]) -> bool {
+        self.reported.iter().any(|reported| path.starts_with(reported))
     }
 
-    /// Compares the numbers of the file with the ranges of [`ranges`]; what is possible but unusual is a warning. `walk` is the
-    /// table that has the keys of `[walk]`.
+    /// Compares the numbers of the file with the ranges of [`ranges`]. A number that is possible but unusual gives a warning. `walk`
+    /// is the table that has the keys of `[walk]`.
     pub fn check_ranges(&mut self, walk: &str) -> Vec<Warning> {
         let mut warnings = Vec::new();
-        for Found { range, key, value, offset } in ranges::found(self.table.get_ref(), walk) {
+        for RangedNumber { range, key, value, offset } in
+            ranges::numbers_with_ranges(self.table.get_ref(), walk)
+        {
             let path: Vec<_> = key.split('.').map(str::to_owned).collect();
-            if self.is_noted(&path) {
+            if self.is_reported(&path) {
                 continue;
             }
             if !range.is_possible(value) {
                 self.push(offset, (key, range.written(value), range.expected()));
             } else if !range.is_usual(value) {
-                warnings.push(Warning { at: self.at(offset), key, message: range.unusual(value) });
+                warnings.push(Warning { at: self.location(offset), key, message: range.unusual(value) });
             }
         }
         warnings
     }
 
-    /// Notes values that do not go with the others, unless something is to be put right first that they may depend on.
-    pub fn check_rules(&mut self, rules: impl FnOnce() -> Vec<Wrong>) {
+    /// Checks the rules between keys, unless the file has other errors, on which their results may depend.
+    pub fn check_rules(&mut self, rules: impl FnOnce() -> Vec<InvalidValue>) {
         if self.problems.is_empty() {
             for wrong in rules() {
                 self.push(self.offset_of(&wrong.0), wrong);
@@ -154,24 +156,27 @@ impl<'a> Document<'a> {
         }
     }
 
-    fn push(&mut self, offset: usize, (key, found, expected): Wrong) {
-        let at =
-            if self.table.get_ref().is_empty() { self.path.display().to_string() } else { self.at(offset) };
+    fn push(&mut self, offset: usize, (key, found, expected): InvalidValue) {
+        let at = if self.table.get_ref().is_empty() {
+            self.path.display().to_string()
+        } else {
+            self.location(offset)
+        };
         self.problems.push((offset, ConfigError::Value { at, key, found, expected }));
     }
 
-    fn at(&self, offset: usize) -> String {
-        super::place_of_offset(self.path, self.text, offset)
+    fn location(&self, offset: usize) -> String {
+        super::location_of_offset(self.path, self.text, offset)
     }
 
     fn offset_of(&self, key: &str) -> usize {
-        nearest(self.table.get_ref(), key).unwrap_or_default()
+        offset_of_key(self.table.get_ref(), key).unwrap_or_default()
     }
 
-    /// All that was found wrong, in the order of the file.
+    /// Ends the reading.
     ///
     /// # Errors
-    /// Anything.
+    /// All errors that were collected, in the order of the file.
     pub fn finish(mut self) -> Result<(), ConfigError> {
         self.problems.sort_by_key(|(offset, _)| *offset);
         ConfigError::all(self.path, self.problems).map_or(Ok(()), Err)
@@ -186,12 +191,12 @@ fn plain(error: &Error) -> String {
     translated(&error.message().trim().replace('\n', "; "))
 }
 
-/// The key that an error misses.
+/// The key that is missing, if the error is about one.
 fn missing(error: &Error) -> Option<&str> {
     error.message().strip_prefix("missing field `")?.split('`').next()
 }
 
-/// The path of the table that stands exactly there.
+/// The path of the table at exactly this span.
 fn holder(table: &DeTable<'_>, span: std::ops::Range<usize>) -> Option<Vec<String>> {
     table.iter().find_map(|(key, value)| {
         let DeValue::Table(inner) = value.get_ref() else { return None };
@@ -200,7 +205,7 @@ fn holder(table: &DeTable<'_>, span: std::ops::Range<usize>) -> Option<Vec<Strin
     })
 }
 
-/// The path of the innermost entry whose key or value holds this place.
+/// The path of the innermost entry whose key or value contains this offset.
 fn innermost(table: &DeTable<'_>, offset: usize) -> Option<Vec<String>> {
     let inside = table.iter().find_map(|(key, value)| match value.get_ref() {
         DeValue::Table(inner) => {
@@ -216,7 +221,7 @@ fn innermost(table: &DeTable<'_>, offset: usize) -> Option<Vec<String>> {
     })
 }
 
-/// The table that has the last key of a path.
+/// The table that contains the last key of a path.
 fn parent<'t, 'a>(table: &'t mut DeTable<'a>, path: &[String]) -> Option<&'t mut DeTable<'a>> {
     let Some((first, rest)) = path.split_first().filter(|(_, rest)| !rest.is_empty()) else {
         return Some(table);

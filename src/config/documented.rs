@@ -1,4 +1,4 @@
-//! Whether the files of `configs/` and `docs/configuration.md` say what is so.
+//! Checks that the files of `configs/` and `docs/configuration.md` describe the configuration as it is.
 
 use std::collections::BTreeSet;
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! What is wrong with a configuration, and where.
+//! Errors of a configuration, with their locations.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -8,28 +8,28 @@ use toml::de::{DeTable, DeValue};
 use super::hints::Unknown;
 
 /// A value that a rule refuses: its key, what was found, what was expected.
-pub type Wrong = (String, String, String);
+pub type InvalidValue = (String, String, String);
 
-/// Why a configuration cannot be used: exit code 2.
+/// Why a configuration is refused (exit code 2).
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// A file that cannot be read.
-    #[error("cannot read {}: {source}{}", path.display(), what_instead(path))]
+    #[error("cannot read {}: {source}{}", path.display(), suggested_file(path))]
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// A file that is no text.
+    /// A file that is not UTF-8 text.
     #[error("{}:{line}: found bytes that are not text; expected a configuration in TOML (UTF-8)", path.display())]
     Encoding {
         /// The file.
         path: PathBuf,
-        /// Where the first of them stands.
+        /// Line of the first invalid byte.
         line: usize,
     },
-    /// TOML that is none, an unknown key, a value of the wrong kind.
+    /// Invalid TOML, an unknown key, or a value of the wrong type.
     #[error("{at}: {message}")]
     Parse {
         /// `file:line:column`.
@@ -37,7 +37,7 @@ pub enum ConfigError {
         /// What was found and expected.
         message: String,
     },
-    /// A value that does not go with the others.
+    /// A value out of its range, or one that contradicts other keys.
     #[error("{at}: {key} is {found}; expected {expected}")]
     Value {
         /// `file:line`.
@@ -49,48 +49,48 @@ pub enum ConfigError {
         /// What was expected.
         expected: String,
     },
-    /// A file that the configuration names and that cannot be used.
+    /// A file named by the configuration that cannot be used.
     #[error("{at}: {key}: {message}")]
     File {
         /// `file:line` of the configuration.
         at: String,
         /// The key.
         key: String,
-        /// What is wrong with the file.
+        /// The problem of the file.
         message: String,
     },
-    /// Several of these.
+    /// Several errors.
     #[error("{} errors in {}:\n{}", errors.len(), path.display(), lines(errors))]
     Several {
         /// The file.
         path: PathBuf,
-        /// In the order of the file.
+        /// The errors, in the order of the file.
         errors: Vec<ConfigError>,
     },
 }
 
-/// Errors of a file that are told.
-const MOST_ERRORS: usize = 12;
+/// Largest number of errors that are printed.
+const MAX_PRINTED_ERRORS: usize = 12;
 
-/// Characters of a line that are shown.
-const MOST_OF_A_LINE: usize = 120;
+/// Largest number of characters of a line that are printed.
+const MAX_LINE_LENGTH: usize = 120;
 
 fn lines(errors: &[ConfigError]) -> String {
-    let mut lines: Vec<_> = errors.iter().take(MOST_ERRORS).map(ToString::to_string).collect();
-    if errors.len() > MOST_ERRORS {
-        lines.push(format!("… and {} more", errors.len() - MOST_ERRORS));
+    let mut lines: Vec<_> = errors.iter().take(MAX_PRINTED_ERRORS).map(ToString::to_string).collect();
+    if errors.len() > MAX_PRINTED_ERRORS {
+        lines.push(format!("… and {} more", errors.len() - MAX_PRINTED_ERRORS));
     }
     lines.join("\n")
 }
 
-/// The directory that `init` makes is taken for its configuration easily.
-fn what_instead(path: &Path) -> String {
+/// Suggests the configuration in `path` if `path` is a directory that `calmwalk init` made.
+fn suggested_file(path: &Path) -> String {
     let inside = path.join("campaign.toml");
     if inside.is_file() { format!("; did you mean {}?", inside.display()) } else { String::new() }
 }
 
 impl ConfigError {
-    /// All of these, each with where it stands; `None` if there are none.
+    /// Combines errors, each with its offset in the file; `None` if there are none.
     pub fn all(path: &Path, problems: Vec<(usize, Self)>) -> Option<Self> {
         let mut errors: Vec<_> = problems.into_iter().map(|(_, error)| error).collect();
         match errors.len() {
@@ -99,12 +99,12 @@ impl ConfigError {
         }
     }
 
-    /// A file of which nothing could be read.
+    /// A file from which no configuration can be deserialized.
     pub(crate) fn unreadable(path: &Path) -> Self {
         Self::Parse { at: path.display().to_string(), message: "expected a configuration".to_owned() }
     }
 
-    /// What is wrong at a place of a file, with its line. `key` is the dotted key that it is about, if the message does not say.
+    /// An error at `span`, with the text of its line. `key` is the dotted key that the error is about, empty if the message names it.
     pub(super) fn parse(
         path: &Path,
         text: &str,
@@ -115,18 +115,18 @@ impl ConfigError {
         let (line, column) = span.map_or((1, 1), |span| line_and_column(text, span.start));
         let at = format!("{}:{line}:{column}", path.display());
         let shown: String =
-            text.lines().nth(line - 1).unwrap_or_default().trim().chars().take(MOST_OF_A_LINE).collect();
+            text.lines().nth(line - 1).unwrap_or_default().trim().chars().take(MAX_LINE_LENGTH).collect();
         let mut message = if key.is_empty() { message } else { format!("{key}: {message}") };
-        // What the whole file lacks has no line of its own.
-        let of_whole = (line, column) == (1, 1) && message.starts_with("missing");
-        if !(shown.is_empty() || of_whole) {
+        // A table that is missing from the whole file has no line.
+        let of_whole_file = (line, column) == (1, 1) && message.starts_with("missing");
+        if !(shown.is_empty() || of_whole_file) {
             message += &format!("\n  {line} | {shown}");
         }
         Self::Parse { at, message }
     }
 }
 
-/// The text of a configuration.
+/// Reads the text of a configuration.
 pub fn read_text(path: &Path) -> Result<String, ConfigError> {
     let bytes = std::fs::read(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
     String::from_utf8(bytes).map_err(|error| {
@@ -136,16 +136,16 @@ pub fn read_text(path: &Path) -> Result<String, ConfigError> {
     })
 }
 
-/// What is wrong with TOML, with a suggestion for an unknown key.
-pub fn in_plain_words(error: &toml::de::Error) -> String {
+/// The message of a TOML error in the words of a user, with a suggestion for an unknown key.
+pub fn user_message(error: &toml::de::Error) -> String {
     let message = translated(&error.message().trim().replace('\n', "; "));
-    match Unknown::of(&message).and_then(|unknown| unknown.nearest()) {
+    match Unknown::from_message(&message).and_then(|unknown| unknown.nearest()) {
         Some(suggestion) => format!("{message}; did you mean `{suggestion}`?"),
         None => message,
     }
 }
 
-/// The words of the parser, which are those of Rust, in the words of those who write configurations.
+/// Replaces the parser's Rust terms by those of TOML.
 pub(super) fn translated(message: &str) -> String {
     let words = [
         ("unknown field", "unknown key"),
@@ -170,27 +170,27 @@ pub(super) fn translated(message: &str) -> String {
     }
 }
 
-/// `file:line` of a dotted key; that of the table that should have it where it is not written out, or the file alone.
-pub fn place(path: &Path, text: &str, key: &str) -> String {
+/// `file:line` of a dotted key; if it is not written out, of the innermost table that would have it; otherwise the file alone.
+pub fn location(path: &Path, text: &str, key: &str) -> String {
     let (table, _) = DeTable::parse_recoverable(text);
-    match nearest(table.get_ref(), key) {
-        Some(offset) => place_of_offset(path, text, offset),
+    match offset_of_key(table.get_ref(), key) {
+        Some(offset) => location_of_offset(path, text, offset),
         None => path.display().to_string(),
     }
 }
 
-/// Where a dotted key stands, or the innermost of the tables that should have it.
-pub(super) fn nearest(table: &DeTable<'_>, key: &str) -> Option<usize> {
+/// Offset of a dotted key, or of the innermost table that would have it.
+pub(super) fn offset_of_key(table: &DeTable<'_>, key: &str) -> Option<usize> {
     let (name, rest) = key.split_once('.').unwrap_or((key, ""));
     let (found, value) = table.get_key_value(name)?;
     let inside = match value.get_ref() {
-        DeValue::Table(inner) if !rest.is_empty() => nearest(inner, rest),
-        // Tables of an array by their number.
+        DeValue::Table(inner) if !rest.is_empty() => offset_of_key(inner, rest),
+        // Elements of an array have numbers as keys.
         DeValue::Array(tables) if !rest.is_empty() => {
             let (number, rest) = rest.split_once('.').unwrap_or((rest, ""));
             let table = number.parse::<usize>().ok().and_then(|number| tables.get(number));
             table.map(|table| match table.get_ref() {
-                DeValue::Table(inner) => nearest(inner, rest).unwrap_or(table.span().start),
+                DeValue::Table(inner) => offset_of_key(inner, rest).unwrap_or(table.span().start),
                 _ => table.span().start,
             })
         }
@@ -200,7 +200,7 @@ pub(super) fn nearest(table: &DeTable<'_>, key: &str) -> Option<usize> {
 }
 
 /// `file:line` of a byte offset.
-pub fn place_of_offset(path: &Path, text: &str, offset: usize) -> String {
+pub fn location_of_offset(path: &Path, text: &str, offset: usize) -> String {
     format!("{}:{}", path.display(), line_and_column(text, offset).0)
 }
 
@@ -217,15 +217,15 @@ mod tests {
     #[test]
     fn keys_are_found_in_their_section() {
         let text = "[a]\nx = 1\n[b]\n# x\nx = 2\n";
-        assert_eq!(place(Path::new("f"), text, "b.x"), "f:5");
-        assert_eq!(place(Path::new("f"), text, "b.y"), "f:3");
-        assert_eq!(place(Path::new("f"), text, "c.x"), "f");
-        assert_eq!(place_of_offset(Path::new("f"), text, 5), "f:2");
+        assert_eq!(location(Path::new("f"), text, "b.x"), "f:5");
+        assert_eq!(location(Path::new("f"), text, "b.y"), "f:3");
+        assert_eq!(location(Path::new("f"), text, "c.x"), "f");
+        assert_eq!(location_of_offset(Path::new("f"), text, 5), "f:2");
         let text = "[a]\nb = { c = { d = 1 },\n  e = 2 }\n[a.f.g]\nh = 3\n";
         for (key, line) in
             [("a.b.c.d", 2), ("a.b.e", 3), ("a.b.x", 2), ("a.f.g.h", 5), ("a.f.g.x", 4), ("a.x", 1)]
         {
-            assert_eq!(place(Path::new("f"), text, key), format!("f:{line}"), "{key}");
+            assert_eq!(location(Path::new("f"), text, key), format!("f:{line}"), "{key}");
         }
     }
 }

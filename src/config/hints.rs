@@ -1,46 +1,19 @@
-//! What to say of a name that is not known.
+//! Suggestions for unknown names.
 
 use serde::de::DeserializeOwned;
 
-/// Names below this likeness are other names.
-const LIKE: f64 = 0.7;
-
-/// What other programs call a key, and what it is called here.
-const SYNONYMS: [(&str, &str); 22] = [
-    ("ecut", "cutoff"),
-    ("encut", "cutoff"),
-    ("ecutwfc", "cutoff"),
-    ("e_cut", "cutoff"),
-    ("cut_off_energy", "cutoff"),
-    ("ecutrho", "fine_cutoff"),
-    ("pawecutdg", "fine_cutoff"),
-    ("rel_cutoff", "relative_cutoff"),
-    ("kspacing", "k_spacing"),
-    ("kpts", "k_spacing"),
-    ("kpoints", "k_spacing"),
-    ("k_points", "k_spacing"),
-    ("sigma", "smearing_width"),
-    ("degauss", "smearing_width"),
-    ("dt", "time_step"),
-    ("timestep", "time_step"),
-    ("temp", "temperature"),
-    ("nsteps", "biased_steps"),
-    ("seed", "rng_seed"),
-    ("gamma", "friction"),
-    ("nelm", "max_scf_steps"),
-    ("ncores", "cores"),
-];
+use crate::nearest_name::nearest;
 
 /// The keys of the tables of a file.
 pub struct KnownKeys(Vec<(&'static str, Vec<String>)>);
 
 impl KnownKeys {
-    /// Of no table.
+    /// Without tables.
     pub fn new() -> Self {
         Self(Vec::new())
     }
 
-    /// With the keys of a type that denies unknown ones, which says itself what they are.
+    /// Adds the keys of `T`, which must deny unknown keys: its error message lists them.
     pub fn with<T: DeserializeOwned>(mut self, table: &'static str) -> Self {
         let keys = match toml::from_str::<T>("'?' = 0") {
             Err(error) => names(error.message()).skip(1).map(str::to_owned).collect(),
@@ -50,7 +23,7 @@ impl KnownKeys {
         self
     }
 
-    /// The tables that have this key, but for one.
+    /// The tables other than `but` that have this key.
     fn tables_with(&self, key: &str, but: &str) -> Vec<String> {
         let with =
             self.0.iter().filter(|(table, keys)| *table != but && keys.iter().any(|known| known == key));
@@ -58,24 +31,24 @@ impl KnownKeys {
     }
 }
 
-/// A name that is not known, among those that are: the parts of "unknown key `x`, expected one of `a`, `b`".
+/// An unknown name and the known ones: the parts of "unknown key `x`, expected one of `a`, `b`".
 pub struct Unknown<'a> {
     found: &'a str,
     known: Vec<&'a str>,
     is_key: bool,
 }
 
-/// What to do about it.
+/// A suggestion for the user.
 pub struct Hint {
-    /// To be put behind the message; empty where nothing is near.
-    pub words: String,
-    /// The key that was meant.
-    pub instead: Option<String>,
+    /// Text to append to the message; empty without a suggestion.
+    pub text: String,
+    /// The key that was probably meant.
+    pub replacement: Option<String>,
 }
 
 impl<'a> Unknown<'a> {
-    /// Of a message of the parser's, if it is about such a name.
-    pub fn of(message: &'a str) -> Option<Self> {
+    /// Parses a message of the parser; `None` if it is not about an unknown name.
+    pub fn from_message(message: &'a str) -> Option<Self> {
         let is_key = message.starts_with("unknown key");
         if !is_key && !message.starts_with("unknown value") {
             return None;
@@ -84,12 +57,12 @@ impl<'a> Unknown<'a> {
         Some(Self { found: names.next()?, known: names.collect(), is_key })
     }
 
-    /// Whether it is the name of a key, and not a value.
+    /// Whether the name is that of a key, not a value.
     pub fn is_key(&self) -> bool {
         self.is_key
     }
 
-    /// The table that it was found in, and what to say of it. `path` is where: the name itself, or what holds it.
+    /// The table in which the name was found, and a suggestion. `path` ends with the name itself or with its table.
     pub fn hint(&self, path: &[String], known: &KnownKeys) -> (Vec<String>, Hint) {
         let holder = match path.split_last() {
             Some((last, before)) if last == self.found && self.is_key => before,
@@ -100,35 +73,22 @@ impl<'a> Unknown<'a> {
             false => Vec::new(),
         };
         let nearest = self.nearest();
-        let words = match (tables.as_slice(), nearest) {
+        let text = match (tables.as_slice(), nearest) {
             ([], Some(name)) => format!("; did you mean `{name}`?"),
             ([], None) => String::new(),
             (tables, _) => format!("; it belongs in {}", tables.join(" or ")),
         };
-        let instead = nearest.filter(|_| self.is_key && tables.is_empty()).map(str::to_owned);
-        (holder.to_vec(), Hint { words, instead })
+        let replacement = nearest.filter(|_| self.is_key && tables.is_empty()).map(str::to_owned);
+        (holder.to_vec(), Hint { text, replacement })
     }
 
-    /// The name that was meant, if one is near.
+    /// The known name that was probably meant.
     pub fn nearest(&self) -> Option<&'a str> {
         nearest(self.found, self.known.iter().copied())
     }
 }
 
-/// The nearest of some names, if one is near: by what other programs call it, or by its letters.
-pub fn nearest<'a>(found: &str, names: impl Iterator<Item = &'a str> + Clone) -> Option<&'a str> {
-    let lower = found.to_ascii_lowercase();
-    let synonym = SYNONYMS.iter().find(|(other, _)| *other == lower);
-    if let Some(name) = synonym.and_then(|(_, name)| names.clone().find(|known| known == name)) {
-        return Some(name);
-    }
-    // Pairs of letters tell a part of a name from letters that are scattered over a longer one.
-    let likeness = |name: &str| strsim::jaro_winkler(&lower, name) + strsim::sorensen_dice(&lower, name);
-    let near = names.filter(|name| strsim::jaro_winkler(&lower, name) > LIKE);
-    near.max_by(|a, b| likeness(a).total_cmp(&likeness(b)))
-}
-
-/// What stands between backticks.
+/// The texts between backticks.
 fn names(message: &str) -> impl Iterator<Item = &str> {
     message.split('`').skip(1).step_by(2)
 }
@@ -138,7 +98,7 @@ mod tests {
     use super::*;
 
     fn nearest_of(message: &str) -> Option<&str> {
-        Unknown::of(message).and_then(|unknown| unknown.nearest())
+        Unknown::from_message(message).and_then(|unknown| unknown.nearest())
     }
 
     #[test]
@@ -163,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn types_say_what_their_keys_are() {
+    fn the_keys_of_a_type_are_found() {
         #[derive(serde::Deserialize)]
         #[serde(deny_unknown_fields)]
         #[allow(dead_code)]

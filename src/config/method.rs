@@ -1,4 +1,4 @@
-//! `label.method`: how labels are made.
+//! `label.method`: the method that computes labels.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -10,7 +10,7 @@ use toml::Spanned;
 
 use super::PotentialFile;
 
-/// Programs that have a calculator of ASE's, and what they are called.
+/// Names of programs that ASE has calculators for.
 const THROUGH_ASE: [&str; 27] = [
     "quantum_espresso",
     "quantumespresso",
@@ -41,11 +41,11 @@ const THROUGH_ASE: [&str; 27] = [
     "lammps",
 ];
 
-/// How labels are made: a table with one key, the name of the method.
+/// The method that computes labels: a table with one key, the name of the method.
 #[derive(Clone, Debug, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LabelMethod {
-    /// Any potential that calmwalk evaluates.
+    /// A potential that calmwalk evaluates.
     Potential(PotentialFile),
     /// A program.
     #[serde(untagged)]
@@ -53,7 +53,7 @@ pub enum LabelMethod {
 }
 
 impl LabelMethod {
-    /// Its key.
+    /// Name of the method, its key.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Potential(_) => "potential",
@@ -61,7 +61,7 @@ impl LabelMethod {
         }
     }
 
-    /// Every path in it.
+    /// All paths in the settings.
     pub(super) fn paths(&mut self) -> Vec<&mut PathBuf> {
         match self {
             Self::Potential(reference) => vec![Spanned::get_mut(&mut reference.file)],
@@ -70,7 +70,7 @@ impl LabelMethod {
     }
 }
 
-/// Written out, so that what is wrong inside a method is told with its place and not as "no method fits".
+/// Not derived, so that an error inside a method has its own message and location instead of "no variant matches".
 impl<'de> Deserialize<'de> for LabelMethod {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         deserializer.deserialize_map(Methods)
@@ -109,7 +109,7 @@ impl<'de> Visitor<'de> for Methods {
     }
 }
 
-/// A map whose first key was read already.
+/// A map whose first key has been read.
 struct Again<A> {
     name: Option<String>,
     map: A,

@@ -31,9 +31,9 @@ use workers::labeller::LabelGuard;
 pub use changes::{Change, Refused, changed_keys, compare, without_changeable};
 pub use check::wrong_thermostat;
 pub use document::Document;
-pub use error::{ConfigError, in_plain_words, place, place_of_offset, read_text};
+pub use error::{ConfigError, location, location_of_offset, read_text, user_message};
 pub use files::{PotentialFile, PotentialKind};
-pub use hints::{KnownKeys, nearest};
+pub use hints::KnownKeys;
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};
 pub use ranges::impossible;
@@ -72,13 +72,13 @@ pub struct Config {
     /// Processes and rounds.
     #[serde(default)]
     pub run: RunSection,
-    /// Who is told what happens.
+    /// Notifications about events of the campaign.
     #[serde(default)]
     pub notify: NotifySection,
 }
 
-/// Values that stand in for keys that must be there and are wrong, so that the rest can be read.
-const STAND_INS: &str = r#"
+/// Placeholders for required keys that are missing or invalid, so that the rest can be checked.
+const PLACEHOLDERS: &str = r#"
 potential = { model = "-" }
 calm = {}
 seed_structures = { files = ["-"] }
@@ -93,7 +93,7 @@ pub struct Loaded {
     pub config: Config,
     /// Its text.
     pub text: String,
-    /// What is possible but hardly meant.
+    /// Values that are probably not intended.
     pub warnings: Vec<Warning>,
 }
 
@@ -105,7 +105,7 @@ impl Config {
     pub fn load(path: &Path) -> Result<Loaded, ConfigError> {
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
-        let config: Option<Self> = document.read(STAND_INS, &Self::known_keys());
+        let config: Option<Self> = document.read(PLACEHOLDERS, &Self::known_keys());
         let warnings = document.check_ranges("walk");
         document.check_rules(|| config.as_ref().map(check::check).unwrap_or_default());
         document.finish()?;
@@ -123,7 +123,7 @@ impl Config {
         }
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
-        let labels: Option<Labels> = document.read(STAND_INS, &Self::known_keys());
+        let labels: Option<Labels> = document.read(PLACEHOLDERS, &Self::known_keys());
         document.check_ranges("walk");
         document
             .check_rules(|| labels.as_ref().map(|all| check::check_label(&all.label)).unwrap_or_default());
@@ -147,7 +147,7 @@ impl Config {
             .with::<GuardSection>("guard")
             .with::<LabelSection>("label")
             .with::<LabelGuard>("label.guard")
-            .with::<CheckSection>("label.check")
+            .with::<ReferenceCheckSection>("label.reference_check")
             .with::<BudgetSection>("budget")
             .with::<RunSection>("run")
             .with::<NotifySection>("notify")
@@ -162,14 +162,14 @@ impl Config {
     }
 
     /// Checks it as a whole; everything that is wrong.
-    pub fn check(&self) -> Vec<error::Wrong> {
+    pub fn check(&self) -> Vec<error::InvalidValue> {
         check::check(self)
     }
 
     /// Every path in it.
     fn paths(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         let optional = self.calm.artifact.iter_mut().chain(&mut self.calm.training_frames);
-        let optional = optional.chain(&mut self.label.check.structures);
+        let optional = optional.chain(&mut self.label.reference_check.structures);
         let others =
             [&mut self.potential.model].into_iter().chain(optional).chain(&mut self.seed_structures.files);
         others.map(Spanned::get_mut).chain(self.label.method.paths())
@@ -212,11 +212,11 @@ impl Config {
 
     /// The limits that the store holds labellers to.
     pub fn budget(&self) -> store::Budget {
-        let BudgetSection { labels, core_hours, wall_hours } = self.budget.clone();
+        let BudgetSection { labels, core_hours, wall_time } = self.budget.clone();
         store::Budget {
             labels: labels.map(|labels| labels.get().into()),
             core_hours: core_hours.map(Positive::get),
-            wall_hours: wall_hours.map(Positive::get),
+            wall_hours: wall_time.map(|time| time.seconds() / 3600.0),
             structures_by: self.limit_of_structures().map(|(_, key)| key.to_owned()),
         }
     }

@@ -26,28 +26,28 @@ pub struct NotifySection {
     pub time_limit: Duration,
 }
 
-/// What may happen to a campaign.
+/// An event of a campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum NotifyEvent {
-    /// It is finished.
+    /// The campaign is finished.
     End,
-    /// `calmwalk run` cannot go on with it.
+    /// `calmwalk run` failed.
     Failure,
-    /// Nothing is found and nothing labelled.
+    /// There was no new candidate or label for `stall_timeout`.
     Stall,
-    /// A budget is used up.
+    /// A budget is exhausted.
     Budget,
-    /// Labels failed.
+    /// As many labels failed as `failed_labels` says.
     FailedLabels,
-    /// The mixture forgets its training data, or does so no longer.
+    /// The forgetting alarm of the mixture is raised or over.
     Forgetting,
-    /// Walk after walk ends early.
+    /// Several walks in succession ended early.
     FailingWalks,
 }
 
 impl NotifyEvent {
-    /// All of them.
+    /// All events.
     pub const ALL: [Self; 7] = [
         Self::End,
         Self::Failure,
@@ -58,7 +58,7 @@ impl NotifyEvent {
         Self::FailingWalks,
     ];
 
-    /// As the configuration has it.
+    /// Name in the configuration.
     pub fn name(self) -> &'static str {
         match self {
             Self::End => "end",
@@ -73,7 +73,7 @@ impl NotifyEvent {
 }
 
 impl NotifySection {
-    /// A command that is given as a path is one relative to the configuration.
+    /// Resolves a command that is a path relative to the directory of the configuration.
     pub(super) fn resolve_paths(&mut self, directory: &Path) {
         if let Some(program) = self.command.iter_mut().flatten().next().filter(|name| name.contains('/')) {
             *program = directory.join(&*program).to_string_lossy().into_owned();

@@ -1,44 +1,45 @@
-//! The numbers that make sense, for every key that is a number: a table that docs/configuration.md repeats.
+//! The range of each numeric key: a table that docs/configuration.md repeats.
 //!
-//! Outside what is possible, nothing sensible can be meant, and the file is refused; outside what is usual, `validate` and
-//! `run` warn. What is left out has its default and needs no check.
+//! A number outside its possible range is an error. A number outside its usual range gives a warning of `validate` and `run`.
+//! Defaults need no check.
 
 use toml::de::{DeTable, DeValue};
 
-use super::error::Wrong;
+use super::error::InvalidValue;
 use crate::duration::Duration;
 
-/// The values of a key.
+/// The range of a key.
 pub struct Range {
     /// Dotted key.
     pub key: &'static str,
     /// Unit, or nothing.
     pub unit: &'static str,
-    /// Least and largest possible value; 0 is below no value that serde lets pass.
+    /// Smallest and largest possible value. Whether 0 itself is allowed is decided by the type of the key.
     pub possible: [f64; 2],
-    /// Least and largest usual value.
+    /// Smallest and largest usual value.
     pub usual: [f64; 2],
-    /// What may be meant by others.
+    /// The probable mistake behind other values.
     pub hint: &'static str,
 }
 
-/// A number of a file that has a range.
-pub struct Found {
+/// A number of a file whose key has a range.
+pub struct RangedNumber {
     /// Its range.
     pub range: &'static Range,
     /// Its dotted key in that file.
     pub key: String,
     /// The number.
     pub value: f64,
-    /// Where it stands, bytes.
+    /// Offset in the file, bytes.
     pub offset: usize,
 }
 
 /// The unit of wall-clock times, which are text with a unit in a file and seconds here.
 const TIME: &str = "time";
 const DAY: f64 = 86_400.0;
+const YEAR: f64 = 365.25 * DAY;
 
-/// Steps, in the sense of time: larger numbers would exhaust it.
+/// Upper limit of numbers of steps; no campaign has more.
 const STEPS: f64 = 1e12;
 
 const FEMTOSECONDS: &str = "it is in fs: 1 ps is 1000 fs";
@@ -65,8 +66,8 @@ const fn range(
     Range { key, unit, possible, usual, hint }
 }
 
-/// All of them, by table.
-pub static RANGES: [Range; 90] = [
+/// All ranges, by table.
+pub static RANGES: [Range; 91] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -127,9 +128,9 @@ pub static RANGES: [Range; 90] = [
     range("label.guard.min_volume_per_atom", "Å³", [0.0, 1e3], [1.0, 50.0], "it is that of an atom, in Å³"),
     range("label.guard.max_volume_per_atom", "Å³", [0.0, 1e6], [5.0, 1e3], "it is that of an atom, in Å³"),
     range("label.guard.max_atoms", "", [0.0, 1e9], [1.0, 1e5], ""),
-    range("label.check.max_energy_difference", "eV/atom", [0.0, 1e3], [1e-4, 0.1], PER_ATOM),
-    range("label.check.max_force_difference", "eV/Å", [0.0, 1e3], [1e-3, 0.5], ""),
-    range("label.check.max_stress_difference", "eV/Å³", [0.0, 1e3], [1e-4, 0.1], STRESS),
+    range("label.reference_check.max_energy_difference", "eV/atom", [0.0, 1e3], [1e-4, 0.1], PER_ATOM),
+    range("label.reference_check.max_force_difference", "eV/Å", [0.0, 1e3], [1e-3, 0.5], ""),
+    range("label.reference_check.max_stress_difference", "eV/Å³", [0.0, 1e3], [1e-4, 0.1], STRESS),
     range("label.method.abinit.cutoff", "eV", [20.0, 1e5], [100.0, 1e4], CUTOFF),
     range("label.method.abinit.fine_cutoff", "eV", [20.0, 1e6], [100.0, 5e4], CUTOFF),
     range("label.method.abinit.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
@@ -155,6 +156,7 @@ pub static RANGES: [Range; 90] = [
     range("label.method.cp2k.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
     range("label.method.cp2k.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
     range("label.method.cp2k.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("budget.wall_time", TIME, [0.001, 10.0 * YEAR], [60.0, YEAR], ""),
     range("run.walkers", "", [0.0, 1024.0], [0.0, 512.0], ""),
     range("run.threads_per_walker", "", [0.0, 256.0], [1.0, 128.0], ""),
     range("run.heartbeat_timeout", TIME, [5.0, 10.0 * DAY], [10.0, DAY], ""),
@@ -166,17 +168,17 @@ pub static RANGES: [Range; 90] = [
 ];
 
 impl Range {
-    /// Whether it can be meant.
+    /// Whether the value is in the possible range.
     pub fn is_possible(&self, value: f64) -> bool {
         (self.possible[0]..=self.possible[1]).contains(&value)
     }
 
-    /// Whether it needs no second look.
+    /// Whether the value is in the usual range.
     pub fn is_usual(&self, value: f64) -> bool {
         (self.usual[0]..=self.usual[1]).contains(&value)
     }
 
-    /// What is possible, in words, with the hint.
+    /// The possible range in words, with the hint.
     pub fn expected(&self) -> String {
         match self.hint {
             "" => self.possible_in_words(),
@@ -184,7 +186,7 @@ impl Range {
         }
     }
 
-    /// What a schema cannot have as limits, in words: what is usual, and of times also what is possible.
+    /// The usual range in words, and the possible one of times, for the description in the schema.
     pub fn note(&self) -> String {
         let usual = format!("Usual: {}.", self.usual_in_words());
         if self.unit == TIME { format!("Possible: {}. {usual}", self.possible_in_words()) } else { usual }
@@ -202,14 +204,14 @@ impl Range {
         self.with_unit(format!("{least} to {most}"))
     }
 
-    /// That a value is unusual, in words.
+    /// The warning about an unusual value.
     pub fn unusual(&self, value: f64) -> String {
         let value = self.with_unit(self.shown(value));
         let hint = if self.hint.is_empty() { String::new() } else { format!("; {}", self.hint) };
         format!("{value} is unusual ({} is usual){hint}", self.usual_in_words())
     }
 
-    /// A value as people write it, without its unit; times have theirs.
+    /// A value in readable form, without unit; times include theirs.
     pub fn shown(&self, value: f64) -> String {
         match self.unit {
             TIME => Duration::from_fractional_seconds(value).to_string(),
@@ -217,7 +219,7 @@ impl Range {
         }
     }
 
-    /// A value as it may stand in a file.
+    /// A value in the form of a configuration.
     pub fn written(&self, value: f64) -> String {
         if self.unit == TIME { self.shown(value) } else { value.to_string() }
     }
@@ -227,41 +229,42 @@ impl Range {
     }
 }
 
-/// A number as people write it.
+/// A number in readable form.
 fn shown(x: f64) -> String {
     if x != 0.0 && !(1e-3..1e5).contains(&x.abs()) { format!("{x:e}") } else { x.to_string() }
 }
 
-/// The numbers of a file that have ranges. What the ranges call `walk` is the table `walk` of the file.
-pub fn found(table: &DeTable<'_>, walk: &str) -> Vec<Found> {
-    let found = |range: &'static Range| {
+/// The numbers of a file whose keys have ranges. `walk` is the table that has the keys of `[walk]`.
+pub fn numbers_with_ranges(table: &DeTable<'_>, walk: &str) -> Vec<RangedNumber> {
+    let find = |range: &'static Range| {
         let key = match range.key.strip_prefix("walk.") {
-            // `calmwalk md` has no bias.
+            // `calmwalk md` has no bias: its key is `steps`.
             Some("biased_steps") if walk != "walk" => format!("{walk}.steps"),
             Some(rest) => format!("{walk}.{rest}"),
             None => range.key.to_owned(),
         };
         let (value, offset) = number(table, &key)?;
-        Some(Found { range, key, value, offset })
+        Some(RangedNumber { range, key, value, offset })
     };
-    RANGES.iter().filter_map(found).collect()
+    RANGES.iter().filter_map(find).collect()
 }
 
-/// What was found and what is expected instead, if `value` is impossible for the key.
+/// What was found and what is expected, if `value` is outside the possible range of the key.
 pub fn expected_instead(key: &str, value: f64) -> Option<(String, String)> {
     let range = RANGES.iter().find(|range| range.key == key)?;
     (!range.is_possible(value)).then(|| (range.written(value), range.expected()))
 }
 
-/// The numbers of a text that cannot be meant.
-pub fn impossible(text: &str) -> Vec<Wrong> {
+/// The numbers of a text that are outside their possible ranges.
+pub fn impossible(text: &str) -> Vec<InvalidValue> {
     let (table, _) = DeTable::parse_recoverable(text);
-    let wrong =
-        found(table.get_ref(), "walk").into_iter().filter(|found| !found.range.is_possible(found.value));
+    let wrong = numbers_with_ranges(table.get_ref(), "walk")
+        .into_iter()
+        .filter(|found| !found.range.is_possible(found.value));
     wrong.map(|found| (found.key, found.range.written(found.value), found.range.expected())).collect()
 }
 
-/// A number by its dotted key, and where it stands.
+/// The number at a dotted key, and its offset in the file.
 fn number(table: &DeTable<'_>, key: &str) -> Option<(f64, usize)> {
     let (name, rest) = key.split_once('.').unwrap_or((key, ""));
     let value = table.get(name)?;
@@ -294,8 +297,10 @@ mod tests {
         let text =
             "[walk]\ntau = 1_5\n[walk.thermostat]\nlangevin = { friction = 1e1 }\n[run]\nwalkers = 0x10\n";
         let (table, _) = DeTable::parse_recoverable(text);
-        let found: Vec<_> =
-            found(table.get_ref(), "walk").into_iter().map(|found| (found.range.key, found.value)).collect();
+        let found: Vec<_> = numbers_with_ranges(table.get_ref(), "walk")
+            .into_iter()
+            .map(|found| (found.range.key, found.value))
+            .collect();
         let expected =
             [("walk.tau", 15.0), ("walk.thermostat.langevin.friction", 10.0), ("run.walkers", 16.0)];
         assert_eq!(found, expected);

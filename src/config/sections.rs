@@ -188,7 +188,7 @@ pub struct CollectSection {
     /// Least number of steps between two collected structures of a walk.
     #[serde(default = "defaults::min_interval")]
     pub min_interval: u64,
-    /// Least number of steps after a candidate that was declined or refused.
+    /// Least number of steps after a candidate that was declined or rejected.
     #[serde(default = "defaults::min_interval_after_decline")]
     pub min_interval_after_decline: NonZeroU64,
     /// Largest number of structures collected by one walk.
@@ -215,10 +215,10 @@ pub struct GuardSection {
     pub zbl: Option<ZblWindows>,
     /// Highest allowed kinetic temperature, K.
     pub max_temperature: Positive,
-    /// Whether a walk rolls back to a checkpoint when the guard refuses one configuration after the other. If not, it
+    /// Whether a walk rolls back to a checkpoint when the guard rejects one configuration after the other. If not, it
     /// goes on.
     pub rollback: bool,
-    /// Number of refused configurations in a row after which a walk rolls back to a checkpoint.
+    /// Number of rejected configurations in a row after which a walk rolls back to a checkpoint.
     pub max_consecutive_rejections: NonZeroU32,
     /// Number of returns to a checkpoint after which the walk ends.
     pub max_rollbacks: u32,
@@ -297,13 +297,13 @@ pub struct LabelSection {
     pub guard: LabelGuard,
     /// Comparison of labels with known ones before the first walk starts.
     #[serde(default)]
-    pub check: CheckSection,
+    pub reference_check: ReferenceCheckSection,
 }
 
-/// `[label.check]`
+/// `[label.reference_check]`
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub struct CheckSection {
+pub struct ReferenceCheckSection {
     /// Extended XYZ file of structures with energy, forces and, where known, stress by the reference that the potential was
     /// trained on. Default: nothing is compared.
     #[schemars(with = "Option<PathBuf>")]
@@ -346,8 +346,8 @@ pub struct BudgetSection {
     pub labels: Option<NonZeroU32>,
     /// Largest sum of core-hours of all attempts to label.
     pub core_hours: Option<Positive>,
-    /// Longest time that the campaign runs, h.
-    pub wall_hours: Option<Positive>,
+    /// Longest time that the campaign runs.
+    pub wall_time: Option<Duration>,
 }
 
 /// `[run]`
@@ -425,7 +425,7 @@ impl LabelSection {
     }
 }
 
-impl CheckSection {
+impl ReferenceCheckSection {
     /// The largest differences.
     pub fn bounds(&self) -> DifferenceBounds {
         DifferenceBounds {
@@ -436,7 +436,7 @@ impl CheckSection {
     }
 }
 
-impl Default for CheckSection {
+impl Default for ReferenceCheckSection {
     fn default() -> Self {
         Self {
             structures: None,

@@ -1,15 +1,15 @@
-//! What a configuration asks for that is possible but hardly meant.
+//! Warnings about values that are possible but probably not intended.
 
 use std::fmt;
 
-/// Something that the user should look at again: `validate` and `run` print it and go on.
+/// A value that the user should check: `validate` and `run` print the warning and continue.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Warning {
     /// `file:line`.
     pub at: String,
     /// Dotted key.
     pub key: String,
-    /// What is unusual about it, and what to do.
+    /// The problem, and what to do.
     pub message: String,
 }
 

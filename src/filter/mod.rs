@@ -20,7 +20,7 @@ pub struct StructureProperties<'a> {
     /// Largest γ_nbr under the original mixture.
     pub gamma_nbr: Option<f64>,
     /// V/V₀.
-    pub volume: Option<f64>,
+    pub relative_volume: Option<f64>,
     /// Kinetic temperature, K.
     pub kinetic_temperature: Option<f64>,
     /// Conditions of the walk.
@@ -40,9 +40,9 @@ pub struct StructureProperties<'a> {
     /// The element of each atom. Empty if unknown.
     pub species: &'a [Species],
     /// `biased`, `control` or `imported`.
-    pub kind: &'a str,
+    pub origin: &'a str,
     /// Name of the seed structure.
-    pub seed: Option<&'a str>,
+    pub seed_structure: Option<&'a str>,
 }
 
 /// A filter expression.
@@ -98,7 +98,7 @@ macro_rules! names {
 names! {
     /// Numeric properties.
     NumberField {
-        Gamma "gamma", GammaNbr "gamma_nbr", Volume "volume", Temperature "temperature",
+        Gamma "gamma", GammaNbr "gamma_nbr", RelativeVolume "relative_volume", Temperature "temperature",
         KineticTemperature "kinetic_temperature", Tau "tau", Walk "walk", Step "step",
         MixtureVersion "mixture_version", Atoms "atoms", Energy "energy", EnergyPerAtom "energy_per_atom",
         MaxForce "max_force"
@@ -108,7 +108,7 @@ names! {
 names! {
     /// Text properties.
     TextField {
-        Element "element", Kind "kind", Seed "seed", Group "group", RetryAdjustment "retry_adjustment"
+        Element "element", Origin "origin", SeedStructure "seed_structure", Group "group", RetryAdjustment "retry_adjustment"
     }
 }
 
@@ -171,7 +171,7 @@ impl StructureProperties<'_> {
         match field {
             NumberField::Gamma => self.gamma,
             NumberField::GammaNbr => self.gamma_nbr,
-            NumberField::Volume => self.volume,
+            NumberField::RelativeVolume => self.relative_volume,
             NumberField::Temperature => self.conditions.map(|conditions| conditions.temperature),
             NumberField::KineticTemperature => self.kinetic_temperature,
             NumberField::Tau => self.conditions.map(|conditions| conditions.tau),
@@ -190,9 +190,9 @@ impl StructureProperties<'_> {
         match field {
             TextField::Element if self.species.is_empty() => None,
             TextField::Element => Some(self.species.iter().any(|species| species.symbol() == value)),
-            TextField::Kind => Some(self.kind == value),
+            TextField::Origin => Some(self.origin == value),
             TextField::Group => self.conditions.map(|conditions| conditions.group == value),
-            TextField::Seed => self.seed.map(|seed| seed == value),
+            TextField::SeedStructure => self.seed_structure.map(|name| name == value),
             TextField::RetryAdjustment => {
                 self.retry_adjustments.map(|names| names.iter().any(|name| name == value))
             }

@@ -4,15 +4,15 @@ use atoms::Species;
 use dft::RetryAdjustment;
 
 use super::{Comparison, Filter, NumberField, TextField};
-use crate::config::nearest;
+use crate::nearest_name::nearest;
 
 /// Maximum nesting of parentheses and `not`, which limits recursion.
 const MAX_DEPTH: usize = 100;
 
-const KINDS: [&str; 3] = ["biased", "control", "imported"];
+const ORIGINS: [&str; 3] = ["biased", "control", "imported"];
 
 /// Synonyms of property names, for hints.
-const SYNONYMS: [(&str, &str); 12] = [
+const SYNONYMS: [(&str, &str); 14] = [
     ("gamma_max", "gamma"),
     ("grade", "gamma"),
     ("natoms", "atoms"),
@@ -21,8 +21,10 @@ const SYNONYMS: [(&str, &str); 12] = [
     ("forces", "max_force"),
     ("fmax", "max_force"),
     ("species", "element"),
-    ("origin", "kind"),
-    ("v", "volume"),
+    ("kind", "origin"),
+    ("seed", "seed_structure"),
+    ("volume", "relative_volume"),
+    ("v", "relative_volume"),
     ("t", "temperature"),
     ("version", "mixture_version"),
 ];
@@ -236,9 +238,9 @@ impl Parser {
             TextField::Element if text.parse::<Species>().is_err() => {
                 return Err(self.error("the symbol of an element, such as Mo"));
             }
-            TextField::Kind if !KINDS.contains(&text.as_str()) => {
-                let kinds = KINDS.join(", ").replace(", imported", " or imported");
-                return Err(self.error(format!("{kinds}{}", hint(&text, KINDS.into_iter()))));
+            TextField::Origin if !ORIGINS.contains(&text.as_str()) => {
+                let origins = ORIGINS.join(", ").replace(", imported", " or imported");
+                return Err(self.error(format!("{origins}{}", hint(&text, ORIGINS.into_iter()))));
             }
             TextField::RetryAdjustment if RetryAdjustment::ALL.iter().all(|known| known.name() != text) => {
                 let names = RetryAdjustment::ALL.map(RetryAdjustment::name);

@@ -12,8 +12,8 @@ fn properties() -> StructureProperties<'static> {
     StructureProperties {
         gamma: Some(2.5),
         step: Some(300),
-        kind: "biased",
-        seed: Some("fcc 100"),
+        origin: "biased",
+        seed_structure: Some("fcc 100"),
         retry_adjustments: Some(&*RETRY_ADJUSTMENTS),
         species: &SPECIES,
         ..StructureProperties::default()
@@ -42,7 +42,7 @@ fn filters_are_evaluated() {
         ("atoms = 3 or atoms = 4 and step = 0", true),
         ("(atoms = 3 or atoms = 4) and step = 0", false),
         ("not gamma > 3 and step <= 300", true),
-        ("seed = 'fcc 100' AND kind != control", true),
+        ("seed_structure = 'fcc 100' AND origin != control", true),
         ("energy_per_atom = -2", true),
         ("energy != -6", false),
         ("retry_adjustment = other_moments", true),
@@ -53,6 +53,28 @@ fn filters_are_evaluated() {
         ("not walk = 0", true),
     ] {
         assert_eq!(matches(text), expected, "{text}");
+    }
+}
+
+/// Whether the word stands in the text, not as a part of another word.
+fn has_word(text: &str, word: &str) -> bool {
+    text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').any(|found| found == word)
+}
+
+#[test]
+fn help_and_docs_name_every_property() {
+    use clap::CommandFactory;
+    let mut command = crate::cli::Arguments::command();
+    let export = command.find_subcommand_mut("export").unwrap();
+    let filter = export.get_arguments().find(|argument| argument.get_long() == Some("where")).unwrap();
+    let help = filter.get_long_help().unwrap().to_string();
+    let docs = include_str!("../../docs/export.md").split("## Select structures").nth(1).unwrap();
+    let page = include_str!("../web/pages/candidates.js");
+    let numbers = NumberField::ALL.iter().map(|(_, name)| *name);
+    for name in numbers.chain(TextField::ALL.iter().map(|(_, name)| *name)) {
+        for (place, text) in [("help", help.as_str()), ("docs/export.md", docs), ("candidates.js", page)] {
+            assert!(has_word(text, name), "{name} is missing in {place}");
+        }
     }
 }
 
@@ -74,9 +96,9 @@ fn errors_have_positions() {
         ("(gamma > 2", 11, "the end", "')'"),
         ("element > Mo", 9, "'>'", "= or != after element"),
         ("element = Xx", 11, "'Xx'", "the symbol of an element"),
-        ("kind = biassed", 8, "'biassed'", "biased, control or imported"),
+        ("origin = biassed", 10, "'biassed'", "biased, control or imported"),
         ("retry_adjustment = moments", 20, "'moments'", "other_moments"),
-        ("seed = 'fcc", 8, "an unterminated text", "a closing '"),
+        ("seed_structure = 'fcc", 18, "an unterminated text", "a closing '"),
         ("γ > 2", 1, "'γ'", "one of gamma,"),
         ("gamma > 2 && step = 1", 11, "'&'", "a name"),
     ] {
@@ -96,7 +118,7 @@ fn conditions() -> impl Strategy<Value = Filter> {
     let finite = any::<f64>().prop_filter("finite", |x| x.is_finite());
     let numbers = (number, comparison, finite).prop_map(|(a, b, c)| Filter::Number(a, b, c));
     let seed = ("[a-zé' ()=0-9]{0,12}", any::<bool>())
-        .prop_map(|(name, equal)| Filter::Text(TextField::Seed, equal, name));
+        .prop_map(|(name, equal)| Filter::Text(TextField::SeedStructure, equal, name));
     let element = proptest::sample::select(vec!["Al", "Mo"]);
     let element = element.prop_map(|symbol| Filter::Text(TextField::Element, true, symbol.to_owned()));
     prop_oneof![numbers, seed, element].prop_recursive(5, 40, 2, |inner| {

@@ -82,7 +82,7 @@ impl Identity {
         same("the BLAKE3 hash of its model", &began.model, &self.model)?;
         let (old, new) = (&began.settings, &self.settings);
         same("its number of features", old.dimension, new.dimension)?;
-        same("its --seed", old.seed, new.seed)?;
+        same("its --rng-seed", old.seed, new.seed)?;
         same(PROJECTION, &began.projection, &self.projection)?;
         same("its --candidates", list(&old.candidates), list(&new.candidates))?;
         same("its --shard-size", old.shard_size, new.shard_size)?;
@@ -140,7 +140,7 @@ mod tests {
             (|other| other.model = "x".into(), "model is abc, now it is x"),
             (|other| other.projection = "y".into(), "projection is def, now it is y"),
             (|other| other.settings.dimension = 4, "features"),
-            (|other| other.settings.seed = 1, "--seed is 42, now it is 1"),
+            (|other| other.settings.seed = 1, "--rng-seed is 42, now it is 1"),
             (|other| other.settings.candidates = vec![1], "--candidates is 1,2, now it is 1"),
             (|other| other.settings.shard_size = 1, "--shard-size"),
             (|other| other.files[0].weight = 0.5, "--weight of a.xyz is 1, now it is 0.5"),

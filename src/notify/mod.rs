@@ -205,7 +205,7 @@ mod tests {
         let (mut watch, mut status) = (watch(), Status::default());
         let walk = |state: &str| store::WalkStatus { state: state.into(), ..store::WalkStatus::default() };
         for (state, expected) in
-            [("blew_up", 0), ("collected", 0), ("trapped", 0), ("blew_up", 1), ("blew_up", 0)]
+            [("diverged", 0), ("quota_reached", 0), ("trapped", 0), ("diverged", 1), ("diverged", 0)]
         {
             status.walks.push(walk(state));
             let due = watch.check(&status, 0);

@@ -5,6 +5,7 @@ mod follow;
 mod overrides;
 mod relocated;
 mod report;
+mod version;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -20,8 +21,9 @@ use crate::exit_status::Failure;
 use crate::output::Bar;
 
 pub use overrides::RuleOverride;
-pub use relocated::RelocatedFiles;
+pub use relocated::{ARTIFACT, MODEL, RelocatedFiles, find_one};
 pub use report::{FateChange, FateCounts, MissingFeatures, Report};
+pub use version::mixture_of;
 
 const BAR: &str = "{bar:32} {pos}/{len} decisions  {eta} left";
 
@@ -33,8 +35,7 @@ pub async fn replay(
 ) -> Result<Report, Failure> {
     let begun = Instant::now();
     let campaign = store.campaign().await?;
-    let resolved: Value = serde_json::from_str(&campaign.resolved_configuration)
-        .map_err(|error| Failure::Failed(format!("damaged database: the configuration: {error}")))?;
+    let resolved = resolved(&campaign)?;
     let mut config = overrides::configuration(&campaign.configuration, settings)?;
     relocated::find(&mut config, &resolved, &store.grade_files().await?, moved)?;
     let mut replay = open(store, &config, settings).await?;
@@ -45,6 +46,12 @@ pub async fn replay(
     report.close(&replay, &end).map_err(failure)?;
     report.seconds = begun.elapsed().as_secs_f64();
     Ok(report)
+}
+
+/// The configuration with its defaults and the hashes of its files.
+pub fn resolved(campaign: &store::Campaign) -> Result<Value, Failure> {
+    serde_json::from_str(&campaign.resolved_configuration)
+        .map_err(|error| Failure::Failed(format!("damaged database: the configuration: {error}")))
 }
 
 /// The selector's state before the first decision.

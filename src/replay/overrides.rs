@@ -1,10 +1,10 @@
-//! Overrides rules of the configuration that a campaign began with.
+//! Overrides rules of the configuration with which a campaign started.
 
 use std::str::FromStr;
 
 use toml::{Table, Value};
 
-use crate::config::{Config, impossible, in_plain_words};
+use crate::config::{Config, impossible, user_message};
 use crate::exit_status::Failure;
 
 /// Keys that affect the selector's decisions. Their effect on walks is recorded and does not change.
@@ -77,7 +77,7 @@ fn parse(value: &str) -> Result<Value, String> {
     if is_word {
         return Ok(Value::String(value.to_owned()));
     }
-    let mut table: Table = format!("value = {value}").parse().map_err(|error| in_plain_words(&error))?;
+    let mut table: Table = format!("value = {value}").parse().map_err(|error| user_message(&error))?;
     table.remove("value").ok_or_else(|| "expected a value".to_owned())
 }
 
@@ -88,12 +88,12 @@ pub fn configuration(stored: &str, settings: &[RuleOverride]) -> Result<Config, 
             "the configuration in the campaign's database: {error}; replay it with the version that began it"
         ))
     };
-    let mut table: Table = stored.parse().map_err(|error| unreadable(in_plain_words(&error)))?;
-    let mut config: Config = toml::from_str(stored).map_err(|error| unreadable(in_plain_words(&error)))?;
+    let mut table: Table = stored.parse().map_err(|error| unreadable(user_message(&error)))?;
+    let mut config: Config = toml::from_str(stored).map_err(|error| unreadable(user_message(&error)))?;
     for RuleOverride { key, value } in settings {
         let wrong = |error: String| Failure::Input(format!("--set {key}={value}: {error}"));
         set_key(&mut table, key, value.clone()).map_err(wrong)?;
-        config = toml::from_str(&table.to_string()).map_err(|error| wrong(in_plain_words(&error)))?;
+        config = toml::from_str(&table.to_string()).map_err(|error| wrong(user_message(&error)))?;
     }
     let set = table.to_string();
     let mut wrong = impossible(&set).into_iter().chain(config.check());

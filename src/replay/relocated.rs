@@ -7,22 +7,27 @@ use serde_json::Value;
 use crate::config::Config;
 use crate::exit_status::Failure;
 
+/// Key of the model in the configuration, as those below.
+pub const MODEL: &str = "potential.model";
+pub const ARTIFACT: &str = "calm.artifact";
+const TRAINING_FRAMES: &str = "calm.training_frames";
+
 /// Files that are not where the campaign last found them.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct RelocatedFiles {
-    /// Path of the model, if it has moved since the last run
+    /// Path of the model file, if it is no longer where the last run found it
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// Path of the artifact, if it has moved
+    /// Path of the artifact, likewise
     #[arg(long, value_name = "FILE")]
     artifact: Option<PathBuf>,
-    /// Path of the training frames, if they have moved
+    /// Path of the training frames, likewise
     #[arg(long, value_name = "FILE")]
     training_frames: Option<PathBuf>,
 }
 
 /// Sets the paths in `config`, from the options or from where the campaign last found them (`found`, paths by key).
-/// Checks that the contents are those that the campaign began with.
+/// Checks that the contents are those with which the campaign started.
 pub fn find(
     config: &mut Config,
     resolved: &Value,
@@ -31,22 +36,38 @@ pub fn find(
 ) -> Result<(), Failure> {
     let calm = &mut config.calm;
     let files = [
-        ("potential.model", "--model", Some(&mut config.potential.model), &moved.model),
-        ("calm.artifact", "--artifact", calm.artifact.as_mut(), &moved.artifact),
-        ("calm.training_frames", "--training-frames", calm.training_frames.as_mut(), &moved.training_frames),
+        (MODEL, Some(&mut config.potential.model)),
+        (ARTIFACT, calm.artifact.as_mut()),
+        (TRAINING_FRAMES, calm.training_frames.as_mut()),
     ];
-    for (key, option, place, moved) in files {
-        let Some(place) = place else { continue };
-        let path = moved.clone().or_else(|| found[key].as_str().map(PathBuf::from));
-        let path = path.ok_or_else(|| {
-            Failure::Input(format!("the store has no path of {key}; give it with {option} FILE"))
-        })?;
-        let expected = resolved["files"][key].as_str().unwrap_or_default();
-        check(&path, expected)
-            .map_err(|error| Failure::Input(format!("{key}: {error}; give its path with {option} FILE")))?;
-        *place.get_mut() = path;
+    for (key, place) in files {
+        if let Some(place) = place {
+            *place.get_mut() = find_one(key, resolved, found, moved)?;
+        }
     }
     Ok(())
+}
+
+/// The path of one file, by its key.
+pub fn find_one(
+    key: &str,
+    resolved: &Value,
+    found: &Value,
+    moved: &RelocatedFiles,
+) -> Result<PathBuf, Failure> {
+    let (option, moved) = match key {
+        MODEL => ("--model", &moved.model),
+        ARTIFACT => ("--artifact", &moved.artifact),
+        _ => ("--training-frames", &moved.training_frames),
+    };
+    let path = moved.clone().or_else(|| found[key].as_str().map(PathBuf::from));
+    let path = path.ok_or_else(|| {
+        Failure::Input(format!("the store has no path of {key}; give it with {option} FILE"))
+    })?;
+    let expected = resolved["files"][key].as_str().unwrap_or_default();
+    check(&path, expected)
+        .map_err(|error| Failure::Input(format!("{key}: {error}; give its path with {option} FILE")))?;
+    Ok(path)
 }
 
 fn check(path: &Path, expected: &str) -> Result<(), String> {

@@ -42,22 +42,22 @@ pub async fn run(
     tls: Option<&Tls>,
     agent: net::Agent,
     threads: usize,
-    patience: Duration,
+    timeout: Duration,
     directory: &Path,
     state: &AgentState,
 ) -> Result<ExitStatus, Failure> {
     let stop = CancellationToken::new();
     cancel_on_signal(stop.clone(), STOP_MESSAGE)?;
     let walkers = agent.walkers;
-    let (uplink, joined, setup) = tokio::select! {
+    let (client, joined, setup) = tokio::select! {
         joined = join(address, tls, agent, directory) => joined?,
         () = stop.cancelled() => return Ok(ExitStatus::Interrupted),
         () = address.wait_until_over() => {
             log_and_print("the campaign is over");
             return Ok(ExitStatus::Done);
         }
-        () = tokio::time::sleep(patience) => {
-            let minutes = patience.as_secs_f64() / 60.0;
+        () = tokio::time::sleep(timeout) => {
+            let minutes = timeout.as_secs_f64() / 60.0;
             return Err(Failure::Failed(format!("no orchestrator has answered at {address} for {minutes:.1} min")));
         }
     };
@@ -66,12 +66,12 @@ pub async fn run(
         count(walkers, "walker"),
         joined.newest().await.version()
     ));
-    let place = ShmDir::for_campaign(directory).map_err(Failure::failed)?;
+    let shm_dir = ShmDir::for_campaign(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
     let (stopping, asked) = (stop.clone(), stop.clone());
-    let numbers = Arc::clone(&state.numbers);
+    let metrics = Arc::clone(&state.metrics);
     let dispatch = |incoming| {
-        tokio::spawn(Agent { uplink, joined, incoming, stopping, orchestrator_timeout: patience, metrics: numbers }.run(move |news| match news {
+        tokio::spawn(Agent { client, joined, incoming, stopping, orchestrator_timeout: timeout, metrics }.run(move |event| match event {
             AgentEvent::Stop => asked.cancel(),
             AgentEvent::Unresponsive { unsent, idle } => log_and_warn(format_args!(
                 "the orchestrator does not answer: {unsent} unsent reports, {idle} of {walkers} walkers idle"
@@ -79,8 +79,8 @@ pub async fn run(
             AgentEvent::Recovered => log_and_print("the orchestrator answers again"),
         }))
     };
-    let ended = run_in(&place, &setup, (walkers, threads), &mixture, dispatch, &stop, state).await;
-    let removed = place.remove().map_err(Failure::failed);
+    let ended = run_in(&shm_dir, &setup, (walkers, threads), &mixture, dispatch, &stop, state).await;
+    let removed = shm_dir.remove().map_err(Failure::failed);
     let ended = ended?;
     removed?;
     Ok(ended)
@@ -94,17 +94,17 @@ async fn join(
     directory: &Path,
 ) -> Result<(Arc<AgentClient>, Membership, AgentConfig), Failure> {
     let waiting = |why: &NetError| log_and_warn(format_args!("waiting for the orchestrator: {why}"));
-    let uplink = AgentClient::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
-    let uplink = Arc::new(uplink);
+    let client = AgentClient::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
+    let client = Arc::new(client);
     loop {
-        let joined = uplink.join().await.map_err(Failure::failed)?;
+        let joined = client.join().await.map_err(Failure::failed)?;
         let setup: AgentConfig = serde_json::from_slice(&joined.setup).map_err(|error| {
             Failure::Failed(format!(
                 "the orchestrator's configuration: {error}: run the same version of calmwalk on all hosts"
             ))
         })?;
         match model(&joined, &setup.model, directory).await? {
-            Some(model) => return Ok((uplink, joined, AgentConfig { model, ..setup })),
+            Some(model) => return Ok((client, joined, AgentConfig { model, ..setup })),
             None => log_and_print("the orchestrator has restarted: joining again"),
         }
     }
@@ -161,7 +161,7 @@ struct AgentHost {
 type DispatchTask = JoinHandle<Result<agent::AgentExit, LinkError>>;
 
 async fn run_in(
-    place: &ShmDir,
+    shm_dir: &ShmDir,
     setup: &AgentConfig,
     (walkers, threads): (u32, usize),
     mixture: &Mixture,
@@ -172,9 +172,9 @@ async fn run_in(
     let sizes = Sizes { walkers, message_bytes: setup.message_bytes };
     let needed =
         SharedMixture::space_needed(mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
-    let _prepared = place.prepare(needed).map_err(Failure::failed)?;
-    let shared = SharedMixture::create(&place.mixture(), mixture, walkers).map_err(Failure::failed)?;
-    let server = Server::open(place, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
+    let _prepared = shm_dir.prepare(needed).map_err(Failure::failed)?;
+    let shared = SharedMixture::create(&shm_dir.mixture(), mixture, walkers).map_err(Failure::failed)?;
+    let server = Server::open(shm_dir, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
     let line = server.handle();
     let limits = Limits {
         heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),

@@ -19,7 +19,7 @@ use crate::process_config::{self, AgentConfig};
 
 /// Lets agents join if this run listens.
 pub struct AgentService {
-    hub: Option<AgentServer>,
+    server: Option<AgentServer>,
     store: Store,
     mixture: Arc<Mixture>,
 }
@@ -30,7 +30,7 @@ impl AgentService {
         // Writes wait here while the database is unreachable.
         let (store, mixture) =
             (run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT), Arc::clone(mixture));
-        let Some(listen) = run.listen else { return Ok(Self { hub: None, store, mixture }) };
+        let Some(listen) = run.listen else { return Ok(Self { server: None, store, mixture }) };
         let config = &run.campaign.config;
         let model = run.campaign.model_files()?;
         let files = model.files().map(|file| (file.hash.clone(), file.path.clone())).collect();
@@ -41,25 +41,30 @@ impl AgentService {
             heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
             restarts: config.run.max_restarts,
         };
-        let welcome = AgentBootstrap { setup: process_config::to_bytes(&setup), files };
-        let patience = config.run.agent_heartbeat_timeout.get();
-        let hub = AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
-        let hub = hub.map_err(|error| match error {
+        let bootstrap = AgentBootstrap {
+            setup: process_config::to_bytes(&setup),
+            files,
+        };
+        let heartbeat_timeout = config.run.agent_heartbeat_timeout.get();
+        let server =
+            AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, heartbeat_timeout, bootstrap)
+                .await;
+        let server = server.map_err(|error| match error {
             NetError::SessionClosed { .. } => Failure::failed(error),
             error => Failure::input(error),
         })?;
-        listen.announce(hub.endpoint())?;
-        log_and_print(format_args!("agents may join at {}", hub.endpoint()));
-        Ok(Self { hub: Some(hub), store, mixture })
+        listen.announce(server.endpoint())?;
+        log_and_print(format_args!("agents may join at {}", server.endpoint()));
+        Ok(Self { server: Some(server), store, mixture })
     }
 
     /// Serves agents until there is no more work and the last agent has left.
     pub async fn run(self, stop: StopTokens, to_reactor: mpsc::Sender<Incoming>) -> Result<(), Failure> {
-        let Some(hub) = self.hub else { return Ok(()) };
+        let Some(server) = self.server else { return Ok(()) };
         let (sender, events) = mpsc::unbounded_channel();
         let on_event = move |event| drop(sender.send(event));
         let (ended, ()) = tokio::join!(
-            hub.run(self.mixture, stop, to_reactor, on_event),
+            server.run(self.mixture, stop, to_reactor, on_event),
             record_events(&self.store, events)
         );
         ended.map_err(Failure::failed)
@@ -114,7 +119,7 @@ async fn record_event(
         AgentEvent::Left(agent) => (agent, "left", "left"),
         AgentEvent::MessageRejected(why) => {
             log_and_warn(format_args!("rejected a message from another host: {why}"));
-            return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
+            return store.log_operation(now, "messages_rejected", &json!({ "remark": why })).await;
         }
     };
     let walkers = count(agent.walkers, "walker");

@@ -112,7 +112,7 @@ impl PoolManager<'_> {
             ChildEvent::Stderr { number, line } => self.display.child_line(number, &line),
             ChildEvent::Ended { number, ended } => {
                 if !matches!(ended.then, ChildState::Exited) {
-                    self.display.line(&format!("slot {number}: {}; {}", ended.reason, ended.then));
+                    self.display.line(&format!("label worker {number}: {}; {}", ended.reason, ended.then));
                 }
                 let record = self.labellers.ended(self.store, number, &ended).await?;
                 if let Some(record) = record {
@@ -167,7 +167,7 @@ impl Display {
             }
         }
         // The labeller has logged it already.
-        self.bar.suspend(|| print_stderr(format_args!("slot {slot}: {line}")));
+        self.bar.suspend(|| print_stderr(format_args!("label worker {slot}: {line}")));
     }
 
     fn queue(&mut self, jobs: bool, led: bool) {

@@ -98,7 +98,7 @@ impl<'a> ProcessRecords<'a> {
         if let Some(rejected) = rejected {
             log_and_warn(&rejected);
             let detail = json!({ "rejected": traffic.rejected, "remark": rejected });
-            self.store.log_operation(now, "messages_dropped", &detail).await?;
+            self.store.log_operation(now, "messages_rejected", &detail).await?;
             self.rejected = traffic.rejected;
         }
         Ok(())

@@ -1,4 +1,4 @@
-//! The check of the reference, before the first walk starts: labels the structures of `label.check` by the campaign's own
+//! The check of the reference, before the first walk starts: labels the structures of `label.reference_check` by the campaign's own
 //! method and compares the labels with what is known.
 //!
 //! These structures are no candidates, so their labels are no jobs of the queue: no budget, export or count has them. Only
@@ -34,7 +34,7 @@ pub const ANY_CHECK: &str = "any";
 pub fn identity(campaign: &Campaign) -> Result<String, Failure> {
     if campaign.known.is_empty() {
         return Err(Failure::Input(format!(
-            "--accept-check: {} has no label.check.structures, so there is no check to accept",
+            "--accept-reference-check: {} has no label.reference_check.structures, so there is no check to accept",
             campaign.path.display()
         )));
     }
@@ -42,7 +42,7 @@ pub fn identity(campaign: &Campaign) -> Result<String, Failure> {
 }
 
 fn begin(campaign: &Campaign) -> ReferenceCheck {
-    let bounds = campaign.config.label.check.bounds();
+    let bounds = campaign.config.label.reference_check.bounds();
     ReferenceCheck::begin(&campaign.protocol, &campaign.known, bounds)
 }
 
@@ -78,7 +78,7 @@ async fn judge(
             check.state = CheckState::Accepted;
         }
         Some(_) => log_and_warn(
-            "WARNING: --accept-check accepts an earlier check: the label protocol, the structures or the bounds of label.check \
+            "WARNING: --accept-reference-check accepts an earlier check: the label protocol, the structures or the bounds of label.reference_check \
              have changed since, so it does not apply",
         ),
     }
@@ -107,9 +107,9 @@ fn refusal(config: &Path, faults: &[String]) -> Failure {
         shown += &format!("; and {} more", faults.len() - MAX_FAULTS);
     }
     Failure::Failed(format!(
-        "the labels contradict the reference of label.check: {shown}. No walk was started. Compare [label.method] with the \
+        "the labels contradict the reference of label.reference_check: {shown}. No walk was started. Compare [label.method] with the \
          reference that the potential was trained on (functional, pseudopotentials, cutoff, k-points, smearing, magnetic moments, \
-         which energy), and the units of the file. If the differences are meant, run calmwalk run {} --accept-check, or \
+         which energy), and the units of the file. If the differences are meant, run calmwalk run {} --accept-reference-check, or \
          calmwalk launch with this option",
         config.display()
     ))
@@ -137,7 +137,7 @@ async fn label_all(
     }
     if !missing.is_empty() {
         let missing = count(missing.len(), "structure");
-        log_and_print(format_args!("checking the reference: labelling {missing} of label.check"));
+        log_and_print(format_args!("checking the reference: labelling {missing} of label.reference_check"));
     }
     made.extend(make(run, missing).await?);
     made.sort_by_key(|(index, _)| *index);

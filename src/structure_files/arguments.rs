@@ -19,7 +19,14 @@ pub struct StructureArguments {
     /// .lammpstrj, dump.*), each also with .gz or .zst
     #[arg(value_name = "DATA", required = true)]
     data: Vec<PathBuf>,
-    /// Leave out structures that do not match a condition, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
+    #[command(flatten)]
+    reading: ReadingArguments,
+}
+
+/// How files of structures are read.
+#[derive(Debug, Clone, clap::Args)]
+pub struct ReadingArguments {
+    /// Use only structures that match FILTER, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
     /// and of labels energy, energy_per_atom (eV), max_force (eV/Å)
     #[arg(long = "where", value_name = "FILTER")]
     filter: Option<Filter>,
@@ -32,9 +39,19 @@ impl StructureArguments {
     /// The files in the order given, all with weight 1.
     ///
     /// # Errors
+    /// Those of [`ReadingArguments::files`].
+    pub fn files(&self) -> Result<StructureFiles, Failure> {
+        self.reading.files(&self.data)
+    }
+}
+
+impl ReadingArguments {
+    /// These files in the order given, all with weight 1.
+    ///
+    /// # Errors
     /// A file that is no regular file, has an unknown format or is given twice; a filter by a property that structures of files do
     /// not have.
-    pub fn files(&self) -> Result<StructureFiles, Failure> {
+    pub fn files(&self, data: &[PathBuf]) -> Result<StructureFiles, Failure> {
         if let Some(filter) = &self.filter
             && let Some(name) = filter.names().into_iter().find(|name| !PROPERTIES.contains(name))
         {
@@ -44,7 +61,7 @@ impl StructureArguments {
             )));
         }
         let mut files: Vec<StructureFile> = Vec::new();
-        for path in &self.data {
+        for path in data {
             check_format(path)?;
             let found = std::fs::metadata(path)
                 .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", path.display())))?;

@@ -83,6 +83,11 @@ impl StructureReader {
         }
     }
 
+    /// Index of the structure that came last in its file, from 0; those that did not match the filter count.
+    pub fn frame_index(&self) -> u64 {
+        self.in_file.saturating_sub(1)
+    }
+
     /// Number of structures that did not match the filter.
     pub fn left_out(&self) -> u64 {
         self.left_out

@@ -18,7 +18,7 @@ use super::exposition::{CONTENT_TYPE, Text};
 #[derive(Clone, Debug, Default)]
 pub struct AgentState {
     /// Its assignments and its connection.
-    pub numbers: Arc<Mutex<AgentMetrics>>,
+    pub metrics: Arc<Mutex<AgentMetrics>>,
     /// Its walkers.
     pub walkers: Arc<Mutex<Vec<ChildStatus>>>,
 }
@@ -29,30 +29,30 @@ pub fn router(state: AgentState) -> Router {
 }
 
 async fn metrics(State(state): State<AgentState>) -> Response {
-    let numbers = state.numbers.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let metrics = state.metrics.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let walkers = state.walkers.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&numbers, &walkers)).into_response()
+    ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&metrics, &walkers)).into_response()
 }
 
-fn text(numbers: &AgentMetrics, walkers: &[ChildStatus]) -> String {
+fn text(metrics: &AgentMetrics, walkers: &[ChildStatus]) -> String {
     let mut text = Text::default();
     let host = store::this_host();
     let labels = [("host", host.as_str()), ("version", env!("CARGO_PKG_VERSION"))];
     text.gauge("calmwalk_agent_info", "Information about the agent; always 1.", &[(&labels, 1.0)]);
-    walker_metrics(&mut text, numbers, walkers);
-    assignment_metrics(&mut text, numbers);
-    let version = numbers.mixture_version.map(|version| version as f64);
+    walker_metrics(&mut text, metrics, walkers);
+    assignment_metrics(&mut text, metrics);
+    let version = metrics.mixture_version.map(|version| version as f64);
     optional_gauge(
         &mut text,
         "calmwalk_agent_mixture_version",
         "Newest mixture version on this host.",
         version,
     );
-    link_metrics(&mut text, numbers);
+    link_metrics(&mut text, metrics);
     text.into_string()
 }
 
-fn walker_metrics(text: &mut Text, numbers: &AgentMetrics, walkers: &[ChildStatus]) {
+fn walker_metrics(text: &mut Text, metrics: &AgentMetrics, walkers: &[ChildStatus]) {
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
     walkers.iter().for_each(|walker| *states.entry(state_name(walker.state)).or_default() += 1);
     let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
@@ -68,18 +68,18 @@ fn walker_metrics(text: &mut Text, numbers: &AgentMetrics, walkers: &[ChildStatu
     text.gauge(
         "calmwalk_agent_idle_walkers",
         "Walkers without an assignment.",
-        &[(&[], numbers.idle as f64)],
+        &[(&[], metrics.idle as f64)],
     );
 }
 
-fn assignment_metrics(text: &mut Text, numbers: &AgentMetrics) {
-    let taken = numbers.assignments_received as f64;
+fn assignment_metrics(text: &mut Text, metrics: &AgentMetrics) {
+    let taken = metrics.assignments_received as f64;
     text.counter(
         "calmwalk_agent_assignments_received_total",
         "Assignments received from the orchestrator.",
         &[(&[], taken)],
     );
-    let assignments = &numbers.assignments;
+    let assignments = &metrics.assignments;
     let outcomes = [
         ("candidate", assignments.candidate),
         ("steps_done", assignments.steps_done),
@@ -95,35 +95,35 @@ fn assignment_metrics(text: &mut Text, numbers: &AgentMetrics) {
         "Assignments by outcome, as acknowledged by the orchestrator.",
         &samples,
     );
-    let steps = numbers.steps as f64;
+    let steps = metrics.steps as f64;
     text.counter("calmwalk_agent_steps_total", "Steps of the walkers of this host.", &[(&[], steps)]);
 }
 
-fn link_metrics(text: &mut Text, numbers: &AgentMetrics) {
-    let linked = f64::from(numbers.is_linked());
+fn link_metrics(text: &mut Text, metrics: &AgentMetrics) {
+    let linked = f64::from(metrics.is_linked());
     text.gauge("calmwalk_agent_link_up", "Whether the orchestrator answers.", &[(&[], linked)]);
     optional_gauge(
         text,
         "calmwalk_agent_link_silence_seconds",
         "Time since the last message from the orchestrator.",
-        numbers.heard.map(|heard| heard.elapsed().as_secs_f64()),
+        metrics.heard.map(|heard| heard.elapsed().as_secs_f64()),
     );
     optional_gauge(
         text,
         "calmwalk_agent_link_round_trip_seconds",
         "Round-trip time of the last request to the orchestrator.",
-        numbers.round_trip.map(|took| took.as_secs_f64()),
+        metrics.round_trip.map(|took| took.as_secs_f64()),
     );
-    let places = numbers.joins as f64;
+    let places = metrics.joins as f64;
     text.counter(
-        "calmwalk_agent_places_total",
+        "calmwalk_agent_joins_total",
         "Number of times that this agent has joined.",
         &[(&[], places)],
     );
     text.gauge(
-        "calmwalk_agent_untold_reports",
+        "calmwalk_agent_unsent_reports",
         "Reports that the orchestrator has not acknowledged yet.",
-        &[(&[], numbers.unsent as f64)],
+        &[(&[], metrics.unsent as f64)],
     );
 }
 

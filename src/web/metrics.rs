@@ -76,7 +76,7 @@ fn candidates(text: &mut Text, status: &Status) {
         ("accepted", candidates.accepted),
         ("covered", declined.covered),
         ("duplicate", declined.duplicate),
-        ("guard", declined.guard),
+        ("too_close", declined.too_close),
         ("budget", declined.budget),
         ("backlog", declined.backlog),
     ];
@@ -86,11 +86,11 @@ fn candidates(text: &mut Text, status: &Status) {
     text.counter("calmwalk_candidates_total", "Candidates of biased walks by fate.", &samples);
     let control = candidates.control as f64;
     text.counter("calmwalk_control_frames_total", "Frames of control walks.", &[(&[], control)]);
-    let refused = candidates.refused_by_walkers as f64;
+    let rejected = candidates.rejected_by_guards as f64;
     text.counter(
-        "calmwalk_refused_structures_total",
-        "Structures refused by the walkers' guards.",
-        &[(&[], refused)],
+        "calmwalk_rejected_structures_total",
+        "Structures rejected by the walkers' guards.",
+        &[(&[], rejected)],
     );
     let version = status.mixture_version as f64;
     text.gauge("calmwalk_mixture_version", "Version of the mixture in force.", &[(&[], version)]);

@@ -4,6 +4,8 @@ pub mod budget;
 pub mod cost;
 pub mod disk;
 pub mod energies;
+#[cfg(test)]
+mod glossary;
 pub mod labels;
 pub mod reference_check;
 pub mod unlabelled;

@@ -10,24 +10,26 @@ pub fn cause(cause: EarlyEndCause) -> &'static str {
         EarlyEndCause::LostAtom => "an atom left the structure",
         EarlyEndCause::Crashed => "walkers crashed",
         EarlyEndCause::Trapped => "atoms repeatedly too close",
-        EarlyEndCause::BadStart => "invalid start",
-        EarlyEndCause::Other => "diverged",
+        EarlyEndCause::InvalidStart => "invalid start",
+        EarlyEndCause::Other => "other",
     }
 }
 
-/// All ends in one line: `12 collected, 3 blew up (too hot)`.
+/// All ends in one line: `12 quota reached, 3 diverged (too hot)`.
 pub fn all(ends: &WalkEnds) -> String {
     let one = |EndCount { end, cause: why, walks, .. }: &EndCount| {
         let end = end.replace('_', " ");
         match why {
-            Some(why) if *why != EarlyEndCause::Trapped => format!("{walks} {end} ({})", cause(*why)),
+            Some(why) if *why != EarlyEndCause::Trapped && cause(*why) != end => {
+                format!("{walks} {end} ({})", cause(*why))
+            }
             _ => format!("{walks} {end}"),
         }
     };
     ends.counts().iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
-/// All ends in one line without causes: `12 collected, 3 blew up`.
+/// All ends in one line without causes: `12 quota reached, 3 diverged`.
 pub fn without_causes(ends: &WalkEnds) -> String {
     let mut numbers: Vec<(&str, u64)> = Vec::new();
     for EndCount { end, walks, .. } in ends.counts() {
@@ -98,7 +100,7 @@ mod tests {
             (said(20.0, 0.0, 300.0), EarlyEndCause::LostAtom),
         ] {
             assert_eq!(
-                early_end_cause("blew_up", &format!("at step 3: {reason}")),
+                early_end_cause("diverged", &format!("at step 3: {reason}")),
                 Some(expected),
                 "{reason}"
             );
@@ -114,16 +116,16 @@ mod tests {
             ..WalkStatus::default()
         };
         let walks = [
-            walk(0, "collected", ""),
+            walk(0, "quota_reached", ""),
             walk(1, "running", ""),
-            walk(2, "blew_up", "at step 5: 9000 K is above the allowed 800 K"),
-            walk(3, "blew_up", "at step 7: 9999 K is above the allowed 800 K"),
-            walk(4, "trapped", "refused by the shortest-bond guard again and again"),
-            walk(5, "collected", ""),
+            walk(2, "diverged", "at step 5: 9000 K is above the allowed 800 K"),
+            walk(3, "diverged", "at step 7: 9999 K is above the allowed 800 K"),
+            walk(4, "trapped", "rejected by the shortest-bond guard again and again"),
+            walk(5, "quota_reached", ""),
         ];
         let ends = WalkEnds::from_walks(&walks);
-        assert_eq!(all(&ends), "2 collected, 2 blew up (too hot), 1 trapped");
-        assert_eq!(without_causes(&ends), "2 collected, 2 blew up, 1 trapped");
+        assert_eq!(all(&ends), "2 quota reached, 2 diverged (too hot), 1 trapped");
+        assert_eq!(without_causes(&ends), "2 quota reached, 2 diverged, 1 trapped");
         assert!(warning(&ends).starts_with("3 of 5 finished walks ended early (2 too hot, 1 atoms"));
     }
 }

@@ -49,7 +49,7 @@ impl Budget {
     /// The configuration key of the time limit that was reached: walks stop where they are.
     pub fn time_used_up(&self, used: &BudgetUse) -> Option<&'static str> {
         let limits = [
-            ("budget.wall_hours", self.wall_hours, used.wall_hours),
+            ("budget.wall_time", self.wall_hours, used.wall_hours),
             ("budget.core_hours", self.core_hours, used.core_hours),
         ];
         let reached = |(_, limit, used): &(&str, Option<f64>, f64)| limit.is_some_and(|limit| *used >= limit);
@@ -78,8 +78,8 @@ mod tests {
         }
         for (core_hours, wall_hours, key) in [
             (1.5, 1.0, Some("budget.core_hours")),
-            (1.6, 0.25, Some("budget.wall_hours")),
-            (1.0, 0.2, Some("budget.wall_hours")),
+            (1.6, 0.25, Some("budget.wall_time")),
+            (1.0, 0.2, Some("budget.wall_time")),
             (1.6, 0.3, None),
         ] {
             let budget =

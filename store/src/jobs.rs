@@ -8,6 +8,7 @@ use crate::database::{FromRow, Row, from_columns};
 use crate::error::Result;
 use crate::exclude::Exclusion;
 use crate::records::{JobState, Label};
+use crate::words;
 
 /// The running label attempt that started first.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -91,12 +92,21 @@ pub struct ImportCounts {
     pub known: usize,
 }
 
+/// Number of structures that were to be queued, by what became of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct QueuedImports {
+    /// New label jobs.
+    pub queued: usize,
+    /// Structures that have a label or a label job already.
+    pub known: usize,
+}
+
 /// An entry of the queue.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Job {
     /// Id of the job.
     pub job: i64,
-    /// Name of the candidate.
+    /// Name of the candidate, or `import-N`.
     pub candidate: String,
     /// Name of the protocol.
     pub protocol: String,
@@ -120,11 +130,11 @@ pub struct Job {
     pub original_gamma: Option<f64>,
     /// Largest γ_nbr under the original mixture.
     pub original_gamma_nbr: Option<f64>,
-    /// `biased` or `control`.
+    /// `biased`, `control` or `imported`.
     pub origin: String,
-    /// Name of the seed structure.
+    /// Name of the seed structure; empty if it was imported.
     pub seed_structure: String,
-    /// The walk that found it.
+    /// The walk that found it; 0 if it was imported.
     pub walk: u32,
     /// Step of the walk, equilibration included.
     pub step: u64,
@@ -192,7 +202,7 @@ impl FromRow for Attempt {
             started: row.get("started")?,
             ended: row.get("ended")?,
             outcome: row.get("outcome")?,
-            class: row.get("class")?,
+            class: row.get::<Option<String>>("class")?.map(|class| words::shown(&class).to_owned()),
             log: row.get("log")?,
             made: CalculationRecord {
                 cores: row.get_or_default("cores")?,

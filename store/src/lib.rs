@@ -38,6 +38,7 @@ mod status;
 mod store;
 mod tables;
 mod walk_progress;
+pub mod words;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -53,7 +54,8 @@ pub use file_names::{DATABASE, LOCK};
 pub use filesystem::{check_directory, free_space, network_file_system};
 pub use jobs::{
     Archive, Attempt, CalculationRecord, CompleteOutcome, FailOutcome, ImportCounts, Job, JobDetails,
-    LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, Supersession,
+    LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, QueuedImports,
+    Supersession,
 };
 pub use listing::{ListCursor, ListOrder, ListedCandidate};
 pub use location::{Location, ServerUrl};

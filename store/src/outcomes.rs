@@ -62,7 +62,7 @@ pub struct LabelUsage {
 /// How often a failure class occurred.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct FailureCount {
-    /// The class, as stored with attempts.
+    /// The class, as views show it ([`crate::words`]).
     pub class: String,
     /// Jobs that met it and were labelled later.
     pub labelled: u64,

@@ -26,7 +26,6 @@ pub struct ProcessRecord {
     /// Process id on its host.
     pub pid: u32,
     /// See [`process_start_time`]; empty if unknown.
-    #[serde(rename = "birth")]
     pub start_time: String,
     /// Host name, for display only.
     pub host: String,

@@ -9,6 +9,7 @@ use crate::database::{FromRow, Row};
 use crate::error::Result;
 use crate::jobs::OldestLease;
 use crate::processes::ProcessRecord;
+use crate::words;
 
 /// Everything that `status` shows.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -54,8 +55,8 @@ pub struct Candidates {
     pub declined: Declined,
     /// Frames of control walks.
     pub control: u64,
-    /// Structures refused by the walkers' guards.
-    pub refused_by_walkers: u64,
+    /// Structures rejected by the walkers' guards.
+    pub rejected_by_guards: u64,
 }
 
 /// Number of declined candidates, by reason.
@@ -66,7 +67,7 @@ pub struct Declined {
     /// Known already.
     pub duplicate: u64,
     /// Atoms too close.
-    pub guard: u64,
+    pub too_close: u64,
     /// As many as there may be.
     pub budget: u64,
     /// Below the raised threshold that holds while the label queue is long.
@@ -111,7 +112,7 @@ pub struct WalkStatus {
     pub conditions: Option<WalkConditions>,
     /// `biased` or `control`.
     pub origin: String,
-    /// `waiting`, `running`, or the reason why it ended.
+    /// `waiting`, `running`, or the reason why it ended ([`crate::words`]).
     pub state: String,
     /// Why it ended, as text.
     pub reason: String,
@@ -134,8 +135,8 @@ pub struct WalkStatus {
     pub steps_per_second: Option<f64>,
     /// Structures accepted.
     pub accepted: u32,
-    /// Refusals by the walker's guard.
-    pub refused: i64,
+    /// Structures rejected by the walker's guard.
+    pub rejected: i64,
     /// Returns to a checkpoint.
     pub returns: u32,
 }
@@ -155,7 +156,7 @@ impl FromRow for WalkStatus {
             seed_structure: row.get("seed_structure")?,
             conditions: None,
             origin: row.get("origin")?,
-            state: row.get("state")?,
+            state: words::shown(&row.get::<String>("state")?).to_owned(),
             reason: row.get("reason")?,
             paused: row.get("paused")?,
             step: row.get("step")?,
@@ -166,7 +167,7 @@ impl FromRow for WalkStatus {
             gamma_max: row.get("gamma_max")?,
             steps_per_second: row.get("steps_per_second")?,
             accepted: row.get("accepted")?,
-            refused: row.get("refused")?,
+            rejected: row.get("refused")?,
             returns: row.get("returns")?,
         })
     }

@@ -68,6 +68,6 @@ async fn hours_sum_over_all_attempts_and_runs() {
     let status = store.status().await.unwrap();
     assert_eq!(
         (status.budget.used_up.as_deref(), status.budget.used.wall_hours),
-        (Some("budget.wall_hours"), 1.0)
+        (Some("budget.wall_time"), 1.0)
     );
 }

@@ -176,8 +176,8 @@ async fn status_counts_everything_once() {
     let reader = home.open_read_only().await;
     let status = serde_json::to_value(reader.status().await.unwrap()).unwrap();
     let candidates = serde_json::json!({
-        "seen": 3, "accepted": 1, "declined": { "covered": 1, "duplicate": 0, "guard": 1, "budget": 0, "backlog": 0 },
-        "control": 1, "refused_by_walkers": 4,
+        "seen": 3, "accepted": 1, "declined": { "covered": 1, "duplicate": 0, "too_close": 1, "budget": 0, "backlog": 0 },
+        "control": 1, "rejected_by_guards": 4,
     });
     assert_eq!(status["candidates"], candidates);
     let labels = serde_json::json!({
@@ -249,7 +249,7 @@ async fn walks_can_be_paused_and_resumed_at_any_time() {
     assert_eq!(pause(&[0, 2], false).await.unwrap(), [0]);
     // Nothing changes if one of them cannot be paused.
     let error = pause(&[0, 2], true).await.unwrap_err().to_string();
-    assert_eq!(error, "walk 2 has ended (blew up): only running walks can be paused");
+    assert_eq!(error, "walk 2 has ended (diverged): only running walks can be paused");
     let error = pause(&[0, 3], true).await.unwrap_err().to_string();
     assert_eq!(error, "the campaign has no walk 3; they are 0 to 2");
 

@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 
 use store::{
     Archive, CalculationRecord, CompleteOutcome, ExportCursor, ExportFilter, ExportSource, FailOutcome, Fate,
-    ImportCounts, JobState, Label, LabelDetails, LabelSource, LabelStatus, Lease, LeaseStatus, Store,
-    StoreError,
+    ImportCounts, JobState, Label, LabelDetails, LabelSource, LabelStatus, Lease, LeaseStatus, QueuedImports,
+    Store, StoreError,
 };
 use wire::{ContentHash, Origin};
 
@@ -293,6 +293,59 @@ async fn imports_label_waiting_jobs_and_can_be_repeated() {
     let frames = [(0, structure(60.0), label(-6.0)), (1, structure(61.0), wrong)];
     assert!(store.import(dft, "bad.extxyz", &frames, 4).await.is_err());
     assert_eq!(store.status().await.unwrap().imported, 2);
+}
+
+#[tokio::test]
+async fn imported_structures_wait_for_their_labels_behind_candidates() {
+    let home = Home::new();
+    let store = home.create().await;
+    let names = accept(&store, 1).await;
+    let new = |frame: u64| ("new.extxyz".to_owned(), frame, structure(50.0 + frame as f64));
+    let structures = [new(0), ("new.extxyz".to_owned(), 1, structure(1e-6)), new(2)];
+    let found = store.queue_imports(&structures, 0, 1).await.unwrap();
+    assert_eq!(found, QueuedImports { queued: 2, known: 1 });
+    assert_eq!(store.queue_imports(&structures, 0, 2).await.unwrap(), QueuedImports { queued: 0, known: 3 });
+    let operations = store.operations(0, 100).await.unwrap();
+    let imports: Vec<_> = operations.iter().filter(|line| line.kind == "import").collect();
+    assert_eq!((imports.len(), &imports[0].detail["files"]["new.extxyz"]), (1, &2.into()));
+    assert_eq!((store.unfinished_jobs().await.unwrap(), store.status().await.unwrap().labels.queued), (3, 3));
+    let listed = store.queue_list(Some(JobState::Queued), 10, 0).await.unwrap();
+    let listed: Vec<_> = listed.iter().map(|job| (job.candidate.as_str(), job.origin.as_str())).collect();
+    assert_eq!(listed, [(names[0].as_str(), "biased"), ("import-1", "imported"), ("import-2", "imported")]);
+    assert_eq!(store.queue_list(None, 1, 1).await.unwrap()[0].candidate, "import-1");
+    let waiting = store.waiting_jobs(protocol("dft").hash).await.unwrap();
+    assert_eq!(waiting.iter().map(|jobs| jobs.jobs).sum::<u64>(), 3);
+    assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+
+    store.prioritise_job("import-2", 1, 3).await.unwrap();
+    let first = lease(&store, "a", 4).await.unwrap();
+    assert_eq!((first.candidate.as_str(), first.model_energy), ("import-2", None));
+    assert_eq!(first.structure, structure(52.0));
+    assert!(store.near_duplicates(&first, 3).await.unwrap().is_none());
+    assert_eq!(store.complete(&first, &label(-5.0), 5).await.unwrap(), CompleteOutcome::Label);
+    assert_eq!(lease(&store, "a", 6).await.unwrap().candidate, names[0]);
+    assert_eq!(lease(&store, "a", 7).await.unwrap().candidate, "import-1");
+    assert_eq!(state(&store, "import-2").await, JobState::Labelled);
+    assert!(matches!(store.queue_show("import-3").await, Err(StoreError::UnknownJob { .. })));
+
+    let imported = ExportFilter { protocol: first.protocol, biased: false, control: false, imported: true };
+    let rows = store.labelled(&imported, None, 10).await.unwrap();
+    assert_eq!(rows.len(), 1);
+    assert!(matches!(&rows[0].source, ExportSource::Import { file, frame: 2 } if file == "new.extxyz"));
+    let expected = BTreeSet::from([rows[0].cursor]);
+    assert_eq!(store.labelled_cursors(&imported).await.unwrap(), expected);
+    store.check_for_export().await.unwrap();
+    // Walks must not find them again.
+    let known = store.known_hashes().await.unwrap();
+    assert!(
+        [50.0, 52.0].iter().all(|shift| known.contains(&ContentHash::from_structure(&structure(*shift))))
+    );
+    // An import with labels ends a job that waits.
+    store.release_all("a", 8).await.unwrap();
+    let labelled = [(0, structure(50.0), label(-7.0))];
+    assert_eq!(store.import(first.protocol, "old.extxyz", &labelled, 9).await.unwrap().labels, 1);
+    assert_eq!(state(&store, "import-1").await, JobState::Labelled);
+    assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
 }
 
 /// A campaign whose labels arrive in the order `order`. Returns the text of its export, read in pages of `page`.

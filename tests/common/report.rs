@@ -55,9 +55,12 @@ pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
 
     // Compare with `status`.
     let collection = text("figures/collection.csv");
-    for fate in ["covered", "duplicate", "guard", "budget", "backlog"] {
+    for fate in ["covered", "duplicate", "too_close", "budget", "backlog"] {
         let number = &status["candidates"]["declined"][fate];
-        assert!(collection.contains(&format!("a,{fate},{number},")), "{fate}: {collection}");
+        assert!(
+            collection.contains(&format!("a,{},{number},", fate.replace('_', " "))),
+            "{fate}: {collection}"
+        );
     }
     let (seen, accepted) = (&status["candidates"]["seen"], &status["candidates"]["accepted"]);
     assert!(collection.contains(&format!("a,accepted,{accepted},")));

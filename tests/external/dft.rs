@@ -58,9 +58,9 @@ fn is_abinit(command: &str) -> bool {
     command.starts_with("abinit ")
 }
 
-/// Labeller, keeper and code are killed at random moments: each label is made once, none is lost and nothing is left.
+/// Labeller, runner and code are killed at random moments: each label is made once, none is lost and nothing is left.
 #[test]
-fn labels_survive_kills_of_labeller_keeper_and_code() {
+fn labels_survive_kills_of_labeller_runner_and_code() {
     let directory = tempfile::tempdir().unwrap();
     let (here, scratch) = (directory.path(), directory.path().join("scratch"));
     fs::create_dir(&scratch).unwrap();
@@ -131,7 +131,11 @@ fn attempts(here: &Path, candidate: &str) -> Vec<Value> {
 /// Checks that a guard has refused a candidate for this reason, and ABINIT has not been started.
 fn is_refused(here: &Path, candidate: &str, reason: &str) {
     let [attempt] = &attempts(here, candidate)[..] else { panic!("{candidate}: more than one attempt") };
-    assert_eq!((&attempt["class"], &attempt["calculation"]), (&"refused".into(), &Value::Null), "{attempt}");
+    assert_eq!(
+        (&attempt["class"], &attempt["calculation"]),
+        (&"rejected_by_label_guard".into(), &Value::Null),
+        "{attempt}"
+    );
     assert!(attempt["log"].as_str().unwrap().contains(reason), "{attempt}");
 }
 

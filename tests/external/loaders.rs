@@ -79,6 +79,23 @@ fn gracemaker_grades_by_an_artifact_of_several_elements() {
 }
 
 #[test]
+fn gracemaker_grades_by_the_mixture_of_a_campaign() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small::default().write(here);
+    succeed(here, ["run", "campaign.toml"]);
+    let path = |file: &str| config(&format!("data/al_eam_1l/{file}")).display().to_string();
+    let (model, data) = (path("kokkos.npz"), path("seed_frames.extxyz"));
+    let original = both_grades(here, &model, &path("gmm_artifacts.npz"), &data);
+    for version in [["--version", "1"].as_slice(), &[]] {
+        succeed(here, ["calm", "export", "campaign", "--output", "calm.npz"].iter().chain(version));
+        let grades = both_grades(here, &model, "calm.npz", &data);
+        let moved = grades.iter().zip(&original).any(|([new, _], [old, _])| (new / old - 1.0).abs() > 1e-2);
+        assert!(moved);
+    }
+}
+
+#[test]
 fn artifacts_of_gracemaker_give_its_grades() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();

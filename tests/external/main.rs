@@ -12,6 +12,7 @@ mod faults;
 mod loaders;
 mod pictures;
 mod postgres_faults;
+mod selection;
 mod slurm;
 mod slurm_build;
 mod slurm_labels;

@@ -42,8 +42,11 @@ fn the_readme_shows_a_campaign() {
     browser.picture(&picture("dashboard"), None);
     let screen = terminal.screen();
     drop(terminal);
-    let pages =
-        get(address, "/api/candidates?order=gamma&fate=accepted&limit=1&where=seed+%3D+%27fcc-100%27").json();
+    let pages = get(
+        address,
+        "/api/candidates?order=gamma&fate=accepted&limit=1&where=seed_structure+%3D+%27fcc-100%27",
+    )
+    .json();
     let id = pages["candidates"][0]["id"].as_str().unwrap().to_owned();
     browser.show(&format!("http://{address}/#candidate/{id}"));
     browser.wait("document.querySelectorAll('.atoms tbody tr').length > 20");
@@ -78,7 +81,7 @@ impl Terminal {
     fn open(here: &Path) -> Self {
         let terminal = Self(format!("calmwalk-picture-{}", std::process::id()));
         let (width, height) = (TERMINAL.0.to_string(), TERMINAL.1.to_string());
-        let command = format!("{} watch aluminium --every 500ms", env!("CARGO_BIN_EXE_calmwalk"));
+        let command = format!("{} watch aluminium --interval 500ms", env!("CARGO_BIN_EXE_calmwalk"));
         let here = here.display().to_string();
         terminal.tmux(&[
             "-f",

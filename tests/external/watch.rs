@@ -29,7 +29,7 @@ impl Terminal {
         let (width, height) = (size.0.to_string(), size.1.to_string());
         let program = env!("CARGO_BIN_EXE_calmwalk");
         let command =
-            format!("{environment} {program} watch '{campaign}' --every 200ms; echo code $?; exec cat");
+            format!("{environment} {program} watch '{campaign}' --interval 200ms; echo code $?; exec cat");
         let here = here.display().to_string();
         let arguments = ["-f", "/dev/null", "new-session", "-d", "-c", &here, "-x", &width, "-y", &height];
         terminal.tmux(&[&arguments[..], &[&command]].concat());
@@ -243,9 +243,9 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
 
     // As calmwalk explain tells it.
     terminal.press("3 /");
-    terminal.write("kind = biased and gamma > 0");
+    terminal.write("origin = biased and gamma > 0");
     terminal.press("Enter");
-    terminal.wait_for("where (kind = 'biased') and (gamma > 0.0)");
+    terminal.wait_for("where (origin = 'biased') and (gamma > 0.0)");
     terminal.press("Enter");
     let screen = terminal.wait_for("trigger");
     let id = screen.lines().nth(1).unwrap().trim().to_owned();

@@ -98,9 +98,9 @@ fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
     succeed(here, part("out.npz", 2, 3, 3));
     let message = fail(here, &merge("out.npz"));
     assert!(message.contains("pass 2 is not done: missing are the parts 1/3, 2/3"), "{message}");
-    let other = [part("out.npz", 2, 1, 3), vec!["--seed".into(), "7".into()]].concat();
+    let other = [part("out.npz", 2, 1, 3), vec!["--rng-seed".into(), "7".into()]].concat();
     let message = refuse(here, other);
-    assert!(message.contains("its --seed is 42, now it is 7"), "{message}");
+    assert!(message.contains("its --rng-seed is 42, now it is 7"), "{message}");
     run_parts(here, "out.npz", 2, 3, "2");
     succeed(here, merge("out.npz"));
     // One process takes what is left.

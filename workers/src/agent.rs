@@ -59,7 +59,7 @@ pub enum AgentEvent {
 /// Runs the agent's part of a campaign.
 pub struct Agent {
     /// The connection to the orchestrator.
-    pub uplink: Arc<AgentClient>,
+    pub client: Arc<AgentClient>,
     /// The registration with the orchestrator.
     pub joined: Membership,
     /// Messages from the walkers of this host.
@@ -80,7 +80,7 @@ type StopReply = (Result<Option<bool>, LinkError>, Duration);
 
 /// State of the agent's exchange with the orchestrator.
 struct AgentState {
-    uplink: Arc<AgentClient>,
+    client: Arc<AgentClient>,
     joined: Arc<Membership>,
     pool: AssignmentPool,
     in_flight: FuturesUnordered<BoxFuture<'static, ExchangeResult>>,
@@ -108,10 +108,10 @@ impl Agent {
     /// The orchestrator is unresponsive, or its program is incompatible with this one.
     pub async fn run(mut self, mut watch: impl FnMut(AgentEvent)) -> Result<AgentExit, LinkError> {
         let slots = self.joined.slots();
-        let uplink = Arc::clone(&self.uplink);
-        let mut over = pin!(uplink.address().wait_until_over());
+        let client = Arc::clone(&self.client);
+        let mut over = pin!(client.address().wait_until_over());
         let mut stop = pin!(self.stopping.cancelled().fuse());
-        let mut state = AgentState::new(self.uplink, self.joined, self.metrics);
+        let mut state = AgentState::new(self.client, self.joined, self.metrics);
         state.metrics().mixture_version = Some(state.joined.newest().await.version());
         state.start(slots);
         let mut ticks = interval(POLL_INTERVAL);
@@ -166,9 +166,9 @@ async fn answer_to<T>(stop_query: &mut Option<BoxFuture<'static, T>>) -> T {
 }
 
 impl AgentState {
-    fn new(uplink: Arc<AgentClient>, joined: Membership, metrics: Arc<Mutex<AgentMetrics>>) -> Self {
+    fn new(client: Arc<AgentClient>, joined: Membership, metrics: Arc<Mutex<AgentMetrics>>) -> Self {
         Self {
-            uplink,
+            client,
             joined: Arc::new(joined),
             pool: AssignmentPool::default(),
             in_flight: FuturesUnordered::new(),
@@ -270,8 +270,8 @@ impl AgentState {
     /// delivered under the new registration.
     fn rejoin(&mut self) {
         if self.joining.is_none() && self.next_joined.is_none() {
-            let uplink = Arc::clone(&self.uplink);
-            self.joining = Some(Box::pin(async move { uplink.join().await }));
+            let client = Arc::clone(&self.client);
+            self.joining = Some(Box::pin(async move { client.join().await }));
         }
     }
 

@@ -1,4 +1,4 @@
-//! Guards that keep a walk physical: which structures are refused as candidates, and when a walk ends.
+//! Guards that keep a walk physical: which structures are rejected as candidates, and when a walk ends.
 
 use atoms::{Evaluation, Neighbour, NeighbourList, Structure, cell};
 

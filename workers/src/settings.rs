@@ -26,7 +26,7 @@ pub struct WalkSettings {
     pub collection: calm::CollectionRule,
     /// Minimum number of steps between two accepted structures of a walk.
     pub gap: u64,
-    /// Minimum number of steps between two candidates after one that was declined or refused.
+    /// Minimum number of steps between two candidates after one that was declined or rejected.
     pub min_interval_after_decline: u64,
     /// Windows of the switched ZBL repulsion; `None` without one.
     pub zbl: Option<ZblWindows>,
@@ -41,9 +41,9 @@ pub struct GuardSettings {
     pub min_distances: MinDistanceRule,
     /// Temperature above which a walk ends, K.
     pub max_temperature: f64,
-    /// Whether a walk rolls back to a checkpoint after refusals; if not, it goes on.
+    /// Whether a walk rolls back to a checkpoint after rejections; if not, it goes on.
     pub rollback: bool,
-    /// Consecutive refusals by the same guard after which the walk rolls back to a checkpoint.
+    /// Consecutive rejections by the same guard after which the walk rolls back to a checkpoint.
     pub max_consecutive_rejections: u32,
     /// Number of roll backs after which the walk ends instead.
     pub max_rollbacks: u32,

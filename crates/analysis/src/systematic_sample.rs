@@ -1,5 +1,7 @@
 //! A bounded sample of a stream of unknown length.
 
+use crate::random::mixed;
+
 /// Keeps items of a stream with equal probability: all of them up to the capacity, then a half, a quarter, and
 /// so on. The choice depends only on the index in the stream, so parallel streams keep the same indices.
 #[derive(Clone, Debug)]
@@ -19,12 +21,17 @@ impl<T> SystematicSample<T> {
 
     /// Offers the next item.
     pub fn add(&mut self, item: T) {
+        self.add_with(|| item);
+    }
+
+    /// Offers the next item, which is made only if it is kept.
+    pub fn add_with(&mut self, item: impl FnOnce() -> T) {
         let level = mixed(self.seen).trailing_zeros();
         self.seen += 1;
         if level < self.least {
             return;
         }
-        self.kept.push((level, item));
+        self.kept.push((level, item()));
         while self.kept.len() > self.room {
             self.least += 1;
             self.kept.retain(|(level, _)| *level >= self.least);
@@ -40,14 +47,6 @@ impl<T> SystematicSample<T> {
     pub fn total(&self) -> u64 {
         self.seen
     }
-}
-
-/// The finaliser of SplitMix64: pseudo-random bits for each index.
-fn mixed(place: u64) -> u64 {
-    let mut x = place.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
-    x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    x ^ (x >> 31)
 }
 
 #[cfg(test)]

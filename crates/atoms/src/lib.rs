@@ -11,6 +11,7 @@ mod min_distances;
 mod neighbours;
 pub mod poscar;
 mod potential;
+pub mod prototypes;
 mod read;
 mod species;
 mod structure;

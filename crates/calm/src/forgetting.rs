@@ -6,8 +6,6 @@
 use serde::{Deserialize, Serialize};
 
 use crate::component::Component;
-use crate::grade::{GradeError, Grades};
-use crate::mixture::Mixture;
 use crate::rules::{Fraction, Positive};
 
 /// The distribution of γ over atoms.
@@ -35,6 +33,18 @@ pub struct ElementForgetting {
     pub mean_square_growth: f64,
     /// Share of its sampled training atoms with γ > 1; `None` without a sample.
     pub share_above_one: Option<f64>,
+    /// Its changed components.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub components: Vec<ComponentForgetting>,
+}
+
+/// The same of one component.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ComponentForgetting {
+    /// Slot.
+    pub component: usize,
+    /// Mean σ² of its training atoms relative to that at the start.
+    pub mean_square_growth: f64,
 }
 
 /// Limits above which the mixture has forgotten too much of its training data.
@@ -65,22 +75,6 @@ impl GradeDistribution {
     }
 }
 
-/// The distribution of γ of training atoms under a mixture. Compare the live mixture's with the original's.
-///
-/// `elements` has the element index of each atom of all frames, `features` is `[atoms × D]`.
-///
-/// # Errors
-/// Those of [`Grades::evaluate`].
-pub fn grade_distribution(
-    mixture: &Mixture,
-    elements: &[usize],
-    features: &[f64],
-) -> Result<GradeDistribution, GradeError> {
-    let mut grades = Grades::default();
-    grades.evaluate(mixture, elements, features, None)?;
-    Ok(GradeDistribution::from_grades(&grades.gamma))
-}
-
 /// By which factor the mean σ² of a component's own training atoms has grown since the start:
 /// tr(C⁻¹ C₀) / tr(C₀⁻¹ C₀), with the regularised inverses of both and the covariance C₀ of the training atoms about the
 /// centroid. `None` for components without statistics.
@@ -90,6 +84,16 @@ pub fn mean_square_growth(before: &Component, now: &Component) -> Option<f64> {
     let trace = |inverse: &[f64]| inverse.iter().zip(&covariance).map(|(a, b)| a * b).sum::<f64>();
     let growth = trace(now.inverse()) / trace(before.inverse());
     growth.is_finite().then_some(growth)
+}
+
+impl ElementForgetting {
+    /// The component whose training atoms have moved away most.
+    pub fn worst_component(&self) -> Option<ComponentForgetting> {
+        let by_growth = |a: &&ComponentForgetting, b: &&ComponentForgetting| {
+            a.mean_square_growth.total_cmp(&b.mean_square_growth)
+        };
+        self.components.iter().max_by(by_growth).copied()
+    }
 }
 
 impl Default for ForgettingAlarm {

@@ -4,7 +4,7 @@
 //! [`Artifact`] holds a [`Mixture`]; [`Grades`] evaluates σ, γ and ∂γ/∂z; [`neighbourhood`] averages γ over
 //! pairs; [`rules`] decides when a structure is collected and when an update is sufficient; [`search::update`]
 //! finds the update; [`forgetting`] detects whether the mixture still covers its training data. [`build`] makes a
-//! mixture from training data.
+//! mixture from training data, [`baselines`] the scores that γ is compared with.
 //!
 //! Matrices are dense, row-major `f64`; batches of features are `[atoms × D]`, row-major. All sums run in a
 //! fixed order on one thread, so results are bitwise reproducible on one kind of processor (grades on every
@@ -12,6 +12,7 @@
 
 mod alpha_scan;
 pub mod artifact;
+pub mod baselines;
 mod batched_grades;
 pub mod build;
 mod bytes;
@@ -24,6 +25,7 @@ pub mod mixture;
 pub mod neighbourhood;
 pub mod rules;
 pub mod search;
+pub mod selection;
 pub mod soundness;
 pub mod staleness;
 mod storage;

@@ -21,6 +21,12 @@ impl Pair {
         let weight = if distance < cutoff { 0.5 * (1.0 + (PI * distance / cutoff).cos()) } else { 0.0 };
         Self { i, j, weight }
     }
+
+    /// The pair with weight 1 within a radius, Å, 0 at or beyond it: the uniform average over these neighbours. With the
+    /// pair's cutoff as radius, they are those of [`Pair::new`], which with a smaller radius averages over fewer.
+    pub fn uniform(i: usize, j: usize, distance: f64, radius: f64) -> Self {
+        Self { i, j, weight: f64::from(distance < radius) }
+    }
 }
 
 /// A pair with the index of an atom that has no grade.

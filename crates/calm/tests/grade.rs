@@ -183,6 +183,14 @@ fn a_pair_counts_by_its_cosine_weight() {
     assert_eq!((error.i, error.j, error.atoms), (0, 1, 1));
 }
 
+#[test]
+fn neighbours_within_a_radius_count_alike() {
+    let pairs =
+        [(0, 1, 2.0), (0, 0, 2.9), (0, 1, 3.0), (1, 0, 3.5)].map(|(i, j, r)| Pair::uniform(i, j, r, 3.0));
+    let averaged = neighbourhood_average(&[1.0, 4.0], pairs).unwrap();
+    assert_close("average", &averaged, &[(1.0 + 4.0 + 1.0) / 3.0, 4.0], 1e-15);
+}
+
 /// Shared numbers give the same bits as owned ones and compare equal.
 #[test]
 fn a_lent_component_is_as_good_as_an_owned_one() {

@@ -3,10 +3,12 @@
 mod common;
 
 mod artifact;
+mod baselines;
 mod build;
 mod forgetting;
 mod grade;
 mod properties;
 mod rules;
+mod selection;
 mod soundness;
 mod update;

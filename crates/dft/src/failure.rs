@@ -80,7 +80,7 @@ impl fmt::Display for FailureClass {
             Self::TimeLimit => "time limit",
             Self::NotConverged => "not converged",
             Self::BadInput => "bad input",
-            Self::LostNode => "lost node",
+            Self::LostNode => "node failure",
             Self::Implausible => "implausible result",
             Self::OtherProgram => "another program",
         })

@@ -4,12 +4,23 @@
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Colour(pub u8, pub u8, pub u8);
 
-/// Vermillion and blue are from Okabe and Ito (2008); they also differ in lightness.
+/// Vermillion, blue and those beside them are from Okabe and Ito (2008); the first two also differ in lightness.
 impl Colour {
     /// Vermillion.
     pub const VERMILLION: Self = Self(0xd5, 0x5e, 0x00);
     /// Blue.
     pub const BLUE: Self = Self(0x00, 0x72, 0xb2);
+    /// Bluish green.
+    pub const GREEN: Self = Self(0x00, 0x9e, 0x73);
+    /// Orange.
+    pub const ORANGE: Self = Self(0xe6, 0x9f, 0x00);
+    /// Reddish purple.
+    pub const PURPLE: Self = Self(0xcc, 0x79, 0xa7);
+    /// Sky blue.
+    pub const SKY: Self = Self(0x56, 0xb4, 0xe9);
+    /// Colours of curves, in order.
+    pub const SERIES: [Self; 6] =
+        [Self::BLUE, Self::VERMILLION, Self::GREEN, Self::ORANGE, Self::PURPLE, Self::SKY];
     /// For text and axes.
     pub const INK: Self = Self(0x22, 0x22, 0x22);
     /// For guide lines.

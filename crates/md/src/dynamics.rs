@@ -142,11 +142,6 @@ impl Dynamics {
         Some(self.kinetic_energy() + self.now.evaluation.energy() + thermostat)
     }
 
-    /// Scales all velocities to add or remove heat.
-    pub fn scale_velocities(&mut self, factor: f64) {
-        self.now.state.velocities.iter_mut().for_each(|v| *v = scale(*v, factor));
-    }
-
     fn thermostat_half_step(&mut self) {
         let Checkpoint { state, thermostat, time_step, .. } = &mut self.now;
         thermostat.half_step(&mut state.velocities, &self.masses, *time_step);

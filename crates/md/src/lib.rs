@@ -1,5 +1,5 @@
 //! Molecular dynamics: velocity Verlet, Langevin (BAOAB) and Nosé–Hoover chains, counter-based random numbers,
-//! volume ramps, and checkpoints from which a run resumes bit for bit.
+//! volume ramps, and checkpoints from which a run resumes bit for bit. Relaxation of positions.
 //!
 //! ```text
 //!  Checkpoint ──resume──▶ Dynamics ──step(potential)──▶ Dynamics ──checkpoint()──▶ Checkpoint
@@ -10,6 +10,7 @@
 mod checkpoint;
 mod dynamics;
 mod error;
+mod fire;
 mod langevin;
 mod nose_hoover;
 mod random;
@@ -21,6 +22,7 @@ mod wrong_setting;
 pub use checkpoint::Checkpoint;
 pub use dynamics::{Dynamics, Settings, default_time_step};
 pub use error::DynamicsError;
+pub use fire::{Fire, Relaxed};
 pub use langevin::{Langevin, LangevinSettings};
 pub use nose_hoover::{NoseHooverChain, NoseHooverSettings};
 pub use random::{Stream, StreamId, philox};

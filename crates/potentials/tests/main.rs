@@ -5,6 +5,7 @@ mod common;
 mod classical;
 mod grace_deep_files;
 mod grace_derivatives;
+mod grace_features;
 mod grace_files;
 mod grace_golden;
 mod grace_mixed;

@@ -5,7 +5,7 @@ use calm::{Staleness, Trial, UpdateEnd, UpdateRule};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use store::records::STALENESS;
-use store::{LoggedDecision, Store, StoreError, StoredCandidate};
+use store::{LoggedDecision, Store, StoreError, StoredCandidate, words};
 
 use super::{CandidateRef, CoveredCandidate};
 
@@ -21,7 +21,7 @@ pub struct DecisionDetails {
     pub round: u64,
     /// `accepted`, `declined` or `control`.
     pub kind: String,
-    /// Why it was declined: `covered`, `duplicate`, `guard`, `budget` or `backlog`.
+    /// Why it was declined: `covered`, `duplicate`, `too_close`, `budget` or `backlog`.
     pub reason: Option<String>,
     /// Factor by which a long label queue had raised the threshold.
     pub raised_by: Option<f64>,
@@ -106,7 +106,7 @@ impl DecisionDetails {
             number: logged.sequence,
             round: logged.round,
             kind: logged.kind.clone(),
-            reason,
+            reason: reason.map(|reason| words::shown(&reason).to_owned()),
             raised_by: detail["raised_by"].as_f64(),
             raised_threshold: detail["threshold"].as_f64(),
             mixture_version: logged.mixture_version,

@@ -38,7 +38,7 @@ pub struct Discovery {
     pub partner: Option<CandidateRef>,
     /// Distances that the guards check.
     pub distances: Distances,
-    /// Current state of the walk, with the refusals of its guard.
+    /// Current state of the walk, with the rejections by its guard.
     pub walk_now: Option<WalkStatus>,
 }
 

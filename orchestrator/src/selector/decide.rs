@@ -275,7 +275,7 @@ impl DecisionState {
         if let Some(training) = state.training {
             detail["training_frames"] = json!(training);
         }
-        detail["forgetting"] = json!({ "level": state.level, "elements": state.elements });
+        detail["forgetting"] = state.in_decision();
         detail["forgetting_alarm"] = json!(state.is_alarming());
         commit.values.push((TRAINING_FRAMES.to_owned(), state.to_json().to_string()));
         Ok(state.is_alarming())
@@ -346,7 +346,8 @@ impl DecisionState {
         let seed_structure = walk.is_biased().then_some(walk.record.seed_structure);
         if seed_structure.is_some_and(|seed| self.restarts_mixture_after(seed)) {
             let next_version = self.mixture.version() + 1;
-            self.mixture = Arc::new(self.regrader.original.at_version(next_version));
+            let restarted = Arc::new(self.regrader.original.at_version(next_version));
+            self.before_restart = Some(std::mem::replace(&mut self.mixture, restarted));
             commit.components.clear();
             commit.restart_mixture = true;
             self.forgetting.restart();
@@ -404,7 +405,7 @@ impl DecisionState {
 fn describe_end(end: &WalkEnd) -> String {
     match end {
         WalkEnd::Steps | WalkEnd::Collected | WalkEnd::Budget => String::new(),
-        WalkEnd::Trapped { guard } => format!("refused by the {guard} guard again and again"),
+        WalkEnd::Trapped { guard } => format!("rejected by the {guard} guard again and again"),
         WalkEnd::BlewUp { reason } | WalkEnd::BadStart { reason } => reason.clone(),
     }
 }

@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use calm::Mixture;
-use calm::forgetting::{ElementForgetting, ForgettingAlarm, GradeDistribution, mean_square_growth};
+use calm::forgetting::{
+    ComponentForgetting, ElementForgetting, ForgettingAlarm, GradeDistribution, mean_square_growth,
+};
 use serde_json::{Value, json};
 
 use super::error::SelectorError;
@@ -82,17 +84,22 @@ impl Forgetting {
     /// An element, with the share above 1 under the original mixture.
     fn element(&self, original: &Mixture, element: usize) -> (ElementForgetting, Option<f64>) {
         let components = original.components(element).unwrap_or_default().iter().enumerate();
-        let (mut sum, mut atoms) = (0.0, 0.0);
+        let (mut sum, mut atoms, mut changed) = (0.0, 0.0, Vec::new());
         for (slot, component) in components {
             let count = component.statistics().map_or(0.0, |statistics| statistics.count);
-            sum += count * self.growth.get(&(element, slot)).copied().unwrap_or(1.0);
+            let growth = self.growth.get(&(element, slot)).copied();
+            sum += count * growth.unwrap_or(1.0);
             atoms += count;
+            changed.extend(
+                growth.map(|growth| ComponentForgetting { component: slot, mean_square_growth: growth }),
+            );
         }
         let shares = self.training.as_ref().and_then(|training| training.shares_of(element, MIN_ATOMS));
         let forgetting = ElementForgetting {
             element: self.symbols.get(element).cloned().unwrap_or_default(),
             mean_square_growth: if atoms > 0.0 { sum / atoms } else { 1.0 },
             share_above_one: shares.map(|[_, live]| live),
+            components: changed,
         };
         (forgetting, shares.map(|[before, _]| before))
     }
@@ -101,6 +108,13 @@ impl Forgetting {
 impl ForgettingState {
     pub fn is_alarming(&self) -> bool {
         self.level > 1.0
+    }
+
+    /// As recorded with the decision: without components.
+    pub fn in_decision(&self) -> Value {
+        let without =
+            |element: &ElementForgetting| ElementForgetting { components: Vec::new(), ..element.clone() };
+        json!({ "level": self.level, "elements": self.elements.iter().map(without).collect::<Vec<_>>() })
     }
 
     /// As stored for display.

@@ -13,10 +13,11 @@ use potentials::grace::GraceModel;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
+use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::file_hash;
 use crate::mixture_build::{self, Part, Work};
 use crate::output::{Table, log_and_warn, print, print_stderr};
-use crate::projection;
+use crate::projection::with_projection;
 use crate::signals::stop_token;
 use crate::structure_files::{StructureArguments, StructureFiles};
 
@@ -26,7 +27,7 @@ const PROJECTED: usize = 128;
 /// Build a CALM mixture from the training data of a model
 ///
 /// Goes through all structures three times: pass 1 finds clusters of environments for each element, pass 2 their covariances,
-/// pass 3 the thresholds. The artifact depends on model, data, --candidates, --seed and --shard-size, but not on the number of
+/// pass 3 the thresholds. The artifact depends on model, data, --candidates, --rng-seed and --shard-size, but not on the number of
 /// threads.
 ///
 /// A model without a projection of its features (uq_rp_matrix) gets a random one, which the artifact stores.
@@ -46,30 +47,34 @@ pub struct Build {
     #[arg(long, short, value_name = "CALM.npz")]
     output: PathBuf,
     /// Also write a copy of the model with the new mixture, for LAMMPS and calmwalk
-    #[arg(long, value_name = "MODEL.npz")]
+    #[arg(long, value_name = "MODEL.npz", conflicts_with = "feature_variant")]
     embed: Option<PathBuf>,
+    /// Features of the mixture, with the projection matrix of the model file: normalised or linear [default: as the file says].
+    /// Mixtures of other features serve comparisons (`calm score`, `calm baseline`), not campaigns
+    #[arg(long, value_name = "VARIANT")]
+    feature_variant: Option<FeatureVariant>,
     /// Weight of the atoms of a file of DATA, 0 or more [default: 1]; may be repeated
     #[arg(long, value_name = "FILE=W", value_parser = weight)]
     weight: Vec<(PathBuf, f64)>,
-    /// Numbers of clusters to choose from for each element, ascending
+    /// Candidate numbers of components per element, ascending; the build chooses one for each element
     #[arg(long, value_name = "K,…", value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
     candidates: Vec<usize>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 42)]
-    seed: u64,
+    rng_seed: u64,
     /// Projected features of a model that has no projection yet; the norms of its basis are added to them [default: 128]
     #[arg(long, value_name = "D", value_parser = clap::value_parser!(u32).range(1..=65536))]
     projection_dimension: Option<u32>,
-    /// Structures of a shard, the unit of work; each thread holds one in memory
+    /// Number of structures per shard. Each thread keeps one shard in memory
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     shard_size: u64,
     /// Threads; each takes whole shards [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Begin anew, whatever state is there
+    /// Discard the saved state and start from pass 1
     #[arg(long)]
     restart: bool,
-    /// On a cluster: take only the shards of --part through this pass
+    /// Run only this pass, on the shards of --part (to share a build between hosts)
     #[arg(long, value_name = "1|2|3", requires = "part", conflicts_with = "restart", value_parser = clap::value_parser!(u8).range(1..=3))]
     pass: Option<u8>,
     /// The part of this process: every n-th shard, from shard i. When all parts of a pass are done, run `calmwalk calm merge`
@@ -96,21 +101,21 @@ impl Build {
             )));
         }
         let dimension = self.projection_dimension.map_or(PROJECTED, |dimension| dimension as usize);
-        let (model, projection, seed) = projected(&self.model, model, self.seed, dimension)?;
+        let (model, projection, seed) = projected(&self.model, model, self.feature_variant, self.rng_seed, dimension)?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let settings = BuildSettings {
             dimension: projection.feature_dimension,
-            seed: self.seed,
+            seed: self.rng_seed,
             candidates: self.candidates.clone(),
             shard_size: self.shard_size,
         };
         let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
         let work = Work {
-            model: Arc::new(model),
+            model,
             files,
             shard_size: self.shard_size,
             part: self.part.unwrap_or(Part::WHOLE),
-            seed: self.seed,
+            seed: self.rng_seed,
             threads: self.threads.map_or(cores, usize::from),
             stop: stop_token()?,
         };
@@ -175,25 +180,36 @@ pub(super) fn write_mixture(
     file.finish()
 }
 
-/// The model with its projection, and the random seed of that if it is known. A model without a projection gets a random
-/// one with `dimension` projected features.
+/// The model with the features of `variant`, their projection, and the random seed of that if it is known. A model without a
+/// projection gets a random one with `dimension` projected features.
 pub(super) fn projected(
     path: &Path,
-    model: GraceModel,
+    mut model: GraceModel,
+    variant: Option<FeatureVariant>,
     seed: u64,
     dimension: usize,
-) -> Result<(GraceModel, Projection, Option<i64>), Failure> {
-    if let Some(own) = projection::of_model(&model) {
+) -> Result<(Arc<GraceModel>, Projection, Option<i64>), Failure> {
+    let seed = if model.projection().is_some() {
         let file = Archive::open(path).map_err(Failure::input)?;
         let key = "uq_rp_seed";
         let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(Failure::input)?;
-        return Ok((model, own, seed.and_then(|seed| seed.data.first().copied())));
-    }
-    let description = model.description();
-    let (rows, layers) = (description.basis_dimension, description.architecture.layers());
-    let drawn = random_projection(seed, rows, dimension, layers);
-    let model = projection::with_projection(model, &drawn).map_err(Failure::failed)?;
-    Ok((model, drawn, i64::try_from(seed).ok()))
+        seed.and_then(|seed| seed.data.first().copied())
+    } else {
+        let description = model.description();
+        let (rows, layers) = (description.basis_dimension, description.architecture.layers());
+        let drawn = random_projection(seed, rows, dimension, layers);
+        model = with_projection(model, &drawn).map_err(Failure::failed)?;
+        i64::try_from(seed).ok()
+    };
+    let found = FeatureModel::new(path, model, variant)?;
+    let Some(projection) = found.projection() else {
+        return Err(Failure::Input(
+            "--feature-variant hidden: a mixture needs projected features; expected normalised or linear"
+                .into(),
+        ));
+    };
+    Ok((found.model, projection, seed))
+}
 }
 
 fn weight(text: &str) -> Result<(PathBuf, f64), String> {

@@ -22,8 +22,8 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Compare the grades of two CALM artifacts of one model on the same structures
 ///
-/// For each element: median and 99 % quantile of γ under both artifacts, the share of atoms with γ > 1 under each and under only one,
-/// and the rank correlation ρ of the two grades (Spearman). Shares count every atom; quantiles and ρ come from a sample of
+/// For each element: median and 99 % quantile of γ under both artifacts, the share of atoms with γ > 1 under A, under B, and under
+/// only one of them, and the rank correlation ρ of the two grades (Spearman). Shares count every atom; quantiles and ρ come from a sample of
 /// 50,000 atoms at most.
 #[derive(Debug, clap::Args)]
 pub struct Compare {

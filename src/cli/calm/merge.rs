@@ -8,6 +8,7 @@ use potentials::grace::GraceModel;
 use super::build::{projected, report, write_mixture};
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{ExitStatus, Failure};
+use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
 use crate::mixture_build::{Merge as PartsMerge, Merged};
 use crate::output::print;
@@ -21,12 +22,15 @@ pub struct Merge {
     /// GRACE model (kokkos.npz) of the build
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
-    /// The --output of the parts
+    /// The value of --output that the parts were run with
     #[arg(long, short, value_name = "CALM.npz")]
     output: PathBuf,
     /// After pass 3, also write a copy of the model with the new mixture, for LAMMPS and calmwalk
-    #[arg(long, value_name = "MODEL.npz")]
+    #[arg(long, value_name = "MODEL.npz", conflicts_with = "feature_variant")]
     embed: Option<PathBuf>,
+    /// The --feature-variant of the parts
+    #[arg(long, value_name = "VARIANT")]
+    feature_variant: Option<FeatureVariant>,
 }
 
 impl Merge {
@@ -39,8 +43,13 @@ impl Merge {
         let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
         let mut merge = PartsMerge::open(&self.output, &hash)?;
         let BuildSettings { seed, dimension, .. } = *merge.settings();
-        let norms = 1 + model.description().architecture.layers();
-        let (model, projection, seed) = projected(&self.model, model, seed, dimension.saturating_sub(norms))?;
+        let norms = match self.feature_variant {
+            Some(FeatureVariant::Linear) => 0,
+            _ => 1 + model.description().architecture.layers(),
+        };
+        let dimension = dimension.saturating_sub(norms);
+        let (model, projection, seed) =
+            projected(&self.model, model, self.feature_variant, seed, dimension)?;
         match merge.run(&model, projection, seed)? {
             Merged::Pass(pass) => {
                 print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;

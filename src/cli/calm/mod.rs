@@ -1,35 +1,51 @@
 //! `calmwalk calm`: commands for CALM mixtures, without a campaign.
 
+mod baseline;
 mod build;
 mod compare;
+mod export;
+mod filter;
 mod info;
 mod merge;
+mod other_scores;
 mod recalibrate;
 mod score;
+mod score_labels;
+mod score_table;
 mod scorer;
+mod validate;
 
+pub(super) use self::score::load;
 use super::{ExitStatus, Failure};
 
-/// Build, recalibrate, compare or inspect CALM mixtures, or grade structures with it
+/// Build, recalibrate, compare, export, inspect and test CALM mixtures and baselines; grade structures, and judge grades by errors
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
+    Baseline(baseline::Baseline),
     Build(build::Build),
     Compare(compare::Compare),
+    Export(export::Export),
+    Filter(filter::Filter),
     Info(info::Info),
     Merge(merge::Merge),
     Recalibrate(recalibrate::Recalibrate),
     Score(score::Score),
+    Validate(validate::Validate),
 }
 
 impl Calm {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         match self {
+            Self::Baseline(command) => command.run(),
             Self::Build(command) => command.run(),
             Self::Compare(command) => command.run(),
+            Self::Export(command) => command.run(),
+            Self::Filter(command) => command.run(),
             Self::Info(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Recalibrate(command) => command.run(),
             Self::Score(command) => command.run(),
+            Self::Validate(command) => command.run(),
         }
     }
 }

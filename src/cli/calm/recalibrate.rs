@@ -71,7 +71,7 @@ fn percentage(text: &str) -> Result<f64, String> {
     found.ok_or_else(|| "expected a percentage, above 0 and at most 100".to_owned())
 }
 
-fn open(path: &Path) -> Result<BufReader<File>, Failure> {
+pub(super) fn open(path: &Path) -> Result<BufReader<File>, Failure> {
     let file = File::open(path);
     file.map(BufReader::new)
         .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", path.display())))

@@ -8,14 +8,15 @@ use atoms::FileError;
 use atoms::extxyz::{Column, ColumnData, Frame, Value, write_frame};
 use calm::Artifact;
 use npyz::{NpyWriter, WriterBuilder};
-use potentials::grace::GraceModel;
 
+use super::other_scores::OtherScores;
+use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
-use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
+use crate::feature_variant::FeatureModel;
 use crate::output::{self, Bar, print};
-use crate::projection::load_artifact;
 use crate::xyz_reader::XyzReader;
 
 /// Keys of labels in a frame.
@@ -28,10 +29,17 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// Writes every frame with the model's energy (eV), forces (eV/Å) and, for periodic cells, stress (eV/Å³, tension positive),
 /// and per atom gamma (extrapolation grade γ), gamma_nbr (its neighbourhood average), sigma (Mahalanobis distance σ) and
 /// component (nearest component of the atom's element, from 0). Rejects structures with atoms closer than 0.4 Å, and mixtures
-/// that cannot come from training data.
+/// that cannot come from training data. With an artifact of other features of the model (`calm build --feature-variant`), those are
+/// graded.
+///
+/// With --baseline, it also writes the scores of baselines (`calmwalk calm baseline`), such as llpr, each with its neighbourhood
+/// average (llpr_nbr). With --ensemble, force_deviation is the norm of the standard deviation of the forces of all models (eV/Å).
 ///
 /// Keeps all other data of the frame. Renames its energy, forces, stress and virial to REF_energy, REF_forces and so on, unless
 /// it already has reference labels; then it replaces the plain ones, which come from another model.
+///
+/// If frames have labels, also prints the errors of the model, and how well γ and γ_nbr of an atom tell large force errors:
+/// Spearman's ρ, ROC-AUC, what γ ≤ 1 keeps, and quantiles by bins of γ, with intervals by bootstrap over structures.
 #[derive(Debug, clap::Args)]
 pub struct Score {
     /// GRACE model (kokkos.npz)
@@ -52,13 +60,36 @@ pub struct Score {
     /// Also write the features z of all atoms to this file: array of shape [atoms, D] in the order of the input, float64
     #[arg(long, value_name = "FILE.npy")]
     features: Option<PathBuf>,
+    /// Also write the scores of this file of baselines (`calmwalk calm baseline`); may be repeated
+    #[arg(long, value_name = "BASELINES.npz")]
+    baseline: Vec<PathBuf>,
+    /// Also write the disagreement of the forces with those of this model; may be repeated
+    #[arg(long, value_name = "MODEL.npz")]
+    ensemble: Vec<PathBuf>,
+    /// Also write the statistics of labelled structures to this file, with all thresholds of the force error
+    #[arg(long, value_name = "FILE.json")]
+    json: Option<PathBuf>,
+    /// Also draw the statistics of labelled structures into this directory: force errors by grade, contamination and ROC-AUC by
+    /// threshold of the force error, as SVG, PNG and CSV
+    #[arg(long, value_name = "DIR")]
+    figures: Option<PathBuf>,
+    /// Also write a table with one row for each structure, for calm filter: line of the input, largest γ and γ_nbr, energy per
+    /// atom of the model and of the label (eV), mean and largest force error (eV/Å)
+    #[arg(long, value_name = "FILE.csv")]
+    table: Option<PathBuf>,
 }
 
 impl Score {
     pub fn run(self) -> Result<ExitStatus, Failure> {
+        for output in self.json.iter().chain(&self.table) {
+            let inputs = [(self.model.as_path(), "the model"), (self.input.as_path(), "the input")];
+            let artifact = self.artifact.as_deref().map(|path| (path, "the artifact"));
+            refuse_to_replace(output, inputs.into_iter().chain(artifact))?;
+        }
         let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
+        let mut others = OtherScores::load(&self.model, &model, &self.baseline, &self.ensemble)?;
         let dimension = artifact.mixture.dimension();
-        let mut scorer = Scorer::new(Arc::new(model), Arc::new(artifact.mixture));
+        let mut scorer = Scorer::new(model.model, Arc::new(artifact.mixture));
         let mut frames = XyzReader::open(&self.input).map_err(Failure::input)?;
         let bar = Bar::new(frames.length, BAR);
         let mut output = AtomicFile::create(&self.output)?;
@@ -66,12 +97,18 @@ impl Score {
         let mut feature_file = self.features.as_deref().map(AtomicFile::create).transpose()?;
         let matrix = feature_file.as_mut().map(|file| feature_matrix(file, dimension));
         let mut matrix = matrix.transpose().map_err(cannot)?;
+        let mut labels = ScoreLabels::new(others.score_columns(), self.table.as_deref())?;
         let mut count = 0_u64;
         while let Some(frame) = frames.next() {
             let mut frame = frame.map_err(Failure::input)?;
             let line = frame.line;
             scorer.score(&frame.structure, self.gradient).map_err(|error| self.at(line, error))?;
+            let columns = others.columns(&frame.structure, &scorer).map_err(|error| self.at(line, error))?;
+            labels.add(&frame, &scorer, &columns)?;
             write_scores(&mut frame, &scorer, self.gradient);
+            for (name, values) in columns {
+                frame.arrays.insert(name, scalars(&values));
+            }
             write_frame(&mut output, &frame).map_err(|error| self.at(line, error))?;
             if let Some(matrix) = &mut matrix {
                 matrix.extend(scorer.features().iter().copied()).map_err(cannot)?;
@@ -94,6 +131,7 @@ impl Score {
                 self.output.display()
             )
         })?;
+        labels.finish(self.json.as_deref(), self.figures.as_deref(), &self.input)?;
         Ok(ExitStatus::Done)
     }
 
@@ -102,20 +140,25 @@ impl Score {
     }
 }
 
-/// The model and the mixture that grades its features.
-pub(super) fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact), Failure> {
-    let export = model;
-    let model = GraceModel::load(export).map_err(Failure::input)?;
-    if let Some(path) = artifact {
-        return load_artifact(model, path).map_err(Failure::Input);
-    }
-    if model.projection().is_none() {
-        let message = "the model has no mixture (uq_*): give its artifact with --artifact, or build one with calmwalk calm build";
-        return Err(Failure::Input(format!("{}: {message}", export.display())));
-    }
-    let own = Artifact::load_export(export).map_err(Failure::input)?;
-    check_sound(&own, export).map_err(Failure::Input)?;
-    Ok((model, own))
+/// The model with the features of the artifact, and the mixture that grades them.
+pub(in crate::cli) fn load(
+    export: &Path,
+    artifact: Option<&Path>,
+) -> Result<(FeatureModel, Artifact), Failure> {
+    let Some(path) = artifact else {
+        let model = FeatureModel::load(export, None)?;
+        let own = Artifact::load_export(export).map_err(Failure::input)?;
+        check_sound(&own, export).map_err(Failure::Input)?;
+        return Ok((model, own));
+    };
+    let artifact = Artifact::load(path).map_err(Failure::input)?;
+    let model = FeatureModel::for_artifact(export, &artifact.projection)?;
+    let own = model.projection().unwrap_or_else(|| artifact.projection.clone());
+    artifact
+        .check_belongs_to(&model.symbols(), &own)
+        .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
+    check_sound(&artifact, path).map_err(Failure::Input)?;
+    Ok((model, artifact))
 }
 
 /// Adds the results to the frame, after moving its own labels.
@@ -126,7 +169,6 @@ fn write_scores(frame: &mut Frame, scorer: &Scorer, gradient: bool) {
     if let Some(stress) = evaluation.stress(&frame.structure) {
         frame.info.insert("stress".into(), stress.into());
     }
-    let scalars = |values: &[f64]| Column { width: 1, entries: ColumnData::Real(values.to_vec()) };
     let component = scorer.grades.component.iter().map(|slot| *slot as i64).collect();
     let mut insert = |name: &str, column| frame.arrays.insert(name.to_owned(), column);
     insert("forces", Column::vectors(&evaluation.forces));
@@ -137,6 +179,10 @@ fn write_scores(frame: &mut Frame, scorer: &Scorer, gradient: bool) {
     if gradient {
         insert("gamma_gradient", Column::vectors(&scorer.pull_back.gradient));
     }
+}
+
+fn scalars(values: &[f64]) -> Column {
+    Column { width: 1, entries: ColumnData::Real(values.to_vec()) }
 }
 
 /// Renames the plain labels to `REF_…`, or removes them if the frame has reference labels.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use atoms::{Evaluation, Structure};
-use calm::neighbourhood::{Pair, PairError};
+use calm::neighbourhood::PairError;
 use calm::{GradeError, Grades, Mixture, neighbourhood_average};
 use potentials::grace::{GraceModel, PullBack};
 
@@ -18,6 +18,10 @@ pub struct Scorer {
     pub grades: Grades,
     /// γ_nbr of the last structure, [n].
     pub gamma_nbr: Vec<f64>,
+    /// The bonds over which γ_nbr averages.
+    pub pairs: Vec<Pair>,
+    /// Element indices of the last structure, [n].
+    pub elements: Vec<usize>,
     /// Energy and forces of the last structure.
     pub evaluation: Evaluation,
     /// ∂Σγ/∂r of the last structure, if requested; otherwise zero.
@@ -47,6 +51,8 @@ impl Scorer {
             cotangent: Vec::new(),
             grades: Grades::default(),
             gamma_nbr: Vec::new(),
+            pairs: Vec::new(),
+            elements: Vec::new(),
             evaluation: Evaluation::default(),
             pull_back: PullBack::default(),
         }
@@ -64,24 +70,11 @@ impl Scorer {
         self.cotangent.resize(features.len(), 0.0);
         let cotangent = gradient.then_some(self.cotangent.as_mut_slice());
         self.grades.evaluate(&self.mixture, &elements, features, cotangent)?;
-        let pairs = self.pairs(structure, &elements);
-        self.gamma_nbr = neighbourhood_average(&self.grades.gamma, pairs)?;
+        self.pairs = self.features.pairs(structure, &elements);
+        self.elements = elements;
+        self.gamma_nbr = neighbourhood_average(&self.grades.gamma, self.pairs.iter().copied())?;
         let cotangent = gradient.then_some(self.cotangent.as_slice());
         self.features.grace.backward(cotangent, &mut self.evaluation, &mut self.pull_back);
         Ok(())
-    }
-
-    /// Directed bonds within the pair cutoffs.
-    fn pairs(&self, structure: &Structure, elements: &[usize]) -> Vec<Pair> {
-        let FeatureCalculator { grace, neighbours } = &self.features;
-        let (model, mut bonds, mut pairs) = (grace.model(), Vec::new(), Vec::new());
-        for (i, centre) in elements.iter().enumerate() {
-            neighbours.bonds_within(structure, i, model.cutoff(), &mut bonds);
-            pairs.extend(bonds.iter().map(|bond| {
-                let j = bond.atom as usize;
-                Pair::new(i, j, bond.r, model.pair_cutoff(*centre, elements[j]))
-            }));
-        }
-        pairs
     }
 }

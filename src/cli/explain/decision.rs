@@ -14,7 +14,9 @@ pub fn write(out: &mut dyn Write, decision: &DecisionDetails, atoms: usize) -> i
     let round = if *round == 0 { String::new() } else { format!(", round {round}") };
     let what = match (kind.as_str(), decision.reason.as_deref()) {
         ("control", _) => "control frame: labelled, but does not update the mixture".to_owned(),
-        ("declined", Some(reason)) => format!("declined: {reason} ({})", describe(reason)),
+        ("declined", Some(reason)) => {
+            format!("declined: {} ({})", reason.replace('_', " "), describe(reason))
+        }
         (kind, _) => kind.to_owned(),
     };
     line(
@@ -35,7 +37,7 @@ fn describe(reason: &str) -> &'static str {
     match reason {
         "covered" => "no longer new under the selector's mixture",
         "duplicate" => "the same structure is already known",
-        "guard" => "atoms are too close to each other",
+        "too_close" => "atoms below a limit of guard.min_distances",
         "budget" => "its seed structure or the campaign has reached its limit",
         "backlog" => "new, but below the raised threshold",
         _ => "",

@@ -53,7 +53,7 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     let Attempt { attempt: number, holder, started, ended, outcome, class, log, made, core_seconds, .. } =
         attempt;
     let outcome = outcome.as_deref().unwrap_or("running");
-    let class = class.as_ref().map_or(String::new(), |class| format!(" ({class})"));
+    let class = class.as_ref().map_or(String::new(), |class| format!(" ({})", class.replace('_', " ")));
     let lasted = match ended {
         Some(ended) => format!("after {:.1} s", (ended - started) as f64 / 1000.0),
         None => format!("for {}", elapsed_since(*started)),

@@ -23,8 +23,8 @@ const SHOWN: usize = 20;
 ///
 /// Shows the atoms that triggered it, its grades under the walker's, the selector's and the original mixture, the decision with
 /// its rule and numbers, every value of α that was tried, the attempts at its label with their costs, the error of the
-/// potential, and the later candidates that it covered. Shows the available part of this for control frames and imported
-/// structures. Works while the campaign runs and on backups.
+/// potential, and the later candidates that it covered. For control frames and imported structures, shows what is
+/// recorded. Works while the campaign runs and on backups.
 #[derive(Debug, clap::Args)]
 pub struct Explain {
     #[command(flatten)]
@@ -137,7 +137,7 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
         Some(_) => String::new(),
         None => format!(
             "; its guard rejected {}, it rolled back {}",
-            count(walk.refused, "structure"),
+            count(walk.rejected, "structure"),
             count(walk.returns, "time")
         ),
     };

@@ -28,7 +28,7 @@ pub fn facts<'a>(
         max_force: Some(row.label.max_force()),
         retry_adjustments: Some(&row.label.details.retry_adjustments),
         species: &row.structure.species,
-        kind: "imported",
+        origin: "imported",
         ..StructureProperties::default()
     };
     let ExportSource::Candidate {
@@ -41,14 +41,14 @@ pub fn facts<'a>(
     StructureProperties {
         gamma: largest(&original.gamma),
         gamma_nbr: largest(&original.gamma_nbr),
-        volume: Some(view.relative_volume()),
+        relative_volume: Some(view.relative_volume()),
         kinetic_temperature: Some(view.temperature()),
         conditions: conditions.get(&view.id().walk),
         walk: Some(view.id().walk.0),
         step: Some(view.id().step),
         mixture_version: Some(*mixture_version_after),
-        kind: origin.name(),
-        seed: Some(seed_structure_name),
+        origin: origin.name(),
+        seed_structure: Some(seed_structure_name),
         ..of_label
     }
 }

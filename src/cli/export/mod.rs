@@ -50,10 +50,11 @@ pub struct Export {
     /// Export only structures that match a filter, such as 'gamma > 2 and element = Mo'
     ///
     /// Combine comparisons with and, or, not and parentheses. Numbers (= != < <= > >=): gamma, gamma_nbr (largest of the
-    /// structure, original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version, atoms, energy (eV, label),
-    /// energy_per_atom (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), kind (biased,
-    /// control or imported), seed (name of the seed structure, in quotes if it contains spaces), retry_adjustment (any of those
-    /// with which the label was computed after failures, such as other_moments).
+    /// structure, original mixture), relative_volume (V/V₀), kinetic_temperature (of the structure, K), temperature (K) and tau
+    /// (of the walk), walk, step, mixture_version (after the decision), atoms, energy (eV, label), energy_per_atom (eV, label),
+    /// max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), origin (biased, control or imported),
+    /// seed_structure (its name, in quotes if it contains spaces), group (of the walk, see [[walks]]), retry_adjustment (any of
+    /// those with which the label was computed after failures, such as other_moments). A comparison with a missing value is false.
     #[arg(long = "where", value_name = "FILTER")]
     condition: Option<Filter>,
     /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test

@@ -161,7 +161,7 @@ struct Commands<'a> {
     directory: String,
     endpoint: String,
     store: Option<&'a str>,
-    /// With `--accept-check`: identity of the check that is accepted.
+    /// With `--accept-reference-check`: identity of the check that is accepted.
     accepted_check: Option<String>,
 }
 
@@ -174,8 +174,11 @@ impl<'a> Commands<'a> {
             directory: text(directory)?,
             endpoint: text(&directory.join(ENDPOINT))?,
             store: campaign.config.run.store.as_deref(),
-            // The job may be requeued after the configuration has changed, with differences that nobody has seen.
-            accepted_check: launch.accept_check.then(|| reference_check::identity(campaign)).transpose()?,
+            // The job may be requeued after the configuration has changed, with differences that the user has not seen.
+            accepted_check: launch
+                .accept_reference_check
+                .then(|| reference_check::identity(campaign))
+                .transpose()?,
         })
     }
 
@@ -189,7 +192,8 @@ impl<'a> Commands<'a> {
         if self.launch.adopt {
             words.push("--adopt");
         }
-        let accepted = self.accepted_check.as_ref().map(|identity| format!("--accept-check={identity}"));
+        let accepted =
+            self.accepted_check.as_ref().map(|identity| format!("--accept-reference-check={identity}"));
         words.extend(accepted.as_deref());
         let tls = self.certificates("orchestrator")?;
         if wanted.agents > 0 {

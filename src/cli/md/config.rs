@@ -10,7 +10,7 @@ use serde::Deserialize;
 use toml::Spanned;
 
 use crate::config::{
-    ConfigError, Document, KnownKeys, PotentialFile, place_of_offset, read_text, wrong_thermostat,
+    ConfigError, Document, KnownKeys, PotentialFile, location_of_offset, read_text, wrong_thermostat,
 };
 use crate::output::log_and_warn;
 
@@ -89,7 +89,7 @@ impl MdConfig {
             *file.get_mut() = directory.join(file.get_ref());
         }
         let wrong = |key: &str, file: &Spanned<PathBuf>, message: String| ConfigError::File {
-            at: place_of_offset(path, &text, file.span().start),
+            at: location_of_offset(path, &text, file.span().start),
             key: key.to_owned(),
             message,
         };

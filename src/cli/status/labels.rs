@@ -106,11 +106,11 @@ fn describe_protocol(jobs: &ProtocolJobs) -> String {
 fn describe_rate(status: &Status) -> String {
     let average = labels_per_hour(status)
         .map_or(String::new(), |average| format!("; {} per hour on average", two_digits(average)));
-    format!("{} computed in the last hour{average}", status.labels_last_hour)
+    format!("{} made in the last hour{average}", status.labels_last_hour)
 }
 
 fn describe_failure(failure: &FailureCount) -> String {
     let FailureCount { class, labelled, failed, unfinished } = failure;
     let (class, jobs) = (class.replace('_', " "), labelled + failed + unfinished);
-    format!("{class} in {jobs}: {labelled} labelled later, {failed} failed, {unfinished} open")
+    format!("{class} in {jobs}: {labelled} labelled, {failed} failed, {unfinished} unfinished")
 }

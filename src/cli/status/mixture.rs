@@ -27,6 +27,16 @@ pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &Page, mode: &st
     if let Some(worst) = worst.filter(|_| page.is_unlimited() || !is_sampled) {
         page.titled(out, "", &describe_worst(worst, !is_sampled && training["alarm"] == true))?;
     }
+    let components = elements.iter().filter_map(|of| Some((of, of.worst_component()?)));
+    let worst = components.max_by(|a, b| a.1.mean_square_growth.total_cmp(&b.1.mean_square_growth));
+    if let Some((of, worst)) = worst.filter(|_| page.is_unlimited()) {
+        let (number, growth) = (worst.component, worst.mean_square_growth);
+        page.titled(
+            out,
+            "",
+            &format!("component {number} of {} is forgotten most: σ² × {growth:.2}", of.element),
+        )?;
+    }
     // Walks that run one after the other have the newest version by construction.
     match values.staleness().filter(|staleness| mode == "live" || staleness.largest() > 0) {
         Some(staleness) => page.titled(
@@ -47,7 +57,7 @@ pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &Page, mode: &st
 
 /// The element whose training data have moved away most.
 fn describe_worst(worst: &ElementForgetting, alarm: bool) -> String {
-    let ElementForgetting { element, mean_square_growth, share_above_one } = worst;
+    let ElementForgetting { element, mean_square_growth, share_above_one, .. } = worst;
     let share = share_above_one.map_or(String::new(), |share| format!(", {:.1} % above 1", 100.0 * share));
     let alarm = if alarm { "; ALARM: the mixture forgets them" } else { "" };
     format!("of its training data, {element} is forgotten most: σ² × {mean_square_growth:.2}{share}{alarm}")

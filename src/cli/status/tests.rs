@@ -25,7 +25,8 @@ pub fn large() -> Snapshot {
     let staleness = json!({ "counts": { "0": 900_000, "3": 100_000 }, "largest": 3 });
     let training = json!({
         "atoms": 20_000, "median": 0.51, "percentile_95": 1.2, "maximum": 7.0, "share_above_one": 0.25, "alarm": true,
-        "level": 1.25, "elements": [{ "element": "Mo", "mean_square_growth": 2.5, "share_above_one": 0.25 }],
+        "level": 1.25, "elements": [{ "element": "Mo", "mean_square_growth": 2.5, "share_above_one": 0.25,
+            "components": [{ "component": 3, "mean_square_growth": 6.1 }] }],
     });
     let values = [(STALENESS, staleness), (TRAINING_FRAMES, training)];
     let hours = CoreHours { expected: 123_456.0, low: 98_765.0, high: 234_567.0 };
@@ -100,9 +101,9 @@ fn status() -> CampaignStatus {
         state: if number < 4 {
             "running"
         } else if number == 4 {
-            "blew_up"
+            "diverged"
         } else {
-            "collected"
+            "quota_reached"
         }
         .into(),
         reason: if number == 4 { "at step 1000000: 23456 K is above the allowed 20000 K" } else { "" }.into(),
@@ -121,7 +122,7 @@ fn status() -> CampaignStatus {
         ..ProcessRecord::new(ProcessRecord::WALKER, Some(number), 4_000_000, 0)
     };
     let declined =
-        Declined { covered: 900_000, duplicate: 10_000, guard: 1_000, budget: 100, backlog: 10_000 };
+        Declined { covered: 900_000, duplicate: 10_000, too_close: 1_000, budget: 100, backlog: 10_000 };
     CampaignStatus {
         walkers_busy: Some(0.625),
         candidates: Candidates {
@@ -129,7 +130,7 @@ fn status() -> CampaignStatus {
             accepted: 80_000,
             declined,
             control: 80_000,
-            refused_by_walkers: 123_456,
+            rejected_by_guards: 123_456,
         },
         labels: Labels {
             queued: 12_345,
@@ -185,9 +186,7 @@ fn the_status_of_a_large_campaign_fits_a_screen() {
         let text = String::from_utf8(text).unwrap();
         let widest = text.lines().map(|line| line.chars().count()).max();
         assert!(text.lines().count() <= lines && widest <= Some(80), "{text}");
-        for words in
-            ["oldest for", "512 computed in the last hour", "123456.7 steps/s", "expected within 30 h"]
-        {
+        for words in ["oldest for", "512 made in the last hour", "123456.7 steps/s", "expected within 30 h"] {
             assert!(text.contains(words), "{words}: {text}");
         }
     }

@@ -88,7 +88,7 @@ mod tests {
 
     #[test]
     fn running_walks_with_large_grades_have_priority() {
-        let mut walks: Vec<_> = (0..50).map(|number| walk(number, "collected", 9.0, None)).collect();
+        let mut walks: Vec<_> = (0..50).map(|number| walk(number, "quota_reached", 9.0, None)).collect();
         walks[3] = walk(3, "running", 1.2, Some(10.0));
         walks[4] = walk(4, "running", 2.5, Some(10.0));
         walks[5] = walk(5, "waiting", 3.5, None);

@@ -1,7 +1,7 @@
 //! Walks, label jobs and decisions as entries of the panes, and their quantities for filters.
 
 use atoms::Species;
-use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus};
+use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus, words};
 use wire::WalkConditions;
 use wire::conditions::VariedConditions;
 
@@ -43,7 +43,7 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) ->
         "running" if led => Tone::Active,
         "running" => Tone::Plain,
         "waiting" => Tone::Plain,
-        "trapped" | "blew_up" | "bad_start" => Tone::Attention,
+        "trapped" | "diverged" | "invalid_start" => Tone::Attention,
         _ => Tone::Ended,
     };
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
@@ -107,8 +107,8 @@ fn decision_entry(decision: &RecentDecision) -> Entry {
         None => String::new(),
     };
     let what = match (found.and_then(|found| found.reason.as_deref()), detail["end"].as_str()) {
-        (Some(reason), _) => format!("{kind}: {reason}"),
-        (None, Some(end)) => format!("{kind}: {}", end.replace('_', " ")),
+        (Some(reason), _) => format!("{kind}: {}", reason.replace('_', " ")),
+        (None, Some(end)) => format!("{kind}: {}", words::as_text(end)),
         (None, None) => kind.clone(),
     };
     let name = found.map(|found| found.seed_structure.as_str()).or_else(|| detail["seed_structure"].as_str());
@@ -142,13 +142,13 @@ pub fn without_campaign(candidate: &str) -> &str {
 fn facts_of_walk(walk: &WalkStatus) -> StructureProperties<'_> {
     StructureProperties {
         gamma: walk.gamma_max,
-        volume: walk.relative_volume,
+        relative_volume: walk.relative_volume,
         kinetic_temperature: walk.temperature,
         conditions: walk.conditions.as_ref(),
         walk: Some(walk.walk),
         step: Some(walk.step),
-        kind: &walk.origin,
-        seed: Some(&walk.seed_structure),
+        origin: &walk.origin,
+        seed_structure: Some(&walk.seed_structure),
         ..StructureProperties::default()
     }
 }
@@ -166,14 +166,14 @@ fn facts_of_job<'a>(
     StructureProperties {
         gamma: job.original_gamma,
         gamma_nbr: job.original_gamma_nbr,
-        volume: job.relative_volume,
+        relative_volume: job.relative_volume,
         kinetic_temperature: job.temperature,
         conditions: conditions_of(walks, job.walk),
         walk: Some(job.walk),
         step: Some(job.step),
         species,
-        kind: &job.origin,
-        seed: Some(&job.seed_structure),
+        origin: &job.origin,
+        seed_structure: Some(&job.seed_structure),
         ..StructureProperties::default()
     }
 }
@@ -193,12 +193,12 @@ fn facts_of_decision<'a>(
     StructureProperties {
         gamma: found.original_gamma,
         gamma_nbr: found.original_gamma_nbr,
-        volume: found.relative_volume,
+        relative_volume: found.relative_volume,
         kinetic_temperature: found.temperature,
         step: Some(found.step),
         species,
-        kind: found.origin.name(),
-        seed: Some(&found.seed_structure),
+        origin: found.origin.name(),
+        seed_structure: Some(&found.seed_structure),
         ..of_walk
     }
 }

@@ -41,7 +41,7 @@ pub struct Watch {
     location: CampaignLocation,
     /// Refresh interval, such as 500ms
     #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(2), value_parser = duration_between("200ms", "1h"))]
-    every: Duration,
+    interval: Duration,
 }
 
 impl Watch {
@@ -53,7 +53,7 @@ impl Watch {
                     .into(),
             ));
         }
-        block_on(watch(location, self.every.get()))?
+        block_on(watch(location, self.interval.get()))?
     }
 }
 

@@ -21,12 +21,12 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
     draw_progress(&mut figure, &mut numbers, places[1], data);
     let caption = format!(
         "Candidates of biased walks (n = {}). a, By decision of the selector: accepted, or declined because the newest mixture \
-         covered them (another walk had found a similar structure), as duplicates, because atoms were too close (guard), because \
-         the quota was reached (budget), or because too many labels were queued (backlog). The walkers’ guards refused {} more \
+         covered them (another walk had found a similar structure), as duplicates, because atoms were too close, because \
+         the quota was reached (budget), or because too many labels were queued (backlog). The walkers’ guards rejected {} more \
          structures before they became candidates. b, Accepted structures against candidates in the order of the decisions; \
          dashed, every candidate accepted. The flatter the line, the fewer new structures the walks find.",
         grouped(candidates.seen),
-        grouped(candidates.refused_by_walkers),
+        grouped(candidates.rejected_by_guards),
     );
     Ok(FigureContent { figure, caption, numbers })
 }
@@ -36,7 +36,7 @@ fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangl
     let fates = [
         ("backlog", declined.backlog),
         ("budget", declined.budget),
-        ("guard", declined.guard),
+        ("too close", declined.too_close),
         ("duplicate", declined.duplicate),
         ("covered", declined.covered),
         ("accepted", candidates.accepted),

@@ -9,7 +9,7 @@ mod grades;
 mod projection;
 mod space;
 
-use ::figures::{Axis, Panel, Rectangle, Scale};
+use ::figures::{Axis, Panel, Scale};
 use analysis::Histogram;
 use wire::Origin;
 
@@ -17,6 +17,7 @@ use super::collections::Collections;
 use super::report_data::ReportData;
 use super::style::origin_style;
 use super::{Csv, FigureEntry, csv};
+use crate::page::style::row;
 
 /// All figures, in the order of the page.
 pub fn all(data: &ReportData) -> Vec<FigureEntry> {
@@ -69,13 +70,6 @@ fn push_histograms(numbers: &mut Csv, panel: &str, histograms: &[(Origin, Histog
 fn origins_of(collections: &Collections) -> Vec<Origin> {
     let both = collections.both().into_iter();
     both.filter(|(_, of)| of.structures.total() > 0).map(|(origin, _)| origin).collect()
-}
-
-/// Rectangles of `number` panels side by side, with room for axis labels.
-fn row(number: usize, [left, gap, right]: [f64; 3], top: f64, height: f64) -> Vec<Rectangle> {
-    let n = number as f64;
-    let width = (super::style::WIDTH - left - right - gap * (n - 1.0)) / n;
-    (0..number).map(|k| Rectangle { x: left + k as f64 * (width + gap), y: top, width, height }).collect()
 }
 
 /// Shown instead of a figure of collected structures.

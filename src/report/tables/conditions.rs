@@ -18,11 +18,11 @@ pub fn conditions(data: &ReportData) -> Table {
         "ended",
         "accepted",
         "per walk",
-        "refused",
+        "rejected",
         "roll-backs",
     ];
     let caption = "Results by the conditions of biased walks: temperature of the thermostat, volume ramp and τ at the start; accepted \
-                   structures, structures refused by the guard, and roll-backs to a checkpoint.";
+                   structures, structures rejected by the guard, and roll-backs to a checkpoint.";
     let mut table = Table::new("conditions", caption, &titles);
     let all = by_conditions(&data.status.walks);
     for (conditions, walks) in all.iter().filter(|_| all.len() > 1) {
@@ -39,7 +39,7 @@ pub fn conditions(data: &ReportData) -> Table {
             text(states(walks.iter().copied()).1),
             count(accepted),
             real(accepted as f64 / number as f64, 2),
-            count(sum(|walk| walk.refused.unsigned_abs())),
+            count(sum(|walk| walk.rejected.unsigned_abs())),
             count(sum(|walk| walk.returns.into())),
         ]);
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use calm::CollectionRule;
-use calm::forgetting::ElementForgetting;
+use calm::forgetting::{ComponentForgetting, ElementForgetting};
 use serde_json::Value;
 use store::records::LEFT_OUT;
 
@@ -71,8 +71,13 @@ pub fn summary(data: &ReportData) -> Table {
     forgotten.sort_by(|a, b| b.mean_square_growth.total_cmp(&a.mean_square_growth));
     if !forgotten.is_empty() {
         let element = |of: &ElementForgetting| {
-            let share = of.share_above_one.map(|share| format!(" ({:.1} % above 1)", 100.0 * share));
-            format!("{} × {:.2}{}", of.element, of.mean_square_growth, share.unwrap_or_default())
+            let share = of.share_above_one.map(|share| format!("{:.1} % above 1", 100.0 * share));
+            let worst = of.worst_component().map(|ComponentForgetting { component, mean_square_growth }| {
+                format!("component {component} × {mean_square_growth:.2}")
+            });
+            let more: Vec<_> = share.into_iter().chain(worst).collect();
+            let more = if more.is_empty() { String::new() } else { format!(" ({})", more.join(", ")) };
+            format!("{} × {:.2}{more}", of.element, of.mean_square_growth)
         };
         let shown: Vec<_> = forgotten.iter().take(MAX_ELEMENTS).map(element).collect();
         row("mean σ² of training atoms, relative to the start", shown.join(", "));

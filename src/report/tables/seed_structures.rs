@@ -20,7 +20,7 @@ pub fn seed_structures(data: &ReportData) -> Table {
         "accepted",
         "covered",
         "duplicate",
-        "guard",
+        "too close",
         "budget",
         "backlog",
         "control frames",
@@ -39,7 +39,7 @@ pub fn seed_structures(data: &ReportData) -> Table {
         let control = data.collections.control.labels.get(&seed.index).copied().unwrap_or_default();
         let of_seed = |walk: &&WalkStatus| walk.seed_structure == seed.name && walk.origin == "biased";
         let (walks, ended) = states(data.status.walks.iter().filter(of_seed));
-        let names = ["accepted", "covered", "duplicate", "guard", "budget", "backlog"];
+        let names = ["accepted", "covered", "duplicate", "too_close", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
         row.push(count(names.iter().map(|name| fate(name)).sum()));
         row.extend(names.map(|name| count(fate(name))));

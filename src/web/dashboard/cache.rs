@@ -46,7 +46,7 @@ impl CachedResponse {
         }
         match &self.state().computed {
             Some(computed) => computed.found.clone().map(json_text),
-            None => Ok((StatusCode::ACCEPTED, json_text(r#"{"reckoning":true}"#)).into_response()),
+            None => Ok((StatusCode::ACCEPTED, json_text(r#"{"computing":true}"#)).into_response()),
         }
     }
 

@@ -38,7 +38,7 @@ enum Order {
     #[default]
     Decision,
     Gamma,
-    Volume,
+    RelativeVolume,
     /// Order in which the jobs of one state would be labelled.
     Queue,
 }
@@ -150,7 +150,7 @@ impl Query {
                 return store.list_fate(origin, reason, descending, after, limit).await;
             }
             (Order::Gamma, ..) => ListOrder::Gamma,
-            (Order::Volume, ..) => ListOrder::Volume,
+            (Order::RelativeVolume, ..) => ListOrder::Volume,
             (Order::Decision | Order::Queue, ..) => ListOrder::Decision,
         };
         store.list_candidates(order, descending, after, limit).await
@@ -160,7 +160,7 @@ impl Query {
         let value = match self.order {
             Order::Decision => None,
             Order::Gamma => row.gamma,
-            Order::Volume => row.relative_volume,
+            Order::RelativeVolume => row.relative_volume,
             Order::Queue => row.priority.map(f64::from),
         };
         ListCursor { value: value.unwrap_or_default(), decision: row.decision }
@@ -195,7 +195,7 @@ fn properties<'a>(
     StructureProperties {
         gamma: row.gamma,
         gamma_nbr: row.gamma_nbr,
-        volume: row.relative_volume,
+        relative_volume: row.relative_volume,
         kinetic_temperature: row.temperature,
         conditions,
         walk: Some(row.walk),
@@ -205,8 +205,8 @@ fn properties<'a>(
         max_force: row.max_force,
         retry_adjustments: row.retry_adjustments.as_deref(),
         species,
-        kind: &row.origin,
-        seed: Some(&row.seed_structure),
+        origin: &row.origin,
+        seed_structure: Some(&row.seed_structure),
     }
 }
 
@@ -217,10 +217,10 @@ impl FromStr for Order {
         match name {
             "decision" => Ok(Self::Decision),
             "gamma" => Ok(Self::Gamma),
-            "volume" => Ok(Self::Volume),
+            "relative_volume" => Ok(Self::RelativeVolume),
             "queue" => Ok(Self::Queue),
             _ => Err(ApiError::bad_request(format!(
-                "order is '{name}', expected one of decision, gamma, volume, queue"
+                "order is '{name}', expected one of decision, gamma, relative_volume, queue"
             ))),
         }
     }

@@ -12,7 +12,7 @@ export async function fetchJson(path, signal) {
 export async function fetchComputed(path, signal) {
   for (;;) {
     const found = await fetchJson(path, signal);
-    if (!found.reckoning) return found;
+    if (!found.computing) return found;
     await new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL));
     signal?.throwIfAborted();
   }

@@ -3,7 +3,7 @@
 import { buttons } from "./actions.js";
 import { candidatePath, fetchJson } from "./api.js";
 import { DASHES, LINES } from "./colours.js";
-import { element, facts, section, state, table } from "./dom.js";
+import { element, facts, section, state, table, words } from "./dom.js";
 import { decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
 import { plot } from "./plot.js";
 import { view } from "./structure.js";
@@ -85,7 +85,7 @@ function decided(decision) {
   const list = facts([
     ["number", whole(decision.number)],
     ["round", decision.round > 0 ? whole(decision.round) : null],
-    ["decision", decision.reason ? `${decision.kind}: ${decision.reason}` : decision.kind],
+    ["decision", decision.reason ? `${decision.kind}: ${words(decision.reason)}` : decision.kind],
     ["threshold raised", decision.raised_by && `by a factor of ${digits(decision.raised_by)} to ${digits(decision.raised_threshold)}, because of a long label queue`],
     ["mixture afterwards", `version ${whole(decision.mixture_version)}`],
     ["update", update && `${update.combination ?? ""} with α = ${digits(update.alpha)}; ${ENDS[update.ended_by]}`],
@@ -108,7 +108,7 @@ function trace(found, grades, signal) {
     const points = (key) => before.filter((one) => one[key] != null).map((one) => [one.step, one[key]]);
     const marks = (key, shape, k) => ({ name: key === "gamma" ? "original mixture" : "the walker's mixture", shape, colour: LINES[k],
       points: before.filter((one) => one[key] != null).map((one) => [one.step, one[key], `#candidate/${encodeURIComponent(one.id)}`,
-        `step ${one.step}: ${one.fate}`]) });
+        `step ${one.step}: ${words(one.fate)}`]) });
     place.replaceChildren(plot({ title: `Walk ${found.walk}, segment ${found.segment}: earlier candidates`,
       x: { title: "step" }, y: { title: "γ_max", least: 0 },
       lines: [{ colour: LINES[0], points: points("gamma") }, { colour: LINES[1], dash: DASHES[1], points: points("walker_gamma") }],
@@ -148,7 +148,7 @@ function job(found) {
 function attempt(made) {
   const how = made.outcome ?? "running";
   const lasted = made.ended == null ? `since ${time(made.started)}` : `after ${duration(made.ended - made.started)}`;
-  const failed = made.class ? ` (${made.class})` : "";
+  const failed = made.class ? ` (${words(made.class)})` : "";
   const line = `attempt ${made.attempt}: ${how}${failed} ${lasted}, by ${made.holder}`;
   const more = [made.calculation && `calculation ${made.calculation}`, made.remedies && `changed after failures: ${made.remedies}`, made.difference, made.log]
     .filter(Boolean).join("\n");

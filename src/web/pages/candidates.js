@@ -11,7 +11,7 @@ const LENGTH = 50;
 const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
 /** Columns: title, whether it is numeric, and the sort order of its title. */
 const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["γ_max", true, "gamma"],
-  ["γ_nbr", true], ["V/V₀", true, "volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
+  ["γ_nbr", true], ["V/V₀", true, "relative_volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
 
 export function show(content, rest, signal) {
   // The query is part of the address, so that it can be bookmarked and shared.
@@ -67,7 +67,7 @@ async function fetchPage(params, after, signal, onProgress, isStale) {
 
 function filters(params, change) {
   const choice = (label, key, names) => element("label", {}, label, element("select", { onchange: (event) => change({ [key]: event.target.value }) },
-    element("option", { value: "" }, "all"), names.map((name) => element("option", { value: name, selected: params.get(key) === name }, name))));
+    element("option", { value: "" }, "all"), names.map((name) => element("option", { value: name, selected: params.get(key) === name }, words(name)))));
   const where = element("input", { type: "search", size: 34, value: params.get("where") ?? "", placeholder: "gamma > 2 and element = Mo",
     spellcheck: "false", autocomplete: "off" });
   const submit = (event) => {
@@ -77,9 +77,9 @@ function filters(params, change) {
   return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
     choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
     element("details", {}, element("summary", {}, "Syntax"), element("p", {},
-      "gamma, gamma_nbr (original mixture), volume (V/V₀), kinetic_temperature (K), temperature, tau and group of its walk, walk, step, mixture_version (after the decision), atoms, " +
+      "gamma, gamma_nbr (original mixture), relative_volume (V/V₀), kinetic_temperature (K), temperature, tau and group of its walk, walk, step, mixture_version (after the decision), atoms, " +
       "energy (eV), energy_per_atom and max_force (eV/Å) of the label, with = != < <= > >=; " +
-      "element, kind (biased or control), seed with = and !=; and, or, not and parentheses. " +
+      "element, origin (biased or control), seed_structure, retry_adjustment with = and !=; and, or, not and parentheses. " +
       "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
 }
 

@@ -12,7 +12,7 @@ export const FATES = {
   accepted: { colour: "#009e73", shape: "circle" },
   covered: { colour: "#56b4e9", shape: "square" },
   duplicate: { colour: "#b58900", shape: "diamond" },
-  guard: { colour: "#d55e00", shape: "triangle" },
+  too_close: { colour: "#d55e00", shape: "triangle" },
   budget: { colour: "#cc79a7", shape: "cross" },
   backlog: { colour: "#0072b2", shape: "plus" },
   control: { colour: "#8a8f98", shape: "ring" },

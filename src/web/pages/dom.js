@@ -64,7 +64,12 @@ export function renew(place, ...children) {
   (again?.disabled ? place.querySelector(".scrolls") : again)?.focus({ preventScroll: true });
 }
 
+/** A word of the JSON as text. */
+export function words(name) {
+  return name.replaceAll("_", " ");
+}
+
 /** A state with a marker that does not rely on colour. */
 export function state(name) {
-  return element("span", { class: "state", "data-state": name }, name.replaceAll("_", " "));
+  return element("span", { class: "state", "data-state": name }, words(name));
 }

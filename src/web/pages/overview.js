@@ -2,7 +2,7 @@
 
 import { canPause, pauseButton } from "./actions.js";
 import { listen } from "./api.js";
-import { element, facts, renew, section, sentence, state, table } from "./dom.js";
+import { element, facts, renew, section, sentence, state, table, words } from "./dom.js";
 import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
 import { campaignState } from "./campaign_state.js";
@@ -13,7 +13,7 @@ export const TITLE = "Overview";
 const WALKS = 40;
 
 const WALK_COLUMNS = [["walk", true], ["seed structure"], ["origin"], ["state"], ["step", true], ["T", true], ["V/V₀", true],
-  ["γ_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["refused", true]];
+  ["γ_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["rejected", true]];
 
 export function show(content, _, signal) {
   const tiles = element("div", { class: "tiles" });
@@ -49,7 +49,7 @@ function summary(status) {
   const { candidates, labels, walks, mixture_version: version, staleness, training_frames: training } = status;
   const underWay = walks.filter(isUnderWay).length;
   const declined = Object.entries(candidates.declined).filter(([, count]) => count > 0)
-    .map(([reason, count]) => `${whole(count)} ${reason}`).join(", ");
+    .map(([reason, count]) => `${whole(count)} ${words(reason)}`).join(", ");
   const how = campaignState(status);
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
@@ -65,7 +65,7 @@ function summary(status) {
       `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${
         labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
       labels.lower_states > 0 && `lower states known of ${whole(labels.lower_states)} structures (calmwalk lower-states)`,
-      `${whole(status.labels_last_hour)} in the last hour`),
+      `${whole(status.labels_last_hour)} made in the last hour`),
     tile("Mixture", `version ${whole(version)}`,
       training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
       ...(training?.elements ?? []).toSorted((a, b) => b.mean_square_growth - a.mean_square_growth).map((of) => `${of.element}: mean σ² of training atoms × ${of.mean_square_growth.toFixed(2)}`).slice(0, 4),
@@ -103,7 +103,7 @@ function queue(status) {
   ]);
   if (failures.length === 0) return list;
   const columns = [["class of failure"], ["failed", true], ["labelled later", true], ["unfinished", true]];
-  const rows = failures.map((failure) => [failure.class, whole(failure.failed), whole(failure.labelled), whole(failure.unfinished)]);
+  const rows = failures.map((failure) => [words(failure.class), whole(failure.failed), whole(failure.labelled), whole(failure.unfinished)]);
   return element("div", {}, list, table("Label failures by class", columns, rows));
 }
 
@@ -135,7 +135,7 @@ function walks({ walks: all, led }, changed) {
   const rows = order.slice(0, WALKS).map((walk) => [
     whole(walk.walk), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : !led && walk.state === "running" ? "stopped" : walk.state), walk.reason && ` ${walk.reason}`),
     whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
-    digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.refused), ...(changed ? [button(walk) || ""] : [])]);
+    digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.rejected), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;
   const [going, paused] = [all.filter((walk) => isUnderWay(walk) && !walk.paused), all.filter((walk) => walk.paused)];
   return element("div", {},

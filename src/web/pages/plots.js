@@ -65,8 +65,8 @@ function axisOfTime(span) {
 function newestCandidates(newest) {
   const fate = (candidate) => (candidate.origin === "control" ? "control" : candidate.fate);
   const point = (candidate) => [candidate.relative_volume, candidate.gamma, `#candidate/${encodeURIComponent(candidate.id)}`,
-    `${shortName(candidate.id)}: ${fate(candidate)}`];
-  const marks = Object.entries(FATES).map(([name, look]) => ({ name, ...look,
+    `${shortName(candidate.id)}: ${words(fate(candidate))}`];
+  const marks = Object.entries(FATES).map(([name, look]) => ({ name: words(name), ...look,
     points: newest.filter((one) => fate(one) === name && one.gamma != null && one.relative_volume != null).map(point) }));
   return plot({ title: `Grade and volume of the newest ${NEWEST} candidates`, x: { title: "V/V₀" },
     y: { title: "γ_max (original mixture)", least: 0 }, marks: marks.filter((kind) => kind.points.length > 0) });

@@ -69,7 +69,11 @@ impl Store {
         }
         if filter.imported {
             let imports: Vec<(i64, i64)> = query(IMPORTS).fetch_all(&mut transaction).await?;
-            let only = |structure: &i64| labelled.contains(structure) && !of_candidates.contains(structure);
+            let only = |structure: &i64| {
+                labelled.contains(structure)
+                    && !of_candidates.contains(structure)
+                    && !dropped.contains(structure)
+            };
             let imports = imports.into_iter().filter(|(_, structure)| only(structure));
             places.extend(imports.map(|(number, _)| ExportCursor::Import(number)));
         }

@@ -49,8 +49,9 @@ const LOSSES: [Rule; 7] = [
     },
     Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM import
-                WHERE NOT EXISTS (SELECT 1 FROM label WHERE label.structure = import.structure)",
-        what: "imported structures without any label",
+                WHERE NOT EXISTS (SELECT 1 FROM label WHERE label.structure = import.structure)
+                AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = import.structure)",
+        what: "imported structures without any label or label job",
         then: LOST,
     },
     Rule {
@@ -77,7 +78,15 @@ const LOSSES: [Rule; 7] = [
 ];
 
 /// Everything else.
-const RULES: [Rule; 10] = [
+const RULES: [Rule; 11] = [
+    Rule {
+        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job
+                WHERE NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.decision = job.decision)
+                AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = job.structure
+                                AND job.decision = 1099511627776 + import.number)",
+        what: "label jobs of neither a candidate nor an imported structure",
+        then: QUEUE,
+    },
     Rule {
         finds: "SELECT count(*), min(id) FROM candidate JOIN decision ON sequence = decision
                 WHERE candidate.id IS DISTINCT FROM decision.candidate OR kind <>

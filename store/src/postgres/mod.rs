@@ -41,7 +41,7 @@ const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 pub const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The migrations in order.
-pub(crate) static STEPS: [Step; 11] = [
+pub(crate) static STEPS: [Step; 12] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -53,6 +53,7 @@ pub(crate) static STEPS: [Step; 11] = [
     (10, "exclude", include_str!("../../migrations/postgres/0010_exclude.sql")),
     (11, "walk conditions", include_str!("../../migrations/postgres/0011_walk_conditions.sql")),
     (12, "lower states", include_str!("../../migrations/postgres/0012_lower_states.sql")),
+    (13, "queued imports", include_str!("../../migrations/postgres/0013_queued_imports.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

@@ -32,7 +32,7 @@ const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` after the newest migration.
-const SCHEMA: i64 = 12;
+const SCHEMA: i64 = 13;
 /// The first version whose rows have checksums.
 const FIRST_WITH_CHECKSUMS: i64 = 9;
 /// How long to wait for another connection that holds the database.
@@ -52,7 +52,7 @@ const PAGE_SIZE: u32 = 1 << 14;
 const WAL_PAGES: u32 = 1 << 12;
 
 /// The migrations in order.
-pub(crate) static STEPS: [Step; 12] = [
+pub(crate) static STEPS: [Step; 13] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
@@ -65,6 +65,7 @@ pub(crate) static STEPS: [Step; 12] = [
     (10, "exclude", include_str!("../../migrations/sqlite/0010_exclude.sql")),
     (11, "walk conditions", include_str!("../../migrations/sqlite/0011_walk_conditions.sql")),
     (12, "lower states", include_str!("../../migrations/sqlite/0012_lower_states.sql")),
+    (13, "queued imports", include_str!("../../migrations/sqlite/0013_queued_imports.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

@@ -47,6 +47,8 @@ pub(crate) const IMPORTS: &str = concat!(
     CROSS JOIN structure ON structure.number = import.structure
     WHERE import.number > $2
     AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.structure = import.structure)
+    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = import.structure AND job.protocol = $1
+                    AND state = 'dropped')
     ORDER BY import.number LIMIT $3"
 );
 

@@ -30,9 +30,9 @@ const WAITING: &str = "SELECT seed_structure, formula, atoms, CAST(sum(number) A
     HAVING sum(number) > 0";
 
 /// The same, counted, for tables of an earlier version.
-const COUNTED_WAITING: &str = "SELECT seed_structure, formula, atoms, count(*)
+const COUNTED_WAITING: &str = "SELECT seed_structure, candidate.formula, candidate.atoms, count(*)
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
-    WHERE job.state IN ('queued', 'leased') AND job.protocol = $1 GROUP BY seed_structure, formula, atoms";
+    WHERE job.state IN ('queued', 'leased') AND job.protocol = $1 GROUP BY seed_structure, candidate.formula, candidate.atoms";
 
 pub(crate) const OLDEST_LEASE: &str = "SELECT job, holder, started FROM attempt WHERE outcome IS NULL
     ORDER BY started, job LIMIT 1";
@@ -41,8 +41,10 @@ pub(crate) const LABELS_SINCE: &str = "SELECT count(*) FROM label WHERE job IS N
 
 /// Compares the stored counts with the rows.
 pub(crate) const WRONG: &str = "SELECT count(*), min(coalesce(found.state, kept.state))
-    FROM (SELECT protocol, state, seed_structure, formula, atoms, count(*) AS number
-          FROM job JOIN candidate ON candidate.decision = job.decision GROUP BY 1, 2, 3, 4, 5) AS found
+    FROM (SELECT protocol, state, coalesce(seed_structure, 4294967295) AS seed_structure, structure.formula AS formula,
+              structure.atoms AS atoms, count(*) AS number
+          FROM job JOIN structure ON structure.number = job.structure
+          LEFT JOIN candidate ON candidate.decision = job.decision GROUP BY 1, 2, 3, 4, 5) AS found
     FULL JOIN job_count AS kept ON kept.protocol = found.protocol AND kept.state = found.state
         AND kept.seed_structure = found.seed_structure AND kept.formula = found.formula AND kept.atoms = found.atoms
     WHERE coalesce(found.number, 0) <> coalesce(kept.number, 0)";

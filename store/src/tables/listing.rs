@@ -8,6 +8,7 @@ use crate::database::{FromRow, Row, query};
 use crate::error::Result;
 use crate::listing::{ListCursor, ListOrder, ListedCandidate};
 use crate::records::{JobState, Label};
+use crate::words;
 
 impl FromRow for ListedCandidate {
     fn from_row(row: &Row) -> Result<Self> {
@@ -21,7 +22,7 @@ impl FromRow for ListedCandidate {
             decision: row.get("candidate__decision")?,
             id: row.get("candidate__id")?,
             origin: row.get("candidate__origin")?,
-            fate: reason.map_or_else(|| row.get("candidate__fate"), Ok)?,
+            fate: words::shown(&reason.map_or_else(|| row.get("candidate__fate"), Ok)?).to_owned(),
             walk: row.get("candidate__walk")?,
             segment: row.get("candidate__segment")?,
             step: row.get("candidate__step")?,
@@ -110,10 +111,11 @@ pub(crate) const SMALLEST_VOLUME: &str =
 /// Candidates of a walk, ordered by name.
 pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2");
 
-/// The index gives the jobs; only those of the page are read.
+/// The index gives the jobs; only those of the page are read. Jobs of imported structures, whose numbers are above all
+/// decisions, are left out.
 pub(crate) const QUEUE: &str = lines!(
     "FROM (SELECT number AS place FROM job WHERE state = $1 AND priority <= $2
-              AND (priority < $2 OR decision > $3) ORDER BY priority DESC, decision LIMIT $4) AS page
+              AND (priority < $2 OR decision > $3) AND decision < 1099511627776 ORDER BY priority DESC, decision LIMIT $4) AS page
         CROSS JOIN job ON job.number = place
         CROSS JOIN candidate ON candidate.decision = job.decision
         CROSS JOIN decision ON sequence = candidate.decision
@@ -144,7 +146,7 @@ impl Store {
         query.bind(decision).bind(limit).fetch_all(&self.database).await
     }
 
-    /// The same in decision order, for one origin and fate. `reason` belongs to `declined`.
+    /// The same in decision order, for one origin and fate. `reason` belongs to `declined`, as views show it.
     pub async fn list_fate(
         &self,
         origin: &str,
@@ -156,7 +158,7 @@ impl Store {
         let fate = if reason.is_some() { "declined" } else { "accepted" };
         let query = query(if descending { NEWEST_OF_FATE } else { OLDEST_OF_FATE });
         let query = query.bind(after.unwrap_or(first(descending).decision)).bind(origin).bind(fate);
-        query.bind(reason).bind(limit).fetch_all(&self.database).await
+        query.bind(reason.map(words::stored)).bind(limit).fetch_all(&self.database).await
     }
 
     /// Candidates whose jobs have a state, in the order in which they would be leased. `after` holds priority and

@@ -70,7 +70,7 @@ impl FromRow for Near {
 impl Store {
     /// Features of the leased structure, [n × D], and features of labelled structures under the same protocol with
     /// the same atoms in the same order, among the `limit` nearest in energy. `None` if its own features were not
-    /// stored.
+    /// stored, as those of imported structures.
     pub async fn near_duplicates(
         &self,
         lease: &Lease,
@@ -78,7 +78,8 @@ impl Store {
     ) -> Result<Option<(Vec<f64>, Vec<NearDuplicate>)>> {
         let mut transaction = self.database.begin_read().await?;
         let protocol = super::protocols::protocol_id(&mut transaction, lease.protocol).await?;
-        let own: Own = query(OWN).bind(lease.job).fetch_one(&mut transaction).await?;
+        let own: Option<Own> = query(OWN).bind(lease.job).fetch_optional(&mut transaction).await?;
+        let Some(own) = own else { return Ok(None) };
         let (Some(energy), Some(features)) = (own.energy, own.features) else { return Ok(None) };
         let near = query(NEAR).bind(own.formula).bind(own.decision).bind(energy).bind(protocol).bind(limit);
         let near: Vec<Near> = near.fetch_all(&mut transaction).await?;

@@ -9,6 +9,7 @@ use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
 use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
+use crate::words;
 
 /// The newest first: the cost of labels may change with the machine.
 pub(crate) const COSTS: &str =
@@ -123,8 +124,12 @@ impl Store {
         let rows: Vec<(String, u64, u64, u64)> =
             query(FAILURE_CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
-        let count =
-            |(class, labelled, failed, unfinished)| FailureCount { class, labelled, failed, unfinished };
+        let count = |(class, labelled, failed, unfinished): (String, u64, u64, u64)| FailureCount {
+            class: words::shown(&class).to_owned(),
+            labelled,
+            failed,
+            unfinished,
+        };
         Ok(rows.into_iter().map(count).collect())
     }
 
@@ -212,7 +217,7 @@ impl FromRow for FinishedCandidate {
             gamma: row.get("candidate__original_gamma")?,
             gamma_nbr: row.get("candidate__original_gamma_nbr")?,
             relative_volume: row.get("candidate__relative_volume")?,
-            class: row.get("class")?,
+            class: row.get::<Option<String>>("class")?.map(|class| words::shown(&class).to_owned()),
             unlabelled,
         })
     }

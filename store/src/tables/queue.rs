@@ -88,7 +88,7 @@ impl Store {
         let sql = "INSERT INTO attempt (job, attempt, holder, started) VALUES ($1, $2, $3, $4)";
         let insert = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
         insert.execute(&mut transaction).await?;
-        let (candidate, model_energy) = candidate_of(&mut transaction, next.decision).await?;
+        let (candidate, model_energy) = candidate_of(&mut transaction, &next).await?;
         let lease = Lease {
             job,
             attempt,
@@ -368,8 +368,11 @@ async fn structure_of(transaction: &mut Transaction, number: i64) -> Result<Stru
     read_structure(found.first().ok_or_else(missing)?)
 }
 
-/// Name and energy by the potential.
-async fn candidate_of(transaction: &mut Transaction, decision: i64) -> Result<(String, Option<f64>)> {
-    let candidate = query("SELECT id, energy FROM candidate WHERE decision = $1").bind(decision);
-    candidate.fetch_one(&mut *transaction).await
+/// Name of the structure, and energy by the potential, which imported structures do not have.
+async fn candidate_of(transaction: &mut Transaction, next: &NextJob) -> Result<(String, Option<f64>)> {
+    let candidate = query("SELECT id, energy FROM candidate WHERE decision = $1").bind(next.decision);
+    match candidate.fetch_optional(&mut *transaction).await? {
+        Some(found) => Ok(found),
+        None => Ok((super::structures::name(transaction, next.structure).await?, None)),
+    }
 }

@@ -1,5 +1,6 @@
 //! Manual changes of the label queue. Each adds an entry to the operations log.
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
@@ -10,7 +11,7 @@ use super::job_counts;
 use super::labels::LabelRow;
 use super::logs::insert_operation;
 use crate::Store;
-use crate::checksum::{CANDIDATE, Names, joined};
+use crate::checksum::{CANDIDATE, Names, STRUCTURE, joined};
 use crate::database::{self, FromRow, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::jobs::{Attempt, Job, JobDetails};
@@ -39,6 +40,19 @@ pub(crate) const LIST: &str = concat!(
     ORDER BY job.priority DESC, job.decision"
 );
 
+/// The imported structures of the same page.
+pub(crate) const LIST_IMPORTS: &str = concat!(
+    "SELECT job.*, import.number AS import, protocol.name, ",
+    joined!(structure),
+    "
+    FROM (SELECT number AS place FROM job WHERE state = $1
+          ORDER BY priority DESC, decision LIMIT $2 OFFSET $3) AS page
+    CROSS JOIN job ON job.number = place CROSS JOIN import ON import.structure = job.structure
+        AND job.decision = 1099511627776 + import.number
+    CROSS JOIN structure ON structure.number = job.structure
+    CROSS JOIN protocol ON protocol.number = job.protocol"
+);
+
 /// The order in which jobs of all states are listed: leased, queued, failed, dropped, finished.
 const STATES: [JobState; 6] = [
     JobState::Leased,
@@ -59,6 +73,19 @@ const SHOW: &str = concat!(
     WHERE job.number = $1"
 );
 
+const SHOW_IMPORT: &str = concat!(
+    "SELECT job.*, import.number AS import, protocol.name, ",
+    joined!(structure),
+    "
+    FROM job CROSS JOIN import ON import.structure = job.structure AND job.decision = 1099511627776 + import.number
+    CROSS JOIN structure ON structure.number = job.structure
+    CROSS JOIN protocol ON protocol.number = job.protocol
+    WHERE job.number = $1"
+);
+
+/// The newest job of an imported structure.
+const FIND_IMPORT: &str = "SELECT coalesce(max(number), 0) FROM job WHERE decision = 1099511627776 + $1";
+
 /// Candidates whose names share a prefix, with the newest job of their structure.
 pub(crate) const FIND: &str = "SELECT id, max(job.number) FROM candidate
     CROSS JOIN job ON job.structure = candidate.structure
@@ -67,6 +94,7 @@ pub(crate) const FIND: &str = "SELECT id, max(job.number) FROM candidate
 struct Row {
     number: i64,
     structure: i64,
+    decision: i64,
     id: String,
     name: String,
     state: String,
@@ -95,6 +123,7 @@ impl FromRow for Row {
         Ok(Self {
             number: row.get("number")?,
             structure: row.get("structure")?,
+            decision: row.get("decision")?,
             id: row.get("candidate__id")?,
             name: row.get("name")?,
             state: row.get("state")?,
@@ -119,6 +148,40 @@ impl FromRow for Row {
     }
 }
 
+/// A job of an imported structure.
+struct ImportRow(Row);
+
+impl FromRow for ImportRow {
+    fn from_row(row: &database::Row) -> Result<Self> {
+        STRUCTURE.verify(row, Names::Joined)?;
+        Ok(Self(Row {
+            number: row.get("number")?,
+            structure: row.get("structure")?,
+            decision: row.get("decision")?,
+            id: format!("import-{}", row.get::<i64>("import")?),
+            name: row.get("name")?,
+            state: row.get("state")?,
+            priority: row.get("priority")?,
+            holder: row.get("holder")?,
+            expires: row.get("expires")?,
+            attempts: row.get("attempts")?,
+            failures: row.get("failures")?,
+            atoms: row.get("structure__atoms")?,
+            formula: row.get("structure__formula")?,
+            original_gamma: None,
+            original_gamma_nbr: None,
+            origin: "imported".to_owned(),
+            seed_name: String::new(),
+            walk: 0,
+            step: 0,
+            temperature: None,
+            relative_volume: None,
+            overruled: row.get_or_default::<Option<i64>>("overruled")?.is_some(),
+            relabel: row.get_or_default("relabel")?,
+        }))
+    }
+}
+
 impl Store {
     /// Jobs in a state, in the order in which they would be leased: by priority, then in decision order. Without a
     /// state, all jobs: leased first, then queued, failed, dropped and finished ones.
@@ -132,8 +195,11 @@ impl Store {
         for state in STATES.into_iter().filter(|listed| state.is_none_or(|state| state == *listed)) {
             let (room, there) = (u64::from(limit) - jobs.len() as u64, number(state));
             if room > 0 && skipped < there {
-                let rows = query(LIST).bind(state.name()).bind(room as i64).bind(skipped as i64);
-                let rows: Vec<Row> = rows.fetch_all(&mut transaction).await?;
+                let page = |sql| query(sql).bind(state.name()).bind(room as i64).bind(skipped as i64);
+                let mut rows: Vec<Row> = page(LIST).fetch_all(&mut transaction).await?;
+                let imports: Vec<ImportRow> = page(LIST_IMPORTS).fetch_all(&mut transaction).await?;
+                rows.extend(imports.into_iter().map(|ImportRow(row)| row));
+                rows.sort_by_key(|row| (Reverse(row.priority), row.decision));
                 let rows = rows.into_iter().map(|row| row.into_job(&excluded));
                 jobs.extend(rows.collect::<Result<Vec<_>>>()?);
             }
@@ -143,14 +209,17 @@ impl Store {
         Ok(jobs)
     }
 
-    /// Finds a job by its candidate's name or a prefix of it. The campaign's part of the name may be omitted.
+    /// Finds a job by its candidate's name or a prefix of it, or by the name of an imported structure. The campaign's part of the name may be omitted.
     pub async fn queue_show(&self, id: &str) -> Result<JobDetails> {
         let (job, _) = self.find(id).await?;
         self.job_details(job).await
     }
 
     pub(super) async fn job_details(&self, job: i64) -> Result<JobDetails> {
-        let row: Row = query(SHOW).bind(job).fetch_one(&self.database).await?;
+        let row = match query(SHOW).bind(job).fetch_optional(&self.database).await? {
+            Some(row) => row,
+            None => query(SHOW_IMPORT).bind(job).fetch_one::<ImportRow>(&self.database).await?.0,
+        };
         let attempts = query("SELECT * FROM attempt WHERE job = $1 ORDER BY attempt").bind(job);
         let attempts: Vec<Attempt> = attempts.fetch_all(&self.database).await?;
         let sql = "SELECT * FROM label WHERE structure = $1
@@ -223,6 +292,11 @@ impl Store {
 
     /// Job id, and full name of the candidate.
     async fn find(&self, id: &str) -> Result<(i64, String)> {
+        if let Some(number) = id.strip_prefix("import-").and_then(|number| number.parse::<i64>().ok()) {
+            let job: i64 = query(FIND_IMPORT).bind(number).fetch_one(&self.database).await?;
+            let unknown = || StoreError::UnknownJob { id: id.into(), near: Vec::new() };
+            return (job > 0).then(|| (job, id.to_owned())).ok_or_else(unknown);
+        }
         let campaign = self.campaign_value("id").await?;
         let campaign = campaign.get(..8).unwrap_or_default();
         let mut found = self.jobs_with_prefix(id).await?;

@@ -10,6 +10,7 @@ use crate::database::{FromRow, Row, query};
 use crate::error::Result;
 use crate::records::JobState;
 use crate::report::{CollectedStructure, FateCount};
+use crate::words;
 
 const COLLECTED: &str = concat!(
     "SELECT candidate.decision AS decision, original_checksum, block, original_grades, state AS job_state, ",
@@ -87,6 +88,10 @@ impl FromRow for CollectedStructure {
 
 impl FromRow for FateCount {
     fn from_row(row: &Row) -> Result<Self> {
-        Ok(Self { part: row.get("part")?, fate: row.get("fate")?, number: row.get("number")? })
+        Ok(Self {
+            part: row.get("part")?,
+            fate: words::shown(&row.get::<String>("fate")?).to_owned(),
+            number: row.get("number")?,
+        })
     }
 }

@@ -162,6 +162,15 @@ impl Store {
         Ok(NewestMixture { decision, version, components })
     }
 
+    /// The first decision with this version of the mixture after it, `None` if there is none.
+    pub async fn first_decision_of(&self, version: u64) -> Result<Option<i64>> {
+        let sql = "SELECT * FROM decision WHERE mixture_version = $1 ORDER BY sequence LIMIT 1";
+        let rows = query(sql).bind(version as i64).rows(&self.database).await?;
+        let Some(row) = rows.first() else { return Ok(None) };
+        DECISION.verify(row, Names::Plain)?;
+        Ok(Some(row.get("sequence")?))
+    }
+
     /// At most `limit` complete candidates after decision `after`, in decision order; those of control walks only
     /// if `control` is set.
     pub async fn candidates(&self, after: i64, control: bool, limit: u32) -> Result<Vec<StoredCandidate>> {

@@ -64,8 +64,8 @@ impl Store {
         for walk in &mut walks {
             walk.conditions = conditions.remove(&WalkId(walk.walk));
         }
-        let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
-        let refused: u64 = refused.fetch_one(&mut transaction).await?;
+        let rejected = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
+        let rejected: u64 = rejected.fetch_one(&mut transaction).await?;
         let sql = "SELECT mixture_version, round FROM decision ORDER BY sequence DESC LIMIT 1";
         let last: Option<(u64, u64)> = query(sql).fetch_optional(&mut transaction).await?;
         let (mixture_version, round) = last.unwrap_or_default();
@@ -89,7 +89,7 @@ impl Store {
         }
         let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.forbids_attempts(&used));
         Ok(Status {
-            candidates: candidates(&fates, refused),
+            candidates: candidates(&fates, rejected),
             imported,
             led,
             mixture_version,
@@ -140,8 +140,8 @@ fn used_up(time: Option<&'static str>, walks: &[WalkStatus]) -> Option<String> {
     time.map(str::to_owned).or_else(ended)
 }
 
-fn candidates(fates: &[(String, String, u64)], refused_by_walkers: u64) -> Candidates {
-    let mut candidates = Candidates { refused_by_walkers, ..Candidates::default() };
+fn candidates(fates: &[(String, String, u64)], rejected_by_guards: u64) -> Candidates {
+    let mut candidates = Candidates { rejected_by_guards, ..Candidates::default() };
     for (origin, fate, count) in fates {
         if origin == "control" {
             candidates.control += count;
@@ -153,7 +153,7 @@ fn candidates(fates: &[(String, String, u64)], refused_by_walkers: u64) -> Candi
             "accepted" => candidates.accepted += count,
             "covered" => declined.covered += count,
             "duplicate" => declined.duplicate += count,
-            "guard" => declined.guard += count,
+            "guard" => declined.too_close += count,
             "budget" => declined.budget += count,
             "backlog" => declined.backlog += count,
             _ => {}

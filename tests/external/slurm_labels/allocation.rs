@@ -22,7 +22,7 @@ fn submit(jobs: &Jobs) {
 
 /// The tasks of a step are not children of `srun`: who only kills that leaves them behind.
 #[test]
-fn a_step_ends_with_its_keeper_and_its_label_is_made_again() {
+fn a_step_ends_with_its_runner_and_its_label_is_made_again() {
     let jobs = Jobs::calling(r#"["srun", "--ntasks=1", "--overlap", "sh", "label.sh"]"#, "");
     let scratch = jobs.home.path().canonicalize().unwrap().join("scratch");
     let run = jobs.place.run();

@@ -49,7 +49,9 @@ fn a_label_outlives_the_daemon_of_its_node() {
     begun.dedup();
     assert!(labels > 2 && begun.len() == labels && jobs.begun().len() == labels, "{}", jobs.place.said());
     assert!(
-        jobs.attempts().iter().all(|attempt| attempt["class"].is_null() || attempt["class"] == "lost_node")
+        jobs.attempts()
+            .iter()
+            .all(|attempt| attempt["class"].is_null() || attempt["class"] == "node_failure")
     );
     assert_no_leftovers(&jobs, &scratch);
 }
@@ -79,6 +81,6 @@ fn a_label_whose_node_dies_is_made_again_once() {
     jobs.go();
     let labels = jobs.finish(run, label);
     assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
-    only(&jobs, "lost_node");
+    only(&jobs, "node_failure");
     assert_no_leftovers(&jobs, &scratch);
 }

@@ -27,7 +27,7 @@ fn a_job_that_is_cancelled_is_lost_and_tried_again() {
     jobs.go();
     let labels = jobs.finish(run, label);
     once_each(&jobs, labels + 1);
-    let lost = only(&jobs, "lost_node");
+    let lost = only(&jobs, "node_failure");
     assert!(lost["log"].as_str().unwrap().contains("is CANCELLED"), "{lost}");
     // Whoever has ended it did not mean the node.
     assert!(!lost["calculation"].as_str().unwrap().contains("\"node\""), "{lost}");
@@ -41,7 +41,7 @@ fn a_job_whose_time_is_over_gets_twice_as_much() {
     wait_until("a job is at work", || jobs.begun().len() == 1);
     end_its_time(&jobs.jobs()[0][0]);
     wait_until("it is begun again", || jobs.begun().len() == 2);
-    // A minute more than the keeper gives it.
+    // A minute more than the runner gives it.
     let times: Vec<_> = jobs.told("%j|%l|%r").into_iter().skip(1).map(|[_, limit, _]| limit).collect();
     assert_eq!(times, ["21:00"]);
     jobs.go();
@@ -84,7 +84,7 @@ fn a_job_whose_node_is_lost_goes_to_another() {
     jobs.go();
     let labels = jobs.finish(run, label);
     once_each(&jobs, labels + 1);
-    let attempt = only(&jobs, "lost_node");
+    let attempt = only(&jobs, "node_failure");
     assert!(attempt["log"].as_str().unwrap().contains(&format!("is NODE_FAIL on {lost}")), "{attempt}");
 }
 
@@ -100,7 +100,7 @@ fn where_there_is_no_other_node_it_goes_to_the_same() {
     jobs.go();
     let labels = jobs.finish(run, label);
     once_each(&jobs, labels + 1);
-    only(&jobs, "lost_node");
+    only(&jobs, "node_failure");
     assert!(!jobs.place.said().contains("label.scratch"), "{}", jobs.place.said());
 }
 
@@ -139,5 +139,5 @@ fn a_job_that_slurm_loses_in_its_midst_is_made_again_once() {
     jobs.go();
     let labels = jobs.finish(run, label);
     assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
-    only(&jobs, "lost_node");
+    only(&jobs, "node_failure");
 }

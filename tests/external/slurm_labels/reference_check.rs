@@ -15,7 +15,7 @@ const KNOWN: usize = 2;
 
 /// A campaign with a check of the seed structures, whose known labels are those that jobs make.
 fn checked() -> Jobs {
-    let jobs = Jobs::with("check = { structures = \"known.extxyz\" }", "--comment=check");
+    let jobs = Jobs::with("reference_check = { structures = \"known.extxyz\" }", "--comment=check");
     let mut frames = atoms::read_extxyz(&jobs.place.path().join("seeds.extxyz")).unwrap();
     for frame in &mut frames {
         let forces = Some(vec![[0.25, 0.0, 0.0]; frame.structure.len()]);

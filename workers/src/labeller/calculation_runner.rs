@@ -42,16 +42,9 @@ const NOT_STARTED: &str = "not-started";
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) enum RunnerRequest {
     /// Run a calculation.
-    #[serde(rename = "Keep")]
     Run(Calculation),
     /// Execute its program.
-    #[serde(rename = "Become")]
-    Exec {
-        #[serde(rename = "keeper")]
-        runner: u32,
-        directory: PathBuf,
-        command: Vec<String>,
-    },
+    Exec { runner: u32, directory: PathBuf, command: Vec<String> },
 }
 
 /// A calculation and its limits.
@@ -68,7 +61,6 @@ pub(super) struct Calculation {
     /// Maximum memory of all its processes together, bytes.
     pub memory_limit: Option<u64>,
     /// How to start a runner.
-    #[serde(rename = "keeper")]
     pub runner: RunnerCommand,
 }
 

@@ -1,4 +1,4 @@
-//! Guards that refuse a structure before any cost is spent on its label.
+//! Guards that reject a structure before any cost is spent on its label.
 
 mod bonds;
 #[cfg(test)]
@@ -18,8 +18,8 @@ use store::{Store, StoreError};
 /// next label on.
 pub const GUARD: &str = "label_guard";
 
-/// Failure class of an attempt that a guard refused.
-pub(super) const REFUSED: &str = "refused";
+/// Failure class of an attempt that a guard rejected.
+pub(super) const REJECTED: &str = "refused";
 
 /// Number of structures whose features are compared: those nearest in energy.
 const MAX_COMPARED: u32 = 32;
@@ -56,7 +56,7 @@ pub struct LabelGuard {
     pub max_volume_per_atom: Option<f64>,
     /// Maximum number of atoms.
     pub max_atoms: Option<u32>,
-    /// Refuses a structure if the features of each atom differ from those of a labelled structure by less than this
+    /// Rejects a structure if the features of each atom differ from those of a labelled structure by less than this
     /// fraction of their norm.
     #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
     pub duplicate_tolerance: Option<f64>,
@@ -93,18 +93,18 @@ impl LabelGuard {
         numbers.into_iter().find_map(wrong)
     }
 
-    /// Why the structure itself is refused; `None` if it may be labelled.
-    pub fn refuses(&self, structure: &Structure) -> Option<String> {
+    /// Why the structure itself is rejected; `None` if it may be labelled.
+    pub fn rejects(&self, structure: &Structure) -> Option<String> {
         let atoms = structure.len();
         if let Some(most) = self.max_atoms.filter(|most| atoms > *most as usize) {
             return Some(format!("{atoms} atoms, where label.guard.max_atoms is {most}"));
         }
-        self.refuses_shape(structure)
-            .or_else(|| self.refuses_volume(structure))
+        self.rejects_shape(structure)
+            .or_else(|| self.rejects_volume(structure))
             .or_else(|| bonds::too_short(structure, &self.min_bond_lengths))
     }
 
-    fn refuses_shape(&self, structure: &Structure) -> Option<String> {
+    fn rejects_shape(&self, structure: &Structure) -> Option<String> {
         let cell = structure.cell.completed(structure.periodic);
         let directions: Vec<_> = (0..3).filter(|k| structure.periodic[*k]).collect();
         let heights = cell.heights();
@@ -133,7 +133,7 @@ impl LabelGuard {
     }
 
     /// Applies to cells that are periodic in all three directions.
-    fn refuses_volume(&self, structure: &Structure) -> Option<String> {
+    fn rejects_volume(&self, structure: &Structure) -> Option<String> {
         if structure.periodic != [true; 3] {
             return None;
         }
@@ -148,8 +148,8 @@ impl LabelGuard {
     }
 }
 
-/// Why the campaign's guard refuses a leased job; `None` if it does not, or if the user has overruled it.
-pub(super) async fn refusal(
+/// Why the campaign's guard rejects a leased job; `None` if it does not, or if the user has overruled it.
+pub(super) async fn rejection(
     store: &Store,
     lease: &Lease,
     size: dft::Size,
@@ -159,7 +159,7 @@ pub(super) async fn refusal(
     }
     let Some(text) = store.metadata(GUARD).await? else { return Ok(None) };
     let guard: LabelGuard = serde_json::from_str(&text).map_err(damaged)?;
-    if let Some(reason) = guard.refuses(&lease.structure) {
+    if let Some(reason) = guard.rejects(&lease.structure) {
         return Ok(Some(reason));
     }
     if let Some(reason) = too_costly(store, lease, size, &guard).await? {
@@ -203,7 +203,7 @@ async fn too_costly(
         .collect();
     let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
     let size = Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 };
-    // Before the first label the cost is unknown and nothing is refused.
+    // Before the first label the cost is unknown and nothing is rejected.
     let expected = CostModel::fit(&measured, None).and_then(|model| model.predict(&size));
     let too_much = expected.map(|expected| expected.core_seconds).filter(|seconds| *seconds > largest);
     Ok(too_much.map(|seconds| {

@@ -27,7 +27,6 @@ pub(super) struct LocalCalculation {
     pub host: String,
     pub directory: PathBuf,
     pub pid: u32,
-    #[serde(rename = "birth")]
     pub start_time: String,
 }
 

@@ -33,7 +33,7 @@ impl Method {
         Self::with_runner(RunnerCommand::default(), code, execution)
     }
 
-    /// The same with keepers ([`super::run_calculation`]) that are started so.
+    /// The same method, with this command to start calculation runners ([`super::run_calculation`]).
     pub fn with_runner(
         runner: RunnerCommand,
         code: Box<dyn DftBackend>,

@@ -38,7 +38,7 @@ use std::time::{Duration, Instant};
 
 use dft::{Failure, FailureClass, Results};
 use store::records::{Label, LabelDetails, Lease, Protocol};
-use store::{LeaseStatus, Store, StoreError};
+use store::{LeaseStatus, Store, StoreError, words};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
@@ -185,10 +185,10 @@ async fn label_jobs(
         debug!(candidate = lease.candidate, job = lease.job, attempt = lease.attempt, "leased");
         let started = Instant::now();
         let size = method.size(&lease.structure);
-        if let Some(reason) = retry_until_written(stop, || guard::refusal(store, &lease, size)).await? {
-            // Another attempt would be refused as well, whatever was tried before.
-            retry_until_written(stop, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
-            announce(&format!("refused {}: {reason}", lease.candidate));
+        if let Some(reason) = retry_until_written(stop, || guard::rejection(store, &lease, size)).await? {
+            // Another attempt would be rejected as well, whatever was tried before.
+            retry_until_written(stop, || store.fail(&lease, guard::REJECTED, &reason, 1, now())).await?;
+            announce(&format!("{} rejected by label guard: {reason}", lease.candidate));
             continue;
         }
         let attempt = match make_label(store, method, &lease, &settings.timing, stop, &now).await? {
@@ -230,7 +230,12 @@ async fn label_jobs(
         match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
             Err(failure) => {
-                warn!(job = lease.job, attempt = lease.attempt, class = failure.class.name(), "{line}");
+                warn!(
+                    job = lease.job,
+                    attempt = lease.attempt,
+                    class = words::shown(failure.class.name()),
+                    "{line}"
+                );
             }
         }
         tell(&line);

@@ -67,7 +67,7 @@ async fn a_calculation_without_a_runner_is_ended_and_started_again() {
         labeller.ended().await.unwrap();
         assert_eq!((fixture.begun(), fixture.labels().await.len()), (2, 1));
         let attempts = fixture.attempts().await;
-        let class = labeller_lives.then_some("lost_node");
+        let class = labeller_lives.then_some("node_failure");
         assert_eq!(outcomes(&attempts), [("lost", class), ("labelled", None)]);
         assert_eq!(fixture.job().await.job.failures, 0);
         fixture.nothing_is_left();

@@ -206,13 +206,7 @@ impl BuiltMixture {
         let fill = std::iter::repeat_n(UNUSED, unused * dimension);
         let centroids = components().flat_map(|c| c.centroid.iter().map(single));
         file.array(&format!("centroids_{index}"), &[slots, dimension], centroids.chain(fill))?;
-        let empty = (0..unused * dimension * dimension).map(|at| {
-            if at % (dimension * dimension) % (dimension + 1) == 0 {
-                (1.0 / REGULARISATION) as f32
-            } else {
-                0.0
-            }
-        });
+        let empty = (0..unused).flat_map(|_| unused_inverse(dimension));
         let inverses = components().flat_map(|c| c.inverse.iter().map(single));
         file.array(&format!("inv_cov_{index}"), &square, inverses.chain(empty))?;
         let fill = std::iter::repeat_n(0.0_f32, unused * dimension * dimension);
@@ -254,6 +248,12 @@ pub(super) fn schema(projection: &Projection) -> i64 {
 /// Numbers in single precision, as files have them.
 pub(super) fn single(values: &[f64]) -> impl Iterator<Item = f32> {
     values.iter().map(|&value| value as f32)
+}
+
+/// Inverse covariance of an unused slot, I/ε.
+pub(super) fn unused_inverse(dimension: usize) -> impl Iterator<Item = f32> {
+    let diagonal = (1.0 / REGULARISATION) as f32;
+    (0..dimension * dimension).map(move |at| if at % (dimension + 1) == 0 { diagonal } else { 0.0 })
 }
 
 /// The thresholds of every slot; unused ones get those of components without data.

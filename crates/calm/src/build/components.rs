@@ -4,7 +4,9 @@ use super::distances::check;
 use super::error::{BuildError, expect_same};
 use super::moments::{ElementSums, Moments, merge_small};
 use super::settings::check_dimension;
-use crate::linear::{Inverse, REGULARISATION, TRUNCATION, pseudo_inverse_with_spectrum, regularised};
+use crate::linear::{
+    Inverse, LinearError, REGULARISATION, TRUNCATION, pseudo_inverse_with_spectrum, regularised,
+};
 
 /// Smaller eigenvalues of C, relative to the largest, do not count for its rank.
 const RANK_TOLERANCE: f64 = 1e-12;
@@ -67,19 +69,38 @@ fn component(slot: usize, Moments { centroid, sums }: Moments) -> Result<BuiltCo
     let (count, effective_count) = (sums.count, sums.effective_count);
     let divisor = if effective_count > 0.0 { effective_count } else { 1.0 };
     let covariance: Vec<f64> = scatter.iter().map(|value| value / divisor).collect();
+    let Inverted { inverse, condition_number, effective_rank, truncated } =
+        inverted(&covariance, dimension).map_err(|source| BuildError::Linear { slot, source })?;
+    Ok(BuiltComponent {
+        centroid,
+        inverse,
+        scatter,
+        count,
+        effective_count,
+        condition_number,
+        effective_rank,
+        truncated,
+    })
+}
+
+/// A regularised inverse, with what artifacts record of it; [`BuiltComponent`] explains the numbers.
+pub(super) struct Inverted {
+    pub inverse: Vec<f64>,
+    pub condition_number: f64,
+    pub effective_rank: usize,
+    pub truncated: usize,
+}
+
+/// (C + εI)⁺ of a covariance, `[D × D]`.
+pub(super) fn inverted(covariance: &[f64], dimension: usize) -> Result<Inverted, LinearError> {
     let Inverse { matrix, eigenvalues, truncated } =
-        pseudo_inverse_with_spectrum(&regularised(&covariance, dimension), dimension)
-            .map_err(|source| BuildError::Linear { slot, source })?;
+        pseudo_inverse_with_spectrum(&regularised(covariance, dimension), dimension)?;
     let largest = eigenvalues.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
     let smallest = eigenvalues.iter().map(|value| value.abs());
     let smallest = smallest.filter(|value| *value > TRUNCATION * largest);
     let own = |value: &&f64| **value - REGULARISATION > RANK_TOLERANCE * largest;
-    Ok(BuiltComponent {
-        centroid,
+    Ok(Inverted {
         inverse: matrix,
-        scatter,
-        count,
-        effective_count,
         condition_number: largest / smallest.fold(f64::INFINITY, f64::min),
         effective_rank: eigenvalues.iter().filter(own).count(),
         truncated,

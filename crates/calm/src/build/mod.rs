@@ -42,6 +42,7 @@ mod scatter;
 mod settings;
 mod sorter;
 mod thresholds;
+mod updated;
 
 pub use artifact::{BuiltElement, BuiltMixture, read_histograms};
 pub use calibration::CalibrationPass;
@@ -54,11 +55,13 @@ pub use mini_batch::{CandidateClusters, ShardClustering, ShardClusters};
 pub use moments::{ComponentSums, ElementSums};
 pub use partition::{ElementPartition, Partitioner};
 pub use projection::random_projection;
+pub(crate) use random::random_key;
 pub use random::shuffled;
 pub use recalibrate::Recalibration;
 pub use scatter::ScatterPass;
 pub use settings::BuildSettings;
 pub use thresholds::{ThresholdRule, Thresholds};
+pub use updated::{UpdatedMixture, UpdatedMixtureError};
 
 #[cfg(test)]
 mod tests {

@@ -30,6 +30,11 @@ impl Random {
     }
 }
 
+/// A number that looks random, as a function of these words.
+pub(crate) fn random_key(words: &[u64]) -> u64 {
+    mix(Random::new(words).state)
+}
+
 /// The numbers 0 to `count` − 1 in random order (Fisher–Yates), as a function of random seed and shard.
 pub fn shuffled(seed: u64, shard: u64, count: usize) -> Vec<usize> {
     let mut random = Random::new(&[seed, shard, SHUFFLE]);

@@ -4,6 +4,7 @@ mod clustering;
 mod golden;
 mod passes;
 mod stored;
+mod updated;
 
 use calm::Projection;
 use calm::build::{

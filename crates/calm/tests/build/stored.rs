@@ -8,7 +8,7 @@ use calm::build::{BuiltMixture, Recalibration, ThresholdRule, read_histograms};
 use super::{Blobs, built, projection, settings, weights};
 use crate::common::{numbers, optional};
 
-fn mixture(asinh: bool, normalised: bool) -> BuiltMixture {
+pub(super) fn mixture(asinh: bool, normalised: bool) -> BuiltMixture {
     let dimension = 5;
     let element = |seed, centres| {
         let blobs = Blobs::new(seed, dimension, centres, 600, 30.0);
@@ -73,14 +73,11 @@ fn stored_histograms_give_the_thresholds_again() {
     assert!(message.contains("no array 'hist_bin_edges'"), "{message}");
 }
 
-#[test]
-fn an_export_with_the_mixture_is_read_back() {
-    let folder = tempfile::tempdir().unwrap();
-    let (path, built) = (folder.path().join("kokkos.npz"), mixture(false, true));
+/// An export of a model with an old mixture of one component.
+pub(super) fn export() -> Cursor<Vec<u8>> {
     let mut model = npz::Writer::new(Cursor::new(Vec::new()));
     model.array("weights", &[2], [1.5, -2.0]).unwrap();
     model.strings("element_names", &[3], &["Al", "Si", "O"]).unwrap();
-    // An old mixture with one component.
     for (key, value) in [
         ("uq_schema_version", 6_i64),
         ("uq_n_elements", 3),
@@ -93,8 +90,14 @@ fn an_export_with_the_mixture_is_read_back() {
     }
     model.array("uq_centroids", &[3, 1, 5], [0.0_f32; 15]).unwrap();
     model.array("uq_rp_matrix", &[3, 5], projection(5).matrix).unwrap();
-    let model = model.finish().unwrap();
-    let written = built.write_export(model, Cursor::new(Vec::new())).unwrap();
+    model.finish().unwrap()
+}
+
+#[test]
+fn an_export_with_the_mixture_is_read_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, built) = (folder.path().join("kokkos.npz"), mixture(false, true));
+    let written = built.write_export(export(), Cursor::new(Vec::new())).unwrap();
     std::fs::write(&path, written.into_inner()).unwrap();
 
     let (found, expected) = (Artifact::load_export(&path).unwrap(), built.artifact().unwrap());

@@ -219,7 +219,7 @@ impl<V: Vector> Evaluator<V> {
     }
 
     /// The reverse pass of all atoms through the first `layers`.
-    fn backward_layers<const N: usize>(&mut self, layers: usize) {
+    pub(super) fn backward_layers<const N: usize>(&mut self, layers: usize) {
         for k in (0..layers).rev() {
             self.backward_layer::<N>(k);
             self.finish_layer::<N>(k);
@@ -285,11 +285,17 @@ impl<V: Vector> Evaluator<V> {
     fn scatter_pull_back(&self, is_computed: bool, pull_back: &mut PullBack) {
         pull_back.reset(self.elements.len());
         if is_computed {
-            for (atom, force) in self.batches.order.iter().zip(&self.forces[1]) {
-                pull_back.gradient[*atom as usize] = force.map(|x| -x);
-            }
-            pull_back.virial = self.strain_derivative(1);
+            self.scatter_gradient(1, pull_back);
         }
+    }
+
+    /// The derivatives from the cotangent `k`.
+    pub(super) fn scatter_gradient(&self, k: usize, pull_back: &mut PullBack) {
+        pull_back.reset(self.elements.len());
+        for (atom, force) in self.batches.order.iter().zip(&self.forces[k]) {
+            pull_back.gradient[*atom as usize] = force.map(|x| -x);
+        }
+        pull_back.virial = self.strain_derivative(k);
     }
 
     /// ∂E/∂ε or ∂H/∂ε, summed over chunks in order.

@@ -32,6 +32,11 @@ impl<V: Vector> Matrix<V> {
         self.inputs as u64 * self.outputs as u64
     }
 
+    /// Number of inputs.
+    pub fn inputs(&self) -> usize {
+        self.inputs
+    }
+
     /// Lanes of one row of inputs.
     pub fn input_lanes(&self) -> usize {
         lanes_for::<V>(self.inputs)

@@ -6,7 +6,7 @@ use super::description::GraceDescription;
 use super::error::UnfitProjection;
 use super::network::AnyNetwork;
 use super::precision::Precision;
-use super::projection::Projection;
+use super::projection::{FeatureForm, Projection};
 
 /// A GRACE model read from a `kokkos.npz` export.
 #[derive(Clone, Debug)]
@@ -67,6 +67,20 @@ impl GraceModel {
     /// The feature map, if the model has one.
     pub fn projection(&self) -> Option<&Projection> {
         self.network.projection()
+    }
+
+    /// D_h, the number of features of [`super::Grace::hidden_layer`].
+    pub fn hidden_dimension(&self) -> usize {
+        self.network.hidden_dimension()
+    }
+
+    /// The same model with other features from the same projection matrix R. `None` without feature arrays.
+    pub fn with_features(&self, form: FeatureForm) -> Option<Self> {
+        self.projection()?;
+        let mut model = self.clone();
+        model.network = model.network.with_features(form);
+        model.description.feature_dimension = model.feature_dimension();
+        Some(model)
     }
 
     /// A summary of the model.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::basis::BasisLayout;
 use super::layer::Layer;
 use super::precision::Precision;
-use super::projection::{FeatureMap, Projection};
+use super::projection::{FeatureForm, FeatureMap, Projection};
 use super::readout::Readout;
 use super::vector::{Double, Single, Vector};
 
@@ -33,6 +33,13 @@ impl<V: Vector> Network<V> {
 
     fn set_projection(&mut self, projection: Projection) {
         self.feature_map = Some(FeatureMap::new(projection, &self.basis));
+    }
+
+    fn with_features(mut self, form: FeatureForm) -> Self {
+        if let Some(map) = &mut self.feature_map {
+            map.projection = map.projection.with_form(form);
+        }
+        self
     }
 }
 
@@ -63,6 +70,24 @@ impl AnyNetwork {
         match self {
             Self::Double(network) => Arc::make_mut(network).set_projection(projection),
             Self::Mixed(network) => Arc::make_mut(network).set_projection(projection),
+        }
+    }
+
+    /// As [`super::GraceModel::hidden_dimension`].
+    pub fn hidden_dimension(&self) -> usize {
+        match self {
+            Self::Double(network) => network.readout.hidden_dimension(),
+            Self::Mixed(network) => network.readout.hidden_dimension(),
+        }
+    }
+
+    /// The same network with other features.
+    pub fn with_features(self, form: FeatureForm) -> Self {
+        match self {
+            Self::Double(network) => {
+                Self::Double(Arc::new(Arc::unwrap_or_clone(network).with_features(form)))
+            }
+            Self::Mixed(network) => Self::Mixed(Arc::new(Arc::unwrap_or_clone(network).with_features(form))),
         }
     }
 

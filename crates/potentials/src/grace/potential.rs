@@ -115,6 +115,21 @@ impl Grace {
         either!(&mut self.0, evaluator => evaluator.backward(feature_cotangent, energy, pull_back));
     }
 
+    /// The numbers h in which the atomic energy is linear, after [`Grace::forward`]: the linear density and the last hidden
+    /// layer of the readout, `[n, D_h]` row-major with D_h = [`GraceModel::hidden_dimension`].
+    pub fn hidden_layer(&mut self, out: &mut Vec<f64>) {
+        either!(&mut self.0, evaluator => evaluator.hidden_layer(out));
+    }
+
+    /// The derivatives of a function H of these numbers, from its cotangent ∂H/∂h `[n, D_h]`, for the structure of the last
+    /// [`Grace::forward`].
+    ///
+    /// # Panics
+    /// If the cotangent has another length.
+    pub fn pull_back_hidden_layer(&mut self, cotangent: &[f64], pull_back: &mut PullBack) {
+        either!(&mut self.0, evaluator => evaluator.pull_back_hidden_layer(cotangent, pull_back));
+    }
+
     /// Number of multiply-adds for the last structure: energies and forces, optionally with features and the
     /// pull-back of their cotangents. Counts sums of products over channels, bonds and couplings without
     /// padding, with tables of radial functions; excludes spherical harmonics, norms and activations.

@@ -36,6 +36,15 @@ pub struct Projection {
     pub layers: usize,
 }
 
+/// How features follow from B and R (paper, "Selection of feature space and uncertainty estimator").
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FeatureForm {
+    /// The normalised feature: z = (B̂ R, s log ‖B‖, s log ‖B_1‖, …).
+    Normalised,
+    /// The linear projected basis: z = B R.
+    Linear,
+}
+
 /// The rows of R for the basis of one layer, and their transpose.
 #[derive(Clone, Debug)]
 pub(super) struct ProjectionMaps<V> {
@@ -108,6 +117,12 @@ impl Projection {
     /// D, the dimension of z.
     pub fn feature_dimension(&self) -> usize {
         self.dimension + if self.density_channels { self.n_norms() } else { 0 }
+    }
+
+    /// The same matrix with other features.
+    pub(super) fn with_form(&self, form: FeatureForm) -> Self {
+        let normalised = form == FeatureForm::Normalised;
+        Self { normalize: normalised, density_channels: normalised, asinh: false, ..self.clone() }
     }
 
     /// Number of norms: that of the whole basis and those of the layers.

@@ -153,7 +153,20 @@ impl<V: Vector> Readout<V> {
         let (atoms, lanes) = (batch.atoms, self.density_lanes());
         zeros(&mut work.cotangent, atoms);
         work.cotangent.iter_mut().for_each(|cotangent| cotangent[0] = V::Number::round(self.scale));
-        for (k, (_, transposed)) in self.layers.iter().enumerate().rev() {
+        self.reverse(self.layers.len(), batch, work);
+        if self.layers.is_empty() {
+            zeros(&mut work.cotangent, atoms * lanes);
+        }
+        work.cotangent
+            .chunks_exact_mut(lanes)
+            .for_each(|cotangent| cotangent[0][0] += V::Number::round(self.scale));
+    }
+
+    /// Goes back through the first `layers` layers of the perceptron: replaces the cotangent of what they give with that of y.
+    #[inline(always)]
+    fn reverse(&self, layers: usize, batch: &Batch, work: &mut ReadoutWork<V>) {
+        let atoms = batch.atoms;
+        for (k, (_, transposed)) in self.layers[..layers].iter().enumerate().rev() {
             if k + 1 < self.layers.len() {
                 let cotangent = V::flat_mut(&mut work.cotangent).iter_mut();
                 cotangent.zip(V::flat(&work.slopes[k])).for_each(|(c, slope)| *c *= *slope);
@@ -164,12 +177,48 @@ impl<V: Vector> Readout<V> {
             transposed.multiply_add((&work.cotangent[..], &mut work.swap[..]), from, to, batch.instructions);
             std::mem::swap(&mut work.swap, &mut work.cotangent);
         }
-        if self.layers.is_empty() {
-            zeros(&mut work.cotangent, atoms * lanes);
+    }
+
+    /// Number of layers before the last hidden one.
+    fn hidden_layers(&self) -> usize {
+        self.layers.len().saturating_sub(1)
+    }
+
+    /// D_h, the numbers in which the energy is linear: y_0 and the last hidden layer, or all of y without hidden layers.
+    pub fn hidden_dimension(&self) -> usize {
+        let last = self.layers.last().map_or(1, |(last, _)| last.inputs());
+        last + usize::from(self.hidden_layers() > 0)
+    }
+
+    /// These numbers after [`Readout::evaluate`], `[atoms, D_h]`.
+    #[inline(always)]
+    pub fn hidden(&self, batch: &Batch, out: &mut [f64], work: &ReadoutWork<V>) {
+        let (hidden, first) = (self.hidden_layers(), usize::from(self.hidden_layers() > 0));
+        for (atom, out) in out.chunks_exact_mut(self.hidden_dimension()).enumerate() {
+            out[0] = row(&work.values[0], batch.atoms, atom)[0].into();
+            let values = row(&work.values[hidden], batch.atoms, atom);
+            out[first..].iter_mut().zip(values).for_each(|(out, value)| *out = (*value).into());
         }
-        work.cotangent
-            .chunks_exact_mut(lanes)
-            .for_each(|cotangent| cotangent[0][0] += V::Number::round(self.scale));
+    }
+
+    /// Replaces ∂E/∂y in `work` with the cotangent of y from that of these numbers, `[atoms, D_h]`.
+    #[inline(always)]
+    pub fn hidden_backward(&self, batch: &Batch, cotangent: &[f64], work: &mut ReadoutWork<V>) {
+        let (hidden, first) = (self.hidden_layers(), usize::from(self.hidden_layers() > 0));
+        let lanes = work.values[hidden].len();
+        zeros(&mut work.cotangent, lanes);
+        for (atom, cotangent) in cotangent.chunks_exact(self.hidden_dimension()).enumerate() {
+            let of_lanes = lanes / batch.atoms;
+            let seeds = V::flat_mut(&mut work.cotangent[atom * of_lanes..][..of_lanes]);
+            seeds.iter_mut().zip(&cotangent[first..]).for_each(|(seed, c)| *seed = V::Number::round(*c));
+        }
+        self.reverse(hidden, batch, work);
+        if first > 0 {
+            let rows = work.cotangent.chunks_exact_mut(self.density_lanes());
+            for (row, cotangent) in rows.zip(cotangent.chunks_exact(self.hidden_dimension())) {
+                row[0][0] += V::Number::round(cotangent[0]);
+            }
+        }
     }
 
     /// ∂E/∂(W B) of all layers after [`Readout::evaluate`], `[atoms, layers, lanes]`.
@@ -187,6 +236,13 @@ impl<V: Vector> Readout<V> {
             }
         }
     }
+}
+
+/// The numbers of one atom.
+#[inline(always)]
+fn row<V: Vector>(lanes: &[V], atoms: usize, atom: usize) -> &[V::Number] {
+    let of_atom = lanes.len() / atoms;
+    V::flat(&lanes[atom * of_atom..][..of_atom])
 }
 
 #[inline(always)]

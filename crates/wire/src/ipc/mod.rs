@@ -54,7 +54,6 @@ pub struct ConnectInfo {
     prefix: String,
     mixture: PathBuf,
     message_bytes: usize,
-    #[serde(rename = "caller")]
     sender: SenderId,
 }
 

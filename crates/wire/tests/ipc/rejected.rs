@@ -32,7 +32,7 @@ impl Stranger {
         config.global.prefix = FileName::new(text("prefix").as_bytes()).unwrap();
         config.global.service.event_connection_suffix = FileName::new(b".e").unwrap();
         let node = NodeBuilder::new().config(&config).create::<Service>().unwrap();
-        let session = door["caller"]["session"].as_u64().unwrap();
+        let session = door["sender"]["session"].as_u64().unwrap();
         let name =
             |what: &str| -> ServiceName { format!("{session:016x}/{what}").as_str().try_into().unwrap() };
         let bell = node.service_builder(&name("server")).event().open().unwrap();

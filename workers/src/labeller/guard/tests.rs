@@ -25,12 +25,12 @@ fn guard(text: &str) -> LabelGuard {
 }
 
 fn refused(guard_text: &str, structure: &Structure) -> bool {
-    guard(guard_text).refuses(structure).is_some()
+    guard(guard_text).rejects(structure).is_some()
 }
 
 #[test]
-fn unset_limits_refuse_nothing() {
-    assert_eq!(LabelGuard::default().refuses(&box_of(0.5, 100.0, 3.0)), None);
+fn unset_limits_reject_nothing() {
+    assert_eq!(LabelGuard::default().rejects(&box_of(0.5, 100.0, 3.0)), None);
     assert_eq!(guard("{}"), LabelGuard::default());
     assert_eq!(LabelGuard::default().fault(), None);
 }
@@ -44,7 +44,7 @@ fn bond_limits_apply_per_pair_and_across_the_boundary() {
     // 1.5 Å through the boundary, and an atom to its own image.
     assert!(refused(r#"{ "min_bond_lengths": { "Si-O": 1.6 } }"#, &box_of(3.5, 9.0, 9.0)));
     assert!(refused(r#"{ "min_bond_lengths": { "O-O": 3.6 } }"#, &box_of(3.5, 9.0, 9.0)));
-    let reason = guard(r#"{ "min_bond_lengths": { "Si-O": 2.5 } }"#).refuses(&apart).unwrap();
+    let reason = guard(r#"{ "min_bond_lengths": { "Si-O": 2.5 } }"#).rejects(&apart).unwrap();
     assert!(reason.contains("2.000 Å") && reason.contains("O-Si is 2.5"), "{reason}");
     assert!(serde_json::from_str::<LabelGuard>(r#"{ "min_bond_lengths": { "Si": 2.0 } }"#).is_err());
 }

@@ -59,7 +59,7 @@ fn script(calculation: &Calculation, requirements: &JobRequirements<'_>) -> io::
     let _ = writeln!(
         script,
         "# Once, however often it is submitted.\ncd -- {directory} && mkdir {BEGUN} || exit 0\n{runner} < {REQUEST}\n\
-         # The keeper must not be the process that Slurm has started.\nexit $?"
+         # The runner must not be the process that Slurm has started.\nexit $?"
     );
     Ok(script)
 }

@@ -1,37 +1,27 @@
-//! The page: one self-contained HTML file with fonts and figures.
+//! The page as one self-contained HTML file with fonts and figures.
 
 use std::fmt::Write;
 
 use figures::{BOLD, REGULAR, escape, to_html, to_svg};
 
-use super::report_data::ReportData;
 use super::style::grouped;
-use super::tables::{Cell, Table, collection_rule};
-use super::{FigureContent, FigureEntry};
+use super::{Block, Cell, FigureContent, FigureEntry, Section, Table};
 
 const STYLE: &str = include_str!("page.css");
 
-/// Content of a section.
-enum Block<'a> {
-    Paragraph(String),
-    Figure(&'a FigureEntry, usize),
-    Table(&'a Table, usize),
-}
-
-/// Writes the page.
-pub fn write(data: &ReportData, parts: &[FigureEntry], tables: &[Table]) -> String {
-    let title = format!("Campaign {}", data.campaign.id);
+/// Writes a page. Title and lead come above the sections; those without content are left out.
+pub fn write(title: &str, lead: &str, sections: Vec<Section<'_>>) -> String {
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n<title>{}</title>\n<style>\n{}{}{STYLE}</style>\n\
          </head>\n<body>\n<h1>{}</h1>\n<p class=\"lead\">{}</p>\n",
-        escape(&title),
+        escape(title),
         face(REGULAR, "normal"),
         face(BOLD, "bold"),
-        escape(&title),
-        to_html(&lead(data))
+        escape(title),
+        to_html(lead)
     );
-    for (heading, blocks) in sections(data, parts, tables) {
+    for (heading, blocks) in sections {
         if blocks.is_empty() {
             continue;
         }
@@ -49,71 +39,6 @@ pub fn write(data: &ReportData, parts: &[FigureEntry], tables: &[Table]) -> Stri
     }
     html.push_str("</body>\n</html>\n");
     html
-}
-
-fn sections<'a>(
-    data: &ReportData,
-    parts: &'a [FigureEntry],
-    tables: &'a [Table],
-) -> Vec<(&'static str, Vec<Block<'a>>)> {
-    // Numbers the figures and tables that exist.
-    let numbered = |name: &str| {
-        let place = parts.iter().position(|part| part.name == name)?;
-        let before = parts[..place].iter().filter(|part| part.drawn.is_ok()).count();
-        Some(Block::Figure(&parts[place], before + 1))
-    };
-    let table = |name: &str| {
-        let place = tables.iter().position(|table| table.name == name)?;
-        Some(Block::Table(&tables[place], place + 1))
-    };
-    let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
-    let why = collection_rule(&data.configuration).map(|rule| {
-        Block::Paragraph(format!(
-            "A structure of a biased walk becomes a candidate when {rule}, under the walker’s mixture. The selector decides with the \
-             newest mixture."
-        ))
-    });
-    vec![
-        ("Summary", blocks(vec![table("summary")])),
-        ("Collected structures", blocks(vec![why, numbered("collection"), table("seed-structures")])),
-        (
-            "Biased against control walks",
-            blocks(vec![
-                numbered("distributions"),
-                numbered("errors"),
-                numbered("space"),
-                numbered("features"),
-            ]),
-        ),
-        (
-            "Force errors by grade",
-            blocks(vec![
-                numbered("grades"),
-                table("correlations"),
-                table("quantiles-gamma"),
-                table("quantiles-gamma-nbr"),
-            ]),
-        ),
-        (
-            "Cost, failures and unlabelled structures",
-            blocks(vec![numbered("cost"), table("failures"), numbered("completion"), table("unlabelled")]),
-        ),
-        ("Settings", blocks(vec![table("settings")])),
-        ("Versions and provenance", blocks(vec![table("provenance")])),
-    ]
-}
-
-fn lead(data: &ReportData) -> String {
-    let candidates = &data.status.candidates;
-    let (biased, control) = (&data.collections.biased, &data.collections.control);
-    format!(
-        "The selector accepted {} structures of {} candidates from biased walks and collected {} frames from control walks; {} of them are \
-         labelled. Unless stated otherwise, grades are those of the original mixture, with which the campaign began.",
-        grouped(candidates.accepted),
-        grouped(candidates.seen),
-        grouped(candidates.control),
-        grouped(biased.labelled() + control.labelled())
-    )
 }
 
 fn write_figure(html: &mut String, part: &FigureEntry, number: usize) {

@@ -1,18 +1,24 @@
 //! How fast the passes of a build are on one thread. Prints a table.
 //!
-//! Passes 2 and 3 are compared with the bare matrix products of the same shapes in the same run: for each block of 128
-//! atoms, XᵀX (its lower half, in pass 2) or XS (in pass 3) of ready matrices, and no assignment, copy or histogram. The
-//! numbers are medians of repeated rounds, in which the passes and their products alternate.
+//! Passes 2 and 3 are compared with the bare matrix products of the same shapes: for each block of 128 atoms, XᵀX (its lower
+//! half, in pass 2) or XS (in pass 3) of ready matrices, and no assignment, copy or histogram. Pass 1 is compared with
+//! scikit-learn's mini-batch k-means as gracemaker's builder uses it, if `CALMWALK_GRACEMAKER_PYTHON` names a Python that has
+//! it. All ratios are medians over rounds in which a pass and what it is compared with follow each other, on one core; times are
+//! those of the processor.
 //!
 //! `cargo bench -p calm --bench build -- 50000` takes another number of atoms than 20,000.
 
+mod peer;
+
 use std::hint::black_box;
-use std::time::{Duration, Instant};
 
 use calm::build::{BuildSettings, BuiltComponent, CalibrationPass, ScatterPass, ShardClustering, components};
 use faer::linalg::matmul::matmul;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::{Accum, Mat, MatMut, MatRef, Par};
+
+use peer::Peer;
+use rustix::time::{ClockId, clock_gettime};
 
 const DIMENSION: usize = 130;
 const CLUSTERS: usize = 8;
@@ -22,6 +28,9 @@ const BATCH: usize = 512;
 /// Atoms of a block in passes 2 and 3.
 const BLOCK: usize = 128;
 const ROUNDS: usize = 31;
+/// Rounds of pass 1 with its peer, which takes seconds.
+const PEER_ROUNDS: usize = 7;
+const CANDIDATES: [usize; 5] = [1, 2, 4, 8, 16];
 
 /// xorshift64*.
 struct Random(u64);
@@ -108,50 +117,89 @@ impl Data {
     }
 }
 
-fn time(work: impl FnOnce()) -> Duration {
-    let start = Instant::now();
+/// Processor time of this thread, s: other programs disturb it less than wall time.
+fn seconds(work: impl FnOnce()) -> f64 {
+    let now = || {
+        let time = clock_gettime(ClockId::ThreadCPUTime);
+        time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
+    };
+    let start = now();
     work();
-    start.elapsed()
+    now() - start
 }
 
-fn median(mut times: Vec<Duration>) -> f64 {
-    times.sort();
-    times[times.len() / 2].as_secs_f64()
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Times of a pass and of what it is compared with, round by round.
+#[derive(Default)]
+struct Pair {
+    own: Vec<f64>,
+    other: Vec<f64>,
+}
+
+impl Pair {
+    fn push(&mut self, own: f64, other: f64) {
+        self.own.push(own);
+        self.other.push(other);
+    }
+
+    /// A row of the table. The ratio is that of the rates, ours to the other's, with quartiles.
+    fn print(self, name: &str, other: &str, atoms: usize) {
+        let rate = |seconds: f64| 1e-3 * atoms as f64 / seconds;
+        let mut ratios: Vec<f64> = self.own.iter().zip(&self.other).map(|(own, other)| other / own).collect();
+        ratios.sort_by(f64::total_cmp);
+        let quantile = |q: usize| ratios[(ratios.len() - 1) * q / 4];
+        println!(
+            "{name:30} {:>9.0}   {other:22} {:>9.0}   {:.2} ({:.2} to {:.2})",
+            rate(median(self.own)),
+            rate(median(self.other)),
+            quantile(2),
+            quantile(1),
+            quantile(3)
+        );
+    }
 }
 
 fn main() {
     let atoms = std::env::args().find_map(|argument| argument.parse().ok()).unwrap_or(ATOMS);
     let data = data(atoms);
     let settings =
-        BuildSettings { dimension: DIMENSION, seed: 1, candidates: vec![1, 2, 4, 8, 16], shard_size: 1 };
+        BuildSettings { dimension: DIMENSION, seed: 1, candidates: CANDIDATES.to_vec(), shard_size: 1 };
     let components = data.scatter();
-    let mut times: [Vec<Duration>; 6] = Default::default();
+    let mut peer = Peer::start(&data.features, DIMENSION, BATCH, &CANDIDATES);
+    println!(
+        "{atoms} atoms, D = {DIMENSION}, {CLUSTERS} components, one thread; 10³ atoms/s, ratio of the rates (quartiles)"
+    );
+    match &mut peer {
+        Some(peer) => {
+            let mut first = Pair::default();
+            for _ in 0..PEER_ROUNDS {
+                first.push(seconds(|| data.clustering(&settings)), peer.seconds());
+            }
+            first.print("1, K = 1, 2, 4, 8, 16", "scikit-learn", atoms);
+        }
+        None => {
+            let rates = (0..PEER_ROUNDS).map(|_| seconds(|| data.clustering(&settings))).collect();
+            println!("{:30} {:>9.0}", "1, K = 1, 2, 4, 8, 16", 1e-3 * atoms as f64 / median(rates));
+        }
+    }
+    drop(peer);
+    let [mut half, mut full, mut third] = [const { Pair { own: Vec::new(), other: Vec::new() } }; 3];
     for _ in 0..ROUNDS {
-        times[0].push(time(|| data.clustering(&settings)));
         // Without the inverses, which do not depend on the number of atoms.
-        times[1].push(time(|| {
+        let scatter = || {
             let mut pass = ScatterPass::new(DIMENSION, &data.centroids).expect("centroids");
             data.batches().for_each(|(features, weights)| pass.add(features, weights).expect("features"));
             black_box(pass.finish());
-        }));
-        times[2].push(time(|| data.bare_scatter(true)));
-        times[3].push(time(|| data.bare_scatter(false)));
-        times[4].push(time(|| data.calibration(&components)));
-        times[5].push(time(|| data.bare_calibration(&components)));
+        };
+        half.push(seconds(scatter), seconds(|| data.bare_scatter(true)));
+        full.push(seconds(scatter), seconds(|| data.bare_scatter(false)));
+        third.push(seconds(|| data.calibration(&components)), seconds(|| data.bare_calibration(&components)));
     }
-    let [first, second, half, full, third, bare] = times.map(median);
-    let rate = |seconds: f64| 1e-3 * atoms as f64 / seconds;
-    println!("{atoms} atoms, D = {DIMENSION}, {CLUSTERS} components, one thread");
-    println!("pass                           10³ atoms/s   share of the product's rate");
-    println!("1, K = 1, 2, 4, 8, 16          {:>11.0}", rate(first));
-    println!(
-        "2                              {:>11.0}   {:.2} (half), {:.2} (full)",
-        rate(second),
-        half / second,
-        full / second
-    );
-    println!("  XᵀX, lower half              {:>11.0}", rate(half));
-    println!("  XᵀX, all                     {:>11.0}", rate(full));
-    println!("3                              {:>11.0}   {:.2}", rate(third), bare / third);
-    println!("  XS                           {:>11.0}", rate(bare));
+    half.print("2", "XᵀX, lower half", atoms);
+    full.print("2", "XᵀX, all", atoms);
+    third.print("3", "XS", atoms);
 }

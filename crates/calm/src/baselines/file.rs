@@ -1,0 +1,114 @@
+//! Files of baselines (`.npz`): baselines of one model, with what ties them to it.
+
+use std::io::{self, Read, Seek, Write};
+use std::path::Path;
+
+use npz::{Archive, Error, Writer};
+
+use super::error::OriginMismatch;
+use super::settings::BaselineSettings;
+use super::{Baseline, Kind, stored};
+
+/// Version of the layout.
+const SCHEMA: usize = 1;
+
+/// The features that baselines belong to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FeatureOrigin {
+    /// Hash of the model's weights and projection.
+    pub model: String,
+    /// Variant of the features.
+    pub variant: String,
+    /// Chemical symbols, in the order of the element indices.
+    pub symbols: Vec<String>,
+    /// Feature dimension D.
+    pub dimension: usize,
+}
+
+impl FeatureOrigin {
+    /// Checks that both have the same features.
+    ///
+    /// # Errors
+    /// The first difference; `self` is the origin of the baselines.
+    pub fn check_same(&self, model: &Self) -> Result<(), OriginMismatch> {
+        let differs = |what, baselines: &dyn ToString, model: &dyn ToString| {
+            let (baselines, model) = (baselines.to_string(), model.to_string());
+            if baselines == model { Ok(()) } else { Err(OriginMismatch { what, baselines, model }) }
+        };
+        differs("list of elements", &self.symbols.join(" "), &model.symbols.join(" "))?;
+        differs("feature variant", &self.variant, &model.variant)?;
+        differs("feature dimension", &self.dimension, &model.dimension)?;
+        differs("hash of weights and projection", &self.model, &model.model)
+    }
+}
+
+/// Baselines of one model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BaselineFile {
+    /// The features that they belong to.
+    pub origin: FeatureOrigin,
+    /// How they were built.
+    pub settings: BaselineSettings,
+    /// In the order in which they were asked for.
+    pub baselines: Vec<Baseline>,
+}
+
+impl BaselineFile {
+    /// Writes the file. The same baselines give the same bytes.
+    ///
+    /// # Errors
+    /// If writing fails.
+    pub fn write<W: Write + Seek>(&self, out: W) -> io::Result<W> {
+        let mut file = Writer::new(out);
+        let names: Vec<&str> = self.origin.symbols.iter().map(String::as_str).collect();
+        file.scalar("baseline_schema", SCHEMA as i64)?;
+        file.strings("element_names", &[names.len()], &names)?;
+        file.strings("feature_variant", &[], &[&self.origin.variant])?;
+        file.scalar("feature_dimension", self.origin.dimension as i64)?;
+        file.strings("model_hash", &[], &[&self.origin.model])?;
+        let kinds: Vec<&str> = self.baselines.iter().map(|baseline| baseline.kind().name()).collect();
+        file.strings("kinds", &[kinds.len()], &kinds)?;
+        stored::write_settings(&mut file, &self.settings)?;
+        for (number, baseline) in self.baselines.iter().enumerate() {
+            stored::write(&mut file, number, baseline)?;
+        }
+        file.finish()
+    }
+
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// Missing or ill-shaped arrays, with file, key, what was found and what was expected.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, Error> {
+        Self::read(&Archive::open(path.as_ref())?)
+    }
+
+    /// Reads an open archive.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn read<R: Read + Seek>(file: &Archive<R>) -> Result<Self, Error> {
+        file.expect_count("baseline_schema", SCHEMA)?;
+        let text = |key: &str| file.strings(key).map(|texts| texts.concat());
+        let origin = FeatureOrigin {
+            model: text("model_hash")?,
+            variant: text("feature_variant")?,
+            symbols: file.strings("element_names")?,
+            dimension: file.count("feature_dimension", 1, 1 << 16)?,
+        };
+        if origin.symbols.is_empty() {
+            return Err(file.invalid("element_names", "no element", "at least one"));
+        }
+        let settings = stored::read_settings(file)?;
+        let mut baselines = Vec::new();
+        for (number, name) in file.strings("kinds")?.into_iter().enumerate() {
+            let kind = Kind::named(&name);
+            let kind = kind.ok_or_else(|| file.invalid("kinds", format!("'{name}'"), Kind::names()))?;
+            baselines.push(stored::read(file, number, kind, &origin)?);
+        }
+        if baselines.is_empty() {
+            return Err(file.invalid("kinds", "no baseline", "at least one"));
+        }
+        Ok(Self { origin, settings, baselines })
+    }
+}

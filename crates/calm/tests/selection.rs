@@ -1,0 +1,269 @@
+//! The lazy selections against complete evaluations after each pick.
+
+use std::sync::Arc;
+
+use calm::build::shuffled;
+use calm::grade::maximum;
+use calm::rules::Positive;
+use calm::selection::{FarthestPoints, Greedy, Metric, Pool, SelectionError, Window, update_settings};
+use calm::{Component, Grades, Mixture, Statistics, UpdateError, regularised_inverse, update};
+use proptest::prelude::*;
+
+use crate::common::{Random, niobium};
+
+const D: usize = 5;
+const WINDOW: Window = Window { above: 1.0, up_to: 60.0 };
+
+/// Two elements with two and one components, whose covariances are those of random atoms.
+fn mixture(random: &mut Random) -> Mixture {
+    let mut component = |centre: f64| {
+        let mut scatter = vec![0.0; D * D];
+        for row in random.take(40 * D).chunks(D) {
+            let row: Vec<f64> = row.iter().zip(1..).map(|(x, k)| x * f64::from(k)).collect();
+            (0..D * D).for_each(|k| scatter[k] += row[k / D] * row[k % D]);
+        }
+        let covariance: Vec<f64> = scatter.iter().map(|value| value / 40.0).collect();
+        let inverse = regularised_inverse(&covariance, D).unwrap();
+        let statistics = Statistics { scatter, count: 40.0, effective_count: 40.0 };
+        Arc::new(Component::new(vec![centre; D], inverse, 1.5, Some(statistics)).unwrap())
+    };
+    Mixture::new(0, vec![vec![component(0.0), component(20.0)], vec![component(-3.0)]]).unwrap()
+}
+
+struct Structures {
+    mixture: Mixture,
+    structures: Vec<(Vec<usize>, Vec<f64>)>,
+    pool: Pool,
+}
+
+/// A pool of small structures, some of which are far away. `memory` in bytes.
+fn structures(seed: u64, count: usize, all_atoms: bool, memory: usize) -> Structures {
+    let mut random = Random(seed);
+    let mixture = mixture(&mut random);
+    let mut pool = Pool::new(D, WINDOW, all_atoms, memory, std::env::temp_dir());
+    let (mut structures, mut grades) = (Vec::new(), Grades::default());
+    for _ in 0..count {
+        let scale = 4.0 * random.next().abs().powi(2);
+        let elements: Vec<usize> = (0..4).map(|_| usize::from(random.next() > 0.3)).collect();
+        let mut features = Vec::new();
+        for &element in &elements {
+            let centre = [if random.next() > 0.5 { 20.0 } else { 0.0 }, -3.0][element];
+            features.extend(random.take(D).iter().map(|x| centre + scale * x));
+        }
+        grades.evaluate(&mixture, &elements, &features, None).unwrap();
+        pool.push(&elements, &grades.component, &grades.gamma, &features).unwrap();
+        structures.push((elements, features));
+    }
+    Structures { mixture, structures, pool }
+}
+
+impl Structures {
+    /// Elements and features of the atoms of a structure within the window of its first grades.
+    fn within(&self, structure: usize) -> (Vec<usize>, Vec<f64>) {
+        let (elements, features) = &self.structures[structure];
+        let mut grades = Grades::default();
+        grades.evaluate(&self.mixture, elements, features, None).unwrap();
+        let kept = (0..elements.len()).filter(|&atom| WINDOW.has(grades.gamma[atom]));
+        let kept: Vec<_> = kept.map(|atom| (elements[atom], &features[atom * D..][..D])).collect();
+        (kept.iter().map(|(e, _)| *e).collect(), kept.iter().flat_map(|(_, z)| z.to_vec()).collect())
+    }
+
+    /// All γ_max after each pick, from the definition.
+    fn complete_greedy(&self, before: &[usize]) -> Vec<(usize, f64)> {
+        let (mut mixture, settings) = (self.mixture.clone(), update_settings(target()));
+        let mut left: Vec<usize> = (0..self.structures.len()).filter(|s| !before.contains(s)).collect();
+        let learn = |mixture: &mut Mixture, structure: usize| {
+            let (elements, features) = self.within(structure);
+            if !elements.is_empty() {
+                let outcome = update(mixture, &elements, &features, &settings).unwrap();
+                *mixture = mixture.with_changes(&outcome.changed).unwrap();
+            }
+        };
+        before.iter().for_each(|&structure| learn(&mut mixture, structure));
+        let mut picks = Vec::new();
+        loop {
+            let gamma = |&structure: &usize| {
+                let (elements, features) = self.within(structure);
+                let mut grades = Grades::default();
+                grades.evaluate(&mixture, &elements, &features, None).unwrap();
+                maximum(&grades.gamma)
+            };
+            let gamma: Vec<f64> = left.iter().map(gamma).collect();
+            let largest = maximum(&gamma);
+            if largest <= WINDOW.above {
+                return picks;
+            }
+            let structure = left.remove(gamma.iter().position(|g| *g == largest).unwrap());
+            picks.push((structure, largest));
+            learn(&mut mixture, structure);
+        }
+    }
+
+    /// Atoms within the window as (structure, group, whitened features).
+    fn whitened(&self) -> Vec<(usize, usize, Vec<f64>)> {
+        let mut points = Vec::new();
+        for structure in 0..self.structures.len() {
+            let (elements, features) = self.within(structure);
+            let mut grades = Grades::default();
+            grades.evaluate(&self.mixture, &elements, &features, None).unwrap();
+            for (atom, &element) in elements.iter().enumerate() {
+                let component = self.mixture.component(element, grades.component[atom]).unwrap();
+                let delta: Vec<f64> =
+                    (0..D).map(|k| features[atom * D + k] - component.centroid()[k]).collect();
+                let lower = lower_factor(component.inverse());
+                let column = |c: usize| (0..D).map(|r| lower[r * D + c] * delta[r]).sum();
+                points.push((structure, element, (0..D).map(column).collect()));
+            }
+        }
+        points
+    }
+}
+
+/// L of S = LLᵀ, by the textbook's formula.
+fn lower_factor(matrix: &[f64]) -> Vec<f64> {
+    let mut lower = vec![0.0; D * D];
+    for i in 0..D {
+        for j in 0..=i {
+            let sum: f64 = (0..j).map(|k| lower[i * D + k] * lower[j * D + k]).sum();
+            let rest = matrix[i * D + j] - sum;
+            lower[i * D + j] = if i == j { rest.sqrt() } else { rest / lower[j * D + j] };
+        }
+    }
+    lower
+}
+
+/// Picks by all distances, starting from the atoms of the structures picked `before`.
+fn complete_farthest(
+    points: &[(usize, usize, Vec<f64>)],
+    before: &[usize],
+    count: usize,
+) -> Vec<(usize, f64)> {
+    let mut nearest = vec![f64::INFINITY; points.len()];
+    let pick = |nearest: &mut Vec<f64>, centre: usize| {
+        for (distance, (_, group, point)) in nearest.iter_mut().zip(points) {
+            if *group == points[centre].1 {
+                let squared = point.iter().zip(&points[centre].2).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
+                *distance = distance.min(squared.sqrt());
+            }
+        }
+    };
+    (0..points.len()).filter(|k| before.contains(&points[*k].0)).for_each(|k| pick(&mut nearest, k));
+    let mut picks: Vec<(usize, f64)> = Vec::new();
+    while picks.len() < count {
+        let farthest = nearest.iter().copied().fold(0.0, f64::max);
+        if farthest < 1e-9 {
+            break;
+        }
+        let place = nearest.iter().position(|distance| *distance == farthest).unwrap();
+        let structure = points[place].0;
+        if !before.contains(&structure) && !picks.iter().any(|(s, _)| *s == structure) {
+            picks.push((structure, farthest));
+        }
+        pick(&mut nearest, place);
+    }
+    picks
+}
+
+fn target() -> Positive {
+    1.25_f64.try_into().unwrap()
+}
+
+fn picked(found: &[(usize, f64)]) -> Vec<usize> {
+    found.iter().map(|(structure, _)| *structure).collect()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn greedy_picks_as_after_a_complete_grading(seed in 0_u64..1000, before in 0_usize..4, memory in 0_usize..9000) {
+        let case = structures(seed, 30, false, memory);
+        let before: Vec<usize> = shuffled(seed, 0, 30).into_iter().take(before).collect();
+        let expected = case.complete_greedy(&before);
+        let mut greedy =
+            Greedy::new(&case.pool, &case.mixture, update_settings(target()), before.iter().copied()).unwrap();
+        let mut found = Vec::new();
+        loop {
+            let left = greedy.gamma_left().unwrap();
+            let Some(pick) = greedy.pick().unwrap() else {
+                prop_assert_eq!(left, None);
+                break;
+            };
+            prop_assert_eq!(left, Some(pick.gamma_max));
+            prop_assert!(pick.gamma_after < 1.25 && pick.alpha > 0.0);
+            found.push((pick.structure, pick.gamma_max));
+        }
+        prop_assert_eq!(picked(&found), picked(&expected));
+        for ((_, gamma), (_, expected)) in found.iter().zip(&expected) {
+            prop_assert!((gamma - expected).abs() <= 1e-9 * expected);
+        }
+    }
+
+    #[test]
+    fn farthest_points_are_those_of_all_distances(seed in 0_u64..1000, before in 1_usize..4, memory in 0_usize..9000) {
+        let case = structures(seed, 30, true, memory);
+        let before: Vec<usize> = shuffled(seed, 1, 30).into_iter().take(before).collect();
+        // Elements without a picked atom: any of their atoms is infinitely far, and the largest γ decides.
+        let points = case.whitened();
+        prop_assume!((0..2).all(|e| points.iter().any(|(s, group, _)| before.contains(s) && *group == e)));
+        let plain = (0..30).flat_map(|structure| {
+            let rows = case.structures[structure].1.chunks(D);
+            rows.map(move |row| (structure, 0, row.to_vec())).collect::<Vec<_>>()
+        });
+        for (metric, points) in [(Metric::Whitened(&case.mixture), points), (Metric::Plain, plain.collect())] {
+            let expected = complete_farthest(&points, &before, 12);
+            let mut points = FarthestPoints::new(&case.pool, metric, before.iter().copied()).unwrap();
+            for (structure, distance) in expected {
+                let found = points.pick().unwrap().unwrap();
+                prop_assert_eq!(found.structure, structure);
+                prop_assert!((found.distance - distance).abs() <= 1e-9 * distance);
+            }
+        }
+    }
+}
+
+#[test]
+fn without_anything_picked_the_largest_grade_of_each_element_comes_first() {
+    let case = structures(3, 30, false, usize::MAX);
+    let atoms = case.pool.atoms();
+    let largest = |element: u16| {
+        let atoms = atoms.iter().filter(|atom| atom.element == element);
+        atoms.max_by(|a, b| a.gamma.total_cmp(&b.gamma)).unwrap()
+    };
+    let (first, second) = (largest(0), largest(1));
+    assert_ne!(first.structure, second.structure);
+    let mut expected = [first, second];
+    expected.sort_by(|a, b| b.gamma.total_cmp(&a.gamma));
+    let mut points = FarthestPoints::new(&case.pool, Metric::Whitened(&case.mixture), []).unwrap();
+    for atom in expected {
+        let found = points.pick().unwrap().unwrap();
+        assert_eq!((found.structure, found.distance), (atom.structure as usize, f64::INFINITY));
+    }
+}
+
+#[test]
+fn farthest_points_end_when_only_copies_are_left() {
+    let mixture = niobium().mixture;
+    let dimension = mixture.dimension();
+    let mut pool = Pool::new(dimension, WINDOW, true, usize::MAX, std::env::temp_dir());
+    for place in [0.0, 1.0, 0.0, 1.0] {
+        pool.push(&[1], &[0], &[2.0], &vec![place; dimension]).unwrap();
+    }
+    let mut points = FarthestPoints::new(&pool, Metric::Plain, []).unwrap();
+    let mut next = || points.pick().unwrap().map(|found| found.structure);
+    assert_eq!([next(), next(), next()], [Some(0), Some(1), None]);
+}
+
+#[test]
+fn a_mixture_without_statistics_cannot_be_updated() {
+    let case = structures(1, 5, false, usize::MAX);
+    let stripped = case.mixture.iter().fold(vec![Vec::new(); 2], |mut elements, (element, _, component)| {
+        let (centroid, inverse) = (component.centroid().to_vec(), component.inverse().to_vec());
+        let component = Component::new(centroid, inverse, component.threshold(), None).unwrap();
+        elements[element].push(Arc::new(component));
+        elements
+    });
+    let mixture = Mixture::new(0, stripped).unwrap();
+    let error = Greedy::new(&case.pool, &mixture, update_settings(target()), []).unwrap_err();
+    assert!(matches!(error, SelectionError::Update(UpdateError::NoStatistics { .. })), "{error}");
+}

@@ -1,0 +1,25 @@
+//! The figures, one per file.
+
+mod bond_scans;
+mod defects;
+mod layout;
+mod solutions;
+mod structures;
+
+use super::Validation;
+use super::defects::DefectKind;
+use crate::page::FigureEntry;
+
+/// All figures, in the order of the page.
+pub fn all(validation: &Validation) -> Vec<FigureEntry> {
+    let part = |name, title, drawn| FigureEntry { name, title, drawn };
+    let defects = |name, kind| defects::draw(validation, name, kind);
+    vec![
+        part("bond-scans", "Compression and stretching", bond_scans::draw(validation)),
+        part("vacancies", "Vacancies", defects("vacancies", DefectKind::Vacancy)),
+        part("surfaces", "Surfaces", defects("surfaces", DefectKind::Surface)),
+        part("grain-boundaries", "Grain boundaries", defects("grain-boundaries", DefectKind::GrainBoundary)),
+        part("structures", "Atoms at defects", structures::draw(validation)),
+        part("solutions", "Solid solutions", solutions::draw(validation)),
+    ]
+}

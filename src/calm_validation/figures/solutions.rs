@@ -1,0 +1,145 @@
+//! γ of random solid solutions against composition (the paper's Figs. 4a and 4d).
+
+use figures::{Axis, Colour, Figure, LegendKey, Marker, Panel, Scale};
+
+use super::super::solutions::{Composition, FirstShell};
+use super::super::{Solution, Validation};
+use super::layout::{Grid, axis, legend_rows, letter, line};
+use crate::csv::{self, Csv};
+use crate::page::FigureContent;
+use crate::page::style::WIDTH;
+
+/// Groups of fewer atoms are not drawn.
+const MIN_ATOMS: usize = 10;
+
+pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
+    let graded = |solution: &&Solution| solution.compositions.iter().any(|of| of.structures > 0);
+    let solutions: Vec<_> = validation.solutions.iter().filter(graded).collect();
+    if solutions.is_empty() {
+        return Err(match validation.solutions.is_empty() {
+            true => "The model has no two elements that form close-packed or bcc metals.".into(),
+            false => "No structure could be graded.".into(),
+        });
+    }
+    let grid = Grid { number: 3 * solutions.len(), height: 120.0, top: 36.0 };
+    let description = "Extrapolation grade of random solid solutions against composition";
+    let mut figure = Figure::new("solutions", description, WIDTH, grid.total_height());
+    let keys = [
+        (LegendKey::Line(line(0)), "γ".to_owned()),
+        (LegendKey::Line(Colour::VERMILLION.dashed(1.2)), "γ_{nbr}".into()),
+        (LegendKey::Dot(Marker::Disc, Colour::BLUE.into()), "first element".into()),
+        (LegendKey::Dot(Marker::Square, Colour::INK.into()), "second element".into()),
+    ];
+    legend_rows(&mut figure, &keys);
+    for (k, solution) in solutions.iter().enumerate() {
+        draw_solution(&mut figure, solution, &grid, 3 * k);
+    }
+    Ok(FigureContent { figure, caption: caption(validation), numbers: numbers(validation) })
+}
+
+fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &Grid, first: usize) {
+    let [a, b] = &solution.elements;
+    let compositions = || solution.compositions.iter().filter(|of| of.structures > 0);
+    let shares = |title: &str| Axis::new(title, Scale::Linear, 0.0, 100.0);
+    let curve = |of: fn(&Composition) -> f64| -> Vec<_> {
+        compositions().map(|composition| [100.0 * composition.fraction, of(composition)]).collect()
+    };
+    let share = format!("{b} in {a}–{b} (%)");
+    let [gamma, average] = [curve(|of| of.scores[0]), curve(|of| of.averages[0])];
+    let values = gamma.iter().chain(&average).map(|[_, y]| *y);
+    let mut panel = Panel::new(grid.place(first), shares(&share), axis("mean γ", values));
+    panel.line([[0.0, 1.0], [100.0, 1.0]], Colour::GREY.dashed(0.7));
+    panel.line(average, Colour::VERMILLION.dashed(1.2));
+    panel.line(gamma.clone(), line(0));
+    panel.dots(gamma, Marker::Disc, 1.8, Colour::VERMILLION, None);
+    panel.panel_letter(letter(first));
+    panel.draw(figure);
+
+    let y = Axis::new("atoms above 1 (%)", Scale::Linear, 0.0, 103.0);
+    let mut panel = Panel::new(grid.place(first + 1), shares(&share), y);
+    panel.line(curve(|of| 100.0 * of.averages_above_1), Colour::VERMILLION.dashed(1.2));
+    let above = curve(|of| 100.0 * of.above_1);
+    panel.line(above.clone(), line(0));
+    panel.dots(above, Marker::Disc, 1.8, Colour::VERMILLION, None);
+    panel.panel_letter(letter(first + 1));
+    panel.draw(figure);
+
+    let groups = |element: &str| -> Vec<_> {
+        let is_shown = |of: &&FirstShell| of.element == element && of.atoms >= MIN_ATOMS;
+        let point = |of: &FirstShell| [100.0 * of.fraction, of.gamma];
+        solution.first_shells.iter().filter(is_shown).map(point).collect()
+    };
+    let [of_a, of_b] = [groups(a), groups(b)];
+    let values = of_a.iter().chain(&of_b).map(|[_, y]| *y);
+    let y = axis("mean γ", values);
+    let mut panel = Panel::new(grid.place(first + 2), shares(&format!("{b} in the first shell (%)")), y);
+    panel.line([[0.0, 1.0], [100.0, 1.0]], Colour::GREY.dashed(0.7));
+    for (points, marker, colour) in [(of_a, Marker::Disc, Colour::BLUE), (of_b, Marker::Square, Colour::INK)]
+    {
+        panel.line(points.clone(), colour.line(0.9));
+        panel.dots(points, marker, 1.8, colour, None);
+    }
+    panel.panel_letter(letter(first + 2));
+    panel.draw(figure);
+}
+
+fn caption(validation: &Validation) -> String {
+    let unrelaxed =
+        validation.solutions.iter().flat_map(|of| &of.compositions).filter(|of| !of.is_relaxed).count();
+    let unrelaxed = match unrelaxed {
+        0 => String::new(),
+        n => format!(
+            " The model has no minimum of the energy near the mean distance of both elements in {n} of them, which is taken."
+        ),
+    };
+    format!(
+        "Random solid solutions of 128 atoms (bcc if the first element is, otherwise fcc), with one relaxed volume for each composition and \
+         displacements of 0.1 Å for each Cartesian component; {} structures for each composition. Left, mean grade of all atoms; middle, share of \
+         the atoms above 1; right, mean γ of the atoms of either element against the composition of their first shell, where there are at least \
+         {MIN_ATOMS} atoms.{unrelaxed}",
+        validation.settings.solution_structures
+    )
+}
+
+fn numbers(validation: &Validation) -> Csv {
+    let mut numbers = Csv::new(&[
+        "elements",
+        "what",
+        "element",
+        "fraction",
+        "distance",
+        "number",
+        "gamma",
+        "gamma_nbr",
+        "above_1",
+        "nbr_above_1",
+    ]);
+    for solution in &validation.solutions {
+        let pair = solution.elements.join("-");
+        for of in &solution.compositions {
+            let means = [
+                of.scores.first().copied(),
+                of.averages.first().copied(),
+                Some(of.above_1),
+                Some(of.averages_above_1),
+            ];
+            let mut row = vec![pair.clone(), "composition".into(), String::new()];
+            row.extend([csv::number(of.fraction), csv::number(of.distance), of.structures.to_string()]);
+            row.extend(means.map(csv::number));
+            numbers.push(&row);
+        }
+        for of in &solution.first_shells {
+            let row = [
+                pair.clone(),
+                "first shell".into(),
+                of.element.clone(),
+                csv::number(of.fraction),
+                String::new(),
+                of.atoms.to_string(),
+                csv::number(of.gamma),
+            ];
+            numbers.push(&[&row[..], &[String::new(), String::new(), String::new()]].concat());
+        }
+    }
+    numbers
+}

@@ -1,0 +1,18 @@
+//! What labelled structures say about the scores of atoms, such as γ and γ_nbr: how well they rank force errors, and what
+//! a limit of the score keeps (paper, sections on the threshold and SI). [`LabelledErrors`] reads one graded structure
+//! after another, with bounded memory; [`LabelledReport`] has the numbers, of which `tables` and `figures` are drawn.
+
+mod collect;
+mod deviations;
+mod estimate;
+mod figures;
+mod report;
+mod tables;
+#[cfg(test)]
+mod tests;
+
+pub use self::collect::{GradedStructure, LabelledErrors, ScoreColumn};
+pub use self::estimate::BOOTSTRAP;
+pub use self::figures::{LabelledFigure, all as figures};
+pub use self::report::LabelledReport;
+pub use self::tables::{all as tables, write};

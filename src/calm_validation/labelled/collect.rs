@@ -1,0 +1,194 @@
+//! Collects scores and errors of one labelled structure after another.
+
+use analysis::{Bins, Exceedance, ForceErrors, LabelledEnergy, SystematicSample};
+use atoms::Species;
+use atoms::cell::{norm, sub};
+use atoms::extxyz::Labels;
+
+use super::deviations::Deviations;
+
+/// Force errors above this count as large, eV/Å (paper, ROC-AUC).
+pub const LARGE_ERROR: f64 = 1.0;
+
+/// Thresholds of the force error, eV/Å, at which contamination is counted.
+pub const THRESHOLDS: [f64; 19] =
+    [0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0];
+
+/// Atoms in the sample for ranks, quantiles and intervals: about 100 bytes each for two scores.
+const SAMPLED_ATOMS: usize = 200_000;
+/// Structures in the sample for energy offsets and the intervals of mean errors.
+const SAMPLED_STRUCTURES: usize = 50_000;
+
+/// A score of atoms; the larger it is, the larger errors are expected.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScoreColumn {
+    /// Its name in tables, with `_{…}` for subscripts.
+    pub name: String,
+    /// Atoms with at most this score are taken to be reliable: 1 for γ. `None` for a score without a calibrated limit.
+    pub limit: Option<f64>,
+}
+
+/// A structure with its scores, predictions and labels.
+#[derive(Clone, Copy, Debug)]
+pub struct GradedStructure<'a> {
+    /// Elements of the atoms, `[n]`.
+    pub species: &'a [Species],
+    /// Scores of the atoms, `[n]` for each column.
+    pub scores: &'a [&'a [f64]],
+    /// What the model predicts.
+    pub predicted: &'a Labels,
+    /// The labels; what is missing here or in the prediction is not compared.
+    pub labels: &'a Labels,
+}
+
+/// Collects labelled structures. Counts, means and contamination are of all of them; ranks, quantiles, bands, intervals
+/// and energy offsets are from systematic samples of at most 200,000 atoms and 50,000 structures.
+pub struct LabelledErrors {
+    pub(super) columns: Vec<ScoreColumn>,
+    pub(super) structures: u64,
+    pub(super) energy: Deviations,
+    pub(super) forces: Deviations,
+    pub(super) stress: Deviations,
+    pub(super) atoms: SystematicSample<SampledAtom>,
+    pub(super) sample: SystematicSample<SampledStructure>,
+    /// Of all atoms: those kept are the ones within the limit of the column, or all atoms without a limit.
+    pub(super) exceedance: Vec<Exceedance>,
+    /// By bins of γ, for columns with a limit.
+    pub(super) bins: Vec<Option<ForceErrors>>,
+    pub(super) left_out: u64,
+}
+
+/// An atom of the sample.
+#[derive(Clone, Debug)]
+pub struct SampledAtom {
+    /// Number of its structure.
+    pub structure: u64,
+    pub species: Species,
+    /// |F_model − F_label|, eV/Å.
+    pub error: f64,
+    /// One for each column.
+    pub scores: Box<[f64]>,
+}
+
+/// A structure of the sample.
+#[derive(Clone, Debug, Default)]
+pub struct SampledStructure {
+    pub energies: Option<LabelledEnergy>,
+    /// Energy per atom, eV.
+    pub energy: Deviations,
+    /// Components, eV/Å.
+    pub forces: Deviations,
+    /// Components, eV/Å³.
+    pub stress: Deviations,
+}
+
+impl ScoreColumn {
+    /// An extrapolation grade, whose limit is 1.
+    pub fn grade(name: &str) -> Self {
+        Self { name: name.into(), limit: Some(1.0) }
+    }
+}
+
+impl LabelledErrors {
+    /// Nothing yet. Each structure brings a score for each of these columns.
+    pub fn new(columns: Vec<ScoreColumn>) -> Self {
+        Self::with_room(columns, SAMPLED_ATOMS, SAMPLED_STRUCTURES)
+    }
+
+    pub(super) fn with_room(columns: Vec<ScoreColumn>, atoms: usize, structures: usize) -> Self {
+        let bins = |column: &ScoreColumn| {
+            column.limit.map(|_| ForceErrors::new(Bins::for_grades(), LARGE_ERROR, atoms))
+        };
+        Self {
+            structures: 0,
+            energy: Deviations::default(),
+            forces: Deviations::default(),
+            stress: Deviations::default(),
+            atoms: SystematicSample::new(atoms),
+            sample: SystematicSample::new(structures),
+            exceedance: vec![Exceedance::new(&THRESHOLDS); columns.len()],
+            bins: columns.iter().map(bins).collect(),
+            left_out: 0,
+            columns,
+        }
+    }
+
+    /// Number of structures with any label that the model also predicts.
+    pub fn structures(&self) -> u64 {
+        self.structures
+    }
+
+    /// Adds a structure. Without labels, nothing changes. Atoms with a score that is not finite are only counted, so that all
+    /// columns have the same atoms.
+    ///
+    /// # Panics
+    /// If the lengths of arrays differ, or if there is not one array of scores for each column.
+    pub fn add(&mut self, graded: &GradedStructure) {
+        let atoms = graded.species.len();
+        let is_complete = graded.scores.iter().all(|scores| scores.len() == atoms);
+        assert!(graded.scores.len() == self.columns.len() && is_complete, "a score of each atom and column");
+        let structure = SampledStructure::of(graded);
+        let SampledStructure { energy, forces, stress, .. } = &structure;
+        if energy.number + forces.number + stress.number == 0.0 {
+            return;
+        }
+        self.energy.merge(energy, 1);
+        self.forces.merge(forces, 1);
+        self.stress.merge(stress, 1);
+        if let (Some(predicted), Some(labels)) = (&graded.predicted.forces, &graded.labels.forces) {
+            for (atom, (a, b)) in predicted.iter().zip(labels).enumerate() {
+                self.add_atom(graded, atom, norm(sub(*a, *b)));
+            }
+        }
+        self.sample.add(structure);
+        self.structures += 1;
+    }
+
+    fn add_atom(&mut self, graded: &GradedStructure, atom: usize, error: f64) {
+        let scores = || graded.scores.iter().map(|scores| scores[atom]);
+        if !(error.is_finite() && scores().all(f64::is_finite)) {
+            self.left_out += 1;
+            return;
+        }
+        for (k, score) in scores().enumerate() {
+            let is_kept = self.columns[k].limit.is_none_or(|limit| score <= limit);
+            self.exceedance[k].add(error, is_kept, 1);
+            if let Some(bins) = &mut self.bins[k] {
+                bins.add(score, error);
+            }
+        }
+        let structure = self.structures;
+        let species = graded.species[atom];
+        self.atoms.add_with(|| SampledAtom { structure, species, error, scores: scores().collect() });
+    }
+}
+
+impl SampledStructure {
+    fn of(graded: &GradedStructure) -> Self {
+        let mut found = Self::default();
+        let (predicted, labels) = (graded.predicted, graded.labels);
+        if let (Some(model), Some(label)) = (predicted.energy, labels.energy) {
+            found.energy.add((model - label) / graded.species.len() as f64);
+            found.energies = Some(LabelledEnergy { composition: composition(graded.species), model, label });
+        }
+        if let (Some(model), Some(label)) = (&predicted.forces, &labels.forces) {
+            assert!(model.len() == label.len() && model.len() == graded.species.len(), "forces of each atom");
+            let pairs = model.as_flattened().iter().zip(label.as_flattened());
+            pairs.for_each(|(a, b)| found.forces.add(a - b));
+        }
+        if let (Some(model), Some(label)) = (&predicted.stress, &labels.stress) {
+            // The six components of a symmetric matrix.
+            for (i, k) in [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)] {
+                found.stress.add(model[i][k] - label[i][k]);
+            }
+        }
+        found
+    }
+}
+
+/// Number of atoms of each element, by ascending atomic number.
+fn composition(species: &[Species]) -> Vec<(u8, u32)> {
+    let mut numbers: Vec<_> = species.iter().map(|species| species.atomic_number()).collect();
+    numbers.sort_unstable();
+    numbers.chunk_by(|a, b| a == b).map(|run| (run[0], run.len() as u32)).collect()
+}

@@ -1,0 +1,56 @@
+//! The figures of the report, with captions and data.
+
+mod curves;
+mod reliability;
+
+use ::figures::{Colour, Figure, Stroke};
+
+use super::report::{Estimate, LabelledReport};
+use crate::csv::Csv;
+
+/// Width of a two-column figure of a journal: 180 mm, in points.
+const WIDTH: f64 = 510.0;
+
+/// A figure.
+pub struct LabelledFigure {
+    /// Name of its files.
+    pub name: &'static str,
+    pub title: &'static str,
+    pub figure: Figure,
+    /// Supports `_{…}` and `^{…}`.
+    pub caption: String,
+    /// What is drawn.
+    pub numbers: Csv,
+}
+
+/// The figures, none without force labels.
+pub fn all(report: &LabelledReport) -> Vec<LabelledFigure> {
+    if report.atoms == 0 {
+        return Vec::new();
+    }
+    let mut figures = vec![curves::areas(report)];
+    if report.scores.iter().any(|score| score.confident.is_some()) {
+        figures.splice(0..0, [reliability::draw(report), curves::contamination(report)]);
+    }
+    figures
+}
+
+/// Line of the curve with this number: colours, then dashes.
+fn stroke(number: usize) -> Stroke {
+    let colour = Colour::SERIES[number % Colour::SERIES.len()];
+    match number / Colour::SERIES.len() {
+        0 => colour.line(1.3),
+        _ => colour.dashed(1.3),
+    }
+}
+
+/// Curve of estimates over thresholds, in runs without undefined values: (threshold, low, value, high).
+fn runs(thresholds: &[f64], estimates: &[Estimate]) -> Vec<Vec<(f64, f64, f64, f64)>> {
+    let point = |(x, estimate): (&f64, &Estimate)| {
+        let value = estimate.value?;
+        let (low, high) = estimate.interval.unwrap_or((value, value));
+        Some((*x, low, value, high))
+    };
+    let points: Vec<_> = thresholds.iter().zip(estimates).map(point).collect();
+    points.split(Option::is_none).map(|run| run.iter().flatten().copied().collect()).collect()
+}

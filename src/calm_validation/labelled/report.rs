@@ -1,0 +1,175 @@
+//! What is said of labelled structures.
+
+use analysis::{ElementOffset, ErrorBin, QuantileBin};
+use atoms::Species;
+use serde::Serialize;
+
+/// Errors of a model, and what scores of atoms say about them. JSON has these names; quantities that are not defined are
+/// null.
+#[derive(Clone, Debug, Serialize)]
+pub struct LabelledReport {
+    /// Structures with a label that the model predicts.
+    pub structures: u64,
+    /// Atoms with a force label and finite scores, which the statistics of the scores are of.
+    pub atoms: u64,
+    /// Atoms left out because of a score or force that is not finite.
+    pub left_out: u64,
+    /// Atoms in the sample that ranks, quantiles, bands and intervals are from, and their structures.
+    pub sampled_atoms: usize,
+    pub sampled_structures: usize,
+    /// How intervals are made: with structures as units.
+    pub bootstrap: BootstrapSettings,
+    /// Energy, eV/atom.
+    pub energy: MeanErrors,
+    /// The same without the offset of each element.
+    pub energy_without_offsets: MeanErrors,
+    /// Offsets of label minus model that were removed, eV/atom.
+    pub offsets: Vec<Offset>,
+    /// Components of forces, eV/Å.
+    pub forces: MeanErrors,
+    /// Components of the stress, eV/Å³.
+    pub stress: MeanErrors,
+    /// Thresholds of the force error |F_model − F_label|, eV/Å, of all curves below.
+    pub thresholds: Vec<f64>,
+    /// Share of the atoms with a force error above each threshold.
+    pub unfiltered: Vec<Option<f64>>,
+    /// One for each score.
+    pub scores: Vec<ScoreReport>,
+}
+
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct BootstrapSettings {
+    pub draws: u32,
+    pub level: f64,
+    pub seed: u64,
+}
+
+/// A value with its confidence interval.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Estimate {
+    pub value: Option<f64>,
+    pub interval: Option<(f64, f64)>,
+}
+
+/// Mean absolute and root mean square error.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct MeanErrors {
+    /// Number of differences.
+    pub number: f64,
+    pub mean_absolute: Estimate,
+    pub root_mean_square: Estimate,
+}
+
+/// Offset of an element, eV/atom.
+#[derive(Clone, Debug, Serialize)]
+pub struct Offset {
+    pub element: &'static str,
+    pub offset: f64,
+    /// Whether the compositions determine it by itself.
+    pub is_separate: bool,
+}
+
+/// What is said of a score.
+#[derive(Clone, Debug, Serialize)]
+pub struct ScoreReport {
+    pub name: String,
+    /// Atoms with at most this score are taken to be reliable.
+    pub limit: Option<f64>,
+    /// Spearman's ρ of score and force error.
+    pub spearman: Estimate,
+    /// Area under the ROC curve for force errors above each threshold.
+    pub auc: Vec<Estimate>,
+    /// Area under the ROC curve for the tenth of the atoms of an element with the largest force errors: mean over elements.
+    pub worst_decile: Estimate,
+    /// The same for each element.
+    pub worst_decile_by_element: Vec<ElementAuc>,
+    /// What the limit keeps.
+    pub confident: Option<Confident>,
+    /// Force errors by bins of the score, for scores with a limit.
+    pub bins: Vec<Bin>,
+    /// Quantiles of the force error in logarithmic bins of the score.
+    pub bands: Vec<Band>,
+    /// Sampled atoms by force error: within and beyond the limit.
+    pub error_histograms: Option<ErrorHistograms>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+pub struct ElementAuc {
+    pub element: &'static str,
+    /// Sampled atoms.
+    pub atoms: usize,
+    /// The 90 % quantile of their force errors, eV/Å.
+    pub threshold: f64,
+    pub auc: Estimate,
+}
+
+/// The atoms with a score within its limit.
+#[derive(Clone, Debug, Serialize)]
+pub struct Confident {
+    /// Their share of all atoms.
+    pub retention: Estimate,
+    /// Share of them with a force error above each threshold.
+    pub contamination: Vec<Estimate>,
+}
+
+/// Force errors of the atoms in a bin of the score, eV/Å.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Bin {
+    pub above: Option<f64>,
+    pub up_to: Option<f64>,
+    pub atoms: u64,
+    /// Share of all atoms.
+    pub share: f64,
+    pub median: Option<f64>,
+    pub p90: Option<f64>,
+    pub p99: Option<f64>,
+    /// Share of the atoms of the bin with a force error above 1 eV/Å.
+    pub large: Option<f64>,
+}
+
+/// Quantiles of the force error of the sampled atoms between two scores, eV/Å.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Band {
+    pub low: f64,
+    pub high: f64,
+    pub atoms: u64,
+    /// 5, 10, 25, 50, 75, 90 and 95 %; null in an empty bin.
+    pub quantiles: Option<[f64; 7]>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+pub struct ErrorHistograms {
+    /// Edges of the bins, eV/Å.
+    pub edges: Vec<f64>,
+    /// Atoms with a score up to the limit.
+    pub within: Vec<u64>,
+    /// Atoms with a larger score.
+    pub beyond: Vec<u64>,
+}
+
+impl LabelledReport {
+    /// The index of a threshold.
+    pub fn threshold(&self, threshold: f64) -> Option<usize> {
+        self.thresholds.iter().position(|found| *found == threshold)
+    }
+}
+
+impl From<ErrorBin> for Bin {
+    fn from(bin: ErrorBin) -> Self {
+        let ErrorBin { above, up_to, atoms, share, median, p90, p99, large, .. } = bin;
+        Self { above, up_to, atoms, share, median, p90, p99, large }
+    }
+}
+
+impl From<QuantileBin> for Band {
+    fn from(bin: QuantileBin) -> Self {
+        Self { low: bin.low, high: bin.high, atoms: bin.number, quantiles: bin.quantiles }
+    }
+}
+
+impl From<ElementOffset> for Offset {
+    fn from(of: ElementOffset) -> Self {
+        let element = Species::from_atomic_number(of.element).map_or("?", Species::symbol);
+        Self { element, offset: of.offset, is_separate: of.is_separate }
+    }
+}

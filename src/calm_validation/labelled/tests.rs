@@ -1,0 +1,218 @@
+//! The report against statistics of the same numbers.
+
+use ::figures::{to_png, to_svg};
+use analysis::{Bootstrap, quantile, roc_auc, spearman};
+use atoms::Species;
+use atoms::cell::{norm, sub};
+use atoms::extxyz::Labels;
+
+use super::*;
+
+const BOOTSTRAP: Bootstrap = Bootstrap { draws: 60, level: 0.9, seed: 3 };
+const ATOMS: usize = 8;
+
+/// A deterministic number between 0 and 1.
+fn uniform(place: usize) -> f64 {
+    let mut x = (place as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    ((x ^ (x >> 27)) >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+/// A structure of aluminium and nickel with errors that grow with the first score; the second is the first, smoothed.
+struct Sample {
+    species: Vec<Species>,
+    scores: [Vec<f64>; 2],
+    predicted: Labels,
+    labels: Labels,
+}
+
+/// Energies of the labels are those of the model plus 1 eV for each aluminium and −2 eV for each nickel atom, to ± 8 meV.
+fn sample(number: usize) -> Sample {
+    let nickel = number % (ATOMS + 1);
+    let element = |atom: usize| Species::from_atomic_number(if atom < nickel { 28 } else { 13 }).unwrap();
+    let place = |atom: usize, k: usize| 1000 * number + 10 * atom + k;
+    let scores: Vec<_> = (0..ATOMS).map(|atom| 3.0 * uniform(place(atom, 0)).powi(2)).collect();
+    let mean = scores.iter().sum::<f64>() / ATOMS as f64;
+    let smooth = scores.iter().map(|score| 0.5 * (score + mean)).collect();
+    let error = |atom: usize| [1, 2, 3].map(|k| scores[atom] * (uniform(place(atom, k)) - 0.5));
+    let offset = (ATOMS - nickel) as f64 - 2.0 * nickel as f64 + 0.016 * (uniform(place(0, 9)) - 0.5);
+    Sample {
+        species: (0..ATOMS).map(element).collect(),
+        predicted: Labels {
+            energy: Some(-3.5),
+            forces: Some(vec![[0.1, 0.2, -0.3]; ATOMS]),
+            stress: Some([[0.01; 3]; 3]),
+        },
+        labels: Labels {
+            energy: Some(-3.5 + offset),
+            forces: Some((0..ATOMS).map(|atom| sub([0.1, 0.2, -0.3], error(atom))).collect()),
+            stress: number.is_multiple_of(2).then_some([[0.013; 3]; 3]),
+        },
+        scores: [scores, smooth],
+    }
+}
+
+fn columns() -> Vec<ScoreColumn> {
+    vec![ScoreColumn::grade("γ"), ScoreColumn { name: "d_{nn}".into(), limit: None }]
+}
+
+fn collected(mut errors: LabelledErrors, samples: &[Sample]) -> LabelledErrors {
+    for Sample { species, scores: [a, b], predicted, labels } in samples {
+        errors.add(&GradedStructure { species, scores: &[a, b], predicted, labels });
+    }
+    errors
+}
+
+/// Force errors and scores of all atoms.
+fn atoms(samples: &[Sample]) -> (Vec<f64>, [Vec<f64>; 2]) {
+    let forces = |sample: &Sample| {
+        let (a, b) = (sample.predicted.forces.clone().unwrap(), sample.labels.forces.clone().unwrap());
+        a.into_iter().zip(b).map(|(a, b)| norm(sub(a, b))).collect::<Vec<_>>()
+    };
+    let column = |k: usize| samples.iter().flat_map(|sample| sample.scores[k].clone()).collect();
+    (samples.iter().flat_map(forces).collect(), [column(0), column(1)])
+}
+
+fn assert_near(found: Option<f64>, expected: Option<f64>) {
+    let (found, expected) = (found.unwrap(), expected.unwrap());
+    assert!((found - expected).abs() < 1e-12, "{found} {expected}");
+}
+
+#[test]
+fn a_report_has_the_statistics_of_its_atoms() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    let (errors, scores) = atoms(&samples);
+    assert_eq!((report.structures, report.atoms, report.left_out), (45, 360, 0));
+    assert_eq!((report.sampled_atoms, report.sampled_structures), (360, 45));
+    for (of, scores) in report.scores.iter().zip(&scores) {
+        assert_near(of.spearman.value, spearman(scores, &errors));
+        for (k, threshold) in report.thresholds.iter().enumerate() {
+            assert_eq!(of.auc[k].value.is_some(), roc_auc(scores, &errors, *threshold).is_some());
+            if let Some(expected) = roc_auc(scores, &errors, *threshold) {
+                assert_near(of.auc[k].value, Some(expected));
+            }
+        }
+        let (low, high) = of.spearman.interval.unwrap();
+        assert!(low < of.spearman.value.unwrap() && of.spearman.value.unwrap() < high);
+    }
+    let share = |test: &dyn Fn(f64) -> bool, of: &[f64]| {
+        Some(of.iter().filter(|x| test(**x)).count() as f64 / of.len() as f64)
+    };
+    let kept: Vec<_> =
+        errors.iter().zip(&scores[0]).filter(|(_, score)| **score <= 1.0).map(|(x, _)| *x).collect();
+    let confident = report.scores[0].confident.as_ref().unwrap();
+    assert_near(confident.retention.value, share(&|score| score <= 1.0, &scores[0]));
+    for (k, threshold) in report.thresholds.iter().enumerate() {
+        assert_near(confident.contamination[k].value, share(&|error| error > *threshold, &kept));
+        assert_near(report.unfiltered[k], share(&|error| error > *threshold, &errors));
+    }
+    assert!(report.scores[1].confident.is_none() && report.scores[1].bins.is_empty());
+    assert_eq!(report.scores[0].bins.iter().map(|bin| bin.atoms).sum::<u64>(), 360);
+}
+
+#[test]
+fn the_worst_decile_is_that_of_each_element() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    let (errors, scores) = atoms(&samples);
+    let species: Vec<_> = samples.iter().flat_map(|sample| sample.species.clone()).collect();
+    let mut areas = Vec::new();
+    for of in &report.scores[0].worst_decile_by_element {
+        let select = |values: &[f64]| -> Vec<f64> {
+            values.iter().zip(&species).filter(|(_, s)| s.symbol() == of.element).map(|(x, _)| *x).collect()
+        };
+        let (errors, scores) = (select(&errors), select(&scores[0]));
+        let mut ascending = errors.clone();
+        ascending.sort_by(f64::total_cmp);
+        let threshold = quantile(&ascending, 0.9).unwrap();
+        assert_eq!((of.atoms, of.threshold), (errors.len(), threshold));
+        assert_near(of.auc.value, roc_auc(&scores, &errors, threshold));
+        areas.push(of.auc.value.unwrap());
+    }
+    assert_eq!(areas.len(), 2);
+    assert_near(report.scores[0].worst_decile.value, Some(0.5 * (areas[0] + areas[1])));
+}
+
+#[test]
+fn energies_are_compared_with_and_without_offsets() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    assert!(report.energy.mean_absolute.value.unwrap() > 0.5, "{:?}", report.energy);
+    assert!(report.energy_without_offsets.root_mean_square.value.unwrap() < 0.001);
+    for (found, (element, offset)) in report.offsets.iter().zip([("Al", 1.0), ("Ni", -2.0)]) {
+        assert_eq!((found.element, found.is_separate), (element, true));
+        assert!((found.offset - offset).abs() < 1e-3, "{found:?}");
+    }
+    // Every other structure has a stress, six components with an error of 3 meV/Å³ each.
+    assert_eq!(report.stress.number, 23.0 * 6.0);
+    assert_near(report.stress.mean_absolute.value, Some(0.003));
+    let (low, high) = report.stress.root_mean_square.interval.unwrap();
+    assert!((low - 0.003).abs() < 1e-12 && (high - 0.003).abs() < 1e-12);
+    assert_eq!(report.forces.number, 360.0 * 3.0);
+}
+
+#[test]
+fn a_bounded_sample_leaves_counts_exact() {
+    let samples: Vec<_> = (0..200).map(sample).collect();
+    let whole = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    let part = collected(LabelledErrors::with_room(columns(), 600, 90), &samples).report(BOOTSTRAP);
+    assert!(part.sampled_atoms <= 600 && part.sampled_structures <= 200 && part.atoms == 1600);
+    assert_eq!(part.unfiltered, whole.unfiltered);
+    assert_eq!(part.forces.mean_absolute.value, whole.forces.mean_absolute.value);
+    let confident = |report: &LabelledReport| {
+        let found = report.scores[0].confident.as_ref().unwrap();
+        (found.retention.value, found.contamination.iter().map(|of| of.value).collect::<Vec<_>>())
+    };
+    assert_eq!(confident(&part), confident(&whole));
+    // Five standard deviations of the correlation of n pairs, 1 / √n, for at least a quarter of the room.
+    let rho = |report: &LabelledReport| report.scores[0].spearman.value.unwrap();
+    assert!((rho(&part) - rho(&whole)).abs() < 5.0 / 150_f64.sqrt());
+}
+
+#[test]
+fn atoms_without_a_finite_score_are_only_counted() {
+    let mut samples: Vec<_> = (0..9).map(sample).collect();
+    samples[3].scores[1][2] = f64::NAN;
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    assert_eq!((report.atoms, report.left_out), (71, 1));
+}
+
+#[test]
+fn what_has_no_labels_says_nothing() {
+    let mut samples: Vec<_> = (0..3).map(sample).collect();
+    samples.iter_mut().for_each(|sample| sample.labels = Labels::default());
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    assert_eq!((report.structures, report.atoms), (0, 0));
+    assert!(tables(&report).is_empty() && figures(&report).is_empty());
+    assert_eq!(report.scores[0].spearman.value, None);
+    assert!(serde_json::to_string(&report).unwrap().contains("\"structures\":0"));
+}
+
+#[test]
+fn figures_and_tables_show_every_score() {
+    // One structure, for which no band has enough atoms, and enough of them.
+    for number in [1, 60] {
+        let samples: Vec<_> = (0..number).map(sample).collect();
+        let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+        let figures = figures(&report);
+        let names: Vec<_> = figures.iter().map(|figure| figure.name).collect();
+        assert_eq!(names, ["reliability", "contamination", "auc-sweep"]);
+        for drawn in figures {
+            assert!(!to_svg(&drawn.figure).contains("NaN"), "{}", drawn.name);
+            assert!(to_png(&drawn.figure, 40.0).is_ok());
+            let rows = String::from_utf8(drawn.numbers.into_bytes()).unwrap();
+            assert!(rows.lines().count() > 5 && rows.contains('γ'), "{rows}");
+        }
+        let mut text = Vec::new();
+        write(&report, &mut text).unwrap();
+        let text = String::from_utf8(text).unwrap();
+        for words in ["labelled structure", "d_nn", "γ ≤ 1", "> 5", "stress components"] {
+            assert!(text.contains(words), "{text}");
+        }
+        // A single structure has no energy offsets.
+        let errors = if number == 1 { 3 } else { 4 };
+        let rows: Vec<_> = tables(&report).iter().map(|table| table.rows.len()).collect();
+        assert_eq!(rows, [errors, 2, 2, 7]);
+    }
+}

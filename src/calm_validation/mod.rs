@@ -1,0 +1,148 @@
+//! Tests of an extrapolation grade that need no labels: bond scans, defects, solid solutions and colliding environments (paper,
+//! 'Minimal validation tests for an extrapolation grade' and 'Structural and compositional extrapolation').
+//!
+//! One file per test, each with its results as plain data; `figures`, `tables` and `text` make a page of them. Random numbers are a
+//! function of the random seed, so the same input gives the same bytes for any number of threads.
+
+mod bond_scans;
+mod collisions;
+mod defects;
+mod detection;
+mod ensemble;
+mod figures;
+mod grader;
+pub mod labelled;
+mod minimum;
+mod progress;
+mod random;
+mod solutions;
+mod tables;
+mod text;
+
+use std::sync::Arc;
+
+use atoms::Species;
+use calm::Mixture;
+use md::Fire;
+use potentials::grace::GraceModel;
+use serde::Serialize;
+
+use crate::exit_status::Failure;
+
+pub use self::bond_scans::BondScan;
+pub use self::collisions::Collision;
+pub use self::defects::Defect;
+pub use self::detection::{Detection, Rule};
+pub use self::ensemble::EnergySpread;
+pub use self::grader::{Grader, Score};
+pub use self::progress::Progress;
+pub use self::solutions::Solution;
+pub use self::tables::{both, verdict};
+pub use self::text::{PAGE, files};
+
+/// What is tested, and how closely.
+#[derive(Clone, Debug, Serialize)]
+pub struct Settings {
+    /// The elements with prototypes and defects.
+    #[serde(skip)]
+    pub elements: Vec<Species>,
+    /// Pairs of elements whose solid solutions are scanned.
+    #[serde(skip)]
+    pub pairs: Vec<[Species; 2]>,
+    /// Distances of a bond scan.
+    pub scan_steps: usize,
+    /// How positions in defects are relaxed; `None` keeps the ideal ones.
+    #[serde(skip)]
+    pub relaxation: Option<Fire>,
+    /// Random structures of each composition of a solid solution.
+    pub solution_structures: usize,
+    /// Random seed of the solid solutions.
+    pub seed: u64,
+}
+
+/// All results.
+#[derive(Clone, Debug, Serialize)]
+pub struct Validation {
+    /// Elements of the model.
+    pub elements: Vec<String>,
+    /// Cutoff of the model, Å.
+    pub cutoff: f64,
+    /// How closely it was tested.
+    pub settings: Settings,
+    /// The scores, γ first. Lists of scores below are in this order.
+    pub scores: Vec<ScoreDescription>,
+    /// Bond scans, of each element its ground state first.
+    pub bond_scans: Vec<BondScan>,
+    /// Vacancies, surfaces and grain boundaries.
+    pub defects: Vec<Defect>,
+    /// Solid solutions.
+    pub solutions: Vec<Solution>,
+    /// Colliding environments.
+    pub collisions: Vec<Collision>,
+}
+
+/// A score and what its bond scans tell.
+#[derive(Clone, Debug, Serialize)]
+pub struct ScoreDescription {
+    /// Its name.
+    pub name: String,
+    /// When it detects a regime.
+    pub rule: Option<Rule>,
+    /// Whether it detects the regimes in the scans of all ground states.
+    pub detection: Detection,
+}
+
+/// The model, the mixture and further scores.
+#[derive(Clone)]
+pub struct Subject {
+    pub model: Arc<GraceModel>,
+    pub mixture: Arc<Mixture>,
+    /// Scores to compare γ with.
+    pub others: Arc<[Box<dyn Score>]>,
+}
+
+/// Runs all tests. `None` if it was stopped.
+pub fn run(
+    subject: &Subject,
+    settings: Settings,
+    progress: &Progress,
+) -> Result<Option<Validation>, Failure> {
+    progress.begin(
+        bond_scans::count(&settings)
+            + defects::count(&settings)
+            + solutions::count(&settings)
+            + collisions::count(&settings),
+    );
+    let bond_scans = bond_scans::run(subject, &settings, progress);
+    let distances = bond_scans::distances(&bond_scans);
+    let defects = defects::run(subject, &settings, &distances, progress);
+    let solutions = solutions::run(subject, &settings, &distances, progress)?;
+    let collisions = collisions::run(subject, &settings, &distances, progress);
+    if progress.is_stopped() {
+        return Ok(None);
+    }
+    let described = |(k, (name, rule)): (usize, (String, Option<Rule>))| ScoreDescription {
+        name,
+        rule,
+        detection: detection::of_all(&bond_scans, k),
+    };
+    Ok(Some(Validation {
+        elements: subject.model.elements().iter().map(|species| species.to_string()).collect(),
+        cutoff: subject.model.cutoff(),
+        scores: subject.scores().into_iter().enumerate().map(described).collect(),
+        settings,
+        bond_scans,
+        defects,
+        solutions,
+        collisions,
+    }))
+}
+
+impl Subject {
+    /// Names and rules of all scores, γ first.
+    fn scores(&self) -> Vec<(String, Option<Rule>)> {
+        let gamma = ("γ".to_owned(), Some(Rule::Threshold(1.0)));
+        let others = self.others.iter().map(|score| (score.name().to_owned(), score.rule()));
+        [gamma].into_iter().chain(others).collect()
+    }
+}

@@ -1,0 +1,226 @@
+//! The tables of the page.
+
+use super::detection::Detection;
+use super::{Rule, Validation};
+use crate::page::{Cell, Table, count, percent, real, text};
+
+/// All tables with rows, in the order of the page.
+pub fn all(validation: &Validation) -> Vec<Table> {
+    let mut tables = vec![
+        detection(validation),
+        bond_scans(validation),
+        defects(validation),
+        solutions(validation),
+        collisions(validation),
+    ];
+    tables.retain(|table| !table.rows.is_empty());
+    tables
+}
+
+/// Yes, no, or a dash.
+pub fn verdict(found: Option<bool>) -> &'static str {
+    match found {
+        Some(true) => "yes",
+        Some(false) => "no",
+        None => "–",
+    }
+}
+
+/// Compression and stretching, as in the paper's Table 1.
+pub fn both(detection: &Detection) -> String {
+    format!("{}/{}", verdict(detection.compression), verdict(detection.stretching))
+}
+
+fn detection(validation: &Validation) -> Table {
+    let caption = "Whether each score detects compression and stretching in the bond scans of all elements, but not \
+                   the crystals at equilibrium. The largest value of each regime is that of the element where it is smallest.";
+    let titles = [
+        "score",
+        "detected when",
+        "compression/stretching",
+        "equilibrium inside",
+        "largest, compressed",
+        "largest, stretched",
+        "largest at equilibrium",
+    ];
+    let mut table = Table::new("detection", caption, &titles).whole();
+    for score in &validation.scores {
+        let found = &score.detection;
+        table.rows.push(vec![
+            text(&*score.name),
+            text(match score.rule {
+                Some(Rule::Threshold(limit)) => format!("above {limit}"),
+                Some(Rule::TimesMedian(factor)) => format!("above {factor} × median at equilibrium"),
+                None => "no rule".into(),
+            }),
+            text(both(found)),
+            text(verdict(found.interpolation)),
+            significant(found.largest_in_compression),
+            significant(found.largest_in_stretching),
+            significant(found.at_equilibrium),
+        ]);
+    }
+    table
+}
+
+/// A number with three significant digits on the page.
+fn significant(x: Option<f64>) -> Cell {
+    let exact = real(x, 0);
+    let shown = x.map_or("–".to_owned(), |x| match x.abs() {
+        size if !x.is_finite() || (size > 0.0 && !(1e-2..1e4).contains(&size)) => format!("{x:.1e}"),
+        size if size >= 100.0 => format!("{x:.0}"),
+        size if size >= 10.0 => format!("{x:.1}"),
+        _ => format!("{x:.2}"),
+    });
+    Cell { shown, ..exact }
+}
+
+fn bond_scans(validation: &Validation) -> Table {
+    let caption = "Bond scans. The equilibrium distance is that of the model’s lowest energy near the published one, unless it has none \
+                   there. Only ground states count for detection, and no crystals that stand in.";
+    let titles = [
+        "element",
+        "crystal",
+        "ground state",
+        "d_{eq} (Å)",
+        "of the model",
+        "score",
+        "compression/stretching",
+        "largest, compressed",
+        "at d_{eq}",
+        "largest, stretched",
+    ];
+    let mut table = Table::new("bond-scans", caption, &titles);
+    for scan in &validation.bond_scans {
+        for (score, found) in validation.scores.iter().zip(&scan.detection) {
+            let state = match (scan.is_ground_state, scan.is_own) {
+                (true, true) => "yes",
+                (true, false) => "stands in",
+                _ => "no",
+            };
+            table.rows.push(vec![
+                text(&*scan.element),
+                text(&*scan.prototype),
+                text(state),
+                real(scan.equilibrium, 3),
+                text(verdict(Some(scan.is_relaxed))),
+                text(&*score.name),
+                text(both(found)),
+                significant(found.largest_in_compression),
+                significant(found.at_equilibrium),
+                significant(found.largest_in_stretching),
+            ]);
+        }
+    }
+    table
+}
+
+fn defects(validation: &Validation) -> Table {
+    let caption = "Grades at defects: of the perfect crystal, next to the defect and farthest from it. The longest displacement is that of the \
+                   relaxation.";
+    let titles = [
+        "element",
+        "crystal",
+        "defect",
+        "atoms",
+        "relaxed",
+        "displacement (Å)",
+        "γ of the crystal",
+        "γ next to it",
+        "γ far away",
+        "γ_{nbr} next to it",
+        "atoms γ > 1 (%)",
+    ];
+    let mut table = Table::new("defects", caption, &titles).whole();
+    for defect in &validation.defects {
+        let (near, far) = (defect.shells.first(), defect.shells.last());
+        let atoms: usize = defect.shells.iter().map(|shell| shell.atoms).sum();
+        let above = defect.graded.as_ref().map(|(_, gamma, _)| {
+            gamma.iter().filter(|gamma| **gamma > 1.0).count() as f64 / gamma.len() as f64
+        });
+        let relaxed = match (&defect.relaxation, &defect.error) {
+            (_, Some(_)) => "not graded",
+            (Some(relaxation), _) if relaxation.is_converged => "yes",
+            (Some(_), _) => "not converged",
+            (None, _) => "no",
+        };
+        table.rows.push(vec![
+            text(&*defect.element),
+            text(&*defect.prototype),
+            text(defect.name),
+            count(atoms as u64),
+            text(relaxed),
+            real(defect.relaxation.as_ref().map(|of| of.largest_displacement), 2),
+            significant(defect.crystal.first().copied()),
+            significant(near.map(|shell| shell.scores[0])),
+            significant(far.map(|shell| shell.scores[0])),
+            significant(near.map(|shell| shell.averages[0])),
+            percent(above),
+        ]);
+    }
+    table
+}
+
+fn solutions(validation: &Validation) -> Table {
+    let caption = "Random solid solutions by composition.";
+    let titles = [
+        "elements",
+        "lattice",
+        "second element (%)",
+        "distance (Å)",
+        "structures",
+        "mean γ",
+        "mean γ_{nbr}",
+        "atoms γ > 1 (%)",
+        "atoms γ_{nbr} > 1 (%)",
+    ];
+    let mut table = Table::new("solutions", caption, &titles);
+    for solution in &validation.solutions {
+        for of in &solution.compositions {
+            table.rows.push(vec![
+                text(solution.elements.join("–")),
+                text(&*solution.prototype),
+                real(100.0 * of.fraction, 0),
+                real(of.distance, 3),
+                count(of.structures as u64),
+                significant(of.scores.first().copied()),
+                significant(of.averages.first().copied()),
+                percent(Some(of.above_1)),
+                percent(Some(of.averages_above_1)),
+            ]);
+        }
+    }
+    table
+}
+
+fn collisions(validation: &Validation) -> Table {
+    let caption = "Colliding environments: an atom in the middle of an octagon, with neighbours at the places 0, 1, 3, 4 (A) or 0, 1, 2, 5 (B). \
+                   Distances and angles are the same, so features of pairs and triples of atoms would have no distance. Rounding is the \
+                   relative distance between A and its mirror image.";
+    let titles = [
+        "element",
+        "features",
+        "|z_{A} − z_{B}| / |z_{A}|",
+        "rounding",
+        "E_{A} − E_{B} (eV)",
+        "γ_{A}",
+        "γ_{B}",
+    ];
+    let mut table = Table::new("collisions", caption, &titles);
+    for collision in &validation.collisions {
+        for features in &collision.features {
+            let [a, b] =
+                [&collision.scores[0], &collision.scores[1]].map(|of| significant(of.first().copied()));
+            table.rows.push(vec![
+                text(&*collision.element),
+                text(features.variant),
+                significant(Some(features.distance)),
+                significant(Some(features.rounding)),
+                significant(Some(collision.energies[0] - collision.energies[1])),
+                a,
+                b,
+            ]);
+        }
+    }
+    table
+}

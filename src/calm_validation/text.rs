@@ -1,0 +1,99 @@
+//! The page: what it says, and in which order; and the other files.
+
+use atoms::extxyz::{Column, ColumnData, Frame, write_frame};
+
+use super::tables::both;
+use super::{Defect, Validation, figures, tables};
+use crate::exit_status::Failure;
+use crate::page::{self, Block, File, Section};
+
+/// File name of the page.
+pub const PAGE: &str = "validation.html";
+
+/// All files, the page first.
+pub fn files(validation: &Validation) -> Result<Vec<File>, Failure> {
+    let (parts, tables) = (figures::all(validation), tables::all(validation));
+    let title = format!("Validation of the extrapolation grade: {}", validation.elements.join(", "));
+    let text = page::write(&title, &lead(validation), sections(&parts, &tables));
+    let json = serde_json::to_vec_pretty(validation).map_err(Failure::failed)?;
+    let mut files = vec![
+        File { path: PAGE.to_owned(), bytes: text.into_bytes() },
+        File { path: "validation.json".into(), bytes: json },
+        File { path: "structures.extxyz".into(), bytes: structures(&validation.defects)? },
+    ];
+    files.extend(page::files(parts, &tables)?);
+    Ok(files)
+}
+
+fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::Table]) -> Vec<Section<'a>> {
+    let figure = |name: &str| Block::figure(parts, name);
+    let table = |name: &str| Block::table(tables, name);
+    let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
+    let words = |words: &str| Some(Block::Paragraph(words.into()));
+    vec![
+        (
+            "Compression and stretching",
+            blocks(vec![
+                words(
+                    "A grade should call crystals near equilibrium interpolation, and both compressed and stretched ones extrapolation.",
+                ),
+                table("detection"),
+                figure("bond-scans"),
+                table("bond-scans"),
+            ]),
+        ),
+        (
+            "Defects",
+            blocks(vec![
+                words(
+                    "A grade should be largest at the defect and fall to that of the perfect crystal within a few layers, unless defects were \
+                     in the training data. The file structures.extxyz has the structures with gamma and gamma_nbr.",
+                ),
+                figure("vacancies"),
+                figure("surfaces"),
+                figure("grain-boundaries"),
+                figure("structures"),
+                table("defects"),
+            ]),
+        ),
+        ("Composition", blocks(vec![figure("solutions"), table("solutions")])),
+        (
+            "Colliding environments",
+            blocks(vec![
+                words(
+                    "Environments that differ should have features that differ: otherwise no score can tell them apart.",
+                ),
+                table("collisions"),
+            ]),
+        ),
+    ]
+}
+
+fn lead(validation: &Validation) -> String {
+    let gamma = &validation.scores[0];
+    let tested = validation.bond_scans.iter().filter(|scan| scan.is_ground_state).count();
+    format!(
+        "Tests without labels, of a model with a cutoff of {} Å. In the bond scans of {tested} of {}, γ detects \
+         compression/stretching: {}.",
+        validation.cutoff,
+        crate::output::count(validation.elements.len() as u64, "element"),
+        both(&gamma.detection)
+    )
+}
+
+/// The structures of the defects with their grades, extended XYZ.
+fn structures(defects: &[Defect]) -> Result<Vec<u8>, Failure> {
+    let mut bytes = Vec::new();
+    for defect in defects {
+        let Some((structure, gamma, averages)) = &defect.graded else { continue };
+        let mut frame = Frame::from(structure.clone());
+        let name = format!("{} {} {}", defect.element, defect.prototype, defect.name);
+        frame.info.insert("name".into(), name.into());
+        for (name, values) in [("gamma", gamma), ("gamma_nbr", averages)] {
+            let column = Column { width: 1, entries: ColumnData::Real(values.clone()) };
+            frame.arrays.insert(name.to_owned(), column);
+        }
+        write_frame(&mut bytes, &frame).map_err(Failure::failed)?;
+    }
+    Ok(bytes)
+}

@@ -1,0 +1,138 @@
+//! `calmwalk calm export`
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use calm::build::UpdatedMixture;
+use calm::{Artifact, Mixture};
+use serde_json::Value;
+use store::Store;
+
+use super::recalibrate::open;
+use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::cli::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::output::{count, print};
+use crate::replay::{self, RelocatedFiles};
+
+/// Write the mixture of a campaign, at any version, as a CALM artifact
+///
+/// The artifact is a copy of the one the campaign began with, with the covariances and counts that updates have changed since. Use it
+/// to grade structures by what the campaign has covered, with calm score, gracemaker or LAMMPS, or to begin another campaign. Reads
+/// the campaign only, which may be running.
+///
+/// The store has the newest version. Earlier ones are computed from the stored candidates, as by calmwalk replay. Version 0 is the
+/// original mixture. Numbers are rounded to single precision, as in every artifact.
+#[derive(Debug, clap::Args)]
+pub struct Export {
+    #[command(flatten)]
+    location: CampaignLocation,
+    /// Version of the mixture, as in the decision log [default: the newest]
+    #[arg(long, value_name = "V")]
+    version: Option<u64>,
+    /// File for the artifact; an existing file is replaced
+    #[arg(long, short, value_name = "OUT.npz")]
+    output: PathBuf,
+    /// Also write a copy of the campaign's model with this mixture, for LAMMPS and calmwalk
+    #[arg(long, value_name = "MODEL.npz")]
+    embed: Option<PathBuf>,
+    #[command(flatten)]
+    moved: RelocatedFiles,
+}
+
+/// A version of a campaign's mixture and the files that it belongs to.
+struct Version {
+    campaign: String,
+    newest: u64,
+    artifact: PathBuf,
+    /// With --embed.
+    model: Option<PathBuf>,
+    original: Artifact,
+    mixture: Arc<Mixture>,
+}
+
+impl Export {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        let found = block_on(self.read())??;
+        let updated = UpdatedMixture::new(&found.artifact, &found.original.mixture, &found.mixture);
+        let updated = updated.map_err(Failure::input)?;
+        if let (Some(model), Some(path)) = (&found.model, &self.embed) {
+            let mut file = AtomicFile::create(path)?;
+            updated.write_export(open(model)?, &mut file).map_err(|error| cannot_write(path, error))?;
+            file.finish()?;
+        }
+        let mut file = AtomicFile::create(&self.output)?;
+        updated
+            .write_artifact(open(&found.artifact)?, &mut file, &found.campaign)
+            .map_err(|error| cannot_write(&self.output, error))?;
+        file.finish()?;
+        self.report(&found)?;
+        Ok(ExitStatus::Done)
+    }
+
+    async fn read(&self) -> Result<Version, Failure> {
+        let store = Store::open_read_only(&self.location.get()?).await?;
+        let found = self.read_from(&store).await;
+        store.close().await;
+        found
+    }
+
+    async fn read_from(&self, store: &Store) -> Result<Version, Failure> {
+        let campaign = store.campaign().await?;
+        let (resolved, files) = (replay::resolved(&campaign)?, store.grade_files().await?);
+        if !matches!(resolved["files"][replay::ARTIFACT], Value::String(_)) {
+            return Err(Failure::Input(
+                "the campaign began with the mixture of its model, which it never changes: expected one with calm.artifact"
+                    .to_owned(),
+            ));
+        }
+        let find = |key| replay::find_one(key, &resolved, &files, &self.moved);
+        let artifact = find(replay::ARTIFACT)?;
+        let model = self.embed.as_ref().map(|_| find(replay::MODEL)).transpose()?;
+        self.check_outputs(&artifact, model.as_deref())?;
+        let original = Artifact::load(&artifact).map_err(Failure::input)?;
+        let newest = store.newest_mixture().await?;
+        let mixture = match self.version.unwrap_or(newest.version) {
+            0 => Arc::new(original.mixture.clone()),
+            version if version > newest.version => {
+                return Err(Failure::Input(format!(
+                    "--version {version}: the mixture of the campaign has versions 0 to {} so far",
+                    newest.version
+                )));
+            }
+            version if version == newest.version => {
+                let stored = newest.components.iter();
+                let stored = stored.map(|one| (one.element as usize, one.slot as usize, &one.bytes[..]));
+                let restored = original.mixture.restored(version, stored);
+                Arc::new(restored.map_err(|error| Failure::Failed(format!("damaged database: {error}")))?)
+            }
+            version => replay::mixture_of(store, version, &self.moved).await?,
+        };
+        let (campaign, newest) = (campaign.id.to_string(), newest.version);
+        Ok(Version { campaign, newest, artifact, model, original, mixture })
+    }
+
+    fn check_outputs(&self, artifact: &Path, model: Option<&Path>) -> Result<(), Failure> {
+        let inputs = || {
+            let model = model.map(|path| (path, "the model of the campaign"));
+            std::iter::once((artifact, "the artifact of the campaign")).chain(model)
+        };
+        let mut outputs = std::iter::once(&self.output).chain(&self.embed);
+        outputs.try_for_each(|output| refuse_to_replace(output, inputs()))
+    }
+
+    fn report(&self, found: &Version) -> Result<(), Failure> {
+        let Version { newest, original, mixture, .. } = found;
+        let pairs = original.mixture.iter().zip(mixture.iter());
+        let changed = pairs.filter(|((.., before), (.., now))| before != now).count();
+        let all = count(mixture.iter().count() as u64, "component");
+        print(|out| {
+            writeln!(
+                out,
+                "mixture version {} of 0 to {newest}: {changed} of {all} changed",
+                mixture.version()
+            )?;
+            let outputs = std::iter::once(&self.output).chain(&self.embed);
+            outputs.into_iter().try_for_each(|path| writeln!(out, "wrote {}", path.display()))
+        })
+    }
+}

@@ -1,0 +1,137 @@
+//! `calmwalk calm filter`
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use figures::{to_png, to_svg};
+
+use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::cli::{ExitStatus, Failure};
+use crate::output::{print, print_json};
+use crate::reliability_filter::{self, Columns, ErrorColumns, FilterReport};
+
+/// Resolution of a PNG, dots per inch.
+const RESOLUTION: f64 = 300.0;
+
+/// Show what a threshold of the grade keeps of a table of structures, against random subsets
+///
+/// For each threshold: the structures with at most this grade, their mean absolute error and, with --class-threshold, precision,
+/// recall and F1 of telling a class, such as the stable structures of Matbench Discovery. Beside each number: mean and standard
+/// deviation over random subsets of the same size, drawn without replacement. A grade that tells errors makes the kept structures
+/// better than these.
+///
+/// The table is a CSV file (commas, titles in the first row) with one row for each structure. Errors have the unit of the table.
+#[derive(Debug, clap::Args)]
+pub struct Filter {
+    /// Table with one row for each structure
+    #[arg(value_name = "TABLE.csv")]
+    table: PathBuf,
+    /// Column of the grade, for example the largest γ of the structure's atoms
+    #[arg(long, value_name = "COLUMN", default_value = "gamma_max")]
+    grade: String,
+    /// Column of the error; its sign does not matter
+    #[arg(long, value_name = "COLUMN", conflicts_with_all = ["predicted", "actual"], required_unless_present = "predicted")]
+    error: Option<String>,
+    /// Column of the predicted value, together with --true: the error is their difference
+    #[arg(long, value_name = "COLUMN", requires = "actual")]
+    predicted: Option<String>,
+    /// Column of the true value
+    #[arg(long = "true", value_name = "COLUMN", requires = "predicted")]
+    actual: Option<String>,
+    /// A structure is in the class if its value is at most this, as an energy above the hull of 0; in the unit of the values
+    #[arg(long, value_name = "VALUE", conflicts_with = "error", allow_negative_numbers = true, value_parser = finite)]
+    class_threshold: Option<f64>,
+    /// A structure is in the class if its value is larger than --class-threshold
+    #[arg(long, requires = "class_threshold")]
+    class_above: bool,
+    /// Thresholds of the grade
+    #[arg(
+        long,
+        value_name = "γ,…",
+        value_delimiter = ',',
+        value_parser = finite,
+        default_value = "0.3,0.4,0.5,0.6,0.7,0.8,0.9,1,1.2,1.5,2,3,5"
+    )]
+    thresholds: Vec<f64>,
+    /// Random subsets for each threshold
+    #[arg(long, value_name = "N", default_value_t = 40, value_parser = clap::value_parser!(u32).range(..=100_000))]
+    draws: u32,
+    /// Random seed
+    #[arg(long, default_value_t = 42)]
+    seed: u64,
+    /// Leave out rows in which one of the numbers is empty or nan
+    #[arg(long)]
+    skip_missing: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Also write the sweep to this file
+    #[arg(long, value_name = "FILE.csv")]
+    csv: Option<PathBuf>,
+    /// Also draw the sweep
+    #[arg(long, value_name = "FILE.svg|.png")]
+    figure: Option<PathBuf>,
+}
+
+fn finite(text: &str) -> Result<f64, String> {
+    let number = text.trim().parse().ok().filter(|number: &f64| number.is_finite());
+    number.ok_or_else(|| "expected a finite number".to_owned())
+}
+
+impl Filter {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        let is_png = self.figure.as_deref().map(is_png).transpose()?;
+        for output in self.csv.iter().chain(&self.figure) {
+            refuse_to_replace(output, [(self.table.as_path(), "the table")])?;
+        }
+        let (rows, left_out) = reliability_filter::read(&self.table, &self.columns(), self.skip_missing)?;
+        let report = FilterReport::new(&rows, left_out, &self.thresholds, self.draws, self.seed);
+        if let Some(path) = &self.csv {
+            write(path, &reliability_filter::csv(&report).into_bytes())?;
+        }
+        if let (Some(path), Some(is_png)) = (&self.figure, is_png) {
+            let figure = reliability_filter::draw(&report, &self.grade);
+            match is_png {
+                true => write(path, &to_png(&figure, RESOLUTION).map_err(Failure::failed)?)?,
+                false => write(path, to_svg(&figure).as_bytes())?,
+            }
+        }
+        match self.json {
+            true => print_json(&report)?,
+            false => print(|out| reliability_filter::write(&report, out))?,
+        }
+        Ok(ExitStatus::Done)
+    }
+
+    fn columns(&self) -> Columns<'_> {
+        let errors = match (&self.predicted, &self.actual) {
+            (Some(predicted), Some(actual)) => ErrorColumns::Values {
+                predicted,
+                actual,
+                limit: self.class_threshold,
+                above: self.class_above,
+            },
+            _ => ErrorColumns::Error(self.error.as_deref().unwrap_or("error")),
+        };
+        Columns { grade: &self.grade, errors }
+    }
+}
+
+/// Whether the name is that of a PNG; otherwise it is that of an SVG.
+fn is_png(path: &Path) -> Result<bool, Failure> {
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    match extension.as_str() {
+        "svg" => Ok(false),
+        "png" => Ok(true),
+        _ => {
+            let shown = path.display();
+            Err(Failure::Input(format!("--figure {shown}: expected a name that ends in .svg or .png")))
+        }
+    }
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    let mut file = AtomicFile::create(path)?;
+    file.write_all(bytes).map_err(|error| cannot_write(path, error))?;
+    file.finish()
+}

@@ -1,0 +1,159 @@
+//! Scores beside γ that `calmwalk calm score` writes: those of baselines, and the disagreement of an ensemble.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use analysis::{EnsembleError, force_deviation};
+use atoms::{Evaluation, Structure};
+use calm::baselines::{Baseline, BaselineError, BaselineFile};
+use calm::neighbourhood::PairError;
+use calm::neighbourhood_average;
+use potentials::grace::{GraceModel, PullBack};
+
+use super::scorer::Scorer;
+use crate::calm_validation::labelled::ScoreColumn;
+use crate::cli::Failure;
+use crate::feature_variant::FeatureModel;
+use crate::features::{FeatureCalculator, FeatureError};
+
+/// Baselines and models with their work arrays.
+pub struct OtherScores {
+    files: Vec<Scores>,
+    ensemble: Vec<FeatureCalculator>,
+}
+
+/// The baselines of one file.
+struct Scores {
+    /// `None` if they score the features that γ grades.
+    calculator: Option<FeatureCalculator>,
+    /// With the names of their columns.
+    baselines: Vec<(String, Baseline)>,
+}
+
+/// Why a structure cannot be scored.
+#[derive(Debug, thiserror::Error)]
+pub enum OtherScoreError {
+    #[error(transparent)]
+    Features(#[from] FeatureError),
+    #[error(transparent)]
+    Baseline(#[from] BaselineError),
+    #[error(transparent)]
+    Pair(#[from] PairError),
+    #[error(transparent)]
+    Ensemble(#[from] EnsembleError),
+}
+
+impl OtherScores {
+    /// Reads files of baselines, which must belong to the model, and further models. `graded` has the features that γ grades.
+    pub fn load(
+        model: &Path,
+        graded: &FeatureModel,
+        baselines: &[PathBuf],
+        ensemble: &[PathBuf],
+    ) -> Result<Self, Failure> {
+        let mut files: Vec<Scores> = Vec::new();
+        for path in baselines {
+            let found = scores(model, graded, path)?;
+            let names = || files.iter().flat_map(|file| &file.baselines).map(|(name, _)| name);
+            if let Some((name, _)) =
+                found.baselines.iter().find(|(name, _)| names().any(|known| known == name))
+            {
+                return Err(Failure::Input(format!(
+                    "{}: another file of baselines has a score '{name}', too; expected one of each",
+                    path.display()
+                )));
+            }
+            files.push(found);
+        }
+        let load =
+            |path: &PathBuf| GraceModel::load(path).map(|model| FeatureCalculator::new(Arc::new(model)));
+        let ensemble = ensemble.iter().map(load).collect::<Result<_, _>>().map_err(Failure::input)?;
+        Ok(Self { files, ensemble })
+    }
+
+    /// The columns of [`Self::columns`], in the same order. D-optimality has the limit 1, as γ has.
+    pub fn score_columns(&self) -> Vec<ScoreColumn> {
+        let baselines = self.files.iter().flat_map(|file| &file.baselines);
+        let limited =
+            baselines.map(|(name, baseline)| (name.as_str(), matches!(baseline, Baseline::DOptimality(_))));
+        let deviation = (!self.ensemble.is_empty()).then_some(("force_deviation", false));
+        let columns: Vec<_> = limited.chain(deviation).collect();
+        let averages = columns.iter().map(|(name, limited)| (format!("{name}_nbr"), *limited));
+        let own = columns.iter().map(|(name, limited)| ((*name).to_owned(), *limited));
+        own.chain(averages)
+            .map(|(name, limited)| ScoreColumn {
+                name: name.replace('_', "-"),
+                limit: limited.then_some(1.0),
+            })
+            .collect()
+    }
+
+    /// Names and values of the columns for a structure that was just scored: of each score, also its average over the
+    /// neighbourhood, with the suffix `_nbr`.
+    pub fn columns(
+        &mut self,
+        structure: &Structure,
+        scorer: &Scorer,
+    ) -> Result<Vec<(String, Vec<f64>)>, OtherScoreError> {
+        let mut columns = Vec::new();
+        for file in &mut self.files {
+            if let Some(calculator) = &mut file.calculator {
+                calculator.compute(structure)?;
+            }
+            for (name, baseline) in &file.baselines {
+                let rows = match &mut file.calculator {
+                    Some(calculator) if baseline.kind().has_force_form() => Some(calculator.force_rows()),
+                    _ => None,
+                };
+                let of_forces = rows.map(|rows| baseline.score_forces(&rows)).transpose()?.flatten();
+                let features =
+                    file.calculator.as_ref().map_or(scorer.features(), FeatureCalculator::features);
+                let found = of_forces.map_or_else(|| baseline.score(&scorer.elements, features), Ok)?;
+                columns.push((name.clone(), found));
+            }
+        }
+        if !self.ensemble.is_empty() {
+            columns.push(("force_deviation".to_owned(), self.force_deviation(structure, scorer)?));
+        }
+        let averages: Vec<_> = columns
+            .iter()
+            .map(|(name, found)| {
+                let pairs = scorer.pairs.iter().copied();
+                Ok((format!("{name}_nbr"), neighbourhood_average(found, pairs)?))
+            })
+            .collect::<Result<_, PairError>>()?;
+        columns.extend(averages);
+        Ok(columns)
+    }
+
+    fn force_deviation(
+        &mut self,
+        structure: &Structure,
+        scorer: &Scorer,
+    ) -> Result<Vec<f64>, OtherScoreError> {
+        let mut forces = vec![scorer.evaluation.forces.clone()];
+        for model in &mut self.ensemble {
+            model.compute(structure)?;
+            let mut evaluation = Evaluation::default();
+            model.grace.backward(None, &mut evaluation, &mut PullBack::default());
+            forces.push(evaluation.forces);
+        }
+        Ok(force_deviation(&forces)?)
+    }
+}
+
+fn scores(model: &Path, graded: &FeatureModel, path: &Path) -> Result<Scores, Failure> {
+    let file = BaselineFile::load(path).map_err(Failure::input)?;
+    let own = FeatureModel::for_baselines(model, &file.origin, path)?;
+    let is_graded = own.projection() == graded.projection();
+    let has_forces = file.baselines.iter().any(|baseline| baseline.kind().has_force_form());
+    let prefix = match file.origin.variant.as_str() {
+        _ if is_graded => String::new(),
+        "normalised" | "linear" | "hidden" => format!("{}_", file.origin.variant),
+        _ => "other_".to_owned(),
+    };
+    let named =
+        |baseline: Baseline| (format!("{prefix}{}", baseline.kind().name().replace('-', "_")), baseline);
+    let calculator = (!is_graded || has_forces).then(|| own.calculator());
+    Ok(Scores { calculator, baselines: file.baselines.into_iter().map(named).collect() })
+}

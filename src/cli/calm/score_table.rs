@@ -1,0 +1,57 @@
+//! The table of `calm score` with one row for each structure, which `calm filter` reads.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use atoms::cell::{norm, sub};
+use atoms::extxyz::{Frame, Labels};
+
+use super::scorer::Scorer;
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::cli::Failure;
+use crate::csv::number;
+
+const TITLES: &str = "line,atoms,gamma_max,gamma_nbr_max,energy_per_atom,label_energy_per_atom,force_error_mean,force_error_max";
+
+/// A file of rows.
+pub struct ScoreTable {
+    path: PathBuf,
+    file: AtomicFile,
+}
+
+impl ScoreTable {
+    /// Begins with the titles.
+    pub fn create(path: &Path) -> Result<Self, Failure> {
+        let mut table = Self { path: path.to_owned(), file: AtomicFile::create(path)? };
+        table.write(TITLES)?;
+        Ok(table)
+    }
+
+    /// Adds a frame that was scored last. Numbers that follow from labels are empty without them.
+    pub fn add(&mut self, frame: &Frame, scorer: &Scorer, labels: &Labels) -> Result<(), Failure> {
+        let atoms = frame.structure.len() as f64;
+        let largest = |values: &[f64]| values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let pairs = labels.forces.iter().flatten().zip(&scorer.evaluation.forces);
+        let errors: Vec<_> = pairs.map(|(a, b)| norm(sub(*a, *b))).collect();
+        let mean = (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / atoms);
+        let row = [
+            frame.line.to_string(),
+            atoms.to_string(),
+            number(largest(&scorer.grades.gamma)),
+            number(largest(&scorer.gamma_nbr)),
+            number(scorer.evaluation.energy() / atoms),
+            number(labels.energy.map(|energy| energy / atoms)),
+            number(mean),
+            number(largest(&errors)),
+        ];
+        self.write(&row.join(","))
+    }
+
+    pub fn finish(self) -> Result<(), Failure> {
+        self.file.finish()
+    }
+
+    fn write(&mut self, line: &str) -> Result<(), Failure> {
+        writeln!(self.file, "{line}").map_err(|error| cannot_write(&self.path, error))
+    }
+}

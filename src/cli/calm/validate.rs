@@ -1,0 +1,229 @@
+//! `calmwalk calm validate`
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use atoms::Species;
+use atoms::prototypes::Prototype;
+use md::Fire;
+use potentials::grace::GraceModel;
+
+use super::score::load;
+use crate::calm_validation::{
+    self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, verdict,
+};
+use crate::cli::{ExitStatus, Failure};
+use crate::output::{self, Bar, Table, decimals, print, print_stderr};
+use crate::page::{create_directory, write_files};
+use crate::signals::stop_token;
+
+const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
+
+/// Metals up to which all pairs are mixed by default.
+const MIXED: usize = 4;
+
+/// Test whether the extrapolation grade of a model can be trusted, without labels
+///
+/// Bond scans of the elements' crystals from compression to stretching, as the paper's minimal test; grades at vacancies, surfaces and
+/// grain boundaries; grades of random solid solutions against composition. Run it after calm build, and before a campaign trusts γ.
+/// Writes a self-contained HTML page, each figure as SVG, PNG and CSV, each table as CSV, all results as JSON, and the graded
+/// structures. The same input gives the same bytes. docs/calm-validation.md explains the tests.
+///
+/// (calmwalk validate checks the configuration of a campaign.)
+#[derive(Debug, clap::Args)]
+pub struct Validate {
+    /// GRACE model (kokkos.npz)
+    #[arg(long, value_name = "MODEL.npz")]
+    model: PathBuf,
+    /// CALM artifact (gmm_artifacts.npz) [default: mixture in the model file]
+    #[arg(long, value_name = "CALM.npz")]
+    artifact: Option<PathBuf>,
+    /// Another model of the same elements, trained independently; may be repeated. The spread of the energies of all models is compared
+    /// with γ
+    #[arg(long, value_name = "MODEL.npz")]
+    ensemble: Vec<PathBuf>,
+    /// Directory for the files, created if it does not exist; files of an earlier validation are replaced
+    #[arg(long, short, value_name = "DIR")]
+    output: PathBuf,
+    /// Elements whose crystals and defects are tested [default: all of the model]
+    #[arg(long, value_name = "SYMBOL,…", value_delimiter = ',')]
+    elements: Vec<Species>,
+    /// Pairs of elements whose solid solutions are tested, such as Mo-W [default: all pairs of the tested metals if there are at most 4]
+    #[arg(long, value_name = "A-B,…", value_delimiter = ',', value_parser = pair)]
+    pairs: Vec<[Species; 2]>,
+    /// Distances of each bond scan
+    #[arg(long, value_name = "N", default_value = "80")]
+    scan_steps: NonZeroUsize,
+    /// Random structures of each composition of a solid solution
+    #[arg(long, value_name = "N", default_value = "10")]
+    solution_structures: NonZeroUsize,
+    /// Keep the ideal positions at defects instead of relaxing them at fixed cell (FIRE, to 0.01 eV/Å)
+    #[arg(long)]
+    no_relax: bool,
+    /// Random seed of the solid solutions
+    #[arg(long, value_name = "N", default_value = "42")]
+    rng_seed: u64,
+}
+
+impl Validate {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
+        let (model, mixture) = (features.model, Arc::new(artifact.mixture));
+        let settings = self.settings(&model)?;
+        let others = self.ensemble(&model)?.into_iter().collect();
+        // Fail before the long computation.
+        create_directory(&self.output)?;
+        let progress = Progress::new(Bar::new(Some(1), BAR), stop_token()?);
+        let subject = Subject { model, mixture, others };
+        let Some(validation) = calm_validation::run(&subject, settings, &progress)? else {
+            print_stderr("stopped; nothing was written");
+            return Ok(ExitStatus::Interrupted);
+        };
+        drop(progress);
+        let files = calm_validation::files(&validation)?;
+        write_files(&self.output, &files)?;
+        print(|out| {
+            bond_scans(&validation).write(out)?;
+            writeln!(out)?;
+            defects(&validation).write(out)?;
+            let page = self.output.join(PAGE);
+            let others = output::count(files.len() - 1, "file");
+            writeln!(out, "\nwrote {} and {others} in the same directory", page.display())
+        })?;
+        Ok(ExitStatus::Done)
+    }
+
+    /// The spread of the energies, if there are further models.
+    fn ensemble(&self, model: &Arc<GraceModel>) -> Result<Option<Box<dyn Score>>, Failure> {
+        let mut models = vec![Arc::clone(model)];
+        for path in &self.ensemble {
+            let other = GraceModel::load(path).map_err(Failure::input)?;
+            if let Some(missing) = model.elements().iter().find(|species| !other.elements().contains(species))
+            {
+                let message = format!("{}: does not support {missing}, as the model does", path.display());
+                return Err(Failure::Input(message));
+            }
+            models.push(Arc::new(other));
+        }
+        Ok((models.len() > 1).then(|| Box::new(EnergySpread::new(models)) as Box<dyn Score>))
+    }
+
+    fn settings(&self, model: &GraceModel) -> Result<Settings, Failure> {
+        let known = model.elements();
+        let names = || known.iter().map(|species| species.symbol()).collect::<Vec<_>>().join(", ");
+        for species in self.elements.iter().chain(self.pairs.iter().flatten()) {
+            if !known.contains(species) {
+                let message = format!("the model does not support {species}; expected some of {}", names());
+                return Err(Failure::Input(message));
+            }
+        }
+        if self.scan_steps.get() < 2 {
+            return Err(Failure::Input("--scan-steps 1: expected at least 2".into()));
+        }
+        let mut elements = if self.elements.is_empty() { known.to_vec() } else { self.elements.clone() };
+        let pairs = if self.pairs.is_empty() { all_pairs(&elements) } else { self.pairs.clone() };
+        // Solid solutions need the equilibrium distances of their elements.
+        for species in pairs.iter().flatten() {
+            if !elements.contains(species) {
+                elements.push(*species);
+            }
+        }
+        Ok(Settings {
+            elements,
+            pairs,
+            scan_steps: self.scan_steps.get(),
+            relaxation: (!self.no_relax).then(Fire::default),
+            solution_structures: self.solution_structures.get(),
+            seed: self.rng_seed,
+        })
+    }
+}
+
+/// All pairs of the metals among the elements, if there are few.
+fn all_pairs(elements: &[Species]) -> Vec<[Species; 2]> {
+    const NOBLE: [u8; 5] = [2, 10, 18, 36, 54];
+    let is_metal = |species: &&Species| {
+        let found = species.ground_state();
+        let is_close_packed =
+            matches!(found.prototype, Prototype::Fcc | Prototype::Bcc | Prototype::Hcp { .. });
+        found.is_own && is_close_packed && !NOBLE.contains(&species.atomic_number())
+    };
+    let metals: Vec<_> = elements.iter().filter(is_metal).copied().collect();
+    if metals.len() > MIXED {
+        return Vec::new();
+    }
+    let others = |k: usize| metals[k + 1..].iter().copied();
+    metals.iter().enumerate().flat_map(|(k, first)| others(k).map(|second| [*first, second])).collect()
+}
+
+fn pair(text: &str) -> Result<[Species; 2], String> {
+    let (first, second) = text.split_once('-').ok_or("expected two elements, such as Mo-W")?;
+    let parse = |symbol: &str| symbol.parse::<Species>().map_err(|error| error.to_string());
+    let pair = [parse(first)?, parse(second)?];
+    if pair[0] == pair[1] { Err("expected two different elements".into()) } else { Ok(pair) }
+}
+
+fn bond_scans(validation: &Validation) -> Table {
+    let mut table = Table::new(&[
+        "element",
+        "crystal",
+        ">d_eq (Å)",
+        "score",
+        "compression/stretching",
+        "equilibrium inside",
+        ">compressed",
+        ">at d_eq",
+        ">stretched",
+    ]);
+    let scans = validation.bond_scans.iter().filter(|scan| scan.is_ground_state);
+    let rows = scans.flat_map(|scan| {
+        let names = [scan.element.clone(), scan.prototype.clone(), format!("{:.3}", scan.equilibrium)];
+        validation.scores.iter().zip(&scan.detection).map(move |(score, found)| (names.clone(), score, found))
+    });
+    let all = ["all", "", ""].map(str::to_owned);
+    let totals = validation.scores.iter().map(|score| (all.clone(), score, &score.detection));
+    for (names, score, found) in rows.chain(totals) {
+        let mut row = names.to_vec();
+        row.extend([score.name.clone(), both(found), verdict(found.interpolation).to_owned()]);
+        let values = [found.largest_in_compression, found.at_equilibrium, found.largest_in_stretching];
+        row.extend(values.map(|value| decimals(value, 2)));
+        table.push(row);
+    }
+    table
+}
+
+fn defects(validation: &Validation) -> Table {
+    let mut table = Table::new(&["element", "defect", ">crystal γ", ">γ next to it", ">γ far away"]);
+    for defect in &validation.defects {
+        let gamma = |of: Option<&f64>| decimals(of.copied(), 2);
+        let near = defect.shells.first().and_then(|shell| shell.scores.first());
+        let far = defect.shells.last().and_then(|shell| shell.scores.first());
+        table.push(vec![
+            defect.element.clone(),
+            format!("{} {}", defect.prototype, defect.name),
+            gamma(defect.crystal.first()),
+            gamma(near),
+            gamma(far),
+        ]);
+    }
+    table
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn metals_are_mixed_with_each_other() {
+        let mixed = |symbols: &[&str]| {
+            let elements: Vec<_> = symbols.iter().map(|symbol| symbol.parse().unwrap()).collect();
+            all_pairs(&elements).len()
+        };
+        assert_eq!((mixed(&["Al"]), mixed(&["Ni", "Al", "H"]), mixed(&["Si", "Ge"])), (0, 1, 0));
+        assert_eq!((mixed(&["Mo", "Nb", "Ta", "W"]), mixed(&["Mo", "Nb", "Ta", "W", "Ti"])), (6, 0));
+        assert!(pair("Mo-W").is_ok());
+        assert_eq!(pair("Mo-Mo").unwrap_err(), "expected two different elements");
+        assert!(pair("MoW").is_err() && pair("Mo-Xx").unwrap_err().contains("Xx"));
+    }
+}

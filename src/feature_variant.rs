@@ -1,0 +1,163 @@
+//! The features of a model: those that its file describes, or others of the same model.
+
+use std::path::Path;
+
+use calm::Projection;
+use calm::baselines::FeatureOrigin;
+use potentials::grace::{FeatureForm, GraceModel};
+
+use crate::exit_status::Failure;
+use crate::features::FeatureCalculator;
+use crate::file_hash;
+use crate::projection::{self, with_projection};
+
+/// Which features to use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum FeatureVariant {
+    /// The normalised and projected basis, with the logarithms of its norms
+    Normalised,
+    /// The projected basis, without normalisation and norms
+    Linear,
+    /// The last hidden layer of the readout, in which the energy is linear
+    Hidden,
+}
+
+impl FeatureVariant {
+    const ALL: [Self; 3] = [Self::Normalised, Self::Linear, Self::Hidden];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Normalised => "normalised",
+            Self::Linear => "linear",
+            Self::Hidden => "hidden",
+        }
+    }
+}
+
+/// A model with one variant of its features.
+#[derive(Clone)]
+pub struct FeatureModel {
+    pub model: std::sync::Arc<GraceModel>,
+    is_hidden: bool,
+}
+
+impl FeatureModel {
+    /// `None` stands for the features that the file describes.
+    ///
+    /// # Errors
+    /// An unreadable model; one without a projection of its features, unless they are those of the hidden layer.
+    pub fn load(path: &Path, variant: Option<FeatureVariant>) -> Result<Self, Failure> {
+        Self::new(path, GraceModel::load(path).map_err(Failure::input)?, variant)
+    }
+
+    /// The same of a model that was loaded from `path`.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn new(path: &Path, model: GraceModel, variant: Option<FeatureVariant>) -> Result<Self, Failure> {
+        Self::of(model, variant).ok_or_else(|| {
+            Failure::Input(format!(
+                "{}: the model has no projection of its features (uq_rp_matrix): give its artifact with --artifact, or build one \
+                 with calmwalk calm build",
+                path.display()
+            ))
+        })
+    }
+
+    fn of(model: GraceModel, variant: Option<FeatureVariant>) -> Option<Self> {
+        let form = match variant {
+            Some(FeatureVariant::Normalised) => FeatureForm::Normalised,
+            Some(FeatureVariant::Linear) => FeatureForm::Linear,
+            Some(FeatureVariant::Hidden) => return Some(Self { model: model.into(), is_hidden: true }),
+            None => {
+                return model.projection().is_some().then(|| Self { model: model.into(), is_hidden: false });
+            }
+        };
+        Some(Self { model: model.with_features(form)?.into(), is_hidden: false })
+    }
+
+    /// The variant of this model whose features an artifact has: the file's own, or another with the same matrix. The file's own
+    /// if none fits. A model without a projection gets that of the artifact.
+    ///
+    /// # Errors
+    /// An unreadable model, or one of another basis.
+    pub fn for_artifact(path: &Path, artifact: &Projection) -> Result<Self, Failure> {
+        let model = GraceModel::load(path).map_err(Failure::input)?;
+        if model.projection().is_none() {
+            let model = with_projection(model, artifact)
+                .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
+            return Self::new(path, model, None);
+        }
+        let own = Self::new(path, model, None)?;
+        let fits = |found: &Self| found.projection().is_some_and(|found| artifact.check_same(&found).is_ok());
+        if fits(&own) {
+            return Ok(own);
+        }
+        let others = [FeatureForm::Normalised, FeatureForm::Linear].map(|form| own.model.with_features(form));
+        let mut others =
+            others.into_iter().flatten().map(|model| Self { model: model.into(), is_hidden: false });
+        Ok(others.find(fits).unwrap_or(own))
+    }
+
+    /// The model of a file of baselines, with their variant.
+    ///
+    /// # Errors
+    /// Baselines of another model, or of features that the model does not have.
+    pub fn for_baselines(path: &Path, baselines: &FeatureOrigin, file: &Path) -> Result<Self, Failure> {
+        let known = FeatureVariant::ALL.into_iter().find(|variant| variant.name() == baselines.variant);
+        let found = Self::load(path, known)?;
+        let same = baselines.check_same(&found.origin(path)?);
+        same.map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
+        Ok(found)
+    }
+
+    /// Computes these features on the calling thread.
+    pub fn calculator(&self) -> FeatureCalculator {
+        let model = self.model.clone();
+        if self.is_hidden { FeatureCalculator::of_hidden_layer(model) } else { FeatureCalculator::new(model) }
+    }
+
+    /// D
+    pub fn dimension(&self) -> usize {
+        if self.is_hidden { self.model.hidden_dimension() } else { self.model.feature_dimension() }
+    }
+
+    /// How the features follow from the basis; `None` for the hidden layer.
+    pub fn projection(&self) -> Option<Projection> {
+        projection::of_model(&self.model).filter(|_| !self.is_hidden)
+    }
+
+    /// Chemical symbols, in the order of the element indices.
+    pub fn symbols(&self) -> Vec<String> {
+        self.model.elements().iter().map(|element| element.symbol().to_owned()).collect()
+    }
+
+    /// What ties baselines to these features.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn origin(&self, path: &Path) -> Result<FeatureOrigin, Failure> {
+        let variant = match self.projection() {
+            None => FeatureVariant::Hidden.name().to_owned(),
+            Some(found) => variant(&found),
+        };
+        Ok(FeatureOrigin {
+            model: file_hash::model_hash(path)?,
+            variant,
+            symbols: self.symbols(),
+            dimension: self.dimension(),
+        })
+    }
+}
+
+/// The name of the features of a projection.
+fn variant(projection: &Projection) -> String {
+    let Projection { asinh, normalised, density_channels, density_scale, .. } = *projection;
+    match (normalised, density_channels, asinh) {
+        (true, true, false) if density_scale == 1.0 => FeatureVariant::Normalised.name().to_owned(),
+        (false, false, false) => FeatureVariant::Linear.name().to_owned(),
+        _ => format!(
+            "normalised {normalised}, density channels {density_channels} × {density_scale}, asinh {asinh}"
+        ),
+    }
+}

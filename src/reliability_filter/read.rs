@@ -1,0 +1,87 @@
+//! Reads the table.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use analysis::GradedRow;
+
+use crate::csv_reader::{CsvReader, Row};
+use crate::exit_status::Failure;
+
+/// Cells that stand for a missing number, besides empty ones.
+const MISSING: [&str; 5] = ["nan", "na", "n/a", "null", "none"];
+
+/// Titles of the columns to read.
+pub struct Columns<'a> {
+    pub grade: &'a str,
+    pub errors: ErrorColumns<'a>,
+}
+
+/// Where errors come from.
+pub enum ErrorColumns<'a> {
+    /// A column of errors, signed or not.
+    Error(&'a str),
+    /// A predicted and a true value. A structure is in the class if its value is at most the limit (above it if `above`).
+    Values { predicted: &'a str, actual: &'a str, limit: Option<f64>, above: bool },
+}
+
+/// Reads all rows, and counts those without one of the numbers, which is an error unless `skip_missing`.
+pub fn read(path: &Path, columns: &Columns, skip_missing: bool) -> Result<(Vec<GradedRow>, usize), Failure> {
+    let file = File::open(path)
+        .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", path.display())))?;
+    let mut table = CsvReader::new(BufReader::new(file)).map_err(|error| error.of(path))?;
+    let place = |title| table.column(title).map(|place| (title, place)).map_err(|error| error.of(path));
+    let titles = match columns.errors {
+        ErrorColumns::Error(error) => vec![columns.grade, error],
+        ErrorColumns::Values { predicted, actual, .. } => vec![columns.grade, predicted, actual],
+    };
+    let places = titles.into_iter().map(place).collect::<Result<Vec<_>, _>>()?;
+    let (mut rows, mut left_out) = (Vec::new(), 0);
+    while let Some(row) = table.next().map_err(|error| error.of(path))? {
+        let mut numbers = Vec::with_capacity(places.len());
+        for (title, place) in &places {
+            match number(&row, title, *place, path)? {
+                Some(number) => numbers.push(number),
+                None if skip_missing => break,
+                None => {
+                    let place = format!("{}:{}", path.display(), row.line);
+                    let message =
+                        format!("column '{title}' has no number; --skip-missing leaves such rows out");
+                    return Err(Failure::Input(format!("{place}: {message}")));
+                }
+            }
+        }
+        match numbers.len() == places.len() {
+            true => rows.push(graded(numbers[0], &numbers[1..], &columns.errors)),
+            false => left_out += 1,
+        }
+    }
+    if rows.is_empty() {
+        return Err(Failure::Input(format!("{}: no row has all numbers", path.display())));
+    }
+    Ok((rows, left_out))
+}
+
+/// The number of a cell; `None` if it is missing.
+fn number(row: &Row, title: &str, place: usize, path: &Path) -> Result<Option<f64>, Failure> {
+    let cell = row.cells[place].trim();
+    if cell.is_empty() || MISSING.contains(&cell.to_lowercase().as_str()) {
+        return Ok(None);
+    }
+    let finite = cell.parse::<f64>().ok().filter(|number| number.is_finite());
+    finite.map(Some).ok_or_else(|| {
+        let place = format!("{}:{}", path.display(), row.line);
+        Failure::Input(format!("{place}: column '{title}' is '{cell}', expected a finite number"))
+    })
+}
+
+fn graded(grade: f64, values: &[f64], columns: &ErrorColumns) -> GradedRow {
+    match (columns, values) {
+        (ErrorColumns::Values { limit, above, .. }, [predicted, actual]) => {
+            let is_in = |value: f64| limit.map(|limit| (value <= limit) != *above);
+            GradedRow { grade, error: predicted - actual, class: is_in(*predicted).zip(is_in(*actual)) }
+        }
+        _ => GradedRow { grade, error: values[0], class: None },
+    }
+}

@@ -1,0 +1,65 @@
+//! The page: what it says, and in which order.
+
+use super::report_data::ReportData;
+use super::tables::collection_rule;
+use crate::page::style::grouped;
+use crate::page::{self, Block, FigureEntry, Section, Table};
+
+/// Writes the page.
+pub fn write(data: &ReportData, parts: &[FigureEntry], tables: &[Table]) -> String {
+    let title = format!("Campaign {}", data.campaign.id);
+    page::write(&title, &lead(data), sections(data, parts, tables))
+}
+
+fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [Table]) -> Vec<Section<'a>> {
+    let numbered = |name: &str| Block::figure(parts, name);
+    let table = |name: &str| Block::table(tables, name);
+    let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
+    let why = collection_rule(&data.configuration).map(|rule| {
+        Block::Paragraph(format!(
+            "A structure of a biased walk becomes a candidate when {rule}, under the walker’s mixture. The selector decides with the \
+             newest mixture."
+        ))
+    });
+    vec![
+        ("Summary", blocks(vec![table("summary")])),
+        ("Collected structures", blocks(vec![why, numbered("collection"), table("seed-structures")])),
+        (
+            "Biased against control walks",
+            blocks(vec![
+                numbered("distributions"),
+                numbered("errors"),
+                numbered("space"),
+                numbered("features"),
+            ]),
+        ),
+        (
+            "Force errors by grade",
+            blocks(vec![
+                numbered("grades"),
+                table("correlations"),
+                table("quantiles-gamma"),
+                table("quantiles-gamma-nbr"),
+            ]),
+        ),
+        (
+            "Cost, failures and unlabelled structures",
+            blocks(vec![numbered("cost"), table("failures"), numbered("completion"), table("unlabelled")]),
+        ),
+        ("Settings", blocks(vec![table("settings")])),
+        ("Versions and provenance", blocks(vec![table("provenance")])),
+    ]
+}
+
+fn lead(data: &ReportData) -> String {
+    let candidates = &data.status.candidates;
+    let (biased, control) = (&data.collections.biased, &data.collections.control);
+    format!(
+        "The selector accepted {} structures of {} candidates from biased walks and collected {} frames from control walks; {} of them are \
+         labelled. Unless stated otherwise, grades are those of the original mixture, with which the campaign began.",
+        grouped(candidates.accepted),
+        grouped(candidates.seen),
+        grouped(candidates.control),
+        grouped(biased.labelled() + control.labelled())
+    )
+}

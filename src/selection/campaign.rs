@@ -1,0 +1,83 @@
+//! The candidates of a campaign as a pool.
+
+use serde_json::Value;
+use store::records::{Fate, StoredCandidate};
+use store::{Location, Store};
+
+use super::{Item, ItemPlace, Source};
+use crate::exit_status::Failure;
+
+/// Candidates per read; each has up to megabytes of features.
+const PAGE: u32 = 16;
+
+/// The candidates of a campaign's biased walks, in decision order.
+pub struct CampaignCandidates {
+    pub store: Store,
+    /// Its index among the campaigns of the pool.
+    number: u32,
+    /// Id of the campaign.
+    pub id: String,
+    /// Leave out accepted candidates.
+    declined_only: bool,
+    /// The stored features are those of the model.
+    same_model: bool,
+    last: i64,
+    /// Every candidate was read.
+    pub(super) is_read: bool,
+    runtime: tokio::runtime::Runtime,
+}
+
+impl CampaignCandidates {
+    /// Opens campaign `number` of the pool for reading. Its stored features are used if its model has the BLAKE3 hash
+    /// `model_hash`.
+    pub fn open(
+        location: &Location,
+        number: u32,
+        model_hash: &str,
+        declined_only: bool,
+    ) -> Result<Self, Failure> {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
+        let (store, campaign) = runtime.block_on(async {
+            let store = Store::open_read_only(location).await?;
+            let campaign = store.campaign().await?;
+            Ok::<_, Failure>((store, campaign))
+        })?;
+        let configuration: Value =
+            serde_json::from_str(&campaign.resolved_configuration).map_err(Failure::failed)?;
+        let same_model = configuration["files"]["potential.model"] == model_hash;
+        let id = campaign.id.to_string();
+        Ok(Self { store, number, id, declined_only, same_model, last: 0, is_read: false, runtime })
+    }
+
+    /// The next candidates; none at the end.
+    pub(super) fn next_page(&mut self) -> Result<Vec<Item>, Failure> {
+        loop {
+            let page = self.runtime.block_on(self.store.candidates(self.last, false, PAGE))?;
+            let Some(last) = page.last() else { return Ok(Vec::new()) };
+            self.last = last.decision;
+            let kept = page.into_iter().filter(|found| !self.declined_only || found.fate != Fate::Accepted);
+            let items: Vec<_> = kept.map(|found| self.item(found)).collect();
+            if !items.is_empty() {
+                return Ok(items);
+            }
+        }
+    }
+
+    fn item(&self, found: StoredCandidate) -> Item {
+        let view = found.block.view();
+        Item {
+            structure: view.structure(),
+            source: Source::Candidate { campaign: self.number, decision: found.decision },
+            features: found.features.filter(|_| self.same_model),
+            place: ItemPlace::Candidate(view.id().to_string()),
+        }
+    }
+
+    /// The candidate of a decision.
+    pub(super) fn candidate(&self, decision: i64) -> Result<StoredCandidate, Failure> {
+        let found = self.runtime.block_on(self.store.candidates(decision - 1, false, 1))?;
+        let found = found.into_iter().find(|found| found.decision == decision);
+        found.ok_or_else(|| Failure::Failed(format!("the candidate of decision {decision} is gone")))
+    }
+}

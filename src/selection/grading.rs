@@ -1,0 +1,233 @@
+//! Reads the structures of a pool and grades their atoms, a block at a time on several threads.
+
+use std::collections::HashMap;
+use std::panic::resume_unwind;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+
+use calm::selection::{Pool, Window};
+use calm::{Grades, Mixture};
+use potentials::grace::GraceModel;
+use tokio_util::sync::CancellationToken;
+use wire::ContentHash;
+
+use super::campaign::CampaignCandidates;
+use super::{GradedPool, Item, ItemPlace, PoolStructure, Source};
+use crate::exit_status::Failure;
+use crate::features::FeatureCalculator;
+use crate::output::{self, Bar};
+use crate::structure_files::{StructureFiles, StructureReader};
+
+/// Structures of a block for each thread.
+const BLOCK: usize = 16;
+
+const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
+
+/// Where the structures of a pool are.
+pub struct PoolFiles {
+    pub files: StructureFiles,
+    pub campaigns: Vec<CampaignCandidates>,
+}
+
+/// How a pool is graded, and what is kept of it.
+pub struct Grading {
+    pub model: Arc<GraceModel>,
+    pub mixture: Arc<Mixture>,
+    pub window: Window,
+    /// Keep the features of atoms outside the window.
+    pub all_atoms: bool,
+    /// Bytes of features in memory; the others are in a temporary file in `directory`.
+    pub memory: usize,
+    pub directory: PathBuf,
+    pub threads: usize,
+    pub stop: CancellationToken,
+}
+
+/// A thread's work arrays.
+struct Worker {
+    calculator: FeatureCalculator,
+    grades: Grades,
+}
+
+/// What was found of a structure.
+struct GradedStructure {
+    elements: Vec<usize>,
+    slots: Vec<usize>,
+    gamma: Vec<f64>,
+    features: Vec<f64>,
+    evaluated: bool,
+}
+
+impl Grading {
+    /// Grades every structure of the files, then of the campaigns; `None` after a cancellation of `stop`.
+    pub fn run(&self, pool: &mut PoolFiles) -> Result<Option<GradedPool>, Failure> {
+        let bytes = Arc::new(AtomicU64::new(0));
+        let total = pool.files.total_bytes()?;
+        let bar = Bar::new((total > 0).then_some(total), BAR);
+        let mut reader = Reader {
+            files: (!pool.files.files.is_empty()).then(|| pool.files.reader(Arc::clone(&bytes))),
+            paths: &pool.files,
+            campaigns: &mut pool.campaigns,
+            waiting: Vec::new(),
+        };
+        let mut workers: Vec<Worker> = (0..self.threads)
+            .map(|_| Worker {
+                calculator: FeatureCalculator::new(Arc::clone(&self.model)),
+                grades: Grades::default(),
+            })
+            .collect();
+        let dimension = self.mixture.dimension();
+        let atoms = Pool::new(dimension, self.window, self.all_atoms, self.memory, self.directory.clone());
+        let mut found =
+            GradedPool { pool: atoms, structures: Vec::new(), compositions: Vec::new(), evaluated: 0 };
+        let mut compositions = HashMap::new();
+        loop {
+            let block = reader.block(BLOCK * self.threads)?;
+            if block.is_empty() {
+                return Ok(Some(found));
+            }
+            if self.stop.is_cancelled() {
+                return Ok(None);
+            }
+            let graded = self.grade(&mut workers, &block);
+            for (item, graded) in block.iter().zip(graded) {
+                found.add(item, &graded?, &mut compositions, self.model.elements().len())?;
+            }
+            let count = found.structures.len();
+            bar.set(bytes.load(Ordering::Relaxed), || output::count(count, "structure"));
+        }
+    }
+
+    /// In the order of the block.
+    fn grade(&self, workers: &mut [Worker], block: &[Item]) -> Vec<Result<GradedStructure, Failure>> {
+        let items = Mutex::new(block.iter().enumerate());
+        let next = || items.lock().unwrap_or_else(PoisonError::into_inner).next();
+        let share = |worker: &mut Worker| {
+            let mut graded = Vec::new();
+            while let Some((number, item)) = next() {
+                graded.push((number, worker.grade(&self.mixture, item)));
+            }
+            graded
+        };
+        let share = &share;
+        let mut graded: Vec<_> = match workers {
+            [worker] => share(worker),
+            workers => thread::scope(|scope| {
+                let threads: Vec<_> =
+                    workers.iter_mut().map(|worker| scope.spawn(move || share(worker))).collect();
+                let results = threads.into_iter();
+                results
+                    .flat_map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)))
+                    .collect()
+            }),
+        };
+        graded.sort_unstable_by_key(|(number, _)| *number);
+        graded.into_iter().map(|(_, result)| result).collect()
+    }
+}
+
+impl Worker {
+    fn grade(&mut self, mixture: &Mixture, item: &Item) -> Result<GradedStructure, Failure> {
+        let wrong = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", item.place));
+        let size = item.structure.len() * mixture.dimension();
+        let known = item.features.as_ref().filter(|features| features.len() == size);
+        let (elements, features) = match known {
+            Some(features) => {
+                let model = self.calculator.grace.model();
+                let elements =
+                    model.element_indices(&item.structure.species).map_err(|error| wrong(&error))?;
+                (elements, features.clone())
+            }
+            None => {
+                let elements = self.calculator.compute(&item.structure).map_err(|error| wrong(&error))?;
+                (elements, self.calculator.grace.features()[..size].to_vec())
+            }
+        };
+        self.grades.evaluate(mixture, &elements, &features, None).map_err(|error| wrong(&error))?;
+        let (slots, gamma) = (self.grades.component.clone(), self.grades.gamma.clone());
+        Ok(GradedStructure { elements, slots, gamma, features, evaluated: known.is_none() })
+    }
+}
+
+impl GradedPool {
+    fn add(
+        &mut self,
+        item: &Item,
+        graded: &GradedStructure,
+        compositions: &mut HashMap<Vec<u32>, u32>,
+        elements: usize,
+    ) -> Result<(), Failure> {
+        let GradedStructure { elements: of_atoms, slots, gamma, features, evaluated } = graded;
+        self.pool
+            .push(of_atoms, slots, gamma, features)
+            .map_err(|error| Failure::Failed(format!("the temporary file of the features: {error}")))?;
+        let mut composition = vec![0; elements];
+        of_atoms.iter().for_each(|element| composition[*element] += 1);
+        let known = compositions.len() as u32;
+        let number = *compositions.entry(composition.clone()).or_insert(known);
+        if number == known {
+            self.compositions.push(composition);
+        }
+        self.evaluated += u64::from(*evaluated);
+        self.structures.push(PoolStructure {
+            source: item.source,
+            hash: hash(&item.structure),
+            composition: number,
+            gamma_max: calm::grade::maximum(gamma),
+        });
+        Ok(())
+    }
+}
+
+/// The first eight bytes of a structure's hash.
+pub(super) fn hash(structure: &atoms::Structure) -> u64 {
+    let ContentHash(bytes) = ContentHash::from_structure(structure);
+    bytes.first_chunk().map_or(0, |first| u64::from_le_bytes(*first))
+}
+
+/// Reads blocks of structures.
+struct Reader<'a> {
+    files: Option<StructureReader>,
+    paths: &'a StructureFiles,
+    campaigns: &'a mut Vec<CampaignCandidates>,
+    /// Structures of a page that did not fit the last block, in reverse order.
+    waiting: Vec<Item>,
+}
+
+impl Reader<'_> {
+    /// At most `size` structures; none at the end.
+    fn block(&mut self, size: usize) -> Result<Vec<Item>, Failure> {
+        let mut block = Vec::with_capacity(size);
+        while block.len() < size {
+            match self.next()? {
+                Some(item) => block.push(item),
+                None => break,
+            }
+        }
+        Ok(block)
+    }
+
+    fn next(&mut self) -> Result<Option<Item>, Failure> {
+        if let Some(reader) = &mut self.files {
+            if let Some((frame, file)) = reader.next()? {
+                let number = self.paths.files.iter().position(|known| known.path == file.path);
+                let frame_index = u32::try_from(reader.frame_index()).map_err(Failure::failed)?;
+                let source = Source::File { file: number.unwrap_or_default() as u32, frame: frame_index };
+                let place = ItemPlace::Line(file.path, frame.line);
+                return Ok(Some(Item { structure: frame.structure, source, features: None, place }));
+            }
+            self.files = None;
+        }
+        while self.waiting.is_empty() {
+            let Some(campaign) = self.campaigns.iter_mut().find(|campaign| !campaign.is_read) else {
+                return Ok(None);
+            };
+            self.waiting = campaign.next_page()?;
+            self.waiting.reverse();
+            campaign.is_read = self.waiting.is_empty();
+        }
+        Ok(self.waiting.pop())
+    }
+}

@@ -1,0 +1,83 @@
+//! Selection of structures for labelling from files and campaigns: reads and grades a pool, and applies strategies to it.
+
+mod campaign;
+mod grading;
+mod output;
+mod picks;
+mod strategy;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use calm::selection::Pool;
+
+pub use self::campaign::CampaignCandidates;
+pub use self::grading::{Grading, PoolFiles};
+pub use self::output::frames;
+pub use self::picks::{Pick, Picks, Rules, pick};
+pub use self::strategy::{Part, Strategy};
+
+/// Structures of a pool with the grades of their atoms.
+pub struct GradedPool {
+    pub pool: Pool,
+    pub structures: Vec<PoolStructure>,
+    /// Number of atoms of each element, by element index. Many structures share one.
+    pub compositions: Vec<Vec<u32>>,
+    /// Structures whose features were computed; those of the others were in the store of their campaign.
+    pub evaluated: u64,
+}
+
+/// What is kept of every structure, 40 bytes.
+pub struct PoolStructure {
+    pub source: Source,
+    /// Begin of its hash: files must not change before the picked structures are read again.
+    pub hash: u64,
+    pub composition: u32,
+    /// Largest γ of all its atoms.
+    pub gamma_max: f64,
+}
+
+/// Where a structure comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// Structure `frame` of a file, both counted from 0.
+    File { file: u32, frame: u32 },
+    /// The candidate of a decision of a campaign.
+    Candidate { campaign: u32, decision: i64 },
+}
+
+impl GradedPool {
+    /// Number of atoms of an element in a structure.
+    pub fn atoms(&self, structure: usize, element: usize) -> u64 {
+        self.compositions[self.structures[structure].composition as usize][element].into()
+    }
+
+    /// Number of atoms of a structure.
+    pub fn total_atoms(&self, structure: usize) -> u64 {
+        self.compositions[self.structures[structure].composition as usize].iter().map(|n| u64::from(*n)).sum()
+    }
+}
+
+/// A structure to be graded.
+struct Item {
+    structure: atoms::Structure,
+    source: Source,
+    /// Features that are known, `[n × D]`.
+    features: Option<Vec<f64>>,
+    place: ItemPlace,
+}
+
+/// For messages.
+enum ItemPlace {
+    Line(Arc<Path>, usize),
+    Candidate(String),
+}
+
+impl std::fmt::Display for ItemPlace {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Line(file, line) => write!(f, "{}:{line}", file.display()),
+            Self::Candidate(id) => write!(f, "candidate {id}"),
+        }
+    }
+}

@@ -1,0 +1,208 @@
+//! `calmwalk select`, and what a campaign makes of it (`import --queue`).
+
+use std::fs;
+use std::path::Path;
+
+use atoms::extxyz::Frame;
+use atoms::read_extxyz;
+use serde_json::Value as Json;
+
+use crate::common::campaign::Small;
+use crate::common::{config, random, refuse, succeed, write_frames};
+
+fn file(path: &str) -> String {
+    config(&format!("data/al_eam_1l/{path}")).display().to_string()
+}
+
+/// Training frames whose atoms are displaced by up to 0.05, 0.1, … Å, and whose info has the number `n`.
+fn pool(path: &Path, count: usize) -> Vec<Frame> {
+    let seeds = read_extxyz(&config("data/aluminium_seeds.extxyz")).unwrap();
+    let frame = |n: usize| {
+        let mut frame = seeds[n % seeds.len()].clone();
+        let scale = 0.05 * (1 + n % 7) as f64;
+        for (k, x) in frame.structure.positions.iter_mut().flatten().enumerate() {
+            let unit = random((1000 * n + k) as u64) as f64 / u64::MAX as f64;
+            *x += scale * (2.0 * unit - 1.0);
+        }
+        frame.info.insert("n".to_owned(), (n as i64).into());
+        frame
+    };
+    let frames: Vec<_> = (0..count).map(frame).collect();
+    write_frames(path, &frames);
+    frames
+}
+
+fn select(here: &Path, arguments: &[&str]) -> Json {
+    let (model, artifact) = (file("kokkos.npz"), file("gmm_artifacts.npz"));
+    let own = ["select", "--model", &model, "--artifact", &artifact, "--output", "out.extxyz", "--json"];
+    serde_json::from_str(&succeed(here, own.iter().chain(arguments))).unwrap()
+}
+
+fn refused(here: &Path, arguments: &[&str]) -> String {
+    let (model, artifact) = (file("kokkos.npz"), file("gmm_artifacts.npz"));
+    let own = ["select", "--model", &model, "--artifact", &artifact];
+    refuse(here, own.iter().chain(arguments))
+}
+
+fn number(frame: &Frame, key: &str) -> f64 {
+    frame.info[key].number().unwrap()
+}
+
+#[test]
+fn selected_structures_keep_their_frames_whatever_threads_and_memory() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let frames = pool(&here.join("pool.extxyz"), 12);
+    let found = select(here, &["pool.extxyz", "--threads", "1"]);
+    let selected = read_extxyz(&here.join("out.extxyz")).unwrap();
+    let picks = found["picks"].as_array().unwrap();
+    assert!(selected.len() > 1 && picks.len() == selected.len());
+    for (rank, (frame, pick)) in selected.iter().zip(picks).enumerate() {
+        let n = number(frame, "n") as usize;
+        assert_eq!((&frame.structure, &frame.info["name"]), (&frames[n].structure, &frames[n].info["name"]));
+        assert_eq!(frame.info["source_file"].text(), Some("pool.extxyz"));
+        assert_eq!(frame.info["selection_strategy"].text(), Some("greedy"));
+        assert_eq!(number(frame, "source_frame") as usize, n);
+        assert_eq!(
+            (number(frame, "selection_rank"), pick["rank"].as_u64()),
+            ((rank + 1) as f64, Some(rank as u64 + 1))
+        );
+        assert_eq!(Some(number(frame, "gamma_max")), pick["gamma_max"].as_f64());
+        assert!(number(frame, "gamma_max") > 1.0);
+    }
+    assert!(selected.windows(2).all(|pair| number(&pair[0], "gamma_max") >= number(&pair[1], "gamma_max")));
+    assert_eq!((&found["gamma_left"], &found["floor"]), (&0.0.into(), &Json::Null));
+    let bytes = fs::read(here.join("out.extxyz")).unwrap();
+    let again = select(here, &["pool.extxyz", "--threads", "2", "--memory", "0"]);
+    assert_eq!((again, fs::read(here.join("out.extxyz")).unwrap()), (found, bytes));
+    // Nothing but the output is left.
+    assert_eq!(fs::read_dir(here).unwrap().count(), 2);
+    let first = select(here, &["pool.extxyz", "-n", "1"]);
+    assert!(first["gamma_left"].as_f64() > Some(1.0));
+}
+
+#[test]
+fn several_strategies_pick_from_what_is_left() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    pool(&here.join("pool.extxyz"), 14);
+    let parts = ["greedy:2", "fps:2", "fps-all:2", "random-extrap:1", "random:3"];
+    let found = select(here, &[&["pool.extxyz", "--strategy"], &parts[..]].concat());
+    let of = |strategy: &str| {
+        let all = found["strategies"].as_array().unwrap().iter();
+        all.filter(|part| part["strategy"] == strategy)
+            .map(|part| part["structures"].as_u64().unwrap())
+            .sum::<u64>()
+    };
+    for part in parts {
+        let (name, number) = part.split_once(':').unwrap();
+        assert_eq!(of(name), number.parse::<u64>().unwrap(), "{name}");
+    }
+    let selected = read_extxyz(&here.join("out.extxyz")).unwrap();
+    let mut numbers: Vec<_> = selected.iter().map(|frame| number(frame, "n") as u64).collect();
+    numbers.sort_unstable();
+    numbers.dedup();
+    assert_eq!(numbers.len(), 10);
+    assert_eq!(found["floor"], 131);
+    // Commas, repetition and aliases are the same.
+    let same = [
+        "--strategy",
+        "greedy:2,fps-extrap:2,fps-all:2",
+        "--strategy",
+        "random-extrap:1",
+        "--strategy",
+        "random-all:3",
+    ];
+    assert_eq!(select(here, &[&["pool.extxyz"], &same[..]].concat()), found);
+    let other = select(here, &[&["pool.extxyz", "--rng-seed", "1", "--strategy"], &parts[..]].concat());
+    assert_ne!(other["picks"], found["picks"]);
+    // With a window, what is above is not seen.
+    let within = select(here, &["pool.extxyz", "--gamma-max", "1.5", "--gamma-min", "1.1", "-n", "1"]);
+    assert!(within["picks"][0]["gamma_max"].as_f64() < Some(1.51));
+}
+
+#[test]
+fn wrong_selections_are_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    pool(&here.join("pool.extxyz"), 2);
+    let out = ["--output", "out.extxyz"];
+    let cases: [(&[&str], &str); 8] = [
+        (
+            &["pool.extxyz", "--strategy", "fps"],
+            "--strategy fps: expected a number of structures, as in fps:25, or -n",
+        ),
+        (&["pool.extxyz", "-n", "3", "--strategy", "greedy", "fps:2"], "-n is for a single strategy"),
+        (&["pool.extxyz", "--strategy", "gredy"], "unknown strategy 'gredy'"),
+        (&["pool.extxyz", "--gamma-min", "2", "--gamma-max", "1"], "--gamma-min 2, --gamma-max 1: expected"),
+        (&["pool.extxyz", "--update-target", "0"], "--update-target: found 0, expected"),
+        (&["pool.extxyz", "--memory=-1"], "--memory -1: expected"),
+        (&["pool.cif"], "pool.cif: unknown format"),
+        (&[], "<POOL>"),
+    ];
+    for (arguments, why) in cases {
+        let message = refused(here, &[arguments, &out[..]].concat());
+        assert!(message.contains(why), "{message}");
+    }
+    let message = refused(here, &["pool.extxyz", "--output", "pool.extxyz"]);
+    assert!(message.contains("is a file of the pool"), "{message}");
+    assert!(!here.join("out.extxyz").exists());
+    // The mixture of an export has no statistics: what updates nothing works.
+    let model = file("kokkos.npz");
+    let own = ["select", "--model", &model, "pool.extxyz", "--output", "out.extxyz"];
+    assert!(refuse(here, own).contains("the mixture has no statistics, which greedy updates"));
+    assert!(succeed(here, own.iter().chain(&["--strategy", "fps:1"])).contains("selected 1 structure of 2"));
+}
+
+#[test]
+fn what_was_selected_is_labelled_by_a_campaign() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small { steps: 120, ..Small::default() }.write(here);
+    succeed(here, ["run", "campaign.toml"]);
+    succeed(here, ["export", "campaign", "--output", "own.extxyz"]);
+    // Of a campaign, the store has the features.
+    let own = select(here, &["--campaign", "campaign", "--strategy", "fps", "-n", "1"]);
+    assert!(own["pool"]["features_from_stores"].as_u64() > Some(0), "{own}");
+    assert_eq!(own["pool"]["features_computed"], 0);
+    let candidate = read_extxyz(&here.join("out.extxyz")).unwrap();
+    assert!(candidate[0].info["candidate_id"].text().is_some());
+    // Accepted candidates have their labels.
+    let accepted = read_extxyz(&here.join("own.extxyz")).unwrap().len();
+    let known = format!("queued 0 structures for labelling; {accepted} already known\n");
+    assert_eq!(queue(here, "own.extxyz"), known);
+
+    pool(&here.join("pool.extxyz"), 8);
+    select(here, &["pool.extxyz", "-n", "2"]);
+    assert_eq!(queue(here, "out.extxyz"), "queued 2 structures for labelling; 0 already known\n");
+    assert_eq!(queue(here, "out.extxyz"), "queued 0 structures for labelling; 2 already known\n");
+    let jobs: Json = serde_json::from_str(&succeed(here, ["queue", "campaign", "list", "--json"])).unwrap();
+    let waiting = jobs.as_array().unwrap().iter().filter(|job| job["state"] == "queued");
+    let waiting: Vec<_> = waiting.map(|job| (job["candidate"].clone(), job["origin"].clone())).collect();
+    let import = |id: &str| (id.into(), "imported".into());
+    assert_eq!(waiting, [import("import-1"), import("import-2")]);
+    succeed(here, ["queue", "campaign", "prioritise", "import-2", "5"]);
+    let status: Json = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
+    assert_eq!(status["labels"]["queued"], 2);
+    succeed(here, ["store", "check", "campaign"]);
+
+    succeed(here, ["run", "campaign.toml"]);
+    assert!(succeed(here, ["explain", "campaign", "import-2"]).contains("import-2"));
+    succeed(here, ["export", "campaign", "--output", "again.extxyz"]);
+    assert_eq!(fs::read(here.join("own.extxyz")).unwrap(), fs::read(here.join("again.extxyz")).unwrap());
+    succeed(here, ["export", "campaign", "--output", "all.extxyz", "--imported"]);
+    let (all, selected) = (read_extxyz(&here.join("all.extxyz")), read_extxyz(&here.join("out.extxyz")));
+    let (all, selected) = (all.unwrap(), selected.unwrap());
+    let imported: Vec<_> =
+        all.iter().filter(|frame| frame.info["origin"].text() == Some("imported")).collect();
+    assert_eq!(imported.len(), 2);
+    for (frame, selected) in imported.into_iter().zip(&selected) {
+        assert_eq!(frame.structure, selected.structure);
+        assert!(frame.labels().unwrap().forces.is_some());
+    }
+    succeed(here, ["store", "check", "campaign"]);
+}
+
+fn queue(here: &Path, file: &str) -> String {
+    succeed(here, ["import", "campaign", file, "--queue"])
+}
