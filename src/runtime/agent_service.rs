@@ -41,10 +41,7 @@ impl AgentService {
             heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
             restarts: config.run.max_restarts,
         };
-        let bootstrap = AgentBootstrap {
-            setup: process_config::to_bytes(&setup),
-            files,
-        };
+        let bootstrap = AgentBootstrap { setup: process_config::to_bytes(&setup), files };
         let heartbeat_timeout = config.run.agent_heartbeat_timeout.get();
         let server =
             AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, heartbeat_timeout, bootstrap)

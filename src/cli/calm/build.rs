@@ -101,7 +101,8 @@ impl Build {
             )));
         }
         let dimension = self.projection_dimension.map_or(PROJECTED, |dimension| dimension as usize);
-        let (model, projection, seed) = projected(&self.model, model, self.feature_variant, self.rng_seed, dimension)?;
+        let (model, projection, seed) =
+            projected(&self.model, model, self.feature_variant, self.rng_seed, dimension)?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let settings = BuildSettings {
             dimension: projection.feature_dimension,
@@ -209,7 +210,6 @@ pub(super) fn projected(
         ));
     };
     Ok((found.model, projection, seed))
-}
 }
 
 fn weight(text: &str) -> Result<(PathBuf, f64), String> {

@@ -48,8 +48,7 @@ impl Merge {
             _ => 1 + model.description().architecture.layers(),
         };
         let dimension = dimension.saturating_sub(norms);
-        let (model, projection, seed) =
-            projected(&self.model, model, self.feature_variant, seed, dimension)?;
+        let (model, projection, seed) = projected(&self.model, model, self.feature_variant, seed, dimension)?;
         match merge.run(&model, projection, seed)? {
             Merged::Pass(pass) => {
                 print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;
