@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use atoms::{Evaluation, Structure};
-use calm::neighbourhood::PairError;
+use calm::neighbourhood::{Pair, PairError};
 use calm::{GradeError, Grades, Mixture, neighbourhood_average};
 use potentials::grace::{GraceModel, PullBack};
 

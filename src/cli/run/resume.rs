@@ -7,7 +7,7 @@ use serde_json::Value;
 use store::{Location, Store, unix_milliseconds};
 
 use crate::campaign::Campaign;
-use crate::config::{Change, Refused, compare, place};
+use crate::config::{self, Change, Refused, compare};
 use crate::exit_status::Failure;
 use crate::output::{count, log_and_print};
 
@@ -100,7 +100,7 @@ fn changed_content(
     other: Option<&Provenance>,
     refused: &Refused,
 ) -> Failure {
-    let at = place(&campaign.path, &campaign.text, refused.key());
+    let at = config::location(&campaign.path, &campaign.text, refused.key());
     let elsewhere = elsewhere(location);
     let hint = other.map_or(String::new(), |known| {
         format!(" (the campaign in {location} is '{}', configured by {})", known.name, known.file.path)
