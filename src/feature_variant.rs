@@ -76,13 +76,12 @@ impl FeatureModel {
         Some(Self { model: model.with_features(form)?.into(), is_hidden: false })
     }
 
-    /// The variant of this model whose features an artifact has: the file's own, or another with the same matrix. The file's own
+    /// The variant of the model of `path` whose features an artifact has: the file's own, or another with the same matrix. The file's own
     /// if none fits. A model without a projection gets that of the artifact.
     ///
     /// # Errors
-    /// An unreadable model, or one of another basis.
-    pub fn for_artifact(path: &Path, artifact: &Projection) -> Result<Self, Failure> {
-        let model = GraceModel::load(path).map_err(Failure::input)?;
+    /// A model of another basis.
+    pub fn for_artifact(path: &Path, model: GraceModel, artifact: &Projection) -> Result<Self, Failure> {
         if model.projection().is_none() {
             let model = with_projection(model, artifact)
                 .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;

@@ -196,7 +196,7 @@ fn wrong_budgets_and_queues_are_refused() {
         "on_queue_full = \"raise\"",
         &[
             "label.on_queue_full is \"raise\"; expected \"wait\", or mode = \"live\"",
-            "how fast labels are made",
+            "the speed of the labellers",
         ],
     );
 }

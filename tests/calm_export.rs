@@ -177,7 +177,6 @@ fn newest_or_zero(here: &Path) -> u64 {
 #[test]
 fn what_cannot_be_exported_is_refused() {
     let small = Small {
-        steps: 120,
         walks_per_round: 4,
         seeds: &["fcc-100", "fcc-097", "fcc-103", "vacancy"],
         ..Small::default()

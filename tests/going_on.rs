@@ -202,7 +202,7 @@ fn added_seed_structures_are_walked() {
     Small { seeds: &["fcc-100", "vacancy", "fcc-097"], ..small() }.write(here);
     let shown = resume_processes(here);
     assert!(
-        shown.starts_with("configuration: seed structures added to the 2 that it has: 'fcc-097'"),
+        shown.starts_with("configuration: seed structures added to the existing 2: 'fcc-097'"),
         "{shown}"
     );
     let walked = walks(here);

@@ -114,7 +114,7 @@ def export(artifact, work):
 
 
 def own_mixture(seed, output, calmwalk, work):
-    options = ["--model", work / "kokkos.npz", work / "training.extxyz", "--seed", seed, "--output", output]
+    options = ["--model", work / "kokkos.npz", work / "training.extxyz", "--rng-seed", seed, "--output", output]
     run(calmwalk, "calm", "build", *options, where=work)
 
 

@@ -351,7 +351,7 @@ mod tests {
             .to_string();
         assert!(message.contains("{\"to\":1.1}, but this campaign started without it: "), "{message}");
         let (key, message) = refused("/files/potential.model", json!("cd"));
-        assert!(message.contains("(BLAKE3 cd)") && message.contains("(ab)"), "{message}");
+        assert!(message.contains("(BLAKE3 cd; this campaign started with ab)"), "{message}");
         assert_eq!(key, "potential.model");
         for (seeds, found) in
             [(json!(["a 1"]), "1 is missing"), (json!(["a 3", "b 2"]), "0 is 'a' (content 3)")]

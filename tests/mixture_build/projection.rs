@@ -50,7 +50,8 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
     }
     assert!(fs::read(here.join("parts.npz")).unwrap() == whole);
 
-    let other = [&["--projection-dimension", "16", "--candidates", "1,2,4"][..], &["--seed", "3"]].concat();
+    let other =
+        [&["--projection-dimension", "16", "--candidates", "1,2,4"][..], &["--rng-seed", "3"]].concat();
     succeed(here, arguments("small.npz", &other));
     let info: Value = serde_json::from_str(&succeed(here, ["calm", "info", "--json", "small.npz"])).unwrap();
     assert_eq!((&info["projected_dimension"], &info["feature_dimension"]), (&16.into(), &18.into()));
@@ -60,7 +61,12 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
     assert!(message.contains("small.npz") && message.contains("its feature dimension is 18"), "{message}");
 
     let message = refuse(here, ["calm", "score", "--model", "plain.npz", "data.extxyz", "--output", "x.xyz"]);
-    assert!(message.contains("plain.npz: the model has no mixture (uq_*): give its artifact"), "{message}");
+    assert!(
+        message.contains(
+            "plain.npz: the model has no projection of its features (uq_rp_matrix): give its artifact"
+        ),
+        "{message}"
+    );
     let silicon = config("data/si_sw_1l/gmm_artifacts.npz").display().to_string();
     let wrong =
         ["calm", "score", "--model", "plain.npz", "--artifact", &silicon, "data.extxyz", "--output", "x.xyz"];

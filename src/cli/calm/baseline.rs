@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use calm::baselines::{Baseline as Score, BaselineFile, BaselineSettings, Builder, Kind};
 use calm::{Artifact, Mixture};
+use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
@@ -148,7 +149,10 @@ impl Baseline {
         let artifact = Artifact::load(path).map_err(Failure::input)?;
         let features = match self.feature_variant {
             Some(_) => FeatureModel::load(&self.model, self.feature_variant)?,
-            None => FeatureModel::for_artifact(&self.model, &artifact.projection)?,
+            None => {
+                let model = GraceModel::load(&self.model).map_err(Failure::input)?;
+                FeatureModel::for_artifact(&self.model, model, &artifact.projection)?
+            }
         };
         let Some(projection) = features.projection() else {
             let message = "no artifact has the features of the hidden layer; leave --artifact out";

@@ -8,6 +8,7 @@ use atoms::FileError;
 use atoms::extxyz::{Column, ColumnData, Frame, Value, write_frame};
 use calm::Artifact;
 use npyz::{NpyWriter, WriterBuilder};
+use potentials::grace::GraceModel;
 
 use super::other_scores::OtherScores;
 use super::score_labels::ScoreLabels;
@@ -151,8 +152,9 @@ pub(in crate::cli) fn load(
         check_sound(&own, export).map_err(Failure::Input)?;
         return Ok((model, own));
     };
+    let model = GraceModel::load(export).map_err(Failure::input)?;
     let artifact = Artifact::load(path).map_err(Failure::input)?;
-    let model = FeatureModel::for_artifact(export, &artifact.projection)?;
+    let model = FeatureModel::for_artifact(export, model, &artifact.projection)?;
     let own = model.projection().unwrap_or_else(|| artifact.projection.clone());
     artifact
         .check_belongs_to(&model.symbols(), &own)

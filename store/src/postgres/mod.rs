@@ -23,7 +23,7 @@ use crate::migrations::{Step, migrator};
 use crate::tables::checksums;
 
 /// The newest migration.
-const SCHEMA: i64 = 12;
+const SCHEMA: i64 = 13;
 /// The first version whose rows have checksums.
 const FIRST_WITH_CHECKSUMS: i64 = 9;
 /// Maximum number of connections per process: one writer and some readers.

@@ -308,7 +308,7 @@ fn clusters_merge_by_their_number_of_atoms_whatever_their_weight() {
         (0..atoms).flat_map(|atom| [centre, centre, centre + 0.01 * atom as f64]).collect()
     };
     let data = [blob(0.0, 40), blob(50.0, 3), blob(-90.0, 5)].concat();
-    let weights = [vec![1.0; 40], vec![1e6; 3], vec![1e-2; 5]].concat();
+    let weights = [vec![1.0; 40], vec![1e4; 3], vec![0.1; 5]].concat();
     let settings = settings(dimension, &[3]);
     let shard = weighted_clusters(&settings, 0, (&data, &weights), 48);
     let found = partition(&settings, 0, &[shard]).unwrap();
@@ -317,7 +317,7 @@ fn clusters_merge_by_their_number_of_atoms_whatever_their_weight() {
     assert_eq!(counts, [5.0, 43.0]);
     // The heavy atoms draw the centroid of the merged cluster to themselves.
     let slot = calm::grade::nearest(found.centroids.chunks_exact(dimension), &[50.0; 3]);
-    assert!((found.centroids[slot * dimension] - 50.0).abs() < 1e-3, "{:?}", found.centroids);
+    assert!((found.centroids[slot * dimension] - 50.0).abs() < 0.1, "{:?}", found.centroids);
 }
 
 #[test]
