@@ -245,7 +245,8 @@ fn a_campaign_keeps_its_supercells() {
     with(70);
     let message = refuse(here, ["run", "campaign.toml"]);
     assert!(
-        message.contains("seed structure 0 is") && message.contains("min_atoms and min_height as they were"),
+        message.contains("seed structure 0 is")
+            && message.contains("min_atoms and min_height, or start another"),
         "{message}"
     );
 }

@@ -196,7 +196,7 @@ fn every_end_is_logged_with_its_reason() {
         (
             WalkEnd::Trapped { guard: "shortest-bond".into() },
             "trapped",
-            "refused by the shortest-bond guard again and again",
+            "rejected by the shortest-bond guard again and again",
         ),
         (WalkEnd::BlewUp { reason: reason() }, "blew_up", "forces are not finite"),
         (WalkEnd::BadStart { reason: reason() }, "bad_start", "forces are not finite"),

@@ -295,6 +295,12 @@ async fn imports_label_waiting_jobs_and_can_be_repeated() {
     assert_eq!(store.status().await.unwrap().imported, 2);
 }
 
+/// What the check finds, but for the candidates of these tests, which have no walks.
+async fn problems(store: &Store) -> Vec<String> {
+    let findings = store.check(|_, _| {}).await.unwrap().into_iter().map(|finding| finding.what);
+    findings.filter(|what| !what.contains("candidates of missing walks")).collect()
+}
+
 #[tokio::test]
 async fn imported_structures_wait_for_their_labels_behind_candidates() {
     let home = Home::new();
@@ -315,7 +321,7 @@ async fn imported_structures_wait_for_their_labels_behind_candidates() {
     assert_eq!(store.queue_list(None, 1, 1).await.unwrap()[0].candidate, "import-1");
     let waiting = store.waiting_jobs(protocol("dft").hash).await.unwrap();
     assert_eq!(waiting.iter().map(|jobs| jobs.jobs).sum::<u64>(), 3);
-    assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+    assert_eq!(problems(&store).await, [""; 0]);
 
     store.prioritise_job("import-2", 1, 3).await.unwrap();
     let first = lease(&store, "a", 4).await.unwrap();
@@ -345,7 +351,7 @@ async fn imported_structures_wait_for_their_labels_behind_candidates() {
     let labelled = [(0, structure(50.0), label(-7.0))];
     assert_eq!(store.import(first.protocol, "old.extxyz", &labelled, 9).await.unwrap().labels, 1);
     assert_eq!(state(&store, "import-1").await, JobState::Labelled);
-    assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+    assert_eq!(problems(&store).await, [""; 0]);
 }
 
 /// A campaign whose labels arrive in the order `order`. Returns the text of its export, read in pages of `page`.

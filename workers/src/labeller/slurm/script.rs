@@ -146,7 +146,7 @@ mod tests {
         assert_eq!(directives, expected);
         assert!(text.contains(r"'/opt/it'\''s/calmwalk' 'calculation-runner' < order.json"), "{text}");
         let order = fs::read_to_string(home.path().join(REQUEST)).unwrap();
-        assert!(order.starts_with("{\"Keep\"") && order.ends_with("}\n"), "{order}");
+        assert!(order.starts_with("{\"Run\"") && order.ends_with("}\n"), "{order}");
         assert!(clear_excluded_nodes(home.path()).unwrap());
         let anywhere = fs::read_to_string(home.path().join(SCRIPT)).unwrap();
         assert_eq!(anywhere, text.replace("#SBATCH --exclude=n1,n2\n", ""));
