@@ -323,7 +323,7 @@ async fn imported_structures_wait_for_their_labels_behind_candidates() {
     assert_eq!(waiting.iter().map(|jobs| jobs.jobs).sum::<u64>(), 3);
     assert_eq!(problems(&store).await, [""; 0]);
 
-    store.prioritise_job("import-2", 1, 3).await.unwrap();
+    store.prioritise_job("import-2", 20, 3).await.unwrap();
     let first = lease(&store, "a", 4).await.unwrap();
     assert_eq!((first.candidate.as_str(), first.model_energy), ("import-2", None));
     assert_eq!(first.structure, structure(52.0));
