@@ -151,7 +151,9 @@ fn wrong_selections_are_refused() {
     let model = file("kokkos.npz");
     let own = ["select", "--model", &model, "pool.extxyz", "--output", "out.extxyz"];
     assert!(refuse(here, own).contains("the mixture has no statistics, which greedy updates"));
-    assert!(succeed(here, own.iter().chain(&["--strategy", "fps-all:1"])).contains("selected 1 structure of 2"));
+    assert!(
+        succeed(here, own.iter().chain(&["--strategy", "fps-all:1"])).contains("selected 1 structure of 2")
+    );
 }
 
 #[test]

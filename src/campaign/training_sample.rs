@@ -134,14 +134,14 @@ mod tests {
     fn sampled(frames: &[Counts]) -> Vec<Counts> {
         let selected = select(frames);
         let mut thinning = Thinning::new(frames, &selected);
-        let mut sampled = |(frame, selected): (&Counts, bool)| {
+        let sampled = |(frame, selected): (&Counts, bool)| {
             let count = |&(species, count): &(Species, usize)| {
                 let atoms = if selected { count } else { 0 };
                 (species, (0..atoms).filter(|_| thinning.keeps(species)).count())
             };
             frame.iter().map(count).collect()
         };
-        frames.iter().zip(selected).map(|pair| sampled(pair)).collect()
+        frames.iter().zip(selected).map(sampled).collect()
     }
 
     fn atoms_of(frames: &[Counts], symbol: &str) -> usize {

@@ -207,7 +207,7 @@ fn read(
         let elements = calculator.compute(&frame.structure).map_err(|error| place.wrong(error))?;
         let needs_forces =
             builders.iter().any(|builder| builder.needs_sweep() && builder.kind().has_force_form());
-        let rows = needs_forces.then(|| calculator.force_rows()).unwrap_or_default();
+        let rows = if needs_forces { calculator.force_rows() } else { Vec::new() };
         for builder in builders.iter_mut().filter(|builder| builder.needs_sweep()) {
             builder.add(&elements, calculator.features()).map_err(|error| place.wrong(error))?;
             builder.add_forces(&rows).map_err(|error| place.wrong(error))?;

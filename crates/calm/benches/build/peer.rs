@@ -29,8 +29,9 @@ impl Peer {
         command.args(candidates.iter().map(ToString::to_string)).stdin(Stdio::piped()).stdout(Stdio::piped());
         // A process inherits the pinning of the one that starts it.
         let pid = std::process::id().to_string();
-        let pinned = Command::new("taskset").args(["--cpu-list", "--pid", CORE, &pid]).stdout(Stdio::null());
-        assert!(pinned.status().expect("taskset of util-linux").success());
+        let mut pin = Command::new("taskset");
+        pin.args(["--cpu-list", "--pid", CORE, &pid]).stdout(Stdio::null());
+        assert!(pin.status().expect("taskset of util-linux").success());
         let mut process = command.spawn().expect("python starts");
         let input = process.stdin.take().expect("its input");
         let lines = BufReader::new(process.stdout.take().expect("its output")).lines();

@@ -82,11 +82,10 @@ fn solve(mut matrix: Vec<Vec<f64>>, mut right: Vec<f64>) -> (Vec<f64>, f64) {
         matrix.swap(k, pivot);
         right.swap(k, pivot);
         determinant *= matrix[k][k];
+        let own = matrix[k].clone();
         for row in k + 1..n {
-            let factor = matrix[row][k] / matrix[k][k];
-            for column in k..n {
-                matrix[row][column] -= factor * matrix[k][column];
-            }
+            let factor = matrix[row][k] / own[k];
+            matrix[row].iter_mut().zip(&own).skip(k).for_each(|(x, own)| *x -= factor * own);
             right[row] -= factor * right[k];
         }
     }

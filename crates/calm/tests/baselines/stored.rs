@@ -66,8 +66,10 @@ fn another_model_is_refused() {
     assert!(own.check_same(&tungsten).unwrap_err().to_string().contains("list of elements is Mo W"));
 }
 
+type Write = dyn Fn(&mut Writer<Cursor<Vec<u8>>>);
+
 /// The file with one array replaced, or left out.
-fn with(key: &str, write: Option<&dyn Fn(&mut Writer<Cursor<Vec<u8>>>)>) -> Result<BaselineFile, String> {
+fn with(key: &str, write: Option<&Write>) -> Result<BaselineFile, String> {
     let mut out = Writer::new(Cursor::new(Vec::new()));
     out.copy(Cursor::new(bytes(&stored())), |name| name == key).unwrap();
     if let Some(write) = write {
