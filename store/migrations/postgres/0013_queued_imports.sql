@@ -1,5 +1,5 @@
 -- What migrations/sqlite/0013_queued_imports.sql changes.
-ALTER TABLE job DROP CONSTRAINT job_decision_fkey;
+ALTER TABLE job DROP CONSTRAINT IF EXISTS job_decision_fkey;
 
 CREATE OR REPLACE FUNCTION count_job(counted job, change BIGINT) RETURNS VOID LANGUAGE SQL VOLATILE AS $$
     INSERT INTO job_count SELECT counted.protocol, counted.state,
