@@ -32,8 +32,12 @@ found = []
 for parts in sys.argv[2:]:
     sys.argv = ['grace_uq', 'select', '--artifact', artifact, '--predicted', 'predicted.pkl.gz', '--output', 'picked.pkl.gz',
                 '--no-element-stratified', '--strategy', *parts.split()]
-    with contextlib.redirect_stdout(io.StringIO()):
-        main()
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            main()
+    except SystemExit as end:
+        if end.code:
+            raise
     picked = pd.read_pickle('picked.pkl.gz')
     gamma = picked['gamma_at_pick'].tolist() if 'gamma_at_pick' in picked else []
     found.append(dict(frames=[info['number'] for info in picked['info']], gamma=[None if np.isnan(g) else g for g in gamma]))
@@ -128,5 +132,7 @@ fn reference(here: &Path, artifact: &str) -> Vec<Picked> {
     let output = command.current_dir(here).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     let printed = String::from_utf8(output.stdout).unwrap();
-    serde_json::from_str(printed.lines().last().unwrap()).unwrap()
+    // TensorFlow may write lines of its own.
+    let found = printed.lines().find(|line| line.starts_with("[{"));
+    serde_json::from_str(found.unwrap_or_else(|| panic!("{printed}"))).unwrap()
 }
