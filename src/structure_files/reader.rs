@@ -23,6 +23,8 @@ pub struct StructureReader {
     in_file: u64,
     matching: u64,
     left_out: u64,
+    /// Whether an error ended it.
+    failed: bool,
 }
 
 /// Where a structure stands.
@@ -49,15 +51,25 @@ impl Place {
 impl StructureReader {
     pub(super) fn new(given: StructureFiles, bytes: Arc<AtomicU64>) -> Self {
         let files = given.files.iter().cloned().collect();
-        Self { given, files, current: None, bytes, in_file: 0, matching: 0, left_out: 0 }
+        Self { given, files, current: None, bytes, in_file: 0, matching: 0, left_out: 0, failed: false }
     }
 
-    /// The next structure that matches the filter, with its file; `None` at the end of the last file.
+    /// The next structure that matches the filter, with its file; `None` at the end of the last file and after an error. Threads that
+    /// share a reader find one error, the one that names the place.
     ///
     /// # Errors
     /// A file that cannot be read or has no structures; labels that the filter cannot read; a filter that no structure of all files
     /// matches.
     pub fn next(&mut self) -> Result<Option<(Frame, StructureFile)>, Failure> {
+        if self.failed {
+            return Ok(None);
+        }
+        let next = self.read_next();
+        self.failed = next.is_err();
+        next
+    }
+
+    fn read_next(&mut self) -> Result<Option<(Frame, StructureFile)>, Failure> {
         while self.current.is_some() || self.open_next()? {
             let Some((file, structures)) = &mut self.current else { continue };
             let Some(frame) = structures.next(&file.path) else {
@@ -117,4 +129,25 @@ fn matches(filter: Option<&Filter>, frame: &Frame, file: &StructureFile) -> Resu
         ..StructureProperties::default()
     };
     Ok(filter.matches(&properties))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn nothing_comes_after_an_error() {
+        let directory = tempfile::tempdir().unwrap();
+        let path: Arc<Path> = directory.path().join("broken.dump").into();
+        fs::write(&path, "ITEM: TIMESTEP\nfirst\n").unwrap();
+        let file = StructureFile { path, weight: 1.0 };
+        let files =
+            StructureFiles { files: vec![file.clone(), file], filter: None, dump_elements: Vec::new() };
+        let mut reader = files.reader(Arc::default());
+        let error = reader.next().unwrap_err();
+        assert!(error.to_string().contains("broken.dump:2: "), "{error}");
+        assert!(reader.next().unwrap().is_none());
+    }
 }
