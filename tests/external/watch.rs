@@ -156,7 +156,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     // The second walk stands still; in reproducible mode the first waits for it.
     terminal.press("Down p");
     terminal.wait_for("walk 1 paused");
-    terminal.wait_for("2 active (1 paused)");
+    terminal.wait_for("2 running (1 paused)");
     let paused = |of: Value| {
         of["walks"].as_array().unwrap().iter().map(|walk| walk["paused"] == true).collect::<Vec<_>>()
     };
