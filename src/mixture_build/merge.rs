@@ -11,13 +11,13 @@ use super::clustering::Clustered;
 use super::identity::Identity;
 use super::mixture;
 use super::part::Part;
-use super::state::{PartEnd, Partition, RunningSums, State};
+use super::state::{BuildState, PartEnd, Partition, RunningSums};
 use super::sums::{components_from_sums, histograms_from_sums};
 use crate::exit_status::Failure;
 
 /// The state of a build in parts.
 pub struct Merge {
-    state: State,
+    state: BuildState,
     identity: Identity,
 }
 
@@ -35,7 +35,7 @@ impl Merge {
     /// # Errors
     /// There is no such state; it belongs to another model; a process uses it.
     pub fn open(output: &Path, model_hash: &str) -> Result<Self, Failure> {
-        let (state, identity) = State::open_existing(output)?;
+        let (state, identity) = BuildState::open_existing(output)?;
         identity.check_model(model_hash).map_err(|difference| state.other_build(&difference))?;
         Ok(Self { state, identity })
     }

@@ -27,7 +27,7 @@ use potentials::grace::GraceModel;
 use self::identity::Identity;
 pub use self::merge::{Merge, Merged};
 pub use self::part::Part;
-use self::state::{PartEnd, State};
+use self::state::{BuildState, PartEnd};
 pub use self::workers::Work;
 use crate::exit_status::Failure;
 use crate::output::print_stderr;
@@ -36,7 +36,7 @@ use crate::output::print_stderr;
 pub struct Build {
     work: Work,
     settings: BuildSettings,
-    state: State,
+    state: BuildState,
     /// Total size of the data files.
     bytes: u64,
 }
@@ -59,8 +59,8 @@ impl Build {
         ShardClustering::new(&settings, 0, 0).map_err(Failure::input)?;
         let identity = Identity::new(model_hash, projection, settings.clone(), &work.files);
         let (state, exists) = match work.part {
-            Part::WHOLE => State::open(output, &identity, restart)?,
-            part => State::open_part(output, &identity, part)?,
+            Part::WHOLE => BuildState::open(output, &identity, restart)?,
+            part => BuildState::open_part(output, &identity, part)?,
         };
         if exists {
             print_stderr(format_args!("continuing from {}", state.directory().display()));

@@ -32,7 +32,7 @@ const END: &str = "end-1-";
 const PAUSE: u32 = 19;
 
 /// The directory, which this process alone uses; or the files of a part in it.
-pub struct State {
+pub struct BuildState {
     directory: PathBuf,
     part: Part,
     _locks: Vec<File>,
@@ -69,7 +69,7 @@ pub struct RunningSums {
     pub elements: Vec<Option<ExactSums>>,
 }
 
-impl State {
+impl BuildState {
     /// Opens the state of the build of `output`, or begins one. Returns it with whether it existed.
     ///
     /// # Errors

@@ -31,7 +31,7 @@ struct Open {
 
 #[derive(Debug)]
 struct Connection {
-    state: State,
+    state: ConnectionState,
     /// When the state began.
     since: Instant,
     task: Option<JoinHandle<()>>,
@@ -39,7 +39,7 @@ struct Connection {
 
 /// What a connection is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum State {
+pub enum ConnectionState {
     /// Waiting for a complete request, or for the client to read a response.
     Idle,
     /// Streaming events until the client leaves.
@@ -84,7 +84,7 @@ impl Connections {
             let mut open = self.open();
             open.next_number += 1;
             let number = open.next_number;
-            let connection = Connection { state: State::Idle, since: Instant::now(), task: None };
+            let connection = Connection { state: ConnectionState::Idle, since: Instant::now(), task: None };
             open.by_number.insert(number, connection);
             number
         };
@@ -111,7 +111,7 @@ impl Open {
         // A connection without a task has only just been accepted.
         let others = self.by_number.iter().filter(|(_, open)| open.task.is_some());
         let first = others.min_by_key(|(_, open)| (open.state, open.since));
-        let Some((number, open)) = first.filter(|(_, open)| open.state != State::Responding) else {
+        let Some((number, open)) = first.filter(|(_, open)| open.state != ConnectionState::Responding) else {
             return Admission::Refuse;
         };
         let left = MIN_IDLE_TIME.saturating_sub(now.saturating_duration_since(open.since));
@@ -131,7 +131,7 @@ impl Open {
 
 impl ConnectionGuard {
     /// Sets the state of the connection.
-    pub fn set_state(&self, state: State) {
+    pub fn set_state(&self, state: ConnectionState) {
         if let Some(open) = self.connections.open().by_number.get_mut(&self.number) {
             (open.state, open.since) = (state, Instant::now());
         }
@@ -140,7 +140,7 @@ impl ConnectionGuard {
     /// How long the connection has been idle. Zero unless it is idle.
     pub fn idle(&self) -> Duration {
         let open = self.connections.open();
-        let idle = open.by_number.get(&self.number).filter(|open| open.state == State::Idle);
+        let idle = open.by_number.get(&self.number).filter(|open| open.state == ConnectionState::Idle);
         idle.map_or(Duration::ZERO, |open| open.since.elapsed())
     }
 }
@@ -167,7 +167,7 @@ fn reserve(limit: u64) -> u64 {
 mod tests {
     use super::*;
 
-    fn open(states: &[(State, u64)], now: Instant) -> Open {
+    fn open(states: &[(ConnectionState, u64)], now: Instant) -> Open {
         let mut open = Open::default();
         for (state, age) in states {
             let since = now - Duration::from_secs(*age);
@@ -183,11 +183,11 @@ mod tests {
         let now = Instant::now() + Duration::from_secs(3600);
         let mut open = open(
             &[
-                (State::Responding, 100),
-                (State::Streaming, 90),
-                (State::Idle, 10),
-                (State::Idle, 20),
-                (State::Streaming, 80),
+                (ConnectionState::Responding, 100),
+                (ConnectionState::Streaming, 90),
+                (ConnectionState::Idle, 10),
+                (ConnectionState::Idle, 20),
+                (ConnectionState::Streaming, 80),
             ],
             now,
         );
@@ -202,7 +202,7 @@ mod tests {
     #[tokio::test]
     async fn new_connections_have_time_to_send_a_request() {
         let now = Instant::now() + Duration::from_secs(3600);
-        let mut open = open(&[(State::Idle, 0)], now);
+        let mut open = open(&[(ConnectionState::Idle, 0)], now);
         let Admission::Later(left) = open.evict(now) else { panic!("it is new") };
         assert!(matches!(open.evict(now + left), Admission::AfterClosing(_)));
     }

@@ -18,7 +18,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use super::connections::{Admission, ConnectionGuard, Connections, State};
+use super::connections::{Admission, ConnectionGuard, ConnectionState, Connections};
 use super::security;
 
 /// Time to receive the headers of a request, from the connection or the previous response.
@@ -104,10 +104,10 @@ async fn serve(stream: TcpStream, router: Router, guard: ConnectionGuard) {
             Ok(body) => body,
             Err(refusal) => return Ok::<_, Infallible>(refusal),
         };
-        guard.set_state(State::Responding);
+        guard.set_state(ConnectionState::Responding);
         let answer = router.call(Request::from_parts(head, body)).await;
         let is_events = answer.as_ref().is_ok_and(|answer| is_event_stream(answer.headers()));
-        guard.set_state(if is_events { State::Streaming } else { State::Idle });
+        guard.set_state(if is_events { ConnectionState::Streaming } else { ConnectionState::Idle });
         answer
     });
     let mut protocol = http1::Builder::new();

@@ -7,9 +7,9 @@ use super::child_status::{ChildState, ChildStatus};
 use super::exit_reason::ExitReason;
 use super::limits::Limits;
 
-/// State of a child, with the times that determine its next action.
+/// What a child is doing, with the times that determine its next action.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum State {
+pub(super) enum ChildPhase {
     /// No process; start one at this time.
     Waiting { until: Duration },
     /// A process with its last heartbeat, or its start time if `yet` is false.
@@ -33,7 +33,7 @@ pub(super) enum KillReason {
 
 #[derive(Clone, Debug)]
 pub(super) struct Child {
-    pub state: State,
+    pub phase: ChildPhase,
     /// Number of starts.
     pub incarnation: u32,
     /// Consecutive failures without a delivery.
@@ -47,32 +47,36 @@ pub(super) struct Child {
 
 impl Default for Child {
     fn default() -> Self {
-        let state = State::Waiting { until: Duration::ZERO };
-        Self { state, incarnation: 0, failures: 0, shortages: 0, restarts: 0, last_failure: None }
+        let phase = ChildPhase::Waiting { until: Duration::ZERO };
+        Self { phase, incarnation: 0, failures: 0, shortages: 0, restarts: 0, last_failure: None }
     }
 }
 
 impl Child {
     /// Whether it never had a process and can still have one.
     pub fn is_fresh(&self) -> bool {
-        self.incarnation == 0 && self.last_failure.is_none() && matches!(self.state, State::Waiting { .. })
+        self.incarnation == 0
+            && self.last_failure.is_none()
+            && matches!(self.phase, ChildPhase::Waiting { .. })
     }
 
     /// Why its process exited; if it was killed, the reason for that. `None` if it had no process.
     pub fn exit_reason(&self, reason: ExitReason) -> Option<ExitReason> {
-        match self.state {
-            State::Running { .. } | State::Stopping { .. } => Some(reason),
+        match self.phase {
+            ChildPhase::Running { .. } | ChildPhase::Stopping { .. } => Some(reason),
             // It may have exited by itself just before the signal.
-            State::Killed { .. }
+            ChildPhase::Killed { .. }
                 if !matches!(reason, ExitReason::Signal { signal: 9, .. } | ExitReason::Unknown) =>
             {
                 Some(reason)
             }
-            State::Killed { reason: KillReason::Unresponsive(silence) } => {
+            ChildPhase::Killed { reason: KillReason::Unresponsive(silence) } => {
                 Some(ExitReason::Unresponsive(silence))
             }
-            State::Killed { reason: KillReason::StopTimeout(grace) } => Some(ExitReason::StopTimeout(grace)),
-            State::Waiting { .. } | State::Exited | State::Failed => None,
+            ChildPhase::Killed { reason: KillReason::StopTimeout(grace) } => {
+                Some(ExitReason::StopTimeout(grace))
+            }
+            ChildPhase::Waiting { .. } | ChildPhase::Exited | ChildPhase::Failed => None,
         }
     }
 
@@ -85,14 +89,14 @@ impl Child {
             self.failures = self.failures.saturating_add(u32::from(!reason.is_shortage()));
             self.last_failure = Some(reason.clone());
         }
-        self.state = if stopping || !failed {
-            State::Exited
+        self.phase = if stopping || !failed {
+            ChildPhase::Exited
         } else if self.shortages > 0 {
-            State::Waiting { until: now.saturating_add(backoff(limits, self.shortages)) }
+            ChildPhase::Waiting { until: now.saturating_add(backoff(limits, self.shortages)) }
         } else if self.failures > limits.max_restarts {
-            State::Failed
+            ChildPhase::Failed
         } else {
-            State::Waiting { until: now.saturating_add(backoff(limits, self.failures)) }
+            ChildPhase::Waiting { until: now.saturating_add(backoff(limits, self.failures)) }
         };
     }
 
@@ -101,49 +105,49 @@ impl Child {
         if self.next_deadline(limits).is_none_or(|due| due > now) {
             return None;
         }
-        let (state, action) = match self.state {
-            State::Waiting { .. } => {
+        let (phase, action) = match self.phase {
+            ChildPhase::Waiting { .. } => {
                 self.incarnation += 1;
                 self.restarts += u32::from(self.last_failure.is_some());
                 let start = Action::Start { number, incarnation: self.incarnation };
-                (State::Running { heard: now, yet: false }, start)
+                (ChildPhase::Running { heard: now, yet: false }, start)
             }
-            State::Running { .. } => (
-                State::Killed { reason: KillReason::Unresponsive(limits.heartbeat_timeout) },
+            ChildPhase::Running { .. } => (
+                ChildPhase::Killed { reason: KillReason::Unresponsive(limits.heartbeat_timeout) },
                 Action::Kill { number },
             ),
-            State::Stopping { .. } if limits.detached => {
-                self.state = State::Exited;
+            ChildPhase::Stopping { .. } if limits.detached => {
+                self.phase = ChildPhase::Exited;
                 return None;
             }
-            State::Stopping { .. } => (
-                State::Killed { reason: KillReason::StopTimeout(limits.grace_period) },
+            ChildPhase::Stopping { .. } => (
+                ChildPhase::Killed { reason: KillReason::StopTimeout(limits.grace_period) },
                 Action::Kill { number },
             ),
-            State::Killed { .. } | State::Exited | State::Failed => return None,
+            ChildPhase::Killed { .. } | ChildPhase::Exited | ChildPhase::Failed => return None,
         };
-        self.state = state;
+        self.phase = phase;
         Some(action)
     }
 
     /// Time of the next action.
     pub fn next_deadline(&self, limits: &Limits) -> Option<Duration> {
-        match self.state {
-            State::Waiting { until } => Some(until),
-            State::Running { heard, .. } => Some(heard.saturating_add(limits.heartbeat_timeout)),
-            State::Stopping { since } => Some(since.saturating_add(limits.grace_period)),
-            State::Killed { .. } | State::Exited | State::Failed => None,
+        match self.phase {
+            ChildPhase::Waiting { until } => Some(until),
+            ChildPhase::Running { heard, .. } => Some(heard.saturating_add(limits.heartbeat_timeout)),
+            ChildPhase::Stopping { since } => Some(since.saturating_add(limits.grace_period)),
+            ChildPhase::Killed { .. } | ChildPhase::Exited | ChildPhase::Failed => None,
         }
     }
 
     pub fn public_state(&self, now: Duration) -> ChildState {
-        match self.state {
-            State::Waiting { until } => ChildState::BackingOff { left: until.saturating_sub(now) },
-            State::Running { yet: false, .. } => ChildState::Starting,
-            State::Running { yet: true, .. } => ChildState::Running,
-            State::Stopping { .. } | State::Killed { .. } => ChildState::Stopping,
-            State::Exited => ChildState::Exited,
-            State::Failed => ChildState::Failed,
+        match self.phase {
+            ChildPhase::Waiting { until } => ChildState::BackingOff { left: until.saturating_sub(now) },
+            ChildPhase::Running { yet: false, .. } => ChildState::Starting,
+            ChildPhase::Running { yet: true, .. } => ChildState::Running,
+            ChildPhase::Stopping { .. } | ChildPhase::Killed { .. } => ChildState::Stopping,
+            ChildPhase::Exited => ChildState::Exited,
+            ChildPhase::Failed => ChildState::Failed,
         }
     }
 

@@ -19,7 +19,7 @@ mod limits;
 use std::time::Duration;
 
 pub use action::Action;
-use child::{Child, State};
+use child::{Child, ChildPhase};
 pub use child_status::{ChildState, ChildStatus};
 pub use exit_reason::ExitReason;
 pub use limits::Limits;
@@ -54,7 +54,7 @@ impl Supervisor {
     pub fn adopt(&mut self, number: u32, now: Duration) -> bool {
         match self.child(number) {
             Some(child) if child.is_fresh() => {
-                child.state = State::Running { heard: now, yet: false };
+                child.phase = ChildPhase::Running { heard: now, yet: false };
                 true
             }
             _ => false,
@@ -64,7 +64,7 @@ impl Supervisor {
     /// Records a heartbeat.
     pub fn heartbeat(&mut self, number: u32, now: Duration) {
         // Late heartbeats of a process that is dead or being killed mean nothing.
-        if let Some(State::Running { heard, yet }) = self.child(number).map(|child| &mut child.state) {
+        if let Some(ChildPhase::Running { heard, yet }) = self.child(number).map(|child| &mut child.phase) {
             *heard = now.max(*heard);
             *yet = true;
         }
@@ -93,8 +93,8 @@ impl Supervisor {
     pub fn close(&mut self) {
         self.stopping = true;
         for child in &mut self.children {
-            if let State::Waiting { .. } = child.state {
-                child.state = State::Exited;
+            if let ChildPhase::Waiting { .. } = child.phase {
+                child.phase = ChildPhase::Exited;
             }
         }
     }
@@ -105,8 +105,8 @@ impl Supervisor {
         self.close();
         let mut actions = Vec::new();
         for (number, child) in (0..).zip(&mut self.children) {
-            if let State::Running { .. } = child.state {
-                child.state = State::Stopping { since: now };
+            if let ChildPhase::Running { .. } = child.phase {
+                child.phase = ChildPhase::Stopping { since: now };
                 actions.push(Action::Terminate { number });
             }
         }
@@ -130,7 +130,7 @@ impl Supervisor {
 
     /// Whether no process is running and none will be started.
     pub fn is_over(&self) -> bool {
-        self.children.iter().all(|child| matches!(child.state, State::Exited | State::Failed))
+        self.children.iter().all(|child| matches!(child.phase, ChildPhase::Exited | ChildPhase::Failed))
     }
 
     /// Status of all children.
@@ -150,7 +150,7 @@ impl Supervisor {
 
     fn reset_heartbeats(&mut self, now: Duration) {
         for child in &mut self.children {
-            if let State::Running { heard, .. } = &mut child.state {
+            if let ChildPhase::Running { heard, .. } = &mut child.phase {
                 *heard = now;
             }
         }

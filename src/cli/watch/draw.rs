@@ -13,7 +13,7 @@ use store::{Candidates, Labels};
 use super::entries;
 use super::messages::WINDOW;
 use super::pane::{Pane, Tone};
-use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, State, Text, WALKS};
+use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, Text, WALKS, WatchState};
 use crate::cli::status as cli_status;
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
@@ -61,7 +61,7 @@ impl Theme {
 }
 
 /// Draws everything.
-pub fn draw(frame: &mut Frame<'_>, state: &mut State, theme: &Theme) {
+pub fn draw(frame: &mut Frame<'_>, state: &mut WatchState, theme: &Theme) {
     let area = frame.area();
     let [above, message, keys] =
         Layout::vertical([Constraint::Fill(1), Constraint::Length(1), Constraint::Length(1)]).areas(area);
@@ -74,7 +74,7 @@ pub fn draw(frame: &mut Frame<'_>, state: &mut State, theme: &Theme) {
     frame.render_widget(Paragraph::new(Line::styled(key_hints(state), Modifier::DIM)), keys);
 }
 
-fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut State, theme: &Theme) {
+fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut WatchState, theme: &Theme) {
     if area.height < MIN_HEIGHT_FOR_PANES {
         return draw_pane(frame, area, state, state.focus, theme);
     }
@@ -99,7 +99,7 @@ fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut State, theme: &Them
     draw_charts(frame, charts, state, theme);
 }
 
-fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
+fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState) {
     let (campaign, status) = (&state.snapshot.campaign, &state.snapshot.status);
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let paused = status.walks.iter().filter(|walk| walk.paused).count();
@@ -144,7 +144,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
     frame.render_widget(Paragraph::new(lines.to_vec()), area);
 }
 
-fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut State, index: usize, theme: &Theme) {
+fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut WatchState, index: usize, theme: &Theme) {
     let (name, titles): (_, &[&str]) = match index {
         WALKS => ("walks", &walks::TITLES),
         QUEUE => (state.view.name(), &entries::JOBS),
@@ -189,7 +189,7 @@ fn pane_title(pane: &Pane, index: usize, name: &str) -> String {
     format!(" {} {name}: {last}{number}{filter}", index + 1)
 }
 
-fn draw_charts(frame: &mut Frame<'_>, area: Rect, state: &State, theme: &Theme) {
+fn draw_charts(frame: &mut Frame<'_>, area: Rect, state: &WatchState, theme: &Theme) {
     let [left, right] = Layout::horizontal([Constraint::Fill(1); 2]).spacing(2).areas(area);
     let charts = &state.charts;
     let (counts, end) = charts.histogram(left.width.into());
@@ -270,7 +270,7 @@ fn wrap(line: &str, width: usize) -> Vec<Cow<'_, str>> {
     textwrap::wrap(line, output::wrapped(width.max(1)).subsequent_indent(&indent))
 }
 
-fn draw_message(frame: &mut Frame<'_>, area: Rect, state: &State, theme: &Theme) {
+fn draw_message(frame: &mut Frame<'_>, area: Rect, state: &WatchState, theme: &Theme) {
     let attention = theme.style(Tone::Attention);
     let width = usize::from(area.width);
     let line = match (&state.mode, &state.message, &state.read_error) {
@@ -288,7 +288,7 @@ fn draw_message(frame: &mut Frame<'_>, area: Rect, state: &State, theme: &Theme)
 }
 
 /// The last line: the available keys, or the prompt.
-fn key_hints(state: &State) -> String {
+fn key_hints(state: &WatchState) -> String {
     match (&state.mode, state.focus) {
         (Mode::Text(_), _) => "↑↓ PgUp PgDn scroll  q back".to_owned(),
         (Mode::Prompt(prompt), _) => match &prompt.kind {

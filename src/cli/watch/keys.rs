@@ -6,7 +6,7 @@ use store::JobState;
 use super::super::ExitStatus;
 use super::entries::{UNKNOWN_QUANTITIES, without_campaign};
 use super::messages::Request;
-use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, State, Text, WALKS};
+use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, Text, WALKS, WatchState};
 use crate::cli::queue::Action as QueueAction;
 use crate::cli::status;
 use crate::cli::walks::{Action as WalksAction, WalkSelection};
@@ -31,7 +31,7 @@ q                quit, or close a text; Ctrl-C quits at once
 Changes are recorded in the operations log, as those by commands. In reproducible mode the other walks of the same round wait for a
 paused walk.";
 
-impl State {
+impl WatchState {
     /// Handles a key.
     pub fn key(&mut self, key: KeyEvent) -> Option<Request> {
         if key.kind == KeyEventKind::Release {
@@ -226,7 +226,7 @@ impl State {
     }
 }
 
-impl State {
+impl WatchState {
     /// Parses a filter, and checks that the pane has its quantities.
     fn parse_filter(&self, text: &str) -> Result<Filter, String> {
         let condition: Filter = text.parse().map_err(|error| format!("invalid filter: {error}"))?;

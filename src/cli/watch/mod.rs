@@ -25,7 +25,7 @@ use self::draw::Theme;
 use self::messages::{Completed, JobView, Request};
 use self::reader::{Poller, Reader};
 use self::screen::Screen;
-use self::state::State;
+use self::state::WatchState;
 use super::{CampaignLocation, ExitStatus, Failure, block_on, duration_between, explain, queue, walks};
 use crate::duration::Duration;
 
@@ -61,7 +61,7 @@ impl Watch {
 async fn watch(location: Location, interval: std::time::Duration) -> Result<ExitStatus, Failure> {
     let mut reader = Reader::new(location.clone());
     // Before the screen opens, so that an error is printed normally.
-    let mut state = State::new(reader.poll(JobView::default()).await?);
+    let mut state = WatchState::new(reader.poll(JobView::default()).await?);
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
     let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;

@@ -73,7 +73,7 @@ pub enum Message {
 }
 
 /// Everything that is drawn.
-pub struct State {
+pub struct WatchState {
     /// The campaign, as in `calmwalk status`.
     pub snapshot: Snapshot,
     /// Which label jobs are shown.
@@ -95,7 +95,7 @@ pub struct State {
     decisions: VecDeque<RecentDecision>,
 }
 
-impl State {
+impl WatchState {
     /// The state after the first poll.
     pub fn new(reading: Reading) -> Self {
         let Reading { snapshot, view, jobs, decisions } = reading;

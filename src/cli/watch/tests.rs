@@ -7,7 +7,7 @@ use wire::Origin;
 
 use super::draw::{Theme, draw};
 use super::messages::{Completed, JobView, Reading, Request};
-use super::state::{DECISIONS, Message, Mode, QUEUE, State, WALKS};
+use super::state::{DECISIONS, Message, Mode, QUEUE, WALKS, WatchState};
 use super::*;
 use crate::cli::queue::Action;
 use crate::cli::status;
@@ -76,12 +76,12 @@ fn reading(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Reading {
     }
 }
 
-fn state() -> State {
+fn state() -> WatchState {
     let jobs = vec![job(1, JobState::Leased), job(2, JobState::Queued), job(3, JobState::Queued)];
-    State::new(reading(jobs, 1..101))
+    WatchState::new(reading(jobs, 1..101))
 }
 
-fn press(state: &mut State, keys: &str) -> Option<Request> {
+fn press(state: &mut WatchState, keys: &str) -> Option<Request> {
     let code = |key: &str| match key {
         "Tab" => KeyCode::Tab,
         "Enter" => KeyCode::Enter,
@@ -95,19 +95,19 @@ fn press(state: &mut State, keys: &str) -> Option<Request> {
     keys.split(' ').map(press).last().flatten()
 }
 
-fn write(state: &mut State, text: &str) {
+fn write(state: &mut WatchState, text: &str) {
     for character in text.chars() {
         assert_eq!(state.key(KeyEvent::new(KeyCode::Char(character), KeyModifiers::NONE)), None);
     }
 }
 
-fn terminal(state: &mut State, width: u16, height: u16, theme: Theme) -> Terminal<TestBackend> {
+fn terminal(state: &mut WatchState, width: u16, height: u16, theme: Theme) -> Terminal<TestBackend> {
     let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
     terminal.draw(|frame| draw(frame, state, &theme)).unwrap();
     terminal
 }
 
-fn screen(state: &mut State, width: u16, height: u16) -> String {
+fn screen(state: &mut WatchState, width: u16, height: u16) -> String {
     terminal(state, width, height, PLAIN).backend().to_string()
 }
 

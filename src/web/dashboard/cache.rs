@@ -19,10 +19,10 @@ const WAIT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// The last result and the computation in progress. Clones share them.
 #[derive(Clone, Debug, Default)]
-pub struct CachedResponse(Arc<Mutex<State>>);
+pub struct CachedResponse(Arc<Mutex<CacheState>>);
 
 #[derive(Debug, Default)]
-struct State {
+struct CacheState {
     computed: Option<Computed>,
     /// Closed at the end of the computation, whether it succeeds or fails.
     in_progress: Option<watch::Receiver<()>>,
@@ -77,7 +77,7 @@ impl CachedResponse {
         Some(in_progress)
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, CacheState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
