@@ -33,7 +33,6 @@ use crate::label_method::MethodConfig;
 use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
 use crate::process_config::{HashedFile, ModelFiles};
-pub use load::check_sound;
 use loader::Loader;
 pub use seed_structures::{SkippedStructure, SourcedStructure};
 pub use short_range::PairRange;

@@ -16,9 +16,10 @@ use super::loader::Loader;
 use super::seed_structures::{SeedStructures, SourcedStructure};
 use super::training_sample::{self, SampledFrame};
 use crate::all_cores;
+use crate::artifact_checks::{check_belongs_to, check_sound};
 use crate::config::{ConfigError, LabelMethod, OnInvalid, PotentialFile, Warning, location};
+use crate::feature_variant::with_projection;
 use crate::label_method::{self, REFERENCE_FILE};
-use crate::projection::{check_belongs_to, with_projection};
 
 /// Largest number of seed-structure atoms that are graded.
 const MAX_GRADED_ATOMS: usize = 256;
@@ -306,20 +307,6 @@ impl Features {
         let rows = frame.atoms.iter().flat_map(|atom| &features[atom * dimension..][..dimension]);
         Ok((frame.atoms.iter().map(|atom| elements[*atom]).collect(), rows.copied().collect()))
     }
-}
-
-/// Refuses an artifact whose numbers cannot come from training data.
-pub fn check_sound(artifact: &Artifact, path: &Path) -> Result<(), String> {
-    let faults = artifact.unsound_components();
-    let Some(first) = faults.first() else { return Ok(()) };
-    let more = match faults.len() - 1 {
-        0 => String::new(),
-        more => format!(" (and {more} more: calmwalk calm info {})", path.display()),
-    };
-    Err(format!(
-        "{}: {first}{more}; rebuild the artifact, or copy it again from where it was built",
-        path.display()
-    ))
 }
 
 /// Explains why an artifact is invalid. Users easily confuse it with an export or an artifact without statistics.
