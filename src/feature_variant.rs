@@ -1,15 +1,14 @@
-//! The features of a model: those that its file describes, or others of the same model.
+//! The features of a model: those that its file describes, those of an artifact, or others of the same model.
 
 use std::path::Path;
 
 use calm::Projection;
 use calm::baselines::FeatureOrigin;
-use potentials::grace::{FeatureForm, GraceModel};
+use potentials::grace::{self, FeatureForm, GraceModel, UnfitProjection};
 
 use crate::exit_status::Failure;
 use crate::features::FeatureCalculator;
 use crate::file_hash;
-use crate::projection::{self, with_projection};
 
 /// Which features to use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -123,7 +122,7 @@ impl FeatureModel {
 
     /// How the features follow from the basis; `None` for the hidden layer.
     pub fn projection(&self) -> Option<Projection> {
-        projection::of_model(&self.model).filter(|_| !self.is_hidden)
+        model_projection(&self.model).filter(|_| !self.is_hidden)
     }
 
     /// Chemical symbols, in the order of the element indices.
@@ -147,6 +146,38 @@ impl FeatureModel {
             dimension: self.dimension(),
         })
     }
+}
+
+/// The projection of a model, if it has one, in the form of artifacts.
+pub fn model_projection(model: &GraceModel) -> Option<Projection> {
+    let found = model.projection()?;
+    Some(Projection {
+        matrix: found.matrix.clone(),
+        rows: found.matrix.len() / found.dimension,
+        columns: found.dimension,
+        feature_dimension: found.feature_dimension(),
+        asinh: found.asinh,
+        normalised: found.normalize,
+        density_channels: found.density_channels,
+        density_scale: found.density_scale,
+    })
+}
+
+/// The model with this projection, in place of its own if it has one.
+///
+/// # Errors
+/// A projection of another basis.
+pub fn with_projection(model: GraceModel, projection: &Projection) -> Result<GraceModel, UnfitProjection> {
+    let layers = model.description().architecture.layers();
+    model.with_projection(grace::Projection {
+        matrix: projection.matrix.clone(),
+        dimension: projection.columns,
+        normalize: projection.normalised,
+        density_channels: projection.density_channels,
+        density_scale: projection.density_scale,
+        asinh: projection.asinh,
+        layers,
+    })
 }
 
 /// The name of the features of a projection.

@@ -3,6 +3,7 @@
 //! them.
 
 mod all_cores;
+mod artifact_checks;
 mod atomic_file;
 mod calm_validation;
 mod campaign;
@@ -29,7 +30,6 @@ mod output;
 mod page;
 mod process_config;
 mod progress;
-mod projection;
 mod reliability_filter;
 mod replay;
 mod report;

@@ -16,11 +16,11 @@ use workers::labeller::LabelBounds;
 use workers::settings::WalkSettings;
 
 use crate::exit_status::Failure;
+use crate::feature_variant::with_projection;
 use crate::file_hash::verify_hash;
 use crate::label_method::MethodConfig;
 use crate::label_setup::LabelSetup;
 use crate::log;
-use crate::projection::with_projection;
 
 /// The files of a model.
 #[derive(Clone, Debug, Deserialize, Serialize)]

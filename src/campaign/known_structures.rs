@@ -11,7 +11,7 @@ use potentials::grace::{Grace, GraceModel};
 use toml::Spanned;
 use wire::ContentHash;
 
-use super::load::Loader;
+use super::loader::Loader;
 use crate::config::{ConfigError, Warning};
 use crate::label_method;
 use crate::output::count;

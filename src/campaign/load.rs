@@ -3,36 +3,23 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use atoms::{NeighbourList, Repetition, Structure};
+use atoms::{NeighbourList, Structure};
 use calm::forgetting::GradeDistribution;
 use calm::{Artifact, ArtifactError, Grades, Mixture, Projection};
-use orchestrator::selector::{SeedStructure, TrainingFrames, UpdateProtocol};
+use orchestrator::selector::{TrainingFrames, UpdateProtocol};
 use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
-use super::geometry::Geometry;
-use super::seed_structures::SeedStructures;
+use super::loader::Loader;
+use super::seed_structures::{SeedStructures, SourcedStructure};
 use super::training_sample::{self, SampledFrame};
 use crate::all_cores;
-use crate::config::{
-    Config, ConfigError, LabelMethod, OnInvalid, PotentialFile, Warning, location, location_of_offset,
-};
+use crate::artifact_checks::{check_belongs_to, check_sound};
+use crate::config::{ConfigError, LabelMethod, OnInvalid, PotentialFile, Warning, location};
+use crate::feature_variant::with_projection;
 use crate::label_method::{self, REFERENCE_FILE};
-use crate::projection::{check_belongs_to, with_projection};
-
-/// A seed structure and its source.
-pub struct SourcedStructure {
-    /// Name and structure.
-    pub seed: SeedStructure,
-    /// `file:line`, and the repetition of a supercell.
-    pub source: String,
-    /// Repetition of the cell in the file.
-    pub repetition: Repetition,
-    /// Its distances.
-    pub geometry: Geometry,
-}
 
 /// Largest number of seed-structure atoms that are graded.
 const MAX_GRADED_ATOMS: usize = 256;
@@ -49,16 +36,6 @@ const TRAINING_FRAMES: &str = "calm.training_frames";
 const NO_STATISTICS: &str = "no scatter matrices and counts, so its mixture can be scored with but not updated; give the \
                           gmm_artifacts.npz of the build, or leave calm.artifact out and set update = \"never\" to \
                           take the mixture of the export as it is";
-
-/// Reads files. Errors name the line of the configuration that names the file.
-pub(super) struct Loader<'a> {
-    /// Path of the configuration file.
-    pub path: &'a Path,
-    /// Its text.
-    pub text: &'a str,
-    /// The parsed configuration.
-    pub config: &'a Config,
-}
 
 impl Loader<'_> {
     /// Loads the model, which must support the configured settings. Without a projection of its features, it gets that of the
@@ -300,24 +277,6 @@ impl Loader<'_> {
         })?;
         Ok((key.to_owned(), blake3::hash(&bytes).to_string()))
     }
-
-    pub(super) fn file_error(
-        &self,
-        key: &str,
-        file: &Spanned<PathBuf>,
-        message: impl ToString,
-    ) -> ConfigError {
-        let at = location_of_offset(self.path, self.text, file.span().start);
-        ConfigError::File { at, key: key.to_owned(), message: message.to_string() }
-    }
-
-    pub(super) fn warning(&self, key: &str, file: &Spanned<PathBuf>, message: String) -> Warning {
-        Warning {
-            at: location_of_offset(self.path, self.text, file.span().start),
-            key: key.to_owned(),
-            message,
-        }
-    }
 }
 
 /// Computes features of structures one after another.
@@ -348,20 +307,6 @@ impl Features {
         let rows = frame.atoms.iter().flat_map(|atom| &features[atom * dimension..][..dimension]);
         Ok((frame.atoms.iter().map(|atom| elements[*atom]).collect(), rows.copied().collect()))
     }
-}
-
-/// Refuses an artifact whose numbers cannot come from training data.
-pub fn check_sound(artifact: &Artifact, path: &Path) -> Result<(), String> {
-    let faults = artifact.unsound_components();
-    let Some(first) = faults.first() else { return Ok(()) };
-    let more = match faults.len() - 1 {
-        0 => String::new(),
-        more => format!(" (and {more} more: calmwalk calm info {})", path.display()),
-    };
-    Err(format!(
-        "{}: {first}{more}; rebuild the artifact, or copy it again from where it was built",
-        path.display()
-    ))
 }
 
 /// Explains why an artifact is invalid. Users easily confuse it with an export or an artifact without statistics.

@@ -13,7 +13,7 @@ use toml::Spanned;
 use wire::ContentHash;
 
 use super::geometry::Geometry;
-use super::load::{Loader, SourcedStructure};
+use super::loader::Loader;
 use crate::all_cores;
 use crate::config::{ConfigError, OnInvalid, Warning, location};
 
@@ -28,6 +28,18 @@ const MAX_LISTED: usize = 20;
 
 /// Largest supercell: a walk of a larger one takes weeks.
 const MAX_SUPERCELL_ATOMS: u64 = 100_000;
+
+/// A seed structure and its source.
+pub struct SourcedStructure {
+    /// Name and structure.
+    pub seed: SeedStructure,
+    /// `file:line`, and the repetition of a supercell.
+    pub source: String,
+    /// Repetition of the cell in the file.
+    pub repetition: Repetition,
+    /// Its distances.
+    pub geometry: Geometry,
+}
 
 /// The seed structures of a campaign.
 #[derive(Default)]

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use atoms::ElementPair;
 use potentials::ZblWindow;
 
-use super::load::{Loader, SourcedStructure};
+use super::loader::Loader;
+use super::seed_structures::SourcedStructure;
 use crate::config::{Config, Warning, location};
 
 /// Number of pairs that a warning names.

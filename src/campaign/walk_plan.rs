@@ -6,8 +6,8 @@ use atoms::Structure;
 use orchestrator::selector::SeedStructure;
 use wire::WalkConditions;
 
-use super::load::{Loader, SourcedStructure};
-use super::seed_structures::{SeedStructures, listed};
+use super::loader::Loader;
+use super::seed_structures::{SeedStructures, SourcedStructure, listed};
 use crate::config::{
     ConfigError, OnInvalid, VolumeRampSection, WalkGroupSection, WalkSection, Warning, location,
 };

@@ -11,7 +11,7 @@ use self::directory::StagedDirectory;
 use crate::Store;
 use crate::database::{Database, query};
 use crate::error::Result;
-use crate::sqlite::DatabaseFile;
+use crate::sqlite::file::DatabaseFile;
 use crate::tables::attempt_end::{AttemptEnd, end_without_label};
 use crate::tables::logs::insert_operation;
 use crate::tables::processes::LEASED;

@@ -9,8 +9,8 @@
 
 use crc32fast::Hasher;
 
-use crate::database::value::{Kind, replace_nul};
-use crate::database::{Row, Value};
+use crate::database::row::Row;
+use crate::database::value::{Kind, Value, replace_nul};
 use crate::error::{Result, StoreError};
 
 /// Stands for the missing checksums of tables of an earlier version that are opened read-only.

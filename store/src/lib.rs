@@ -66,7 +66,7 @@ pub use outcomes::{
     FailureCount, FinishedCandidate, LabelCost, LabelUsage, LabelledEnergies, NearDuplicate, PendingJobs,
     Unlabelled, ValueRange,
 };
-pub use postgres::SERVER_RECONNECT_TIMEOUT;
+pub use postgres::server::SERVER_RECONNECT_TIMEOUT;
 pub use process_start::{is_local, is_running, process_start_time};
 pub use processes::{ProcessRecord, this_host};
 pub use recent::{DecidedCandidate, RecentDecision};

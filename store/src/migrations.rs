@@ -27,7 +27,7 @@ mod tests {
     #[tokio::test]
     async fn the_migrations_match_the_files_of_their_folder() {
         for (folder, steps) in
-            [("sqlite", &crate::sqlite::STEPS[..]), ("postgres", &crate::postgres::STEPS[..])]
+            [("sqlite", &crate::sqlite::open::STEPS[..]), ("postgres", &crate::postgres::open::STEPS[..])]
         {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("migrations").join(folder);
             let known = |migrator: Migrator| -> Vec<_> {

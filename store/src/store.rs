@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use crate::database::{Clock, Database};
+use crate::database::Database;
 use crate::error::Result;
 use crate::location::Location;
 use crate::lock::CampaignLock;
-use crate::postgres::Server;
-use crate::sqlite::DatabaseFile;
+use crate::postgres::server::{Clock, Server};
+use crate::sqlite::file::DatabaseFile;
 
 /// The database of one campaign. Clones share its connections.
 #[derive(Clone, Debug)]

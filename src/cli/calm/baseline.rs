@@ -9,8 +9,8 @@ use calm::{Artifact, Mixture};
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
+use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
 use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::features::FeatureCalculator;

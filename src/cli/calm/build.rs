@@ -10,14 +10,13 @@ use calm::build::{BuildSettings, BuiltElement, BuiltMixture, random_projection};
 use npz::Archive;
 use potentials::grace::GraceModel;
 
+use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
-use crate::feature_variant::{FeatureModel, FeatureVariant};
+use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 use crate::file_hash;
 use crate::mixture_build::{self, Part, Work};
 use crate::output::{Table, log_and_warn, print, print_stderr};
-use crate::projection::with_projection;
 use crate::signals::stop_token;
 use crate::structure_files::{StructureArguments, StructureFiles};
 

@@ -9,10 +9,10 @@ use calm::{Artifact, Grades};
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
+use crate::artifact_checks::load_artifact;
 use crate::cli::{ExitStatus, Failure};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, Table, decimals, print, print_json};
-use crate::projection::load_artifact;
 use crate::structure_files::{Place, StructureArguments};
 
 /// Atoms of each element whose grades are kept for quantiles and ranks.

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use calm::Artifact;
 use calm::build::{ElementHistograms, Recalibration, ThresholdRule, read_histograms};
 
+use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::campaign::check_sound;
 use crate::cli::{ExitStatus, Failure};
 use crate::output::{Table, print};
 

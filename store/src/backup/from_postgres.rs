@@ -7,8 +7,8 @@ use sqlx::{AssertSqlSafe, Executor, Postgres};
 use crate::database::value::Kind;
 use crate::database::{Database, Row, Transaction, Value, execute_rows, query};
 use crate::error::{Result, StoreError};
-use crate::postgres::Server;
-use crate::sqlite::DatabaseFile;
+use crate::postgres::server::Server;
+use crate::sqlite::file::DatabaseFile;
 use crate::tables::budget::rebuild_totals;
 use crate::tables::checksums;
 
@@ -90,7 +90,7 @@ const OPERATIONS: Table = table!("operation" { number: I, time: I, kind: T, deta
 
 /// Writes the copy into a directory.
 pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
-    let mut from = server.begin_read().await?;
+    let mut from = Transaction::Postgres(server.begin_read().await?, server.clock);
     // Their checksums are marked as unknown.
     let without_checksums = !from.has_column("label", "checksum").await?;
     let tables = || TABLES.iter().chain([&OPERATIONS]);

@@ -12,7 +12,7 @@ use crate::encoding::decode_structure;
 use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
 use crate::tables::checksums;
-use crate::tables::labels::decode_label;
+use crate::tables::label_row::decode_label;
 
 /// Rows read at a time: a row of a large structure has megabytes.
 const PAGE: u32 = 16;

@@ -2,8 +2,9 @@
 //!
 //! SQLite and PostgreSQL execute the same SQL, with `$1` for bound values and four types: BIGINT (also for
 //! booleans: 0 and 1), DOUBLE PRECISION, TEXT and BYTEA. Each difference is handled in one place: beginning a
-//! transaction (this file), locking rows ([`query`]), writing many rows at once ([`rows`]), values ([`value`]). The
-//! modules `sqlite` and `postgres` create and open databases.
+//! transaction (this file), locking rows ([`query`]), writing many rows at once ([`rows`]), values ([`value`]). Below
+//! it, `sqlite/file` and `postgres/server` have the connections; above it, the `open` of each creates, opens and
+//! migrates databases.
 
 pub mod query;
 pub mod row;
@@ -19,8 +20,8 @@ pub use rows::execute_rows;
 pub use value::Value;
 
 use crate::error::{Result, StoreError};
-use crate::postgres::Server;
-use crate::sqlite::DatabaseFile;
+use crate::postgres::server::{Clock, Server};
+use crate::sqlite::file::DatabaseFile;
 
 /// An open database. Clones share its connections.
 #[derive(Clone, Debug)]
@@ -36,21 +37,12 @@ pub enum Transaction {
     Postgres(sqlx::Transaction<'static, Postgres>, Clock),
 }
 
-/// The clock that leases use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Clock {
-    /// The server's clock: hosts need not agree on the time.
-    Server,
-    /// The caller's clock, as in SQLite, which serves one host.
-    Caller,
-}
-
 impl Database {
     /// Begins a transaction that may write.
     pub async fn begin(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.begin().await?)),
-            Self::Postgres(server) => server.begin().await,
+            Self::Postgres(server) => Ok(Transaction::Postgres(server.begin().await?, server.clock)),
         }
     }
 
@@ -61,7 +53,9 @@ impl Database {
     pub async fn begin_as_leader(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.begin().await?)),
-            Self::Postgres(server) => server.begin_as_leader().await,
+            Self::Postgres(server) => {
+                Ok(Transaction::Postgres(server.begin_as_leader().await?, server.clock))
+            }
         }
     }
 
@@ -70,7 +64,10 @@ impl Database {
     pub async fn begin_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
         match self {
             Self::Sqlite(file) => Ok((Transaction::Sqlite(file.begin().await?), false)),
-            Self::Postgres(server) => server.begin_commit(mark, again).await,
+            Self::Postgres(server) => {
+                let (transaction, made) = server.begin_commit(mark, again).await?;
+                Ok((Transaction::Postgres(transaction, server.clock), made))
+            }
         }
     }
 
@@ -78,7 +75,7 @@ impl Database {
     pub async fn begin_read(&self) -> Result<Transaction> {
         match self {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.readers.begin().await?)),
-            Self::Postgres(server) => server.begin_read().await,
+            Self::Postgres(server) => Ok(Transaction::Postgres(server.begin_read().await?, server.clock)),
         }
     }
 

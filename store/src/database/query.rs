@@ -9,7 +9,7 @@ use super::row::{FromRow, Row};
 use super::value::Value;
 use super::{Database, Target, Transaction, missing_row};
 use crate::error::{Result, StoreError};
-use crate::postgres::{RETRY_INTERVAL, Server};
+use crate::postgres::server::{RETRY_INTERVAL, Server};
 
 /// SQL with its bound values.
 #[derive(Clone)]

@@ -13,7 +13,8 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
-use super::{Server, make_tables, options};
+use super::open::make_tables;
+use super::server::{Server, options};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
 use crate::process_start::process_start_time;

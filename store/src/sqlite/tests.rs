@@ -1,11 +1,16 @@
 //! Tests of internals: query plans, connection settings, a full disk.
 
+use std::path::Path;
+
 use sqlx::AssertSqlSafe;
 use wire::CampaignId;
 
-use super::*;
+use super::file::{DatabaseFile, PAGE_SIZE, WAL_PAGES};
+use super::open::{APPLICATION, MIGRATIONS, SCHEMA};
 use crate::Store;
 use crate::check;
+use crate::database::Database;
+use crate::error::StoreError;
 use crate::records::{Campaign, Commit, ComponentRecord};
 use crate::tables::{
     attempt_end, candidate_history, exclude, export, job_counts, listing, lower_states, outcomes, queue,

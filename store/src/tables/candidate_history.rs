@@ -3,7 +3,7 @@
 
 use wire::{ContentHash, WalkId};
 
-use super::labels::LabelRow;
+use super::label_row::LabelRow;
 use super::status::walks;
 use crate::Store;
 use crate::candidate_history::{

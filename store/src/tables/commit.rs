@@ -16,7 +16,7 @@ use crate::Store;
 use crate::database::{Transaction, execute_rows, query};
 use crate::encoding::integer;
 use crate::error::{Result, StoreError};
-use crate::postgres::SERVER_RECONNECT_TIMEOUT;
+use crate::postgres::server::SERVER_RECONNECT_TIMEOUT;
 use crate::records::Commit;
 
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);

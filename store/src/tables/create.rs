@@ -6,9 +6,9 @@ use crate::Store;
 use crate::database::Database;
 use crate::error::Result;
 use crate::location::Location;
-use crate::postgres::Server;
+use crate::postgres::server::Server;
 use crate::records::{Campaign, SeedStructure};
-use crate::sqlite::DatabaseFile;
+use crate::sqlite::file::DatabaseFile;
 
 impl Store {
     /// Creates a campaign on a server or in an existing directory. The caller holds its [`crate::CampaignLock`].

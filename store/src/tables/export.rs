@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use wire::ContentHash;
 
-use super::labels::LabelRow;
+use super::label_row::LabelRow;
 use super::restore::{block, grades, origin};
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_STRUCTURE, joined};

@@ -1,7 +1,7 @@
 //! Pages of the candidate table. Each query reads an index from the first row of the page, so its cost does not
 //! depend on the number of rows.
 
-use super::labels::LabelRow;
+use super::label_row::LabelRow;
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, Names, joined};
 use crate::database::{FromRow, Row, query};

@@ -7,7 +7,7 @@
 use serde_json::json;
 
 use super::exclude::{self, NamedStructure};
-use super::labels::LabelRow;
+use super::label_row::LabelRow;
 use super::logs::insert_operation;
 use super::protocols::set_campaign_value;
 use super::structures;

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::attempt_end::end_attempt;
 use super::exclude;
 use super::job_counts;
-use super::labels::LabelRow;
+use super::label_row::LabelRow;
 use super::logs::insert_operation;
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, STRUCTURE, joined};

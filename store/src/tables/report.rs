@@ -2,7 +2,7 @@
 
 use wire::ContentHash;
 
-use super::labels::LabelRow;
+use super::label_row::LabelRow;
 use super::restore::{block, grades, origin};
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};

@@ -16,13 +16,14 @@ use tokio_util::sync::CancellationToken;
 
 use super::blocking::blocking;
 use super::calculation_handle::CalculationHandle;
+use super::calculation_request::{CalculationNote, CalculationRequest};
 use super::calculation_runner::{Calculation, CalculationEnd, EndReason, WORK};
 use super::calculation_state::CalculationState;
+use super::failure_classes::failure_classes;
 use super::file_error::file_error;
 use super::label_attempt::{EndedCalculation, LabelAttempt, SingleLabel};
 use super::local;
 use super::prepare::{PreparedInput, prepare, read, write};
-use super::recorded_label::{LabelProgress, RecordedLabel};
 use super::scratch::{self, ScratchRoot};
 use super::slurm::{self, Slurm};
 use super::{BatchSystem, ExecutionSettings, RunnerCommand, log, private_directory, retry_until_written};
@@ -54,30 +55,6 @@ struct CurrentCalculation {
 enum PreparedCalculation {
     Local(local::PreparedRunner),
     Slurm(slurm::Job),
-}
-
-/// A structure to calculate, and what was tried before.
-pub(super) struct CalculationRequest<'a> {
-    pub structure: &'a Structure,
-    /// Number of the job and of its attempt, for the name of the directory.
-    pub job: i64,
-    pub attempt: u32,
-    /// Classes of the failures so far, oldest first.
-    pub failures: Vec<FailureClass>,
-    /// Calculations that may still be running or unread, newest first, as they were recorded.
-    pub earlier: &'a [String],
-    /// Calculations that failed.
-    pub failed: &'a [String],
-    pub record: CalculationNote<'a>,
-}
-
-/// Where a calculation is recorded before it starts.
-#[derive(Clone, Copy)]
-pub(super) enum CalculationNote<'a> {
-    /// With the attempt of this lease.
-    Lease(&'a Lease),
-    /// In the progress of a label outside the queue.
-    Progress(&'a RecordedLabel<'a>, &'a LabelProgress),
 }
 
 impl CodeMethod {
@@ -137,8 +114,8 @@ impl CodeMethod {
                     retry_until_written(stop, || store.record_calculation(lease, &identity, &prepared.record))
                         .await
                 }
-                CalculationNote::Progress(label, progress) => {
-                    label.record_calculation(store, progress, identity, stop).await
+                CalculationNote::Progress(key, progress) => {
+                    progress.record_calculation(store, key, identity, stop).await
                 }
             }
         };
@@ -452,11 +429,6 @@ impl CodeMethod {
     fn current(&self) -> MutexGuard<'_, Option<CurrentCalculation>> {
         self.current.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// The classes of failures with these names.
-pub(super) fn failure_classes(names: &[String]) -> Vec<FailureClass> {
-    names.iter().filter_map(|name| FailureClass::from_name(name)).collect()
 }
 
 /// Nodes where these calculations failed and another node may help.

@@ -10,7 +10,8 @@ use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use super::code::{CodeMethod, failure_classes};
+use super::code::CodeMethod;
+use super::failure_classes::failure_classes;
 use super::label_attempt::{EndedCalculation, LabelAttempt};
 use super::{ExecutionSettings, ReferenceMethod, RunnerCommand};
 

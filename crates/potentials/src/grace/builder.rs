@@ -7,10 +7,9 @@ use super::basis::BasisLayout;
 use super::description::{Architecture, GraceDescription};
 use super::error::{GraceError, mismatch};
 use super::layer::LayerDraft;
-use super::load::has_projection;
 use super::network::Network;
 use super::networks::readout;
-use super::projection::{FeatureMap, Projection};
+use super::projection::{FeatureMap, Projection, has_projection};
 use super::shared_reader::reject_unread_arrays;
 use super::vector::Vector;
 

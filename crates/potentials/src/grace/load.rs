@@ -11,6 +11,7 @@ use super::error::GraceError;
 use super::model::GraceModel;
 use super::network::{AnyNetwork, Network};
 use super::precision::Precision;
+use super::projection::has_projection;
 use super::radial::RadialPath;
 use super::symmetry::require_invariance;
 use super::vector::Vector;
@@ -70,11 +71,6 @@ impl GraceModel {
             _ => require_invariance(archive, model),
         }
     }
-}
-
-/// Whether an export has a projection of the features.
-pub(super) fn has_projection(archive: &Archive) -> bool {
-    archive.contains("uq_schema_version")
 }
 
 /// Detects the depth by the lists of single-particle basis functions that only deeper models have.

@@ -2,6 +2,8 @@
 
 use std::ops::Range;
 
+use npz::Archive;
+
 use super::basis::BasisLayout;
 use super::batches::Chunk;
 use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
@@ -248,6 +250,11 @@ impl<V: Vector> FeatureMap<V> {
     fn lanes(&self) -> usize {
         self.maps.first().map_or(0, |maps| maps.forward.output_lanes())
     }
+}
+
+/// Whether an export has a projection of the features.
+pub(super) fn has_projection(archive: &Archive) -> bool {
+    archive.contains("uq_schema_version")
 }
 
 #[inline(always)]
