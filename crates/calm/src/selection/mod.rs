@@ -4,13 +4,13 @@
 //! with the largest γ and updates a copy of the mixture with it; [`FarthestPoints`] picks structures whose atoms are far from
 //! those picked already; [`random_structures`] draws without replacement; [`floors`] makes sure that each element has enough atoms.
 //!
-//! Both [`Greedy`] and [`FarthestPoints`] keep an upper bound for each atom and compute it again only when it is the largest (lazy
-//! evaluation; Minoux, Optimization Techniques 1978): γ only falls when covariances grow, and distances to the nearest picked atom
-//! only fall when atoms are picked.
+//! Both [`Greedy`] and [`FarthestPoints`] keep an upper bound for each atom and compute it again only when it is the largest
+//! (`lazy_heap`): γ only falls when covariances grow, and distances to the nearest picked atom only fall when atoms are picked.
 
 mod farthest_points;
 pub mod floors;
 mod greedy;
+mod lazy_heap;
 mod pool;
 mod random;
 mod rows;
