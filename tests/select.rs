@@ -85,8 +85,8 @@ fn selected_structures_keep_their_frames_whatever_threads_and_memory() {
 fn several_strategies_pick_from_what_is_left() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    pool(&here.join("pool.extxyz"), 14);
-    let parts = ["greedy:2", "fps:2", "fps-all:2", "random-extrap:1", "random:3"];
+    pool(&here.join("pool.extxyz"), 21);
+    let parts = ["greedy:2", "fps:2", "fps-all:2", "d-optimal:1", "random-extrap:1", "random:3"];
     let found = select(here, &[&["pool.extxyz", "--strategy"], &parts[..]].concat());
     let of = |strategy: &str| {
         let all = found["strategies"].as_array().unwrap().iter();
@@ -102,12 +102,14 @@ fn several_strategies_pick_from_what_is_left() {
     let mut numbers: Vec<_> = selected.iter().map(|frame| number(frame, "n") as u64).collect();
     numbers.sort_unstable();
     numbers.dedup();
-    assert_eq!(numbers.len(), 10);
+    assert_eq!(numbers.len(), 11);
     assert_eq!(found["floor"], 131);
-    // Commas, repetition and aliases are the same.
+    // Commas, repetition and aliases are the same, and so is a single thread.
     let same = [
+        "--threads",
+        "1",
         "--strategy",
-        "greedy:2,fps-extrap:2,fps-all:2",
+        "greedy:2,fps-extrap:2,fps-all:2,d-optimal:1",
         "--strategy",
         "random-extrap:1",
         "--strategy",
@@ -151,6 +153,8 @@ fn wrong_selections_are_refused() {
     let model = file("kokkos.npz");
     let own = ["select", "--model", &model, "pool.extxyz", "--output", "out.extxyz"];
     assert!(refuse(here, own).contains("the mixture has no statistics, which greedy updates"));
+    let message = refuse(here, own.iter().chain(&["--strategy", "random:1", "d-optimal:1"]));
+    assert!(message.contains("the mixture has no statistics, which d-optimal starts from"), "{message}");
     assert!(
         succeed(here, own.iter().chain(&["--strategy", "fps-all:1"])).contains("selected 1 structure of 2")
     );

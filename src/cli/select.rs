@@ -31,6 +31,10 @@ use crate::structure_files::ReadingArguments;
 /// fps (fps-extrap): farthest points over the atoms with γ within the window, of features that the mixture whitens; structures in the
 /// order in which their first atom is picked. Starts from what is picked already. fps-all: over all atoms, of plain features.
 ///
+/// d-optimal: the structure whose atoms within the window add most to the information of a linear model of the features z: to
+/// log det Σ zzᵀ, summed over the elements. Starts from the training data, which weigh as much as one atom of each element, and from
+/// what is picked already.
+///
 /// random (random-all): uniformly at random. random-extrap: among structures with an atom within the window.
 ///
 /// Writes what the frames had, with selection_strategy, selection_rank (from 1), gamma_max (at the pick), and source_file and
@@ -41,7 +45,7 @@ pub struct Select {
     /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
-    /// CALM artifact (gmm_artifacts.npz); greedy needs its statistics [default: mixture in the model file]
+    /// CALM artifact (gmm_artifacts.npz); greedy and d-optimal need its statistics [default: mixture in the model file]
     #[arg(long, value_name = "CALM.npz")]
     artifact: Option<PathBuf>,
     /// Structures: extended XYZ (.extxyz, .xyz), POSCAR (.poscar, .vasp, POSCAR*, CONTCAR*) or text dumps of LAMMPS (.dump,
@@ -57,7 +61,7 @@ pub struct Select {
     /// Of campaigns, only declined candidates
     #[arg(long, requires = "campaign")]
     declined: bool,
-    /// Strategies in order, each with its number of structures: greedy, fps, fps-all, random, random-extrap
+    /// Strategies in order, each with its number of structures: greedy, fps, fps-all, d-optimal, random, random-extrap
     #[arg(long, value_name = "NAME[:N]", num_args = 1.., value_delimiter = ',', default_value = "greedy")]
     strategy: Vec<Part>,
     /// Number of structures, for a single strategy [default for greedy: all that it finds]
@@ -110,10 +114,15 @@ impl Select {
         let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
         let (model, mixture) = (features.model, Arc::new(artifact.mixture));
 
-        if parts.iter().any(|part| part.strategy == Strategy::Greedy) && !mixture.can_be_updated() {
+        let needed =
+            parts.iter().find_map(|Part { strategy, .. }| Some((strategy, strategy.use_of_statistics()?)));
+        if let Some((strategy, uses)) = needed
+            && !mixture.can_be_updated()
+        {
             return Err(Failure::Input(format!(
-                "{}: the mixture has no statistics, which greedy updates: use --artifact with the gmm_artifacts.npz of this model",
-                self.model.display()
+                "{}: the mixture has no statistics, which {} {uses}: use --artifact with the gmm_artifacts.npz of this model",
+                self.model.display(),
+                strategy.name()
             )));
         }
         let mut pool = PoolFiles { files, campaigns: self.campaigns()? };

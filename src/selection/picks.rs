@@ -2,7 +2,7 @@
 
 use calm::Mixture;
 use calm::rules::{Positive, UpdateSettings};
-use calm::selection::{FarthestPoints, Greedy, Metric, floors, random_structures, update_settings};
+use calm::selection::{DOptimal, FarthestPoints, Greedy, Metric, floors, random_structures, update_settings};
 use tokio_util::sync::CancellationToken;
 
 use super::GradedPool;
@@ -86,6 +86,15 @@ pub fn pick(
                 let mut points = FarthestPoints::new(&pool.pool, metric, picked).map_err(Failure::failed)?;
                 while !is_complete(&picks)
                     && let Some(found) = points.pick().map_err(Failure::failed)?
+                {
+                    picks.push(pool.pick(found.structure, part.strategy.name()));
+                    shown(picks.len() - before);
+                }
+            }
+            Strategy::DOptimal => {
+                let mut design = DOptimal::new(&pool.pool, mixture, picked).map_err(Failure::failed)?;
+                while !is_complete(&picks)
+                    && let Some(found) = design.pick().map_err(Failure::failed)?
                 {
                     picks.push(pool.pick(found.structure, part.strategy.name()));
                     shown(picks.len() - before);

@@ -11,6 +11,8 @@ pub enum Strategy {
     FarthestPoints,
     /// Farthest points over all atoms and plain features.
     FarthestPointsAll,
+    /// Largest gain in the information of the atoms within the window.
+    DOptimal,
     /// Uniformly at random.
     Random,
     /// Uniformly at random among structures with an atom within the window.
@@ -27,10 +29,11 @@ pub struct Part {
 
 impl Strategy {
     /// Every strategy with its names, the first of which is written.
-    const NAMES: [(Self, &[&str]); 5] = [
+    const NAMES: [(Self, &[&str]); 6] = [
         (Self::Greedy, &["greedy"]),
         (Self::FarthestPoints, &["fps", "fps-extrap"]),
         (Self::FarthestPointsAll, &["fps-all"]),
+        (Self::DOptimal, &["d-optimal"]),
         (Self::Random, &["random", "random-all"]),
         (Self::RandomExtrapolating, &["random-extrap"]),
     ];
@@ -39,6 +42,15 @@ impl Strategy {
     pub fn name(self) -> &'static str {
         let found = Self::NAMES.into_iter().find(|(strategy, _)| *strategy == self);
         found.and_then(|(_, names)| names.first().copied()).unwrap_or_default()
+    }
+
+    /// What it does with the statistics of the mixture, if it needs them.
+    pub fn use_of_statistics(self) -> Option<&'static str> {
+        match self {
+            Self::Greedy => Some("updates"),
+            Self::DOptimal => Some("starts from"),
+            Self::FarthestPoints | Self::FarthestPointsAll | Self::Random | Self::RandomExtrapolating => None,
+        }
     }
 }
 
@@ -72,6 +84,7 @@ mod tests {
         let part = |text: &str| text.parse::<Part>();
         assert_eq!(part("greedy"), Ok(Part { strategy: Strategy::Greedy, number: None }));
         assert_eq!(part("fps-extrap:25"), Ok(Part { strategy: Strategy::FarthestPoints, number: Some(25) }));
+        assert_eq!(part("d-optimal:9"), Ok(Part { strategy: Strategy::DOptimal, number: Some(9) }));
         for (strategy, names) in Strategy::NAMES {
             assert!(names.iter().all(|name| part(name).unwrap().strategy == strategy));
         }

@@ -39,6 +39,12 @@ pub enum LinearError {
         /// Rows and columns.
         dimension: usize,
     },
+    /// A matrix that should be positive definite is not.
+    #[error("a {dimension} × {dimension} matrix is not positive definite")]
+    NotPositive {
+        /// Rows and columns.
+        dimension: usize,
+    },
 }
 
 /// Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix.

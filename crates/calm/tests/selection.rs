@@ -6,7 +6,7 @@ use calm::build::shuffled;
 use calm::grade::maximum;
 use calm::rules::Positive;
 use calm::selection::{
-    FarthestPoints, Greedy, Metric, Pool, PoolAtom, SelectionError, Window, update_settings,
+    DOptimal, FarthestPoints, Greedy, Metric, Pool, PoolAtom, SelectionError, Window, update_settings,
 };
 use calm::{Component, Grades, Mixture, Statistics, UpdateError, regularised_inverse, update};
 use proptest::prelude::*;
@@ -119,6 +119,57 @@ impl Structures {
         }
         points
     }
+
+    /// Λ_e of each element without picks: the mean of **zz**ᵀ over the training atoms, and 10⁻⁶.
+    fn information(&self) -> [Vec<f64>; 2] {
+        [0, 1].map(|element| {
+            let components = self.mixture.components(element).unwrap();
+            let statistics = || components.iter().map(|component| component.statistics().unwrap());
+            let count: f64 = statistics().map(|statistics| statistics.effective_count).sum();
+            let entry = |k: usize| {
+                let sums = components.iter().zip(statistics()).map(|(component, statistics)| {
+                    let product = component.centroid()[k / D] * component.centroid()[k % D];
+                    statistics.scatter[k] + statistics.effective_count * product
+                });
+                sums.sum::<f64>() / count + if k / D == k % D { 1e-6 } else { 0.0 }
+            };
+            (0..D * D).map(entry).collect()
+        })
+    }
+
+    /// All gains after each pick, by determinants.
+    fn complete_d_optimal(&self, before: &[usize]) -> Vec<(usize, f64)> {
+        let within: Vec<_> = (0..self.structures.len()).map(|structure| self.within(structure)).collect();
+        let with = |information: &[Vec<f64>; 2], structure: usize| {
+            let mut information = information.clone();
+            let (elements, features) = &within[structure];
+            for (element, z) in elements.iter().zip(features.chunks(D)) {
+                (0..D * D).for_each(|k| information[*element][k] += z[k / D] * z[k % D]);
+            }
+            information
+        };
+        let size = |information: &[Vec<f64>; 2]| information.iter().map(|m| log_determinant(m)).sum::<f64>();
+        let mut information = self.information();
+        before.iter().for_each(|structure| information = with(&information, *structure));
+        let free = |structure: &usize| !before.contains(structure) && !within[*structure].0.is_empty();
+        let mut left: Vec<usize> = (0..self.structures.len()).filter(free).collect();
+        let mut picks = Vec::new();
+        while !left.is_empty() {
+            let gains =
+                left.iter().map(|structure| size(&with(&information, *structure)) - size(&information));
+            let gains: Vec<f64> = gains.collect();
+            let largest = maximum(&gains);
+            let structure = left.remove(gains.iter().position(|gain| *gain == largest).unwrap());
+            information = with(&information, structure);
+            picks.push((structure, largest));
+        }
+        picks
+    }
+}
+
+fn log_determinant(matrix: &[f64]) -> f64 {
+    let lower = lower_factor(matrix);
+    (0..D).map(|k| 2.0 * lower[k * D + k].ln()).sum()
 }
 
 /// L of S = LLᵀ, by the textbook's formula.
@@ -222,6 +273,63 @@ proptest! {
             }
         }
     }
+
+    #[test]
+    fn d_optimal_picks_have_the_largest_of_all_gains(seed in 0_u64..1000, before in 0_usize..4, memory in 0_usize..9000) {
+        let before: Vec<usize> = shuffled(seed, 2, 30).into_iter().take(before).collect();
+        // Atoms outside the window change nothing, whether the pool has them or not.
+        let case = structures(seed, 30, seed.is_multiple_of(2), memory);
+        let expected = case.complete_d_optimal(&before);
+        let mut design = DOptimal::new(&case.pool, &case.mixture, before.iter().copied()).unwrap();
+        let mut found = Vec::new();
+        while let Some(pick) = design.pick().unwrap() {
+            found.push((pick.structure, pick.gain));
+        }
+        prop_assert_eq!(picked(&found), picked(&expected));
+        for ((_, gain), (_, expected)) in found.iter().zip(&expected) {
+            prop_assert!((gain - expected).abs() <= 1e-9 * expected.max(1.0), "{} {}", gain, expected);
+        }
+    }
+}
+
+#[test]
+fn d_optimal_picks_fill_the_directions_that_are_missing() {
+    let mixture = Mixture::new(0, vec![vec![Arc::new(Component::unknown_element(2))]]).unwrap();
+    let mut pool = Pool::new(2, WINDOW, true, usize::MAX, std::env::temp_dir());
+    let mut push = |gamma: f64, features: &[f64]| {
+        let atoms = features.len() / 2;
+        pool.push(&vec![0; atoms], &vec![0; atoms], &vec![gamma; atoms], features).unwrap();
+    };
+    push(2.0, &[1.0, 0.0]);
+    push(2.0, &[1.0, 0.0]);
+    push(2.0, &[0.0, 0.9]);
+    // More atoms than features: both directions.
+    push(2.0, &[0.3, 0.0, 0.4, 0.0, 0.0, 0.5]);
+    push(2.0, &[0.0, 0.0]);
+    // Below and above the window.
+    push(0.5, &[5.0, 5.0]);
+    push(70.0, &[5.0, 5.0]);
+    let picks = |before: &[usize]| {
+        let mut design = DOptimal::new(&pool, &mixture, before.iter().copied()).unwrap();
+        std::iter::from_fn(|| design.pick().unwrap())
+            .map(|pick| (pick.structure, pick.gain))
+            .collect::<Vec<_>>()
+    };
+    // Λ = εI, then (ε + 1/4)I; the first of two copies, the direction without it, the second copy.
+    let epsilon = 1e-6_f64;
+    let expected = [
+        (3, 2.0 * (1.0 + 0.25 / epsilon).ln()),
+        (0, (1.0 + 1.0 / (0.25 + epsilon)).ln()),
+        (2, (1.0 + 0.81 / (0.25 + epsilon)).ln()),
+        (1, (1.0 + 1.0 / (1.25 + epsilon)).ln()),
+    ];
+    let found = picks(&[]);
+    assert_eq!(picked(&found), picked(&expected));
+    for ((_, gain), (_, expected)) in found.iter().zip(&expected) {
+        assert!((gain - expected).abs() < 1e-9, "{gain} {expected}");
+    }
+    // With one direction picked before, the other comes first.
+    assert_eq!(picked(&picks(&[0])), [2, 1, 3]);
 }
 
 #[test]
@@ -265,6 +373,9 @@ fn a_mixture_without_statistics_cannot_be_updated() {
         elements
     });
     let mixture = Mixture::new(0, stripped).unwrap();
-    let error = Greedy::new(&case.pool, &mixture, update_settings(target()), []).unwrap_err();
-    assert!(matches!(error, SelectionError::Update(UpdateError::NoStatistics { .. })), "{error}");
+    let greedy = Greedy::new(&case.pool, &mixture, update_settings(target()), []).map(drop);
+    for found in [greedy, DOptimal::new(&case.pool, &mixture, []).map(drop)] {
+        let error = found.unwrap_err();
+        assert!(matches!(error, SelectionError::Update(UpdateError::NoStatistics { .. })), "{error}");
+    }
 }

@@ -1,9 +1,9 @@
 //! Farthest points: structures whose atoms are far from all that was picked.
 
-use std::cmp::Ordering;
-use std::collections::{BinaryHeap, HashMap};
+use std::collections::HashMap;
 
 use super::SelectionError;
+use super::lazy_heap::{Bound, LazyHeap};
 use super::pool::Pool;
 use super::rows::FeatureRows;
 use crate::grade::GradeError;
@@ -36,7 +36,9 @@ pub struct FarthestPoints<'a> {
     rows: Vec<(usize, usize)>,
     /// The picked atoms of each group, `[centres × D]`.
     centres: Vec<Vec<f64>>,
-    bounds: BinaryHeap<Bound>,
+    /// Of the squared distance of an atom that may be picked to the nearest centre of its group: its version is the number of centres
+    /// that the atom was compared to, and the γ of those that were compared to none is their preference.
+    bounds: LazyHeap,
     taken: Vec<bool>,
 }
 
@@ -47,17 +49,6 @@ pub struct FarthestPoint {
     pub structure: usize,
     /// Distance of its atom to the nearest one picked before; infinite if there is none.
     pub distance: f64,
-}
-
-/// An upper bound of the squared distance of an atom to the nearest centre of its group.
-#[derive(Debug, Clone, Copy)]
-struct Bound {
-    squared: f64,
-    gamma: f64,
-    /// Index of the atom among those that may be picked.
-    place: usize,
-    /// Number of centres that it has been compared to.
-    compared: usize,
 }
 
 impl<'a> FarthestPoints<'a> {
@@ -73,7 +64,7 @@ impl<'a> FarthestPoints<'a> {
     ) -> Result<Self, SelectionError> {
         let (points, rows) = (pool.features().empty_like(), Vec::new());
         let taken = vec![false; pool.len()];
-        let mut found = Self { pool, points, rows, centres: Vec::new(), bounds: BinaryHeap::new(), taken };
+        let mut found = Self { pool, points, rows, centres: Vec::new(), bounds: LazyHeap::default(), taken };
         picked.into_iter().for_each(|structure| found.taken[structure] = true);
         let mut factors = HashMap::new();
         for (index, atom) in pool.atoms().iter().enumerate() {
@@ -112,10 +103,10 @@ impl<'a> FarthestPoints<'a> {
             self.centres[group].extend_from_slice(point);
             return Ok(());
         }
-        let place = self.rows.len();
+        let index = self.rows.len();
         self.rows.push((atom, group));
         self.points.push(point)?;
-        self.bounds.push(Bound { squared: f64::INFINITY, gamma: known.gamma, place, compared: 0 });
+        self.bounds.push(Bound { value: f64::INFINITY, preference: known.gamma, index, version: 0 });
         Ok(())
     }
 
@@ -127,25 +118,26 @@ impl<'a> FarthestPoints<'a> {
     pub fn pick(&mut self) -> Result<Option<FarthestPoint>, SelectionError> {
         let (dimension, mut point) = (self.points.dimension(), Vec::new());
         while let Some(mut top) = self.bounds.pop() {
-            let (atom, group) = self.rows[top.place];
-            let behind = &self.centres[group][top.compared * dimension..];
+            let (atom, group) = self.rows[top.index];
+            let behind = &self.centres[group][top.version * dimension..];
             point.clear();
-            self.points.read(top.place..top.place + 1, &mut point)?;
+            self.points.read(top.index..top.index + 1, &mut point)?;
             if !behind.is_empty() {
                 let distances =
                     behind.chunks_exact(dimension).take(CHUNK).map(|centre| squared_distance(centre, &point));
-                top.squared = distances.fold(top.squared, f64::min);
-                top.compared += CHUNK.min(behind.len() / dimension);
+                top.value = distances.fold(top.value, f64::min);
+                top.preference = 0.0;
+                top.version += CHUNK.min(behind.len() / dimension);
                 self.bounds.push(top);
                 continue;
             }
-            if top.squared <= 0.0 {
+            if top.value <= 0.0 {
                 return Ok(None);
             }
             self.centres[group].extend_from_slice(&point);
             let structure = self.pool.atoms()[atom].structure as usize;
             if !std::mem::replace(&mut self.taken[structure], true) {
-                return Ok(Some(FarthestPoint { structure, distance: top.squared.sqrt() }));
+                return Ok(Some(FarthestPoint { structure, distance: top.value.sqrt() }));
             }
         }
         Ok(None)
@@ -198,28 +190,3 @@ fn root(inverse: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
         })
         .collect())
 }
-
-/// By distance; of equal distances the largest γ if they are infinite, then the first atom.
-impl Ord for Bound {
-    fn cmp(&self, other: &Self) -> Ordering {
-        let by_gamma = || match self.squared.is_infinite() {
-            true => self.gamma.total_cmp(&other.gamma),
-            false => Ordering::Equal,
-        };
-        self.squared.total_cmp(&other.squared).then_with(by_gamma).then(other.place.cmp(&self.place))
-    }
-}
-
-impl PartialOrd for Bound {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Bound {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Bound {}

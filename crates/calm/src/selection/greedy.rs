@@ -1,11 +1,11 @@
 //! The structure with the largest γ first, with an update of a copy of the mixture after each pick.
 
-use std::cmp::Ordering;
-use std::collections::{BinaryHeap, HashMap};
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::SelectionError;
-use super::pool::Pool;
+use super::lazy_heap::{Bound, LazyHeap};
+use super::pool::{Pool, PoolAtom};
 use crate::component::Statistics;
 use crate::grade::{GradeError, Grades, maximum};
 use crate::mixture::{ChangedComponent, Mixture};
@@ -32,8 +32,9 @@ pub struct Greedy<'a> {
     mixture: Mixture,
     settings: UpdateSettings,
     /// Number of updates of each component that has had one.
-    versions: HashMap<(usize, usize), u32>,
-    bounds: BinaryHeap<Bound>,
+    versions: Versions,
+    /// Of the γ of atoms.
+    bounds: LazyHeap,
     taken: Vec<bool>,
     grades: Grades,
 }
@@ -51,14 +52,8 @@ pub struct GreedyPick {
     pub alpha: f64,
 }
 
-/// An upper bound of the γ of an atom.
-#[derive(Debug, Clone, Copy)]
-struct Bound {
-    gamma: f64,
-    atom: usize,
-    /// Updates of its component when it was graded.
-    version: u32,
-}
+/// Number of updates of components, by element and slot.
+type Versions = HashMap<(usize, usize), usize>;
 
 /// The additive update until γ_max is below `target` (default of the walkers' update: 1.25).
 pub fn update_settings(target: Positive) -> UpdateSettings {
@@ -88,8 +83,8 @@ impl<'a> Greedy<'a> {
             pool,
             mixture: consistent(mixture, pool)?,
             settings,
-            versions: HashMap::new(),
-            bounds: BinaryHeap::new(),
+            versions: Versions::new(),
+            bounds: LazyHeap::default(),
             taken: vec![false; pool.len()],
             grades: Grades::default(),
         };
@@ -109,7 +104,7 @@ impl<'a> Greedy<'a> {
     /// # Errors
     /// Those of [`Self::new`].
     pub fn pick(&mut self) -> Result<Option<GreedyPick>, SelectionError> {
-        let Some(Bound { gamma, atom, .. }) = self.largest()? else { return Ok(None) };
+        let Some(Bound { value: gamma, index: atom, .. }) = self.largest()? else { return Ok(None) };
         let structure = self.pool.atoms()[atom].structure as usize;
         let (alpha, gamma_after) = self.learn(structure)?.unwrap_or_default();
         Ok(Some(GreedyPick { structure, gamma_max: gamma, gamma_after, alpha }))
@@ -121,47 +116,31 @@ impl<'a> Greedy<'a> {
     /// # Errors
     /// Those of [`Self::new`].
     pub fn gamma_left(&mut self) -> Result<Option<f64>, SelectionError> {
-        Ok(self.largest()?.map(|bound| bound.gamma))
+        Ok(self.largest()?.map(|bound| bound.value))
     }
 
     /// The atom with the largest γ, which stays in the queue.
     fn largest(&mut self) -> Result<Option<Bound>, SelectionError> {
-        let mut stale = Vec::with_capacity(BATCH);
         loop {
-            while stale.len() < BATCH
-                && let Some(&top) = self.bounds.peek()
-            {
-                let taken = self.taken[self.pool.atoms()[top.atom].structure as usize];
-                let fresh = top.version == self.version(top.atom);
-                if fresh && !taken {
-                    break;
-                }
-                self.bounds.pop();
-                if !taken {
-                    stale.push(top.atom);
-                }
+            let outdated = self.bounds.take_outdated(BATCH, |atom| {
+                let atom = &self.pool.atoms()[atom];
+                (!self.taken[atom.structure as usize]).then(|| version(&self.versions, atom))
+            });
+            if outdated.is_empty() {
+                return Ok(self.bounds.largest());
             }
-            if stale.is_empty() {
-                return Ok(self.bounds.peek().copied());
-            }
-            self.grade(&stale)?;
-            stale.clear();
+            self.grade(&outdated)?;
         }
-    }
-
-    fn version(&self, atom: usize) -> u32 {
-        let atom = &self.pool.atoms()[atom];
-        self.versions.get(&(atom.element.into(), atom.slot.into())).copied().unwrap_or_default()
     }
 
     /// Grades atoms and puts those above the lower limit into the queue. The others never rise above it again.
     fn grade(&mut self, atoms: &[usize]) -> Result<(), SelectionError> {
         let (elements, features) = self.pool.read(atoms.iter().copied())?;
         self.grades.evaluate(&self.mixture, &elements, &features, None)?;
-        for (index, &atom) in atoms.iter().enumerate() {
-            let gamma = self.grades.gamma[index];
-            if gamma > self.pool.window().above {
-                self.bounds.push(Bound { gamma, atom, version: self.version(atom) });
+        for (&value, &index) in self.grades.gamma.iter().zip(atoms) {
+            if value > self.pool.window().above {
+                let version = version(&self.versions, &self.pool.atoms()[index]);
+                self.bounds.push(Bound { value, preference: 0.0, index, version });
             }
         }
         Ok(())
@@ -183,6 +162,11 @@ impl<'a> Greedy<'a> {
     }
 }
 
+/// Number of updates of the component of an atom.
+fn version(versions: &Versions, atom: &PoolAtom) -> usize {
+    versions.get(&(atom.element.into(), atom.slot.into())).copied().unwrap_or_default()
+}
+
 /// The mixture with inverses that follow from its covariances, for the components that atoms of the pool belong to.
 fn consistent(mixture: &Mixture, pool: &Pool) -> Result<Mixture, SelectionError> {
     let mut places: Vec<(usize, usize)> =
@@ -202,24 +186,3 @@ fn consistent(mixture: &Mixture, pool: &Pool) -> Result<Mixture, SelectionError>
     }
     Ok(mixture.with_changes(&changed)?)
 }
-
-/// By γ; of equal ones the first atom is the largest.
-impl Ord for Bound {
-    fn cmp(&self, other: &Self) -> Ordering {
-        self.gamma.total_cmp(&other.gamma).then(other.atom.cmp(&self.atom))
-    }
-}
-
-impl PartialOrd for Bound {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Bound {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Bound {}

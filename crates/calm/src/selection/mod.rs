@@ -2,19 +2,22 @@
 //!
 //! A [`Pool`] has the atoms of the structures that a selection may look at, with their features. [`Greedy`] picks the structure
 //! with the largest γ and updates a copy of the mixture with it; [`FarthestPoints`] picks structures whose atoms are far from
-//! those picked already; [`random_structures`] draws without replacement; [`floors`] makes sure that each element has enough atoms.
+//! those picked already; [`DOptimal`] picks those that add most to the determinant of the information matrices;
+//! [`random_structures`] draws without replacement; [`floors`] makes sure that each element has enough atoms.
 //!
-//! Both [`Greedy`] and [`FarthestPoints`] keep an upper bound for each atom and compute it again only when it is the largest (lazy
-//! evaluation; Minoux, Optimization Techniques 1978): γ only falls when covariances grow, and distances to the nearest picked atom
-//! only fall when atoms are picked.
+//! [`Greedy`], [`FarthestPoints`] and [`DOptimal`] keep upper bounds and compute only the largest again (`lazy_heap`): γ only falls
+//! when covariances grow, distances to the nearest picked atom only fall when atoms are picked, and so do gains in information.
 
+mod d_optimal;
 mod farthest_points;
 pub mod floors;
 mod greedy;
+mod lazy_heap;
 mod pool;
 mod random;
 mod rows;
 
+pub use d_optimal::{DOptimal, DOptimalPick};
 pub use farthest_points::{FarthestPoint, FarthestPoints, Metric};
 pub use greedy::{Greedy, GreedyPick, update_settings};
 pub use pool::{Pool, PoolAtom, Window};
@@ -47,6 +50,14 @@ pub enum SelectionError {
         element: usize,
         /// Component index.
         slot: usize,
+        /// What failed.
+        source: LinearError,
+    },
+    /// An information matrix without a factor.
+    #[error("information matrix of element {element}: {source}")]
+    Information {
+        /// Element index.
+        element: usize,
         /// What failed.
         source: LinearError,
     },
