@@ -10,10 +10,11 @@ use super::score_table::ScoreTable;
 use super::scorer::Scorer;
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::calm_validation::labelled::{
-    self, BOOTSTRAP, GradedStructure, LabelledErrors, LabelledFigure, LabelledReport, ScoreColumn,
+    self, BOOTSTRAP, GradedStructure, LabelledErrors, LabelledReport, ScoreColumn,
 };
 use crate::cli::Failure;
 use crate::output::{count, log_and_warn, print};
+use crate::page::{FigureContent, FigureEntry};
 
 /// Resolution of images, dots per inch.
 const RESOLUTION: f64 = 300.0;
@@ -96,7 +97,8 @@ impl ScoreLabels {
 fn write_figures(directory: &Path, report: &LabelledReport) -> Result<(), Failure> {
     std::fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))?;
     let mut captions = String::new();
-    for LabelledFigure { name, title, figure, caption, numbers } in labelled::figures(report) {
+    for FigureEntry { name, title, drawn } in labelled::figures(report) {
+        let Ok(FigureContent { figure, caption, numbers }) = drawn else { continue };
         captions += &format!("{name}\n{title}. {}\n\n", figures::plain(&caption));
         let path = |extension: &str| directory.join(format!("{name}.{extension}"));
         write_file(&path("svg"), to_svg(&figure).as_bytes())?;
