@@ -67,13 +67,14 @@ impl ScoreLabels {
     }
 
     /// Prints the tables, if any frame has labels, and writes the files.
-    pub fn finish(self, json: Option<&Path>, figures: Option<&Path>, input: &Path) -> Result<(), Failure> {
-        self.table.map_or(Ok(()), ScoreTable::finish)?;
-        if let (number, Some(first)) = &self.unreadable {
-            let frames = count(*number, "frame");
-            let place = input.display();
-            log_and_warn(format_args!("{place}: no statistics of the labels of {frames}: {first}"));
-        }
+    pub fn finish(
+        mut self,
+        json: Option<&Path>,
+        figures: Option<&Path>,
+        input: &Path,
+    ) -> Result<(), Failure> {
+        self.table.take().map_or(Ok(()), ScoreTable::finish)?;
+        self.warn(input);
         if self.errors.structures() == 0 && json.is_none() && figures.is_none() {
             return Ok(());
         }
@@ -90,6 +91,29 @@ impl ScoreLabels {
             writeln!(out)?;
             labelled::write(&report, out)
         })
+    }
+
+    /// The statistics, which need a label.
+    ///
+    /// # Errors
+    /// No label that the model predicts.
+    pub fn report(self, input: &Path) -> Result<LabelledReport, Failure> {
+        self.warn(input);
+        if self.errors.structures() == 0 {
+            return Err(Failure::Input(format!(
+                "{}: no structure has a label; expected energy, forces or stress, or REF_energy and so on",
+                input.display()
+            )));
+        }
+        Ok(self.errors.report(BOOTSTRAP))
+    }
+
+    fn warn(&self, input: &Path) {
+        if let (number, Some(first)) = &self.unreadable {
+            let frames = count(*number, "frame");
+            let place = input.display();
+            log_and_warn(format_args!("{place}: no statistics of the labels of {frames}: {first}"));
+        }
     }
 }
 
