@@ -5,6 +5,7 @@
 //! One file per test, each with its results as plain data; `figures`, `tables` and `text` make a page of them. Random numbers are a
 //! function of the random seed, so the same input gives the same bytes for any number of threads.
 
+mod baseline_score;
 mod bond_scans;
 mod collisions;
 mod defects;
@@ -31,6 +32,7 @@ use serde::Serialize;
 use self::labelled::LabelledReport;
 use crate::exit_status::Failure;
 
+pub use self::baseline_score::{BaselineScore, score_own_features};
 pub use self::bond_scans::BondScan;
 pub use self::collisions::Collision;
 pub use self::defects::Defect;

@@ -46,6 +46,9 @@ pub struct Validate {
     /// CALM artifact (gmm_artifacts.npz) [default: mixture in the model file]
     #[arg(long, value_name = "CALM.npz")]
     artifact: Option<PathBuf>,
+    /// Also test the scores of this file of baselines (`calmwalk calm baseline`); may be repeated
+    #[arg(long, value_name = "BASELINES.npz")]
+    baseline: Vec<PathBuf>,
     /// Another model of the same elements, trained independently; may be repeated. The spread of the energies of all models is compared
     /// with γ
     #[arg(long, value_name = "MODEL.npz")]
@@ -82,8 +85,9 @@ impl Validate {
         let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
         let (model, mixture) = (features.model.clone(), Arc::new(artifact.mixture));
         let settings = self.settings(&model)?;
-        let others = self.ensemble(&model)?.into_iter().collect();
+        let spread = self.ensemble(&model)?;
         let mut compared = self.compared(&features)?;
+        let others = compared.baselines().into_iter().chain(spread).collect();
         // Fail before the long computation.
         create_directory(&self.output)?;
         let stop = stop_token()?;
@@ -121,12 +125,15 @@ impl Validate {
         Ok(ExitStatus::Done)
     }
 
-    /// The scores that labelled structures are compared with beside γ and γ_nbr. The output must not replace these structures.
+    /// The baselines, and what else labelled structures are scored by beside γ and γ_nbr. The output must not replace these structures.
     fn compared(&self, features: &FeatureModel) -> Result<OtherScores, Failure> {
-        let Some(input) = &self.labelled else { return OtherScores::load(&self.model, features, &[], &[]) };
-        let structures = self.output.join("structures.extxyz");
-        refuse_to_replace(&structures, [(input.as_path(), "the file of labelled structures")])?;
-        OtherScores::load(&self.model, features, &[], &self.ensemble)
+        let mut ensemble: &[PathBuf] = &[];
+        if let Some(input) = &self.labelled {
+            let structures = self.output.join("structures.extxyz");
+            refuse_to_replace(&structures, [(input.as_path(), "the file of labelled structures")])?;
+            ensemble = &self.ensemble;
+        }
+        OtherScores::load(&self.model, features, &self.baseline, ensemble)
     }
 
     /// The spread of the energies, if there are further models.
