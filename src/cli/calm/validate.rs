@@ -14,9 +14,8 @@ use super::score::load;
 use super::scorer::Scorer;
 use super::validate_labels;
 use crate::atomic_file::refuse_to_replace;
-use crate::calm_validation::labelled;
 use crate::calm_validation::{
-    self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, verdict,
+    self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, labelled, verdict,
 };
 use crate::cli::{ExitStatus, Failure};
 use crate::feature_variant::FeatureModel;
