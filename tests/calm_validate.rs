@@ -1,15 +1,44 @@
-//! Tests of a grade without labels, through the program.
+//! Tests of a grade without and with labels, through the program.
 
 use std::path::Path;
 
-use serde_json::Value;
+use atoms::extxyz::Frame;
+use atoms::prototypes::Prototype;
+use atoms::read_extxyz;
+use serde_json::{Value, json};
 
-use crate::common::{config, refuse, succeed};
+use crate::common::{config, deviation, refuse, succeed, write_frames};
 
 fn validate(directory: &Path, model: &str, output: &str, more: &[&str]) -> String {
     let model = config(&format!("data/{model}/kokkos.npz"));
     let start = ["calm", "validate", "--model", model.to_str().unwrap(), "--output", output];
     succeed(directory, start.iter().chain(more))
+}
+
+fn read_json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+/// Builds baselines of the aluminium model from four of its training structures.
+fn baselines(here: &Path, arguments: &[&str]) {
+    write_frames(&here.join("train.extxyz"), &aluminium(4));
+    let model = config("data/al_eam_1l/kokkos.npz");
+    let start = ["calm", "baseline", "--model", model.to_str().unwrap(), "train.extxyz", "--output"];
+    succeed(here, start.iter().chain(arguments));
+}
+
+/// Labelled structures that the aluminium model was trained on.
+fn aluminium(number: usize) -> Vec<Frame> {
+    let mut frames = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
+    frames.truncate(number);
+    frames
+}
+
+/// Grades a file by the aluminium model into scored.extxyz. Returns what is printed.
+fn score(here: &Path, input: &str, arguments: &[&str]) -> String {
+    let model = config("data/al_eam_1l/kokkos.npz");
+    let start = ["calm", "score", "--model", model.to_str().unwrap(), input, "--output", "scored.extxyz"];
+    succeed(here, start.iter().chain(arguments))
 }
 
 fn json(directory: &Path) -> Value {
@@ -127,6 +156,116 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let atoms: u64 =
         solution["first_shells"].as_array().unwrap().iter().map(|of| of["atoms"].as_u64().unwrap()).sum();
     assert_eq!(atoms, 11 * 128);
+}
+
+#[test]
+fn baselines_are_scanned_beside_the_grade() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let artifact = config("data/al_eam_1l/gmm_artifacts.npz");
+    let kinds = "d-optimality-element,euclidean,likelihood";
+    baselines(here, &["b.npz", "--artifact", artifact.to_str().unwrap(), "--kind", kinds]);
+    let linear = ["--feature-variant", "linear", "--kind", "llpr", "--regularisation", "1e-6"];
+    baselines(here, &[&["l.npz"], &linear[..]].concat());
+    let files = ["--baseline", "b.npz", "--baseline", "l.npz"];
+    let quick = ["--scan-steps", "11", "--no-relax"];
+    let text = validate(here, "al_eam_1l", "out", &[&quick[..], &files[..]].concat());
+    let found = json(&here.join("out"));
+    let scores = found["scores"].as_array().unwrap();
+    let described: Vec<_> = scores.iter().map(|score| json!([score["name"], score["rule"]])).collect();
+    let expected = json!([
+        ["γ", {"threshold": 1.0}],
+        ["d-optimality-element", {"threshold": 1.0}],
+        ["euclidean", {"times_median": 10.0}],
+        ["likelihood", null],
+        ["linear-llpr", {"times_median": 10.0}],
+    ]);
+    assert_eq!(Value::from(described), expected);
+
+    // The same crystals, graded by calm score.
+    let scan = &found["bond_scans"][0];
+    let points = scan["points"].as_array().unwrap();
+    let graded: Vec<_> = points.iter().filter(|point| !point["energy"].is_null()).collect();
+    assert!(graded.len() > 8, "{scan}");
+    let crystal = |point: &&Value| {
+        Frame::from(Prototype::Fcc.structure("Al".parse().unwrap(), point["distance"].as_f64().unwrap()))
+    };
+    write_frames(&here.join("in.extxyz"), &graded.iter().map(crystal).collect::<Vec<_>>());
+    score(here, "in.extxyz", &files);
+    let scored = read_extxyz(&here.join("scored.extxyz")).unwrap();
+    let columns = ["gamma", "d_optimality_element", "euclidean", "likelihood", "linear_llpr"];
+    for (k, column) in columns.into_iter().enumerate() {
+        let largest = |frame: &Frame| {
+            frame.arrays[column].reals().unwrap().into_iter().fold(f64::NEG_INFINITY, f64::max)
+        };
+        let expected: Vec<_> = scored.iter().map(largest).collect();
+        let scanned: Vec<_> = graded.iter().map(|point| point["scores"][k].as_f64().unwrap()).collect();
+        assert!(deviation(&scanned, &expected) < 1e-6, "{column}: {scanned:?} {expected:?}");
+    }
+
+    // Its own rule decides on each score.
+    let equilibrium = scan["equilibrium"].as_f64().unwrap();
+    let largest = |k: usize| {
+        let compressed =
+            points.iter().filter(|point| point["distance"].as_f64().unwrap() < 0.8 * equilibrium);
+        compressed.filter_map(|point| point["scores"][k].as_f64()).fold(f64::NEG_INFINITY, f64::max)
+    };
+    let detection = |k: usize| &scan["detection"][k];
+    assert_eq!(detection(1)["compression"], json!(largest(1) > 1.0));
+    let median = detection(2)["median_near_equilibrium"].as_f64().unwrap();
+    assert_eq!(detection(2)["compression"], json!(largest(2) > 10.0 * median));
+    assert_eq!(detection(3)["compression"], Value::Null);
+    assert!(text.contains("d-optimality-element") && text.contains("linear-llpr"), "{text}");
+    let table = std::fs::read_to_string(here.join("out/tables/detection.csv")).unwrap();
+    assert!(table.contains("\neuclidean,above 10 × median at equilibrium,"), "{table}");
+    let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
+    assert!(page.contains("Not drawn, as it has no zero: likelihood."));
+}
+
+#[test]
+fn labelled_structures_have_a_section() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    baselines(here, &["b.npz", "--kind", "llpr"]);
+    write_frames(&here.join("labelled.extxyz"), &aluminium(3));
+    let printed =
+        score(here, "labelled.extxyz", &["--baseline", "b.npz", "--json", "l.json", "--figures", "drawn"]);
+    let more = ["--labelled", "labelled.extxyz", "--baseline", "b.npz", "--scan-steps", "2", "--no-relax"];
+    let text = validate(here, "al_eam_1l", "out", &more);
+    // Everything is as calm score has it.
+    let (_, tables) = printed.split_once("\n\n").unwrap();
+    assert!(tables.contains("Spearman’s ρ") && text.contains(tables), "{text}\n{tables}");
+    let found = json(&here.join("out"));
+    assert_eq!(found["labelled"], read_json(&here.join("l.json")));
+    let names: Vec<_> =
+        found["labelled"]["scores"].as_array().unwrap().iter().map(|score| score["name"].clone()).collect();
+    assert_eq!(json!(names), json!(["γ", "γ_{nbr}", "llpr", "llpr-nbr"]));
+    let same = |file: &str, kind: &str| {
+        let of_validation = std::fs::read(here.join("out").join(kind).join(file)).unwrap();
+        assert!(of_validation == std::fs::read(here.join("drawn").join(file)).unwrap(), "{file}");
+    };
+    for table in ["label-errors.csv", "ranks.csv", "confident.csv", "quantiles.csv"] {
+        same(table, "tables");
+    }
+    for figure in ["reliability.svg", "contamination.csv", "auc-sweep.png"] {
+        same(figure, "figures");
+    }
+    let rho = found["labelled"]["scores"][0]["spearman"]["value"].as_f64().unwrap();
+    let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
+    assert!(page.contains("<h2>Labelled structures</h2>") && page.contains("id=\"table-ranks\""));
+    assert!(
+        page.contains(&format!("In 3 labelled structures, Spearman’s ρ of γ and force error is {rho:.3}."))
+    );
+
+    // What has no labels is refused, and so is an output that would replace them.
+    let model = config("data/al_eam_1l/kokkos.npz");
+    let refused = |output: &str, labelled: &str| {
+        let start = ["calm", "validate", "--model", model.to_str().unwrap(), "--output", output];
+        refuse(here, start.into_iter().chain(["--labelled", labelled]))
+    };
+    write_frames(&here.join("bare.extxyz"), &[Frame::from(aluminium(1).remove(0).structure)]);
+    assert!(refused("new", "bare.extxyz").contains("bare.extxyz: no structure has a label"));
+    assert!(refused("out", "out/structures.extxyz").contains("is the file of labelled structures"));
 }
 
 #[test]

@@ -23,6 +23,11 @@ pub enum Rule {
     TimesMedian(f64),
 }
 
+impl Rule {
+    /// That of scores without a threshold.
+    pub const TENFOLD: Self = Self::TimesMedian(10.0);
+}
+
 /// What a score tells of a bond scan. Values are `None` where the scan has no distance of that regime.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Detection {
@@ -61,7 +66,10 @@ pub fn detect(
     let median = analysis::quantile(&near, 0.5);
     let limit = match rule {
         Some(Rule::Threshold(limit)) => Some(limit),
-        Some(Rule::TimesMedian(factor)) => median.map(|median| factor * median),
+        // A score may be infinite for all atoms of an element, which tells nothing.
+        Some(Rule::TimesMedian(factor)) => {
+            median.map(|median| factor * median).filter(|limit| limit.is_finite())
+        }
         None => None,
     };
     let is_above = |value: Option<f64>| value.zip(limit).map(|(value, limit)| value > limit);
@@ -110,6 +118,15 @@ mod tests {
     fn verdicts(score: impl Fn(f64) -> Option<f64>, rule: Rule) -> [Option<bool>; 3] {
         let found = detect(&scan(&score), 2.5, score(2.5), Some(rule));
         [found.compression, found.interpolation, found.stretching]
+    }
+
+    #[test]
+    fn a_score_without_finite_values_decides_nothing() {
+        assert_eq!(verdicts(|_| Some(f64::INFINITY), Rule::TENFOLD), [None; 3]);
+        assert_eq!(
+            verdicts(|_| Some(f64::INFINITY), Rule::Threshold(1.0)),
+            [Some(true), Some(false), Some(true)]
+        );
     }
 
     #[test]

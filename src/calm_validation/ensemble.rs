@@ -8,10 +8,6 @@ use potentials::grace::GraceModel;
 use super::{Rule, Score};
 use crate::features::FeatureCalculator;
 
-/// Increase over its median near equilibrium by which the spread of the energies detects a regime (paper, 'Validation models, datasets and
-/// metrics').
-const INCREASE: f64 = 10.0;
-
 /// Scores all atoms of a structure by the standard deviation of the energy per atom over the models, eV.
 pub struct EnergySpread {
     models: Vec<Arc<GraceModel>>,
@@ -32,7 +28,7 @@ impl Score for EnergySpread {
     }
 
     fn rule(&self) -> Option<Rule> {
-        Some(Rule::TimesMedian(INCREASE))
+        Some(Rule::TENFOLD)
     }
 
     fn for_thread(&self) -> Box<dyn Score> {

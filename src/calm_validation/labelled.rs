@@ -13,6 +13,6 @@ mod tests;
 
 pub use self::collect::{GradedStructure, LabelledErrors, ScoreColumn};
 pub use self::estimate::BOOTSTRAP;
-pub use self::figures::{LabelledFigure, all as figures};
+pub use self::figures::all as figures;
 pub use self::report::LabelledReport;
 pub use self::tables::{all as tables, write};

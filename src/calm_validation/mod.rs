@@ -1,9 +1,11 @@
-//! Tests of an extrapolation grade that need no labels: bond scans, defects, solid solutions and colliding environments (paper,
-//! 'Minimal validation tests for an extrapolation grade' and 'Structural and compositional extrapolation').
+//! Tests of an extrapolation grade. Most need no labels: bond scans, defects, solid solutions and colliding environments (paper,
+//! 'Minimal validation tests for an extrapolation grade' and 'Structural and compositional extrapolation'). `labelled` compares grades
+//! with labels.
 //!
 //! One file per test, each with its results as plain data; `figures`, `tables` and `text` make a page of them. Random numbers are a
 //! function of the random seed, so the same input gives the same bytes for any number of threads.
 
+mod baseline_score;
 mod bond_scans;
 mod collisions;
 mod defects;
@@ -27,8 +29,10 @@ use md::Fire;
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
+use self::labelled::LabelledReport;
 use crate::exit_status::Failure;
 
+pub use self::baseline_score::{BaselineScore, score_own_features};
 pub use self::bond_scans::BondScan;
 pub use self::collisions::Collision;
 pub use self::defects::Defect;
@@ -79,6 +83,8 @@ pub struct Validation {
     pub solutions: Vec<Solution>,
     /// Colliding environments.
     pub collisions: Vec<Collision>,
+    /// What labelled structures say, if there are any.
+    pub labelled: Option<LabelledReport>,
 }
 
 /// A score and what its bond scans tell.
@@ -101,10 +107,11 @@ pub struct Subject {
     pub others: Arc<[Box<dyn Score>]>,
 }
 
-/// Runs all tests. `None` if it was stopped.
+/// Runs all tests without labels, and adds what labelled structures say. `None` if it was stopped.
 pub fn run(
     subject: &Subject,
     settings: Settings,
+    labelled: Option<LabelledReport>,
     progress: &Progress,
 ) -> Result<Option<Validation>, Failure> {
     progress.begin(
@@ -135,6 +142,7 @@ pub fn run(
         defects,
         solutions,
         collisions,
+        labelled,
     }))
 }
 

@@ -1,7 +1,7 @@
 //! The tables of the page.
 
 use super::detection::Detection;
-use super::{Rule, Validation};
+use super::{Rule, Validation, labelled};
 use crate::page::{Cell, Table, count, percent, real, text};
 
 /// All tables with rows, in the order of the page.
@@ -13,6 +13,7 @@ pub fn all(validation: &Validation) -> Vec<Table> {
         solutions(validation),
         collisions(validation),
     ];
+    tables.extend(validation.labelled.iter().flat_map(labelled::tables));
     tables.retain(|table| !table.rows.is_empty());
     tables
 }

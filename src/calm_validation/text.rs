@@ -2,6 +2,7 @@
 
 use atoms::extxyz::{Column, ColumnData, Frame, write_frame};
 
+use super::labelled::LabelledReport;
 use super::tables::both;
 use super::{Defect, Validation, figures, tables};
 use crate::exit_status::Failure;
@@ -66,19 +67,45 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::Table]) -> Ve
                 table("collisions"),
             ]),
         ),
+        (
+            "Labelled structures",
+            blocks(vec![
+                table("label-errors").and(words(
+                    "A grade should rank the force errors of atoms, and few of the atoms within its limit should have large ones. Intervals are \
+                     too narrow for few structures, and for frames of one trajectory.",
+                )),
+                table("label-errors"),
+                figure("reliability"),
+                table("ranks"),
+                figure("contamination"),
+                table("confident"),
+                figure("auc-sweep"),
+                table("quantiles"),
+            ]),
+        ),
     ]
 }
 
 fn lead(validation: &Validation) -> String {
     let gamma = &validation.scores[0];
     let tested = validation.bond_scans.iter().filter(|scan| scan.is_ground_state).count();
+    let labelled = validation.labelled.as_ref().map_or(String::new(), ranking);
     format!(
         "Tests without labels, of a model with a cutoff of {} Å. In the bond scans of {tested} of {}, γ detects \
-         compression/stretching: {}.",
+         compression/stretching: {}.{labelled}",
         validation.cutoff,
         crate::output::count(validation.elements.len() as u64, "element"),
         both(&gamma.detection)
     )
+}
+
+/// How well the first score, γ, ranks the force errors of labelled structures.
+fn ranking(report: &LabelledReport) -> String {
+    let structures = crate::output::count(report.structures, "labelled structure");
+    let rho = report.scores.first().and_then(|score| score.spearman.value);
+    rho.map_or(format!(" {structures} without an order of force errors."), |rho| {
+        format!(" In {structures}, Spearman’s ρ of γ and force error is {rho:.3}.")
+    })
 }
 
 /// The structures of the defects with their grades, extended XYZ.

@@ -6,20 +6,22 @@ mod layout;
 mod solutions;
 mod structures;
 
-use super::Validation;
 use super::defects::DefectKind;
+use super::{Validation, labelled};
 use crate::page::FigureEntry;
 
 /// All figures, in the order of the page.
 pub fn all(validation: &Validation) -> Vec<FigureEntry> {
     let part = |name, title, drawn| FigureEntry { name, title, drawn };
     let defects = |name, kind| defects::draw(validation, name, kind);
-    vec![
+    let mut figures = vec![
         part("bond-scans", "Compression and stretching", bond_scans::draw(validation)),
         part("vacancies", "Vacancies", defects("vacancies", DefectKind::Vacancy)),
         part("surfaces", "Surfaces", defects("surfaces", DefectKind::Surface)),
         part("grain-boundaries", "Grain boundaries", defects("grain-boundaries", DefectKind::GrainBoundary)),
         part("structures", "Atoms at defects", structures::draw(validation)),
         part("solutions", "Solid solutions", solutions::draw(validation)),
-    ]
+    ];
+    figures.extend(validation.labelled.iter().flat_map(labelled::figures));
+    figures
 }

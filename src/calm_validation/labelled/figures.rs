@@ -3,28 +3,13 @@
 mod curves;
 mod reliability;
 
-use ::figures::{Colour, Figure, Stroke};
+use ::figures::{Colour, Stroke};
 
 use super::report::{Estimate, LabelledReport};
-use crate::csv::Csv;
-
-/// Width of a two-column figure of a journal: 180 mm, in points.
-const WIDTH: f64 = 510.0;
-
-/// A figure.
-pub struct LabelledFigure {
-    /// Name of its files.
-    pub name: &'static str,
-    pub title: &'static str,
-    pub figure: Figure,
-    /// Supports `_{…}` and `^{…}`.
-    pub caption: String,
-    /// What is drawn.
-    pub numbers: Csv,
-}
+use crate::page::FigureEntry;
 
 /// The figures, none without force labels.
-pub fn all(report: &LabelledReport) -> Vec<LabelledFigure> {
+pub fn all(report: &LabelledReport) -> Vec<FigureEntry> {
     if report.atoms == 0 {
         return Vec::new();
     }

@@ -4,48 +4,14 @@ use std::io::{self, Write};
 
 use super::collect::LARGE_ERROR;
 use super::report::{Bin, Estimate, LabelledReport, MeanErrors, ScoreReport};
-use crate::csv::{self, Csv};
-use crate::output::{self, Table, decimals, range};
+use crate::output::{self, range};
+use crate::page::{Cell, Table, count, percent, real, text};
 
 /// The force error of the paper's table of contamination, eV/Å.
 const CONTAMINATION: f64 = 0.5;
 
-/// A table.
-#[derive(Clone, Debug)]
-pub struct LabelledTable {
-    /// Letters and hyphens.
-    pub name: &'static str,
-    /// Supports `_{…}` and `^{…}`, as the titles and cells do.
-    pub caption: String,
-    pub titles: Vec<&'static str>,
-    pub rows: Vec<Vec<Cell>>,
-}
-
-/// A cell.
-#[derive(Clone, Debug)]
-pub struct Cell {
-    /// Rounded.
-    pub shown: String,
-    /// With full precision.
-    pub exact: String,
-    /// Numbers are right-aligned.
-    pub is_number: bool,
-}
-
-impl LabelledTable {
-    /// The content of its file.
-    pub fn csv(&self) -> Csv {
-        let titles: Vec<_> = self.titles.iter().map(|title| ::figures::plain(title)).collect();
-        let mut csv = Csv::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
-        for row in &self.rows {
-            csv.push(&row.iter().map(|cell| ::figures::plain(&cell.exact)).collect::<Vec<_>>());
-        }
-        csv
-    }
-}
-
 /// All tables that have rows.
-pub fn all(report: &LabelledReport) -> Vec<LabelledTable> {
+pub fn all(report: &LabelledReport) -> Vec<Table> {
     let mut tables = vec![errors(report)];
     if report.atoms > 0 {
         tables.extend([ranks(report), confident(report), quantiles(report)]);
@@ -74,9 +40,9 @@ pub fn write(report: &LabelledReport, out: &mut dyn Write) -> io::Result<()> {
             format!("{}{}", if cell.is_number { ">" } else { "" }, ::figures::plain(title))
         };
         let titles: Vec<_> = table.titles.iter().zip(&table.rows[0]).map(align).collect();
-        let mut aligned = Table::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
+        let mut aligned = output::Table::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
         for row in &table.rows {
-            aligned.push(row.iter().map(|cell| ::figures::plain(&cell.shown)).collect());
+            aligned.push(row.iter().map(|cell| cell.shown.clone()).collect());
         }
         writeln!(out, "\n{}", ::figures::plain(&table.caption))?;
         aligned.write(out)?;
@@ -84,7 +50,7 @@ pub fn write(report: &LabelledReport, out: &mut dyn Write) -> io::Result<()> {
     Ok(())
 }
 
-fn errors(report: &LabelledReport) -> LabelledTable {
+fn errors(report: &LabelledReport) -> Table {
     let row = |name: &str, of: &MeanErrors| {
         let mut row = vec![text(name), count(of.number as u64)];
         for estimate in [of.mean_absolute, of.root_mean_square] {
@@ -98,36 +64,29 @@ fn errors(report: &LabelledReport) -> LabelledTable {
         row("force components (meV/Å)", &report.forces),
         row("stress components (meV/Å³)", &report.stress),
     ];
-    LabelledTable {
-        name: "label-errors",
-        caption: format!("Errors of the model against the labels, {}", intervals(report)),
-        titles: vec!["", "number", "MAE", INTERVAL, "RMSE", INTERVAL],
-        rows: rows.into_iter().flatten().collect(),
-    }
+    let caption = format!("Errors of the model against the labels, {}", intervals(report));
+    let titles = ["", "number", "MAE", INTERVAL, "RMSE", INTERVAL];
+    Table { rows: rows.into_iter().flatten().collect(), ..Table::new("label-errors", &caption, &titles) }
 }
 
-fn ranks(report: &LabelledReport) -> LabelledTable {
+fn ranks(report: &LabelledReport) -> Table {
     let row = |score: &ScoreReport| {
         let area = report.threshold(LARGE_ERROR).map(|k| score.auc[k]).unwrap_or_default();
         let estimates = [score.spearman, area, score.worst_decile];
         let cells = estimates.into_iter().flat_map(|estimate| cells(estimate, 1.0, 3));
-        [text(&score.name)].into_iter().chain(cells).collect()
+        [name(score)].into_iter().chain(cells).collect()
     };
-    LabelledTable {
-        name: "ranks",
-        caption: "Scores and force errors |F_{model} − F_{label}| of atoms: Spearman’s ρ, ROC-AUC for errors above 1 eV/Å and for the \
-                  worst decile of each element (mean over elements)"
-            .into(),
-        titles: vec!["score", "ρ", INTERVAL, "AUC > 1 eV/Å", INTERVAL, "AUC worst decile", INTERVAL],
-        rows: report.scores.iter().map(row).collect(),
-    }
+    let caption = "Scores and force errors |F_{model} − F_{label}| of atoms: Spearman’s ρ, ROC-AUC for errors above 1 eV/Å and for the \
+                   worst decile of each element (mean over elements)";
+    let titles = ["score", "ρ", INTERVAL, "AUC > 1 eV/Å", INTERVAL, "AUC worst decile", INTERVAL];
+    Table { rows: report.scores.iter().map(row).collect(), ..Table::new("ranks", caption, &titles) }
 }
 
-fn confident(report: &LabelledReport) -> LabelledTable {
+fn confident(report: &LabelledReport) -> Table {
     let places = [CONTAMINATION, LARGE_ERROR].map(|error| report.threshold(error));
     let row = |score: &ScoreReport| {
         let (limit, found) = (score.limit?, score.confident.as_ref()?);
-        let mut row = vec![text(&format!("{} ≤ {limit}", score.name))];
+        let mut row = vec![text(::figures::plain(&format!("{} ≤ {limit}", score.name)))];
         row.extend(cells(found.retention, 100.0, 1));
         let of = |place: Option<usize>| place.map(|k| found.contamination[k]).unwrap_or_default();
         row.extend(places.into_iter().flat_map(|place| cells(of(place), 100.0, 2)));
@@ -142,32 +101,24 @@ fn confident(report: &LabelledReport) -> LabelledTable {
         all.extend(unfiltered.into_iter().flat_map(|estimate| cells(estimate, 100.0, 2)));
         rows.push(all);
     }
-    LabelledTable {
-        name: "confident",
-        caption: "Atoms within the limit of a score: their share of all atoms, and the share of them with a force error above 0.5 and \
-                  1 eV/Å"
-            .into(),
-        titles: vec!["", "kept (%)", INTERVAL, "above 0.5 (%)", INTERVAL, "above 1 (%)", INTERVAL],
-        rows,
-    }
+    let caption = "Atoms within the limit of a score: their share of all atoms, and the share of them with a force error above 0.5 and \
+                   1 eV/Å";
+    let titles = ["", "kept (%)", INTERVAL, "above 0.5 (%)", INTERVAL, "above 1 (%)", INTERVAL];
+    Table { rows, ..Table::new("confident", caption, &titles) }
 }
 
-fn quantiles(report: &LabelledReport) -> LabelledTable {
+fn quantiles(report: &LabelledReport) -> Table {
     let row = |score: &ScoreReport, bin: &Bin| {
-        let percent = |share: Option<f64>| number(share.map(|share| 100.0 * share), 1);
-        let mut row = vec![text(&score.name), text(&range(bin.above, bin.up_to)), count(bin.atoms)];
+        let mut row = vec![name(score), text(range(bin.above, bin.up_to)), count(bin.atoms)];
         row.push(percent(Some(bin.share)));
-        row.extend([bin.median, bin.p90, bin.p99].map(|error| number(error, 3)));
+        row.extend([bin.median, bin.p90, bin.p99].map(|error| real(error, 3)));
         row.push(percent(bin.large));
         row
     };
     let rows = report.scores.iter().flat_map(|score| score.bins.iter().map(move |bin| row(score, bin)));
-    LabelledTable {
-        name: "quantiles",
-        caption: "Force errors (eV/Å) by bins of a score".into(),
-        titles: vec!["score", "bin", "atoms", "atoms (%)", "median", "p90", "p99", "above 1 eV/Å (%)"],
-        rows: rows.collect(),
-    }
+    let caption = "Force errors (eV/Å) by bins of a score";
+    let titles = ["score", "bin", "atoms", "atoms (%)", "median", "p90", "p99", "above 1 eV/Å (%)"];
+    Table { rows: rows.collect(), ..Table::new("quantiles", caption, &titles) }
 }
 
 /// Title of the columns with intervals.
@@ -178,24 +129,17 @@ fn intervals(report: &LabelledReport) -> String {
     format!("with {level:.0} % intervals (bootstrap over structures) here and below")
 }
 
-fn text(words: &str) -> Cell {
-    Cell { shown: words.into(), exact: words.into(), is_number: false }
-}
-
-fn count(number: u64) -> Cell {
-    Cell { shown: number.to_string(), exact: number.to_string(), is_number: true }
-}
-
-fn number(x: Option<f64>, digits: usize) -> Cell {
-    Cell { shown: decimals(x, digits), exact: csv::number(x), is_number: true }
+/// The name of a score without markup, which cells do not support.
+fn name(score: &ScoreReport) -> Cell {
+    text(::figures::plain(&score.name))
 }
 
 /// Value and interval.
 fn cells(estimate: Estimate, factor: f64, digits: usize) -> [Cell; 2] {
-    let interval = estimate.interval.map(|(low, high)| [low, high].map(|x| number(Some(factor * x), digits)));
+    let interval = estimate.interval.map(|(low, high)| [low, high].map(|x| real(factor * x, digits)));
     let text = |of: fn(&Cell) -> &String| {
         interval.as_ref().map_or(String::new(), |[low, high]| format!("{} to {}", of(low), of(high)))
     };
     let interval = Cell { shown: text(|cell| &cell.shown), exact: text(|cell| &cell.exact), is_number: true };
-    [number(estimate.value.map(|value| factor * value), digits), interval]
+    [real(estimate.value.map(|value| factor * value), digits), interval]
 }

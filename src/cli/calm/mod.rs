@@ -14,6 +14,7 @@ mod score_labels;
 mod score_table;
 mod scorer;
 mod validate;
+mod validate_labels;
 
 pub(super) use self::score::load;
 use super::{ExitStatus, Failure};

@@ -1,4 +1,4 @@
-//! Scores beside γ that `calmwalk calm score` writes: those of baselines, and the disagreement of an ensemble.
+//! Scores beside γ that `calmwalk calm score` writes and `calm validate` tests: those of baselines, and the disagreement of an ensemble.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,6 +12,7 @@ use potentials::grace::{GraceModel, PullBack};
 
 use super::scorer::Scorer;
 use crate::calm_validation::labelled::ScoreColumn;
+use crate::calm_validation::{BaselineScore, Score, score_own_features};
 use crate::cli::Failure;
 use crate::feature_variant::FeatureModel;
 use crate::features::{FeatureCalculator, FeatureError};
@@ -24,10 +25,14 @@ pub struct OtherScores {
 
 /// The baselines of one file.
 struct Scores {
+    /// The features that they score.
+    model: FeatureModel,
+    /// Whether γ grades the same.
+    is_graded: bool,
     /// `None` if they score the features that γ grades.
     calculator: Option<FeatureCalculator>,
     /// With the names of their columns.
-    baselines: Vec<(String, Baseline)>,
+    baselines: Vec<(String, Arc<Baseline>)>,
 }
 
 /// Why a structure cannot be scored.
@@ -75,7 +80,7 @@ impl OtherScores {
     pub fn score_columns(&self) -> Vec<ScoreColumn> {
         let baselines = self.files.iter().flat_map(|file| &file.baselines);
         let limited =
-            baselines.map(|(name, baseline)| (name.as_str(), matches!(baseline, Baseline::DOptimality(_))));
+            baselines.map(|(name, baseline)| (name.as_str(), matches!(**baseline, Baseline::DOptimality(_))));
         let deviation = (!self.ensemble.is_empty()).then_some(("force_deviation", false));
         let columns: Vec<_> = limited.chain(deviation).collect();
         let averages = columns.iter().map(|(name, limited)| (format!("{name}_nbr"), *limited));
@@ -86,6 +91,20 @@ impl OtherScores {
                 limit: limited.then_some(1.0),
             })
             .collect()
+    }
+
+    /// The baselines as scores that `calm validate` compares γ with, named as in [`Self::score_columns`].
+    pub fn baselines(&self) -> Vec<Box<dyn Score>> {
+        let of_file = |file: &Scores| -> Vec<Box<dyn Score>> {
+            let of = |(name, baseline): &(String, Arc<Baseline>)| {
+                let needs_own = !file.is_graded || baseline.kind().has_force_form();
+                let own = needs_own.then(|| file.model.clone());
+                let score = BaselineScore::new(name.replace('_', "-"), Arc::clone(baseline), own);
+                Box::new(score) as Box<dyn Score>
+            };
+            file.baselines.iter().map(of).collect()
+        };
+        self.files.iter().flat_map(of_file).collect()
     }
 
     /// Names and values of the columns for a structure that was just scored: of each score, also its average over the
@@ -101,14 +120,10 @@ impl OtherScores {
                 calculator.compute(structure)?;
             }
             for (name, baseline) in &file.baselines {
-                let rows = match &mut file.calculator {
-                    Some(calculator) if baseline.kind().has_force_form() => Some(calculator.force_rows()),
-                    _ => None,
+                let found = match &mut file.calculator {
+                    Some(calculator) => score_own_features(baseline, calculator, &scorer.elements)?,
+                    None => baseline.score(&scorer.elements, scorer.features())?,
                 };
-                let of_forces = rows.map(|rows| baseline.score_forces(&rows)).transpose()?.flatten();
-                let features =
-                    file.calculator.as_ref().map_or(scorer.features(), FeatureCalculator::features);
-                let found = of_forces.map_or_else(|| baseline.score(&scorer.elements, features), Ok)?;
                 columns.push((name.clone(), found));
             }
         }
@@ -152,8 +167,10 @@ fn scores(model: &Path, graded: &FeatureModel, path: &Path) -> Result<Scores, Fa
         "normalised" | "linear" | "hidden" => format!("{}_", file.origin.variant),
         _ => "other_".to_owned(),
     };
-    let named =
-        |baseline: Baseline| (format!("{prefix}{}", baseline.kind().name().replace('-', "_")), baseline);
+    let named = |baseline: Baseline| {
+        (format!("{prefix}{}", baseline.kind().name().replace('-', "_")), Arc::new(baseline))
+    };
     let calculator = (!is_graded || has_forces).then(|| own.calculator());
-    Ok(Scores { calculator, baselines: file.baselines.into_iter().map(named).collect() })
+    let baselines = file.baselines.into_iter().map(named).collect();
+    Ok(Scores { model: own, is_graded, calculator, baselines })
 }

@@ -10,10 +10,11 @@ use super::score_table::ScoreTable;
 use super::scorer::Scorer;
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::calm_validation::labelled::{
-    self, BOOTSTRAP, GradedStructure, LabelledErrors, LabelledFigure, LabelledReport, ScoreColumn,
+    self, BOOTSTRAP, GradedStructure, LabelledErrors, LabelledReport, ScoreColumn,
 };
 use crate::cli::Failure;
 use crate::output::{count, log_and_warn, print};
+use crate::page::{FigureContent, FigureEntry};
 
 /// Resolution of images, dots per inch.
 const RESOLUTION: f64 = 300.0;
@@ -66,13 +67,14 @@ impl ScoreLabels {
     }
 
     /// Prints the tables, if any frame has labels, and writes the files.
-    pub fn finish(self, json: Option<&Path>, figures: Option<&Path>, input: &Path) -> Result<(), Failure> {
-        self.table.map_or(Ok(()), ScoreTable::finish)?;
-        if let (number, Some(first)) = &self.unreadable {
-            let frames = count(*number, "frame");
-            let place = input.display();
-            log_and_warn(format_args!("{place}: no statistics of the labels of {frames}: {first}"));
-        }
+    pub fn finish(
+        mut self,
+        json: Option<&Path>,
+        figures: Option<&Path>,
+        input: &Path,
+    ) -> Result<(), Failure> {
+        self.table.take().map_or(Ok(()), ScoreTable::finish)?;
+        self.warn(input);
         if self.errors.structures() == 0 && json.is_none() && figures.is_none() {
             return Ok(());
         }
@@ -90,13 +92,37 @@ impl ScoreLabels {
             labelled::write(&report, out)
         })
     }
+
+    /// The statistics, which need a label.
+    ///
+    /// # Errors
+    /// No label that the model predicts.
+    pub fn report(self, input: &Path) -> Result<LabelledReport, Failure> {
+        self.warn(input);
+        if self.errors.structures() == 0 {
+            return Err(Failure::Input(format!(
+                "{}: no structure has a label; expected energy, forces or stress, or REF_energy and so on",
+                input.display()
+            )));
+        }
+        Ok(self.errors.report(BOOTSTRAP))
+    }
+
+    fn warn(&self, input: &Path) {
+        if let (number, Some(first)) = &self.unreadable {
+            let frames = count(*number, "frame");
+            let place = input.display();
+            log_and_warn(format_args!("{place}: no statistics of the labels of {frames}: {first}"));
+        }
+    }
 }
 
 /// Each figure as SVG, PNG and the numbers as CSV, each table as CSV, and the captions.
 fn write_figures(directory: &Path, report: &LabelledReport) -> Result<(), Failure> {
     std::fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))?;
     let mut captions = String::new();
-    for LabelledFigure { name, title, figure, caption, numbers } in labelled::figures(report) {
+    for FigureEntry { name, title, drawn } in labelled::figures(report) {
+        let Ok(FigureContent { figure, caption, numbers }) = drawn else { continue };
         captions += &format!("{name}\n{title}. {}\n\n", figures::plain(&caption));
         let path = |extension: &str| directory.join(format!("{name}.{extension}"));
         write_file(&path("svg"), to_svg(&figure).as_bytes())?;

@@ -9,11 +9,16 @@ use atoms::prototypes::Prototype;
 use md::Fire;
 use potentials::grace::GraceModel;
 
+use super::other_scores::OtherScores;
 use super::score::load;
+use super::scorer::Scorer;
+use super::validate_labels;
+use crate::atomic_file::refuse_to_replace;
 use crate::calm_validation::{
-    self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, verdict,
+    self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, labelled, verdict,
 };
 use crate::cli::{ExitStatus, Failure};
+use crate::feature_variant::FeatureModel;
 use crate::output::{self, Bar, Table, decimals, print, print_stderr};
 use crate::page::{create_directory, write_files};
 use crate::signals::stop_token;
@@ -23,10 +28,11 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// Metals up to which all pairs are mixed by default.
 const MIXED: usize = 4;
 
-/// Test whether the extrapolation grade of a model can be trusted, without labels
+/// Test whether the extrapolation grade of a model can be trusted, with and without labels
 ///
 /// Bond scans of the elements' crystals from compression to stretching, as the paper's minimal test; grades at vacancies, surfaces and
-/// grain boundaries; grades of random solid solutions against composition. Run it after calm build, and before a campaign trusts γ.
+/// grain boundaries; grades of random solid solutions against composition. With --labelled, also how well the grade ranks the force
+/// errors of labelled structures, as calm score says. Run it after calm build, and before a campaign trusts γ.
 /// Writes a self-contained HTML page, each figure as SVG, PNG and CSV, each table as CSV, all results as JSON, and the graded
 /// structures. The same input gives the same bytes. docs/calm-validation.md explains the tests.
 ///
@@ -39,10 +45,17 @@ pub struct Validate {
     /// CALM artifact (gmm_artifacts.npz) [default: mixture in the model file]
     #[arg(long, value_name = "CALM.npz")]
     artifact: Option<PathBuf>,
+    /// Also test the scores of this file of baselines (`calmwalk calm baseline`); may be repeated
+    #[arg(long, value_name = "BASELINES.npz")]
+    baseline: Vec<PathBuf>,
     /// Another model of the same elements, trained independently; may be repeated. The spread of the energies of all models is compared
     /// with γ
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
+    /// Structures with labels, extended XYZ. The page also shows how well γ, γ_nbr and the other scores of an atom tell large force
+    /// errors
+    #[arg(long, value_name = "LABELLED.extxyz")]
+    labelled: Option<PathBuf>,
     /// Directory for the files, created if it does not exist; files of an earlier validation are replaced
     #[arg(long, short, value_name = "DIR")]
     output: PathBuf,
@@ -69,16 +82,29 @@ pub struct Validate {
 impl Validate {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
-        let (model, mixture) = (features.model, Arc::new(artifact.mixture));
+        let (model, mixture) = (features.model.clone(), Arc::new(artifact.mixture));
         let settings = self.settings(&model)?;
-        let others = self.ensemble(&model)?.into_iter().collect();
+        let spread = self.ensemble(&model)?;
+        let mut compared = self.compared(&features)?;
+        let others = compared.baselines().into_iter().chain(spread).collect();
         // Fail before the long computation.
         create_directory(&self.output)?;
-        let progress = Progress::new(Bar::new(Some(1), BAR), stop_token()?);
+        let stop = stop_token()?;
+        let labelled = match &self.labelled {
+            None => None,
+            Some(input) => {
+                let mut scorer = Scorer::new(model.clone(), mixture.clone());
+                let found = validate_labels::report(input, &mut scorer, &mut compared, &stop)?;
+                if found.is_none() {
+                    return Ok(stopped());
+                }
+                found
+            }
+        };
+        let progress = Progress::new(Bar::new(Some(1), BAR), stop);
         let subject = Subject { model, mixture, others };
-        let Some(validation) = calm_validation::run(&subject, settings, &progress)? else {
-            print_stderr("stopped; nothing was written");
-            return Ok(ExitStatus::Interrupted);
+        let Some(validation) = calm_validation::run(&subject, settings, labelled, &progress)? else {
+            return Ok(stopped());
         };
         drop(progress);
         let files = calm_validation::files(&validation)?;
@@ -87,11 +113,26 @@ impl Validate {
             bond_scans(&validation).write(out)?;
             writeln!(out)?;
             defects(&validation).write(out)?;
+            if let Some(report) = &validation.labelled {
+                writeln!(out)?;
+                labelled::write(report, out)?;
+            }
             let page = self.output.join(PAGE);
             let others = output::count(files.len() - 1, "file");
             writeln!(out, "\nwrote {} and {others} in the same directory", page.display())
         })?;
         Ok(ExitStatus::Done)
+    }
+
+    /// The baselines, and what else labelled structures are scored by beside γ and γ_nbr. The output must not replace these structures.
+    fn compared(&self, features: &FeatureModel) -> Result<OtherScores, Failure> {
+        let mut ensemble: &[PathBuf] = &[];
+        if let Some(input) = &self.labelled {
+            let structures = self.output.join("structures.extxyz");
+            refuse_to_replace(&structures, [(input.as_path(), "the file of labelled structures")])?;
+            ensemble = &self.ensemble;
+        }
+        OtherScores::load(&self.model, features, &self.baseline, ensemble)
     }
 
     /// The spread of the energies, if there are further models.
@@ -138,6 +179,11 @@ impl Validate {
             seed: self.rng_seed,
         })
     }
+}
+
+fn stopped() -> ExitStatus {
+    print_stderr("stopped; nothing was written");
+    ExitStatus::Interrupted
 }
 
 /// All pairs of the metals among the elements, if there are few.

@@ -3,8 +3,10 @@
 use ::figures::{Anchor, Axis, Colour, Figure, Panel, Rectangle, Scale, Stroke};
 
 use super::super::report::{Estimate, LabelledReport};
-use super::{LabelledFigure, WIDTH, runs, stroke};
+use super::{runs, stroke};
 use crate::csv::{Csv, number};
+use crate::page::style::WIDTH;
+use crate::page::{FigureContent, FigureEntry};
 
 const PLACE: Rectangle = Rectangle { x: 48.0, y: 14.0, width: 270.0, height: 190.0 };
 const HEIGHT: f64 = 240.0;
@@ -15,7 +17,7 @@ const SWEEP: (f64, f64) = (0.05, 5.0);
 /// Axis of the thresholds.
 const ERROR: &str = "threshold of the force error (eV Å^{−1})";
 
-pub fn contamination(report: &LabelledReport) -> LabelledFigure {
+pub fn contamination(report: &LabelledReport) -> FigureEntry {
     let (low, high) = (report.thresholds[0], report.thresholds[report.thresholds.len() - 1]);
     let x = Axis::new(ERROR, Scale::Logarithmic, low, high);
     let y = Axis::new("probability of a larger error", Scale::Linear, 0.0, 1.0);
@@ -39,7 +41,7 @@ pub fn contamination(report: &LabelledReport) -> LabelledFigure {
     chart.finish("Contamination of the confident set", caption)
 }
 
-pub fn areas(report: &LabelledReport) -> LabelledFigure {
+pub fn areas(report: &LabelledReport) -> FigureEntry {
     let is_shown = |x: &&f64| (SWEEP.0..=SWEEP.1).contains(*x);
     let thresholds: Vec<_> = report.thresholds.iter().filter(is_shown).copied().collect();
     let first = report.thresholds.iter().position(|x| *x >= SWEEP.0).unwrap_or(0);
@@ -104,9 +106,9 @@ impl Chart {
         self.curves += 1;
     }
 
-    fn finish(self, title: &'static str, caption: String) -> LabelledFigure {
+    fn finish(self, title: &'static str, caption: String) -> FigureEntry {
         let Self { name, mut figure, panel, numbers, .. } = self;
         panel.draw(&mut figure);
-        LabelledFigure { name, title, figure, caption, numbers }
+        FigureEntry { name, title, drawn: Ok(FigureContent { figure, caption, numbers }) }
     }
 }

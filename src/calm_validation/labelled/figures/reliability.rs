@@ -3,8 +3,9 @@
 use ::figures::{Anchor, Axis, Colour, Figure, Panel, Rectangle, Scale, Side};
 
 use super::super::report::{Band, ErrorHistograms, LabelledReport, ScoreReport};
-use super::{LabelledFigure, WIDTH};
 use crate::csv::{Csv, number};
+use crate::page::style::WIDTH;
+use crate::page::{FigureContent, FigureEntry};
 
 /// Bins with fewer atoms are not drawn.
 const MIN_ATOMS: u64 = 20;
@@ -15,7 +16,7 @@ const ROW: f64 = 232.0;
 const BANDS: [(usize, usize, f64); 3] = [(0, 6, 0.12), (1, 5, 0.18), (2, 4, 0.26)];
 const MEDIAN: usize = 3;
 
-pub fn draw(report: &LabelledReport) -> LabelledFigure {
+pub fn draw(report: &LabelledReport) -> FigureEntry {
     let shown: Vec<_> = report.scores.iter().filter(|score| score.limit.is_some()).collect();
     let rows = shown.len().div_ceil(2);
     let description = "Force error against the grade of an atom";
@@ -34,7 +35,8 @@ pub fn draw(report: &LabelledReport) -> LabelledFigure {
          score, red beyond it. Margins: distribution of the score, and of the force errors of either population by itself. {}.",
         shown.iter().map(|score| facts(score)).collect::<Vec<_>>().join("; ")
     );
-    LabelledFigure { name: "reliability", title: "Reliability of the threshold", figure, caption, numbers }
+    let drawn = Ok(FigureContent { figure, caption, numbers });
+    FigureEntry { name: "reliability", title: "Reliability of the threshold", drawn }
 }
 
 fn facts(score: &ScoreReport) -> String {

@@ -1,0 +1,92 @@
+//! Baselines as scores to compare γ with.
+
+use std::sync::Arc;
+
+use atoms::Structure;
+use calm::baselines::{Baseline, BaselineError, Kind};
+
+use super::{Rule, Score};
+use crate::feature_variant::FeatureModel;
+use crate::features::FeatureCalculator;
+
+/// A baseline, with a calculator if it needs one.
+pub struct BaselineScore {
+    name: String,
+    baseline: Arc<Baseline>,
+    /// The features of the baseline with their calculator, unless it scores the features that γ grades, and these alone.
+    own: Option<(FeatureModel, FeatureCalculator)>,
+}
+
+impl BaselineScore {
+    /// `own` has the features of the baseline; `None` if it scores the features that γ grades, and these alone.
+    pub fn new(name: String, baseline: Arc<Baseline>, own: Option<FeatureModel>) -> Self {
+        let own = own.map(|model| {
+            let calculator = model.calculator();
+            (model, calculator)
+        });
+        Self { name, baseline, own }
+    }
+}
+
+impl Score for BaselineScore {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn rule(&self) -> Option<Rule> {
+        rule(self.baseline.kind())
+    }
+
+    fn for_thread(&self) -> Box<dyn Score> {
+        let own = self.own.as_ref().map(|(model, _)| model.clone());
+        Box::new(Self::new(self.name.clone(), Arc::clone(&self.baseline), own))
+    }
+
+    fn score(
+        &mut self,
+        structure: &Structure,
+        elements: &[usize],
+        features: &[f64],
+    ) -> Result<Vec<f64>, String> {
+        let found = match &mut self.own {
+            None => self.baseline.score(elements, features),
+            Some((_, calculator)) => {
+                calculator.compute(structure).map_err(|error| error.to_string())?;
+                score_own_features(&self.baseline, calculator, elements)
+            }
+        };
+        found.map_err(|error| error.to_string())
+    }
+}
+
+/// Scores the features that `calculator` computed last, or their forces if that is what the baseline scores.
+///
+/// # Errors
+/// Features that the baseline cannot score.
+pub fn score_own_features(
+    baseline: &Baseline,
+    calculator: &mut FeatureCalculator,
+    elements: &[usize],
+) -> Result<Vec<f64>, BaselineError> {
+    if baseline.kind().has_force_form() {
+        let rows = calculator.force_rows();
+        if let Some(found) = baseline.score_forces(&rows)? {
+            return Ok(found);
+        }
+    }
+    baseline.score(elements, calculator.features())
+}
+
+/// D-optimality is calibrated as γ is: no training atom is above 1. Other scores have a zero but no limit, except the likelihood, which
+/// has neither.
+fn rule(kind: Kind) -> Option<Rule> {
+    match kind {
+        Kind::DOptimalityElement | Kind::DOptimalityCentred | Kind::DOptimalityComponent => {
+            Some(Rule::Threshold(1.0))
+        }
+        Kind::Llpr | Kind::LlprSum | Kind::LlprForces | Kind::Euclidean | Kind::KNearest => {
+            Some(Rule::TENFOLD)
+        }
+        Kind::Likelihood => None,
+    }
+}
