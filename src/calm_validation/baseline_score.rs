@@ -77,8 +77,8 @@ pub fn score_own_features(
     baseline.score(elements, calculator.features())
 }
 
-/// D-optimality is calibrated as γ is: no training atom is above 1. Other scores have a zero but no limit, except the likelihood, which
-/// has neither.
+/// D-optimality detects above 1, as in the paper: no training atom is above 1. Other scores have no limit. Those that have a zero are
+/// judged as the paper judges the spread of an ensemble; the likelihood has none.
 fn rule(kind: Kind) -> Option<Rule> {
     match kind {
         Kind::DOptimalityElement | Kind::DOptimalityCentred | Kind::DOptimalityComponent => {
