@@ -282,3 +282,39 @@ fn every_package_obeys_the_lints() {
         assert_eq!(inherited, Some(true), "{} needs [lints] workspace = true", folder.display());
     }
 }
+
+/// A browser finds a name that is not imported only when it comes to the line.
+#[test]
+fn pages_import_the_functions_that_they_call() {
+    let folder = root().join("src/web/pages");
+    let files = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let scripts: Vec<_> = files.filter(|path| path.extension().is_some_and(|end| end == "js")).collect();
+    let texts: Vec<_> = scripts.iter().map(|path| std::fs::read_to_string(path).unwrap()).collect();
+    let is_part = |letter: char| letter.is_alphanumeric() || ['_', '.', '$'].contains(&letter);
+    let exported = |text: &str| -> Vec<String> {
+        let functions = text.lines().filter_map(|line| {
+            let line = line.strip_prefix("export ")?;
+            line.strip_prefix("async ").unwrap_or(line).strip_prefix("function ")
+        });
+        functions.map(|rest| rest.split('(').next().unwrap().to_owned()).collect()
+    };
+    let names: BTreeSet<_> = texts.iter().flat_map(|text| exported(text)).collect();
+    assert!(names.contains("words"), "{names:?}");
+    for (path, text) in scripts.iter().zip(&texts) {
+        let known = |name: &str| {
+            let declares = |line: &str| {
+                let mut words = line.split(|letter: char| !is_part(letter));
+                ["import", "export", "function", "async", "const", "let"]
+                    .iter()
+                    .any(|start| line.starts_with(start))
+                    && words.any(|word| word == name)
+            };
+            text.lines().map(str::trim_start).any(declares)
+        };
+        for name in &names {
+            let mut calls = text.match_indices(&format!("{name}("));
+            let is_called = calls.any(|(at, _)| !text[..at].ends_with(is_part));
+            assert!(!is_called || known(name), "{} calls {name} without importing it", path.display());
+        }
+    }
+}

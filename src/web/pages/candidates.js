@@ -2,7 +2,7 @@
 
 import { fetchJson } from "./api.js";
 import { FATES } from "./colours.js";
-import { element, renew, state } from "./dom.js";
+import { element, renew, state, words } from "./dom.js";
 import { decimals, shortName, whole } from "./format.js";
 
 export const TITLE = "Candidates";

@@ -2,6 +2,7 @@
 
 import { fetchJson, listen } from "./api.js";
 import { DASHES, FATES, LINES } from "./colours.js";
+import { words } from "./dom.js";
 import { shortName, tick, whole } from "./format.js";
 import { plot } from "./plot.js";
 
