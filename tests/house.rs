@@ -312,7 +312,8 @@ fn pages_import_the_functions_that_they_call() {
             text.lines().map(str::trim_start).any(declares)
         };
         for name in &names {
-            let mut calls = text.match_indices(&format!("{name}("));
+            let call = format!("{name}(");
+            let mut calls = text.match_indices(&call);
             let is_called = calls.any(|(at, _)| !text[..at].ends_with(is_part));
             assert!(!is_called || known(name), "{} calls {name} without importing it", path.display());
         }
