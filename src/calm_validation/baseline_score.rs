@@ -77,7 +77,7 @@ pub fn score_own_features(
     baseline.score(elements, calculator.features())
 }
 
-/// D-optimality detects above 1, as in the paper: no training atom is above 1. Other scores have no limit. Those that have a zero are
+/// D-optimality detects above 1, as in the paper. Other scores have no limit. Those that have a zero are
 /// judged as the paper judges the spread of an ensemble; the likelihood has none.
 fn rule(kind: Kind) -> Option<Rule> {
     match kind {
