@@ -4,7 +4,9 @@
 //! would compile both databases a second time for the build.
 
 use sqlx::SqlSafeStr;
-use sqlx::migrate::{Migration, MigrationType, Migrator};
+use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
+
+use crate::error::StoreError;
 
 /// Version, name and SQL of a migration, from its file `<version>_<name>.sql`.
 pub type Step = (i64, &'static str, &'static str);
@@ -15,6 +17,14 @@ pub fn migrator(steps: &[Step]) -> Migrator {
         Migration::new(*version, (*name).into(), MigrationType::Simple, text.into_sql_str(), false)
     });
     Migrator::with_migrations(migrations.collect())
+}
+
+/// A failed migration; what the database says is told as it is elsewhere.
+pub fn schema_error(error: MigrateError) -> StoreError {
+    match error {
+        MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => error.into(),
+        error => StoreError::Schema(error),
+    }
 }
 
 #[cfg(test)]

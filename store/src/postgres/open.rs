@@ -11,7 +11,7 @@ use super::server::Server;
 use crate::database::{Database, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
-use crate::migrations::{Step, migrator};
+use crate::migrations::{Step, migrator, schema_error};
 use crate::tables::checksums;
 
 /// The newest migration.
@@ -135,13 +135,5 @@ async fn version(url: &ServerUrl, connection: &mut PgConnection) -> Result<Optio
             Err(StoreError::Version { path: url.as_str().into(), found, reads: SCHEMA })
         }
         found => Ok(found),
-    }
-}
-
-fn schema_error(error: sqlx::migrate::MigrateError) -> StoreError {
-    match error {
-        sqlx::migrate::MigrateError::Execute(error)
-        | sqlx::migrate::MigrateError::ExecuteMigration(error, _) => error.into(),
-        error => StoreError::Schema(error),
     }
 }

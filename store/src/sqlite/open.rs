@@ -17,7 +17,7 @@ use crate::database::{Database, Transaction};
 use crate::error::{Result, StoreError};
 use crate::file_names::DATABASE;
 use crate::filesystem::check_directory;
-use crate::migrations::{Step, migrator};
+use crate::migrations::{Step, migrator, schema_error};
 use crate::tables::checksums;
 
 /// `PRAGMA application_id` of a campaign: "CALM".
@@ -170,14 +170,6 @@ async fn identify(path: &Path, immutable: bool) -> Result<i64> {
 
 async fn pragma(connection: &mut SqliteConnection, pragma: &'static str) -> Result<i64> {
     Ok(sqlx::query_scalar(pragma).fetch_one(connection).await?)
-}
-
-fn schema_error(error: sqlx::migrate::MigrateError) -> StoreError {
-    match error {
-        sqlx::migrate::MigrateError::Execute(error)
-        | sqlx::migrate::MigrateError::ExecuteMigration(error, _) => error.into(),
-        error => StoreError::Schema(error),
-    }
 }
 
 /// Removes what a killed [`Store::create`] left behind.
