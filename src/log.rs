@@ -30,7 +30,7 @@ static CONFIG: OnceLock<LogConfig> = OnceLock::new();
 
 /// Options of long-running commands.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Options {
+pub struct LogArgs {
     /// Append the log of this process and its children to this file (docs/log.md)
     #[arg(long = "log", value_name = "FILE")]
     file: Option<PathBuf>,
@@ -76,7 +76,7 @@ pub struct LogConfig {
     format: Format,
 }
 
-impl Options {
+impl LogArgs {
     /// Initializes the log of this process if one is requested.
     ///
     /// # Errors

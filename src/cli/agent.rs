@@ -9,7 +9,7 @@ use wire::net::{self, Address, Tls};
 
 use super::{ExitStatus, Failure, block_on, duration_between};
 use crate::duration::Duration;
-use crate::log::Options;
+use crate::log::LogArgs;
 use crate::output::log_and_warn;
 use crate::runtime::scratch_dir::{self, ScratchDir};
 use crate::runtime::{agent_host, cores};
@@ -22,7 +22,7 @@ use crate::web::{self, agent_metrics::AgentState};
 /// work (exit code 0), or on Ctrl-C or SIGTERM (exit code 130). Walks are checkpointed within seconds of SIGTERM, so the notice
 /// of a batch system suffices. See docs/hosts.md.
 #[derive(Debug, clap::Args)]
-pub struct Agent {
+pub struct AgentArgs {
     /// Address of the orchestrator, such as tcp/head:7447, or @FILE as written by `run --announce`. FILE is read again when the
     /// orchestrator stops answering
     #[arg(long, value_name = "ENDPOINT")]
@@ -47,10 +47,10 @@ pub struct Agent {
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = web::address)]
     metrics: Option<SocketAddr>,
     #[command(flatten)]
-    log: Options,
+    log: LogArgs,
 }
 
-impl Agent {
+impl AgentArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         self.log.init("agent")?;
         let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));

@@ -9,9 +9,9 @@ use super::{ExitStatus, Failure};
 ///
 /// Reads its settings from standard input, and outlives the labeller that started it.
 #[derive(Debug, clap::Args)]
-pub struct CalculationRunner {}
+pub struct CalculationRunnerArgs {}
 
-impl CalculationRunner {
+impl CalculationRunnerArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
         run_calculation().map_err(Failure::failed)?;

@@ -13,13 +13,13 @@ use crate::output::{count, print};
 /// Each run does this at its start and end; use the command for killed campaigns that you do not resume. Skips running
 /// campaigns, and removes nothing that a campaign needs to resume.
 #[derive(Debug, clap::Args)]
-pub struct Clean {
+pub struct CleanArgs {
     /// Directories of campaigns [default: all campaigns of this user on this host]
     #[arg(value_name = "DIR")]
     directories: Vec<PathBuf>,
 }
 
-impl Clean {
+impl CleanArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.directories.is_empty() {
             for shared in ShmDir::all().map_err(Failure::failed)? {

@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 
 use store::Store;
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
-use crate::log::Options;
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use crate::log::LogArgs;
 use crate::output::log_and_print;
 use crate::web::{self, dashboard};
 
@@ -14,17 +14,17 @@ use crate::web::{self, dashboard};
 /// For a campaign that runs elsewhere, has ended or is a backup; use `calmwalk run --dashboard` for the campaign that it runs.
 /// Stop with Ctrl-C. docs/dashboard.md describes the pages.
 #[derive(Debug, clap::Args)]
-pub struct Dashboard {
+pub struct DashboardArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Address and port to listen on; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8080", value_parser = web::address)]
     address: SocketAddr,
     #[command(flatten)]
-    log: Options,
+    log: LogArgs,
 }
 
-impl Dashboard {
+impl DashboardArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         self.log.init("dashboard")?;
         block_on(async {

@@ -25,7 +25,7 @@ const SHOWN: usize = 20;
 /// The time of the walks follows from a few steps measured on this host. The cost of a label is extrapolated from the labels of
 /// another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk label-file`). `calmwalk validate` shows the seed structures: elements, distances, grades, those that are skipped.
 #[derive(Debug, clap::Args)]
-pub struct Estimate {
+pub struct EstimateArgs {
     /// Configuration of the campaign (TOML)
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
@@ -75,7 +75,7 @@ struct CampaignEstimate {
     disk: DiskForecast,
 }
 
-impl Estimate {
+impl EstimateArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let campaign = Campaign::load(&self.config)?;
         let estimate = self.estimate(&campaign)?;

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use store::{ExcludedLabel, ExclusionChange, Store, unix_milliseconds};
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{Table, print, print_json, warn_if_unencrypted};
 
 /// Exclude bad labels from exports and statistics, or include them again
@@ -15,9 +15,9 @@ use crate::output::{Table, print, print_json, warn_if_unencrypted};
 ///
 /// Works while the campaign runs. Changes either all given structures or none.
 #[derive(Debug, clap::Args)]
-pub struct Exclude {
+pub struct ExcludeArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Candidates: ids, unique prefixes of ids, or decision numbers; or imported structures, such as import-3
     #[arg(value_name = "ID", required_unless_present = "list")]
     ids: Vec<String>,
@@ -42,7 +42,7 @@ fn parse_reason(text: &str) -> Result<String, String> {
     }
 }
 
-impl Exclude {
+impl ExcludeArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.list {
             let excluded = block_on(self.read())??;

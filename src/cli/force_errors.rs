@@ -6,7 +6,7 @@ use analysis::{CompletionBin, ErrorBin};
 use monitor::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use store::{Protocol, Store};
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json, range};
 use crate::wording;
 
@@ -21,9 +21,9 @@ const NAMES: usize = 3;
 /// structures are counted separately ('without label') in their bins. Energy errors exclude a fitted offset per element, because
 /// labels and potential have different zeros of energy. Works while the campaign runs.
 #[derive(Debug, clap::Args)]
-pub struct ForceErrors {
+pub struct ForceErrorsArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Use the labels of this protocol [default: the current protocol]
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
@@ -32,7 +32,7 @@ pub struct ForceErrors {
     json: bool,
 }
 
-impl ForceErrors {
+impl ForceErrorsArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (protocol, statistics) = block_on(self.read())??;
         if self.json {

@@ -8,7 +8,7 @@ use store::{CampaignLock, ImportCounts, QueuedImports, Store, unix_milliseconds}
 use wire::ContentHash;
 use workers::labeller::LabelBounds;
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::label_setup;
 use crate::output::{count, print};
 use crate::xyz_reader::{XyzReader, label};
@@ -26,9 +26,9 @@ use crate::xyz_reader::{XyzReader, label};
 /// The campaign must not be running: imported structures change which candidates are duplicates, and the decision log records
 /// when.
 #[derive(Debug, clap::Args)]
-pub struct Import {
+pub struct ImportArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Extended XYZ files
     #[arg(value_name = "FILES", required = true)]
     files: Vec<PathBuf>,
@@ -67,7 +67,7 @@ impl File {
     }
 }
 
-impl Import {
+impl ImportArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.queue {
             let structures: Vec<_> =

@@ -11,7 +11,7 @@ use crate::output::print;
 ///
 /// Also writes campaign.schema.json, which lets an editor complete and check campaign.toml.
 #[derive(Debug, clap::Args)]
-pub struct Init {
+pub struct InitArgs {
     /// Directory for the files; created if it does not exist
     #[arg(value_name = "DIR")]
     directory: PathBuf,
@@ -37,7 +37,7 @@ const FILES: [(&str, &[u8]); 5] = [
 const SCHEMA: &str = "campaign.schema.json";
 const SCHEMA_LINE: &str = "#:schema ./campaign.schema.json\n\n";
 
-impl Init {
+impl InitArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let config = self.directory.join("campaign.toml");
         let written = [SCHEMA_LINE.as_bytes(), CAMPAIGN].concat();

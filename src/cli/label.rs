@@ -10,7 +10,7 @@ use super::{ExitStatus, Failure, block_on, campaign_location, duration_between};
 use crate::config::Config;
 use crate::duration::Duration;
 use crate::label_setup::{HostOptions, LabelSetup};
-use crate::log::Options;
+use crate::log::LogArgs;
 use crate::output::{log_and_print, warn_if_unencrypted};
 use crate::runtime::label_pool::{self, LabelPool};
 use crate::signals::cancel_on_signal;
@@ -24,7 +24,7 @@ const RETRY_INTERVAL: std::time::Duration = std::time::Duration::from_secs(2);
 /// process. Waits for label jobs until the campaign is finished (exit code 0), also while no run is active. On Ctrl-C or
 /// SIGTERM, labels in progress that do not finish within --grace-period return to the queue (exit code 130).
 #[derive(Debug, clap::Args)]
-pub struct Label {
+pub struct LabelArgs {
     /// Store of the campaign: its directory (on the host that runs it), or the postgres:// URL
     #[arg(long, value_name = "LOCATION")]
     store: PathBuf,
@@ -52,10 +52,10 @@ pub struct Label {
     #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(0), value_parser = duration_between("0s", "10000h"))]
     wait_timeout: Duration,
     #[command(flatten)]
-    log: Options,
+    log: LogArgs,
 }
 
-impl Label {
+impl LabelArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         self.log.init("label")?;
         block_on(self.label())?

@@ -15,7 +15,7 @@ use super::{ExitStatus, Failure, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::Config;
 use crate::label_method::{self, MethodConfig};
-use crate::log::Options;
+use crate::log::LogArgs;
 use crate::output::{print, print_json};
 use crate::signals::cancel_on_signal;
 
@@ -25,7 +25,7 @@ use crate::signals::cancel_on_signal;
 /// the cost. Stops at the first failure. Pass the printed core-seconds to `calmwalk estimate --core-seconds` to estimate the
 /// cost of a campaign.
 #[derive(Debug, clap::Args)]
-pub struct LabelFile {
+pub struct LabelFileArgs {
     /// Structures to label: extended XYZ or POSCAR
     #[arg(value_name = "STRUCTURES")]
     structures: PathBuf,
@@ -39,7 +39,7 @@ pub struct LabelFile {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    log: Options,
+    log: LogArgs,
 }
 
 /// A labelled structure, as it is printed.
@@ -68,7 +68,7 @@ struct Labelled {
     core_seconds: f64,
 }
 
-impl LabelFile {
+impl LabelFileArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         self.log.init("label-file")?;
         block_on(async {

@@ -18,9 +18,9 @@ use crate::process_config::{self, LabellerConfig};
 /// or the next run takes it over; if `calmwalk label` is killed, it exits. On SIGTERM it exits after the current label. A
 /// calculation of an external program that needs more than a few seconds keeps running and is left to the next labeller.
 #[derive(Debug, clap::Args)]
-pub struct Labeller {}
+pub struct LabellerArgs {}
 
-impl Labeller {
+impl LabellerArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
         let setup: LabellerConfig = process_config::from_stdin()?;

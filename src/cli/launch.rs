@@ -26,7 +26,7 @@ const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
 /// numbers. Each job checkpoints and exits before its time limit, and is requeued until the campaign is finished. `calmwalk
 /// status` shows the jobs. See docs/slurm.md.
 #[derive(Debug, clap::Args)]
-pub struct Launch {
+pub struct LaunchArgs {
     /// Configuration of the campaign (TOML), on a file system that all nodes share
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
@@ -106,7 +106,7 @@ pub fn job_names(location: &Location) -> JobNames {
     JobNames::new(&blake3::hash(location.as_bytes()).to_hex()[..12])
 }
 
-impl Launch {
+impl LaunchArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let System::Slurm = self.on;
         let directory = self.directory()?;

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use store::{LowerState, LowerStateChange, StateResult, Store, unix_milliseconds};
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{Table, decimals, print, print_json, warn_if_unencrypted};
 
 /// List labels for which a lower magnetic state is known, or replace them by it
@@ -16,9 +16,9 @@ use crate::output::{Table, decimals, print, print_json, warn_if_unencrypted};
 /// With IDs or --all, the lowest result becomes the label of each structure. The old label stays in the store as superseded,
 /// with date and reason. Works while the campaign runs. Changes either all given structures or none.
 #[derive(Debug, clap::Args)]
-pub struct LowerStates {
+pub struct LowerStatesArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Structures to change. Candidates: ids, unique prefixes of ids, or decision numbers; or imported structures, such as import-3
     #[arg(value_name = "ID")]
     ids: Vec<String>,
@@ -33,7 +33,7 @@ pub struct LowerStates {
     json: bool,
 }
 
-impl LowerStates {
+impl LowerStatesArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.all || !self.ids.is_empty() {
             let changes = block_on(self.take())??;

@@ -49,95 +49,95 @@ use crate::exit_status::{ExitStatus, Failure};
 #[command(name = "calmwalk", version, max_term_width = 100)]
 pub struct Arguments {
     #[command(subcommand)]
-    command: Command,
+    command: CliCommand,
 }
 
 // The help text of a command is the documentation of its type.
 #[derive(Debug, Subcommand)]
-enum Command {
-    Init(init::Init),
-    Validate(validate::Validate),
-    Schema(schema::Schema),
-    Estimate(estimate::Estimate),
-    Run(run::Run),
-    Agent(agent::Agent),
-    Label(label::Label),
-    LabelFile(label_file::LabelFile),
-    Launch(launch::Launch),
-    Status(status::Status),
-    Dashboard(dashboard::Dashboard),
-    Watch(watch::Watch),
-    ForceErrors(force_errors::ForceErrors),
-    Queue(queue::Queue),
-    Relabel(relabel::Relabel),
-    Exclude(exclude::Exclude),
-    LowerStates(lower_states::LowerStates),
-    Walks(walks::Walks),
-    Explain(explain::Explain),
-    Export(export::Export),
-    Report(report::Report),
-    Replay(replay::Replay),
+enum CliCommand {
+    Init(init::InitArgs),
+    Validate(validate::ValidateArgs),
+    Schema(schema::SchemaArgs),
+    Estimate(estimate::EstimateArgs),
+    Run(run::RunArgs),
+    Agent(agent::AgentArgs),
+    Label(label::LabelArgs),
+    LabelFile(label_file::LabelFileArgs),
+    Launch(launch::LaunchArgs),
+    Status(status::StatusArgs),
+    Dashboard(dashboard::DashboardArgs),
+    Watch(watch::WatchArgs),
+    ForceErrors(force_errors::ForceErrorsArgs),
+    Queue(queue::QueueArgs),
+    Relabel(relabel::RelabelArgs),
+    Exclude(exclude::ExcludeArgs),
+    LowerStates(lower_states::LowerStatesArgs),
+    Walks(walks::WalksArgs),
+    Explain(explain::ExplainArgs),
+    Export(export::ExportArgs),
+    Report(report::ReportArgs),
+    Replay(replay::ReplayArgs),
     #[command(subcommand)]
-    Calm(calm::Calm),
-    Select(select::Select),
-    Import(import::Import),
-    Store(store::StoreCommand),
-    Md(md::Md),
-    Clean(clean::Clean),
+    Calm(calm::CalmCommand),
+    Select(select::SelectArgs),
+    Import(import::ImportArgs),
+    Store(store::StoreArgs),
+    Md(md::MdArgs),
+    Clean(clean::CleanArgs),
     #[command(hide = true)]
-    Walker(walker::Walker),
+    Walker(walker::WalkerArgs),
     #[command(hide = true)]
-    Labeller(labeller::Labeller),
+    Labeller(labeller::LabellerArgs),
     #[command(hide = true)]
-    CalculationRunner(calculation_runner::CalculationRunner),
+    CalculationRunner(calculation_runner::CalculationRunnerArgs),
 }
 
 /// Runs the command.
 pub fn run(arguments: Arguments) -> Result<ExitStatus, Failure> {
     match arguments.command {
-        Command::Init(command) => command.run(),
-        Command::Validate(command) => command.run(),
-        Command::Schema(command) => command.run(),
-        Command::Estimate(command) => command.run(),
-        Command::Run(command) => command.run(),
-        Command::Agent(command) => command.run(),
-        Command::Label(command) => command.run(),
-        Command::LabelFile(command) => command.run(),
-        Command::Launch(command) => command.run(),
-        Command::Status(command) => command.run(),
-        Command::Dashboard(command) => command.run(),
-        Command::Watch(command) => command.run(),
-        Command::ForceErrors(command) => command.run(),
-        Command::Queue(command) => command.run(),
-        Command::Relabel(command) => command.run(),
-        Command::Exclude(command) => command.run(),
-        Command::LowerStates(command) => command.run(),
-        Command::Walks(command) => command.run(),
-        Command::Explain(command) => command.run(),
-        Command::Export(command) => command.run(),
-        Command::Report(command) => command.run(),
-        Command::Replay(command) => command.run(),
-        Command::Calm(command) => command.run(),
-        Command::Select(command) => command.run(),
-        Command::Import(command) => command.run(),
-        Command::Store(command) => command.run(),
-        Command::Md(command) => command.run(),
-        Command::Clean(command) => command.run(),
-        Command::Walker(command) => command.run(),
-        Command::Labeller(command) => command.run(),
-        Command::CalculationRunner(command) => command.run(),
+        CliCommand::Init(command) => command.run(),
+        CliCommand::Validate(command) => command.run(),
+        CliCommand::Schema(command) => command.run(),
+        CliCommand::Estimate(command) => command.run(),
+        CliCommand::Run(command) => command.run(),
+        CliCommand::Agent(command) => command.run(),
+        CliCommand::Label(command) => command.run(),
+        CliCommand::LabelFile(command) => command.run(),
+        CliCommand::Launch(command) => command.run(),
+        CliCommand::Status(command) => command.run(),
+        CliCommand::Dashboard(command) => command.run(),
+        CliCommand::Watch(command) => command.run(),
+        CliCommand::ForceErrors(command) => command.run(),
+        CliCommand::Queue(command) => command.run(),
+        CliCommand::Relabel(command) => command.run(),
+        CliCommand::Exclude(command) => command.run(),
+        CliCommand::LowerStates(command) => command.run(),
+        CliCommand::Walks(command) => command.run(),
+        CliCommand::Explain(command) => command.run(),
+        CliCommand::Export(command) => command.run(),
+        CliCommand::Report(command) => command.run(),
+        CliCommand::Replay(command) => command.run(),
+        CliCommand::Calm(command) => command.run(),
+        CliCommand::Select(command) => command.run(),
+        CliCommand::Import(command) => command.run(),
+        CliCommand::Store(command) => command.run(),
+        CliCommand::Md(command) => command.run(),
+        CliCommand::Clean(command) => command.run(),
+        CliCommand::Walker(command) => command.run(),
+        CliCommand::Labeller(command) => command.run(),
+        CliCommand::CalculationRunner(command) => command.run(),
     }
 }
 
 /// The argument that names a campaign.
 #[derive(Debug, clap::Args)]
-struct CampaignLocation {
+struct CampaignArgs {
     /// Campaign: its directory, the directory of its configuration, or the postgres:// URL of its store
     #[arg(value_name = "DIR")]
     location: PathBuf,
 }
 
-impl CampaignLocation {
+impl CampaignArgs {
     /// The location is parsed here and not by clap, whose error message would print the password of a URL.
     fn get(&self) -> Result<Location, Failure> {
         campaign_location::parse(&self.location)

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
 use crate::wording;
 
@@ -16,20 +16,20 @@ use crate::wording;
 /// ID is the id of a candidate or a unique prefix of it; its campaign part can be omitted.
 #[derive(Debug, clap::Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
-pub struct Queue {
+pub struct QueueArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     #[command(subcommand)]
-    action: Action,
+    action: QueueCommand,
     /// Print JSON
     #[arg(long, global = true)]
     json: bool,
 }
 
 #[derive(Clone, Debug, PartialEq, clap::Subcommand)]
-pub enum Action {
+pub enum QueueCommand {
     /// List label jobs: running jobs first, then queued ones in the order in which labellers take them, then the rest
-    List(List),
+    List(QueueListArgs),
     /// Show a label job with its attempts and the logs of failed ones
     Show {
         /// Id of the candidate
@@ -66,7 +66,7 @@ pub enum Action {
 }
 
 #[derive(Clone, Debug, PartialEq, clap::Args)]
-pub struct List {
+pub struct QueueListArgs {
     /// List only jobs in this state: queued, leased, labelled, failed, dropped or superseded [default: all]
     #[arg(long, value_parser = parse_state)]
     state: Option<JobState>,
@@ -83,19 +83,19 @@ fn parse_state(name: &str) -> Result<JobState, String> {
         .ok_or_else(|| format!("expected one of {}", JobState::ALL.map(JobState::name).join(", ")))
 }
 
-impl Queue {
+impl QueueArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = &self.location.get()?;
         match &self.action {
-            Action::List(list) => {
+            QueueCommand::List(list) => {
                 let jobs = block_on(read_list(location, list))??;
                 if self.json { print_json(&jobs)? } else { print(|out| write_list(out, &jobs, list))? }
             }
-            Action::Show { id } => {
+            QueueCommand::Show { id } => {
                 let details = block_on(read_details(location, id))??;
                 if self.json { print_json(&details)? } else { print(|out| write_details(out, &details))? }
             }
-            Action::Files { id, output } => {
+            QueueCommand::Files { id, output } => {
                 let written = block_on(files::write(location, id, output))??;
                 if self.json { print_json(&written)? } else { print(|out| write_files(out, &written))? }
             }
@@ -105,7 +105,7 @@ impl Queue {
     }
 
     /// Changes one job after the other, and prints the new state of each.
-    fn change(&self, location: &Location, action: &Action) -> Result<(), Failure> {
+    fn change(&self, location: &Location, action: &QueueCommand) -> Result<(), Failure> {
         let mut changed = Vec::new();
         let result = block_on(change(location, action, &mut changed))?;
         if self.json {
@@ -117,7 +117,7 @@ impl Queue {
     }
 }
 
-async fn read_list(location: &Location, list: &List) -> Result<Vec<Job>, Failure> {
+async fn read_list(location: &Location, list: &QueueListArgs) -> Result<Vec<Job>, Failure> {
     let store = Store::open_read_only(location).await?;
     Ok(store.queue_list(list.state, list.limit, list.offset).await?)
 }
@@ -128,20 +128,24 @@ async fn read_details(location: &Location, id: &str) -> Result<JobDetails, Failu
 }
 
 /// Changes the jobs that `action` names. Appends their new states to `changed`, also those before a failure.
-pub async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) -> Result<(), Failure> {
+pub async fn change(
+    location: &Location,
+    action: &QueueCommand,
+    changed: &mut Vec<Job>,
+) -> Result<(), Failure> {
     let store = Store::open(location).await?;
     let ids = match action {
-        Action::Drop { ids } | Action::Retry { ids } => ids.as_slice(),
-        Action::Show { id } | Action::Prioritise { id, .. } => std::slice::from_ref(id),
-        Action::List(_) | Action::Files { .. } => &[],
+        QueueCommand::Drop { ids } | QueueCommand::Retry { ids } => ids.as_slice(),
+        QueueCommand::Show { id } | QueueCommand::Prioritise { id, .. } => std::slice::from_ref(id),
+        QueueCommand::List(_) | QueueCommand::Files { .. } => &[],
     };
     for id in ids {
         let now = unix_milliseconds();
         let candidate = match action {
-            Action::Drop { .. } => store.drop_job(id, now).await?,
-            Action::Retry { .. } => store.retry_job(id, now).await?,
-            Action::Prioritise { priority, .. } => store.prioritise_job(id, *priority, now).await?,
-            Action::List(_) | Action::Show { .. } | Action::Files { .. } => id.clone(),
+            QueueCommand::Drop { .. } => store.drop_job(id, now).await?,
+            QueueCommand::Retry { .. } => store.retry_job(id, now).await?,
+            QueueCommand::Prioritise { priority, .. } => store.prioritise_job(id, *priority, now).await?,
+            QueueCommand::List(_) | QueueCommand::Show { .. } | QueueCommand::Files { .. } => id.clone(),
         };
         changed.push(store.queue_show(&candidate).await?.job);
     }
@@ -150,11 +154,11 @@ pub async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>
 }
 
 /// The message for a changed job.
-pub fn message(action: &Action, job: &Job) -> String {
+pub fn message(action: &QueueCommand, job: &Job) -> String {
     let Job { candidate, state, priority, .. } = job;
     match action {
-        Action::Drop { .. } => format!("{candidate} is dropped: it will not be labelled or exported"),
-        Action::Prioritise { .. } => format!("{candidate} now has priority {priority}"),
+        QueueCommand::Drop { .. } => format!("{candidate} is dropped: it will not be labelled or exported"),
+        QueueCommand::Prioritise { .. } => format!("{candidate} now has priority {priority}"),
         _ => format!("{candidate} is {state} again"),
     }
 }
@@ -168,7 +172,7 @@ fn state_of(job: &Job) -> String {
     }
 }
 
-fn write_list(out: &mut dyn Write, jobs: &[Job], list: &List) -> io::Result<()> {
+fn write_list(out: &mut dyn Write, jobs: &[Job], list: &QueueListArgs) -> io::Result<()> {
     if jobs.is_empty() {
         let state = list.state.map_or(String::new(), |state| format!("{state} "));
         return match list.offset {

@@ -14,7 +14,7 @@ use store::{CampaignLock, Location, NewProtocol, Protocol, RelabelCounts, Store,
 use self::protocol_change::ProtocolChange;
 use self::selection::Selection;
 use super::campaign_location::shell_argument;
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::filter::Filter;
 use crate::output::{count, print, print_json, warn_if_unencrypted};
 use crate::wording;
@@ -29,9 +29,9 @@ use crate::wording;
 /// calculations are cancelled. The campaign must not be running, and the next `calmwalk run` needs that configuration.
 #[derive(Debug, clap::Args)]
 #[command(group = clap::ArgGroup::new("target").required(true).args(["ids", "all", "condition"]))]
-pub struct Relabel {
+pub struct RelabelArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Candidates to relabel, also those labelled by the current protocol: ids, unique prefixes of ids, or decision numbers
     #[arg(value_name = "ID")]
     ids: Vec<String>,
@@ -72,7 +72,7 @@ struct RelabelReport {
     next: String,
 }
 
-impl Relabel {
+impl RelabelArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let report = block_on(self.relabel())??;
         if self.json {

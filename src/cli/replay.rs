@@ -4,9 +4,11 @@ use std::io::{self, Write};
 
 use store::Store;
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
-use crate::replay::{self, FateChange, FateCounts, MissingFeatures, RelocatedFiles, Report, RuleOverride};
+use crate::replay::{
+    self, FateChange, FateCounts, MissingFeatures, RelocatedFilesArgs, Report, RuleOverride,
+};
 
 /// Changed decisions printed without --json.
 const SHOWN: usize = 20;
@@ -20,20 +22,20 @@ const SHOWN: usize = 20;
 /// that walkers never offered do not appear under a looser rule, walks that would have continued are not continued, and
 /// trajectories do not react to the changed mixture.
 #[derive(Debug, clap::Args)]
-pub struct Replay {
+pub struct ReplayArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Change a configuration key of the selector to a value (TOML), such as collect.criterion.threshold=2.0; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<RuleOverride>,
     #[command(flatten)]
-    moved: RelocatedFiles,
+    moved: RelocatedFilesArgs,
     /// Print JSON, with all changed decisions
     #[arg(long)]
     json: bool,
 }
 
-impl Replay {
+impl ReplayArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let report = block_on(self.replay())??;
         if self.json {

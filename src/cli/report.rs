@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use store::Store;
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{count, print};
 use crate::page::{create_directory, write_files};
 use crate::report::{self, PAGE};
@@ -16,15 +16,15 @@ use crate::report::{self, PAGE};
 /// CSV, and each table as CSV. Works on running and finished campaigns and on backups; the same campaign gives the same bytes.
 /// docs/report.md describes the figures.
 #[derive(Debug, clap::Args)]
-pub struct Report {
+pub struct ReportArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Directory for the files, created if it does not exist; files of an earlier report are replaced
     #[arg(long, short, value_name = "DIR", default_value = "report")]
     output: PathBuf,
 }
 
-impl Report {
+impl ReportArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         // Fail before the long computation.

@@ -44,7 +44,7 @@ use crate::{log, summary, web};
 /// The same command starts a campaign and resumes it after any interruption. Ctrl-C or SIGTERM checkpoints the walks and exits
 /// within seconds (exit code 130); a second signal exits at once.
 #[derive(Debug, clap::Args)]
-pub struct Run {
+pub struct RunArgs {
     /// Configuration of the campaign (TOML)
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
@@ -76,15 +76,15 @@ pub struct Run {
     #[arg(long, value_name = "NAME", requires = "announce")]
     host: Option<String>,
     #[command(flatten)]
-    web: web::ListenAddresses,
+    web: web::ListenArgs,
     #[command(flatten)]
-    log: log::Options,
+    log: log::LogArgs,
     /// How long to wait for another run to release the campaign, such as 15m
     #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(0), value_parser = duration_between("0s", "10000h"))]
     wait_timeout: Duration,
 }
 
-impl Run {
+impl RunArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         self.log.init("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;

@@ -8,9 +8,9 @@ use crate::output::print;
 ///
 /// With the schema, an editor completes and checks campaign files. docs/configuration.md describes how.
 #[derive(Debug, clap::Args)]
-pub struct Schema {}
+pub struct SchemaArgs {}
 
-impl Schema {
+impl SchemaArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         print(|out| out.write_all(schema_text().as_bytes()))?;
         Ok(ExitStatus::Done)

@@ -19,7 +19,7 @@ use crate::selection::{
     pick,
 };
 use crate::signals::stop_token;
-use crate::structure_files::ReadingArguments;
+use crate::structure_files::StructureReadingArgs;
 
 /// Select structures for labelling from a pool
 ///
@@ -41,7 +41,7 @@ use crate::structure_files::ReadingArguments;
 /// source_frame (from 0), or campaign, candidate_id and fate. `calmwalk import --queue` brings them into a campaign for labelling. Reads
 /// files twice and keeps the features of atoms within the window only; see docs/select.md.
 #[derive(Debug, clap::Args)]
-pub struct Select {
+pub struct SelectArgs {
     /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
@@ -53,7 +53,7 @@ pub struct Select {
     #[arg(value_name = "POOL", required_unless_present = "campaign")]
     pool: Vec<PathBuf>,
     #[command(flatten)]
-    reading: ReadingArguments,
+    reading: StructureReadingArgs,
     /// Also the candidates of a campaign's biased walks: its directory or the postgres:// URL of its store; may be repeated. Stored
     /// features are used where the store has them
     #[arg(long, value_name = "DIR")]
@@ -101,7 +101,7 @@ pub struct Select {
     json: bool,
 }
 
-impl Select {
+impl SelectArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (parts, window, target) = (self.parts()?, self.window()?, self.target()?);
         let files = self.reading.files(&self.pool)?;
@@ -246,7 +246,7 @@ fn all_cores() -> usize {
 
 /// What is said of a selection.
 struct Report<'a> {
-    command: &'a Select,
+    command: &'a SelectArgs,
     model: &'a GraceModel,
     files: &'a PoolFiles,
     pool: &'a GradedPool,

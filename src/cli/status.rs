@@ -17,12 +17,12 @@ use monitor::expected_end::ExpectedEnd;
 use monitor::label_cost::SECONDS_PER_HOUR;
 use monitor::reference_check::ReferenceCheck;
 use monitor::walk_ends::WalkEnds;
-use store::{Candidates, Location, Status as CampaignStatus, Store, unix_milliseconds};
+use store::{Candidates, Location, Status, Store, unix_milliseconds};
 
 use self::batch_jobs::BatchJobs;
 use self::page::{Page, cut};
 pub use self::processes::state;
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{count, decimals, print, print_json};
 use crate::wording::cost::two_digits;
 use crate::wording::disk::megabytes;
@@ -33,9 +33,9 @@ use crate::wording::{budget, reference_check, walk_ends};
 /// Shows walks, mixture, label queue, costs, processes and the expected end. Works on running and finished campaigns and on
 /// backups. docs/status.md describes the JSON output.
 #[derive(Debug, clap::Args)]
-pub struct Status {
+pub struct StatusArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -47,7 +47,7 @@ pub struct Status {
     walks: Option<usize>,
 }
 
-impl Status {
+impl StatusArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         let snapshot = block_on(read(&location))??;
@@ -145,7 +145,7 @@ fn write_check(out: &mut dyn Write, page: &Page, check: &ReferenceCheck) -> io::
     reference_check::table(check).lines().try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
 }
 
-fn describe_disk(disk: &DiskUse, page: &Page, status: &CampaignStatus) -> String {
+fn describe_disk(disk: &DiskUse, page: &Page, status: &Status) -> String {
     let now = megabytes(disk.bytes);
     let Some((forecast, end)) = disk.forecast.zip(disk.at_the_end(status)) else {
         return format!("{now} now");
@@ -171,7 +171,7 @@ pub fn expected_end(end: &ExpectedEnd) -> Option<String> {
     Some(format!("expected within {hours} h ({})", parts.join(", ")))
 }
 
-fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
+fn describe_walks(status: &Status, ends: &WalkEnds) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let state = if status.led { "running" } else { "unfinished" };
     let ended = match ends.ended() {

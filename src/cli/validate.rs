@@ -27,7 +27,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// not change the exit code. Grades every seed structure under the original mixture, measures a few steps on this host to
 /// estimate the time of walks, and shows the worst seed structures.
 #[derive(Debug, clap::Args)]
-pub struct Validate {
+pub struct ValidateArgs {
     /// Configuration of a campaign (TOML)
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
@@ -39,7 +39,7 @@ pub struct Validate {
     csv: Option<PathBuf>,
 }
 
-impl Validate {
+impl ValidateArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();

@@ -16,9 +16,9 @@ use crate::{log, signals};
 ///
 /// Reads its settings from standard input. Exits with the process that started it, and on SIGTERM after the current step.
 #[derive(Debug, clap::Args)]
-pub struct Walker {}
+pub struct WalkerArgs {}
 
-impl Walker {
+impl WalkerArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let setup: WalkerConfig = process_config::from_stdin()?;
         log::init(setup.log.clone(), "walker", Some(setup.door.walker()))?;

@@ -3,7 +3,7 @@
 use store::{Location, Store, unix_milliseconds};
 use wire::WalkId;
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::print;
 
 /// Pause or resume walks
@@ -13,23 +13,23 @@ use crate::output::print;
 /// not depend on when a walk was paused.
 #[derive(Debug, clap::Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
-pub struct Walks {
+pub struct WalksArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     #[command(subcommand)]
-    action: Action,
+    action: WalksCommand,
 }
 
 #[derive(Clone, Debug, PartialEq, clap::Subcommand)]
-pub enum Action {
+pub enum WalksCommand {
     /// Pause walks
-    Pause(WalkSelection),
+    Pause(WalkSelectionArgs),
     /// Resume paused walks
-    Resume(WalkSelection),
+    Resume(WalkSelectionArgs),
 }
 
 #[derive(Clone, Debug, PartialEq, clap::Args)]
-pub struct WalkSelection {
+pub struct WalkSelectionArgs {
     /// Numbers of the walks, as in calmwalk status
     #[arg(value_name = "WALK", required_unless_present = "all", conflicts_with = "all", value_parser = walk_number)]
     pub walks: Vec<u32>,
@@ -38,7 +38,7 @@ pub struct WalkSelection {
     pub all: bool,
 }
 
-impl Walks {
+impl WalksArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         let messages = block_on(change(&location, &self.action))??;
@@ -48,10 +48,10 @@ impl Walks {
 }
 
 /// Pauses or resumes walks. Returns messages.
-pub async fn change(location: &Location, action: &Action) -> Result<Vec<String>, Failure> {
+pub async fn change(location: &Location, action: &WalksCommand) -> Result<Vec<String>, Failure> {
     let (selection, paused) = match action {
-        Action::Pause(selection) => (selection, true),
-        Action::Resume(selection) => (selection, false),
+        WalksCommand::Pause(selection) => (selection, true),
+        WalksCommand::Resume(selection) => (selection, false),
     };
     let store = Store::open(location).await?;
     let walks = match selection.all {

@@ -21,7 +21,7 @@ use crate::exit_status::Failure;
 use crate::output::Bar;
 
 pub use overrides::RuleOverride;
-pub use relocated::{ARTIFACT, MODEL, RelocatedFiles, find_one};
+pub use relocated::{ARTIFACT, MODEL, RelocatedFilesArgs, find_one};
 pub use report::{FateChange, FateCounts, MissingFeatures, Report};
 pub use version::mixture_of;
 
@@ -31,7 +31,7 @@ const BAR: &str = "{bar:32} {pos}/{len} decisions  {eta} left";
 pub async fn replay(
     store: &Store,
     settings: &[RuleOverride],
-    moved: &RelocatedFiles,
+    moved: &RelocatedFilesArgs,
 ) -> Result<Report, Failure> {
     let begun = Instant::now();
     let campaign = store.campaign().await?;

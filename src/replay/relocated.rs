@@ -14,7 +14,7 @@ const TRAINING_FRAMES: &str = "calm.training_frames";
 
 /// Files that are not where the campaign last found them.
 #[derive(Clone, Debug, Default, clap::Args)]
-pub struct RelocatedFiles {
+pub struct RelocatedFilesArgs {
     /// Path of the model file, if it is no longer where the last run found it
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
@@ -32,7 +32,7 @@ pub fn find(
     config: &mut Config,
     resolved: &Value,
     found: &Value,
-    moved: &RelocatedFiles,
+    moved: &RelocatedFilesArgs,
 ) -> Result<(), Failure> {
     let calm = &mut config.calm;
     let files = [
@@ -53,7 +53,7 @@ pub fn find_one(
     key: &str,
     resolved: &Value,
     found: &Value,
-    moved: &RelocatedFiles,
+    moved: &RelocatedFilesArgs,
 ) -> Result<PathBuf, Failure> {
     let (option, moved) = match key {
         MODEL => ("--model", &moved.model),

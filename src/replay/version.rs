@@ -6,7 +6,7 @@ use calm::Mixture;
 use store::Store;
 
 use super::report::{MissingFeatures, Report};
-use super::{BAR, RelocatedFiles, follow, is_other_processor, open, overrides, relocated, resolved};
+use super::{BAR, RelocatedFilesArgs, follow, is_other_processor, open, overrides, relocated, resolved};
 use crate::exit_status::Failure;
 use crate::output::Bar;
 
@@ -17,7 +17,7 @@ use crate::output::Bar;
 pub async fn mixture_of(
     store: &Store,
     version: u64,
-    moved: &RelocatedFiles,
+    moved: &RelocatedFilesArgs,
 ) -> Result<Arc<Mixture>, Failure> {
     let campaign = store.campaign().await?;
     let resolved = resolved(&campaign)?;

@@ -14,18 +14,18 @@ const PROPERTIES: [&str; 5] = ["atoms", "element", "energy", "energy_per_atom", 
 
 /// Where structures come from.
 #[derive(Debug, Clone, clap::Args)]
-pub struct StructureArguments {
+pub struct StructureArgs {
     /// Structures: extended XYZ (.extxyz, .xyz), POSCAR (.poscar, .vasp, POSCAR*, CONTCAR*) or text dumps of LAMMPS (.dump,
     /// .lammpstrj, dump.*), each also with .gz or .zst
     #[arg(value_name = "DATA", required = true)]
     data: Vec<PathBuf>,
     #[command(flatten)]
-    reading: ReadingArguments,
+    reading: StructureReadingArgs,
 }
 
 /// How files of structures are read.
 #[derive(Debug, Clone, clap::Args)]
-pub struct ReadingArguments {
+pub struct StructureReadingArgs {
     /// Use only structures that match FILTER, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
     /// and of labels energy, energy_per_atom (eV), max_force (eV/Å)
     #[arg(long = "where", value_name = "FILTER")]
@@ -35,17 +35,17 @@ pub struct ReadingArguments {
     dump_elements: Vec<Species>,
 }
 
-impl StructureArguments {
+impl StructureArgs {
     /// The files in the order given, all with weight 1.
     ///
     /// # Errors
-    /// Those of [`ReadingArguments::files`].
+    /// Those of [`StructureReadingArgs::files`].
     pub fn files(&self) -> Result<StructureFiles, Failure> {
         self.reading.files(&self.data)
     }
 }
 
-impl ReadingArguments {
+impl StructureReadingArgs {
     /// These files in the order given, all with weight 1.
     ///
     /// # Errors

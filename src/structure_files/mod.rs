@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicU64;
 
 use atoms::Species;
 
-pub use self::arguments::{ReadingArguments, StructureArguments};
+pub use self::arguments::{StructureArgs, StructureReadingArgs};
 pub use self::reader::{Place, StructureReader};
 use crate::exit_status::Failure;
 use crate::filter::Filter;

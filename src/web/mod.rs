@@ -23,7 +23,7 @@ use crate::output::{log_and_print, print_stderr};
 
 /// Options for the addresses to serve on.
 #[derive(Debug, clap::Args)]
-pub struct ListenAddresses {
+pub struct ListenArgs {
     /// Serve the dashboard to web browsers at this address, such as 127.0.0.1:8080 (docs/dashboard.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     dashboard: Option<SocketAddr>,
@@ -74,7 +74,7 @@ impl Drop for RunningServers {
     }
 }
 
-impl ListenAddresses {
+impl ListenArgs {
     /// Binds the addresses before any work begins.
     pub async fn listen(&self) -> Result<BoundListeners, Failure> {
         let (mut dashboard, mut metrics) = (None, None);

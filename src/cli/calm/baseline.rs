@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use calm::baselines::{Baseline as Score, BaselineFile, BaselineSettings, Builder, Kind};
+use calm::baselines::{Baseline, BaselineFile, BaselineSettings, Builder, Kind};
 use calm::{Artifact, Mixture};
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
@@ -16,7 +16,7 @@ use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, Table, print, print_stderr};
 use crate::signals::stop_token;
-use crate::structure_files::{Place, StructureArguments, StructureFiles};
+use crate::structure_files::{Place, StructureArgs, StructureFiles};
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
@@ -28,7 +28,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// Components (d-optimality-centred, d-optimality-component, euclidean, likelihood) are those of the artifact, or of the mixture in
 /// the model file; likelihood needs an artifact.
 #[derive(Debug, clap::Args)]
-pub struct Baseline {
+pub struct CalmBaselineArgs {
     /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
@@ -39,7 +39,7 @@ pub struct Baseline {
     #[arg(long, value_name = "VARIANT")]
     feature_variant: Option<FeatureVariant>,
     #[command(flatten)]
-    data: StructureArguments,
+    data: StructureArgs,
     /// Kind of score, may be repeated: d-optimality-element, d-optimality-centred, d-optimality-component, llpr, llpr-sum,
     /// llpr-forces, euclidean, k-nearest, likelihood
     #[arg(long, required = true, value_name = "KIND", value_delimiter = ',')]
@@ -48,12 +48,12 @@ pub struct Baseline {
     #[arg(long, short, value_name = "BASELINES.npz")]
     output: PathBuf,
     #[command(flatten)]
-    settings: Settings,
+    settings: BaselineSettingsArgs,
 }
 
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Settings")]
-struct Settings {
+struct BaselineSettingsArgs {
     /// D-optimality: how much the score of a training atom may exceed 1
     #[arg(long, value_name = "X", default_value_t = BaselineSettings::default().tolerance)]
     tolerance: f64,
@@ -80,7 +80,7 @@ struct Settings {
     rng_seed: u64,
 }
 
-impl Settings {
+impl BaselineSettingsArgs {
     fn get(&self) -> BaselineSettings {
         BaselineSettings {
             tolerance: self.tolerance,
@@ -95,7 +95,7 @@ impl Settings {
     }
 }
 
-impl Baseline {
+impl CalmBaselineArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let files = self.data.files()?;
         self.protect_inputs(&files)?;
@@ -226,7 +226,7 @@ fn report(file: &BaselineFile, output: &Path) -> Result<(), Failure> {
     for baseline in &file.baselines {
         let (kind, dimension) = (baseline.kind().to_string(), baseline.dimension().to_string());
         let [sets, rows, remark] = match baseline {
-            Score::DOptimality(found) => {
+            Baseline::DOptimality(found) => {
                 let ranks: Vec<usize> = found.ranks().into_iter().filter(|rank| *rank > 0).collect();
                 let (least, most) = (ranks.iter().min(), ranks.iter().max());
                 let rows = match (least, most) {

@@ -18,7 +18,7 @@ use crate::file_hash;
 use crate::mixture_build::{self, Part, Work};
 use crate::output::{Table, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
-use crate::structure_files::{StructureArguments, StructureFiles};
+use crate::structure_files::{StructureArgs, StructureFiles};
 
 /// Projected features of a model without a projection, as in the paper.
 const PROJECTED: usize = 128;
@@ -36,12 +36,12 @@ const PROJECTED: usize = 128;
 /// Keeps its state in CALM.npz.build until the artifact is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same
 /// command continues from the last finished shards.
 #[derive(Debug, clap::Args)]
-pub struct Build {
+pub struct CalmBuildArgs {
     /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
     #[command(flatten)]
-    data: StructureArguments,
+    data: StructureArgs,
     /// File for the artifact; an existing file is replaced at the end
     #[arg(long, short, value_name = "CALM.npz")]
     output: PathBuf,
@@ -81,7 +81,7 @@ pub struct Build {
     part: Option<Part>,
 }
 
-impl Build {
+impl CalmBuildArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let outputs: Vec<&Path> =
             std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path).collect();

@@ -13,7 +13,7 @@ use crate::artifact_checks::load_artifact;
 use crate::cli::{ExitStatus, Failure};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, Table, decimals, print, print_json};
-use crate::structure_files::{Place, StructureArguments};
+use crate::structure_files::{Place, StructureArgs};
 
 /// Atoms of each element whose grades are kept for quantiles and ranks.
 const SAMPLED: usize = 50_000;
@@ -26,7 +26,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// only one of them, and the rank correlation ρ of the two grades (Spearman). Shares count every atom; quantiles and ρ come from a sample of
 /// 50,000 atoms at most.
 #[derive(Debug, clap::Args)]
-pub struct Compare {
+pub struct CalmCompareArgs {
     /// GRACE model (kokkos.npz) that both artifacts belong to
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
@@ -37,7 +37,7 @@ pub struct Compare {
     #[arg(value_name = "B.npz")]
     second: PathBuf,
     #[command(flatten)]
-    data: StructureArguments,
+    data: StructureArgs,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -67,7 +67,7 @@ struct Comparison {
     rank_correlation: Option<f64>,
 }
 
-impl Compare {
+impl CalmCompareArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let model = GraceModel::load(&self.model).map_err(Failure::input)?;
         let (model, first) = load_artifact(model, &self.first).map_err(Failure::Input)?;

@@ -10,9 +10,9 @@ use store::Store;
 
 use super::recalibrate::open;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::cli::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::cli::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{count, print};
-use crate::replay::{self, RelocatedFiles};
+use crate::replay::{self, RelocatedFilesArgs};
 
 /// Write the mixture of a campaign, at any version, as a CALM artifact
 ///
@@ -23,9 +23,9 @@ use crate::replay::{self, RelocatedFiles};
 /// The store has the newest version. Earlier ones are computed from the stored candidates, as by calmwalk replay. Version 0 is the
 /// original mixture. Numbers are rounded to single precision, as in every artifact.
 #[derive(Debug, clap::Args)]
-pub struct Export {
+pub struct CalmExportArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Version of the mixture, as in the decision log [default: the newest]
     #[arg(long, value_name = "V")]
     version: Option<u64>,
@@ -36,7 +36,7 @@ pub struct Export {
     #[arg(long, value_name = "MODEL.npz")]
     embed: Option<PathBuf>,
     #[command(flatten)]
-    moved: RelocatedFiles,
+    moved: RelocatedFilesArgs,
 }
 
 /// A version of a campaign's mixture and the files that it belongs to.
@@ -50,7 +50,7 @@ struct Version {
     mixture: Arc<Mixture>,
 }
 
-impl Export {
+impl CalmExportArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let found = block_on(self.read())??;
         let updated = UpdatedMixture::new(&found.artifact, &found.original.mixture, &found.mixture);

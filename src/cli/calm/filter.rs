@@ -22,7 +22,7 @@ const RESOLUTION: f64 = 300.0;
 ///
 /// The table is a CSV file (commas, titles in the first row) with one row for each structure. Errors have the unit of the table.
 #[derive(Debug, clap::Args)]
-pub struct Filter {
+pub struct CalmFilterArgs {
     /// Table with one row for each structure
     #[arg(value_name = "TABLE.csv")]
     table: PathBuf,
@@ -78,7 +78,7 @@ fn finite(text: &str) -> Result<f64, String> {
     number.ok_or_else(|| "expected a finite number".to_owned())
 }
 
-impl Filter {
+impl CalmFilterArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let is_png = self.figure.as_deref().map(is_png).transpose()?;
         for output in self.csv.iter().chain(&self.figure) {

@@ -19,7 +19,7 @@ const SHOWN: usize = 40;
 ///
 /// Detects the type of the file from its contents.
 #[derive(Debug, clap::Args)]
-pub struct Info {
+pub struct CalmInfoArgs {
     /// GRACE model (kokkos.npz) or CALM artifact (gmm_artifacts.npz)
     #[arg(value_name = "MODEL_OR_ARTIFACT")]
     file: PathBuf,
@@ -105,7 +105,7 @@ struct ComponentInfo {
     truncated: Option<u32>,
 }
 
-impl Info {
+impl CalmInfoArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let content = inspect(&self.file)?;
         if self.json {

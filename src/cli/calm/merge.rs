@@ -18,7 +18,7 @@ use crate::output::print;
 /// Run it when all parts of a pass are done: after pass 1 it finds the components, after pass 2 their covariances, and after pass 3
 /// it writes the artifact. The result is that of a build by one process, whatever the number of parts.
 #[derive(Debug, clap::Args)]
-pub struct Merge {
+pub struct CalmMergeArgs {
     /// GRACE model (kokkos.npz) of the build
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
@@ -33,7 +33,7 @@ pub struct Merge {
     feature_variant: Option<FeatureVariant>,
 }
 
-impl Merge {
+impl CalmMergeArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         for output in std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path) {
             refuse_to_replace(output, [(self.model.as_path(), "the model")])?;

@@ -21,20 +21,20 @@ use super::{ExitStatus, Failure};
 
 /// Build, recalibrate, compare, export, inspect and test CALM mixtures and baselines; grade structures, and judge grades by errors
 #[derive(Debug, clap::Subcommand)]
-pub enum Calm {
-    Baseline(baseline::Baseline),
-    Build(build::Build),
-    Compare(compare::Compare),
-    Export(export::Export),
-    Filter(filter::Filter),
-    Info(info::Info),
-    Merge(merge::Merge),
-    Recalibrate(recalibrate::Recalibrate),
-    Score(score::Score),
-    Validate(validate::Validate),
+pub enum CalmCommand {
+    Baseline(baseline::CalmBaselineArgs),
+    Build(build::CalmBuildArgs),
+    Compare(compare::CalmCompareArgs),
+    Export(export::CalmExportArgs),
+    Filter(filter::CalmFilterArgs),
+    Info(info::CalmInfoArgs),
+    Merge(merge::CalmMergeArgs),
+    Recalibrate(recalibrate::CalmRecalibrateArgs),
+    Score(score::CalmScoreArgs),
+    Validate(validate::CalmValidateArgs),
 }
 
-impl Calm {
+impl CalmCommand {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         match self {
             Self::Baseline(command) => command.run(),

@@ -18,7 +18,7 @@ use crate::output::{Table, print};
 /// component's training atoms, as `calm build` sets it. With --percentile, it is a quantile of σ. Components with too few training
 /// atoms get the largest reliable threshold of their element.
 #[derive(Debug, clap::Args)]
-pub struct Recalibrate {
+pub struct CalmRecalibrateArgs {
     /// CALM artifact (gmm_artifacts.npz)
     #[arg(value_name = "CALM.npz")]
     artifact: PathBuf,
@@ -36,7 +36,7 @@ pub struct Recalibrate {
     embed: Option<PathBuf>,
 }
 
-impl Recalibrate {
+impl CalmRecalibrateArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let outputs = || std::iter::once(&self.output).chain(&self.embed);
         let inputs = || {

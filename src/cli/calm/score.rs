@@ -42,7 +42,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// If frames have labels, also prints the errors of the model, and how well γ and γ_nbr of an atom tell large force errors:
 /// Spearman's ρ, ROC-AUC, what γ ≤ 1 keeps, and quantiles by bins of γ, with intervals by bootstrap over structures.
 #[derive(Debug, clap::Args)]
-pub struct Score {
+pub struct CalmScoreArgs {
     /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
@@ -80,7 +80,7 @@ pub struct Score {
     table: Option<PathBuf>,
 }
 
-impl Score {
+impl CalmScoreArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         for output in self.json.iter().chain(&self.table) {
             let inputs = [(self.model.as_path(), "the model"), (self.input.as_path(), "the input")];

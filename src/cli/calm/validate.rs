@@ -38,7 +38,7 @@ const MIXED: usize = 4;
 ///
 /// (calmwalk validate checks the configuration of a campaign.)
 #[derive(Debug, clap::Args)]
-pub struct Validate {
+pub struct CalmValidateArgs {
     /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
@@ -79,7 +79,7 @@ pub struct Validate {
     rng_seed: u64,
 }
 
-impl Validate {
+impl CalmValidateArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
         let (model, mixture) = (features.model.clone(), Arc::new(artifact.mixture));

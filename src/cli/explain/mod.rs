@@ -11,7 +11,7 @@ use monitor::candidate_details::{
 };
 use store::{Location, Store};
 
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::output::{count, decimals, print, print_json};
 
 /// Indent of lines without a title.
@@ -26,9 +26,9 @@ const SHOWN: usize = 20;
 /// potential, and the later candidates that it covered. For control frames and imported structures, shows what is
 /// recorded. Works while the campaign runs and on backups.
 #[derive(Debug, clap::Args)]
-pub struct Explain {
+pub struct ExplainArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Candidate: its id or a unique prefix of it (the campaign part can be omitted), or the number of its decision; or
     /// import-N for an imported structure
     id: String,
@@ -37,7 +37,7 @@ pub struct Explain {
     json: bool,
 }
 
-impl Explain {
+impl ExplainArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let details = block_on(read(self.location.get()?, &self.id))??;
         if self.json {

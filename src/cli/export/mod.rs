@@ -12,7 +12,7 @@ use store::records::Protocol;
 use store::{DATABASE, ExportCursor, ExportFilter, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
-use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, ExitStatus, Failure, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::filter::Filter;
 use crate::output::{self, Bar, print};
@@ -32,9 +32,9 @@ const BAR: &str = "{spinner} {pos} structures";
 /// the cell, μ_B) and per atom magmoms (μ_B). Fails without writing a file if the database is damaged or incomplete. See
 /// docs/export.md.
 #[derive(Debug, clap::Args)]
-pub struct Export {
+pub struct ExportArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// File to write; an existing file is replaced once the export is complete
     #[arg(long, short, value_name = "FILE.extxyz")]
     output: PathBuf,
@@ -135,7 +135,7 @@ async fn check_completeness(
     )))
 }
 
-impl Export {
+impl ExportArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let Exported { counts, labels, others } = block_on(self.export())??;
         for (path, count, _) in &counts {

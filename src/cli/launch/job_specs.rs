@@ -8,7 +8,7 @@ use orchestrator::slurm::{DesiredJobs, Job, JobNames, JobOptions, JobPhase, Plan
 use wire::net::Tls;
 
 use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
-use super::{FOLDER, Launch, absolute};
+use super::{FOLDER, LaunchArgs, absolute};
 use crate::atomic_file::cannot_write;
 use crate::campaign::Campaign;
 use crate::exit_status::Failure;
@@ -31,7 +31,7 @@ pub struct JobSpecs {
 
 impl JobSpecs {
     pub fn new(
-        launch: &Launch,
+        launch: &LaunchArgs,
         campaign: &Campaign,
         directory: &Path,
         wanted: DesiredJobs,
@@ -147,7 +147,7 @@ impl JobSpecs {
 }
 
 /// Options of `sbatch` for every job.
-fn options(launch: &Launch) -> Vec<String> {
+fn options(launch: &LaunchArgs) -> Vec<String> {
     let named = [("time", &launch.time), ("partition", &launch.partition), ("account", &launch.account)];
     let named = named.iter().filter_map(|(name, value)| Some(format!("--{name}={}", value.as_ref()?)));
     named.chain(launch.options.iter().cloned()).collect()
@@ -155,7 +155,7 @@ fn options(launch: &Launch) -> Vec<String> {
 
 /// The commands that the jobs run, quoted for a shell.
 struct Commands<'a> {
-    launch: &'a Launch,
+    launch: &'a LaunchArgs,
     program: String,
     config: String,
     directory: String,
@@ -166,7 +166,7 @@ struct Commands<'a> {
 }
 
 impl<'a> Commands<'a> {
-    fn new(launch: &'a Launch, campaign: &'a Campaign, directory: &Path) -> Result<Self, Failure> {
+    fn new(launch: &'a LaunchArgs, campaign: &'a Campaign, directory: &Path) -> Result<Self, Failure> {
         Ok(Self {
             launch,
             program: text(&std::env::current_exe().map_err(Failure::failed)?)?,

@@ -25,7 +25,7 @@ const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 /// part), momenta (in the units of ASE), step, time_fs and temperature (K; 3n − 3 degrees of freedom if the momentum is
 /// conserved, 3n with Langevin). On Ctrl-C or SIGTERM, writes the last step and exits.
 #[derive(Debug, clap::Args)]
-pub struct Md {
+pub struct MdArgs {
     /// Configuration (TOML): structure, [potential], [dynamics], [output]; see configs/md-aluminium.toml
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
@@ -34,7 +34,7 @@ pub struct Md {
     output: Option<PathBuf>,
 }
 
-impl Md {
+impl MdArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (config, start, mut potential) = MdConfig::load(&self.config)?;
         let path = self.output.unwrap_or_else(|| config.output.trajectory.clone());

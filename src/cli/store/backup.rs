@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use store::{DATABASE, Store, unix_milliseconds};
 
-use super::{CampaignLocation, ExitStatus, Failure};
+use super::{CampaignArgs, ExitStatus, Failure};
 use crate::cli::block_on;
 use crate::output::{Bar, print};
 use crate::wording::disk::megabytes;
@@ -17,15 +17,15 @@ const BAR: &str = "copying {bar:32} {percent} %  {eta} left";
 /// and other commands read it, and run can resume it (remove run.store from the configuration). It is a consistent snapshot,
 /// and appears only when it is complete and on disk.
 #[derive(Debug, clap::Args)]
-pub struct Backup {
+pub struct StoreBackupArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Directory of the backup; it must not exist
     #[arg(value_name = "TARGET")]
     target: PathBuf,
 }
 
-impl Backup {
+impl StoreBackupArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         block_on(self.backup())??;
         let target = self.target.display();

@@ -3,7 +3,7 @@
 use calm::Component;
 use store::{ComponentRecord, Finding, Store, StoreError};
 
-use super::{CampaignLocation, ExitStatus, Failure};
+use super::{CampaignArgs, ExitStatus, Failure};
 use crate::cli::block_on;
 use crate::output::{Bar, print};
 
@@ -17,12 +17,12 @@ const BAR: &str = "checking {bar:32} {pos}/{len} rows  {eta} left";
 /// Only reads, also while the campaign runs. Prints each finding with its meaning and remedy; the exit code is 1 if there are
 /// any.
 #[derive(Debug, clap::Args)]
-pub struct Check {
+pub struct StoreCheckArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
 }
 
-impl Check {
+impl StoreCheckArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (findings, rows) = block_on(self.check())??;
         print(|out| {

@@ -2,7 +2,7 @@
 
 use store::{CampaignLock, Store, unix_milliseconds};
 
-use super::{CampaignLocation, ExitStatus, Failure};
+use super::{CampaignArgs, ExitStatus, Failure};
 use crate::cli::block_on;
 use crate::output::{log_and_print, print};
 use crate::wording::disk::megabytes;
@@ -11,15 +11,15 @@ use crate::wording::disk::megabytes;
 ///
 /// The campaign must not be running. Rewrites the database, which temporarily needs disk space for a copy of it.
 #[derive(Debug, clap::Args)]
-pub struct Compact {
+pub struct StoreCompactArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Also delete the feature vectors of declined candidates; `calmwalk replay --set` then stops at the first of them
     #[arg(long)]
     drop_declined_features: bool,
 }
 
-impl Compact {
+impl StoreCompactArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let (before, after) = block_on(self.compact())??;
         print(|out| writeln!(out, "{} before, {} after", megabytes(before), megabytes(after)))?;

@@ -4,29 +4,29 @@ mod backup;
 mod check;
 mod compact;
 
-use super::{CampaignLocation, ExitStatus, Failure};
+use super::{CampaignArgs, ExitStatus, Failure};
 
 /// Check, back up or compact the store of a campaign
 #[derive(Debug, clap::Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
-pub struct StoreCommand {
+pub struct StoreArgs {
     #[command(subcommand)]
-    action: Action,
+    action: StoreCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Action {
-    Check(check::Check),
-    Backup(backup::Backup),
-    Compact(compact::Compact),
+enum StoreCommand {
+    Check(check::StoreCheckArgs),
+    Backup(backup::StoreBackupArgs),
+    Compact(compact::StoreCompactArgs),
 }
 
-impl StoreCommand {
+impl StoreArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         match self.action {
-            Action::Check(command) => command.run(),
-            Action::Backup(command) => command.run(),
-            Action::Compact(command) => command.run(),
+            StoreCommand::Check(command) => command.run(),
+            StoreCommand::Backup(command) => command.run(),
+            StoreCommand::Compact(command) => command.run(),
         }
     }
 }

@@ -7,9 +7,9 @@ use super::super::ExitStatus;
 use super::entries::{UNKNOWN_QUANTITIES, without_campaign};
 use super::messages::Request;
 use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, Text, WALKS, WatchState};
-use crate::cli::queue::Action as QueueAction;
+use crate::cli::queue::QueueCommand;
 use crate::cli::status;
-use crate::cli::walks::{Action as WalksAction, WalkSelection};
+use crate::cli::walks::{WalkSelectionArgs, WalksCommand};
 use crate::filter::Filter;
 
 /// The text of F1.
@@ -131,8 +131,8 @@ impl WatchState {
             self.message = Some(Message::Error("no walk is selected".into()));
             return None;
         }
-        let selection = WalkSelection { walks, all };
-        let action = if pauses { WalksAction::Pause(selection) } else { WalksAction::Resume(selection) };
+        let selection = WalkSelectionArgs { walks, all };
+        let action = if pauses { WalksCommand::Pause(selection) } else { WalksCommand::Resume(selection) };
         let request = Request::Walks(action);
         if !all {
             return Some(request);
@@ -153,14 +153,14 @@ impl WatchState {
         self.mode = match code {
             KeyCode::Char('d') => Mode::Confirm(
                 format!("drop {short} ({state})? It will not be labelled or exported"),
-                Request::Queue(QueueAction::Drop { ids: vec![id] }),
+                Request::Queue(QueueCommand::Drop { ids: vec![id] }),
             ),
             KeyCode::Char('=') => {
                 Mode::Prompt(Prompt { kind: PromptKind::Priority(id), text: priority.to_string() })
             }
             _ if is_over => Mode::Confirm(
                 format!("queue {short} ({state}) again?"),
-                Request::Queue(QueueAction::Retry { ids: vec![id] }),
+                Request::Queue(QueueCommand::Retry { ids: vec![id] }),
             ),
             _ => {
                 let message = format!(
@@ -215,7 +215,7 @@ impl WatchState {
             },
             PromptKind::Priority(id) => match text.parse() {
                 Ok(priority) => {
-                    return Some(Request::Queue(QueueAction::Prioritise { id: id.clone(), priority }));
+                    return Some(Request::Queue(QueueCommand::Prioritise { id: id.clone(), priority }));
                 }
                 Err(_) => format!("'{text}' is not a priority: expected an integer (larger values first)"),
             },

@@ -3,8 +3,8 @@
 use monitor::Snapshot;
 use store::{Job, JobState, RecentDecision};
 
-use crate::cli::queue::Action as QueueAction;
-use crate::cli::walks::Action as WalksAction;
+use crate::cli::queue::QueueCommand;
+use crate::cli::walks::WalksCommand;
 use crate::exit_status::ExitStatus;
 
 /// Number of newest decisions kept, for charts and filters.
@@ -59,9 +59,9 @@ pub enum Request {
     /// Read the history of a candidate.
     Explain(String),
     /// Change label jobs.
-    Queue(QueueAction),
+    Queue(QueueCommand),
     /// Pause or resume walks.
-    Walks(WalksAction),
+    Walks(WalksCommand),
 }
 
 /// The result of a request, as text.

@@ -26,7 +26,7 @@ use self::messages::{Completed, JobView, Request};
 use self::reader::{Poller, Reader};
 use self::screen::Screen;
 use self::state::WatchState;
-use super::{CampaignLocation, ExitStatus, Failure, block_on, duration_between, explain, queue, walks};
+use super::{CampaignArgs, ExitStatus, Failure, block_on, duration_between, explain, queue, walks};
 use crate::duration::Duration;
 
 /// Monitor and control a campaign in the terminal
@@ -36,15 +36,15 @@ use crate::duration::Duration;
 /// walks; F1 or ? lists them (docs/watch.md). Works on running and finished campaigns and on backups, and does not block a run.
 /// Set NO_COLOR for output without colours.
 #[derive(Debug, clap::Args)]
-pub struct Watch {
+pub struct WatchArgs {
     #[command(flatten)]
-    location: CampaignLocation,
+    location: CampaignArgs,
     /// Refresh interval, such as 500ms
     #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(2), value_parser = duration_between("200ms", "1h"))]
     interval: Duration,
 }
 
-impl Watch {
+impl WatchArgs {
     pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         if !io::stdout().is_terminal() {

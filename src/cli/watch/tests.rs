@@ -9,7 +9,7 @@ use super::draw::{Theme, draw};
 use super::messages::{Completed, JobView, Reading, Request};
 use super::state::{DECISIONS, Message, Mode, QUEUE, WALKS, WatchState};
 use super::*;
-use crate::cli::queue::Action;
+use crate::cli::queue::QueueCommand;
 use crate::cli::status;
 
 const PLAIN: Theme = Theme { colours: false };
@@ -219,7 +219,7 @@ fn irreversible_changes_need_confirmation() {
     // New jobs do not change the pending request.
     state.apply(Ok(reading(vec![job(9, JobState::Leased), job(8, JobState::Queued)], 101..101)));
     let id = |number| job(number, JobState::Queued).candidate;
-    assert_eq!(press(&mut state, "y"), Some(Request::Queue(Action::Drop { ids: vec![id(2)] })));
+    assert_eq!(press(&mut state, "y"), Some(Request::Queue(QueueCommand::Drop { ids: vec![id(2)] })));
     assert_eq!(press(&mut state, "d n"), None);
     assert_eq!(state.message, Some(Message::Success("cancelled".into())));
     assert_eq!(press(&mut state, "t"), None);
@@ -230,15 +230,15 @@ fn irreversible_changes_need_confirmation() {
     assert_eq!(press(&mut state, "Enter"), None);
     assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("'10x' is not a priority")));
     let request = press(&mut state, "Back Back Back - 5 Enter");
-    assert_eq!(request, Some(Request::Queue(Action::Prioritise { id: id(9), priority: -5 })));
+    assert_eq!(request, Some(Request::Queue(QueueCommand::Prioritise { id: id(9), priority: -5 })));
 
-    let walks = |walks: &[u32], all| walks::WalkSelection { walks: walks.to_vec(), all };
+    let walks = |walks: &[u32], all| walks::WalkSelectionArgs { walks: walks.to_vec(), all };
     assert_eq!(press(&mut state, "d"), None);
     press(&mut state, "n");
     let request = press(&mut state, "1 Down p");
-    assert_eq!(request, Some(Request::Walks(walks::Action::Pause(walks(&[1], false)))));
+    assert_eq!(request, Some(Request::Walks(walks::WalksCommand::Pause(walks(&[1], false)))));
     assert_eq!(press(&mut state, "R"), None);
-    assert_eq!(press(&mut state, "y"), Some(Request::Walks(walks::Action::Resume(walks(&[], true)))));
+    assert_eq!(press(&mut state, "y"), Some(Request::Walks(walks::WalksCommand::Resume(walks(&[], true)))));
     assert_eq!(press(&mut state, "3 p"), None);
     assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("the pane of the walks")));
 }
