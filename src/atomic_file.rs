@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::{Builder, TempPath};
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// A file that is written to a temporary file beside its target and renamed when it is complete. A killed process
 /// leaves the old file unchanged.
@@ -20,7 +20,7 @@ pub struct AtomicFile {
 
 impl AtomicFile {
     /// Creates the temporary file for `target`.
-    pub fn create(target: &Path) -> Result<Self, Failure> {
+    pub fn create(target: &Path) -> Result<Self, CommandError> {
         let cannot = |error| cannot_create(target, error);
         // Replaces the target of a symbolic link, not the link.
         let target = target.canonicalize().unwrap_or_else(|_| target.to_owned());
@@ -42,7 +42,7 @@ impl AtomicFile {
     }
 
     /// Renames the complete file to its target.
-    pub fn finish(self) -> Result<(), Failure> {
+    pub fn finish(self) -> Result<(), CommandError> {
         let Self { target, file, temporary } = self;
         let cannot = |error| cannot_write(&target, error);
         let file = file.into_inner().map_err(|error| cannot(error.into_error()))?;
@@ -53,19 +53,19 @@ impl AtomicFile {
 }
 
 /// The failure to write an output file.
-pub fn cannot_write(path: &Path, error: impl std::fmt::Display) -> Failure {
-    Failure::Failed(format!("cannot write {}: {error}", path.display()))
+pub fn cannot_write(path: &Path, error: impl std::fmt::Display) -> CommandError {
+    CommandError::Failed(format!("cannot write {}: {error}", path.display()))
 }
 
 /// The failure to create an output file. A wrong path is wrong input.
-pub fn cannot_create(path: &Path, error: io::Error) -> Failure {
+pub fn cannot_create(path: &Path, error: io::Error) -> CommandError {
     use io::ErrorKind as Kind;
     let message = format!("cannot write {}: {error}", path.display());
     match error.kind() {
         Kind::NotFound | Kind::NotADirectory | Kind::IsADirectory | Kind::PermissionDenied => {
-            Failure::Input(message)
+            CommandError::Input(message)
         }
-        _ => Failure::Failed(message),
+        _ => CommandError::Failed(message),
     }
 }
 
@@ -73,13 +73,13 @@ pub fn cannot_create(path: &Path, error: io::Error) -> Failure {
 pub fn refuse_to_replace<'a>(
     output: &Path,
     files: impl IntoIterator<Item = (&'a Path, &'a str)>,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let Ok(output_file) = output.canonicalize() else { return Ok(()) };
     let same = |(file, _): &(&Path, &str)| file.canonicalize().is_ok_and(|file| file == output_file);
     match files.into_iter().find(same) {
         Some((_, what)) => {
             let shown = output.display();
-            Err(Failure::Input(format!("{shown} is {what}: name another file for the output")))
+            Err(CommandError::Input(format!("{shown} is {what}: name another file for the output")))
         }
         None => Ok(()),
     }

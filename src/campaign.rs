@@ -28,7 +28,7 @@ use wire::{CampaignId, ContentHash};
 use workers::settings::{GuardSettings, WalkSettings};
 
 use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_changeable};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::label_method::MethodConfig;
 use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
@@ -136,12 +136,12 @@ impl Campaign {
     }
 
     /// How labels are made.
-    pub fn method(&self) -> Result<MethodConfig, Failure> {
+    pub fn method(&self) -> Result<MethodConfig, CommandError> {
         MethodConfig::from_section(&self.config.label)
     }
 
     /// Size of the label of each seed structure, on which its cost depends. A program must be installed.
-    pub fn label_sizes(&self) -> Result<Vec<dft::Size>, Failure> {
+    pub fn label_sizes(&self) -> Result<Vec<dft::Size>, CommandError> {
         let structures = self.seed_structures.iter().map(|seed| &seed.seed.structure);
         Ok(match &self.config.label.method {
             LabelMethod::Potential(_) => structures
@@ -149,7 +149,7 @@ impl Campaign {
                 .collect(),
             LabelMethod::Code(settings) => {
                 let code = settings.prepare(&self.config.label.pass_environment);
-                let code = code.map_err(|error| Failure::Input(error.to_string()))?;
+                let code = code.map_err(|error| CommandError::Input(error.to_string()))?;
                 structures.map(|structure| code.size(structure)).collect()
             }
         })
@@ -169,15 +169,15 @@ impl Campaign {
     }
 
     /// The files that walkers load the model from.
-    pub fn model_files(&self) -> Result<ModelFiles, Failure> {
+    pub fn model_files(&self) -> Result<ModelFiles, CommandError> {
         let Config { potential, calm, .. } = &self.config;
-        let file = |key: &str, path: &Path| -> Result<HashedFile, Failure> {
-            let path = std::path::absolute(path).map_err(Failure::failed)?;
+        let file = |key: &str, path: &Path| -> Result<HashedFile, CommandError> {
+            let path = std::path::absolute(path).map_err(CommandError::failed)?;
             Ok(HashedFile { path, hash: self.hash_of(key) })
         };
         let export = potential.model.get_ref();
         // The campaign's own model has the projection already.
-        let projected = GraceModel::has_projection(export).map_err(Failure::input)?;
+        let projected = GraceModel::has_projection(export).map_err(CommandError::input)?;
         let artifact = calm.artifact.as_ref().filter(|_| !projected);
         Ok(ModelFiles {
             export: file("potential.model", export)?,

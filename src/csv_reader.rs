@@ -3,7 +3,7 @@
 use std::io::{self, BufRead};
 use std::path::Path;
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Rows of a table whose first row has the titles.
 pub struct CsvReader<R> {
@@ -50,9 +50,9 @@ enum Fault {
 
 impl CsvError {
     /// Wrong input, which names the file.
-    pub fn of(self, path: &Path) -> Failure {
+    pub fn of(self, path: &Path) -> CommandError {
         let place = self.line.map_or(String::new(), |line| format!(":{line}"));
-        Failure::Input(format!("{}{place}: {}", path.display(), self.fault))
+        CommandError::Input(format!("{}{place}: {}", path.display(), self.fault))
     }
 }
 

@@ -18,7 +18,7 @@ pub enum ExitStatus {
 
 /// Why a command failed.
 #[derive(Debug)]
-pub enum Failure {
+pub enum CommandError {
     /// Wrong input or configuration: exit code 2.
     Input(String),
     /// Any other failure: exit code 1.
@@ -36,7 +36,7 @@ impl ExitStatus {
     }
 }
 
-impl Failure {
+impl CommandError {
     /// Wrong input.
     pub fn input(error: impl ToString) -> Self {
         Self::Input(error.to_string())
@@ -64,20 +64,20 @@ impl Failure {
     }
 }
 
-impl std::fmt::Display for Failure {
+impl std::fmt::Display for CommandError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let (Self::Input(message) | Self::Failed(message)) = self;
         f.write_str(message)
     }
 }
 
-impl From<ConfigError> for Failure {
+impl From<ConfigError> for CommandError {
     fn from(error: ConfigError) -> Self {
         Self::input(error)
     }
 }
 
-impl From<store::StoreError> for Failure {
+impl From<store::StoreError> for CommandError {
     fn from(error: store::StoreError) -> Self {
         use store::StoreError as E;
         match error {

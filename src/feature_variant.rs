@@ -6,7 +6,7 @@ use calm::Projection;
 use calm::baselines::FeatureOrigin;
 use potentials::grace::{self, FeatureForm, GraceModel, UnfitProjection};
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
 use crate::file_hash;
 
@@ -45,17 +45,21 @@ impl FeatureModel {
     ///
     /// # Errors
     /// An unreadable model; one without a projection of its features, unless they are those of the hidden layer.
-    pub fn load(path: &Path, variant: Option<FeatureVariant>) -> Result<Self, Failure> {
-        Self::new(path, GraceModel::load(path).map_err(Failure::input)?, variant)
+    pub fn load(path: &Path, variant: Option<FeatureVariant>) -> Result<Self, CommandError> {
+        Self::new(path, GraceModel::load(path).map_err(CommandError::input)?, variant)
     }
 
     /// The same of a model that was loaded from `path`.
     ///
     /// # Errors
     /// As [`Self::load`].
-    pub fn new(path: &Path, model: GraceModel, variant: Option<FeatureVariant>) -> Result<Self, Failure> {
+    pub fn new(
+        path: &Path,
+        model: GraceModel,
+        variant: Option<FeatureVariant>,
+    ) -> Result<Self, CommandError> {
         Self::of(model, variant).ok_or_else(|| {
-            Failure::Input(format!(
+            CommandError::Input(format!(
                 "{}: the model has no projection of its features (uq_rp_matrix): give its artifact with --artifact, or build one \
                  with calmwalk calm build",
                 path.display()
@@ -80,10 +84,10 @@ impl FeatureModel {
     ///
     /// # Errors
     /// A model of another basis.
-    pub fn for_artifact(path: &Path, model: GraceModel, artifact: &Projection) -> Result<Self, Failure> {
+    pub fn for_artifact(path: &Path, model: GraceModel, artifact: &Projection) -> Result<Self, CommandError> {
         if model.projection().is_none() {
             let model = with_projection(model, artifact)
-                .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
+                .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;
             return Self::new(path, model, None);
         }
         let own = Self::new(path, model, None)?;
@@ -101,11 +105,11 @@ impl FeatureModel {
     ///
     /// # Errors
     /// Baselines of another model, or of features that the model does not have.
-    pub fn for_baselines(path: &Path, baselines: &FeatureOrigin, file: &Path) -> Result<Self, Failure> {
+    pub fn for_baselines(path: &Path, baselines: &FeatureOrigin, file: &Path) -> Result<Self, CommandError> {
         let known = FeatureVariant::ALL.into_iter().find(|variant| variant.name() == baselines.variant);
         let found = Self::load(path, known)?;
         let same = baselines.check_same(&found.origin(path)?);
-        same.map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
+        same.map_err(|error| CommandError::Input(format!("{}: {error}", file.display())))?;
         Ok(found)
     }
 
@@ -134,7 +138,7 @@ impl FeatureModel {
     ///
     /// # Errors
     /// A file that cannot be read.
-    pub fn origin(&self, path: &Path) -> Result<FeatureOrigin, Failure> {
+    pub fn origin(&self, path: &Path) -> Result<FeatureOrigin, CommandError> {
         let variant = match self.projection() {
             None => FeatureVariant::Hidden.name().to_owned(),
             Some(found) => variant(&found),

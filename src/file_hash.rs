@@ -5,7 +5,7 @@ use std::path::Path;
 
 use npz::Archive;
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// The BLAKE3 hash of a file.
 pub fn hash(path: &Path) -> std::io::Result<String> {
@@ -16,8 +16,8 @@ pub fn hash(path: &Path) -> std::io::Result<String> {
 ///
 /// # Errors
 /// A file that is no archive of numbers and texts.
-pub fn model_hash(path: &Path) -> Result<String, Failure> {
-    let file = Archive::open(path).map_err(Failure::input)?;
+pub fn model_hash(path: &Path) -> Result<String, CommandError> {
+    let file = Archive::open(path).map_err(CommandError::input)?;
     let mut hasher = blake3::Hasher::new();
     let keys = file.names().filter(|key| !key.starts_with("uq_") || *key == "uq_rp_matrix");
     for key in keys {
@@ -30,7 +30,7 @@ pub fn model_hash(path: &Path) -> Result<String, Failure> {
                 }
             }
             Err(_) => {
-                let texts = file.strings(key).map_err(Failure::input)?;
+                let texts = file.strings(key).map_err(CommandError::input)?;
                 hasher.update(format!("{texts:?}\n").as_bytes());
             }
         }
@@ -39,13 +39,13 @@ pub fn model_hash(path: &Path) -> Result<String, Failure> {
 }
 
 /// Checks that a file has this BLAKE3 hash.
-pub fn verify_hash(path: &Path, expected: &str) -> Result<(), Failure> {
-    let found =
-        hash(path).map_err(|error| Failure::Input(format!("cannot read {}: {error}", path.display())))?;
+pub fn verify_hash(path: &Path, expected: &str) -> Result<(), CommandError> {
+    let found = hash(path)
+        .map_err(|error| CommandError::Input(format!("cannot read {}: {error}", path.display())))?;
     if found == expected {
         return Ok(());
     }
-    Err(Failure::Input(format!(
+    Err(CommandError::Input(format!(
         "{}: the file has another content (BLAKE3 {found}) than when this run began ({expected}); restore the old file",
         path.display()
     )))

@@ -12,7 +12,7 @@ use wire::ContentHash;
 use workers::labeller::{ExecutionSettings, Method};
 
 use crate::config::{LabelMethod, LabelSection, PotentialFile, PotentialKind, changed_keys};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::file_hash::{hash, verify_hash};
 
 /// Configuration key of a reference potential's file.
@@ -42,13 +42,14 @@ pub enum MethodConfig {
 
 impl MethodConfig {
     /// The method of a configuration, with absolute paths.
-    pub fn from_section(label: &LabelSection) -> Result<Self, Failure> {
-        let absolute = |path: &Path| std::path::absolute(path).map_err(Failure::failed);
+    pub fn from_section(label: &LabelSection) -> Result<Self, CommandError> {
+        let absolute = |path: &Path| std::path::absolute(path).map_err(CommandError::failed);
         match &label.method {
             LabelMethod::Potential(PotentialFile { kind, file }) => {
                 let file = file.get_ref();
-                let file_hash = hash(file)
-                    .map_err(|error| Failure::Input(format!("cannot read {}: {error}", file.display())))?;
+                let file_hash = hash(file).map_err(|error| {
+                    CommandError::Input(format!("cannot read {}: {error}", file.display()))
+                })?;
                 Ok(Self::Potential { kind: *kind, file: absolute(file)?, file_hash })
             }
             LabelMethod::Code(settings) => {
@@ -62,11 +63,11 @@ impl MethodConfig {
     }
 
     /// Protocol settings of the labels. A program must be installed.
-    pub fn identity(&self) -> Result<Value, Failure> {
+    pub fn identity(&self) -> Result<Value, CommandError> {
         match self {
             Self::Potential { kind, file_hash, .. } => Ok(potential_identity(*kind, file_hash)),
             Self::Code { settings, running } => {
-                let code = settings.prepare(&running.pass_environment).map_err(Failure::input)?;
+                let code = settings.prepare(&running.pass_environment).map_err(CommandError::input)?;
                 Ok(code_identity(settings.name(), &*code))
             }
         }
@@ -80,17 +81,17 @@ impl MethodConfig {
         }
     }
     /// Prepares the method to label by `protocol`. Fails if a file or program has been replaced.
-    pub fn load(&self, protocol: &Protocol) -> Result<Method, Failure> {
+    pub fn load(&self, protocol: &Protocol) -> Result<Method, CommandError> {
         match self {
             Self::Potential { kind, file, file_hash } => {
                 verify_hash(file, file_hash)?;
-                let potential = kind.load(file).map_err(Failure::Input)?;
+                let potential = kind.load(file).map_err(CommandError::Input)?;
                 // Detects a file that was replaced while it was read.
                 verify_hash(file, file_hash)?;
                 Ok(Method::reference(potential))
             }
             Self::Code { settings, running } => {
-                let code = settings.prepare(&running.pass_environment).map_err(Failure::input)?;
+                let code = settings.prepare(&running.pass_environment).map_err(CommandError::input)?;
                 check_protocol(&code_identity(settings.name(), &*code), protocol)?;
                 Ok(Method::code(code, running.clone()))
             }
@@ -157,10 +158,10 @@ pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(),
 }
 
 /// Checks that labels with these settings belong to the protocol.
-pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), Failure> {
+pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), CommandError> {
     match changed_keys(&protocol.settings, identity).first() {
         None => Ok(()),
-        Some((key, before, after)) => Err(Failure::Input(format!(
+        Some((key, before, after)) => Err(CommandError::Input(format!(
             "labels made here would not belong to the campaign's protocol '{}': {key} is {after} here, but {before} \
              in the protocol",
             protocol.name

@@ -9,7 +9,7 @@ use store::{Protocol, Store};
 use workers::labeller::LabelBounds;
 
 use crate::config::LabelSection;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::file_hash::hash;
 use crate::label_method::{MethodConfig, REFERENCE_FILE, check_protocol};
 
@@ -58,12 +58,16 @@ struct LabelLimits {
 
 impl LabelSetup {
     /// Reads the setup of `protocol`, which is in force, and locates on this host what the method needs.
-    pub async fn read(store: &Store, protocol: Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
+    pub async fn read(
+        store: &Store,
+        protocol: Protocol,
+        here: HostOptions<'_>,
+    ) -> Result<Self, CommandError> {
         let text = store.campaign().await?.configuration_in_force;
         let EffectiveConfig { label: LabelLimits { max_attempts: attempts, bounds, lease_timeout } } =
             serde_json::from_str(&text).map_err(unreadable)?;
         let noted = store.metadata(LABEL_METHOD_KEY).await?.ok_or_else(|| {
-            Failure::Failed(
+            CommandError::Failed(
                 "the store has no label settings: an earlier version of this program last ran the campaign; run it once \
                  with this one"
                     .to_owned(),
@@ -72,7 +76,7 @@ impl LabelSetup {
         let noted: MethodConfig = serde_json::from_str(&noted).map_err(unreadable)?;
         let found = noted.name();
         if let Some(wanted) = here.method.filter(|wanted| *wanted != found) {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "--method {wanted}, but the labels of this campaign are made by the method '{found}': leave --method out, \
                  or name the intended campaign"
             )));
@@ -84,7 +88,7 @@ impl LabelSetup {
 }
 
 /// Limits of plausible labels, from the configuration in force.
-pub async fn read_bounds(store: &Store) -> Result<LabelBounds, Failure> {
+pub async fn read_bounds(store: &Store) -> Result<LabelBounds, CommandError> {
     let text = store.campaign().await?.configuration_in_force;
     let configuration: Value = serde_json::from_str(&text).map_err(unreadable)?;
     match &configuration["label"] {
@@ -93,8 +97,8 @@ pub async fn read_bounds(store: &Store) -> Result<LabelBounds, Failure> {
     }
 }
 
-fn unreadable(error: serde_json::Error) -> Failure {
-    Failure::Failed(format!(
+fn unreadable(error: serde_json::Error) -> CommandError {
+    CommandError::Failed(format!(
         "cannot read the label settings in the store ({error}): another version of this program may have written them, \
          or the database is damaged; run calmwalk store check"
     ))
@@ -105,7 +109,7 @@ fn method_for_this_host(
     noted: MethodConfig,
     protocol: &Protocol,
     here: HostOptions<'_>,
-) -> Result<MethodConfig, Failure> {
+) -> Result<MethodConfig, CommandError> {
     let given = here.label.as_ref().map(MethodConfig::from_section).transpose()?;
     match (noted, given) {
         (MethodConfig::Potential { kind, file, .. }, None) => {
@@ -115,7 +119,7 @@ fn method_for_this_host(
         (noted @ MethodConfig::Code { .. }, given) => {
             let (name, method) = (noted.name(), given.unwrap_or(noted));
             if let Some(file) = here.files.first() {
-                return Err(Failure::Input(format!(
+                return Err(CommandError::Input(format!(
                     "--file {}: give the files of the method '{name}' in a --config",
                     file.display()
                 )));
@@ -124,7 +128,7 @@ fn method_for_this_host(
                 return Err(method_mismatch(method.name(), name));
             }
             let identity = method.identity().map_err(|failure| {
-                Failure::Input(format!(
+                CommandError::Input(format!(
                     "cannot make labels on this host: {failure}; if the missing file or program has another path here, \
                      give it in a --config"
                 ))
@@ -136,8 +140,8 @@ fn method_for_this_host(
     }
 }
 
-fn method_mismatch(found: &str, expected: &str) -> Failure {
-    Failure::Input(match (found, expected) {
+fn method_mismatch(found: &str, expected: &str) -> CommandError {
+    CommandError::Input(match (found, expected) {
         ("potential", "potential") => {
             "--config: give the file of a reference potential with --file".to_owned()
         }
@@ -148,22 +152,26 @@ fn method_mismatch(found: &str, expected: &str) -> Failure {
 }
 
 /// The file with which labels of the protocol are made, and its BLAKE3 hash: one of `given`, or the leader's file.
-fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(PathBuf, String), Failure> {
+fn find_file(
+    noted: &Path,
+    protocol: &Protocol,
+    given: &[PathBuf],
+) -> Result<(PathBuf, String), CommandError> {
     let expected = protocol.settings["file_hash"].as_str().unwrap_or_default();
     let mut found = None;
     for path in given {
         let hash = hash(path).map_err(|error| {
-            Failure::Input(format!("--file {}: cannot be read ({error})", path.display()))
+            CommandError::Input(format!("--file {}: cannot be read ({error})", path.display()))
         })?;
         if hash != expected {
             // A file that is not needed is most likely a mistake.
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "--file {}: its content (BLAKE3 {hash}) differs from that of the file that makes this campaign's \
                  labels",
                 path.display()
             )));
         }
-        found = Some((std::path::absolute(path).map_err(Failure::failed)?, hash));
+        found = Some((std::path::absolute(path).map_err(CommandError::failed)?, hash));
     }
     if let Some(found) = found {
         return Ok(found);
@@ -173,7 +181,7 @@ fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(Pa
         Ok(hash) => format!("{} here has another content (BLAKE3 {hash})", noted.display()),
         Err(error) => format!("{} cannot be read here ({error})", noted.display()),
     };
-    Err(Failure::Input(format!(
+    Err(CommandError::Input(format!(
         "{REFERENCE_FILE}: this campaign's labels need the file with BLAKE3 {expected}, but {why}; copy it to this \
          host and pass it with --file"
     )))

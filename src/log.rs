@@ -20,7 +20,7 @@ use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 use tracing_subscriber::registry::Registry;
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// The packages of this program. Only warnings and errors are logged from other crates.
 const WORKSPACE_CRATES: [&str; 5] = ["calmwalk", "orchestrator", "store", "wire", "workers"];
@@ -81,7 +81,7 @@ impl LogArgs {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub fn init(&self, process: &'static str) -> Result<(), Failure> {
+    pub fn init(&self, process: &'static str) -> Result<(), CommandError> {
         let Some(file) = &self.file else { return Ok(()) };
         let file = std::path::absolute(file).map_err(|error| cannot_write(file, &error))?;
         init(Some(LogConfig { file, level: self.level, format: self.format }), process, None)
@@ -94,7 +94,11 @@ pub fn child_config() -> Option<LogConfig> {
 }
 
 /// Initializes the log of a child process. `process` is its kind and `number` its number among those of that kind.
-pub fn init(setup: Option<LogConfig>, process: &'static str, number: Option<u32>) -> Result<(), Failure> {
+pub fn init(
+    setup: Option<LogConfig>,
+    process: &'static str,
+    number: Option<u32>,
+) -> Result<(), CommandError> {
     let Some(setup) = setup else { return Ok(()) };
     let opened = OpenOptions::new().append(true).create(true).mode(0o600).open(&setup.file);
     let file = opened.map_err(|error| cannot_write(&setup.file, &error))?;
@@ -107,8 +111,8 @@ pub fn init(setup: Option<LogConfig>, process: &'static str, number: Option<u32>
     Ok(())
 }
 
-fn cannot_write(file: &Path, error: &std::io::Error) -> Failure {
-    Failure::Input(format!("--log: cannot write to {}: {error}", file.display()))
+fn cannot_write(file: &Path, error: &std::io::Error) -> CommandError {
+    CommandError::Input(format!("--log: cannot write to {}: {error}", file.display()))
 }
 
 /// Writes events to the file.

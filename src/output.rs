@@ -9,17 +9,17 @@ use serde::Serialize;
 use store::Location;
 use textwrap::{WordSeparator, WordSplitter, WrapAlgorithm};
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Shorter work shows no bar.
 const BAR_AFTER: Duration = Duration::from_secs(1);
 
 /// Writes to standard output. A closed pipe (`| head`) is no failure.
-pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Failure> {
+pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), CommandError> {
     let mut out = BufWriter::new(io::stdout().lock());
     match write(&mut out).and_then(|()| out.flush()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
-            Err(Failure::Failed(format!("cannot write to the standard output: {error}")))
+            Err(CommandError::Failed(format!("cannot write to the standard output: {error}")))
         }
         _ => Ok(()),
     }
@@ -55,8 +55,8 @@ pub fn warn_if_unencrypted(location: &Location) {
 }
 
 /// Prints JSON to standard output.
-pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
-    let text = serde_json::to_string_pretty(value).map_err(Failure::failed)?;
+pub fn print_json(value: &impl Serialize) -> Result<(), CommandError> {
+    let text = serde_json::to_string_pretty(value).map_err(CommandError::failed)?;
     print(|out| writeln!(out, "{text}"))
 }
 

@@ -15,7 +15,7 @@ use wire::ipc::ConnectInfo;
 use workers::labeller::LabelBounds;
 use workers::settings::WalkSettings;
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::feature_variant::with_projection;
 use crate::file_hash::verify_hash;
 use crate::label_method::MethodConfig;
@@ -117,11 +117,13 @@ pub struct PoolConfig {
 }
 
 /// Reads the configuration of this process.
-pub fn from_stdin<T: DeserializeOwned>() -> Result<T, Failure> {
+pub fn from_stdin<T: DeserializeOwned>() -> Result<T, CommandError> {
     let mut text = String::new();
-    io::stdin().read_to_string(&mut text).map_err(Failure::failed)?;
+    io::stdin().read_to_string(&mut text).map_err(CommandError::failed)?;
     serde_json::from_str(&text).map_err(|error| {
-        Failure::Input(format!("standard input: {error}; this command is internal, calmwalk run starts it"))
+        CommandError::Input(format!(
+            "standard input: {error}; this command is internal, calmwalk run starts it"
+        ))
     })
 }
 
@@ -146,14 +148,14 @@ impl LabellerConfig {
 
 impl ModelFiles {
     /// Loads the model and checks that it is the one of the run.
-    pub fn load(&self) -> Result<Arc<GraceModel>, Failure> {
+    pub fn load(&self) -> Result<Arc<GraceModel>, CommandError> {
         verify_hash(&self.export.path, &self.export.hash)?;
         let model = GraceModel::load_in(&self.export.path, self.precision, RadialPath::default());
-        let mut model = model.map_err(Failure::input)?;
+        let mut model = model.map_err(CommandError::input)?;
         if let Some(artifact) = &self.artifact {
             verify_hash(&artifact.path, &artifact.hash)?;
-            let projection = Projection::load(&artifact.path).map_err(Failure::input)?;
-            model = with_projection(model, &projection).map_err(Failure::input)?;
+            let projection = Projection::load(&artifact.path).map_err(CommandError::input)?;
+            model = with_projection(model, &projection).map_err(CommandError::input)?;
         }
         Ok(Arc::new(model))
     }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
 /// A batch system signals every process of a job, and the job script forwards the signal it receives. Signals within
@@ -16,10 +16,10 @@ const SIGNAL_MERGE_WINDOW: Duration = Duration::from_secs(5);
 
 /// Cancels `stop` and prints `message` on the first Ctrl-C, SIGTERM or hang-up. A second signal exits at once, which is
 /// safe too, unless it is a SIGTERM within [`SIGNAL_MERGE_WINDOW`] of the first.
-pub fn cancel_on_signal(stop: CancellationToken, message: &'static str) -> Result<(), Failure> {
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
-    let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
+pub fn cancel_on_signal(stop: CancellationToken, message: &'static str) -> Result<(), CommandError> {
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(CommandError::failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(CommandError::failed)?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(CommandError::failed)?;
     tokio::spawn(async move {
         let mut asked: Option<Instant> = None;
         loop {
@@ -43,12 +43,12 @@ pub fn cancel_on_signal(stop: CancellationToken, message: &'static str) -> Resul
 
 /// For commands without a runtime: returns a token that the first Ctrl-C or SIGTERM cancels, so that work can stop in
 /// order. The second signal exits at once.
-pub fn stop_token() -> Result<CancellationToken, Failure> {
+pub fn stop_token() -> Result<CancellationToken, CommandError> {
     let runtime =
-        tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Failure::failed)?;
+        tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(CommandError::failed)?;
     let guard = runtime.enter();
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(CommandError::failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(CommandError::failed)?;
     drop(guard);
     let stop = CancellationToken::new();
     let asked = stop.clone();

@@ -30,7 +30,7 @@ use potentials::grace::GraceModel;
 use serde::Serialize;
 
 use self::labelled::LabelledReport;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 pub use self::baseline_score::{BaselineScore, score_own_features};
 pub use self::bond_scans::BondScan;
@@ -113,7 +113,7 @@ pub fn run(
     settings: Settings,
     labelled: Option<LabelledReport>,
     progress: &Progress,
-) -> Result<Option<Validation>, Failure> {
+) -> Result<Option<Validation>, CommandError> {
     progress.begin(
         bond_scans::count(&settings)
             + defects::count(&settings)

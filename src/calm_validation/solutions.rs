@@ -10,7 +10,7 @@ use super::bond_scans::scaled;
 use super::random::Random;
 use super::{Grader, Progress, Settings, Subject, minimum};
 use crate::all_cores;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Compositions: 0, 10 %, …, 100 % of the second element.
 const COMPOSITIONS: usize = 11;
@@ -93,7 +93,7 @@ pub fn run(
     settings: &Settings,
     distances: &BTreeMap<String, f64>,
     progress: &Progress,
-) -> Result<Vec<Solution>, Failure> {
+) -> Result<Vec<Solution>, CommandError> {
     let tasks = (0..settings.pairs.len()).flat_map(|pair| (0..COMPOSITIONS).map(move |step| (pair, step)));
     let tasks: Vec<_> = tasks.collect();
     let graded = all_cores::map(
@@ -106,7 +106,7 @@ pub fn run(
         },
     );
     let mut graded = graded.into_iter();
-    let solution = |pair: &[Species; 2]| -> Result<Solution, Failure> {
+    let solution = |pair: &[Species; 2]| -> Result<Solution, CommandError> {
         let of_pair: Vec<_> = graded.by_ref().take(COMPOSITIONS).collect::<Result<_, _>>()?;
         let (compositions, atoms): (Vec<_>, Vec<_>) = of_pair.into_iter().unzip();
         let (prototype, _, shell) = lattice(*pair);
@@ -125,7 +125,7 @@ fn composition(
     distances: &BTreeMap<String, f64>,
     progress: &Progress,
     (pair, step): (usize, usize),
-) -> Result<(Composition, Vec<Atom>), Failure> {
+) -> Result<(Composition, Vec<Atom>), CommandError> {
     let elements = settings.pairs[pair];
     let fraction = step as f64 / (COMPOSITIONS - 1) as f64;
     let [first, second] = elements.map(|species| distances[species.symbol()]);
@@ -180,9 +180,9 @@ fn occupied(crystal: &Structure, other: Species, fraction: f64, random: &mut Ran
 }
 
 /// Indices of the nearest neighbours of each site.
-fn nearest_neighbours(crystal: &Structure, distance: f64) -> Result<Vec<Vec<usize>>, Failure> {
+fn nearest_neighbours(crystal: &Structure, distance: f64) -> Result<Vec<Vec<usize>>, CommandError> {
     let mut list = NeighbourList::new(1.05 * distance, 0.0);
-    list.update(crystal).map_err(Failure::failed)?;
+    list.update(crystal).map_err(CommandError::failed)?;
     let of = |site| list.neighbours_of(site).iter().map(|neighbour| neighbour.atom as usize).collect();
     Ok((0..crystal.len()).map(of).collect())
 }

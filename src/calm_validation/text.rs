@@ -5,18 +5,18 @@ use atoms::extxyz::{Column, ColumnData, Frame, write_frame};
 use super::labelled::LabelledReport;
 use super::tables::both;
 use super::{Defect, Validation, figures, tables};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::page::{self, Block, File, Section};
 
 /// File name of the page.
 pub const PAGE: &str = "validation.html";
 
 /// All files, the page first.
-pub fn files(validation: &Validation) -> Result<Vec<File>, Failure> {
+pub fn files(validation: &Validation) -> Result<Vec<File>, CommandError> {
     let (parts, tables) = (figures::all(validation), tables::all(validation));
     let title = format!("Validation of the extrapolation grade: {}", validation.elements.join(", "));
     let text = page::write(&title, &lead(validation), sections(&parts, &tables));
-    let json = serde_json::to_vec_pretty(validation).map_err(Failure::failed)?;
+    let json = serde_json::to_vec_pretty(validation).map_err(CommandError::failed)?;
     let mut files = vec![
         File { path: PAGE.to_owned(), bytes: text.into_bytes() },
         File { path: "validation.json".into(), bytes: json },
@@ -109,7 +109,7 @@ fn ranking(report: &LabelledReport) -> String {
 }
 
 /// The structures of the defects with their grades, extended XYZ.
-fn structures(defects: &[Defect]) -> Result<Vec<u8>, Failure> {
+fn structures(defects: &[Defect]) -> Result<Vec<u8>, CommandError> {
     let mut bytes = Vec::new();
     for defect in defects {
         let Some((structure, gamma, averages)) = &defect.graded else { continue };
@@ -120,7 +120,7 @@ fn structures(defects: &[Defect]) -> Result<Vec<u8>, Failure> {
             let column = Column { width: 1, entries: ColumnData::Real(values.clone()) };
             frame.arrays.insert(name.to_owned(), column);
         }
-        write_frame(&mut bytes, &frame).map_err(Failure::failed)?;
+        write_frame(&mut bytes, &frame).map_err(CommandError::failed)?;
     }
     Ok(bytes)
 }

@@ -12,7 +12,7 @@ use wire::{CampaignId, Origin, WalkConditions, WalkId};
 use workers::walk::{WalkContext, advance};
 
 use super::{Campaign, SourcedStructure};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Steps that are measured of each size, after the first.
 const MEASURED_STEPS: usize = 10;
@@ -49,8 +49,9 @@ impl StepTimes {
     ///
     /// # Errors
     /// The system cannot create the threads of a walker.
-    pub fn measure(campaign: &Campaign) -> Result<Self, Failure> {
-        let threads = Threads::new(campaign.config.run.threads_per_walker.get()).map_err(Failure::failed)?;
+    pub fn measure(campaign: &Campaign) -> Result<Self, CommandError> {
+        let threads =
+            Threads::new(campaign.config.run.threads_per_walker.get()).map_err(CommandError::failed)?;
         let mut settings = campaign.walk_settings();
         // Only the bias of the walk differs from that of its control walk, and the volume is that of the seed structure.
         (settings.equilibration, settings.steps) = (0, u64::MAX);

@@ -7,7 +7,7 @@ use orchestrator::launcher::raise_descriptor_limit;
 use store::ProcessRecord;
 use wire::net::{self, Address, Tls};
 
-use super::{ExitStatus, Failure, block_on, duration_between};
+use super::{CommandError, ExitStatus, block_on, duration_between};
 use crate::duration::Duration;
 use crate::log::LogArgs;
 use crate::output::log_and_warn;
@@ -51,18 +51,18 @@ pub struct AgentArgs {
 }
 
 impl AgentArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         self.log.init("agent")?;
         let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));
         let tls = self.tls.as_deref().map(Tls::from_directory);
         if let Some(tls) = &tls {
-            let checked = tls.check_for_agent().map_err(Failure::input)?;
+            let checked = tls.check_for_agent().map_err(CommandError::input)?;
             checked.warnings.iter().for_each(|warning| log_and_warn(format_args!("WARNING: {warning}")));
         }
         raise_descriptor_limit();
         scratch_dir::clean();
         let scratch = ScratchDir::new().map_err(|error| {
-            Failure::Failed(format!(
+            CommandError::Failed(format!(
                 "cannot create a directory in {}: {error}",
                 std::env::temp_dir().display()
             ))

@@ -3,7 +3,7 @@
 use orchestrator::launcher;
 use workers::labeller::run_calculation;
 
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 
 /// Internal: run one calculation for a labeller
 ///
@@ -12,9 +12,9 @@ use super::{ExitStatus, Failure};
 pub struct CalculationRunnerArgs {}
 
 impl CalculationRunnerArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
-        launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
-        run_calculation().map_err(Failure::failed)?;
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
+        launcher::set_process_name(c"calmwalk").map_err(CommandError::failed)?;
+        run_calculation().map_err(CommandError::failed)?;
         Ok(ExitStatus::Done)
     }
 }

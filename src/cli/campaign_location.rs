@@ -7,7 +7,7 @@ use monitor::provenance::Provenance;
 use serde_json::Value;
 use store::{DATABASE, Location, Store};
 
-use super::Failure;
+use super::CommandError;
 use crate::campaign::Campaign;
 use crate::config::compare;
 
@@ -17,7 +17,7 @@ pub fn default_directory(config: &Path) -> PathBuf {
 }
 
 /// Parses an argument: the URL of a server, or a directory that leads to one campaign.
-pub fn parse(text: &Path) -> Result<Location, Failure> {
+pub fn parse(text: &Path) -> Result<Location, CommandError> {
     let location = text.to_str().map_or_else(|| Ok(Location::from(text)), str::parse)?;
     match location {
         Location::Directory(directory) => find_campaign(&directory),
@@ -39,7 +39,7 @@ pub fn shell_argument(location: &Location) -> String {
 ///
 /// # Errors
 /// There are several campaigns.
-fn find_campaign(directory: &Path) -> Result<Location, Failure> {
+fn find_campaign(directory: &Path) -> Result<Location, CommandError> {
     if has_campaign(directory) || !directory.is_dir() {
         return Ok(directory.into());
     }
@@ -54,7 +54,7 @@ fn find_campaign(directory: &Path) -> Result<Location, Failure> {
     match found.len() {
         0 => Ok(directory.into()),
         1 => Ok(found.remove(0)),
-        several => Err(Failure::Input(format!(
+        several => Err(CommandError::Input(format!(
             "{} contains {several} campaigns: name one of {}",
             directory.display(),
             names.join(", ")
@@ -82,7 +82,7 @@ fn has_campaign(directory: &Path) -> bool {
 ///
 /// # Errors
 /// There is such a campaign.
-pub async fn check_former_locations(campaign: &Campaign, directory: &Path) -> Result<(), Failure> {
+pub async fn check_former_locations(campaign: &Campaign, directory: &Path) -> Result<(), CommandError> {
     if campaign.config.run.store.is_some() || has_campaign(directory) {
         return Ok(());
     }
@@ -94,7 +94,7 @@ pub async fn check_former_locations(campaign: &Campaign, directory: &Path) -> Re
         if is_campaign_of(&former, campaign, directory).await {
             let (config, former, directory) =
                 (campaign.path.display(), former.display(), directory.display());
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{config}: {former} already contains a campaign of this configuration, but the default directory is {directory}. Use \
                  --directory {former} to continue that campaign, or --directory {directory} to start a new one"
             )));

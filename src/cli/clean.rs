@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use store::CampaignLock;
 use wire::shm_dir::{Removed, ShmDir, ShmDirError};
 
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 use crate::output::{count, print};
 
 /// Remove shared-memory files left behind by killed processes
@@ -20,19 +20,19 @@ pub struct CleanArgs {
 }
 
 impl CleanArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         if self.directories.is_empty() {
-            for shared in ShmDir::all().map_err(Failure::failed)? {
+            for shared in ShmDir::all().map_err(CommandError::failed)? {
                 let campaign = shared.campaign_directory();
                 match clean(&shared, campaign) {
                     Ok(removed) => report(campaign.unwrap_or(shared.directory()), removed)?,
-                    Err(Failure::Input(message)) => print(|out| writeln!(out, "skipped: {message}"))?,
+                    Err(CommandError::Input(message)) => print(|out| writeln!(out, "skipped: {message}"))?,
                     Err(failure) => return Err(failure),
                 }
             }
         }
         for directory in &self.directories {
-            let shared = ShmDir::for_campaign(directory).map_err(Failure::input)?;
+            let shared = ShmDir::for_campaign(directory).map_err(CommandError::input)?;
             report(directory, clean(&shared, Some(directory))?)?;
         }
         Ok(ExitStatus::Done)
@@ -40,18 +40,18 @@ impl CleanArgs {
 }
 
 /// Removes the shared-memory files of a campaign, under the lock that keeps it from starting meanwhile.
-fn clean(shared: &ShmDir, campaign: Option<&Path>) -> Result<Removed, Failure> {
+fn clean(shared: &ShmDir, campaign: Option<&Path>) -> Result<Removed, CommandError> {
     // A campaign whose directory was deleted cannot start.
     let campaign = campaign.filter(|directory| directory.is_dir());
     let _lock = campaign.map(|directory| CampaignLock::acquire(directory, "calmwalk clean")).transpose()?;
     shared.remove().map_err(|error| match error {
         // In use although the directory is not locked: it may be invisible here, or renamed.
-        ShmDirError::InUse { .. } => Failure::input(error),
-        error => Failure::failed(error),
+        ShmDirError::InUse { .. } => CommandError::input(error),
+        error => CommandError::failed(error),
     })
 }
 
-fn report(directory: &Path, removed: Removed) -> Result<(), Failure> {
+fn report(directory: &Path, removed: Removed) -> Result<(), CommandError> {
     let Removed { files, bytes } = removed;
     let megabytes = bytes as f64 / 1e6;
     print(|out| {

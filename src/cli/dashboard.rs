@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 
 use store::Store;
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::log::LogArgs;
 use crate::output::log_and_print;
 use crate::web::{self, dashboard};
@@ -25,15 +25,15 @@ pub struct DashboardArgs {
 }
 
 impl DashboardArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         self.log.init("dashboard")?;
         block_on(async {
             let listener = web::listen(self.address).await?;
             let store = Store::open_read_only(&self.location.get()?).await?;
-            let address = listener.local_addr().map_err(Failure::failed)?;
+            let address = listener.local_addr().map_err(CommandError::failed)?;
             let serving = web::Server::start(listener, dashboard::Dashboard::new(store, None, None).router());
             log_and_print(format_args!("dashboard at http://{address}/"));
-            tokio::signal::ctrl_c().await.map_err(Failure::failed)?;
+            tokio::signal::ctrl_c().await.map_err(CommandError::failed)?;
             serving.end();
             Ok(ExitStatus::Done)
         })?

@@ -9,7 +9,7 @@ use monitor::label_cost::{CoreHours, CostEstimator};
 use serde_json::json;
 use store::{Location, Store};
 
-use super::{ExitStatus, Failure, block_on, campaign_location};
+use super::{CommandError, ExitStatus, block_on, campaign_location};
 use crate::campaign::{Campaign, StepTimes, WalkTime};
 use crate::disk_forecast;
 use crate::output::{Table, count, print, print_json};
@@ -76,7 +76,7 @@ struct CampaignEstimate {
 }
 
 impl EstimateArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let campaign = Campaign::load(&self.config)?;
         let estimate = self.estimate(&campaign)?;
         if self.json {
@@ -87,7 +87,7 @@ impl EstimateArgs {
         Ok(ExitStatus::Done)
     }
 
-    fn estimate(&self, campaign: &Campaign) -> Result<CampaignEstimate, Failure> {
+    fn estimate(&self, campaign: &Campaign) -> Result<CampaignEstimate, CommandError> {
         let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
         let times = StepTimes::measure(campaign)?;
@@ -124,7 +124,7 @@ impl EstimateArgs {
     }
 
     /// The cost model, and a description of its source.
-    fn costs(&self, first: Option<&Size>) -> Result<(Option<CostEstimator>, String), Failure> {
+    fn costs(&self, first: Option<&Size>) -> Result<(Option<CostEstimator>, String), CommandError> {
         if let (Some(core_seconds), Some(size)) = (self.core_seconds, first) {
             let measured = Measured { size: *size, core_seconds };
             let costs = CostEstimator::from_model(CostModel::fit(&[measured], None));
@@ -150,9 +150,9 @@ fn newest_labels(count: usize) -> String {
     if count == 1 { "newest label".to_owned() } else { format!("{count} newest labels") }
 }
 
-async fn fit_costs(location: &Location) -> Result<CostEstimator, Failure> {
+async fn fit_costs(location: &Location) -> Result<CostEstimator, CommandError> {
     let store = Store::open_read_only(location).await?;
-    let none = || Failure::Input("--cost-from: that campaign has no labels".into());
+    let none = || CommandError::Input("--cost-from: that campaign has no labels".into());
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
     let costs = CostEstimator::from_store(&store, protocol.hash).await?;
     store.close().await;

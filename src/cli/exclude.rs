@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use store::{ExcludedLabel, ExclusionChange, Store, unix_milliseconds};
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{Table, print, print_json, warn_if_unencrypted};
 
 /// Exclude bad labels from exports and statistics, or include them again
@@ -43,7 +43,7 @@ fn parse_reason(text: &str) -> Result<String, String> {
 }
 
 impl ExcludeArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         if self.list {
             let excluded = block_on(self.read())??;
             if self.json {
@@ -62,14 +62,14 @@ impl ExcludeArgs {
         Ok(ExitStatus::Done)
     }
 
-    async fn read(&self) -> Result<Vec<ExcludedLabel>, Failure> {
+    async fn read(&self) -> Result<Vec<ExcludedLabel>, CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let excluded = store.excluded().await?;
         store.close().await;
         Ok(excluded)
     }
 
-    async fn change(&self) -> Result<Vec<ExclusionChange>, Failure> {
+    async fn change(&self) -> Result<Vec<ExclusionChange>, CommandError> {
         let location = self.location.get()?;
         warn_if_unencrypted(&location);
         let store = Store::open(&location).await?;

@@ -6,7 +6,7 @@ use analysis::{CompletionBin, ErrorBin};
 use monitor::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use store::{Protocol, Store};
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{Table, count, decimals, print, print_json, range};
 use crate::wording;
 
@@ -33,7 +33,7 @@ pub struct ForceErrorsArgs {
 }
 
 impl ForceErrorsArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (protocol, statistics) = block_on(self.read())??;
         if self.json {
             print_json(&statistics.to_json(&protocol))?;
@@ -43,7 +43,7 @@ impl ForceErrorsArgs {
         Ok(ExitStatus::Done)
     }
 
-    async fn read(&self) -> Result<(Protocol, LabelStatistics), Failure> {
+    async fn read(&self) -> Result<(Protocol, LabelStatistics), CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let protocol = self.select_protocol(&store).await?;
         let statistics = label_statistics::read(&store, protocol.hash).await?;
@@ -51,16 +51,17 @@ impl ForceErrorsArgs {
         Ok((protocol, statistics))
     }
 
-    async fn select_protocol(&self, store: &Store) -> Result<Protocol, Failure> {
+    async fn select_protocol(&self, store: &Store) -> Result<Protocol, CommandError> {
         let Some(name) = &self.protocol else {
-            let none = || Failure::Input("the campaign has no labels: it has no label protocol yet".into());
+            let none =
+                || CommandError::Input("the campaign has no labels: it has no label protocol yet".into());
             return store.protocol_in_force().await?.ok_or_else(none);
         };
         let protocols = store.protocols().await?;
         let found = protocols.iter().find(|protocol| protocol.name == *name);
         found.cloned().ok_or_else(|| {
             let names: Vec<_> = protocols.iter().map(|protocol| format!("'{}'", protocol.name)).collect();
-            Failure::Input(format!("the campaign has no protocol '{name}'; it has {}", names.join(", ")))
+            CommandError::Input(format!("the campaign has no protocol '{name}'; it has {}", names.join(", ")))
         })
     }
 }

@@ -8,7 +8,7 @@ use store::{CampaignLock, ImportCounts, QueuedImports, Store, unix_milliseconds}
 use wire::ContentHash;
 use workers::labeller::LabelBounds;
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::label_setup;
 use crate::output::{count, print};
 use crate::xyz_reader::{XyzReader, label};
@@ -53,10 +53,10 @@ struct File {
 
 impl File {
     /// Applies the campaign's bounds for its own labels.
-    fn check(&self, bounds: &LabelBounds) -> Result<(), Failure> {
+    fn check(&self, bounds: &LabelBounds) -> Result<(), CommandError> {
         for ((_, _, label), line) in self.frames.iter().zip(&self.lines) {
             if let Some(problem) = bounds.refuses(label.energy, &label.forces, label.stress.as_ref()) {
-                return Err(Failure::Input(format!(
+                return Err(CommandError::Input(format!(
                     "{}:{line}: {problem}: nothing was imported; correct the label, remove the frame, or raise the limit if it is \
                      correct",
                     self.name
@@ -68,7 +68,7 @@ impl File {
 }
 
 impl ImportArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         if self.queue {
             let structures: Vec<_> =
                 self.files.iter().map(|path| read_unlabelled(path)).collect::<Result<_, _>>()?;
@@ -92,7 +92,7 @@ impl ImportArgs {
     async fn queue_structures(
         &self,
         structures: &[(String, u64, Structure)],
-    ) -> Result<QueuedImports, Failure> {
+    ) -> Result<QueuedImports, CommandError> {
         let location = self.location.get()?;
         let store = Store::open(&location).await?;
         // Imported structures change which candidates are duplicates: exclude a run.
@@ -103,7 +103,7 @@ impl ImportArgs {
         Ok(queued)
     }
 
-    async fn import(&self, files: &[File]) -> Result<(Protocol, ImportCounts), Failure> {
+    async fn import(&self, files: &[File]) -> Result<(Protocol, ImportCounts), CommandError> {
         let location = self.location.get()?;
         let store = Store::open(&location).await?;
         // Imported structures change which candidates are duplicates: exclude a run.
@@ -126,42 +126,42 @@ impl ImportArgs {
     }
 }
 
-fn read(path: &Path) -> Result<File, Failure> {
+fn read(path: &Path) -> Result<File, CommandError> {
     let name = path.display().to_string();
     let (mut frames, mut lines) = (Vec::new(), Vec::new());
-    for (number, frame) in XyzReader::open(path).map_err(Failure::input)?.enumerate() {
-        let frame = frame.map_err(Failure::input)?;
+    for (number, frame) in XyzReader::open(path).map_err(CommandError::input)?.enumerate() {
+        let frame = frame.map_err(CommandError::input)?;
         let label =
-            label(&frame).map_err(|error| Failure::Input(format!("{name}:{}: {error}", frame.line)))?;
+            label(&frame).map_err(|error| CommandError::Input(format!("{name}:{}: {error}", frame.line)))?;
         frames.push((number as u64, frame.structure, label));
         lines.push(frame.line);
     }
     if frames.is_empty() {
-        return Err(Failure::input(FileError::Empty(path.to_owned())));
+        return Err(CommandError::input(FileError::Empty(path.to_owned())));
     }
     Ok(File { name, frames, lines })
 }
 
 /// The structures of a file with its name and their numbers in it.
-fn read_unlabelled(path: &Path) -> Result<Vec<(String, u64, Structure)>, Failure> {
+fn read_unlabelled(path: &Path) -> Result<Vec<(String, u64, Structure)>, CommandError> {
     let name = path.display().to_string();
     let mut structures = Vec::new();
-    for (number, frame) in XyzReader::open(path).map_err(Failure::input)?.enumerate() {
-        let frame = frame.map_err(Failure::input)?;
-        let wrong = |error| Failure::Input(format!("{name}:{}: {error}", frame.line));
+    for (number, frame) in XyzReader::open(path).map_err(CommandError::input)?.enumerate() {
+        let frame = frame.map_err(CommandError::input)?;
+        let wrong = |error| CommandError::Input(format!("{name}:{}: {error}", frame.line));
         frame.structure.validate().map_err(wrong)?;
         structures.push((name.clone(), number as u64, frame.structure));
     }
     if structures.is_empty() {
-        return Err(Failure::input(FileError::Empty(path.to_owned())));
+        return Err(CommandError::input(FileError::Empty(path.to_owned())));
     }
     Ok(structures)
 }
 
 /// The current protocol of the campaign.
-async fn current_protocol(store: &Store) -> Result<Protocol, Failure> {
+async fn current_protocol(store: &Store) -> Result<Protocol, CommandError> {
     store.protocol_in_force().await?.ok_or_else(|| {
-        Failure::Input(
+        CommandError::Input(
             "the campaign has no label protocol yet: start it with calmwalk run first, or use --protocol"
                 .to_owned(),
         )
@@ -169,12 +169,12 @@ async fn current_protocol(store: &Store) -> Result<Protocol, Failure> {
 }
 
 /// The protocol of this name, created if it does not exist.
-async fn protocol_named(store: &Store, name: &str) -> Result<Protocol, Failure> {
+async fn protocol_named(store: &Store, name: &str) -> Result<Protocol, CommandError> {
     if let Some(known) = store.protocols().await?.into_iter().find(|protocol| protocol.name == name) {
         return Ok(known);
     }
     if name.trim().is_empty() {
-        return Err(Failure::Input("--protocol is empty; expected a name".to_owned()));
+        return Err(CommandError::Input("--protocol is empty; expected a name".to_owned()));
     }
     let settings = serde_json::json!({ "method": "import" });
     let hash = ContentHash(*blake3::hash(format!("calmwalk import protocol {name}").as_bytes()).as_bytes());

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 use crate::config::schema_text;
 use crate::output::print;
 
@@ -38,7 +38,7 @@ const SCHEMA: &str = "campaign.schema.json";
 const SCHEMA_LINE: &str = "#:schema ./campaign.schema.json\n\n";
 
 impl InitArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let config = self.directory.join("campaign.toml");
         let written = [SCHEMA_LINE.as_bytes(), CAMPAIGN].concat();
         let schema = schema_text();
@@ -50,7 +50,7 @@ impl InitArgs {
             .collect();
         if let Some((existing, _)) = files.iter().find(|(path, _)| path.exists()) {
             let existing = existing.display();
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{existing} already exists: choose another directory or remove the file"
             )));
         }
@@ -66,9 +66,9 @@ impl InitArgs {
     }
 }
 
-fn write(path: &Path, content: &[u8]) -> Result<(), Failure> {
+fn write(path: &Path, content: &[u8]) -> Result<(), CommandError> {
     let directory = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(directory)
         .and_then(|()| fs::write(path, content))
-        .map_err(|error| Failure::Failed(format!("cannot write {}: {error}", path.display())))
+        .map_err(|error| CommandError::Failed(format!("cannot write {}: {error}", path.display())))
 }

@@ -6,7 +6,7 @@ use std::time::Instant;
 use store::{Location, Store, StoreError};
 use tokio_util::sync::CancellationToken;
 
-use super::{ExitStatus, Failure, block_on, campaign_location, duration_between};
+use super::{CommandError, ExitStatus, block_on, campaign_location, duration_between};
 use crate::config::Config;
 use crate::duration::Duration;
 use crate::label_setup::{HostOptions, LabelSetup};
@@ -56,12 +56,12 @@ pub struct LabelArgs {
 }
 
 impl LabelArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         self.log.init("label")?;
         block_on(self.label())?
     }
 
-    async fn label(self) -> Result<ExitStatus, Failure> {
+    async fn label(self) -> Result<ExitStatus, CommandError> {
         let stop = CancellationToken::new();
         cancel_on_signal(stop.clone(), "stopping: labels in progress finish or return to the queue …")?;
         warn_if_unencrypted(&campaign_location::parse(&self.store)?);
@@ -70,7 +70,9 @@ impl LabelArgs {
                 return Ok(ExitStatus::Interrupted);
             };
             let location = match campaign_location::parse(&self.store)? {
-                Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
+                Location::Directory(directory) => {
+                    std::path::absolute(directory).map_err(CommandError::failed)?
+                }
                 // The text of the argument still has the password.
                 Location::Server(_) if self.store.to_str().is_some_and(Location::is_server) => {
                     self.store.clone()
@@ -102,7 +104,7 @@ impl LabelArgs {
     async fn wait_for_campaign(
         &self,
         stop: &CancellationToken,
-    ) -> Result<Option<(Store, LabelSetup)>, Failure> {
+    ) -> Result<Option<(Store, LabelSetup)>, CommandError> {
         let (started, mut reported) = (Instant::now(), false);
         while !stop.is_cancelled() {
             // Parsed at each attempt: the campaign may appear in a subdirectory.
@@ -140,7 +142,7 @@ impl LabelArgs {
 enum OpenError {
     /// It may be possible later.
     NotReady(StoreError),
-    Fatal(Failure),
+    Fatal(CommandError),
 }
 
 impl From<StoreError> for OpenError {

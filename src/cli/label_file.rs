@@ -11,7 +11,7 @@ use store::Protocol;
 use tokio_util::sync::CancellationToken;
 use workers::labeller::{SingleLabel, label_structure};
 
-use super::{ExitStatus, Failure, block_on};
+use super::{CommandError, ExitStatus, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::Config;
 use crate::label_method::{self, MethodConfig};
@@ -69,7 +69,7 @@ struct Labelled {
 }
 
 impl LabelFileArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         self.log.init("label-file")?;
         block_on(async {
             let stop = CancellationToken::new();
@@ -79,9 +79,9 @@ impl LabelFileArgs {
     }
 
     /// Labels the structures one after the other, up to the first failure.
-    async fn label(&self, stop: &CancellationToken) -> Result<ExitStatus, Failure> {
+    async fn label(&self, stop: &CancellationToken) -> Result<ExitStatus, CommandError> {
         let section = Config::load_label(&self.config)?;
-        let frames = read_structures(&self.structures).map_err(Failure::input)?;
+        let frames = read_structures(&self.structures).map_err(CommandError::input)?;
         let setup = MethodConfig::from_section(&section)?;
         let protocol = label_method::protocol(section.protocol_name(), setup.identity()?);
         let method = setup.load(&protocol)?;
@@ -90,7 +90,7 @@ impl LabelFileArgs {
         for frame in frames {
             let source = format!("{}:{}", self.structures.display(), frame.line);
             let structure = frame.structure;
-            structure.validate().map_err(|error| Failure::Input(format!("{source}: {error}")))?;
+            structure.validate().map_err(|error| CommandError::Input(format!("{source}: {error}")))?;
             let attempt = tokio::select! {
                 attempt = label_structure(&method, &structure, &bounds) => attempt?,
                 () = stop.cancelled() => {
@@ -119,12 +119,12 @@ impl Labelled {
         structure: &Structure,
         protocol: &Protocol,
         attempt: SingleLabel,
-    ) -> Result<Self, Failure> {
+    ) -> Result<Self, CommandError> {
         let SingleLabel { result, log, core_seconds } = attempt;
         let label = result.map_err(|failure| {
             let log = log.trim_end();
             let log = if log.is_empty() { String::new() } else { format!("; end of its log:\n{log}") };
-            Failure::Failed(format!("{source}: no label: {failure}{log}"))
+            CommandError::Failed(format!("{source}: no label: {failure}{log}"))
         })?;
         Ok(Self {
             source,

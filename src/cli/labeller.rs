@@ -7,7 +7,7 @@ use store::{Location, ProcessRecord, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use workers::labeller::{ExitPolicy, LabellerSettings, Method, Shutdown, Timing, retry_until_written, serve};
 
-use super::{ExitStatus, Failure, block_on};
+use super::{CommandError, ExitStatus, block_on};
 use crate::log;
 use crate::output::print_stderr;
 use crate::process_config::{self, LabellerConfig};
@@ -21,13 +21,13 @@ use crate::process_config::{self, LabellerConfig};
 pub struct LabellerArgs {}
 
 impl LabellerArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
-        launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
+        launcher::set_process_name(c"calmwalk").map_err(CommandError::failed)?;
         let setup: LabellerConfig = process_config::from_stdin()?;
         log::init(setup.log.clone(), "labeller", setup.number)?;
         match &setup.slot {
-            Some(slot) => launcher::end_with_parent(slot.parent).map_err(Failure::failed)?,
-            None => launcher::start_own_session().map_err(Failure::failed)?,
+            Some(slot) => launcher::end_with_parent(slot.parent).map_err(CommandError::failed)?,
+            None => launcher::start_own_session().map_err(CommandError::failed)?,
         }
         let method = setup.method.load(&setup.protocol)?;
         let closing = Shutdown::default();
@@ -36,9 +36,9 @@ impl LabellerArgs {
     }
 }
 
-async fn label(setup: LabellerConfig, method: Method, closing: &Shutdown) -> Result<(), Failure> {
+async fn label(setup: LabellerConfig, method: Method, closing: &Shutdown) -> Result<(), CommandError> {
     let (mut terminate, stop) =
-        (signal(SignalKind::terminate()).map_err(Failure::failed)?, closing.stop.clone());
+        (signal(SignalKind::terminate()).map_err(CommandError::failed)?, closing.stop.clone());
     tokio::spawn(async move {
         terminate.recv().await;
         stop.cancel();

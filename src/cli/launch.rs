@@ -12,7 +12,7 @@ use orchestrator::slurm::{DesiredJobs, JobNames, JobPhase, Plan, Slurm, SlurmErr
 use store::Location;
 
 use self::job_specs::JobSpecs;
-use super::{ExitStatus, Failure, block_on, campaign_location};
+use super::{CommandError, ExitStatus, block_on, campaign_location};
 use crate::campaign::Campaign;
 use crate::config::Config;
 use crate::output::{count, log_and_print, log_and_warn, print};
@@ -107,7 +107,7 @@ pub fn job_names(location: &Location) -> JobNames {
 }
 
 impl LaunchArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let System::Slurm = self.on;
         let directory = self.directory()?;
         let slurm = Slurm::with_timeout(COMMAND_TIMEOUT);
@@ -137,13 +137,13 @@ impl LaunchArgs {
     }
 
     /// The canonical path of the campaign's directory, from which the names of its jobs follow.
-    fn directory(&self) -> Result<PathBuf, Failure> {
+    fn directory(&self) -> Result<PathBuf, CommandError> {
         let directory =
             self.directory.clone().unwrap_or_else(|| campaign_location::default_directory(&self.config));
         let created = DirBuilder::new().recursive(true).mode(0o700).create(&directory);
         let canonical = created.and_then(|()| directory.canonicalize());
         canonical.map_err(|error| {
-            Failure::Input(format!("cannot create the directory {}: {error}", directory.display()))
+            CommandError::Input(format!("cannot create the directory {}: {error}", directory.display()))
         })
     }
 
@@ -167,10 +167,10 @@ impl LaunchArgs {
         names: &JobNames,
         specs: &JobSpecs,
         wanted: DesiredJobs,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandError> {
         let jobs = |error: SlurmError| match self.dry_run && error.is_missing() {
             true => Ok(Vec::new()),
-            false => Err(Failure::failed(error)),
+            false => Err(CommandError::failed(error)),
         };
         if self.dry_run {
             let jobs = slurm.jobs(names).await.or_else(jobs)?;
@@ -184,7 +184,7 @@ impl LaunchArgs {
             let action = if cancel.contains(&job.id) { "cancelled" } else { "kept" };
             print(|out| writeln!(out, "{}: job {} ({}) {action}", job.role, job.id, job.state))?;
         }
-        slurm.cancel(&cancel).await.map_err(Failure::failed)?;
+        slurm.cancel(&cancel).await.map_err(CommandError::failed)?;
         let mut orchestrator = specs.orchestrator_job(&jobs, &cancel);
         if let Some(id) = orchestrator.filter(|_| self.accept_reference_check) {
             log_and_warn(format_args!(
@@ -203,23 +203,24 @@ impl LaunchArgs {
                     "{role}: {full}; waiting until it does. To stop waiting, press Ctrl-C and launch again later"
                 ));
             };
-            let id = slurm.submit(names, submission, &request, on_full).await.map_err(Failure::failed)?;
+            let id =
+                slurm.submit(names, submission, &request, on_full).await.map_err(CommandError::failed)?;
             orchestrator = orchestrator.or(Some(id));
             print(|out| writeln!(out, "{}: job {id} submitted", submission.role))?;
         }
         Ok(())
     }
 
-    async fn stop(&self, slurm: &Slurm, names: &JobNames) -> Result<(), Failure> {
+    async fn stop(&self, slurm: &Slurm, names: &JobNames) -> Result<(), CommandError> {
         // A job of the campaign that runs this command must not wait for its own end.
         let own = std::env::var("SLURM_JOB_ID").ok().and_then(|id| id.parse().ok());
         let cancelled = if self.pending { slurm.withdraw(names).await } else { slurm.stop(names, own).await };
-        let cancelled = cancelled.map_err(Failure::failed)?;
+        let cancelled = cancelled.map_err(CommandError::failed)?;
         print(|out| writeln!(out, "{} cancelled", count(cancelled, "job")))
     }
 }
 
 /// An absolute path, valid in any working directory of a job.
-fn absolute(path: &Path) -> Result<PathBuf, Failure> {
-    std::path::absolute(path).map_err(Failure::failed)
+fn absolute(path: &Path) -> Result<PathBuf, CommandError> {
+    std::path::absolute(path).map_err(CommandError::failed)
 }

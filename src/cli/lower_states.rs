@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use store::{LowerState, LowerStateChange, StateResult, Store, unix_milliseconds};
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{Table, decimals, print, print_json, warn_if_unencrypted};
 
 /// List labels for which a lower magnetic state is known, or replace them by it
@@ -34,7 +34,7 @@ pub struct LowerStatesArgs {
 }
 
 impl LowerStatesArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         if self.all || !self.ids.is_empty() {
             let changes = block_on(self.take())??;
             if self.json {
@@ -46,7 +46,7 @@ impl LowerStatesArgs {
         }
         if self.reason.is_some() {
             let message = "--reason needs IDs or --all: without them, nothing is changed";
-            return Err(Failure::Input(message.to_owned()));
+            return Err(CommandError::Input(message.to_owned()));
         }
         let states = block_on(self.read())??;
         if self.json {
@@ -57,14 +57,14 @@ impl LowerStatesArgs {
         Ok(ExitStatus::Done)
     }
 
-    async fn read(&self) -> Result<Vec<LowerState>, Failure> {
+    async fn read(&self) -> Result<Vec<LowerState>, CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let states = store.lower_states().await?;
         store.close().await;
         Ok(states)
     }
 
-    async fn take(&self) -> Result<Vec<LowerStateChange>, Failure> {
+    async fn take(&self) -> Result<Vec<LowerStateChange>, CommandError> {
         let location = self.location.get()?;
         warn_if_unencrypted(&location);
         let store = Store::open(&location).await?;

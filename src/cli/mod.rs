@@ -40,7 +40,7 @@ use ::store::Location;
 use clap::{Parser, Subcommand};
 
 use crate::duration::Duration;
-use crate::exit_status::{ExitStatus, Failure};
+use crate::exit_status::{CommandError, ExitStatus};
 
 /// Grow the training set of an interatomic potential by molecular dynamics biased towards structures it does not know.
 ///
@@ -93,7 +93,7 @@ enum CliCommand {
 }
 
 /// Runs the command.
-pub fn run(arguments: Arguments) -> Result<ExitStatus, Failure> {
+pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
     match arguments.command {
         CliCommand::Init(command) => command.run(),
         CliCommand::Validate(command) => command.run(),
@@ -139,7 +139,7 @@ struct CampaignArgs {
 
 impl CampaignArgs {
     /// The location is parsed here and not by clap, whose error message would print the password of a URL.
-    fn get(&self) -> Result<Location, Failure> {
+    fn get(&self) -> Result<Location, CommandError> {
         campaign_location::parse(&self.location)
     }
 }
@@ -158,9 +158,9 @@ fn duration_between(
 }
 
 /// Runs a future that uses the database to its end.
-fn block_on<T>(future: impl Future<Output = T>) -> Result<T, Failure> {
+fn block_on<T>(future: impl Future<Output = T>) -> Result<T, CommandError> {
     let runtime =
-        tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
+        tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(CommandError::failed)?;
     let output = runtime.block_on(future);
     // A thread may still compute a label that was already returned to the queue: do not wait for it.
     runtime.shutdown_background();

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
 use crate::wording;
 
@@ -84,7 +84,7 @@ fn parse_state(name: &str) -> Result<JobState, String> {
 }
 
 impl QueueArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let location = &self.location.get()?;
         match &self.action {
             QueueCommand::List(list) => {
@@ -105,7 +105,7 @@ impl QueueArgs {
     }
 
     /// Changes one job after the other, and prints the new state of each.
-    fn change(&self, location: &Location, action: &QueueCommand) -> Result<(), Failure> {
+    fn change(&self, location: &Location, action: &QueueCommand) -> Result<(), CommandError> {
         let mut changed = Vec::new();
         let result = block_on(change(location, action, &mut changed))?;
         if self.json {
@@ -117,12 +117,12 @@ impl QueueArgs {
     }
 }
 
-async fn read_list(location: &Location, list: &QueueListArgs) -> Result<Vec<Job>, Failure> {
+async fn read_list(location: &Location, list: &QueueListArgs) -> Result<Vec<Job>, CommandError> {
     let store = Store::open_read_only(location).await?;
     Ok(store.queue_list(list.state, list.limit, list.offset).await?)
 }
 
-async fn read_details(location: &Location, id: &str) -> Result<JobDetails, Failure> {
+async fn read_details(location: &Location, id: &str) -> Result<JobDetails, CommandError> {
     let store = Store::open_read_only(location).await?;
     Ok(store.queue_show(id).await?)
 }
@@ -132,7 +132,7 @@ pub async fn change(
     location: &Location,
     action: &QueueCommand,
     changed: &mut Vec<Job>,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let store = Store::open(location).await?;
     let ids = match action {
         QueueCommand::Drop { ids } | QueueCommand::Retry { ids } => ids.as_slice(),

@@ -14,7 +14,7 @@ use store::{CampaignLock, Location, NewProtocol, Protocol, RelabelCounts, Store,
 use self::protocol_change::ProtocolChange;
 use self::selection::Selection;
 use super::campaign_location::shell_argument;
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::filter::Filter;
 use crate::output::{count, print, print_json, warn_if_unencrypted};
 use crate::wording;
@@ -73,7 +73,7 @@ struct RelabelReport {
 }
 
 impl RelabelArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let report = block_on(self.relabel())??;
         if self.json {
             print_json(&report.as_json(self.dry_run))?;
@@ -83,7 +83,7 @@ impl RelabelArgs {
         Ok(ExitStatus::Done)
     }
 
-    async fn relabel(&self) -> Result<RelabelReport, Failure> {
+    async fn relabel(&self) -> Result<RelabelReport, CommandError> {
         let location = self.location.get()?;
         warn_if_unencrypted(&location);
         let store = match self.dry_run {
@@ -91,7 +91,7 @@ impl RelabelArgs {
             false => Store::open(&location).await?,
         };
         let none = || {
-            Failure::Input(
+            CommandError::Input(
                 "the campaign has no label protocol yet: start it with calmwalk run first".to_owned(),
             )
         };
@@ -121,7 +121,7 @@ impl RelabelArgs {
     }
 
     /// How the labels will be computed.
-    async fn next(&self, store: &Store, location: &Location) -> Result<String, Failure> {
+    async fn next(&self, store: &Store, location: &Location) -> Result<String, CommandError> {
         if store.status().await?.led {
             return Ok("the campaign is running: its labellers compute the labels".to_owned());
         }
@@ -138,7 +138,7 @@ impl RelabelArgs {
         ))
     }
 
-    async fn select(&self, store: &Store, protocol: &Protocol) -> Result<Selection, Failure> {
+    async fn select(&self, store: &Store, protocol: &Protocol) -> Result<Selection, CommandError> {
         let all = store.relabellable(protocol.hash).await?;
         if !self.ids.is_empty() {
             return Selection::from_ids(store, all, &self.ids).await;
@@ -155,7 +155,7 @@ impl RelabelArgs {
         store: &Store,
         new: Option<&ProtocolChange>,
         selection: &Selection,
-    ) -> Result<RelabelCounts, Failure> {
+    ) -> Result<RelabelCounts, CommandError> {
         let changes: Vec<_> = new.iter().flat_map(|new| &new.changes).map(|change| change.detail()).collect();
         let protocol = new.map(|new| NewProtocol {
             protocol: &new.protocol,

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use store::Store;
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
 use crate::replay::{
     self, FateChange, FateCounts, MissingFeatures, RelocatedFilesArgs, Report, RuleOverride,
@@ -36,7 +36,7 @@ pub struct ReplayArgs {
 }
 
 impl ReplayArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let report = block_on(self.replay())??;
         if self.json {
             print_json(&report)?;
@@ -45,14 +45,14 @@ impl ReplayArgs {
         }
         match report.difference {
             None => Ok(ExitStatus::Done),
-            Some(difference) => Err(Failure::Failed(format!(
+            Some(difference) => Err(CommandError::Failed(format!(
                 "decision {} is not reproduced: {} was {}, and is now {}",
                 difference.decision, difference.what, difference.recorded, difference.now
             ))),
         }
     }
 
-    async fn replay(&self) -> Result<Report, Failure> {
+    async fn replay(&self) -> Result<Report, CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let report = replay::replay(&store, &self.settings, &self.moved).await;
         store.close().await;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use store::Store;
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, print};
 use crate::page::{create_directory, write_files};
 use crate::report::{self, PAGE};
@@ -25,7 +25,7 @@ pub struct ReportArgs {
 }
 
 impl ReportArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let location = self.location.get()?;
         // Fail before the long computation.
         create_directory(&self.output)?;

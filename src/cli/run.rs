@@ -25,7 +25,7 @@ use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
 
 use super::campaign_location::{self, shell_argument};
-use super::{ExitStatus, Failure, block_on, duration_between};
+use super::{CommandError, ExitStatus, block_on, duration_between};
 use crate::campaign::Campaign;
 use crate::disk_forecast;
 use crate::duration::Duration;
@@ -85,7 +85,7 @@ pub struct RunArgs {
 }
 
 impl RunArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         self.log.init("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
@@ -141,10 +141,10 @@ impl RunArgs {
 }
 
 /// Creates the directory of the campaign, readable by this user only.
-fn create_directory(directory: &Path) -> Result<(), Failure> {
+fn create_directory(directory: &Path) -> Result<(), CommandError> {
     if directory.to_string_lossy().contains("://") {
         // A URL may have a password in it.
-        return Err(Failure::Input(
+        return Err(CommandError::Input(
             "--directory is a URL; expected a directory of this host. Set the URL of a database with run.store in the configuration"
                 .to_owned(),
         ));
@@ -156,7 +156,7 @@ fn create_directory(directory: &Path) -> Result<(), Failure> {
         ErrorKind::AlreadyExists => {
             failed(std::io::Error::new(ErrorKind::NotADirectory, "it is a file")).into()
         }
-        _ => Failure::Input(format!("{}; choose another one with --directory", failed(source))),
+        _ => CommandError::Input(format!("{}; choose another one with --directory", failed(source))),
     })
 }
 
@@ -177,7 +177,7 @@ async fn run(
     directory: &Path,
     location: &Location,
     options: RunOptions<'_>,
-) -> Result<ExitStatus, Failure> {
+) -> Result<ExitStatus, CommandError> {
     let RunOptions { in_process, adopt, accept_reference_check, listen, web, wait_timeout } = options;
     let lock = lock::server(location, wait_timeout).await?;
     let origin = Provenance::new(&campaign.path, &campaign.text, directory);
@@ -257,7 +257,7 @@ async fn work(
     selector: Selector,
     in_process: bool,
     accept_reference_check: Option<&str>,
-) -> Result<reactor::RunOutcome, Failure> {
+) -> Result<reactor::RunOutcome, CommandError> {
     let runtime::RunContext { campaign, store, stop, .. } = run;
     let Surroundings { location, lock, web } = surroundings;
     let (limits, used_up) = (campaign.config.budget(), time_budget::exhausted_time_limit(store).await?);
@@ -287,7 +287,7 @@ async fn open_store(
     location: &Location,
     origin: &Provenance,
     adopt: bool,
-) -> Result<Store, Failure> {
+) -> Result<Store, CommandError> {
     let now = unix_milliseconds();
     let resolved = campaign.resolved();
     let store = match Store::open(location).await {
@@ -323,8 +323,8 @@ async fn open_store(
 }
 
 /// Stores what other processes need to know: the label method, the guard, the elements of the model and the disk forecast.
-async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
-    let text = |json: serde_json::Result<String>| json.map_err(Failure::failed);
+async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), CommandError> {
+    let text = |json: serde_json::Result<String>| json.map_err(CommandError::failed);
     let method = campaign.method()?;
     store.set_metadata(LABEL_METHOD_KEY, &text(serde_json::to_string(&method))?).await?;
     store.set_metadata(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
@@ -341,7 +341,7 @@ async fn warn_if_disk_is_too_small(
     campaign: &Campaign,
     directory: &Path,
     store: &Store,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let forecast = disk_forecast::estimate(campaign);
     let needed = (forecast.bytes() + disk_forecast::WAL_BYTES).saturating_sub(store.size().await?);
     let free = store::free_space(directory)?;
@@ -358,16 +358,16 @@ async fn warn_if_disk_is_too_small(
 }
 
 /// Why the campaign does not go on, and how it does.
-async fn paused_by_alarm(campaign: &Campaign, store: &Store) -> Result<Failure, Failure> {
+async fn paused_by_alarm(campaign: &Campaign, store: &Store) -> Result<CommandError, CommandError> {
     let values = MixtureValues(store.values().await?).training_frames();
-    let measured = Measured::deserialize(values).map_err(Failure::failed)?;
-    Ok(Failure::Failed(format!(
+    let measured = Measured::deserialize(values).map_err(CommandError::failed)?;
+    Ok(CommandError::Failed(format!(
         "the campaign is paused: {}, then run it again",
         ForgettingRule::new(&campaign.config.calm).raised_message(&measured)
     )))
 }
 
-async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, Failure> {
+async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, CommandError> {
     let snapshot = SelectorSnapshot {
         walks: store.load_walks().await?,
         components: store.load_components().await?,
@@ -384,7 +384,7 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
         campaign.training.clone(),
         snapshot,
     )
-    .map_err(Failure::failed)?;
+    .map_err(CommandError::failed)?;
     let started = selector.start_walks();
     if !started.decisions.is_empty() {
         store.commit(&started).await?;

@@ -1,6 +1,6 @@
 //! `calmwalk schema`
 
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 use crate::config::schema_text;
 use crate::output::print;
 
@@ -11,7 +11,7 @@ use crate::output::print;
 pub struct SchemaArgs {}
 
 impl SchemaArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         print(|out| out.write_all(schema_text().as_bytes()))?;
         Ok(ExitStatus::Done)
     }

@@ -10,7 +10,7 @@ use potentials::grace::GraceModel;
 use serde_json::{Value, json};
 
 use super::calm::load;
-use super::{ExitStatus, Failure, campaign_location};
+use super::{CommandError, ExitStatus, campaign_location};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::file_hash;
 use crate::output::{Table, count, decimals, print, print_json, print_stderr};
@@ -102,7 +102,7 @@ pub struct SelectArgs {
 }
 
 impl SelectArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (parts, window, target) = (self.parts()?, self.window()?, self.target()?);
         let files = self.reading.files(&self.pool)?;
         let inputs = files.paths().map(|path| (path, "a file of the pool"));
@@ -119,7 +119,7 @@ impl SelectArgs {
         if let Some((strategy, uses)) = needed
             && !mixture.can_be_updated()
         {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{}: the mixture has no statistics, which {} {uses}: use --artifact with the gmm_artifacts.npz of this model",
                 self.model.display(),
                 strategy.name()
@@ -158,14 +158,14 @@ impl SelectArgs {
     }
 
     /// The strategies with the numbers of structures that they pick.
-    fn parts(&self) -> Result<Vec<Part>, Failure> {
+    fn parts(&self) -> Result<Vec<Part>, CommandError> {
         let mut parts = self.strategy.clone();
         match (parts.as_mut_slice(), self.number) {
-            (_, Some(0)) => return Err(Failure::Input("-n 0: expected a number above 0".to_owned())),
+            (_, Some(0)) => return Err(CommandError::Input("-n 0: expected a number above 0".to_owned())),
             ([part], Some(number)) if part.number.is_none() => part.number = Some(number),
             (_, Some(_)) => {
                 let message = "-n is for a single strategy without a number; give each its own, as in greedy:200 fps:25";
-                return Err(Failure::Input(message.to_owned()));
+                return Err(CommandError::Input(message.to_owned()));
             }
             (_, None) => (),
         }
@@ -174,34 +174,34 @@ impl SelectArgs {
             None => Ok(parts),
             Some(part) => {
                 let name = part.strategy.name();
-                Err(Failure::Input(format!(
+                Err(CommandError::Input(format!(
                     "--strategy {name}: expected a number of structures, as in {name}:25, or -n"
                 )))
             }
         }
     }
 
-    fn window(&self) -> Result<Window, Failure> {
+    fn window(&self) -> Result<Window, CommandError> {
         let window = Window { above: self.gamma_min, up_to: self.gamma_max.unwrap_or(f64::INFINITY) };
         if window.above >= 0.0 && window.above < window.up_to {
             return Ok(window);
         }
         let Window { above, up_to } = window;
-        Err(Failure::Input(format!(
+        Err(CommandError::Input(format!(
             "--gamma-min {above}, --gamma-max {up_to}: expected a lower limit of 0 or more that is below the upper one"
         )))
     }
 
-    fn target(&self) -> Result<Positive, Failure> {
+    fn target(&self) -> Result<Positive, CommandError> {
         Positive::try_from(self.update_target)
-            .map_err(|error| Failure::Input(format!("--update-target: {error}")))
+            .map_err(|error| CommandError::Input(format!("--update-target: {error}")))
     }
 
-    fn memory_bytes(&self) -> Result<usize, Failure> {
+    fn memory_bytes(&self) -> Result<usize, CommandError> {
         if self.memory.is_finite() && self.memory >= 0.0 {
             return Ok((self.memory * f64::from(1 << 30)) as usize);
         }
-        Err(Failure::Input(format!("--memory {}: expected a number of GiB, 0 or more", self.memory)))
+        Err(CommandError::Input(format!("--memory {}: expected a number of GiB, 0 or more", self.memory)))
     }
 
     /// That of the output.
@@ -219,11 +219,11 @@ impl SelectArgs {
         }
     }
 
-    fn campaigns(&self) -> Result<Vec<CampaignCandidates>, Failure> {
+    fn campaigns(&self) -> Result<Vec<CampaignCandidates>, CommandError> {
         if self.campaign.is_empty() {
             return Ok(Vec::new());
         }
-        let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
+        let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
         let campaigns = self.campaign.iter().zip(0..);
         let open = |(path, number): (&PathBuf, u32)| {
             CampaignCandidates::open(&campaign_location::parse(path)?, number, &hash, self.declined)
@@ -231,7 +231,7 @@ impl SelectArgs {
         campaigns.map(open).collect()
     }
 
-    fn write(&self, files: &PoolFiles, pool: &GradedPool, picks: &[Pick]) -> Result<(), Failure> {
+    fn write(&self, files: &PoolFiles, pool: &GradedPool, picks: &[Pick]) -> Result<(), CommandError> {
         let mut output = AtomicFile::create(&self.output)?;
         for frame in frames(files, pool, picks)? {
             write_frame(&mut output, &frame).map_err(|error| cannot_write(&self.output, error))?;
@@ -263,7 +263,7 @@ struct Element {
 }
 
 impl Report<'_> {
-    fn print(&self) -> Result<(), Failure> {
+    fn print(&self) -> Result<(), CommandError> {
         if self.command.json { print_json(&self.json()) } else { self.print_tables() }
     }
 
@@ -304,7 +304,7 @@ impl Report<'_> {
         picks.into_iter().map(|pick| self.pool.total_atoms(pick.structure)).sum()
     }
 
-    fn print_tables(&self) -> Result<(), Failure> {
+    fn print_tables(&self) -> Result<(), CommandError> {
         let mut strategies = Table::new(&["strategy", ">structures", ">atoms", ">largest γ", ">smallest γ"]);
         for (name, picks) in self.strategies() {
             let gamma = || picks.iter().map(|pick| pick.gamma_max);

@@ -22,7 +22,7 @@ use store::{Candidates, Location, Status, Store, unix_milliseconds};
 use self::batch_jobs::BatchJobs;
 use self::page::{Page, cut};
 pub use self::processes::state;
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, decimals, print, print_json};
 use crate::wording::cost::two_digits;
 use crate::wording::disk::megabytes;
@@ -48,12 +48,12 @@ pub struct StatusArgs {
 }
 
 impl StatusArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let location = self.location.get()?;
         let snapshot = block_on(read(&location))??;
         let jobs = block_on(BatchJobs::query(&location))?;
         if self.json {
-            let mut json = snapshot.to_json().map_err(Failure::failed)?;
+            let mut json = snapshot.to_json().map_err(CommandError::failed)?;
             jobs.add_to(&mut json);
             print_json(&json)?;
         } else {
@@ -64,7 +64,7 @@ impl StatusArgs {
     }
 }
 
-async fn read(location: &Location) -> Result<Snapshot, Failure> {
+async fn read(location: &Location) -> Result<Snapshot, CommandError> {
     let store = Store::open_read_only(location).await?;
     let snapshot = Snapshot::read(&store).await?;
     store.close().await;

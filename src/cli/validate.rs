@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use calm::Artifact;
 
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::campaign::{Campaign, PairRange, Remark, SeedTriage, StepTimes, triage};
 use crate::disk_forecast;
@@ -40,7 +40,7 @@ pub struct ValidateArgs {
 }
 
 impl ValidateArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
         let csv = self.csv.as_deref().map(AtomicFile::create).transpose()?;

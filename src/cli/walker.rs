@@ -8,7 +8,7 @@ use wire::ipc::IpcWalker;
 use workers::walk::WalkContext;
 use workers::walker;
 
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 use crate::process_config::{self, WalkerConfig};
 use crate::{log, signals};
 
@@ -19,18 +19,18 @@ use crate::{log, signals};
 pub struct WalkerArgs {}
 
 impl WalkerArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let setup: WalkerConfig = process_config::from_stdin()?;
         log::init(setup.log.clone(), "walker", Some(setup.door.walker()))?;
-        launcher::set_process_name(c"calmwalk").map_err(Failure::failed)?;
-        launcher::end_with_parent(setup.parent).map_err(Failure::failed)?;
+        launcher::set_process_name(c"calmwalk").map_err(CommandError::failed)?;
+        launcher::end_with_parent(setup.parent).map_err(CommandError::failed)?;
         let stopping = signals::stop_token()?;
-        let threads = Threads::new(setup.threads).map_err(Failure::failed)?;
+        let threads = Threads::new(setup.threads).map_err(CommandError::failed)?;
         let context = WalkContext { model: setup.model.load()?, threads, settings: Arc::new(setup.settings) };
-        let mut transport = IpcWalker::connect(&setup.door, stopping).map_err(Failure::failed)?;
+        let mut transport = IpcWalker::connect(&setup.door, stopping).map_err(CommandError::failed)?;
         let ended = walker::run(&context, &mut transport);
         match (ended, transport.failure()) {
-            (_, Some(failure)) => Err(Failure::failed(failure)),
+            (_, Some(failure)) => Err(CommandError::failed(failure)),
             (walker::WalkerExit::Dismissed, None) => Ok(ExitStatus::Done),
             (walker::WalkerExit::Stopped, None) => Ok(ExitStatus::Interrupted),
         }

@@ -3,7 +3,7 @@
 use store::{Location, Store, unix_milliseconds};
 use wire::WalkId;
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::print;
 
 /// Pause or resume walks
@@ -39,7 +39,7 @@ pub struct WalkSelectionArgs {
 }
 
 impl WalksArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let location = self.location.get()?;
         let messages = block_on(change(&location, &self.action))??;
         print(|out| messages.iter().try_for_each(|line| writeln!(out, "{line}")))?;
@@ -48,7 +48,7 @@ impl WalksArgs {
 }
 
 /// Pauses or resumes walks. Returns messages.
-pub async fn change(location: &Location, action: &WalksCommand) -> Result<Vec<String>, Failure> {
+pub async fn change(location: &Location, action: &WalksCommand) -> Result<Vec<String>, CommandError> {
     let (selection, paused) = match action {
         WalksCommand::Pause(selection) => (selection, true),
         WalksCommand::Resume(selection) => (selection, false),

@@ -14,7 +14,7 @@ use calm::build::ShardClusters;
 
 use super::stream::ShardHash;
 use crate::atomic_file::{cannot_create, cannot_write};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Length of content, index and hash of the shard, hash of the content.
 const HEADER: usize = 8 + 8 + 32 + 32;
@@ -37,7 +37,7 @@ struct Log {
 
 impl KnownShards {
     /// Reads the logs of other processes and that of this one.
-    pub fn open(own: PathBuf, logs: &[PathBuf]) -> Result<Self, Failure> {
+    pub fn open(own: PathBuf, logs: &[PathBuf]) -> Result<Self, CommandError> {
         let mut known = Self { logs: Vec::new(), own: (own, None), places: BTreeMap::new() };
         for path in logs {
             let is_own = *path == known.own.0;
@@ -57,7 +57,7 @@ impl KnownShards {
     }
 
     /// Adds a log up to its first incomplete record.
-    fn read_log(&mut self, mut log: Log) -> Result<(), Failure> {
+    fn read_log(&mut self, mut log: Log) -> Result<(), CommandError> {
         let cannot = |error| unreadable(&log.path, error);
         let length = log.file.metadata().map_err(cannot)?.len();
         let mut file = BufReader::new(&log.file);
@@ -86,7 +86,7 @@ impl KnownShards {
     }
 
     /// The clusters of a shard by element index, if they are known.
-    pub fn read(&self, index: u64, hash: ShardHash) -> Result<Option<Vec<ShardClusters>>, Failure> {
+    pub fn read(&self, index: u64, hash: ShardHash) -> Result<Option<Vec<ShardClusters>>, CommandError> {
         let Some(&(number, position)) = self.places.get(&(index, hash)) else { return Ok(None) };
         let log = &self.logs[number];
         let damaged = || unreadable(&log.path, "the file is damaged; begin anew with --restart");
@@ -106,7 +106,12 @@ impl KnownShards {
     }
 
     /// Adds a finished shard, which has a record in the log of this process then.
-    pub fn append(&mut self, index: u64, hash: ShardHash, elements: &[ShardClusters]) -> Result<(), Failure> {
+    pub fn append(
+        &mut self,
+        index: u64,
+        hash: ShardHash,
+        elements: &[ShardClusters],
+    ) -> Result<(), CommandError> {
         let number = self.own_log()?;
         let log = &mut self.logs[number];
         let content = postcard::to_stdvec(elements).map_err(|error| cannot_write(&log.path, error))?;
@@ -122,7 +127,7 @@ impl KnownShards {
         Ok(())
     }
 
-    fn own_log(&mut self) -> Result<usize, Failure> {
+    fn own_log(&mut self) -> Result<usize, CommandError> {
         let (path, number) = &mut self.own;
         if let Some(number) = number {
             return Ok(*number);
@@ -151,8 +156,8 @@ fn fields(header: &[u8; HEADER]) -> (u64, u64, ShardHash, blake3::Hash) {
     (number(0), number(8), hash(16), blake3::Hash::from_bytes(hash(48)))
 }
 
-fn unreadable(path: &Path, error: impl std::fmt::Display) -> Failure {
-    Failure::Failed(format!("cannot read {}: {error}", path.display()))
+fn unreadable(path: &Path, error: impl std::fmt::Display) -> CommandError {
+    CommandError::Failed(format!("cannot read {}: {error}", path.display()))
 }
 
 #[cfg(test)]

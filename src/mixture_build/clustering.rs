@@ -12,7 +12,7 @@ use super::progress::Progress;
 use super::state::Partition;
 use super::stream::{Shard, ShardHash};
 use super::workers::{Counters, run_pass};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// What pass 1 found.
 pub(super) struct Clustered {
@@ -26,7 +26,7 @@ pub(super) struct Clustered {
 
 impl Build {
     /// Pass 1. `None` once it was stopped.
-    pub(super) fn partition(&mut self) -> Result<Option<Partition>, Failure> {
+    pub(super) fn partition(&mut self) -> Result<Option<Partition>, CommandError> {
         if let Some(partition) = self.state.partition()? {
             return Ok(Some(partition));
         }
@@ -37,7 +37,7 @@ impl Build {
     }
 
     /// Clusters the shards of this process. `None` once it was stopped.
-    pub(super) fn cluster(&mut self) -> Result<Option<Clustered>, Failure> {
+    pub(super) fn cluster(&mut self) -> Result<Option<Clustered>, CommandError> {
         let Self { work, settings, state, bytes } = self;
         let mut known = state.known_shards()?;
         let finished: BTreeSet<(u64, ShardHash)> = known.shards().collect();
@@ -73,19 +73,24 @@ impl Build {
 
 impl Clustered {
     /// Combines the clusters of the shards in their order.
-    pub(super) fn combine(self, settings: &BuildSettings, elements: usize) -> Result<Partition, Failure> {
+    pub(super) fn combine(
+        self,
+        settings: &BuildSettings,
+        elements: usize,
+    ) -> Result<Partition, CommandError> {
         let Self { structures, hashes, known } = self;
         let partitioners = (0..elements).map(|element| Partitioner::new(settings, element));
-        let mut partitioners: Vec<_> = partitioners.collect::<Result<_, _>>().map_err(Failure::failed)?;
+        let mut partitioners: Vec<_> =
+            partitioners.collect::<Result<_, _>>().map_err(CommandError::failed)?;
         for (&index, &hash) in &hashes {
             let found = known.read(index, hash)?.ok_or_else(|| {
                 let path = known.path().display();
-                Failure::Failed(format!(
+                CommandError::Failed(format!(
                     "{path}: the clusters of shard {index} are missing; remove the directory and begin anew"
                 ))
             })?;
             for (partitioner, of_element) in partitioners.iter_mut().zip(&found) {
-                partitioner.add(of_element).map_err(Failure::failed)?;
+                partitioner.add(of_element).map_err(CommandError::failed)?;
             }
         }
         let elements = partitioners.into_iter().map(Partitioner::finish).collect();

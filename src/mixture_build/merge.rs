@@ -13,7 +13,7 @@ use super::mixture;
 use super::part::Part;
 use super::state::{BuildState, PartEnd, Partition, RunningSums};
 use super::sums::{components_from_sums, histograms_from_sums};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// The state of a build in parts.
 pub struct Merge {
@@ -34,7 +34,7 @@ impl Merge {
     ///
     /// # Errors
     /// There is no such state; it belongs to another model; a process uses it.
-    pub fn open(output: &Path, model_hash: &str) -> Result<Self, Failure> {
+    pub fn open(output: &Path, model_hash: &str) -> Result<Self, CommandError> {
         let (state, identity) = BuildState::open_existing(output)?;
         identity.check_model(model_hash).map_err(|difference| state.other_build(&difference))?;
         Ok(Self { state, identity })
@@ -54,7 +54,7 @@ impl Merge {
         model: &GraceModel,
         projection: Projection,
         projection_seed: Option<i64>,
-    ) -> Result<Merged, Failure> {
+    ) -> Result<Merged, CommandError> {
         let same = self.identity.check_projection(&projection);
         same.map_err(|difference| self.state.other_build(&difference))?;
         let Some(partition) = self.state.partition()? else {
@@ -77,12 +77,12 @@ impl Merge {
     }
 
     /// Removes the state, which a written artifact no longer needs.
-    pub fn finish(self) -> Result<(), Failure> {
+    pub fn finish(self) -> Result<(), CommandError> {
         self.state.remove()
     }
 
     /// What all parts found in pass 1.
-    fn pass_1(&self) -> Result<Clustered, Failure> {
+    fn pass_1(&self) -> Result<Clustered, CommandError> {
         let ends = self.state.part_ends()?;
         let done = |part: Part| ends.contains_key(&part);
         let parts = complete(1, ends.keys().copied(), done)?;
@@ -90,7 +90,7 @@ impl Merge {
         for part in parts {
             let PartEnd { structures: found, hashes: own } = &ends[&part];
             if structures.is_some_and(|before| before != *found) {
-                return Err(Failure::Failed(format!(
+                return Err(CommandError::Failed(format!(
                     "part {part} of pass 1 found {found} structures in the data files, part 1 found {}: the files have changed; \
                      remove {} and begin anew",
                     structures.unwrap_or_default(),
@@ -105,7 +105,7 @@ impl Merge {
     }
 
     /// The sums of all parts in pass 2 or 3.
-    fn sums(&self, pass: usize, partition: &Partition) -> Result<RunningSums, Failure> {
+    fn sums(&self, pass: usize, partition: &Partition) -> Result<RunningSums, CommandError> {
         let shards = partition.hashes.len() as u64;
         let mut found = self.state.part_sums(pass)?;
         let done =
@@ -117,7 +117,7 @@ impl Merge {
             all.finished.extend(sums.finished);
             for (total, own) in all.elements.iter_mut().zip(sums.elements) {
                 match (total.as_mut(), own) {
-                    (Some(total), Some(own)) => total.merge(&own).map_err(Failure::failed)?,
+                    (Some(total), Some(own)) => total.merge(&own).map_err(CommandError::failed)?,
                     (None, Some(own)) => *total = Some(own),
                     (_, None) => (),
                 }
@@ -132,7 +132,7 @@ fn complete(
     pass: usize,
     begun: impl Iterator<Item = Part>,
     done: impl Fn(Part) -> bool,
-) -> Result<Vec<Part>, Failure> {
+) -> Result<Vec<Part>, CommandError> {
     let mut divisions: Vec<u64> = begun.map(Part::of).collect();
     divisions.sort_unstable();
     divisions.dedup();
@@ -140,11 +140,14 @@ fn complete(
         return Ok(Part::all(*of).collect());
     }
     let Some(of) = divisions.last() else {
-        return Err(Failure::Failed(format!(
+        return Err(CommandError::Failed(format!(
             "no part of pass {pass} is done: run calmwalk calm build … --pass {pass} --part i/n for every i"
         )));
     };
     let missing: Vec<String> =
         Part::all(*of).filter(|part| !done(*part)).take(10).map(|part| part.to_string()).collect();
-    Err(Failure::Failed(format!("pass {pass} is not done: missing are the parts {}", missing.join(", "))))
+    Err(CommandError::Failed(format!(
+        "pass {pass} is not done: missing are the parts {}",
+        missing.join(", ")
+    )))
 }

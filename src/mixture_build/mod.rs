@@ -29,7 +29,7 @@ pub use self::merge::{Merge, Merged};
 pub use self::part::Part;
 use self::state::{BuildState, PartEnd};
 pub use self::workers::Work;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::print_stderr;
 
 /// A build under way.
@@ -55,8 +55,8 @@ impl Build {
         projection: &Projection,
         output: &Path,
         restart: bool,
-    ) -> Result<Self, Failure> {
-        ShardClustering::new(&settings, 0, 0).map_err(Failure::input)?;
+    ) -> Result<Self, CommandError> {
+        ShardClustering::new(&settings, 0, 0).map_err(CommandError::input)?;
         let identity = Identity::new(model_hash, projection, settings.clone(), &work.files);
         let (state, exists) = match work.part {
             Part::WHOLE => BuildState::open(output, &identity, restart)?,
@@ -73,7 +73,7 @@ impl Build {
         &mut self,
         projection: Projection,
         projection_seed: Option<i64>,
-    ) -> Result<Option<BuiltMixture>, Failure> {
+    ) -> Result<Option<BuiltMixture>, CommandError> {
         let Some(partition) = self.partition()? else { return Ok(None) };
         let Some(components) = self.components(&partition)? else { return Ok(None) };
         let Some(histograms) = self.histograms(&partition, &components)? else { return Ok(None) };
@@ -86,9 +86,9 @@ impl Build {
     ///
     /// # Errors
     /// The pass before is not merged yet.
-    pub fn run_part(&mut self, pass: u8) -> Result<bool, Failure> {
+    pub fn run_part(&mut self, pass: u8) -> Result<bool, CommandError> {
         let not_merged = |pass: u8| {
-            Failure::Failed(format!(
+            CommandError::Failed(format!(
                 "pass {pass} is not merged yet: when all its parts are done, run calmwalk calm merge"
             ))
         };
@@ -106,7 +106,7 @@ impl Build {
     }
 
     /// Removes the state, which a written artifact no longer needs.
-    pub fn finish(self) -> Result<(), Failure> {
+    pub fn finish(self) -> Result<(), CommandError> {
         self.state.remove()
     }
 }
@@ -119,11 +119,11 @@ fn mixture(
     settings: BuildSettings,
     components: Vec<Option<Vec<BuiltComponent>>>,
     histograms: Vec<Option<ElementHistograms>>,
-) -> Result<BuiltMixture, Failure> {
+) -> Result<BuiltMixture, CommandError> {
     let elements = components.into_iter().zip(histograms).map(|(components, histograms)| {
         Some(BuiltElement { components: components?, histograms: histograms? })
     });
     let symbols = model.elements().iter().map(|element| element.symbol().to_owned()).collect();
     BuiltMixture::new(symbols, projection, projection_seed, settings, elements.collect())
-        .map_err(Failure::failed)
+        .map_err(CommandError::failed)
 }

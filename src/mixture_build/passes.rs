@@ -5,7 +5,7 @@ use calm::build::{ShardClustering, ShardClusters};
 use tokio_util::sync::CancellationToken;
 
 use super::stream::{Shard, ShardHash, TrainingStructure};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
 
 /// Atoms of an element that are passed on together: they stay in the cache.
@@ -94,10 +94,10 @@ pub fn run_shard<P: ElementPass>(
     passes: Vec<Option<P>>,
     stop: &CancellationToken,
     each: impl Fn(),
-) -> Result<Option<ShardResult<P::Partial>>, Failure> {
+) -> Result<Option<ShardResult<P::Partial>>, CommandError> {
     let empty = |pass| Element { pass, features: Vec::new(), weights: Vec::new() };
     let mut elements: Vec<Element<P>> = passes.into_iter().map(empty).collect();
-    let broken = |error: BuildError| Failure::Failed(format!("shard {}: {error}", shard.index));
+    let broken = |error: BuildError| CommandError::Failed(format!("shard {}: {error}", shard.index));
     for number in shuffled(seed, shard.index, shard.structures.len()) {
         if stop.is_cancelled() {
             return Ok(None);
@@ -121,7 +121,7 @@ fn add<P>(
     calculator: &mut FeatureCalculator,
     structure: &TrainingStructure,
     elements: &mut [Element<P>],
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let found = calculator.compute(&structure.structure).map_err(|error| structure.place.wrong(error))?;
     let dimension = calculator.grace.model().feature_dimension();
     let rows = calculator.grace.features().chunks_exact(dimension);

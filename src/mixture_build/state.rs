@@ -20,7 +20,7 @@ use super::identity::Identity;
 use super::part::Part;
 use super::stream::ShardHash;
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 const IDENTITY: &str = "build.json";
 const LOCK: &str = "lock";
@@ -74,7 +74,7 @@ impl BuildState {
     ///
     /// # Errors
     /// Another process uses it; it belongs to another build (unless `restart`, which removes it first).
-    pub fn open(output: &Path, identity: &Identity, restart: bool) -> Result<(Self, bool), Failure> {
+    pub fn open(output: &Path, identity: &Identity, restart: bool) -> Result<(Self, bool), CommandError> {
         let directory = directory(output);
         fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
         let lock = lock(&directory.join(LOCK), output, File::try_lock)?;
@@ -96,7 +96,7 @@ impl BuildState {
     ///
     /// # Errors
     /// A process uses this part or the whole; the state belongs to another build.
-    pub fn open_part(output: &Path, identity: &Identity, part: Part) -> Result<(Self, bool), Failure> {
+    pub fn open_part(output: &Path, identity: &Identity, part: Part) -> Result<(Self, bool), CommandError> {
         let directory = directory(output);
         fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
         let whole = lock(&directory.join(LOCK), output, File::try_lock_shared)?;
@@ -123,10 +123,10 @@ impl BuildState {
     ///
     /// # Errors
     /// There is none; a process uses it.
-    pub fn open_existing(output: &Path) -> Result<(Self, Identity), Failure> {
+    pub fn open_existing(output: &Path) -> Result<(Self, Identity), CommandError> {
         let directory = directory(output);
         if !directory.join(IDENTITY).is_file() {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{}: expected the directory of a build in parts (calmwalk calm build … --pass 1 --part 1/2)",
                 directory.display()
             )));
@@ -141,16 +141,16 @@ impl BuildState {
         Self { directory, part, _locks: locks, saved: Instant::now(), cost: Duration::ZERO }
     }
 
-    fn identity(&self) -> Result<Identity, Failure> {
+    fn identity(&self) -> Result<Identity, CommandError> {
         let path = self.path(IDENTITY);
         let text = fs::read(&path).map_err(|error| unreadable(&path, error))?;
         serde_json::from_slice(&text).map_err(|error| unreadable(&path, error))
     }
 
-    fn write_identity(&self, identity: &Identity) -> Result<(), Failure> {
+    fn write_identity(&self, identity: &Identity) -> Result<(), CommandError> {
         let path = self.path(IDENTITY);
         let mut file = AtomicFile::create(&path)?;
-        let text = serde_json::to_vec_pretty(identity).map_err(Failure::failed)?;
+        let text = serde_json::to_vec_pretty(identity).map_err(CommandError::failed)?;
         file.write_all(&text).map_err(|error| cannot_write(&path, error))?;
         file.finish()
     }
@@ -166,7 +166,7 @@ impl BuildState {
     }
 
     /// The shards whose clusters are known.
-    pub fn known_shards(&self) -> Result<KnownShards, Failure> {
+    pub fn known_shards(&self) -> Result<KnownShards, CommandError> {
         let is_log = |name: &&String| {
             let of_part = || Part::from_file_name(name.strip_prefix(CLUSTERS)?.strip_prefix('-')?);
             name.as_str() == CLUSTERS || of_part().is_some()
@@ -177,7 +177,7 @@ impl BuildState {
     }
 
     /// Saves the log of this process.
-    pub fn save_known_shards(&mut self, known: &KnownShards) -> Result<(), Failure> {
+    pub fn save_known_shards(&mut self, known: &KnownShards) -> Result<(), CommandError> {
         let begun = Instant::now();
         known.sync().map_err(|error| cannot_write(known.path(), error))?;
         self.has_saved(begun);
@@ -185,22 +185,22 @@ impl BuildState {
     }
 
     /// Ends pass 1 of the part.
-    pub fn save_part_end(&mut self, end: &PartEnd) -> Result<(), Failure> {
+    pub fn save_part_end(&mut self, end: &PartEnd) -> Result<(), CommandError> {
         self.write(&format!("{END}{}", self.part.file_name()), end)
     }
 
     /// The parts that are through pass 1.
-    pub fn part_ends(&self) -> Result<BTreeMap<Part, PartEnd>, Failure> {
+    pub fn part_ends(&self) -> Result<BTreeMap<Part, PartEnd>, CommandError> {
         self.parts(END)
     }
 
     /// The sums of all parts in pass 2 or 3.
-    pub fn part_sums(&self, pass: usize) -> Result<BTreeMap<Part, RunningSums>, Failure> {
+    pub fn part_sums(&self, pass: usize) -> Result<BTreeMap<Part, RunningSums>, CommandError> {
         self.parts(&format!("pass-{pass}-"))
     }
 
     /// The files of parts whose names begin with `prefix`.
-    fn parts<T: DeserializeOwned>(&self, prefix: &str) -> Result<BTreeMap<Part, T>, Failure> {
+    fn parts<T: DeserializeOwned>(&self, prefix: &str) -> Result<BTreeMap<Part, T>, CommandError> {
         let mut found = BTreeMap::new();
         for name in self.names()? {
             if let Some(part) = name.strip_prefix(prefix).and_then(Part::from_file_name)
@@ -213,27 +213,27 @@ impl BuildState {
     }
 
     /// The result of pass 1, if it is finished.
-    pub fn partition(&self) -> Result<Option<Partition>, Failure> {
+    pub fn partition(&self) -> Result<Option<Partition>, CommandError> {
         self.read(PARTITION)
     }
 
     /// Ends pass 1.
-    pub fn save_partition(&mut self, partition: &Partition) -> Result<(), Failure> {
+    pub fn save_partition(&mut self, partition: &Partition) -> Result<(), CommandError> {
         self.write(PARTITION, partition)
     }
 
     /// The sums of pass 2 or 3 over the shards of this process.
-    pub fn sums(&self, pass: usize) -> Result<RunningSums, Failure> {
+    pub fn sums(&self, pass: usize) -> Result<RunningSums, CommandError> {
         Ok(self.read(&self.own_name(&format!("pass-{pass}")))?.unwrap_or_default())
     }
 
     /// The sums of pass 2 or 3 over all shards, or over those that are merged.
-    pub fn merged_sums(&self, pass: usize) -> Result<RunningSums, Failure> {
+    pub fn merged_sums(&self, pass: usize) -> Result<RunningSums, CommandError> {
         Ok(self.read(&format!("pass-{pass}"))?.unwrap_or_default())
     }
 
     /// Replaces the sums of pass 2 or 3.
-    pub fn save_sums(&mut self, pass: usize, sums: &RunningSums) -> Result<(), Failure> {
+    pub fn save_sums(&mut self, pass: usize, sums: &RunningSums) -> Result<(), CommandError> {
         self.write(&self.own_name(&format!("pass-{pass}")), sums)
     }
 
@@ -246,7 +246,7 @@ impl BuildState {
     }
 
     /// Removes the directory, but leaves files that are none of the state's.
-    pub fn remove(self) -> Result<(), Failure> {
+    pub fn remove(self) -> Result<(), CommandError> {
         self.clear()?;
         for name in self.names()?.iter().filter(|name| name.starts_with(LOCK)) {
             let lock = self.path(name);
@@ -261,7 +261,7 @@ impl BuildState {
     }
 
     /// Removes the identity first: a directory without it has no state.
-    fn clear(&self) -> Result<(), Failure> {
+    fn clear(&self) -> Result<(), CommandError> {
         let own = |name: &String| is_result(name) || (name.starts_with('.') && name.ends_with(".part"));
         let rest = self.names()?.into_iter().filter(own);
         for name in std::iter::once(IDENTITY.to_owned()).chain(rest) {
@@ -276,7 +276,7 @@ impl BuildState {
         Ok(())
     }
 
-    fn names(&self) -> Result<Vec<String>, Failure> {
+    fn names(&self) -> Result<Vec<String>, CommandError> {
         let entries = fs::read_dir(&self.directory).map_err(|error| unreadable(&self.directory, error))?;
         Ok(entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect())
     }
@@ -285,7 +285,7 @@ impl BuildState {
         self.directory.join(name)
     }
 
-    fn write(&mut self, name: &str, value: &impl Serialize) -> Result<(), Failure> {
+    fn write(&mut self, name: &str, value: &impl Serialize) -> Result<(), CommandError> {
         let begun = Instant::now();
         let path = self.path(name);
         let bytes = postcard::to_stdvec(value).map_err(|error| cannot_write(&path, error))?;
@@ -304,7 +304,7 @@ impl BuildState {
         self.cost = self.saved - begun;
     }
 
-    fn read<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>, Failure> {
+    fn read<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>, CommandError> {
         let path = self.path(name);
         let bytes = match fs::read(&path) {
             Ok(bytes) => bytes,
@@ -320,8 +320,8 @@ impl BuildState {
     }
 
     /// The failure to continue the state of another build.
-    pub fn other_build(&self, difference: &str) -> Failure {
-        Failure::Input(format!(
+    pub fn other_build(&self, difference: &str) -> CommandError {
+        CommandError::Input(format!(
             "{} has the state of another build: {difference}; repeat the command that began it, or begin anew with --restart",
             self.directory.display()
         ))
@@ -343,21 +343,21 @@ fn lock(
     path: &Path,
     output: &Path,
     lock: impl Fn(&File) -> Result<(), TryLockError>,
-) -> Result<File, Failure> {
+) -> Result<File, CommandError> {
     let file = File::create(path).map_err(|error| cannot_create(path, error))?;
     match lock(&file) {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {
-            Err(Failure::Failed(format!("another process builds {} now", output.display())))
+            Err(CommandError::Failed(format!("another process builds {} now", output.display())))
         }
         Err(TryLockError::Error(error)) => Err(cannot_write(path, error)),
     }
 }
 
-fn unreadable(path: &Path, error: impl std::fmt::Display) -> Failure {
-    Failure::Failed(format!("cannot read {}: {error}", path.display()))
+fn unreadable(path: &Path, error: impl std::fmt::Display) -> CommandError {
+    CommandError::Failed(format!("cannot read {}: {error}", path.display()))
 }
 
-fn cannot_remove(path: &Path, error: impl std::fmt::Display) -> Failure {
-    Failure::Failed(format!("cannot remove {}: {error}", path.display()))
+fn cannot_remove(path: &Path, error: impl std::fmt::Display) -> CommandError {
+    CommandError::Failed(format!("cannot remove {}: {error}", path.display()))
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicU64;
 use atoms::Structure;
 
 use super::part::Part;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::structure_files::{Place, StructureFiles, StructureReader};
 
 /// A structure with its place in the files.
@@ -44,7 +44,7 @@ impl ShardReader {
     }
 
     /// The next shard of the part, `None` at the end of the last file.
-    pub fn next_shard(&mut self) -> Result<Option<Shard>, Failure> {
+    pub fn next_shard(&mut self) -> Result<Option<Shard>, CommandError> {
         loop {
             let index = self.next;
             let mut structures = Vec::new();

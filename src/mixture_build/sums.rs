@@ -11,7 +11,7 @@ use super::progress::Progress;
 use super::state::{Partition, RunningSums};
 use super::stream::Shard;
 use super::workers::{Counters, run_pass};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output;
 
 /// The sums of each element, by element index.
@@ -22,7 +22,7 @@ impl Build {
     pub(super) fn components(
         &mut self,
         partition: &Partition,
-    ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, Failure> {
+    ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, CommandError> {
         let Some(sums) = self.sums_of_pass_2(partition)? else { return Ok(None) };
         components_from_sums(self.settings.dimension, partition, sums).map(Some)
     }
@@ -32,7 +32,7 @@ impl Build {
         &mut self,
         partition: &Partition,
         components: &[Option<Vec<BuiltComponent>>],
-    ) -> Result<Option<Vec<Option<ElementHistograms>>>, Failure> {
+    ) -> Result<Option<Vec<Option<ElementHistograms>>>, CommandError> {
         let Some(sums) = self.sums_of_pass_3(partition, components)? else { return Ok(None) };
         histograms_from_sums(sums).map(Some)
     }
@@ -41,7 +41,7 @@ impl Build {
     pub(super) fn merged_components(
         &self,
         partition: &Partition,
-    ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, Failure> {
+    ) -> Result<Option<Vec<Option<Vec<BuiltComponent>>>>, CommandError> {
         let sums = self.state.merged_sums(2)?;
         if sums.finished.len() != partition.hashes.len() {
             return Ok(None);
@@ -50,7 +50,10 @@ impl Build {
     }
 
     /// Counts and scatter of this process's shards.
-    pub(super) fn sums_of_pass_2(&mut self, partition: &Partition) -> Result<Option<ElementTotals>, Failure> {
+    pub(super) fn sums_of_pass_2(
+        &mut self,
+        partition: &Partition,
+    ) -> Result<Option<ElementTotals>, CommandError> {
         let dimension = self.settings.dimension;
         let begin = |element: usize| {
             let centroids = &partition.elements[element].centroids;
@@ -64,7 +67,7 @@ impl Build {
         &mut self,
         partition: &Partition,
         components: &[Option<Vec<BuiltComponent>>],
-    ) -> Result<Option<ElementTotals>, Failure> {
+    ) -> Result<Option<ElementTotals>, CommandError> {
         let begin = |element: usize| components[element].as_deref().map(CalibrationPass::new).transpose();
         self.sums(3, partition, begin, |found: &ElementHistograms| found.to_row())
     }
@@ -76,7 +79,7 @@ impl Build {
         partition: &Partition,
         begin: impl Fn(usize) -> Result<Option<P>, BuildError> + Sync,
         to_row: impl Fn(&P::Partial) -> Vec<f64>,
-    ) -> Result<Option<ElementTotals>, Failure> {
+    ) -> Result<Option<ElementTotals>, CommandError> {
         let Self { work, state, bytes, .. } = self;
         let mut sums = state.sums(pass)?;
         if sums.finished.len() as u64 == work.part.count(partition.hashes.len() as u64) {
@@ -111,7 +114,7 @@ impl Build {
         state.save_sums(pass, &sums)?;
         let Some(structures) = ended? else { return Ok(None) };
         if structures != partition.structures {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "the data files have {} now, pass 1 found {}; begin anew with --restart",
                 output::count(structures, "structure"),
                 partition.structures
@@ -127,28 +130,30 @@ pub(super) fn components_from_sums(
     dimension: usize,
     partition: &Partition,
     sums: ElementTotals,
-) -> Result<Vec<Option<Vec<BuiltComponent>>>, Failure> {
+) -> Result<Vec<Option<Vec<BuiltComponent>>>, CommandError> {
     let of = |(found, sums): (&ElementPartition, Option<ExactSums>)| {
         let built = |sums: ExactSums| {
             let sums = ElementSums::from_row(dimension, &sums.totals())?;
             components(&found.centroids, &sums)
         };
-        sums.map(built).transpose().map_err(Failure::failed)
+        sums.map(built).transpose().map_err(CommandError::failed)
     };
     partition.elements.iter().zip(sums).map(of).collect()
 }
 
 /// The histograms of each element, from the sums of pass 3 over all shards.
-pub(super) fn histograms_from_sums(sums: ElementTotals) -> Result<Vec<Option<ElementHistograms>>, Failure> {
+pub(super) fn histograms_from_sums(
+    sums: ElementTotals,
+) -> Result<Vec<Option<ElementHistograms>>, CommandError> {
     let of = |sums: Option<ExactSums>| {
-        sums.map(|sums| ElementHistograms::from_row(&sums.totals())).transpose().map_err(Failure::failed)
+        sums.map(|sums| ElementHistograms::from_row(&sums.totals())).transpose().map_err(CommandError::failed)
     };
     sums.into_iter().map(of).collect()
 }
 
-fn changed_since_pass_1(shard: &Shard) -> Failure {
+fn changed_since_pass_1(shard: &Shard) -> CommandError {
     let place = shard.structures.first().map_or(String::new(), |first| format!(" (from {})", first.place));
-    Failure::Input(format!(
+    CommandError::Input(format!(
         "the structures of shard {}{place} have changed since pass 1; restore the files, or begin anew with --restart",
         shard.index
     ))
@@ -159,8 +164,8 @@ fn add(
     sums: &mut RunningSums,
     shard: u64,
     rows: impl Iterator<Item = Option<Vec<f64>>>,
-) -> Result<(), Failure> {
-    let wrong = |error: BuildError| Failure::Failed(format!("shard {shard}: {error}"));
+) -> Result<(), CommandError> {
+    let wrong = |error: BuildError| CommandError::Failed(format!("shard {shard}: {error}"));
     let rows: Vec<Option<Vec<f64>>> = rows.collect();
     for (sum, row) in sums.elements.iter_mut().zip(&rows) {
         if let Some(row) = row {

@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 use super::part::Part;
 use super::passes::{ElementPass, ShardResult, run_shard};
 use super::stream::{Shard, ShardReader};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
 use crate::structure_files::StructureFiles;
 
@@ -56,7 +56,7 @@ struct Shared<'a, F, B> {
     begin: B,
     counters: &'a Counters,
     /// The first of them is the one that a single thread would have met.
-    failures: Mutex<Vec<(u64, Failure)>>,
+    failures: Mutex<Vec<(u64, CommandError)>>,
 }
 
 /// Takes all shards of the part but those that `is_finished` knows through a pass, and gives their results to `receive` in the order in which
@@ -66,12 +66,12 @@ struct Shared<'a, F, B> {
 /// Returns the number of structures in the files; `None` after a cancellation.
 pub fn run_pass<P: ElementPass>(
     work: &Work,
-    is_finished: impl Fn(&Shard) -> Result<bool, Failure> + Sync,
+    is_finished: impl Fn(&Shard) -> Result<bool, CommandError> + Sync,
     begin: impl Fn(u64) -> Result<Vec<Option<P>>, BuildError> + Sync,
     counters: &Counters,
-    mut receive: impl FnMut(ShardResult<P::Partial>) -> Result<(), Failure>,
+    mut receive: impl FnMut(ShardResult<P::Partial>) -> Result<(), CommandError>,
     progress: impl Fn(),
-) -> Result<Option<u64>, Failure> {
+) -> Result<Option<u64>, CommandError> {
     let reader = ShardReader::new(&work.files, work.shard_size, work.part, Arc::clone(&counters.bytes));
     let shared = Shared {
         work,
@@ -121,7 +121,7 @@ impl<F, B> Shared<'_, F, B> {
     fn take_shards<P>(&self, results: &SyncSender<ShardResult<P::Partial>>) -> Option<u64>
     where
         P: ElementPass,
-        F: Fn(&Shard) -> Result<bool, Failure>,
+        F: Fn(&Shard) -> Result<bool, CommandError>,
         B: Fn(u64) -> Result<Vec<Option<P>>, BuildError>,
     {
         let mut calculator = FeatureCalculator::new(Arc::clone(&self.work.model));
@@ -159,7 +159,7 @@ impl<F, B> Shared<'_, F, B> {
             let each = || {
                 computed.fetch_add(1, Ordering::Relaxed);
             };
-            let passes = (self.begin)(shard.index).map_err(Failure::failed);
+            let passes = (self.begin)(shard.index).map_err(CommandError::failed);
             let result = passes
                 .and_then(|passes| run_shard(&mut calculator, &shard, work.seed, passes, &work.stop, each));
             match result {
@@ -172,7 +172,7 @@ impl<F, B> Shared<'_, F, B> {
     }
 
     /// Hands out no more shards.
-    fn fail(&self, shard: u64, failure: Failure) {
+    fn fail(&self, shard: u64, failure: CommandError) {
         self.reader.lock().unwrap_or_else(PoisonError::into_inner).take();
         self.failures.lock().unwrap_or_else(PoisonError::into_inner).push((shard, failure));
     }

@@ -15,7 +15,7 @@ pub use self::html::write;
 pub use self::table::{Cell, Table, count, percent, real, text};
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::csv::Csv;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Resolution of the images, dots per inch.
 const RESOLUTION: f64 = 300.0;
@@ -72,12 +72,12 @@ impl<'a> Block<'a> {
 }
 
 /// The files of figures and tables.
-pub fn files(figures: Vec<FigureEntry>, tables: &[Table]) -> Result<Vec<File>, Failure> {
+pub fn files(figures: Vec<FigureEntry>, tables: &[Table]) -> Result<Vec<File>, CommandError> {
     let mut files = Vec::new();
     for part in figures {
         let Ok(drawn) = part.drawn else { continue };
         let path = |ending: &str| format!("figures/{}.{ending}", part.name);
-        let image = to_png(&drawn.figure, RESOLUTION).map_err(Failure::failed)?;
+        let image = to_png(&drawn.figure, RESOLUTION).map_err(CommandError::failed)?;
         let svg = to_svg(&drawn.figure);
         files.push(File { path: path("svg"), bytes: svg.into_bytes() });
         files.push(File { path: path("png"), bytes: image });
@@ -91,7 +91,7 @@ pub fn files(figures: Vec<FigureEntry>, tables: &[Table]) -> Result<Vec<File>, F
 }
 
 /// Writes the files into a directory, replacing those of an earlier page.
-pub fn write_files(directory: &Path, files: &[File]) -> Result<(), Failure> {
+pub fn write_files(directory: &Path, files: &[File]) -> Result<(), CommandError> {
     for File { path, bytes } in files {
         let path = directory.join(path);
         path.parent().map_or(Ok(()), create_directory)?;
@@ -103,9 +103,9 @@ pub fn write_files(directory: &Path, files: &[File]) -> Result<(), Failure> {
 }
 
 /// Creates the directory of a page.
-pub fn create_directory(directory: &Path) -> Result<(), Failure> {
+pub fn create_directory(directory: &Path) -> Result<(), CommandError> {
     if directory.exists() && !directory.is_dir() {
-        return Err(Failure::Input(format!("{} is no directory", directory.display())));
+        return Err(CommandError::Input(format!("{} is no directory", directory.display())));
     }
     fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))
 }

@@ -7,7 +7,7 @@ use std::path::Path;
 use analysis::GradedRow;
 
 use crate::csv_reader::{CsvReader, Row};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Cells that stand for a missing number, besides empty ones.
 const MISSING: [&str; 5] = ["nan", "na", "n/a", "null", "none"];
@@ -27,9 +27,13 @@ pub enum ErrorColumns<'a> {
 }
 
 /// Reads all rows, and counts those without one of the numbers, which is an error unless `skip_missing`.
-pub fn read(path: &Path, columns: &Columns, skip_missing: bool) -> Result<(Vec<GradedRow>, usize), Failure> {
+pub fn read(
+    path: &Path,
+    columns: &Columns,
+    skip_missing: bool,
+) -> Result<(Vec<GradedRow>, usize), CommandError> {
     let file = File::open(path)
-        .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", path.display())))?;
+        .map_err(|error| CommandError::Input(format!("{}: cannot be opened: {error}", path.display())))?;
     let mut table = CsvReader::new(BufReader::new(file)).map_err(|error| error.of(path))?;
     let place = |title| table.column(title).map(|place| (title, place)).map_err(|error| error.of(path));
     let titles = match columns.errors {
@@ -48,7 +52,7 @@ pub fn read(path: &Path, columns: &Columns, skip_missing: bool) -> Result<(Vec<G
                     let place = format!("{}:{}", path.display(), row.line);
                     let message =
                         format!("column '{title}' has no number; --skip-missing leaves such rows out");
-                    return Err(Failure::Input(format!("{place}: {message}")));
+                    return Err(CommandError::Input(format!("{place}: {message}")));
                 }
             }
         }
@@ -58,13 +62,13 @@ pub fn read(path: &Path, columns: &Columns, skip_missing: bool) -> Result<(Vec<G
         }
     }
     if rows.is_empty() {
-        return Err(Failure::Input(format!("{}: no row has all numbers", path.display())));
+        return Err(CommandError::Input(format!("{}: no row has all numbers", path.display())));
     }
     Ok((rows, left_out))
 }
 
 /// The number of a cell; `None` if it is missing.
-fn number(row: &Row, title: &str, place: usize, path: &Path) -> Result<Option<f64>, Failure> {
+fn number(row: &Row, title: &str, place: usize, path: &Path) -> Result<Option<f64>, CommandError> {
     let cell = row.cells[place].trim();
     if cell.is_empty() || MISSING.contains(&cell.to_lowercase().as_str()) {
         return Ok(None);
@@ -72,7 +76,7 @@ fn number(row: &Row, title: &str, place: usize, path: &Path) -> Result<Option<f6
     let finite = cell.parse::<f64>().ok().filter(|number| number.is_finite());
     finite.map(Some).ok_or_else(|| {
         let place = format!("{}:{}", path.display(), row.line);
-        Failure::Input(format!("{place}: column '{title}' is '{cell}', expected a finite number"))
+        CommandError::Input(format!("{place}: column '{title}' is '{cell}', expected a finite number"))
     })
 }
 

@@ -10,7 +10,7 @@ use store::{Store, StoredCandidate};
 use super::failure;
 use super::report::{LogEntry, Report};
 use crate::all_cores;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::Bar;
 use crate::runtime::cores;
 
@@ -27,7 +27,7 @@ pub async fn follow(
     report: &mut Report,
     last: i64,
     bar: &Bar,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let mut prefetch = Prefetch::new(replay.is_exact());
     for first in (1..=last).step_by(PAGE_ROWS as usize) {
         let to = last.min(first + PAGE_ROWS - 1);
@@ -47,7 +47,7 @@ pub async fn follow(
                 return Ok(());
             }
             let (stored, examined) = candidate.map(|ready| (ready.stored, ready.examined)).unzip();
-            let examined = examined.flatten().transpose().map_err(Failure::failed)?;
+            let examined = examined.flatten().transpose().map_err(CommandError::failed)?;
             let now = replay.apply(recorded, examined).map_err(failure)?;
             report.add(LogEntry { decision: recorded, candidate: stored.as_ref() }, now, replay.is_exact());
             bar.set(recorded.sequence.unsigned_abs(), String::new);
@@ -59,8 +59,8 @@ pub async fn follow(
     Ok(())
 }
 
-fn damaged(decision: i64, problem: &str) -> Failure {
-    Failure::Failed(format!(
+fn damaged(decision: i64, problem: &str) -> CommandError {
+    CommandError::Failed(format!(
         "decision {decision}: {problem}: the database is damaged; restore the campaign from a backup"
     ))
 }
@@ -89,7 +89,7 @@ impl Prefetch {
         store: &Store,
         replay: &Replay,
         decision: i64,
-    ) -> Result<PrefetchedCandidate, Failure> {
+    ) -> Result<PrefetchedCandidate, CommandError> {
         self.ready.retain(|ready| ready.stored.decision >= decision);
         if self.ready.is_empty() {
             let cores = cores();
@@ -111,7 +111,7 @@ fn examine_one(
     mut stored: StoredCandidate,
     examiner: &Regrader,
     mixture: &Arc<Mixture>,
-) -> Result<PrefetchedCandidate, Failure> {
+) -> Result<PrefetchedCandidate, CommandError> {
     let Some(features) = stored.features.take() else {
         return Ok(PrefetchedCandidate { stored, examined: None });
     };

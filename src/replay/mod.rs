@@ -17,7 +17,7 @@ use store::Store;
 
 use crate::campaign::{self, grader};
 use crate::config::Config;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::Bar;
 
 pub use overrides::RuleOverride;
@@ -32,7 +32,7 @@ pub async fn replay(
     store: &Store,
     settings: &[RuleOverride],
     moved: &RelocatedFilesArgs,
-) -> Result<Report, Failure> {
+) -> Result<Report, CommandError> {
     let begun = Instant::now();
     let campaign = store.campaign().await?;
     let resolved = resolved(&campaign)?;
@@ -49,13 +49,13 @@ pub async fn replay(
 }
 
 /// The configuration with its defaults and the hashes of its files.
-pub fn resolved(campaign: &store::Campaign) -> Result<Value, Failure> {
+pub fn resolved(campaign: &store::Campaign) -> Result<Value, CommandError> {
     serde_json::from_str(&campaign.resolved_configuration)
-        .map_err(|error| Failure::Failed(format!("damaged database: the configuration: {error}")))
+        .map_err(|error| CommandError::Failed(format!("damaged database: the configuration: {error}")))
 }
 
 /// The selector's state before the first decision.
-async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Result<Replay, Failure> {
+async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Result<Replay, CommandError> {
     let (model, artifact, training) = campaign::load_for_grades(config, Path::new("(the campaign)"))?;
     let seeds = store.seed_structures().await?.into_iter();
     // The log has the conditions of walks.
@@ -80,6 +80,6 @@ fn is_other_processor(resolved: &Value) -> bool {
     resolved["instructions"].as_str().is_some_and(|then| then != campaign::instructions())
 }
 
-fn failure(error: ReplayError) -> Failure {
-    Failure::failed(error)
+fn failure(error: ReplayError) -> CommandError {
+    CommandError::failed(error)
 }

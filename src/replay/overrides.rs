@@ -5,7 +5,7 @@ use std::str::FromStr;
 use toml::{Table, Value};
 
 use crate::config::{Config, impossible, user_message};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Keys that affect the selector's decisions. Their effect on walks is recorded and does not change.
 const KEYS: [&str; 13] = [
@@ -82,16 +82,16 @@ fn parse(value: &str) -> Result<Value, String> {
 }
 
 /// Parses the configuration `stored` and applies these overrides.
-pub fn configuration(stored: &str, settings: &[RuleOverride]) -> Result<Config, Failure> {
+pub fn configuration(stored: &str, settings: &[RuleOverride]) -> Result<Config, CommandError> {
     let unreadable = |error: String| {
-        Failure::Input(format!(
+        CommandError::Input(format!(
             "the configuration in the campaign's database: {error}; replay it with the version that began it"
         ))
     };
     let mut table: Table = stored.parse().map_err(|error| unreadable(user_message(&error)))?;
     let mut config: Config = toml::from_str(stored).map_err(|error| unreadable(user_message(&error)))?;
     for RuleOverride { key, value } in settings {
-        let wrong = |error: String| Failure::Input(format!("--set {key}={value}: {error}"));
+        let wrong = |error: String| CommandError::Input(format!("--set {key}={value}: {error}"));
         set_key(&mut table, key, value.clone()).map_err(wrong)?;
         config = toml::from_str(&table.to_string()).map_err(|error| wrong(user_message(&error)))?;
     }
@@ -99,7 +99,7 @@ pub fn configuration(stored: &str, settings: &[RuleOverride]) -> Result<Config, 
     let mut wrong = impossible(&set).into_iter().chain(config.check());
     match wrong.next() {
         Some((key, found, expected)) => {
-            Err(Failure::Input(format!("--set: {key} is {found}; expected {expected}")))
+            Err(CommandError::Input(format!("--set: {key} is {found}; expected {expected}")))
         }
         None => Ok(config),
     }
@@ -172,7 +172,7 @@ mod tests {
             (&["calm.covariance_update=conves"], "did you mean `convex`?"),
             (&["collect.max_per_walk.x=1"], "invalid type: map, expected a whole number"),
         ] {
-            let Err(Failure::Input(error)) = with(texts) else { panic!("{texts:?} are taken") };
+            let Err(CommandError::Input(error)) = with(texts) else { panic!("{texts:?} are taken") };
             assert!(error.contains(words), "{error}");
         }
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 use crate::config::Config;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Key of the model in the configuration, as those below.
 pub const MODEL: &str = "potential.model";
@@ -33,7 +33,7 @@ pub fn find(
     resolved: &Value,
     found: &Value,
     moved: &RelocatedFilesArgs,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let calm = &mut config.calm;
     let files = [
         (MODEL, Some(&mut config.potential.model)),
@@ -54,7 +54,7 @@ pub fn find_one(
     resolved: &Value,
     found: &Value,
     moved: &RelocatedFilesArgs,
-) -> Result<PathBuf, Failure> {
+) -> Result<PathBuf, CommandError> {
     let (option, moved) = match key {
         MODEL => ("--model", &moved.model),
         ARTIFACT => ("--artifact", &moved.artifact),
@@ -62,11 +62,11 @@ pub fn find_one(
     };
     let path = moved.clone().or_else(|| found[key].as_str().map(PathBuf::from));
     let path = path.ok_or_else(|| {
-        Failure::Input(format!("the store has no path of {key}; give it with {option} FILE"))
+        CommandError::Input(format!("the store has no path of {key}; give it with {option} FILE"))
     })?;
     let expected = resolved["files"][key].as_str().unwrap_or_default();
     check(&path, expected)
-        .map_err(|error| Failure::Input(format!("{key}: {error}; give its path with {option} FILE")))?;
+        .map_err(|error| CommandError::Input(format!("{key}: {error}; give its path with {option} FILE")))?;
     Ok(path)
 }
 

@@ -7,7 +7,7 @@ use store::Store;
 
 use super::report::{MissingFeatures, Report};
 use super::{BAR, RelocatedFilesArgs, follow, is_other_processor, open, overrides, relocated, resolved};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::Bar;
 
 /// The mixture of a version between the first and the newest, by a replay of the decisions before it.
@@ -18,7 +18,7 @@ pub async fn mixture_of(
     store: &Store,
     version: u64,
     moved: &RelocatedFilesArgs,
-) -> Result<Arc<Mixture>, Failure> {
+) -> Result<Arc<Mixture>, CommandError> {
     let campaign = store.campaign().await?;
     let resolved = resolved(&campaign)?;
     let mut config = overrides::configuration(&campaign.configuration, &[])?;
@@ -26,14 +26,16 @@ pub async fn mixture_of(
     let mut replay = open(store, &config, &[]).await?;
     let last = store.first_decision_of(version).await?;
     let last = last.ok_or_else(|| {
-        Failure::Failed(format!("mixture version {version}: no decision made it: the database is damaged"))
+        CommandError::Failed(format!(
+            "mixture version {version}: no decision made it: the database is damaged"
+        ))
     })?;
     let mut report = Report::new(&campaign, &[], is_other_processor(&resolved), last);
     let bar = Bar::new(Some(last.unsigned_abs()), BAR);
     follow::follow(store, &mut replay, &mut report, last, &bar).await?;
     drop(bar);
     if let Some(MissingFeatures { decision, candidate, .. }) = &report.stopped {
-        return Err(Failure::Input(format!(
+        return Err(CommandError::Input(format!(
             "mixture version {version} is the result of decision {last} and cannot be computed again: the features of candidate \
              {candidate} (decision {decision}) were not stored (limit: collect.declined_features_mb); expected at most version {} or \
              the newest",
@@ -47,14 +49,14 @@ pub async fn mixture_of(
             }
             false => "",
         };
-        return Err(Failure::Failed(format!(
+        return Err(CommandError::Failed(format!(
             "mixture version {version} cannot be computed again: decision {} is not reproduced: {} was {}, and is now {}{processor}",
             difference.decision, difference.what, difference.recorded, difference.now
         )));
     }
     let found = replay.mixture_of(version).map(Arc::clone);
     found.ok_or_else(|| {
-        Failure::Failed(format!(
+        CommandError::Failed(format!(
             "mixture version {version}: after decision {last} the replay has version {}",
             replay.mixture().version()
         ))

@@ -16,11 +16,11 @@ use store::Store;
 
 use self::report_data::ReportData;
 use crate::csv::{self, Csv};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::page::{self, FigureContent, FigureEntry, File};
 
 /// Reads the campaign and builds all files of its report, the page first.
-pub async fn build(store: &Store) -> Result<Vec<File>, Failure> {
+pub async fn build(store: &Store) -> Result<Vec<File>, CommandError> {
     let data = ReportData::read(store).await?;
     let parts = figures::all(&data);
     let tables = tables::all(&data);

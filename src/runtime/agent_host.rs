@@ -23,7 +23,7 @@ use workers::agent::{self, Agent, AgentEvent};
 
 use super::process_manager::all_failed_message;
 use super::{CHANNEL, STOP_MESSAGE};
-use crate::exit_status::{ExitStatus, Failure};
+use crate::exit_status::{CommandError, ExitStatus};
 use crate::file_hash::verify_hash;
 use crate::log;
 use crate::output::{count, log_and_print, log_and_warn};
@@ -45,7 +45,7 @@ pub async fn run(
     timeout: Duration,
     directory: &Path,
     state: &AgentState,
-) -> Result<ExitStatus, Failure> {
+) -> Result<ExitStatus, CommandError> {
     let stop = CancellationToken::new();
     cancel_on_signal(stop.clone(), STOP_MESSAGE)?;
     let walkers = agent.walkers;
@@ -58,7 +58,7 @@ pub async fn run(
         }
         () = tokio::time::sleep(timeout) => {
             let minutes = timeout.as_secs_f64() / 60.0;
-            return Err(Failure::Failed(format!("no orchestrator has answered at {address} for {minutes:.1} min")));
+            return Err(CommandError::Failed(format!("no orchestrator has answered at {address} for {minutes:.1} min")));
         }
     };
     log_and_print(format_args!(
@@ -66,7 +66,7 @@ pub async fn run(
         count(walkers, "walker"),
         joined.newest().await.version()
     ));
-    let shm_dir = ShmDir::for_campaign(directory).map_err(Failure::failed)?;
+    let shm_dir = ShmDir::for_campaign(directory).map_err(CommandError::failed)?;
     let mixture = joined.newest().await;
     let (stopping, asked) = (stop.clone(), stop.clone());
     let metrics = Arc::clone(&state.metrics);
@@ -80,7 +80,7 @@ pub async fn run(
         }))
     };
     let ended = run_in(&shm_dir, &setup, (walkers, threads), &mixture, dispatch, &stop, state).await;
-    let removed = shm_dir.remove().map_err(Failure::failed);
+    let removed = shm_dir.remove().map_err(CommandError::failed);
     let ended = ended?;
     removed?;
     Ok(ended)
@@ -92,14 +92,14 @@ async fn join(
     tls: Option<&Tls>,
     agent: net::Agent,
     directory: &Path,
-) -> Result<(Arc<AgentClient>, Membership, AgentConfig), Failure> {
+) -> Result<(Arc<AgentClient>, Membership, AgentConfig), CommandError> {
     let waiting = |why: &NetError| log_and_warn(format_args!("waiting for the orchestrator: {why}"));
-    let client = AgentClient::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
+    let client = AgentClient::open(address, tls, agent, waiting).await.map_err(CommandError::input)?;
     let client = Arc::new(client);
     loop {
-        let joined = client.join().await.map_err(Failure::failed)?;
+        let joined = client.join().await.map_err(CommandError::failed)?;
         let setup: AgentConfig = serde_json::from_slice(&joined.setup).map_err(|error| {
-            Failure::Failed(format!(
+            CommandError::Failed(format!(
                 "the orchestrator's configuration: {error}: run the same version of calmwalk on all hosts"
             ))
         })?;
@@ -116,7 +116,7 @@ async fn model(
     joined: &Membership,
     model: &ModelFiles,
     directory: &Path,
-) -> Result<Option<ModelFiles>, Failure> {
+) -> Result<Option<ModelFiles>, CommandError> {
     let Some(export) = file(joined, &model.export, directory.join("kokkos.npz")).await? else {
         return Ok(None);
     };
@@ -131,7 +131,11 @@ async fn model(
 }
 
 /// A file of the orchestrator, or its copy, which is downloaded to `path`.
-async fn file(joined: &Membership, file: &HashedFile, path: PathBuf) -> Result<Option<HashedFile>, Failure> {
+async fn file(
+    joined: &Membership,
+    file: &HashedFile,
+    path: PathBuf,
+) -> Result<Option<HashedFile>, CommandError> {
     let hash = &file.hash;
     if verify_hash(&file.path, hash).is_ok() {
         return Ok(Some(file.clone()));
@@ -139,11 +143,11 @@ async fn file(joined: &Membership, file: &HashedFile, path: PathBuf) -> Result<O
     log_and_print("the orchestrator's model file is not on this host: downloading the model …");
     let bytes = match joined.fetch_file(hash).await {
         Err(LinkError::RejoinRequired(_)) => return Ok(None),
-        bytes => bytes.map_err(Failure::failed)?,
+        bytes => bytes.map_err(CommandError::failed)?,
     };
     fs::write(&path, bytes)
-        .map_err(|error| Failure::Failed(format!("cannot write {}: {error}", path.display())))?;
-    verify_hash(&path, hash).map_err(Failure::failed)?;
+        .map_err(|error| CommandError::Failed(format!("cannot write {}: {error}", path.display())))?;
+    verify_hash(&path, hash).map_err(CommandError::failed)?;
     Ok(Some(HashedFile { path, hash: hash.clone() }))
 }
 
@@ -168,13 +172,13 @@ async fn run_in(
     dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
     stop: &CancellationToken,
     state: &AgentState,
-) -> Result<ExitStatus, Failure> {
+) -> Result<ExitStatus, CommandError> {
     let sizes = Sizes { walkers, message_bytes: setup.message_bytes };
     let needed =
-        SharedMixture::space_needed(mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
-    let _prepared = shm_dir.prepare(needed).map_err(Failure::failed)?;
-    let shared = SharedMixture::create(&shm_dir.mixture(), mixture, walkers).map_err(Failure::failed)?;
-    let server = Server::open(shm_dir, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
+        SharedMixture::space_needed(mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
+    let _prepared = shm_dir.prepare(needed).map_err(CommandError::failed)?;
+    let shared = SharedMixture::create(&shm_dir.mixture(), mixture, walkers).map_err(CommandError::failed)?;
+    let server = Server::open(shm_dir, sizes, u64::from(std::process::id())).map_err(CommandError::failed)?;
     let line = server.handle();
     let limits = Limits {
         heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),
@@ -215,7 +219,7 @@ fn launch(
 
 impl AgentHost {
     /// Runs until every walker has ended and every report is delivered.
-    async fn supervise(mut self, stop: &CancellationToken) -> Result<ExitStatus, Failure> {
+    async fn supervise(mut self, stop: &CancellationToken) -> Result<ExitStatus, CommandError> {
         let (mut dispatched, mut gone) = (None, false);
         let mut stop_requested = pin!(stop.cancelled().fuse());
         let mut ticks = interval(STATUS_INTERVAL);
@@ -229,20 +233,20 @@ impl AgentHost {
                 }
                 () = &mut stop_requested => self.walkers.stop(),
                 ended = &mut self.dispatching, if dispatched.is_none() => {
-                    let ended = ended.map_err(Failure::failed)?;
+                    let ended = ended.map_err(CommandError::failed)?;
                     match ended {
                         Ok(agent::AgentExit::Done) => self.walkers.close(),
                         _ => self.walkers.stop(),
                     }
-                    dispatched = Some(ended.map_err(Failure::failed));
+                    dispatched = Some(ended.map_err(CommandError::failed));
                 }
             }
         }
-        self.serving.await.map_err(Failure::failed)?.map_err(Failure::failed)?;
+        self.serving.await.map_err(CommandError::failed)?.map_err(CommandError::failed)?;
         match dispatched.transpose()? {
             Some(agent::AgentExit::Done) => Ok(ExitStatus::Done),
             _ => match self.failed {
-                Some(how) => Err(Failure::Failed(format!("no walker is left: {how}"))),
+                Some(how) => Err(CommandError::Failed(format!("no walker is left: {how}"))),
                 None => Ok(ExitStatus::Interrupted),
             },
         }

@@ -13,7 +13,7 @@ use wire::transport::Incoming;
 use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::RunContext;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print, log_and_warn};
 use crate::process_config::{self, AgentConfig};
 
@@ -26,7 +26,11 @@ pub struct AgentService {
 
 impl AgentService {
     /// Starts to listen if the run is configured to.
-    pub async fn open(run: RunContext<'_>, session: u64, mixture: &Arc<Mixture>) -> Result<Self, Failure> {
+    pub async fn open(
+        run: RunContext<'_>,
+        session: u64,
+        mixture: &Arc<Mixture>,
+    ) -> Result<Self, CommandError> {
         // Writes wait here while the database is unreachable.
         let (store, mixture) =
             (run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT), Arc::clone(mixture));
@@ -47,8 +51,8 @@ impl AgentService {
             AgentServer::open(&listen.endpoint, listen.tls.as_ref(), session, heartbeat_timeout, bootstrap)
                 .await;
         let server = server.map_err(|error| match error {
-            NetError::SessionClosed { .. } => Failure::failed(error),
-            error => Failure::input(error),
+            NetError::SessionClosed { .. } => CommandError::failed(error),
+            error => CommandError::input(error),
         })?;
         listen.announce(server.endpoint())?;
         log_and_print(format_args!("agents may join at {}", server.endpoint()));
@@ -56,7 +60,7 @@ impl AgentService {
     }
 
     /// Serves agents until there is no more work and the last agent has left.
-    pub async fn run(self, stop: StopTokens, to_reactor: mpsc::Sender<Incoming>) -> Result<(), Failure> {
+    pub async fn run(self, stop: StopTokens, to_reactor: mpsc::Sender<Incoming>) -> Result<(), CommandError> {
         let Some(server) = self.server else { return Ok(()) };
         let (sender, events) = mpsc::unbounded_channel();
         let on_event = move |event| drop(sender.send(event));
@@ -64,7 +68,7 @@ impl AgentService {
             server.run(self.mixture, stop, to_reactor, on_event),
             record_events(&self.store, events)
         );
-        ended.map_err(Failure::failed)
+        ended.map_err(CommandError::failed)
     }
 }
 

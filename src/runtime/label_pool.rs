@@ -16,7 +16,7 @@ use super::labellers::Labellers;
 use super::multi_process::LABELLER_TIMEOUT;
 use super::process_manager::{PROVEN_AFTER, all_failed_message};
 use super::process_records;
-use crate::exit_status::{ExitStatus, Failure};
+use crate::exit_status::{CommandError, ExitStatus};
 use crate::label_setup::LabelSetup;
 use crate::output::{Bar, log_and_print, print_stderr};
 use crate::process_config::{self, LabellerConfig, PoolConfig};
@@ -43,7 +43,11 @@ pub struct LabelPool {
 /// Makes labels until there is nothing left to do or `stop` is cancelled.
 ///
 /// Await this on the main thread: the labellers end with the thread that starts them.
-pub async fn run(store: &Store, pool: LabelPool, stop: &CancellationToken) -> Result<ExitStatus, Failure> {
+pub async fn run(
+    store: &Store,
+    pool: LabelPool,
+    stop: &CancellationToken,
+) -> Result<ExitStatus, CommandError> {
     let attempts = pool.label_setup.attempts;
     let mut manager = PoolManager {
         store,
@@ -73,7 +77,7 @@ pub async fn run(store: &Store, pool: LabelPool, stop: &CancellationToken) -> Re
     }
     let failure = failure.or_else(|| all_failed_message(&mut manager.labellers.children));
     match failure.filter(|_| !stop.is_cancelled()) {
-        Some(why) => Err(Failure::Failed(format!("no slot is left: {why}"))),
+        Some(why) => Err(CommandError::Failed(format!("no slot is left: {why}"))),
         None if stop.is_cancelled() => Ok(ExitStatus::Interrupted),
         None => Ok(ExitStatus::Done),
     }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use wire::net::{Announcement, CertificateFault, Endpoint, Tls};
 
 use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::exit_status::{ExitStatus, Failure};
+use crate::exit_status::{CommandError, ExitStatus};
 use crate::output::log_and_warn;
 
 /// Where agents of other hosts may join.
@@ -29,11 +29,11 @@ impl Listen {
     ///
     /// # Errors
     /// Fails if no agent could join with these certificates.
-    pub fn check(&self) -> Result<(), Failure> {
+    pub fn check(&self) -> Result<(), CommandError> {
         let Some(tls) = &self.tls else { return Ok(()) };
-        let checked = tls.check_for_orchestrator().map_err(Failure::input)?;
+        let checked = tls.check_for_orchestrator().map_err(CommandError::input)?;
         checked.warnings.iter().for_each(|warning| log_and_warn(format_args!("WARNING: {warning}")));
-        let endpoint = self.endpoint.with_host_name(&self.host).map_err(Failure::input)?;
+        let endpoint = self.endpoint.with_host_name(&self.host).map_err(CommandError::input)?;
         let host = endpoint.plain_host();
         if checked.is_valid_for(host) {
             return Ok(());
@@ -41,7 +41,7 @@ impl Listen {
         let names = checked.names.join(", ");
         if self.announce.is_some() {
             let fault = CertificateFault::OtherNames { names, host: host.to_owned() };
-            return Err(Failure::input(fault.at(&tls.certificate)));
+            return Err(CommandError::input(fault.at(&tls.certificate)));
         }
         // The name that agents use is unknown here, but it is hardly that of another host.
         if host.parse::<IpAddr>().is_err() {
@@ -53,19 +53,19 @@ impl Listen {
     }
 
     /// Announces the endpoint in the file.
-    pub fn announce(&self, endpoint: &Endpoint) -> Result<(), Failure> {
+    pub fn announce(&self, endpoint: &Endpoint) -> Result<(), CommandError> {
         let Some(path) = &self.announce else { return Ok(()) };
-        let endpoint = endpoint.with_host_name(&self.host).map_err(Failure::input)?;
+        let endpoint = endpoint.with_host_name(&self.host).map_err(CommandError::input)?;
         write_announcement(path, &Announcement::Endpoint(endpoint))
     }
 
     /// Removes the announcement of an earlier run.
-    pub fn clear_announcement(&self) -> Result<(), Failure> {
+    pub fn clear_announcement(&self) -> Result<(), CommandError> {
         self.announce.as_deref().map_or(Ok(()), remove)
     }
 
     /// Announces that there is no more work, or removes the announcement if the run was interrupted.
-    pub fn announce_end(&self, ended: ExitStatus) -> Result<(), Failure> {
+    pub fn announce_end(&self, ended: ExitStatus) -> Result<(), CommandError> {
         match (self.announce.as_deref(), ended) {
             (None, _) => Ok(()),
             (Some(path), ExitStatus::Done | ExitStatus::NoWalkCompleted) => {
@@ -76,14 +76,14 @@ impl Listen {
     }
 }
 
-fn remove(path: &Path) -> Result<(), Failure> {
+fn remove(path: &Path) -> Result<(), CommandError> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(cannot_write(path, error)),
         _ => Ok(()),
     }
 }
 
-fn write_announcement(path: &Path, announcement: &Announcement) -> Result<(), Failure> {
+fn write_announcement(path: &Path, announcement: &Announcement) -> Result<(), CommandError> {
     let mut file = AtomicFile::create(path)?;
     write!(file, "{announcement}").map_err(|error| cannot_write(path, error))?;
     file.finish()

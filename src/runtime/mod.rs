@@ -32,7 +32,7 @@ use wire::transport::Incoming;
 use self::throughput::Throughput;
 use crate::campaign::Campaign;
 use crate::config::{Config, QueueFull};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::forgetting::ForgettingRule;
 use crate::progress::Display;
 use crate::signals::cancel_on_signal;
@@ -70,7 +70,7 @@ pub async fn run(
     selector: Selector,
     in_process: bool,
     accept: Option<&str>,
-) -> Result<reactor::RunOutcome, Failure> {
+) -> Result<reactor::RunOutcome, CommandError> {
     cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
     let go_on = tokio::select! {
         go_on = reference_check::run(run, accept) => go_on?,

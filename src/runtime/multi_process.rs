@@ -23,7 +23,7 @@ use wire::shm_dir::ShmDir;
 use super::agent_service::AgentService;
 use super::process_manager::{self, ProcessManager};
 use super::{CHANNEL, ReactorTask, RunContext, spawn, start_reactor, wanted_walkers};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Time that the last writes to the database may take after all processes have ended.
 const DATABASE_TIMEOUT: Duration = Duration::from_secs(60);
@@ -33,11 +33,11 @@ pub const LABELLER_TIMEOUT: Duration = Duration::from_secs(60);
 /// Runs the campaign until it is finished or stopped.
 ///
 /// Await this on the main thread: the walkers end with the thread that starts them.
-pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
-    let place = ShmDir::for_campaign(run.directory).map_err(Failure::failed)?;
+pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, CommandError> {
+    let place = ShmDir::for_campaign(run.directory).map_err(CommandError::failed)?;
     let ended = run_in(&place, run, selector).await;
     // No process needs the shared memory any more. The next start removes what cannot be removed now.
-    let removed = place.remove().map_err(Failure::failed);
+    let removed = place.remove().map_err(CommandError::failed);
     let ended = ended?;
     removed?;
     Ok(ended)
@@ -47,17 +47,17 @@ async fn run_in(
     place: &ShmDir,
     run: RunContext<'_>,
     selector: Selector,
-) -> Result<reactor::RunOutcome, Failure> {
+) -> Result<reactor::RunOutcome, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
     let walkers = wanted_walkers(campaign);
     let mixture = Arc::clone(selector.mixture());
     let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
     let needed =
-        SharedMixture::space_needed(&mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
-    let _prepared = place.prepare(needed).map_err(Failure::failed)?;
+        SharedMixture::space_needed(&mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
+    let _prepared = place.prepare(needed).map_err(CommandError::failed)?;
     let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
-    let shared = shared.map_err(Failure::failed)?;
-    let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
+    let shared = shared.map_err(CommandError::failed)?;
+    let server = Server::open(place, sizes, session(process)).map_err(CommandError::failed)?;
 
     // The manager cancels it too, when the run cannot go on.
     let stopping = run.stop.child_token();
@@ -83,7 +83,7 @@ async fn run_in(
     let tokens = StopTokens { stopping: stopping.clone(), closing: no_more_work.clone() };
     let remote = agents.run(tokens, to_reactor);
     let serving = tokio::spawn(async {
-        tokio::try_join!(async { local.await.map_err(Failure::failed) }, remote).map(|_| ())
+        tokio::try_join!(async { local.await.map_err(CommandError::failed) }, remote).map(|_| ())
     });
     let reactor = start_reactor(run, selector, incoming, stopping);
     supervise(manager, reactor, no_more_work, serving, run.stop).await
@@ -103,9 +103,9 @@ enum ManagerEvent {
     /// A stop was requested.
     StopRequested,
     /// The reactor has ended.
-    ReactorEnded(Result<reactor::RunOutcome, Failure>),
+    ReactorEnded(Result<reactor::RunOutcome, CommandError>),
     /// The transport has ended.
-    TransportEnded(Result<(), Failure>),
+    TransportEnded(Result<(), CommandError>),
 }
 
 /// Supervises the processes until all walks are over and every structure has its label, or until a stop is requested.
@@ -114,9 +114,9 @@ async fn supervise(
     mut manager: ProcessManager<'_>,
     mut reactor: ReactorTask,
     no_more_work: CancellationToken,
-    mut serving: JoinHandle<Result<(), Failure>>,
+    mut serving: JoinHandle<Result<(), CommandError>>,
     stop: &CancellationToken,
-) -> Result<reactor::RunOutcome, Failure> {
+) -> Result<reactor::RunOutcome, CommandError> {
     let (mut reactor_result, mut transport_result, mut stop_requested) = (None, None, false);
     let mut database_deadline = None;
     while reactor_result.is_none() || transport_result.is_none() || !manager.has_ended() {
@@ -169,14 +169,14 @@ async fn expired(time: &mut Option<Pin<Box<Sleep>>>) {
     }
 }
 
-fn database_unreachable() -> Failure {
-    Failure::Failed(format!(
+fn database_unreachable() -> CommandError {
+    CommandError::Failed(format!(
         "stopping, but the database has not answered for {} s: walks keep their last checkpoints; run the same command to continue the campaign",
         DATABASE_TIMEOUT.as_secs()
     ))
 }
 
 /// The result of a task. A panic is a failure too.
-fn flatten<T>(ended: Result<Result<T, impl ToString>, JoinError>) -> Result<T, Failure> {
-    ended.map_err(Failure::failed)?.map_err(Failure::failed)
+fn flatten<T>(ended: Result<Result<T, impl ToString>, JoinError>) -> Result<T, CommandError> {
+    ended.map_err(CommandError::failed)?.map_err(CommandError::failed)
 }

@@ -16,7 +16,7 @@ use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::config::{Config, NotifyEvent};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::forgetting::{ForgettingRule, Measured};
 use crate::notify::{METADATA_KEY, Notification, NotificationTracker};
 use crate::output::log_and_warn;
@@ -77,7 +77,7 @@ impl<'a> Notifier<'a> {
         }
     }
 
-    async fn check(&mut self) -> Result<(), Failure> {
+    async fn check(&mut self) -> Result<(), CommandError> {
         let mut due = self.tracker.check(&self.store.status().await?, unix_milliseconds());
         let values = MixtureValues(self.store.values().await?);
         if let Ok(measured) = Measured::deserialize(values.training_frames()) {
@@ -87,10 +87,10 @@ impl<'a> Notifier<'a> {
             return Ok(());
         }
         // Store this first, so that no event is reported twice.
-        let told = serde_json::to_string(self.tracker.sent()).map_err(Failure::failed)?;
+        let told = serde_json::to_string(self.tracker.sent()).map_err(CommandError::failed)?;
         self.store.set_metadata(METADATA_KEY, &told).await?;
         let snapshot = Snapshot::read(self.store).await?;
-        let state = snapshot.to_json().map_err(Failure::failed)?;
+        let state = snapshot.to_json().map_err(CommandError::failed)?;
         due.into_iter().for_each(|due| self.notify(due, &state));
         Ok(())
     }
@@ -131,7 +131,7 @@ pub async fn run(notifier: &mut Option<Notifier<'_>>) -> Infallible {
 }
 
 /// Checks a last time at the end of a run, which may have failed, and waits for all commands.
-pub async fn finish(notifier: Option<Notifier<'_>>, failure: Option<&Failure>) {
+pub async fn finish(notifier: Option<Notifier<'_>>, failure: Option<&CommandError>) {
     let Some(mut notifier) = notifier else { return };
     if let Some(due) = failure.and_then(|failure| notifier.tracker.failed(&failure.to_string())) {
         // The database may be what failed.

@@ -13,7 +13,7 @@ use workers::labeller::HEARTBEAT_INTERVAL;
 use super::db_status::DbStatus;
 use super::labellers::Labellers;
 use super::process_records::ProcessRecords;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::log_and_print;
 
 /// Interval between checks for unfinished labels after the last walk has ended.
@@ -146,8 +146,8 @@ impl<'a> ProcessManager<'a> {
     }
 
     /// Fails if the campaign cannot go on.
-    pub fn failure(&self) -> Result<(), Failure> {
-        self.failure.clone().map_or(Ok(()), |failure| Err(Failure::Failed(failure)))
+    pub fn failure(&self) -> Result<(), CommandError> {
+        self.failure.clone().map_or(Ok(()), |failure| Err(CommandError::Failed(failure)))
     }
 
     fn is_stopping(&self) -> bool {

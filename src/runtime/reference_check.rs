@@ -17,7 +17,7 @@ use workers::labeller::{LabelOutcome, RecordedLabel, give_up_others};
 
 use super::RunContext;
 use crate::campaign::Campaign;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print, log_and_warn, print_stderr};
 use crate::wording;
 
@@ -31,9 +31,9 @@ pub const ANY_CHECK: &str = "any";
 ///
 /// # Errors
 /// There is no check.
-pub fn identity(campaign: &Campaign) -> Result<String, Failure> {
+pub fn identity(campaign: &Campaign) -> Result<String, CommandError> {
     if campaign.known.is_empty() {
-        return Err(Failure::Input(format!(
+        return Err(CommandError::Input(format!(
             "--accept-reference-check: {} has no label.reference_check.structures, so there is no check to accept",
             campaign.path.display()
         )));
@@ -51,7 +51,7 @@ fn begin(campaign: &Campaign) -> ReferenceCheck {
 ///
 /// # Errors
 /// A difference above its bound, a label that cannot be made, errors of the database.
-pub async fn run(run: RunContext<'_>, accept: Option<&str>) -> Result<bool, Failure> {
+pub async fn run(run: RunContext<'_>, accept: Option<&str>) -> Result<bool, CommandError> {
     let RunContext { campaign, store, .. } = run;
     if campaign.known.is_empty() {
         return Ok(true);
@@ -71,7 +71,7 @@ async fn judge(
     run: RunContext<'_>,
     mut check: ReferenceCheck,
     accept: Option<&str>,
-) -> Result<bool, Failure> {
+) -> Result<bool, CommandError> {
     match accept.filter(|_| check.state != CheckState::Passed) {
         None => {}
         Some(accepted) if accepted == ANY_CHECK || accepted == check.identity => {
@@ -101,12 +101,12 @@ async fn judge(
     Ok(true)
 }
 
-fn refusal(config: &Path, faults: &[String]) -> Failure {
+fn refusal(config: &Path, faults: &[String]) -> CommandError {
     let mut shown = faults[..faults.len().min(MAX_FAULTS)].join("; ");
     if faults.len() > MAX_FAULTS {
         shown += &format!("; and {} more", faults.len() - MAX_FAULTS);
     }
-    Failure::Failed(format!(
+    CommandError::Failed(format!(
         "the labels contradict the reference of label.reference_check: {shown}. No walk was started. Compare [label.method] with the \
          reference that the potential was trained on (functional, pseudopotentials, cutoff, k-points, smearing, magnetic moments, \
          which energy), and the units of the file. If the differences are meant, run calmwalk run {} --accept-reference-check, or \
@@ -119,7 +119,7 @@ fn refusal(config: &Path, faults: &[String]) -> Failure {
 async fn label_all(
     run: RunContext<'_>,
     check: &ReferenceCheck,
-) -> Result<Option<Vec<Result<Label, String>>>, Failure> {
+) -> Result<Option<Vec<Result<Label, String>>>, CommandError> {
     let RunContext { campaign, store, .. } = run;
     let (keys, bounds) = (keys(campaign), campaign.config.label.bounds());
     let attempts = campaign.config.label.max_attempts.get();
@@ -151,7 +151,7 @@ type Labelled = (usize, Result<Label, String>);
 async fn make(
     run: RunContext<'_>,
     missing: Vec<(usize, RecordedLabel<'_>)>,
-) -> Result<Vec<Labelled>, Failure> {
+) -> Result<Vec<Labelled>, CommandError> {
     let RunContext { campaign, store, stop, .. } = run;
     let slots = campaign.config.label.concurrency.max(1).min(missing.len());
     let next = Mutex::new(missing.into_iter());
@@ -165,7 +165,7 @@ async fn make(
             made.push((index, report(&campaign.known[index], outcome)));
         }
         method.end();
-        Ok::<_, Failure>(made)
+        Ok::<_, CommandError>(made)
     };
     let made = try_join_all((0..slots).map(|_| slot())).await?;
     Ok(made.into_iter().flatten().collect())

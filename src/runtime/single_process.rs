@@ -22,10 +22,10 @@ use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
 use super::{CHANNEL, ReactorTask, RunContext, start_reactor, wanted_walkers};
 use crate::campaign::Campaign;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Runs the campaign until it is finished or stopped.
-pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, Failure> {
+pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::RunOutcome, CommandError> {
     if let Ok(place) = ShmDir::for_campaign(run.directory) {
         // Removes what a killed run left in shared memory. This run needs nothing there.
         let _ = place.remove();
@@ -63,7 +63,7 @@ struct Tasks {
 
 impl Tasks {
     /// Starts all of them.
-    fn start(run: RunContext<'_>, selector: Selector) -> Result<Self, Failure> {
+    fn start(run: RunContext<'_>, selector: Selector) -> Result<Self, CommandError> {
         let stopping = run.stop.child_token();
         let closing = Arc::new(Shutdown::new(run.stop.child_token()));
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
@@ -75,11 +75,11 @@ impl Tasks {
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign, because its queue could only grow.
-    async fn finish(mut self) -> Result<reactor::RunOutcome, Failure> {
+    async fn finish(mut self) -> Result<reactor::RunOutcome, CommandError> {
         let mut failure = None;
         let ended = loop {
             tokio::select! {
-                ended = &mut self.reactor => break ended.map_err(Failure::failed)?,
+                ended = &mut self.reactor => break ended.map_err(CommandError::failed)?,
                 Some(labeller) = self.labellers.join_next() => {
                     failure = failure_of(labeller).or(failure);
                     self.stopping.cancel();
@@ -101,9 +101,9 @@ impl Tasks {
             failure = failure_of(labeller).or(failure);
         }
         if panicked > 0 {
-            return Err(Failure::Failed(format!("{panicked} walkers crashed: see the message above")));
+            return Err(CommandError::Failed(format!("{panicked} walkers crashed: see the message above")));
         }
-        let ended = ended.map_err(Failure::failed)?;
+        let ended = ended.map_err(CommandError::failed)?;
         match failure {
             Some(failure) => Err(failure),
             // Every walk is over, but the labellers were asked to stop and may have left jobs.
@@ -125,10 +125,10 @@ async fn wait_for_labels(store: &Store) -> Result<(), StoreError> {
 }
 
 /// Why a labeller failed, if it did.
-fn failure_of(labeller: Result<Result<(), StoreError>, JoinError>) -> Option<Failure> {
+fn failure_of(labeller: Result<Result<(), StoreError>, JoinError>) -> Option<CommandError> {
     match labeller {
-        Ok(ended) => ended.err().map(Failure::from),
-        Err(crash) => Some(Failure::Failed(format!("a labeller crashed: {crash}"))),
+        Ok(ended) => ended.err().map(CommandError::from),
+        Err(crash) => Some(CommandError::Failed(format!("a labeller crashed: {crash}"))),
     }
 }
 
@@ -136,16 +136,17 @@ fn start_walkers(
     campaign: &Campaign,
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &CancellationToken,
-) -> Result<Vec<JoinHandle<walker::WalkerExit>>, Failure> {
+) -> Result<Vec<JoinHandle<walker::WalkerExit>>, CommandError> {
     let (model, settings) = (Arc::clone(&campaign.model), Arc::new(campaign.walk_settings()));
     let start = |number| {
         let mut transport = InProcess::new(number, to_reactor.clone(), stopping.clone());
-        let threads = Threads::new(campaign.config.run.threads_per_walker.get()).map_err(Failure::failed)?;
+        let threads =
+            Threads::new(campaign.config.run.threads_per_walker.get()).map_err(CommandError::failed)?;
         let context = WalkContext { model: Arc::clone(&model), threads, settings: Arc::clone(&settings) };
         thread::Builder::new()
             .name(format!("walker-{number}"))
             .spawn(move || walker::run(&context, &mut transport))
-            .map_err(|error| Failure::Failed(format!("cannot start walker {number}: {error}")))
+            .map_err(|error| CommandError::Failed(format!("cannot start walker {number}: {error}")))
     };
     (0..wanted_walkers(campaign)).map(start).collect()
 }
@@ -153,7 +154,7 @@ fn start_walkers(
 fn start_labellers(
     run: RunContext<'_>,
     closing: &Arc<Shutdown>,
-) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
+) -> Result<JoinSet<Result<(), StoreError>>, CommandError> {
     let RunContext { campaign, store, process, .. } = run;
     let label = &campaign.config.label;
     let mut labellers = JoinSet::new();

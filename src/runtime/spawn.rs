@@ -11,7 +11,7 @@ use wire::ipc::ServerHandle;
 use super::RunContext;
 use super::labellers::Labellers;
 use crate::campaign::Campaign;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::label_setup::LabelSetup;
 use crate::log;
 use crate::process_config::{self, LabellerConfig, WalkerConfig};
@@ -20,7 +20,7 @@ use crate::process_config::{self, LabellerConfig, WalkerConfig};
 pub fn walker_launcher(
     campaign: &Campaign,
     line: ServerHandle,
-) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, Failure> {
+) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, CommandError> {
     let model = campaign.model_files()?;
     let (parent, settings) = (std::process::id(), campaign.walk_settings());
     let threads = campaign.config.run.threads_per_walker.get();
@@ -39,7 +39,7 @@ pub fn walker_launcher(
 }
 
 /// Adopts the labellers that an earlier run left with the same configuration, and launches the missing ones.
-pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers, Failure> {
+pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers, CommandError> {
     let RunContext { campaign, store, directory, .. } = run;
     let location = match &campaign.config.run.store {
         Some(url) => PathBuf::from(url),
@@ -73,7 +73,7 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
 }
 
 /// Asks the labellers of an earlier run to end, because this run makes labels itself.
-pub async fn stop_labellers(store: &Store) -> Result<(), Failure> {
+pub async fn stop_labellers(store: &Store) -> Result<(), CommandError> {
     for found in running_labellers(store).await? {
         let _ = request_exit(found.pid, &found.start_time);
     }
@@ -88,6 +88,6 @@ async fn running_labellers(store: &Store) -> Result<Vec<ProcessRecord>, StoreErr
     Ok(labellers)
 }
 
-fn absolute(path: &Path) -> Result<PathBuf, Failure> {
-    std::path::absolute(path).map_err(Failure::failed)
+fn absolute(path: &Path) -> Result<PathBuf, CommandError> {
+    std::path::absolute(path).map_err(CommandError::failed)
 }

@@ -5,7 +5,7 @@ use store::records::{Fate, StoredCandidate};
 use store::{Location, Store};
 
 use super::{Item, ItemPlace, Source};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Candidates per read; each has up to megabytes of features.
 const PAGE: u32 = 16;
@@ -35,23 +35,23 @@ impl CampaignCandidates {
         number: u32,
         model_hash: &str,
         declined_only: bool,
-    ) -> Result<Self, Failure> {
+    ) -> Result<Self, CommandError> {
         let runtime =
-            tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
+            tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(CommandError::failed)?;
         let (store, campaign) = runtime.block_on(async {
             let store = Store::open_read_only(location).await?;
             let campaign = store.campaign().await?;
-            Ok::<_, Failure>((store, campaign))
+            Ok::<_, CommandError>((store, campaign))
         })?;
         let configuration: Value =
-            serde_json::from_str(&campaign.resolved_configuration).map_err(Failure::failed)?;
+            serde_json::from_str(&campaign.resolved_configuration).map_err(CommandError::failed)?;
         let same_model = configuration["files"]["potential.model"] == model_hash;
         let id = campaign.id.to_string();
         Ok(Self { store, number, id, declined_only, same_model, last: 0, is_read: false, runtime })
     }
 
     /// The next candidates; none at the end.
-    pub(super) fn next_page(&mut self) -> Result<Vec<Item>, Failure> {
+    pub(super) fn next_page(&mut self) -> Result<Vec<Item>, CommandError> {
         loop {
             let page = self.runtime.block_on(self.store.candidates(self.last, false, PAGE))?;
             let Some(last) = page.last() else { return Ok(Vec::new()) };
@@ -75,9 +75,9 @@ impl CampaignCandidates {
     }
 
     /// The candidate of a decision.
-    pub(super) fn candidate(&self, decision: i64) -> Result<StoredCandidate, Failure> {
+    pub(super) fn candidate(&self, decision: i64) -> Result<StoredCandidate, CommandError> {
         let found = self.runtime.block_on(self.store.candidates(decision - 1, false, 1))?;
         let found = found.into_iter().find(|found| found.decision == decision);
-        found.ok_or_else(|| Failure::Failed(format!("the candidate of decision {decision} is gone")))
+        found.ok_or_else(|| CommandError::Failed(format!("the candidate of decision {decision} is gone")))
     }
 }

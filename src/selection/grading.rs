@@ -15,7 +15,7 @@ use wire::ContentHash;
 
 use super::campaign::CampaignCandidates;
 use super::{GradedPool, Item, ItemPlace, PoolStructure, Source};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar};
 use crate::structure_files::{StructureFiles, StructureReader};
@@ -62,7 +62,7 @@ struct GradedStructure {
 
 impl Grading {
     /// Grades every structure of the files, then of the campaigns; `None` after a cancellation of `stop`.
-    pub fn run(&self, pool: &mut PoolFiles) -> Result<Option<GradedPool>, Failure> {
+    pub fn run(&self, pool: &mut PoolFiles) -> Result<Option<GradedPool>, CommandError> {
         let bytes = Arc::new(AtomicU64::new(0));
         let total = pool.files.total_bytes()?;
         let bar = Bar::new((total > 0).then_some(total), BAR);
@@ -101,7 +101,7 @@ impl Grading {
     }
 
     /// In the order of the block.
-    fn grade(&self, workers: &mut [Worker], block: &[Item]) -> Vec<Result<GradedStructure, Failure>> {
+    fn grade(&self, workers: &mut [Worker], block: &[Item]) -> Vec<Result<GradedStructure, CommandError>> {
         let items = Mutex::new(block.iter().enumerate());
         let next = || items.lock().unwrap_or_else(PoisonError::into_inner).next();
         let share = |worker: &mut Worker| {
@@ -129,8 +129,8 @@ impl Grading {
 }
 
 impl Worker {
-    fn grade(&mut self, mixture: &Mixture, item: &Item) -> Result<GradedStructure, Failure> {
-        let wrong = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", item.place));
+    fn grade(&mut self, mixture: &Mixture, item: &Item) -> Result<GradedStructure, CommandError> {
+        let wrong = |error: &dyn std::fmt::Display| CommandError::Input(format!("{}: {error}", item.place));
         let size = item.structure.len() * mixture.dimension();
         let known = item.features.as_ref().filter(|features| features.len() == size);
         let (elements, features) = match known {
@@ -158,11 +158,11 @@ impl GradedPool {
         graded: &GradedStructure,
         compositions: &mut HashMap<Vec<u32>, u32>,
         elements: usize,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandError> {
         let GradedStructure { elements: of_atoms, slots, gamma, features, evaluated } = graded;
         self.pool
             .push(of_atoms, slots, gamma, features)
-            .map_err(|error| Failure::Failed(format!("the temporary file of the features: {error}")))?;
+            .map_err(|error| CommandError::Failed(format!("the temporary file of the features: {error}")))?;
         let mut composition = vec![0; elements];
         of_atoms.iter().for_each(|element| composition[*element] += 1);
         let known = compositions.len() as u32;
@@ -198,7 +198,7 @@ struct Reader<'a> {
 
 impl Reader<'_> {
     /// At most `size` structures; none at the end.
-    fn block(&mut self, size: usize) -> Result<Vec<Item>, Failure> {
+    fn block(&mut self, size: usize) -> Result<Vec<Item>, CommandError> {
         let mut block = Vec::with_capacity(size);
         while block.len() < size {
             match self.next()? {
@@ -209,11 +209,11 @@ impl Reader<'_> {
         Ok(block)
     }
 
-    fn next(&mut self) -> Result<Option<Item>, Failure> {
+    fn next(&mut self) -> Result<Option<Item>, CommandError> {
         if let Some(reader) = &mut self.files {
             if let Some((frame, file)) = reader.next()? {
                 let number = self.paths.files.iter().position(|known| known.path == file.path);
-                let frame_index = u32::try_from(reader.frame_index()).map_err(Failure::failed)?;
+                let frame_index = u32::try_from(reader.frame_index()).map_err(CommandError::failed)?;
                 let source = Source::File { file: number.unwrap_or_default() as u32, frame: frame_index };
                 let place = ItemPlace::Line(file.path, frame.line);
                 return Ok(Some(Item { structure: frame.structure, source, features: None, place }));

@@ -9,11 +9,11 @@ use store::records::Fate;
 use super::grading::{PoolFiles, hash};
 use super::picks::Pick;
 use super::{GradedPool, Source};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// The frames of the picks, in order: what the files have, read again, and what the campaigns have, with `selection_strategy`,
 /// `selection_rank` (from 1), `gamma_max`, and `source_file` and `source_frame` (from 0) or `campaign`, `candidate_id` and `fate`.
-pub fn frames(files: &PoolFiles, pool: &GradedPool, picks: &[Pick]) -> Result<Vec<Frame>, Failure> {
+pub fn frames(files: &PoolFiles, pool: &GradedPool, picks: &[Pick]) -> Result<Vec<Frame>, CommandError> {
     let mut frames: Vec<Option<Frame>> = picks.iter().map(|_| None).collect();
     read_files(files, pool, picks, &mut frames)?;
     let mut found = Vec::with_capacity(picks.len());
@@ -24,7 +24,9 @@ pub fn frames(files: &PoolFiles, pool: &GradedPool, picks: &[Pick]) -> Result<Ve
             (None, Source::Candidate { campaign, decision }) => candidate(files, campaign, decision)?,
             (None, Source::File { file, .. }) => {
                 let path = files.files.files[file as usize].path.display();
-                return Err(Failure::Failed(format!("{path}: the file became shorter during the selection")));
+                return Err(CommandError::Failed(format!(
+                    "{path}: the file became shorter during the selection"
+                )));
             }
         };
         let mut info = |key: &str, value| frame.info.insert(key.to_owned(), value);
@@ -42,7 +44,7 @@ fn read_files(
     pool: &GradedPool,
     picks: &[Pick],
     frames: &mut [Option<Frame>],
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     // Structures of files are numbered first, in the order in which they are read.
     let is_file = |pick: &Pick| matches!(pool.structures[pick.structure].source, Source::File { .. });
     let mut wanted: Vec<(usize, usize)> = picks
@@ -66,7 +68,7 @@ fn read_files(
         }
         let Some((mut frame, file)) = last else { continue };
         if hash(&frame.structure) != pool.structures[structure].hash {
-            return Err(Failure::Failed(format!(
+            return Err(CommandError::Failed(format!(
                 "{}:{}: the file was changed during the selection; repeat the command",
                 file.path.display(),
                 frame.line
@@ -80,7 +82,7 @@ fn read_files(
     Ok(())
 }
 
-fn candidate(files: &PoolFiles, campaign: u32, decision: i64) -> Result<Frame, Failure> {
+fn candidate(files: &PoolFiles, campaign: u32, decision: i64) -> Result<Frame, CommandError> {
     let campaign = &files.campaigns[campaign as usize];
     let found = campaign.candidate(decision)?;
     let view = found.block.view();

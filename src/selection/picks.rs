@@ -7,7 +7,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::GradedPool;
 use super::strategy::{Part, Strategy};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::Bar;
 
 const BAR: &str = "{bar:32} {pos}/{len}  {msg}";
@@ -50,7 +50,7 @@ pub fn pick(
     mixture: &Mixture,
     rules: &Rules,
     stop: &CancellationToken,
-) -> Result<Option<Picks>, Failure> {
+) -> Result<Option<Picks>, CommandError> {
     let settings = update_settings(rules.update_target);
     let mut picks: Vec<Pick> = Vec::new();
     let mut left = None;
@@ -64,10 +64,10 @@ pub fn pick(
         left = None;
         match part.strategy {
             Strategy::Greedy => {
-                let mut greedy =
-                    Greedy::new(&pool.pool, mixture, settings.clone(), picked).map_err(Failure::failed)?;
+                let mut greedy = Greedy::new(&pool.pool, mixture, settings.clone(), picked)
+                    .map_err(CommandError::failed)?;
                 while !is_complete(&picks)
-                    && let Some(found) = greedy.pick().map_err(Failure::failed)?
+                    && let Some(found) = greedy.pick().map_err(CommandError::failed)?
                 {
                     picks.push(Pick {
                         structure: found.structure,
@@ -76,25 +76,26 @@ pub fn pick(
                     });
                     shown(picks.len() - before);
                 }
-                left = Some(greedy.gamma_left().map_err(Failure::failed)?.unwrap_or_default());
+                left = Some(greedy.gamma_left().map_err(CommandError::failed)?.unwrap_or_default());
             }
             Strategy::FarthestPoints | Strategy::FarthestPointsAll => {
                 let metric = match part.strategy {
                     Strategy::FarthestPoints => Metric::Whitened(mixture),
                     _ => Metric::Plain,
                 };
-                let mut points = FarthestPoints::new(&pool.pool, metric, picked).map_err(Failure::failed)?;
+                let mut points =
+                    FarthestPoints::new(&pool.pool, metric, picked).map_err(CommandError::failed)?;
                 while !is_complete(&picks)
-                    && let Some(found) = points.pick().map_err(Failure::failed)?
+                    && let Some(found) = points.pick().map_err(CommandError::failed)?
                 {
                     picks.push(pool.pick(found.structure, part.strategy.name()));
                     shown(picks.len() - before);
                 }
             }
             Strategy::DOptimal => {
-                let mut design = DOptimal::new(&pool.pool, mixture, picked).map_err(Failure::failed)?;
+                let mut design = DOptimal::new(&pool.pool, mixture, picked).map_err(CommandError::failed)?;
                 while !is_complete(&picks)
-                    && let Some(found) = design.pick().map_err(Failure::failed)?
+                    && let Some(found) = design.pick().map_err(CommandError::failed)?
                 {
                     picks.push(pool.pick(found.structure, part.strategy.name()));
                     shown(picks.len() - before);
@@ -154,11 +155,11 @@ fn gamma_left(
     mixture: &Mixture,
     settings: UpdateSettings,
     picks: &[Pick],
-) -> Result<Option<f64>, Failure> {
+) -> Result<Option<f64>, CommandError> {
     if !mixture.can_be_updated() {
         return Ok(None);
     }
     let picked = picks.iter().map(|pick| pick.structure);
-    let mut greedy = Greedy::new(&pool.pool, mixture, settings, picked).map_err(Failure::failed)?;
-    Ok(Some(greedy.gamma_left().map_err(Failure::failed)?.unwrap_or_default()))
+    let mut greedy = Greedy::new(&pool.pool, mixture, settings, picked).map_err(CommandError::failed)?;
+    Ok(Some(greedy.gamma_left().map_err(CommandError::failed)?.unwrap_or_default()))
 }

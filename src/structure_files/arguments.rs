@@ -6,7 +6,7 @@ use atoms::Species;
 
 use super::format::check_format;
 use super::{StructureFile, StructureFiles};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::filter::Filter;
 
 /// Properties that structures of files have.
@@ -40,7 +40,7 @@ impl StructureArgs {
     ///
     /// # Errors
     /// Those of [`StructureReadingArgs::files`].
-    pub fn files(&self) -> Result<StructureFiles, Failure> {
+    pub fn files(&self) -> Result<StructureFiles, CommandError> {
         self.reading.files(&self.data)
     }
 }
@@ -51,11 +51,11 @@ impl StructureReadingArgs {
     /// # Errors
     /// A file that is no regular file, has an unknown format or is given twice; a filter by a property that structures of files do
     /// not have.
-    pub fn files(&self, data: &[PathBuf]) -> Result<StructureFiles, Failure> {
+    pub fn files(&self, data: &[PathBuf]) -> Result<StructureFiles, CommandError> {
         if let Some(filter) = &self.filter
             && let Some(name) = filter.names().into_iter().find(|name| !PROPERTIES.contains(name))
         {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "--where: structures of files have no '{name}'; expected one of {}",
                 PROPERTIES.join(", ")
             )));
@@ -63,16 +63,17 @@ impl StructureReadingArgs {
         let mut files: Vec<StructureFile> = Vec::new();
         for path in data {
             check_format(path)?;
-            let found = std::fs::metadata(path)
-                .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", path.display())))?;
+            let found = std::fs::metadata(path).map_err(|error| {
+                CommandError::Input(format!("{}: cannot be opened: {error}", path.display()))
+            })?;
             if !found.is_file() {
-                return Err(Failure::Input(format!(
+                return Err(CommandError::Input(format!(
                     "{}: expected a regular file, which can be read several times",
                     path.display()
                 )));
             }
             if files.iter().any(|file| *file.path == **path) {
-                return Err(Failure::Input(format!("{} is given twice", path.display())));
+                return Err(CommandError::Input(format!("{} is given twice", path.display())));
             }
             files.push(StructureFile { path: path.as_path().into(), weight: 1.0 });
         }

@@ -10,7 +10,7 @@ use atoms::extxyz::{self, Frame};
 use atoms::{FileError, Species, lammps_dump, poscar};
 use flate2::read::MultiGzDecoder;
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// The structures of a file, in order.
 pub enum Structures {
@@ -44,11 +44,11 @@ fn format(path: &Path) -> Option<Format> {
 }
 
 /// Checks that the name of a file shows a format that can be read.
-pub fn check_format(path: &Path) -> Result<(), Failure> {
+pub fn check_format(path: &Path) -> Result<(), CommandError> {
     if format(path).is_some() {
         return Ok(());
     }
-    Err(Failure::Input(format!(
+    Err(CommandError::Input(format!(
         "{}: unknown format: expected a name that ends in .extxyz, .xyz, .poscar, .vasp, .dump or .lammpstrj or begins with \
          POSCAR, CONTCAR or dump., each with or without .gz or .zst",
         path.display()

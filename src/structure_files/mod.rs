@@ -13,7 +13,7 @@ use atoms::Species;
 
 pub use self::arguments::{StructureArgs, StructureReadingArgs};
 pub use self::reader::{Place, StructureReader};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::filter::Filter;
 
 /// Files of structures, in order.
@@ -41,9 +41,9 @@ impl StructureFiles {
     }
 
     /// Total size of the files, bytes.
-    pub fn total_bytes(&self) -> Result<u64, Failure> {
+    pub fn total_bytes(&self) -> Result<u64, CommandError> {
         let size = |file: &StructureFile| std::fs::metadata(&file.path).map(|found| found.len());
-        self.files.iter().map(size).sum::<io::Result<u64>>().map_err(Failure::failed)
+        self.files.iter().map(size).sum::<io::Result<u64>>().map_err(CommandError::failed)
     }
 
     /// The paths, for messages and for checks that no output replaces an input.

@@ -10,7 +10,7 @@ use atoms::extxyz::Frame;
 
 use super::format::Structures;
 use super::{StructureFile, StructureFiles};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::filter::{Filter, StructureProperties};
 
 /// Reads one structure after another.
@@ -43,8 +43,8 @@ impl std::fmt::Display for Place {
 
 impl Place {
     /// Wrong input, which names file and line.
-    pub fn wrong(&self, reason: impl std::fmt::Display) -> Failure {
-        Failure::Input(format!("{self}: {reason}"))
+    pub fn wrong(&self, reason: impl std::fmt::Display) -> CommandError {
+        CommandError::Input(format!("{self}: {reason}"))
     }
 }
 
@@ -60,7 +60,7 @@ impl StructureReader {
     /// # Errors
     /// A file that cannot be read or has no structures; labels that the filter cannot read; a filter that no structure of all files
     /// matches.
-    pub fn next(&mut self) -> Result<Option<(Frame, StructureFile)>, Failure> {
+    pub fn next(&mut self) -> Result<Option<(Frame, StructureFile)>, CommandError> {
         if self.failed {
             return Ok(None);
         }
@@ -69,17 +69,17 @@ impl StructureReader {
         next
     }
 
-    fn read_next(&mut self) -> Result<Option<(Frame, StructureFile)>, Failure> {
+    fn read_next(&mut self) -> Result<Option<(Frame, StructureFile)>, CommandError> {
         while self.current.is_some() || self.open_next()? {
             let Some((file, structures)) = &mut self.current else { continue };
             let Some(frame) = structures.next(&file.path) else {
                 if self.in_file == 0 {
-                    return Err(Failure::input(FileError::Empty(file.path.to_path_buf())));
+                    return Err(CommandError::input(FileError::Empty(file.path.to_path_buf())));
                 }
                 self.current = None;
                 continue;
             };
-            let frame = frame.map_err(Failure::input)?;
+            let frame = frame.map_err(CommandError::input)?;
             self.in_file += 1;
             if matches(self.given.filter.as_ref(), &frame, file)? {
                 self.matching += 1;
@@ -89,7 +89,7 @@ impl StructureReader {
         }
         match &self.given.filter {
             Some(filter) if self.matching == 0 => {
-                Err(Failure::Input(format!("no structure of the files matches --where '{filter}'")))
+                Err(CommandError::Input(format!("no structure of the files matches --where '{filter}'")))
             }
             _ => Ok(None),
         }
@@ -106,21 +106,21 @@ impl StructureReader {
     }
 
     /// Opens the next file; false after the last one.
-    fn open_next(&mut self) -> Result<bool, Failure> {
+    fn open_next(&mut self) -> Result<bool, CommandError> {
         let Some(file) = self.files.pop_front() else { return Ok(false) };
         self.in_file = 0;
-        let structures =
-            Structures::open(&file.path, &self.given.dump_elements, &self.bytes).map_err(Failure::input)?;
+        let structures = Structures::open(&file.path, &self.given.dump_elements, &self.bytes)
+            .map_err(CommandError::input)?;
         self.current = Some((file, structures));
         Ok(true)
     }
 }
 
 /// Whether a structure matches the filter.
-fn matches(filter: Option<&Filter>, frame: &Frame, file: &StructureFile) -> Result<bool, Failure> {
+fn matches(filter: Option<&Filter>, frame: &Frame, file: &StructureFile) -> Result<bool, CommandError> {
     let Some(filter) = filter else { return Ok(true) };
     let labels =
-        frame.labels().map_err(|error| Failure::Input(format!("{}: {error}", file.path.display())))?;
+        frame.labels().map_err(|error| CommandError::Input(format!("{}: {error}", file.path.display())))?;
     let norm = |force: &[f64; 3]| force.iter().map(|x| x * x).sum::<f64>().sqrt();
     let properties = StructureProperties {
         species: &frame.structure.species,

@@ -18,7 +18,7 @@ use tokio::net::TcpListener;
 
 use self::dashboard::{Dashboard, Mutations};
 pub use self::server::Server;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::{log_and_print, print_stderr};
 
 /// Options for the addresses to serve on.
@@ -76,7 +76,7 @@ impl Drop for RunningServers {
 
 impl ListenArgs {
     /// Binds the addresses before any work begins.
-    pub async fn listen(&self) -> Result<BoundListeners, Failure> {
+    pub async fn listen(&self) -> Result<BoundListeners, CommandError> {
         let (mut dashboard, mut metrics) = (None, None);
         if let Some(address) = self.dashboard {
             dashboard = Some(listen(address).await?);
@@ -96,7 +96,7 @@ impl BoundListeners {
         location: &Location,
         store: &Store,
         artifact: &Artifact,
-    ) -> Result<RunningServers, Failure> {
+    ) -> Result<RunningServers, CommandError> {
         let mut serving = RunningServers::default();
         if self.dashboard.is_none() && self.metrics.is_none() {
             return Ok(serving);
@@ -110,7 +110,7 @@ impl BoundListeners {
             let original =
                 InitialMixture { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
             let mutations = Mutations::new(store.clone())?;
-            let address = listener.local_addr().map_err(Failure::failed)?;
+            let address = listener.local_addr().map_err(CommandError::failed)?;
             tracing::info!("dashboard at http://{address}/");
             // Print the token, but do not log it.
             print_stderr(format_args!("dashboard at http://{address}/#token={}", mutations.token()));
@@ -122,24 +122,24 @@ impl BoundListeners {
 }
 
 /// Binds an address before any work begins. Requests are not authenticated, so the address must be loopback.
-pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
+pub async fn listen(address: SocketAddr) -> Result<TcpListener, CommandError> {
     if !address.ip().is_loopback() {
-        return Err(Failure::Input(format!(
+        return Err(CommandError::Input(format!(
             "will not listen on {address}: anyone who reaches it could read the campaign; use a loopback address such as \
              127.0.0.1:{port}, and reach it from other hosts with ssh -L {port}:127.0.0.1:{port}",
             port = address.port()
         )));
     }
     TcpListener::bind(address).await.map_err(|error| {
-        Failure::Input(format!(
+        CommandError::Input(format!(
             "cannot listen on {address}: {error}; use another port, or port 0 for any free one"
         ))
     })
 }
 
 /// Prints the address of the metrics and serves them.
-pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, Failure> {
-    let address = listener.local_addr().map_err(Failure::failed)?;
+pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, CommandError> {
+    let address = listener.local_addr().map_err(CommandError::failed)?;
     log_and_print(format_args!("metrics at http://{address}/metrics"));
     Ok(Server::start(listener, router))
 }

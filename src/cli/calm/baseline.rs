@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, Table, print, print_stderr};
@@ -96,7 +96,7 @@ impl BaselineSettingsArgs {
 }
 
 impl CalmBaselineArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let files = self.data.files()?;
         self.protect_inputs(&files)?;
         let (features, artifact) = self.load()?;
@@ -116,7 +116,7 @@ impl CalmBaselineArgs {
             }
         }
         let finished = builders.into_iter().map(Builder::finish).collect::<Result<_, _>>();
-        let baselines = finished.map_err(Failure::input)?;
+        let baselines = finished.map_err(CommandError::input)?;
         let file = BaselineFile { origin: features.origin(&self.model)?, settings, baselines };
         let mut output = AtomicFile::create(&self.output)?;
         file.write(&mut output).map_err(|error| cannot_write(&self.output, error))?;
@@ -125,7 +125,7 @@ impl CalmBaselineArgs {
         Ok(ExitStatus::Done)
     }
 
-    fn protect_inputs(&self, files: &StructureFiles) -> Result<(), Failure> {
+    fn protect_inputs(&self, files: &StructureFiles) -> Result<(), CommandError> {
         let data = files.paths().map(|path| (path, "a file of training data"));
         let model = std::iter::once((self.model.as_path(), "the model"));
         let artifact = self.artifact.iter().map(|path| (path.as_path(), "the artifact"));
@@ -135,33 +135,33 @@ impl CalmBaselineArgs {
     }
 
     /// The features, and the mixture over them if there is one.
-    fn load(&self) -> Result<(FeatureModel, Option<Artifact>), Failure> {
+    fn load(&self) -> Result<(FeatureModel, Option<Artifact>), CommandError> {
         let Some(path) = &self.artifact else {
             let features = FeatureModel::load(&self.model, self.feature_variant)?;
             let projection =
                 features.projection().filter(|_| self.kind.iter().any(|kind| kind.needs_mixture()));
             let Some(projection) = projection else { return Ok((features, None)) };
-            let own = Artifact::load_export(&self.model).map_err(Failure::input)?;
-            check_sound(&own, &self.model).map_err(Failure::Input)?;
+            let own = Artifact::load_export(&self.model).map_err(CommandError::input)?;
+            check_sound(&own, &self.model).map_err(CommandError::Input)?;
             let fits = own.projection.check_same(&projection).is_ok();
             return Ok((features, fits.then_some(own)));
         };
-        let artifact = Artifact::load(path).map_err(Failure::input)?;
+        let artifact = Artifact::load(path).map_err(CommandError::input)?;
         let features = match self.feature_variant {
             Some(_) => FeatureModel::load(&self.model, self.feature_variant)?,
             None => {
-                let model = GraceModel::load(&self.model).map_err(Failure::input)?;
+                let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
                 FeatureModel::for_artifact(&self.model, model, &artifact.projection)?
             }
         };
         let Some(projection) = features.projection() else {
             let message = "no artifact has the features of the hidden layer; leave --artifact out";
-            return Err(Failure::Input(format!("{}: {message}", path.display())));
+            return Err(CommandError::Input(format!("{}: {message}", path.display())));
         };
         artifact
             .check_belongs_to(&features.symbols(), &projection)
-            .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
-        check_sound(&artifact, path).map_err(Failure::Input)?;
+            .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;
+        check_sound(&artifact, path).map_err(CommandError::Input)?;
         Ok((features, Some(artifact)))
     }
 
@@ -170,17 +170,17 @@ impl CalmBaselineArgs {
         features: &FeatureModel,
         settings: &BaselineSettings,
         mixture: Option<&Mixture>,
-    ) -> Result<Vec<Builder>, Failure> {
+    ) -> Result<Vec<Builder>, CommandError> {
         let elements = features.symbols().len();
         let mut builders = Vec::new();
         for (number, kind) in self.kind.iter().enumerate() {
             if self.kind[..number].contains(kind) {
-                return Err(Failure::Input(format!("--kind {kind}: given twice")));
+                return Err(CommandError::Input(format!("--kind {kind}: given twice")));
             }
             let builder = Builder::new(*kind, settings, features.dimension(), elements, mixture);
             builders.push(builder.map_err(|error| {
                 let hint = if mixture.is_none() { " (--artifact)" } else { "" };
-                Failure::Input(format!("--kind {kind}: {error}{hint}"))
+                CommandError::Input(format!("--kind {kind}: {error}{hint}"))
             })?);
         }
         Ok(builders)
@@ -194,7 +194,7 @@ fn read(
     builders: &mut [Builder],
     sweep: usize,
     stop: &CancellationToken,
-) -> Result<bool, Failure> {
+) -> Result<bool, CommandError> {
     let bytes = Arc::new(AtomicU64::new(0));
     let bar = Bar::new(Some(files.total_bytes()?), BAR);
     let mut structures = files.reader(Arc::clone(&bytes));
@@ -221,7 +221,7 @@ fn read(
 }
 
 /// A table of what was built.
-fn report(file: &BaselineFile, output: &Path) -> Result<(), Failure> {
+fn report(file: &BaselineFile, output: &Path) -> Result<(), CommandError> {
     let mut table = Table::new(&["score", ">features", ">active sets", ">rows of each", "remark"]);
     for baseline in &file.baselines {
         let (kind, dimension) = (baseline.kind().to_string(), baseline.dimension().to_string());

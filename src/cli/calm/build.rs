@@ -12,7 +12,7 @@ use potentials::grace::GraceModel;
 
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 use crate::file_hash;
 use crate::mixture_build::{self, Part, Work};
@@ -82,7 +82,7 @@ pub struct CalmBuildArgs {
 }
 
 impl CalmBuildArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let outputs: Vec<&Path> =
             std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path).collect();
         let files = self.weighted_files()?;
@@ -91,9 +91,9 @@ impl CalmBuildArgs {
         outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
         // Errors in paths are found before hours of work.
         outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
-        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
+        let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
         if let (Some(found), Some(_)) = (model.projection(), self.projection_dimension) {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "--projection-dimension: {} has a projection with {} features; expected a model without one",
                 self.model.display(),
                 found.dimension
@@ -109,7 +109,7 @@ impl CalmBuildArgs {
             candidates: self.candidates.clone(),
             shard_size: self.shard_size,
         };
-        let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
+        let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
         let work = Work {
             model,
             files,
@@ -135,22 +135,23 @@ impl CalmBuildArgs {
     }
 
     /// The training data with their weights.
-    fn weighted_files(&self) -> Result<StructureFiles, Failure> {
+    fn weighted_files(&self) -> Result<StructureFiles, CommandError> {
         let mut data = self.data.files()?;
         for (number, (path, weight)) in self.weight.iter().enumerate() {
             if self.weight[..number].iter().any(|(other, _)| other == path) {
-                return Err(Failure::Input(format!("--weight {}: given twice", path.display())));
+                return Err(CommandError::Input(format!("--weight {}: given twice", path.display())));
             }
             let file = data.files.iter_mut().find(|file| *file.path == **path);
-            let unknown =
-                || Failure::Input(format!("--weight {}: expected one of the files of DATA", path.display()));
+            let unknown = || {
+                CommandError::Input(format!("--weight {}: expected one of the files of DATA", path.display()))
+            };
             file.ok_or_else(unknown)?.weight = *weight;
         }
         Ok(data)
     }
 }
 
-fn end_part(pass: u8, part: Part, done: bool) -> Result<ExitStatus, Failure> {
+fn end_part(pass: u8, part: Part, done: bool) -> Result<ExitStatus, CommandError> {
     if !done {
         print_stderr("stopped; the same command continues");
         return Ok(ExitStatus::Interrupted);
@@ -167,11 +168,12 @@ pub(super) fn write_mixture(
     model: &Path,
     embed: Option<&Path>,
     output: &Path,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     if let Some(path) = embed {
         let mut file = AtomicFile::create(path)?;
-        let model = File::open(model)
-            .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", model.display())))?;
+        let model = File::open(model).map_err(|error| {
+            CommandError::Input(format!("{}: cannot be opened: {error}", model.display()))
+        })?;
         mixture.write_export(BufReader::new(model), &mut file).map_err(|error| cannot_write(path, error))?;
         file.finish()?;
     }
@@ -188,22 +190,22 @@ pub(super) fn projected(
     variant: Option<FeatureVariant>,
     seed: u64,
     dimension: usize,
-) -> Result<(Arc<GraceModel>, Projection, Option<i64>), Failure> {
+) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
     let seed = if model.projection().is_some() {
-        let file = Archive::open(path).map_err(Failure::input)?;
+        let file = Archive::open(path).map_err(CommandError::input)?;
         let key = "uq_rp_seed";
-        let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(Failure::input)?;
+        let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(CommandError::input)?;
         seed.and_then(|seed| seed.data.first().copied())
     } else {
         let description = model.description();
         let (rows, layers) = (description.basis_dimension, description.architecture.layers());
         let drawn = random_projection(seed, rows, dimension, layers);
-        model = with_projection(model, &drawn).map_err(Failure::failed)?;
+        model = with_projection(model, &drawn).map_err(CommandError::failed)?;
         i64::try_from(seed).ok()
     };
     let found = FeatureModel::new(path, model, variant)?;
     let Some(projection) = found.projection() else {
-        return Err(Failure::Input(
+        return Err(CommandError::Input(
             "--feature-variant hidden: a mixture needs projected features; expected normalised or linear"
                 .into(),
         ));
@@ -219,8 +221,8 @@ fn weight(text: &str) -> Result<(PathBuf, f64), String> {
 }
 
 /// A table of the elements.
-pub(super) fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), Failure> {
-    let artifact = mixture.artifact().map_err(Failure::failed)?;
+pub(super) fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), CommandError> {
+    let artifact = mixture.artifact().map_err(CommandError::failed)?;
     if let Err(fault) = check_sound(&artifact, output) {
         log_and_warn(format_args!("WARNING: {fault}; campaigns and calm score refuse this artifact"));
     }

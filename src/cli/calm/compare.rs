@@ -10,7 +10,7 @@ use potentials::grace::GraceModel;
 use serde::Serialize;
 
 use crate::artifact_checks::load_artifact;
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, Table, decimals, print, print_json};
 use crate::structure_files::{Place, StructureArgs};
@@ -68,10 +68,10 @@ struct Comparison {
 }
 
 impl CalmCompareArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
-        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
-        let (model, first) = load_artifact(model, &self.first).map_err(Failure::Input)?;
-        let (model, second) = load_artifact(model, &self.second).map_err(Failure::Input)?;
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
+        let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
+        let (model, first) = load_artifact(model, &self.first).map_err(CommandError::Input)?;
+        let (model, second) = load_artifact(model, &self.second).map_err(CommandError::Input)?;
         let artifacts = [first, second];
         let symbols = artifacts[0].symbols.clone();
         let gradings = self.grade(model, &artifacts)?;
@@ -86,7 +86,7 @@ impl CalmCompareArgs {
     }
 
     /// The grades of all atoms, by element.
-    fn grade(&self, model: GraceModel, artifacts: &[Artifact; 2]) -> Result<Vec<Grading>, Failure> {
+    fn grade(&self, model: GraceModel, artifacts: &[Artifact; 2]) -> Result<Vec<Grading>, CommandError> {
         let dimension = model.feature_dimension();
         let mut gradings: Vec<_> = model.elements().iter().map(|_| Grading::new()).collect();
         let mut calculator = FeatureCalculator::new(Arc::new(model));
@@ -114,7 +114,7 @@ impl CalmCompareArgs {
         Ok(gradings)
     }
 
-    fn report(&self, found: &[Comparison]) -> Result<(), Failure> {
+    fn report(&self, found: &[Comparison]) -> Result<(), CommandError> {
         let titles = [
             "element",
             ">atoms",

@@ -10,7 +10,7 @@ use store::Store;
 
 use super::recalibrate::open;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::cli::{CampaignArgs, ExitStatus, Failure, block_on};
+use crate::cli::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, print};
 use crate::replay::{self, RelocatedFilesArgs};
 
@@ -51,10 +51,10 @@ struct Version {
 }
 
 impl CalmExportArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let found = block_on(self.read())??;
         let updated = UpdatedMixture::new(&found.artifact, &found.original.mixture, &found.mixture);
-        let updated = updated.map_err(Failure::input)?;
+        let updated = updated.map_err(CommandError::input)?;
         if let (Some(model), Some(path)) = (&found.model, &self.embed) {
             let mut file = AtomicFile::create(path)?;
             updated.write_export(open(model)?, &mut file).map_err(|error| cannot_write(path, error))?;
@@ -69,18 +69,18 @@ impl CalmExportArgs {
         Ok(ExitStatus::Done)
     }
 
-    async fn read(&self) -> Result<Version, Failure> {
+    async fn read(&self) -> Result<Version, CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let found = self.read_from(&store).await;
         store.close().await;
         found
     }
 
-    async fn read_from(&self, store: &Store) -> Result<Version, Failure> {
+    async fn read_from(&self, store: &Store) -> Result<Version, CommandError> {
         let campaign = store.campaign().await?;
         let (resolved, files) = (replay::resolved(&campaign)?, store.grade_files().await?);
         if !matches!(resolved["files"][replay::ARTIFACT], Value::String(_)) {
-            return Err(Failure::Input(
+            return Err(CommandError::Input(
                 "the campaign began with the mixture of its model, which it never changes: expected one with calm.artifact"
                     .to_owned(),
             ));
@@ -89,12 +89,12 @@ impl CalmExportArgs {
         let artifact = find(replay::ARTIFACT)?;
         let model = self.embed.as_ref().map(|_| find(replay::MODEL)).transpose()?;
         self.check_outputs(&artifact, model.as_deref())?;
-        let original = Artifact::load(&artifact).map_err(Failure::input)?;
+        let original = Artifact::load(&artifact).map_err(CommandError::input)?;
         let newest = store.newest_mixture().await?;
         let mixture = match self.version.unwrap_or(newest.version) {
             0 => Arc::new(original.mixture.clone()),
             version if version > newest.version => {
-                return Err(Failure::Input(format!(
+                return Err(CommandError::Input(format!(
                     "--version {version}: the mixture of the campaign has versions 0 to {} so far",
                     newest.version
                 )));
@@ -103,7 +103,9 @@ impl CalmExportArgs {
                 let stored = newest.components.iter();
                 let stored = stored.map(|one| (one.element as usize, one.slot as usize, &one.bytes[..]));
                 let restored = original.mixture.restored(version, stored);
-                Arc::new(restored.map_err(|error| Failure::Failed(format!("damaged database: {error}")))?)
+                Arc::new(
+                    restored.map_err(|error| CommandError::Failed(format!("damaged database: {error}")))?,
+                )
             }
             version => replay::mixture_of(store, version, &self.moved).await?,
         };
@@ -111,7 +113,7 @@ impl CalmExportArgs {
         Ok(Version { campaign, newest, artifact, model, original, mixture })
     }
 
-    fn check_outputs(&self, artifact: &Path, model: Option<&Path>) -> Result<(), Failure> {
+    fn check_outputs(&self, artifact: &Path, model: Option<&Path>) -> Result<(), CommandError> {
         let inputs = || {
             let model = model.map(|path| (path, "the model of the campaign"));
             std::iter::once((artifact, "the artifact of the campaign")).chain(model)
@@ -120,7 +122,7 @@ impl CalmExportArgs {
         outputs.try_for_each(|output| refuse_to_replace(output, inputs()))
     }
 
-    fn report(&self, found: &Version) -> Result<(), Failure> {
+    fn report(&self, found: &Version) -> Result<(), CommandError> {
         let Version { newest, original, mixture, .. } = found;
         let pairs = original.mixture.iter().zip(mixture.iter());
         let changed = pairs.filter(|((.., before), (.., now))| before != now).count();

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use figures::{to_png, to_svg};
 
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::output::{print, print_json};
 use crate::reliability_filter::{self, Columns, ErrorColumns, FilterReport};
 
@@ -79,7 +79,7 @@ fn finite(text: &str) -> Result<f64, String> {
 }
 
 impl CalmFilterArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let is_png = self.figure.as_deref().map(is_png).transpose()?;
         for output in self.csv.iter().chain(&self.figure) {
             refuse_to_replace(output, [(self.table.as_path(), "the table")])?;
@@ -92,7 +92,7 @@ impl CalmFilterArgs {
         if let (Some(path), Some(is_png)) = (&self.figure, is_png) {
             let figure = reliability_filter::draw(&report, &self.grade);
             match is_png {
-                true => write(path, &to_png(&figure, RESOLUTION).map_err(Failure::failed)?)?,
+                true => write(path, &to_png(&figure, RESOLUTION).map_err(CommandError::failed)?)?,
                 false => write(path, to_svg(&figure).as_bytes())?,
             }
         }
@@ -118,19 +118,19 @@ impl CalmFilterArgs {
 }
 
 /// Whether the name is that of a PNG; otherwise it is that of an SVG.
-fn is_png(path: &Path) -> Result<bool, Failure> {
+fn is_png(path: &Path) -> Result<bool, CommandError> {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match extension.as_str() {
         "svg" => Ok(false),
         "png" => Ok(true),
         _ => {
             let shown = path.display();
-            Err(Failure::Input(format!("--figure {shown}: expected a name that ends in .svg or .png")))
+            Err(CommandError::Input(format!("--figure {shown}: expected a name that ends in .svg or .png")))
         }
     }
 }
 
-fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+fn write(path: &Path, bytes: &[u8]) -> Result<(), CommandError> {
     let mut file = AtomicFile::create(path)?;
     file.write_all(bytes).map_err(|error| cannot_write(path, error))?;
     file.finish()

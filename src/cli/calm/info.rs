@@ -9,7 +9,7 @@ use npz::Archive;
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::output::{Table, decimals, print, print_json};
 
 /// Components printed without --json.
@@ -106,7 +106,7 @@ struct ComponentInfo {
 }
 
 impl CalmInfoArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let content = inspect(&self.file)?;
         if self.json {
             print_json(&content)?;
@@ -117,23 +117,23 @@ impl CalmInfoArgs {
     }
 }
 
-fn inspect(path: &Path) -> Result<Content, Failure> {
+fn inspect(path: &Path) -> Result<Content, CommandError> {
     let archive = &Archive::open(path)
-        .map_err(|error| Failure::Input(format!("{error} (kokkos.npz or gmm_artifacts.npz)")))?;
+        .map_err(|error| CommandError::Input(format!("{error} (kokkos.npz or gmm_artifacts.npz)")))?;
     if archive.contains("__schema_version__") {
-        let artifact = Artifact::load(path).map_err(Failure::input)?;
+        let artifact = Artifact::load(path).map_err(CommandError::input)?;
         return Ok(Content::Artifact(MixtureInfo::new(&artifact, "__schema_version__", archive)));
     }
     if !archive.contains("element_names") {
-        return Err(Failure::Input(format!(
+        return Err(CommandError::Input(format!(
             "{}: neither a GRACE model (no array 'element_names') nor a CALM artifact (no array '__schema_version__')",
             path.display()
         )));
     }
-    let model = GraceModel::load(path).map_err(Failure::input)?;
+    let model = GraceModel::load(path).map_err(CommandError::input)?;
     let mixture = match archive.contains("uq_schema_version") {
         true => {
-            let artifact = Artifact::load_export(path).map_err(Failure::input)?;
+            let artifact = Artifact::load_export(path).map_err(CommandError::input)?;
             Some(MixtureInfo::new(&artifact, "uq_schema_version", archive))
         }
         false => None,

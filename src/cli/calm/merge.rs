@@ -7,7 +7,7 @@ use potentials::grace::GraceModel;
 
 use super::build::{projected, report, write_mixture};
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
 use crate::mixture_build::{Merge as PartsMerge, Merged};
@@ -34,13 +34,13 @@ pub struct CalmMergeArgs {
 }
 
 impl CalmMergeArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         for output in std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path) {
             refuse_to_replace(output, [(self.model.as_path(), "the model")])?;
             AtomicFile::create(output)?;
         }
-        let model = GraceModel::load(&self.model).map_err(Failure::input)?;
-        let hash = file_hash::hash(&self.model).map_err(Failure::input)?;
+        let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
+        let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
         let mut merge = PartsMerge::open(&self.output, &hash)?;
         let BuildSettings { seed, dimension, .. } = *merge.settings();
         let norms = match self.feature_variant {

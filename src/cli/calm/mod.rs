@@ -17,7 +17,7 @@ mod validate;
 mod validate_labels;
 
 pub(super) use self::score::load;
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 
 /// Build, recalibrate, compare, export, inspect and test CALM mixtures and baselines; grade structures, and judge grades by errors
 #[derive(Debug, clap::Subcommand)]
@@ -35,7 +35,7 @@ pub enum CalmCommand {
 }
 
 impl CalmCommand {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         match self {
             Self::Baseline(command) => command.run(),
             Self::Build(command) => command.run(),

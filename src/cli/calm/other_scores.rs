@@ -13,7 +13,7 @@ use potentials::grace::{GraceModel, PullBack};
 use super::scorer::Scorer;
 use crate::calm_validation::labelled::ScoreColumn;
 use crate::calm_validation::{BaselineScore, Score, score_own_features};
-use crate::cli::Failure;
+use crate::cli::CommandError;
 use crate::feature_variant::FeatureModel;
 use crate::features::{FeatureCalculator, FeatureError};
 
@@ -55,7 +55,7 @@ impl OtherScores {
         graded: &FeatureModel,
         baselines: &[PathBuf],
         ensemble: &[PathBuf],
-    ) -> Result<Self, Failure> {
+    ) -> Result<Self, CommandError> {
         let mut files: Vec<Scores> = Vec::new();
         for path in baselines {
             let found = scores(model, graded, path)?;
@@ -63,7 +63,7 @@ impl OtherScores {
             if let Some((name, _)) =
                 found.baselines.iter().find(|(name, _)| names().any(|known| known == name))
             {
-                return Err(Failure::Input(format!(
+                return Err(CommandError::Input(format!(
                     "{}: another file of baselines has a score '{name}', too; expected one of each",
                     path.display()
                 )));
@@ -72,7 +72,7 @@ impl OtherScores {
         }
         let load =
             |path: &PathBuf| GraceModel::load(path).map(|model| FeatureCalculator::new(Arc::new(model)));
-        let ensemble = ensemble.iter().map(load).collect::<Result<_, _>>().map_err(Failure::input)?;
+        let ensemble = ensemble.iter().map(load).collect::<Result<_, _>>().map_err(CommandError::input)?;
         Ok(Self { files, ensemble })
     }
 
@@ -157,8 +157,8 @@ impl OtherScores {
     }
 }
 
-fn scores(model: &Path, graded: &FeatureModel, path: &Path) -> Result<Scores, Failure> {
-    let file = BaselineFile::load(path).map_err(Failure::input)?;
+fn scores(model: &Path, graded: &FeatureModel, path: &Path) -> Result<Scores, CommandError> {
+    let file = BaselineFile::load(path).map_err(CommandError::input)?;
     let own = FeatureModel::for_baselines(model, &file.origin, path)?;
     let is_graded = own.projection() == graded.projection();
     let has_forces = file.baselines.iter().any(|baseline| baseline.kind().has_force_form());

@@ -9,7 +9,7 @@ use calm::build::{ElementHistograms, Recalibration, ThresholdRule, read_histogra
 
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::output::{Table, print};
 
 /// Set new thresholds from the histograms of a CALM artifact, without its training data
@@ -37,19 +37,19 @@ pub struct CalmRecalibrateArgs {
 }
 
 impl CalmRecalibrateArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let outputs = || std::iter::once(&self.output).chain(&self.embed);
         let inputs = || {
             let model = self.model.iter().map(|path| (path.as_path(), "the model"));
             std::iter::once((self.artifact.as_path(), "the artifact itself")).chain(model)
         };
         outputs().try_for_each(|output| refuse_to_replace(output, inputs()))?;
-        let before = Artifact::load(&self.artifact).map_err(Failure::input)?;
-        check_sound(&before, &self.artifact).map_err(Failure::Input)?;
+        let before = Artifact::load(&self.artifact).map_err(CommandError::input)?;
+        check_sound(&before, &self.artifact).map_err(CommandError::Input)?;
         if let Some(model) = &self.model {
             check_has_mixture(model, &before)?;
         }
-        let histograms = read_histograms(&self.artifact).map_err(Failure::input)?;
+        let histograms = read_histograms(&self.artifact).map_err(CommandError::input)?;
         let rule = self.percentile.map_or(ThresholdRule::Robust, ThresholdRule::Percentile);
         let found = Recalibration::new(rule, before.mixture.dimension(), &histograms);
         if let (Some(model), Some(path)) = (&self.model, &self.embed) {
@@ -71,24 +71,24 @@ fn percentage(text: &str) -> Result<f64, String> {
     found.ok_or_else(|| "expected a percentage, above 0 and at most 100".to_owned())
 }
 
-pub(super) fn open(path: &Path) -> Result<BufReader<File>, Failure> {
+pub(super) fn open(path: &Path) -> Result<BufReader<File>, CommandError> {
     let file = File::open(path);
     file.map(BufReader::new)
-        .map_err(|error| Failure::Input(format!("{}: cannot be opened: {error}", path.display())))
+        .map_err(|error| CommandError::Input(format!("{}: cannot be opened: {error}", path.display())))
 }
 
 /// The mixture of the model's export is that of the artifact, but for thresholds.
-fn check_has_mixture(model: &Path, artifact: &Artifact) -> Result<(), Failure> {
-    let own = Artifact::load_export(model).map_err(Failure::input)?;
+fn check_has_mixture(model: &Path, artifact: &Artifact) -> Result<(), CommandError> {
+    let own = Artifact::load_export(model).map_err(CommandError::input)?;
     let centroids = |of: &Artifact| -> Vec<_> {
         of.mixture.iter().map(|(element, slot, found)| (element, slot, found.centroid().to_vec())).collect()
     };
     let same = artifact.check_belongs_to(&own.symbols, &own.projection);
-    same.map_err(|error| Failure::Input(format!("{}: {error}", model.display())))?;
+    same.map_err(|error| CommandError::Input(format!("{}: {error}", model.display())))?;
     if centroids(&own) == centroids(artifact) {
         return Ok(());
     }
-    Err(Failure::Input(format!(
+    Err(CommandError::Input(format!(
         "{}: the model has another mixture than the artifact; expected the same centroids",
         model.display()
     )))
@@ -100,7 +100,7 @@ fn report(
     histograms: &[Option<ElementHistograms>],
     after: &Recalibration,
     output: &Path,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let titles =
         ["element", ">atoms", ">components", ">thresholds before", ">after", ">γ > 1 before", ">after"];
     let mut table = Table::new(&titles);

@@ -15,7 +15,7 @@ use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
 use crate::output::{self, Bar, print};
 use crate::xyz_reader::XyzReader;
@@ -81,7 +81,7 @@ pub struct CalmScoreArgs {
 }
 
 impl CalmScoreArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         for output in self.json.iter().chain(&self.table) {
             let inputs = [(self.model.as_path(), "the model"), (self.input.as_path(), "the input")];
             let artifact = self.artifact.as_deref().map(|path| (path, "the artifact"));
@@ -91,7 +91,7 @@ impl CalmScoreArgs {
         let mut others = OtherScores::load(&self.model, &model, &self.baseline, &self.ensemble)?;
         let dimension = artifact.mixture.dimension();
         let mut scorer = Scorer::new(model.model, Arc::new(artifact.mixture));
-        let mut frames = XyzReader::open(&self.input).map_err(Failure::input)?;
+        let mut frames = XyzReader::open(&self.input).map_err(CommandError::input)?;
         let bar = Bar::new(frames.length, BAR);
         let mut output = AtomicFile::create(&self.output)?;
         let cannot = |error| cannot_write(self.features.as_deref().unwrap_or(Path::new("")), error);
@@ -101,7 +101,7 @@ impl CalmScoreArgs {
         let mut labels = ScoreLabels::new(others.score_columns(), self.table.as_deref())?;
         let mut count = 0_u64;
         while let Some(frame) = frames.next() {
-            let mut frame = frame.map_err(Failure::input)?;
+            let mut frame = frame.map_err(CommandError::input)?;
             let line = frame.line;
             scorer.score(&frame.structure, self.gradient).map_err(|error| self.at(line, error))?;
             let columns = others.columns(&frame.structure, &scorer).map_err(|error| self.at(line, error))?;
@@ -118,7 +118,7 @@ impl CalmScoreArgs {
             bar.set(frames.position(), || output::count(count, "frame"));
         }
         if count == 0 {
-            return Err(Failure::input(FileError::Empty(self.input)));
+            return Err(CommandError::input(FileError::Empty(self.input)));
         }
         matrix.map_or(Ok(()), NpyWriter::finish).map_err(cannot)?;
         feature_file.map_or(Ok(()), AtomicFile::finish)?;
@@ -136,8 +136,8 @@ impl CalmScoreArgs {
         Ok(ExitStatus::Done)
     }
 
-    fn at(&self, line: usize, error: impl std::fmt::Display) -> Failure {
-        Failure::Input(format!("{}:{line}: {error}", self.input.display()))
+    fn at(&self, line: usize, error: impl std::fmt::Display) -> CommandError {
+        CommandError::Input(format!("{}:{line}: {error}", self.input.display()))
     }
 }
 
@@ -145,21 +145,21 @@ impl CalmScoreArgs {
 pub(in crate::cli) fn load(
     export: &Path,
     artifact: Option<&Path>,
-) -> Result<(FeatureModel, Artifact), Failure> {
+) -> Result<(FeatureModel, Artifact), CommandError> {
     let Some(path) = artifact else {
         let model = FeatureModel::load(export, None)?;
-        let own = Artifact::load_export(export).map_err(Failure::input)?;
-        check_sound(&own, export).map_err(Failure::Input)?;
+        let own = Artifact::load_export(export).map_err(CommandError::input)?;
+        check_sound(&own, export).map_err(CommandError::Input)?;
         return Ok((model, own));
     };
-    let model = GraceModel::load(export).map_err(Failure::input)?;
-    let artifact = Artifact::load(path).map_err(Failure::input)?;
+    let model = GraceModel::load(export).map_err(CommandError::input)?;
+    let artifact = Artifact::load(path).map_err(CommandError::input)?;
     let model = FeatureModel::for_artifact(export, model, &artifact.projection)?;
     let own = model.projection().unwrap_or_else(|| artifact.projection.clone());
     artifact
         .check_belongs_to(&model.symbols(), &own)
-        .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
-    check_sound(&artifact, path).map_err(Failure::Input)?;
+        .map_err(|error| CommandError::Input(format!("{}: {error}", path.display())))?;
+    check_sound(&artifact, path).map_err(CommandError::Input)?;
     Ok((model, artifact))
 }
 

@@ -12,7 +12,7 @@ use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::calm_validation::labelled::{
     self, BOOTSTRAP, GradedStructure, LabelledErrors, LabelledReport, ScoreColumn,
 };
-use crate::cli::Failure;
+use crate::cli::CommandError;
 use crate::output::{count, log_and_warn, print};
 use crate::page::{FigureContent, FigureEntry};
 
@@ -29,7 +29,7 @@ pub struct ScoreLabels {
 
 impl ScoreLabels {
     /// With the columns of `others` beside γ and γ_nbr, and the file for one row of each structure, if it is wanted.
-    pub fn new(others: Vec<ScoreColumn>, table: Option<&Path>) -> Result<Self, Failure> {
+    pub fn new(others: Vec<ScoreColumn>, table: Option<&Path>) -> Result<Self, CommandError> {
         let own = [ScoreColumn::grade("γ"), ScoreColumn::grade("γ_{nbr}")];
         let columns = own.into_iter().chain(others).collect();
         let table = table.map(ScoreTable::create).transpose()?;
@@ -42,7 +42,7 @@ impl ScoreLabels {
         frame: &Frame,
         scorer: &Scorer,
         others: &[(String, Vec<f64>)],
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandError> {
         let labels = frame.labels().unwrap_or_else(|error| {
             self.unreadable.0 += 1;
             self.unreadable.1.get_or_insert_with(|| error.to_string());
@@ -72,7 +72,7 @@ impl ScoreLabels {
         json: Option<&Path>,
         figures: Option<&Path>,
         input: &Path,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandError> {
         self.table.take().map_or(Ok(()), ScoreTable::finish)?;
         self.warn(input);
         if self.errors.structures() == 0 && json.is_none() && figures.is_none() {
@@ -80,7 +80,7 @@ impl ScoreLabels {
         }
         let report = self.errors.report(BOOTSTRAP);
         if let Some(path) = json {
-            let text = serde_json::to_string_pretty(&report).map_err(Failure::failed)?;
+            let text = serde_json::to_string_pretty(&report).map_err(CommandError::failed)?;
             write_file(path, (text + "\n").as_bytes())?;
         }
         figures.map_or(Ok(()), |directory| write_figures(directory, &report))?;
@@ -97,10 +97,10 @@ impl ScoreLabels {
     ///
     /// # Errors
     /// No label that the model predicts.
-    pub fn report(self, input: &Path) -> Result<LabelledReport, Failure> {
+    pub fn report(self, input: &Path) -> Result<LabelledReport, CommandError> {
         self.warn(input);
         if self.errors.structures() == 0 {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{}: no structure has a label; expected energy, forces or stress, or REF_energy and so on",
                 input.display()
             )));
@@ -118,7 +118,7 @@ impl ScoreLabels {
 }
 
 /// Each figure as SVG, PNG and the numbers as CSV, each table as CSV, and the captions.
-fn write_figures(directory: &Path, report: &LabelledReport) -> Result<(), Failure> {
+fn write_figures(directory: &Path, report: &LabelledReport) -> Result<(), CommandError> {
     std::fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))?;
     let mut captions = String::new();
     for FigureEntry { name, title, drawn } in labelled::figures(report) {
@@ -126,7 +126,7 @@ fn write_figures(directory: &Path, report: &LabelledReport) -> Result<(), Failur
         captions += &format!("{name}\n{title}. {}\n\n", figures::plain(&caption));
         let path = |extension: &str| directory.join(format!("{name}.{extension}"));
         write_file(&path("svg"), to_svg(&figure).as_bytes())?;
-        write_file(&path("png"), &to_png(&figure, RESOLUTION).map_err(Failure::failed)?)?;
+        write_file(&path("png"), &to_png(&figure, RESOLUTION).map_err(CommandError::failed)?)?;
         write_file(&path("csv"), &numbers.into_bytes())?;
     }
     for table in labelled::tables(report) {
@@ -135,7 +135,7 @@ fn write_figures(directory: &Path, report: &LabelledReport) -> Result<(), Failur
     write_file(&directory.join("captions.txt"), captions.as_bytes())
 }
 
-fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), CommandError> {
     let mut file = AtomicFile::create(path)?;
     file.write_all(bytes).map_err(|error| cannot_write(path, error))?;
     file.finish()

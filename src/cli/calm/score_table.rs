@@ -8,7 +8,7 @@ use atoms::extxyz::{Frame, Labels};
 
 use super::scorer::Scorer;
 use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::cli::Failure;
+use crate::cli::CommandError;
 use crate::csv::number;
 
 const TITLES: &str = "line,atoms,gamma_max,gamma_nbr_max,energy_per_atom,label_energy_per_atom,force_error_mean,force_error_max";
@@ -21,14 +21,14 @@ pub struct ScoreTable {
 
 impl ScoreTable {
     /// Begins with the titles.
-    pub fn create(path: &Path) -> Result<Self, Failure> {
+    pub fn create(path: &Path) -> Result<Self, CommandError> {
         let mut table = Self { path: path.to_owned(), file: AtomicFile::create(path)? };
         table.write(TITLES)?;
         Ok(table)
     }
 
     /// Adds a frame that was scored last. Numbers that follow from labels are empty without them.
-    pub fn add(&mut self, frame: &Frame, scorer: &Scorer, labels: &Labels) -> Result<(), Failure> {
+    pub fn add(&mut self, frame: &Frame, scorer: &Scorer, labels: &Labels) -> Result<(), CommandError> {
         let atoms = frame.structure.len() as f64;
         let largest = |values: &[f64]| values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let pairs = labels.forces.iter().flatten().zip(&scorer.evaluation.forces);
@@ -47,11 +47,11 @@ impl ScoreTable {
         self.write(&row.join(","))
     }
 
-    pub fn finish(self) -> Result<(), Failure> {
+    pub fn finish(self) -> Result<(), CommandError> {
         self.file.finish()
     }
 
-    fn write(&mut self, line: &str) -> Result<(), Failure> {
+    fn write(&mut self, line: &str) -> Result<(), CommandError> {
         writeln!(self.file, "{line}").map_err(|error| cannot_write(&self.path, error))
     }
 }

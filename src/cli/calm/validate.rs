@@ -17,7 +17,7 @@ use crate::atomic_file::refuse_to_replace;
 use crate::calm_validation::{
     self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, labelled, verdict,
 };
-use crate::cli::{ExitStatus, Failure};
+use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
 use crate::output::{self, Bar, Table, decimals, print, print_stderr};
 use crate::page::{create_directory, write_files};
@@ -80,7 +80,7 @@ pub struct CalmValidateArgs {
 }
 
 impl CalmValidateArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
         let (model, mixture) = (features.model.clone(), Arc::new(artifact.mixture));
         let settings = self.settings(&model)?;
@@ -125,7 +125,7 @@ impl CalmValidateArgs {
     }
 
     /// The baselines, and what else labelled structures are scored by beside γ and γ_nbr. The output must not replace these structures.
-    fn compared(&self, features: &FeatureModel) -> Result<OtherScores, Failure> {
+    fn compared(&self, features: &FeatureModel) -> Result<OtherScores, CommandError> {
         let mut ensemble: &[PathBuf] = &[];
         if let Some(input) = &self.labelled {
             let structures = self.output.join("structures.extxyz");
@@ -136,31 +136,31 @@ impl CalmValidateArgs {
     }
 
     /// The spread of the energies, if there are further models.
-    fn ensemble(&self, model: &Arc<GraceModel>) -> Result<Option<Box<dyn Score>>, Failure> {
+    fn ensemble(&self, model: &Arc<GraceModel>) -> Result<Option<Box<dyn Score>>, CommandError> {
         let mut models = vec![Arc::clone(model)];
         for path in &self.ensemble {
-            let other = GraceModel::load(path).map_err(Failure::input)?;
+            let other = GraceModel::load(path).map_err(CommandError::input)?;
             if let Some(missing) = model.elements().iter().find(|species| !other.elements().contains(species))
             {
                 let message = format!("{}: does not support {missing}, as the model does", path.display());
-                return Err(Failure::Input(message));
+                return Err(CommandError::Input(message));
             }
             models.push(Arc::new(other));
         }
         Ok((models.len() > 1).then(|| Box::new(EnergySpread::new(models)) as Box<dyn Score>))
     }
 
-    fn settings(&self, model: &GraceModel) -> Result<Settings, Failure> {
+    fn settings(&self, model: &GraceModel) -> Result<Settings, CommandError> {
         let known = model.elements();
         let names = || known.iter().map(|species| species.symbol()).collect::<Vec<_>>().join(", ");
         for species in self.elements.iter().chain(self.pairs.iter().flatten()) {
             if !known.contains(species) {
                 let message = format!("the model does not support {species}; expected some of {}", names());
-                return Err(Failure::Input(message));
+                return Err(CommandError::Input(message));
             }
         }
         if self.scan_steps.get() < 2 {
-            return Err(Failure::Input("--scan-steps 1: expected at least 2".into()));
+            return Err(CommandError::Input("--scan-steps 1: expected at least 2".into()));
         }
         let mut elements = if self.elements.is_empty() { known.to_vec() } else { self.elements.clone() };
         let pairs = if self.pairs.is_empty() { all_pairs(&elements) } else { self.pairs.clone() };

@@ -9,7 +9,7 @@ use super::other_scores::OtherScores;
 use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
 use crate::calm_validation::labelled::LabelledReport;
-use crate::cli::Failure;
+use crate::cli::CommandError;
 use crate::output::{self, Bar};
 use crate::xyz_reader::XyzReader;
 
@@ -24,8 +24,8 @@ pub fn report(
     scorer: &mut Scorer,
     others: &mut OtherScores,
     stop: &CancellationToken,
-) -> Result<Option<LabelledReport>, Failure> {
-    let mut frames = XyzReader::open(input).map_err(Failure::input)?;
+) -> Result<Option<LabelledReport>, CommandError> {
+    let mut frames = XyzReader::open(input).map_err(CommandError::input)?;
     let bar = Bar::new(frames.length, BAR);
     let mut labels = ScoreLabels::new(others.score_columns(), None)?;
     let mut count = 0_u64;
@@ -33,9 +33,9 @@ pub fn report(
         if stop.is_cancelled() {
             return Ok(None);
         }
-        let frame = frame.map_err(Failure::input)?;
+        let frame = frame.map_err(CommandError::input)?;
         let at = |error: &dyn std::fmt::Display| {
-            Failure::Input(format!("{}:{}: {error}", input.display(), frame.line))
+            CommandError::Input(format!("{}:{}: {error}", input.display(), frame.line))
         };
         scorer.score(&frame.structure, false).map_err(|error| at(&error))?;
         let columns = others.columns(&frame.structure, scorer).map_err(|error| at(&error))?;
@@ -44,7 +44,7 @@ pub fn report(
         bar.set(frames.position(), || output::count(count, "frame"));
     }
     if count == 0 {
-        return Err(Failure::input(FileError::Empty(input.to_owned())));
+        return Err(CommandError::input(FileError::Empty(input.to_owned())));
     }
     drop(bar);
     labels.report(input).map(Some)

@@ -11,7 +11,7 @@ use monitor::candidate_details::{
 };
 use store::{Location, Store};
 
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, decimals, print, print_json};
 
 /// Indent of lines without a title.
@@ -38,7 +38,7 @@ pub struct ExplainArgs {
 }
 
 impl ExplainArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let details = block_on(read(self.location.get()?, &self.id))??;
         if self.json {
             print_json(&details)?
@@ -50,13 +50,13 @@ impl ExplainArgs {
 }
 
 /// The output of the command.
-pub async fn text(location: Location, id: &str) -> Result<String, Failure> {
+pub async fn text(location: Location, id: &str) -> Result<String, CommandError> {
     let (mut text, details) = (Vec::new(), read(location, id).await?);
-    write(&mut text, &details).map_err(Failure::failed)?;
+    write(&mut text, &details).map_err(CommandError::failed)?;
     Ok(String::from_utf8_lossy(&text).into_owned())
 }
 
-async fn read(location: Location, id: &str) -> Result<CandidateDetails, Failure> {
+async fn read(location: Location, id: &str) -> Result<CandidateDetails, CommandError> {
     let store = Store::open_read_only(&location).await?;
     let details = candidate_details::read(&store, id).await?;
     store.close().await;

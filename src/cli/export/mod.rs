@@ -12,7 +12,7 @@ use store::records::Protocol;
 use store::{DATABASE, ExportCursor, ExportFilter, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
-use super::{CampaignArgs, ExitStatus, Failure, block_on};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::filter::Filter;
 use crate::output::{self, Bar, print};
@@ -115,7 +115,7 @@ async fn check_completeness(
     store: &Store,
     filter: &ExportFilter,
     mut missing: BTreeSet<ExportCursor>,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     if missing.is_empty() {
         return Ok(());
     }
@@ -127,7 +127,7 @@ async fn check_completeness(
         Some(ExportCursor::Candidate(decision)) => format!("that of decision {decision}"),
         Some(ExportCursor::Import(number)) => format!("import-{number}"),
     };
-    Err(Failure::Failed(format!(
+    Err(CommandError::Failed(format!(
         "damaged database: {} of {} labelled structures are missing, the first is {place}; nothing was written. calmwalk store \
          check shows the damage; restore the campaign from a backup",
         missing.len(),
@@ -136,7 +136,7 @@ async fn check_completeness(
 }
 
 impl ExportArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let Exported { counts, labels, others } = block_on(self.export())??;
         for (path, count, _) in &counts {
             if matches!(self.keys, KeyNames::Grace) && (1..count.frames).contains(&count.without_stress) {
@@ -183,7 +183,7 @@ impl ExportArgs {
         Ok(ExitStatus::Done)
     }
 
-    async fn export(&self) -> Result<Exported, Failure> {
+    async fn export(&self) -> Result<Exported, CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         store.check_for_export().await?;
         let protocol = self.select_protocol(&store).await?;
@@ -219,7 +219,7 @@ impl ExportArgs {
         }
         check_completeness(&store, &filter, missing).await?;
         if let (0, Some(condition)) = (frames, &self.condition) {
-            return Err(Failure::Input(format!("no labelled structure matches --where '{condition}'")));
+            return Err(CommandError::Input(format!("no labelled structure matches --where '{condition}'")));
         }
         let mut counts = Vec::new();
         for Part { path, file, count, assigned } in parts {
@@ -236,7 +236,7 @@ impl ExportArgs {
     }
 
     /// The files to write, and the index of the file of each seed structure.
-    async fn parts(&self, store: &Store) -> Result<(Vec<Part>, BTreeMap<u32, usize>), Failure> {
+    async fn parts(&self, store: &Store) -> Result<(Vec<Part>, BTreeMap<u32, usize>), CommandError> {
         let Some(shares) = &self.split else {
             return Ok((vec![self.part(self.output.clone(), 0)?], BTreeMap::new()));
         };
@@ -244,7 +244,7 @@ impl ExportArgs {
         let seeds: Vec<_> = seeds.map(|seed| (seed.index, seed.name)).collect();
         let assigned = shares
             .assign(&seeds, self.split_seed)
-            .map_err(|error| Failure::Input(format!("--split: {error}")))?;
+            .map_err(|error| CommandError::Input(format!("--split: {error}")))?;
         let mut parts = Vec::new();
         for (number, name) in shares.names().enumerate() {
             let seeds = assigned.values().filter(|part| **part == number).count();
@@ -253,7 +253,7 @@ impl ExportArgs {
         Ok((parts, assigned))
     }
 
-    fn part(&self, path: PathBuf, assigned: usize) -> Result<Part, Failure> {
+    fn part(&self, path: PathBuf, assigned: usize) -> Result<Part, CommandError> {
         let files = [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()];
         let [database, log, lock] = files.map(|name| self.location.location.join(name));
         let own = [&database, &log, &lock].map(|file| (file.as_path(), "a file of the campaign itself"));
@@ -267,7 +267,7 @@ impl ExportArgs {
     }
 
     /// The requested protocol, or the only one with labels to export.
-    async fn select_protocol(&self, store: &Store) -> Result<Protocol, Failure> {
+    async fn select_protocol(&self, store: &Store) -> Result<Protocol, CommandError> {
         let protocols = store.protocols().await?;
         let names = |protocols: &[Protocol]| {
             let names: Vec<_> = protocols.iter().map(|protocol| format!("'{}'", protocol.name)).collect();
@@ -283,13 +283,13 @@ impl ExportArgs {
         match (with_labels.as_slice(), &self.protocol) {
             ([protocol], _) => Ok(protocol.clone()),
             ([], Some(name)) if !protocols.iter().any(|protocol| protocol.name == *name) => {
-                Err(Failure::Input(format!(
+                Err(CommandError::Input(format!(
                     "the campaign has no protocol '{name}'; it has {}",
                     names(&protocols)
                 )))
             }
-            ([], _) => Err(Failure::Input(self.nothing_to_export(&store.status().await?))),
-            (several, _) => Err(Failure::Input(format!(
+            ([], _) => Err(CommandError::Input(self.nothing_to_export(&store.status().await?))),
+            (several, _) => Err(CommandError::Input(format!(
                 "there are labels of several protocols, which must not be mixed in one file: select one with --protocol \
                  ({})",
                 names(several)
@@ -324,7 +324,7 @@ impl From<KeyNames> for LabelKeys {
 }
 
 impl Part {
-    fn write(&mut self, frame: &Frame, seed: Option<u32>, has_stress: bool) -> Result<(), Failure> {
+    fn write(&mut self, frame: &Frame, seed: Option<u32>, has_stress: bool) -> Result<(), CommandError> {
         self.count.frames += 1;
         self.count.without_stress += u64::from(!has_stress);
         self.count.seed_structures.extend(seed);

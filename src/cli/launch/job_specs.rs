@@ -11,7 +11,7 @@ use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill
 use super::{FOLDER, LaunchArgs, absolute};
 use crate::atomic_file::cannot_write;
 use crate::campaign::Campaign;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::runtime::reference_check;
 
 /// The file in the campaign's directory to which the orchestrator announces its endpoint.
@@ -35,7 +35,7 @@ impl JobSpecs {
         campaign: &Campaign,
         directory: &Path,
         wanted: DesiredJobs,
-    ) -> Result<Self, Failure> {
+    ) -> Result<Self, CommandError> {
         let folder = directory.join(FOLDER);
         let commands = Commands::new(launch, campaign, directory)?;
         let job = quoted(&text(&folder.join(COMMON))?);
@@ -77,7 +77,7 @@ impl JobSpecs {
 
     /// Excludes concurrent launches, if the file system supports locks. Otherwise Slurm runs only one of two jobs with the same
     /// name at a time.
-    pub fn lock(&self) -> Result<Option<File>, Failure> {
+    pub fn lock(&self) -> Result<Option<File>, CommandError> {
         fs::create_dir_all(&self.folder).map_err(|error| cannot_write(&self.folder, error))?;
         let path = self.folder.join("launch.lock");
         let file = File::options().create(true).append(true).open(&path);
@@ -86,13 +86,13 @@ impl JobSpecs {
     }
 
     /// Writes the scripts.
-    pub fn write(&self) -> Result<(), Failure> {
+    pub fn write(&self) -> Result<(), CommandError> {
         self.scripts.iter().try_for_each(|(name, text)| templates::write(&self.folder.join(name), text))
     }
 
     /// Removes the endpoint file before a new orchestrator starts. It may still say that the campaign is finished, and agents
     /// would exit.
-    pub fn remove_endpoint(&self) -> Result<(), Failure> {
+    pub fn remove_endpoint(&self) -> Result<(), CommandError> {
         let path = self.directory.join(ENDPOINT);
         match fs::remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => Err(cannot_write(&path, error)),
@@ -166,10 +166,10 @@ struct Commands<'a> {
 }
 
 impl<'a> Commands<'a> {
-    fn new(launch: &'a LaunchArgs, campaign: &'a Campaign, directory: &Path) -> Result<Self, Failure> {
+    fn new(launch: &'a LaunchArgs, campaign: &'a Campaign, directory: &Path) -> Result<Self, CommandError> {
         Ok(Self {
             launch,
-            program: text(&std::env::current_exe().map_err(Failure::failed)?)?,
+            program: text(&std::env::current_exe().map_err(CommandError::failed)?)?,
             config: text(&absolute(&launch.config)?)?,
             directory: text(directory)?,
             endpoint: text(&directory.join(ENDPOINT))?,
@@ -187,7 +187,7 @@ impl<'a> Commands<'a> {
         words.map(quoted).collect::<Vec<_>>().join(" ")
     }
 
-    fn orchestrator(&self, wanted: DesiredJobs) -> Result<String, Failure> {
+    fn orchestrator(&self, wanted: DesiredJobs) -> Result<String, CommandError> {
         let mut words = vec!["run", &self.config, "--directory", &self.directory, WAIT_TIMEOUT];
         if self.launch.adopt {
             words.push("--adopt");
@@ -204,7 +204,7 @@ impl<'a> Commands<'a> {
         Ok(self.command(words))
     }
 
-    fn agent(&self) -> Result<String, Failure> {
+    fn agent(&self) -> Result<String, CommandError> {
         let join = format!("@{}", self.endpoint);
         let (walkers, threads) = (self.launch.walkers.to_string(), self.launch.threads.to_string());
         let tls = self.certificates("agent")?;
@@ -233,7 +233,7 @@ impl<'a> Commands<'a> {
     }
 
     /// The directory with the certificate of `role`, "orchestrator" or "agent", after a check of its files.
-    fn certificates(&self, role: &str) -> Result<Option<String>, Failure> {
+    fn certificates(&self, role: &str) -> Result<Option<String>, CommandError> {
         let Some(tls) = &self.launch.tls else { return Ok(None) };
         let directory = absolute(&tls.join(role))?;
         let certificates = Tls::from_directory(&directory);
@@ -241,17 +241,17 @@ impl<'a> Commands<'a> {
             "orchestrator" => certificates.check_for_orchestrator(),
             _ => certificates.check_for_agent(),
         };
-        checked.map_err(Failure::input)?;
+        checked.map_err(CommandError::input)?;
         text(&directory).map(Some)
     }
 
     /// Without certificates, all jobs must run on the orchestrator's node.
-    fn check_reachable(&self, tls: bool) -> Result<(), Failure> {
+    fn check_reachable(&self, tls: bool) -> Result<(), CommandError> {
         let is_node = |option: &String| option.starts_with("--nodelist") || option.starts_with("-w");
         if tls || self.launch.options.iter().any(is_node) {
             return Ok(());
         }
-        Err(Failure::Input(
+        Err(CommandError::Input(
             "agents on other nodes than the orchestrator's need certificates: create them and pass their directory with --tls \
              (docs/slurm.md), or run all jobs on one node with '-- --nodelist=NODE'"
                 .to_owned(),
@@ -260,10 +260,10 @@ impl<'a> Commands<'a> {
 }
 
 /// A path as text for a script.
-fn text(path: &Path) -> Result<String, Failure> {
+fn text(path: &Path) -> Result<String, CommandError> {
     let text = path.to_str().filter(|text| !text.contains('\n'));
     text.map(str::to_owned).ok_or_else(|| {
-        Failure::Input(format!(
+        CommandError::Input(format!(
             "{}: a path in a job script must be UTF-8 without line breaks",
             path.display()
         ))

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::Path;
 
 use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// The built-in templates, from `configs/slurm`.
 const TEMPLATES: [(&str, &str); 4] = [
@@ -24,12 +24,12 @@ pub const COMMON: &str = "job.sh";
 pub type Values<'a> = [(&'a str, String)];
 
 /// The template of this name: from the site's directory if given, else the built-in one.
-pub fn template(site: Option<&Path>, name: &str) -> Result<String, Failure> {
+pub fn template(site: Option<&Path>, name: &str) -> Result<String, CommandError> {
     match site {
         Some(directory) => {
             let path = directory.join(name);
             let failed = |error| {
-                Failure::Input(format!(
+                CommandError::Input(format!(
                     "cannot read {}: {error}; --template needs a directory with the four files of configs/slurm",
                     path.display()
                 ))
@@ -47,7 +47,7 @@ pub fn template(site: Option<&Path>, name: &str) -> Result<String, Failure> {
 ///
 /// # Errors
 /// A name has no value.
-pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, Failure> {
+pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, CommandError> {
     let mut text = String::with_capacity(template.len());
     let mut rest = template;
     while let Some(begin) = rest.find('{') {
@@ -62,7 +62,7 @@ pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, F
         let Some((_, value)) = values.iter().find(|(name, _)| *name == word) else {
             let line = 1 + template[..template.len() - from.len()].matches('\n').count();
             let known: Vec<_> = values.iter().map(|(name, _)| format!("{{{name}}}")).collect();
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{name}:{line}: unknown placeholder {{{word}}}; expected one of {}",
                 known.join(", ")
             )));
@@ -81,7 +81,7 @@ fn placeholder(text: &str) -> Option<&str> {
 }
 
 /// Writes a script atomically: a job may read it at this moment.
-pub fn write(path: &Path, text: &str) -> Result<(), Failure> {
+pub fn write(path: &Path, text: &str) -> Result<(), CommandError> {
     let mut file = AtomicFile::create(path)?;
     file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
     file.finish()
@@ -103,7 +103,7 @@ mod tests {
 
     use super::*;
 
-    fn filled(template: &str) -> Result<String, Failure> {
+    fn filled(template: &str) -> Result<String, CommandError> {
         fill("agent.sbatch", template, &[("cpus", "4".into()), ("command", "calmwalk agent".into())])
     }
 
@@ -117,7 +117,7 @@ mod tests {
 
     #[test]
     fn unknown_placeholders_are_rejected_with_their_line() {
-        let Err(Failure::Input(message)) = filled("{cpus}\n\nx {cpu} {command}") else { panic!() };
+        let Err(CommandError::Input(message)) = filled("{cpus}\n\nx {cpu} {command}") else { panic!() };
         assert_eq!(message, "agent.sbatch:3: unknown placeholder {cpu}; expected one of {cpus}, {command}");
     }
 

@@ -12,7 +12,7 @@ use md::{Dynamics, Settings, State, Stream, default_time_step};
 
 use self::config::{DynamicsSection, MdConfig, OutputSection};
 use self::trajectory::{Trajectory, time};
-use super::{ExitStatus, Failure};
+use super::{CommandError, ExitStatus};
 use crate::atomic_file::refuse_to_replace;
 use crate::output::{Bar, count, decimals, print};
 use crate::signals;
@@ -35,7 +35,7 @@ pub struct MdArgs {
 }
 
 impl MdArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (config, start, mut potential) = MdConfig::load(&self.config)?;
         let path = self.output.unwrap_or_else(|| config.output.trajectory.clone());
         let inputs = [
@@ -47,7 +47,7 @@ impl MdArgs {
         let state = initial_state(&config.dynamics, start.structure);
         let settings = settings(&config.dynamics, &state);
         let mut dynamics = Dynamics::new(state, settings, &mut *potential).map_err(|error| {
-            Failure::Input(format!("{}:{}: {error}", config.structure.get_ref().display(), start.line))
+            CommandError::Input(format!("{}:{}: {error}", config.structure.get_ref().display(), start.line))
         })?;
         let stopping = signals::stop_token()?;
         let mut trajectory = Trajectory::create(&path)?;
@@ -63,7 +63,9 @@ impl MdArgs {
         drop(progress);
         let (frames, file) = (trajectory.frames, path.display());
         outcome.map_err(|failure| match failure {
-            Failure::Failed(message) => Failure::Failed(format!("{message}; {frames} frames are in {file}")),
+            CommandError::Failed(message) => {
+                CommandError::Failed(format!("{message}; {frames} frames are in {file}"))
+            }
             other => other,
         })?;
         trajectory.push(&dynamics)?;
@@ -99,11 +101,11 @@ fn integrate(
     dynamics: &mut Dynamics,
     potential: &mut dyn Potential,
     steps: u64,
-    mut observe: impl FnMut(&Dynamics) -> Result<bool, Failure>,
-) -> Result<(), Failure> {
+    mut observe: impl FnMut(&Dynamics) -> Result<bool, CommandError>,
+) -> Result<(), CommandError> {
     while observe(dynamics)? && dynamics.state().step < steps {
         let step = dynamics.state().step + 1;
-        dynamics.step(potential).map_err(|error| Failure::Failed(format!("step {step}: {error}")))?;
+        dynamics.step(potential).map_err(|error| CommandError::Failed(format!("step {step}: {error}")))?;
     }
     Ok(())
 }

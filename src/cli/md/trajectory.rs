@@ -8,7 +8,7 @@ use atoms::units::ACCELERATION;
 use md::Dynamics;
 
 use crate::atomic_file::{cannot_create, cannot_write};
-use crate::cli::Failure;
+use crate::cli::CommandError;
 
 /// A trajectory file, valid after every frame.
 pub struct Trajectory {
@@ -21,13 +21,13 @@ pub struct Trajectory {
 
 impl Trajectory {
     /// Creates the file; an existing one is replaced.
-    pub fn create(path: &Path) -> Result<Self, Failure> {
+    pub fn create(path: &Path) -> Result<Self, CommandError> {
         let file = File::create(path).map_err(|error| cannot_create(path, error))?;
         Ok(Self { path: path.to_owned(), file, frames: 0, last_step: None })
     }
 
     /// Appends the current step, unless it is already the last frame.
-    pub fn push(&mut self, dynamics: &Dynamics) -> Result<(), Failure> {
+    pub fn push(&mut self, dynamics: &Dynamics) -> Result<(), CommandError> {
         let step = dynamics.state().step;
         if self.last_step != Some(step) {
             write_frame(&mut self.file, &frame(dynamics)).map_err(|error| cannot_write(&self.path, error))?;

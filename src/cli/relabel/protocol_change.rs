@@ -7,7 +7,7 @@ use atoms::Species;
 use monitor::provenance::{self, Provenance};
 use store::{Protocol, Store, StoreError};
 
-use super::Failure;
+use super::CommandError;
 use crate::config::{Change, Config, LabelSection, changed_keys};
 use crate::label_method::{self, MethodConfig};
 use crate::label_setup::LABEL_METHOD_KEY;
@@ -26,7 +26,7 @@ pub struct ProtocolChange {
 
 impl ProtocolChange {
     /// Reads the [label] section of a file and loads its method on this host. `None` if its protocol is the current one.
-    pub async fn read(store: &Store, path: &Path, in_force: &Protocol) -> Result<Option<Self>, Failure> {
+    pub async fn read(store: &Store, path: &Path, in_force: &Protocol) -> Result<Option<Self>, CommandError> {
         let section = Config::load_label(path)?;
         let method = MethodConfig::from_section(&section)?;
         let protocol = label_method::protocol(section.protocol_name(), method.identity()?);
@@ -41,7 +41,7 @@ impl ProtocolChange {
         let after = label_method::with_protocol(&before, &section, &protocol);
         let changed = changed_keys(&before, &after).into_iter();
         let changes = changed.map(|(key, before, after)| Change::Key { key, before, after }).collect();
-        let note = serde_json::to_string(&method).map_err(Failure::failed)?;
+        let note = serde_json::to_string(&method).map_err(CommandError::failed)?;
         let mut notes = vec![(LABEL_METHOD_KEY, note)];
         notes.extend(origin_note(store, path).await?);
         Ok(Some(Self { protocol, configuration: after.to_string(), changes, notes }))
@@ -54,26 +54,26 @@ impl ProtocolChange {
 }
 
 /// The record that lets the campaign resume with this file.
-async fn origin_note(store: &Store, path: &Path) -> Result<Option<(&'static str, String)>, Failure> {
+async fn origin_note(store: &Store, path: &Path) -> Result<Option<(&'static str, String)>, CommandError> {
     let Some(known) = Provenance::read(store).await? else { return Ok(None) };
     let text = std::fs::read_to_string(path)
-        .map_err(|error| Failure::Input(format!("cannot read {}: {error}", path.display())))?;
-    let note = serde_json::to_string(&known.relabelled(path, &text)).map_err(Failure::failed)?;
+        .map_err(|error| CommandError::Input(format!("cannot read {}: {error}", path.display())))?;
+    let note = serde_json::to_string(&known.relabelled(path, &text)).map_err(CommandError::failed)?;
     Ok(Some((provenance::METADATA_KEY, note)))
 }
 
 /// Checks that names and protocols correspond one to one in the campaign.
-async fn check_name(store: &Store, protocol: &Protocol, path: &Path) -> Result<(), Failure> {
+async fn check_name(store: &Store, protocol: &Protocol, path: &Path) -> Result<(), CommandError> {
     let (path, name) = (path.display(), &protocol.name);
     for known in store.protocols().await? {
         if known.hash == protocol.hash && known.name != *name {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{path}: label.protocol is '{name}', but in this campaign the same protocol is named '{}': use that name",
                 known.name
             )));
         }
         if known.hash != protocol.hash && known.name == *name {
-            return Err(Failure::Input(format!(
+            return Err(CommandError::Input(format!(
                 "{path}: label.protocol is '{name}', but in this campaign '{name}' is a protocol with other settings: choose a new \
                  name, such as protocol = \"{name}-2\""
             )));
@@ -83,10 +83,10 @@ async fn check_name(store: &Store, protocol: &Protocol, path: &Path) -> Result<(
 }
 
 /// Checks that the method supports the elements of all seed structures.
-async fn check_elements(store: &Store, section: &LabelSection, path: &Path) -> Result<(), Failure> {
+async fn check_elements(store: &Store, section: &LabelSection, path: &Path) -> Result<(), CommandError> {
     let seeds = store.seed_structures().await?;
     let species: BTreeSet<Species> =
         seeds.iter().flat_map(|seed| seed.structure.species.iter().copied()).collect();
     label_method::supports(section, &species)
-        .map_err(|error| Failure::Input(format!("{}: label.method: {error}", path.display())))
+        .map_err(|error| CommandError::Input(format!("{}: label.method: {error}", path.display())))
 }

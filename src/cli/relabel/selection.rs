@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashSet};
 use store::{ExportFilter, JobState, PendingJobs, Relabellable, Store};
 use wire::ContentHash;
 
-use super::Failure;
+use super::CommandError;
 use crate::cli::export::frame::facts;
 use crate::filter::Filter;
 use crate::output;
@@ -41,16 +41,20 @@ impl Selection {
     }
 
     /// The structures of these candidates, whatever the protocol of their labels.
-    pub async fn from_ids(store: &Store, all: Vec<Relabellable>, ids: &[String]) -> Result<Self, Failure> {
+    pub async fn from_ids(
+        store: &Store,
+        all: Vec<Relabellable>,
+        ids: &[String],
+    ) -> Result<Self, CommandError> {
         let mut wanted = HashSet::new();
         for id in ids {
             let candidate = store.find_candidate(id).await?.candidate;
             let content = match store.candidate(&candidate).await? {
                 Some(stored) => stored.block.view().id().content,
-                None => return Err(Failure::Input(format!("there is no candidate {candidate}"))),
+                None => return Err(CommandError::Input(format!("there is no candidate {candidate}"))),
             };
             if !all.iter().any(|structure| structure.content == content) {
-                return Err(Failure::Input(format!(
+                return Err(CommandError::Input(format!(
                     "{candidate} has no label to replace: see calmwalk explain (to queue a failed or dropped candidate again, \
                      use calmwalk queue … retry)"
                 )));
@@ -109,7 +113,7 @@ pub async fn matching(
     store: &Store,
     all: Vec<Relabellable>,
     condition: &Filter,
-) -> Result<Vec<Relabellable>, Failure> {
+) -> Result<Vec<Relabellable>, CommandError> {
     let mut matching = HashSet::new();
     let conditions = store.walk_conditions().await?;
     for protocol in store.protocols().await? {
@@ -125,7 +129,7 @@ pub async fn matching(
     }
     let all: Vec<_> = all.into_iter().filter(|structure| matching.contains(&structure.content.0)).collect();
     if all.is_empty() {
-        return Err(Failure::Input(format!("no labelled structure matches --where '{condition}'")));
+        return Err(CommandError::Input(format!("no labelled structure matches --where '{condition}'")));
     }
     Ok(all)
 }

@@ -6,7 +6,7 @@ use orchestrator::reactor::RunOutcome;
 use serde_json::{Value, json};
 use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds};
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// How long a run that has failed tries to record its end: the database may be the reason.
 const FAILURE_TIMEOUT: Duration = Duration::from_secs(10);
@@ -30,7 +30,7 @@ pub async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
 pub async fn unregister(
     store: Store,
     process: &ProcessRecord,
-    worked: Result<&RunOutcome, &Failure>,
+    worked: Result<&RunOutcome, &CommandError>,
 ) -> Result<Store, StoreError> {
     let how = match worked {
         Ok(RunOutcome::Finished) => json!({ "process": process.id, "how": "done" }),

@@ -8,11 +8,15 @@ use store::{Location, Store, unix_milliseconds};
 
 use crate::campaign::Campaign;
 use crate::config::{self, Change, Refused, compare};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print};
 
 /// Records the configuration of a new campaign.
-pub async fn record_start(store: &Store, origin: &Provenance, location: &Location) -> Result<(), Failure> {
+pub async fn record_start(
+    store: &Store,
+    origin: &Provenance,
+    location: &Location,
+) -> Result<(), CommandError> {
     record(store, origin).await?;
     log_and_print(format_args!(
         "starting campaign '{}' in {location} with {}",
@@ -28,7 +32,7 @@ pub async fn resume(
     location: &Location,
     origin: &Provenance,
     adopt: bool,
-) -> Result<(), Failure> {
+) -> Result<(), CommandError> {
     let known = Provenance::read(store).await?;
     let has_campaign = matches!(location, Location::Directory(_));
     let matched = known.as_ref().map(|known| known.compare(origin, has_campaign, Path::exists));
@@ -54,22 +58,26 @@ pub async fn resume(
     Ok(store.set_configuration_in_force(&resolved.to_string(), &details, unix_milliseconds()).await?)
 }
 
-async fn in_force(store: &Store) -> Result<Value, Failure> {
+async fn in_force(store: &Store) -> Result<Value, CommandError> {
     let text = store.campaign().await?.configuration_in_force;
     serde_json::from_str(&text).map_err(|error| {
-        Failure::Failed(format!(
+        CommandError::Failed(format!(
             "damaged database: the configuration in force: {error}; restore the campaign from a backup"
         ))
     })
 }
 
-async fn record(store: &Store, origin: &Provenance) -> Result<(), Failure> {
-    let text = serde_json::to_string(origin).map_err(Failure::failed)?;
+async fn record(store: &Store, origin: &Provenance) -> Result<(), CommandError> {
+    let text = serde_json::to_string(origin).map_err(CommandError::failed)?;
     Ok(store.set_metadata(provenance::METADATA_KEY, &text).await?)
 }
 
 /// Reports where the campaign resumes.
-async fn report_progress(store: &Store, origin: &Provenance, location: &Location) -> Result<(), Failure> {
+async fn report_progress(
+    store: &Store,
+    origin: &Provenance,
+    location: &Location,
+) -> Result<(), CommandError> {
     let status = store.status().await?;
     let decisions = store.newest_mixture().await?.decision;
     let steps: u64 = status.walks.iter().map(|walk| walk.step).sum();
@@ -99,20 +107,20 @@ fn changed_content(
     location: &Location,
     other: Option<&Provenance>,
     refused: &Refused,
-) -> Failure {
+) -> CommandError {
     let at = config::location(&campaign.path, &campaign.text, refused.key());
     let elsewhere = elsewhere(location);
     let hint = other.map_or(String::new(), |known| {
         format!(" (the campaign in {location} is '{}', configured by {})", known.name, known.file.path)
     });
-    Failure::Input(format!("{at}: {refused}, or start another campaign {elsewhere}{hint}"))
+    CommandError::Input(format!("{at}: {refused}, or start another campaign {elsewhere}{hint}"))
 }
 
 /// The configuration is compatible, but the campaign was started with another file.
-fn other_file(campaign: &Campaign, location: &Location, known: &Provenance) -> Failure {
+fn other_file(campaign: &Campaign, location: &Location, known: &Provenance) -> CommandError {
     let (given, name, file) = (campaign.path.display(), &known.name, &known.file.path);
     let elsewhere = elsewhere(location);
-    Failure::Input(format!(
+    CommandError::Input(format!(
         "{given}: the campaign in {location} is '{name}', which belongs to another configuration, {file}. Resume it with that \
          file, start another campaign {elsewhere}, or resume it with {given} by --adopt"
     ))

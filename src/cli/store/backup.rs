@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use store::{DATABASE, Store, unix_milliseconds};
 
-use super::{CampaignArgs, ExitStatus, Failure};
+use super::{CampaignArgs, CommandError, ExitStatus};
 use crate::cli::block_on;
 use crate::output::{Bar, print};
 use crate::wording::disk::megabytes;
@@ -26,7 +26,7 @@ pub struct StoreBackupArgs {
 }
 
 impl StoreBackupArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         block_on(self.backup())??;
         let target = self.target.display();
         let size = std::fs::metadata(self.target.join(DATABASE)).map_or(0, |file| file.len());
@@ -34,7 +34,7 @@ impl StoreBackupArgs {
         Ok(ExitStatus::Done)
     }
 
-    async fn backup(&self) -> Result<(), Failure> {
+    async fn backup(&self) -> Result<(), CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let mut bar = None;
         let report = |done, all| bar.get_or_insert_with(|| Bar::new(Some(all), BAR)).set(done, String::new);

@@ -3,7 +3,7 @@
 use calm::Component;
 use store::{ComponentRecord, Finding, Store, StoreError};
 
-use super::{CampaignArgs, ExitStatus, Failure};
+use super::{CampaignArgs, CommandError, ExitStatus};
 use crate::cli::block_on;
 use crate::output::{Bar, print};
 
@@ -23,7 +23,7 @@ pub struct StoreCheckArgs {
 }
 
 impl StoreCheckArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (findings, rows) = block_on(self.check())??;
         print(|out| {
             findings.iter().try_for_each(|finding| writeln!(out, "{finding}"))?;
@@ -31,11 +31,11 @@ impl StoreCheckArgs {
         })?;
         match findings.len() {
             0 => Ok(ExitStatus::Done),
-            found => Err(Failure::Failed(format!("{found} findings in {}", self.location.get()?))),
+            found => Err(CommandError::Failed(format!("{found} findings in {}", self.location.get()?))),
         }
     }
 
-    async fn check(&self) -> Result<(Vec<Finding>, u64), Failure> {
+    async fn check(&self) -> Result<(Vec<Finding>, u64), CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let (mut bar, mut rows) = (None, 0);
         let mut findings = store

@@ -2,7 +2,7 @@
 
 use store::{CampaignLock, Store, unix_milliseconds};
 
-use super::{CampaignArgs, ExitStatus, Failure};
+use super::{CampaignArgs, CommandError, ExitStatus};
 use crate::cli::block_on;
 use crate::output::{log_and_print, print};
 use crate::wording::disk::megabytes;
@@ -20,13 +20,13 @@ pub struct StoreCompactArgs {
 }
 
 impl StoreCompactArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (before, after) = block_on(self.compact())??;
         print(|out| writeln!(out, "{} before, {} after", megabytes(before), megabytes(after)))?;
         Ok(ExitStatus::Done)
     }
 
-    async fn compact(&self) -> Result<(u64, u64), Failure> {
+    async fn compact(&self) -> Result<(u64, u64), CommandError> {
         let location = self.location.get()?;
         // Fails if there is no campaign, before the lock creates files.
         Store::open_read_only(&location).await?.close().await;

@@ -4,7 +4,7 @@ mod backup;
 mod check;
 mod compact;
 
-use super::{CampaignArgs, ExitStatus, Failure};
+use super::{CampaignArgs, CommandError, ExitStatus};
 
 /// Check, back up or compact the store of a campaign
 #[derive(Debug, clap::Args)]
@@ -22,7 +22,7 @@ enum StoreCommand {
 }
 
 impl StoreArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         match self.action {
             StoreCommand::Check(command) => command.run(),
             StoreCommand::Backup(command) => command.run(),

@@ -26,7 +26,7 @@ use self::messages::{Completed, JobView, Request};
 use self::reader::{Poller, Reader};
 use self::screen::Screen;
 use self::state::WatchState;
-use super::{CampaignArgs, ExitStatus, Failure, block_on, duration_between, explain, queue, walks};
+use super::{CampaignArgs, CommandError, ExitStatus, block_on, duration_between, explain, queue, walks};
 use crate::duration::Duration;
 
 /// Monitor and control a campaign in the terminal
@@ -45,10 +45,10 @@ pub struct WatchArgs {
 }
 
 impl WatchArgs {
-    pub fn run(self) -> Result<ExitStatus, Failure> {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
         let location = self.location.get()?;
         if !io::stdout().is_terminal() {
-            return Err(Failure::Input(
+            return Err(CommandError::Input(
                 "standard output is not a terminal: use calmwalk status, or calmwalk status --json for other programs"
                     .into(),
             ));
@@ -58,13 +58,13 @@ impl WatchArgs {
 }
 
 /// Polls, draws and handles keys until the user quits.
-async fn watch(location: Location, interval: std::time::Duration) -> Result<ExitStatus, Failure> {
+async fn watch(location: Location, interval: std::time::Duration) -> Result<ExitStatus, CommandError> {
     let mut reader = Reader::new(location.clone());
     // Before the screen opens, so that an error is printed normally.
     let mut state = WatchState::new(reader.poll(JobView::default()).await?);
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
-    let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(CommandError::failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(CommandError::failed)?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(CommandError::failed)?;
     let theme = Theme::from_environment();
     let mut screen = Screen::open()?;
     let (mut poller, mut events, mut requests) =
@@ -75,17 +75,17 @@ async fn watch(location: Location, interval: std::time::Duration) -> Result<Exit
             event = events.recv() => match event {
                 Some(Event::Key(key)) => state.key(key),
                 Some(_) => None,
-                None => return Err(Failure::Failed("the terminal was closed".into())),
+                None => return Err(CommandError::Failed("the terminal was closed".into())),
             },
             reading = poller.next() => match reading {
                 Some(reading) => {
                     state.apply(reading);
                     None
                 }
-                None => return Err(Failure::Failed("the task that reads the campaign ended unexpectedly".into())),
+                None => return Err(CommandError::Failed("the task that reads the campaign ended unexpectedly".into())),
             },
             Some(completed) = requests.join_next() => {
-                state.complete(completed.map_err(Failure::failed)?);
+                state.complete(completed.map_err(CommandError::failed)?);
                 poller.poll_now(state.view);
                 None
             }
@@ -104,7 +104,7 @@ async fn watch(location: Location, interval: std::time::Duration) -> Result<Exit
 
 /// Does what the commands of the same names do.
 async fn perform(location: Location, request: Request) -> Completed {
-    let message = |failure: Failure| failure.to_string();
+    let message = |failure: CommandError| failure.to_string();
     match request {
         Request::Explain(id) => {
             let history = explain::text(location, &id).await.map_err(message);

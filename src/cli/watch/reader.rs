@@ -8,7 +8,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 
 use super::messages::{JobView, Reading, WINDOW};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Maximum number of jobs read per state.
 const MAX_JOBS: u32 = 300;
@@ -29,7 +29,7 @@ impl Reader {
     }
 
     /// Polls once.
-    pub async fn poll(&mut self, view: JobView) -> Result<Reading, Failure> {
+    pub async fn poll(&mut self, view: JobView) -> Result<Reading, CommandError> {
         let store = match &self.server {
             Some(store) => store.clone(),
             None => Store::open_read_only(&self.location).await?,
@@ -42,7 +42,7 @@ impl Reader {
         reading
     }
 
-    async fn read(&mut self, store: &Store, view: JobView) -> Result<Reading, Failure> {
+    async fn read(&mut self, store: &Store, view: JobView) -> Result<Reading, CommandError> {
         let snapshot = Snapshot::read(store).await?;
         let mut jobs = Vec::new();
         for state in view.states() {
@@ -56,7 +56,7 @@ impl Reader {
 
 /// A task that polls at an interval.
 pub struct Poller {
-    readings: mpsc::Receiver<Result<Reading, Failure>>,
+    readings: mpsc::Receiver<Result<Reading, CommandError>>,
     view: watch::Sender<JobView>,
 }
 
@@ -70,7 +70,7 @@ impl Poller {
     }
 
     /// The result of the next poll; `None` if the task has ended.
-    pub async fn next(&mut self) -> Option<Result<Reading, Failure>> {
+    pub async fn next(&mut self) -> Option<Result<Reading, CommandError>> {
         self.readings.recv().await
     }
 
@@ -84,7 +84,7 @@ async fn poll_repeatedly(
     mut reader: Reader,
     interval: Duration,
     mut requested: watch::Receiver<JobView>,
-    sender: mpsc::Sender<Result<Reading, Failure>>,
+    sender: mpsc::Sender<Result<Reading, CommandError>>,
 ) {
     loop {
         if let Ok(Err(_)) = timeout(interval, requested.changed()).await {

@@ -11,7 +11,7 @@ use ratatui::crossterm::terminal::{
 use ratatui::prelude::CrosstermBackend;
 use ratatui::{Frame, Terminal};
 
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// The terminal while it is drawn on.
 pub struct Screen {
@@ -20,7 +20,7 @@ pub struct Screen {
 
 impl Screen {
     /// Switches the terminal to raw mode. A panic restores it before its message is printed.
-    pub fn open() -> Result<Self, Failure> {
+    pub fn open() -> Result<Self, CommandError> {
         let report = panic::take_hook();
         panic::set_hook(Box::new(move |panic| {
             restore();
@@ -28,7 +28,7 @@ impl Screen {
         }));
         Self::enter().map_err(|error| {
             restore();
-            Failure::Failed(format!("cannot draw on this terminal: {error}"))
+            CommandError::Failed(format!("cannot draw on this terminal: {error}"))
         })
     }
 
@@ -39,9 +39,11 @@ impl Screen {
     }
 
     /// Draws; only changes are sent to the terminal.
-    pub fn draw(&mut self, draw: impl FnOnce(&mut Frame<'_>)) -> Result<(), Failure> {
+    pub fn draw(&mut self, draw: impl FnOnce(&mut Frame<'_>)) -> Result<(), CommandError> {
         let drawn = self.terminal.draw(draw);
-        drawn.map(drop).map_err(|error| Failure::Failed(format!("cannot draw on this terminal: {error}")))
+        drawn
+            .map(drop)
+            .map_err(|error| CommandError::Failed(format!("cannot draw on this terminal: {error}")))
     }
 }
 

@@ -9,7 +9,7 @@ use super::charts::Charts;
 use super::entries;
 use super::messages::{Completed, JobView, Reading, Request, WINDOW};
 use super::pane::Pane;
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 
 /// Index of the pane of walks.
 pub const WALKS: usize = 0;
@@ -116,7 +116,7 @@ impl WatchState {
     }
 
     /// Applies the result of a poll. On an error, the former state stays.
-    pub fn apply(&mut self, reading: Result<Reading, Failure>) {
+    pub fn apply(&mut self, reading: Result<Reading, CommandError>) {
         let Reading { snapshot, view, jobs, decisions } = match reading {
             Ok(reading) => reading,
             Err(failure) => {

@@ -268,7 +268,7 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
 #[test]
 fn the_last_state_stays_while_the_campaign_cannot_be_read() {
     let mut state = state();
-    state.apply(Err(Failure::Failed("the server is away".into())));
+    state.apply(Err(CommandError::Failed("the server is away".into())));
     let text = screen(&mut state, 80, 24);
     assert!(
         text.contains("outdated, cannot read the campaign: the server is away")

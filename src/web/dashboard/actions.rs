@@ -13,7 +13,7 @@ use wire::WalkId;
 
 use super::Dashboard;
 use super::response::{self, ApiError, ApiResult};
-use crate::exit_status::Failure;
+use crate::exit_status::CommandError;
 use crate::web::security;
 
 const HEADER: &str = "x-calmwalk-token";
@@ -27,10 +27,10 @@ pub struct Mutations {
 
 impl Mutations {
     /// Generates a random token.
-    pub fn new(store: Store) -> Result<Self, Failure> {
+    pub fn new(store: Store) -> Result<Self, CommandError> {
         let mut bytes = [0; 16];
         let read = File::open("/dev/urandom").and_then(|mut source| source.read_exact(&mut bytes));
-        read.map_err(|error| Failure::Failed(format!("cannot read /dev/urandom: {error}")))?;
+        read.map_err(|error| CommandError::Failed(format!("cannot read /dev/urandom: {error}")))?;
         Ok(Self { store, token: bytes.iter().map(|byte| format!("{byte:02x}")).collect() })
     }
 
