@@ -48,7 +48,7 @@ const FILE_KEYS: [&str; 4] =
 const MAX_SHOWN_SUPERCELLS: usize = 5;
 
 /// A campaign that is ready to run.
-pub struct Campaign {
+pub struct LoadedCampaign {
     /// The configuration.
     pub config: Config,
     /// Path of the configuration file.
@@ -77,7 +77,7 @@ pub struct Campaign {
     pub warnings: Vec<Warning>,
 }
 
-impl Campaign {
+impl LoadedCampaign {
     /// Reads a configuration and every file that it names.
     ///
     /// # Errors

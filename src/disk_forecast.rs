@@ -2,7 +2,7 @@
 
 use monitor::disk::DiskForecast;
 
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 
 /// Decision, candidate, job, attempt and label with their indexes, without what scales with the number of atoms,
 /// bytes.
@@ -17,7 +17,7 @@ const CHECKPOINT_BYTES_PER_ATOM: u64 = 450;
 pub const WAL_BYTES: u64 = 70_000_000;
 
 /// Estimates the disk space of a campaign that collects all that its configuration allows.
-pub fn estimate(campaign: &Campaign) -> DiskForecast {
+pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
     let config = &campaign.config;
     let features = campaign.artifact.mixture.dimension() as u64;
     let seeds = || campaign.seed_structures.iter().map(|named| named.seed.structure.len() as u64);

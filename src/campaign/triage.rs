@@ -8,7 +8,7 @@ use calm::rules::count_above;
 use calm::{Grades, Mixture};
 use potentials::grace::Grace;
 
-use super::{Campaign, SourcedStructure};
+use super::{LoadedCampaign, SourcedStructure};
 use crate::all_cores;
 
 /// What is noteworthy about a seed structure; the worst comes first.
@@ -53,7 +53,7 @@ pub struct SeedTriage<'a> {
 
 /// Grades every seed structure of a campaign, on all cores. The worst structures come first: by their remark, then by
 /// γ_max. Calls `on_graded` after each.
-pub fn triage(campaign: &Campaign, on_graded: impl Fn() + Sync) -> Vec<SeedTriage<'_>> {
+pub fn triage(campaign: &LoadedCampaign, on_graded: impl Fn() + Sync) -> Vec<SeedTriage<'_>> {
     let examiner = || Examiner::new(campaign);
     let mut all = all_cores::map(campaign.seed_structures.iter(), examiner, |examiner, seed| {
         let found = examiner.examine(seed);
@@ -67,14 +67,14 @@ pub fn triage(campaign: &Campaign, on_graded: impl Fn() + Sync) -> Vec<SeedTriag
 
 /// Examines one seed structure after another.
 struct Examiner<'a> {
-    campaign: &'a Campaign,
+    campaign: &'a LoadedCampaign,
     grace: Grace,
     neighbours: NeighbourList,
     grades: Grades,
 }
 
 impl<'a> Examiner<'a> {
-    fn new(campaign: &'a Campaign) -> Self {
+    fn new(campaign: &'a LoadedCampaign) -> Self {
         let model = Arc::clone(&campaign.model);
         let neighbours = NeighbourList::new(model.cutoff(), 0.0);
         Self { campaign, grace: Grace::new(model), neighbours, grades: Grades::default() }
@@ -131,7 +131,7 @@ impl PairDistance {
 }
 
 /// The elements of a structure of which the original mixture has no data.
-fn not_in_mixture(campaign: &Campaign, structure: &Structure) -> BTreeSet<Species> {
+fn not_in_mixture(campaign: &LoadedCampaign, structure: &Structure) -> BTreeSet<Species> {
     let (elements, mixture): (_, &Mixture) = (campaign.model.elements(), &campaign.artifact.mixture);
     let species: BTreeSet<_> = structure.species.iter().copied().collect();
     let has_data = |species: &Species| {

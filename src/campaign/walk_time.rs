@@ -11,7 +11,7 @@ use wire::messages::Assignment;
 use wire::{CampaignId, Origin, WalkConditions, WalkId};
 use workers::walk::{WalkContext, advance};
 
-use super::{Campaign, SourcedStructure};
+use super::{LoadedCampaign, SourcedStructure};
 use crate::exit_status::CommandError;
 
 /// Steps that are measured of each size, after the first.
@@ -49,7 +49,7 @@ impl StepTimes {
     ///
     /// # Errors
     /// The system cannot create the threads of a walker.
-    pub fn measure(campaign: &Campaign) -> Result<Self, CommandError> {
+    pub fn measure(campaign: &LoadedCampaign) -> Result<Self, CommandError> {
         let threads =
             Threads::new(campaign.config.run.threads_per_walker.get()).map_err(CommandError::failed)?;
         let mut settings = campaign.walk_settings();

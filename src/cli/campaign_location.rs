@@ -8,7 +8,7 @@ use serde_json::Value;
 use store::{DATABASE, Location, Store};
 
 use super::CommandError;
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::config::compare;
 
 /// The default directory of a campaign: the path of its configuration without the extension.
@@ -82,7 +82,7 @@ fn has_campaign(directory: &Path) -> bool {
 ///
 /// # Errors
 /// There is such a campaign.
-pub async fn check_former_locations(campaign: &Campaign, directory: &Path) -> Result<(), CommandError> {
+pub async fn check_former_locations(campaign: &LoadedCampaign, directory: &Path) -> Result<(), CommandError> {
     if campaign.config.run.store.is_some() || has_campaign(directory) {
         return Ok(());
     }
@@ -104,7 +104,7 @@ pub async fn check_former_locations(campaign: &Campaign, directory: &Path) -> Re
 }
 
 /// Whether the campaign in `former` belongs to this configuration. A campaign that cannot be read does not.
-async fn is_campaign_of(former: &Path, campaign: &Campaign, directory: &Path) -> bool {
+async fn is_campaign_of(former: &Path, campaign: &LoadedCampaign, directory: &Path) -> bool {
     let Ok(store) = Store::open_read_only(former).await else { return false };
     let in_force = store.campaign().await.ok().map(|found| found.configuration_in_force);
     let found = Provenance::read(&store).await.ok().flatten();

@@ -10,7 +10,7 @@ use serde_json::json;
 use store::{Location, Store};
 
 use super::{CommandError, ExitStatus, block_on, campaign_location};
-use crate::campaign::{Campaign, StepTimes, WalkTime};
+use crate::campaign::{LoadedCampaign, StepTimes, WalkTime};
 use crate::disk_forecast;
 use crate::output::{Table, count, print, print_json};
 use crate::wording;
@@ -77,7 +77,7 @@ struct CampaignEstimate {
 
 impl EstimateArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let campaign = Campaign::load(&self.config)?;
+        let campaign = LoadedCampaign::load(&self.config)?;
         let estimate = self.estimate(&campaign)?;
         if self.json {
             print_json(&as_json(&estimate))?;
@@ -87,7 +87,7 @@ impl EstimateArgs {
         Ok(ExitStatus::Done)
     }
 
-    fn estimate(&self, campaign: &Campaign) -> Result<CampaignEstimate, CommandError> {
+    fn estimate(&self, campaign: &LoadedCampaign) -> Result<CampaignEstimate, CommandError> {
         let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
         let times = StepTimes::measure(campaign)?;

@@ -13,7 +13,7 @@ use store::Location;
 
 use self::job_specs::JobSpecs;
 use super::{CommandError, ExitStatus, block_on, campaign_location};
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::config::Config;
 use crate::output::{count, log_and_print, log_and_warn, print};
 
@@ -116,7 +116,7 @@ impl LaunchArgs {
             let names = job_names(&config.location(&directory)?);
             block_on(self.stop(&slurm, &names))??;
         } else {
-            let campaign = Campaign::load(&self.config)?;
+            let campaign = LoadedCampaign::load(&self.config)?;
             if self.directory.is_none() {
                 block_on(campaign_location::check_former_locations(&campaign, &directory))??;
             }

@@ -26,7 +26,7 @@ use workers::labeller::GUARD;
 
 use super::campaign_location::{self, shell_argument};
 use super::{CommandError, ExitStatus, block_on, duration_between};
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::disk_forecast;
 use crate::duration::Duration;
 use crate::forgetting::{ForgettingRule, Measured};
@@ -87,7 +87,7 @@ pub struct RunArgs {
 impl RunArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         self.log.init("orchestrator")?;
-        let campaign = Campaign::load(&self.config)?;
+        let campaign = LoadedCampaign::load(&self.config)?;
         campaign.print_warnings();
         // The job of a campaign keeps its command when the configuration changes.
         if self.accept_reference_check.as_deref() == Some(ANY_CHECK) {
@@ -173,7 +173,7 @@ struct RunOptions<'a> {
 }
 
 async fn run(
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     directory: &Path,
     location: &Location,
     options: RunOptions<'_>,
@@ -283,7 +283,7 @@ async fn work(
 
 /// Creates the campaign, or opens an existing one and checks that it belongs to this configuration.
 async fn open_store(
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     location: &Location,
     origin: &Provenance,
     adopt: bool,
@@ -323,7 +323,7 @@ async fn open_store(
 }
 
 /// Stores what other processes need to know: the label method, the guard, the elements of the model and the disk forecast.
-async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), CommandError> {
+async fn write_metadata(campaign: &LoadedCampaign, store: &Store) -> Result<(), CommandError> {
     let text = |json: serde_json::Result<String>| json.map_err(CommandError::failed);
     let method = campaign.method()?;
     store.set_metadata(LABEL_METHOD_KEY, &text(serde_json::to_string(&method))?).await?;
@@ -338,7 +338,7 @@ async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), Comman
 
 /// Warns if the disk is too small for the campaign.
 async fn warn_if_disk_is_too_small(
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     directory: &Path,
     store: &Store,
 ) -> Result<(), CommandError> {
@@ -358,7 +358,7 @@ async fn warn_if_disk_is_too_small(
 }
 
 /// Why the campaign does not go on, and how it does.
-async fn paused_by_alarm(campaign: &Campaign, store: &Store) -> Result<CommandError, CommandError> {
+async fn paused_by_alarm(campaign: &LoadedCampaign, store: &Store) -> Result<CommandError, CommandError> {
     let values = MixtureValues(store.values().await?).training_frames();
     let measured = Measured::deserialize(values).map_err(CommandError::failed)?;
     Ok(CommandError::Failed(format!(
@@ -367,7 +367,7 @@ async fn paused_by_alarm(campaign: &Campaign, store: &Store) -> Result<CommandEr
     )))
 }
 
-async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, CommandError> {
+async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Result<Selector, CommandError> {
     let snapshot = SelectorSnapshot {
         walks: store.load_walks().await?,
         components: store.load_components().await?,

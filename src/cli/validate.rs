@@ -10,7 +10,7 @@ use calm::Artifact;
 
 use super::{CommandError, ExitStatus};
 use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::campaign::{Campaign, PairRange, Remark, SeedTriage, StepTimes, triage};
+use crate::campaign::{LoadedCampaign, PairRange, Remark, SeedTriage, StepTimes, triage};
 use crate::disk_forecast;
 use crate::output::{Bar, Table, count, decimals, print};
 use crate::runtime;
@@ -41,7 +41,7 @@ pub struct ValidateArgs {
 
 impl ValidateArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let campaign = Campaign::load(&self.config)?;
+        let campaign = LoadedCampaign::load(&self.config)?;
         campaign.print_warnings();
         let csv = self.csv.as_deref().map(AtomicFile::create).transpose()?;
         let seeds = graded(&campaign);
@@ -64,7 +64,7 @@ impl ValidateArgs {
 }
 
 /// Grades the seed structures with a progress bar.
-fn graded(campaign: &Campaign) -> Vec<SeedTriage<'_>> {
+fn graded(campaign: &LoadedCampaign) -> Vec<SeedTriage<'_>> {
     let (bar, done) = (Bar::new(Some(campaign.seed_structures.len() as u64), BAR), AtomicU64::new(0));
     triage(campaign, || bar.set(done.fetch_add(1, Ordering::Relaxed) + 1, || "seed structures".to_owned()))
 }
@@ -72,7 +72,7 @@ fn graded(campaign: &Campaign) -> Vec<SeedTriage<'_>> {
 /// How many seed structures are noteworthy, how long walks take, and whether walkers wait.
 fn write_seeds(
     out: &mut dyn Write,
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     seeds: &[SeedTriage<'_>],
     times: &StepTimes,
 ) -> io::Result<()> {
@@ -97,8 +97,8 @@ fn write_seeds(
     }
 }
 
-fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()> {
-    let Campaign { model, artifact: Artifact { mixture, .. }, seed_structures, .. } = campaign;
+fn write(out: &mut dyn Write, path: &Path, campaign: &LoadedCampaign) -> io::Result<()> {
+    let LoadedCampaign { model, artifact: Artifact { mixture, .. }, seed_structures, .. } = campaign;
     let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
     let architecture = model.description().architecture;
     let atoms = || seed_structures.iter().map(|named| named.seed.structure.len());

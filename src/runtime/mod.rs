@@ -30,7 +30,7 @@ use tokio_util::sync::CancellationToken;
 use wire::transport::Incoming;
 
 use self::throughput::Throughput;
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::config::{Config, QueueFull};
 use crate::exit_status::CommandError;
 use crate::forgetting::ForgettingRule;
@@ -45,7 +45,7 @@ const CHANNEL: usize = 64;
 #[derive(Clone, Copy)]
 pub struct RunContext<'a> {
     /// The configuration and the files that it names, loaded.
-    pub campaign: &'a Campaign,
+    pub campaign: &'a LoadedCampaign,
     /// The campaign's database.
     pub store: &'a Store,
     /// The database record of this process.
@@ -126,7 +126,7 @@ fn start_reactor(
 }
 
 /// Number of walkers to run in parallel, from the configuration.
-fn wanted_walkers(campaign: &Campaign) -> u32 {
+fn wanted_walkers(campaign: &LoadedCampaign) -> u32 {
     match campaign.config.run.walkers {
         0 => (cores() / campaign.config.run.threads_per_walker.get() as u32).max(1),
         wanted => wanted as u32,
@@ -134,7 +134,7 @@ fn wanted_walkers(campaign: &Campaign) -> u32 {
 }
 
 /// A sentence about walkers that can have nothing to do, if there are any: rounds have too few walks for them.
-pub fn idle_walkers(campaign: &Campaign) -> Option<String> {
+pub fn idle_walkers(campaign: &LoadedCampaign) -> Option<String> {
     let Config { campaign: section, run, .. } = &campaign.config;
     let walkers = wanted_walkers(campaign) as usize;
     let walks = run.walks_per_round.get() * (1 + usize::from(section.control));

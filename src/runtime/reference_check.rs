@@ -16,7 +16,7 @@ use wire::ContentHash;
 use workers::labeller::{LabelOutcome, RecordedLabel, give_up_others};
 
 use super::RunContext;
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print, log_and_warn, print_stderr};
 use crate::wording;
@@ -31,7 +31,7 @@ pub const ANY_CHECK: &str = "any";
 ///
 /// # Errors
 /// There is no check.
-pub fn identity(campaign: &Campaign) -> Result<String, CommandError> {
+pub fn identity(campaign: &LoadedCampaign) -> Result<String, CommandError> {
     if campaign.known.is_empty() {
         return Err(CommandError::Input(format!(
             "--accept-reference-check: {} has no label.reference_check.structures, so there is no check to accept",
@@ -41,7 +41,7 @@ pub fn identity(campaign: &Campaign) -> Result<String, CommandError> {
     Ok(begin(campaign).identity)
 }
 
-fn begin(campaign: &Campaign) -> ReferenceCheck {
+fn begin(campaign: &LoadedCampaign) -> ReferenceCheck {
     let bounds = campaign.config.label.reference_check.bounds();
     ReferenceCheck::begin(&campaign.protocol, &campaign.known, bounds)
 }
@@ -172,7 +172,7 @@ async fn make(
 }
 
 /// Metadata key of the progress of each label.
-fn keys(campaign: &Campaign) -> Vec<String> {
+fn keys(campaign: &LoadedCampaign) -> Vec<String> {
     let key = |known: &KnownStructure| {
         let structure = ContentHash::from_structure(&known.structure);
         format!("{METADATA_KEY}/{}/{structure}", campaign.protocol.hash)

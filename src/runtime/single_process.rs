@@ -21,7 +21,7 @@ use super::db_status::DbStatus;
 use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
 use super::{CHANNEL, ReactorTask, RunContext, start_reactor, wanted_walkers};
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 
 /// Runs the campaign until it is finished or stopped.
@@ -133,7 +133,7 @@ fn failure_of(labeller: Result<Result<(), StoreError>, JoinError>) -> Option<Com
 }
 
 fn start_walkers(
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &CancellationToken,
 ) -> Result<Vec<JoinHandle<walker::WalkerExit>>, CommandError> {

@@ -10,7 +10,7 @@ use wire::ipc::ServerHandle;
 
 use super::RunContext;
 use super::labellers::Labellers;
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 use crate::label_setup::LabelSetup;
 use crate::log;
@@ -18,7 +18,7 @@ use crate::process_config::{self, LabellerConfig, WalkerConfig};
 
 /// Returns the function that launches a walker.
 pub fn walker_launcher(
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     line: ServerHandle,
 ) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, CommandError> {
     let model = campaign.model_files()?;

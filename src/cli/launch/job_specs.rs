@@ -10,7 +10,7 @@ use wire::net::Tls;
 use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
 use super::{FOLDER, LaunchArgs, absolute};
 use crate::atomic_file::cannot_write;
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::exit_status::CommandError;
 use crate::runtime::reference_check;
 
@@ -32,7 +32,7 @@ pub struct JobSpecs {
 impl JobSpecs {
     pub fn new(
         launch: &LaunchArgs,
-        campaign: &Campaign,
+        campaign: &LoadedCampaign,
         directory: &Path,
         wanted: DesiredJobs,
     ) -> Result<Self, CommandError> {
@@ -166,7 +166,11 @@ struct Commands<'a> {
 }
 
 impl<'a> Commands<'a> {
-    fn new(launch: &'a LaunchArgs, campaign: &'a Campaign, directory: &Path) -> Result<Self, CommandError> {
+    fn new(
+        launch: &'a LaunchArgs,
+        campaign: &'a LoadedCampaign,
+        directory: &Path,
+    ) -> Result<Self, CommandError> {
         Ok(Self {
             launch,
             program: text(&std::env::current_exe().map_err(CommandError::failed)?)?,

@@ -6,7 +6,7 @@ use monitor::provenance::{self, ConfigMatch, Provenance};
 use serde_json::Value;
 use store::{Location, Store, unix_milliseconds};
 
-use crate::campaign::Campaign;
+use crate::campaign::LoadedCampaign;
 use crate::config::{self, Change, Refused, compare};
 use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print};
@@ -27,7 +27,7 @@ pub async fn record_start(
 
 /// Checks that the campaign in the store belongs to this configuration, and applies the permitted changes of the configuration.
 pub async fn resume(
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     store: &Store,
     location: &Location,
     origin: &Provenance,
@@ -103,7 +103,7 @@ async fn report_progress(
 
 /// The configuration differs from that of the campaign in a key that may not change; it may belong to another campaign.
 fn changed_content(
-    campaign: &Campaign,
+    campaign: &LoadedCampaign,
     location: &Location,
     other: Option<&Provenance>,
     refused: &Refused,
@@ -117,7 +117,7 @@ fn changed_content(
 }
 
 /// The configuration is compatible, but the campaign was started with another file.
-fn other_file(campaign: &Campaign, location: &Location, known: &Provenance) -> CommandError {
+fn other_file(campaign: &LoadedCampaign, location: &Location, known: &Provenance) -> CommandError {
     let (given, name, file) = (campaign.path.display(), &known.name, &known.file.path);
     let elsewhere = elsewhere(location);
     CommandError::Input(format!(

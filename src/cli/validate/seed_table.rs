@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::campaign::{Campaign, Remark, SeedTriage, SkippedStructure, StepTimes};
+use crate::campaign::{LoadedCampaign, Remark, SeedTriage, SkippedStructure, StepTimes};
 use crate::csv::{Csv, number};
 use crate::output::{Table, decimals};
 use crate::wording::cost::wall_time;
@@ -97,7 +97,7 @@ fn state(remark: &Remark) -> &'static str {
 }
 
 /// All seed structures: skipped ones, and the others in their order.
-pub fn csv(campaign: &Campaign, seeds: &[SeedTriage<'_>], times: &StepTimes) -> Csv {
+pub fn csv(campaign: &LoadedCampaign, seeds: &[SeedTriage<'_>], times: &StepTimes) -> Csv {
     let mut csv = Csv::new(&COLUMNS);
     campaign.skipped.iter().for_each(|skipped| csv.push(&skipped_row(skipped)));
     seeds.iter().for_each(|found| csv.push(&row(found, times)));
