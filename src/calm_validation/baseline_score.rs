@@ -5,7 +5,7 @@ use std::sync::Arc;
 use atoms::Structure;
 use calm::baselines::{Baseline, BaselineError, Kind};
 
-use super::{Rule, Score};
+use super::{AtomScore, DetectionRule};
 use crate::feature_variant::FeatureModel;
 use crate::features::FeatureCalculator;
 
@@ -28,16 +28,16 @@ impl BaselineScore {
     }
 }
 
-impl Score for BaselineScore {
+impl AtomScore for BaselineScore {
     fn name(&self) -> &str {
         &self.name
     }
 
-    fn rule(&self) -> Option<Rule> {
+    fn rule(&self) -> Option<DetectionRule> {
         rule(self.baseline.kind())
     }
 
-    fn for_thread(&self) -> Box<dyn Score> {
+    fn for_thread(&self) -> Box<dyn AtomScore> {
         let own = self.own.as_ref().map(|(model, _)| model.clone());
         Box::new(Self::new(self.name.clone(), Arc::clone(&self.baseline), own))
     }
@@ -79,13 +79,13 @@ pub fn score_own_features(
 
 /// D-optimality detects above 1, as in the paper. Other scores have no limit. Those that have a zero are
 /// judged as the paper judges the spread of an ensemble; the likelihood has none.
-fn rule(kind: Kind) -> Option<Rule> {
+fn rule(kind: Kind) -> Option<DetectionRule> {
     match kind {
         Kind::DOptimalityElement | Kind::DOptimalityCentred | Kind::DOptimalityComponent => {
-            Some(Rule::Threshold(1.0))
+            Some(DetectionRule::Threshold(1.0))
         }
         Kind::Llpr | Kind::LlprSum | Kind::LlprForces | Kind::Euclidean | Kind::KNearest => {
-            Some(Rule::TENFOLD)
+            Some(DetectionRule::TENFOLD)
         }
         Kind::Likelihood => None,
     }

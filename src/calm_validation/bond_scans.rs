@@ -7,7 +7,7 @@ use atoms::{Cell, Repetition, Species, Structure};
 use serde::Serialize;
 
 use super::detection::{COMPRESSION, Detection, LONGEST, detect};
-use super::{Grader, Progress, Settings, Subject, minimum};
+use super::{Subject, ValidationGrader, ValidationProgress, ValidationSettings, minimum};
 use crate::all_cores;
 
 /// Shortest distance of a scan, Å; half the equilibrium distance if that leaves too little compression, but at least
@@ -66,16 +66,16 @@ fn prototypes(species: Species) -> Vec<(Species, GroundState, bool)> {
 }
 
 /// Number of scans.
-pub fn count(settings: &Settings) -> usize {
+pub fn count(settings: &ValidationSettings) -> usize {
     2 * settings.elements.len()
 }
 
 /// Scans all elements.
-pub fn run(subject: &Subject, settings: &Settings, progress: &Progress) -> Vec<BondScan> {
+pub fn run(subject: &Subject, settings: &ValidationSettings, progress: &ValidationProgress) -> Vec<BondScan> {
     let scans: Vec<_> = settings.elements.iter().flat_map(|species| prototypes(*species)).collect();
     all_cores::map(
         scans.into_iter(),
-        || Grader::new(subject),
+        || ValidationGrader::new(subject),
         |grader, (species, expected, is_ground_state)| {
             let found = scan(grader, subject, settings, progress, (species, expected, is_ground_state));
             progress.advance();
@@ -91,10 +91,10 @@ pub fn distances(scans: &[BondScan]) -> BTreeMap<String, f64> {
 }
 
 fn scan(
-    grader: &mut Grader,
+    grader: &mut ValidationGrader,
     subject: &Subject,
-    settings: &Settings,
-    progress: &Progress,
+    settings: &ValidationSettings,
+    progress: &ValidationProgress,
     (species, expected, is_ground_state): (Species, GroundState, bool),
 ) -> BondScan {
     let prototype = expected.prototype;
@@ -140,7 +140,7 @@ fn scan(
 }
 
 impl ScanPoint {
-    fn new(grader: &mut Grader, structure: &Structure, distance: f64, subject: &Subject) -> Self {
+    fn new(grader: &mut ValidationGrader, structure: &Structure, distance: f64, subject: &Subject) -> Self {
         match grader.grade(structure) {
             Ok(graded) => Self {
                 distance,

@@ -6,7 +6,7 @@ use atoms::{Cell, Species, Structure};
 use potentials::grace::Projection;
 use serde::Serialize;
 
-use super::{Grader, Progress, Settings, Subject};
+use super::{Subject, ValidationGrader, ValidationProgress, ValidationSettings};
 use crate::all_cores;
 
 /// Two sets of places on an octagon with the same distances between their members, which neither rotation nor reflection turns into each
@@ -52,20 +52,20 @@ struct Environment {
 }
 
 /// Number of pairs.
-pub fn count(settings: &Settings) -> usize {
+pub fn count(settings: &ValidationSettings) -> usize {
     settings.elements.len()
 }
 
 /// The pairs of all elements, with their equilibrium distances, Å; elements whose clusters cannot be graded are left out.
 pub fn run(
     subject: &Subject,
-    settings: &Settings,
+    settings: &ValidationSettings,
     distances: &BTreeMap<String, f64>,
-    progress: &Progress,
+    progress: &ValidationProgress,
 ) -> Vec<Collision> {
     let found = all_cores::map(
         settings.elements.iter(),
-        || Grader::new(subject),
+        || ValidationGrader::new(subject),
         |grader, species| {
             let found = Collision::new(grader, subject, *species, RADIUS * distances[species.symbol()]);
             progress.advance();
@@ -76,7 +76,7 @@ pub fn run(
 }
 
 impl Collision {
-    fn new(grader: &mut Grader, subject: &Subject, species: Species, radius: f64) -> Option<Self> {
+    fn new(grader: &mut ValidationGrader, subject: &Subject, species: Species, radius: f64) -> Option<Self> {
         let mut of = |places: [u8; 4], turn: f64, mirror: f64| {
             Environment::new(grader, &cluster(species, radius, places, turn, mirror))
         };
@@ -116,7 +116,7 @@ impl FeatureDistance {
 
 impl Environment {
     /// The first atom of a cluster. `None` if it cannot be graded.
-    fn new(grader: &mut Grader, cluster: &Structure) -> Option<Self> {
+    fn new(grader: &mut ValidationGrader, cluster: &Structure) -> Option<Self> {
         let graded = grader.grade(cluster).ok()?;
         let grace = &grader.features.grace;
         let features = grace.features()[..grace.model().feature_dimension()].to_vec();

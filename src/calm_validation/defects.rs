@@ -8,7 +8,7 @@ use atoms::{Species, Structure, Vec3};
 use serde::Serialize;
 
 use super::grader::Graded;
-use super::{Grader, Progress, Settings, Subject};
+use super::{Subject, ValidationGrader, ValidationProgress, ValidationSettings};
 use crate::all_cores;
 
 /// Atoms whose distances differ by less are one shell, Å.
@@ -79,7 +79,7 @@ pub struct Shell {
 type Task = (Species, Prototype, f64, DefectKind, Option<Facet>);
 
 /// The defects of the crystals that elements really form.
-fn tasks(settings: &Settings, distance: impl Fn(Species) -> f64) -> Vec<Task> {
+fn tasks(settings: &ValidationSettings, distance: impl Fn(Species) -> f64) -> Vec<Task> {
     let of = |species: &Species| {
         let (species, prototype) = (*species, species.ground_state().prototype);
         let d = distance(species);
@@ -93,21 +93,21 @@ fn tasks(settings: &Settings, distance: impl Fn(Species) -> f64) -> Vec<Task> {
 }
 
 /// Number of defects.
-pub fn count(settings: &Settings) -> usize {
+pub fn count(settings: &ValidationSettings) -> usize {
     tasks(settings, |species| species.ground_state().distance).len()
 }
 
 /// Relaxes and grades the defects of all elements, with these equilibrium distances, Å.
 pub fn run(
     subject: &Subject,
-    settings: &Settings,
+    settings: &ValidationSettings,
     distances: &BTreeMap<String, f64>,
-    progress: &Progress,
+    progress: &ValidationProgress,
 ) -> Vec<Defect> {
     let tasks = tasks(settings, |species| distances[species.symbol()]);
     all_cores::map(
         tasks.into_iter(),
-        || Grader::new(subject),
+        || ValidationGrader::new(subject),
         |grader, task| {
             let defect = Defect::new(grader, settings, progress, task);
             progress.advance();
@@ -118,9 +118,9 @@ pub fn run(
 
 impl Defect {
     fn new(
-        grader: &mut Grader,
-        settings: &Settings,
-        progress: &Progress,
+        grader: &mut ValidationGrader,
+        settings: &ValidationSettings,
+        progress: &ValidationProgress,
         (species, prototype, distance, kind, facet): Task,
     ) -> Self {
         let (ideal, distances, centre) = ideal(species, prototype, distance, kind, facet);
@@ -196,9 +196,9 @@ fn ideal(
 
 /// The structure with relaxed positions, if that was asked for and is possible.
 fn relaxed(
-    grader: &mut Grader,
-    settings: &Settings,
-    progress: &Progress,
+    grader: &mut ValidationGrader,
+    settings: &ValidationSettings,
+    progress: &ValidationProgress,
     ideal: &Structure,
 ) -> (Structure, Option<Relaxation>) {
     let Some(fire) = settings.relaxation else { return (ideal.clone(), None) };
@@ -251,7 +251,7 @@ mod tests {
     #[test]
     fn every_crystal_has_its_defects() {
         let elements = ["Al", "W", "Si", "H", "Ti"].map(|symbol| symbol.parse().unwrap()).to_vec();
-        let settings = Settings {
+        let settings = ValidationSettings {
             elements,
             pairs: Vec::new(),
             scan_steps: 2,

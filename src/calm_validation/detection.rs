@@ -16,14 +16,14 @@ const NEAR: f64 = 0.05;
 /// When a score detects a regime (paper, 'Validation models, datasets and metrics').
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Rule {
+pub enum DetectionRule {
     /// Its largest value is above this.
     Threshold(f64),
     /// Its largest value is above this multiple of the median within 5 % of equilibrium.
     TimesMedian(f64),
 }
 
-impl Rule {
+impl DetectionRule {
     /// That of scores without a threshold.
     pub const TENFOLD: Self = Self::TimesMedian(10.0);
 }
@@ -53,7 +53,7 @@ pub fn detect(
     scan: &[(f64, Option<f64>)],
     equilibrium: f64,
     at_equilibrium: Option<f64>,
-    rule: Option<Rule>,
+    rule: Option<DetectionRule>,
 ) -> Detection {
     let within = |is_inside: &dyn Fn(f64) -> bool| -> Vec<f64> {
         scan.iter().filter(|(d, _)| is_inside(*d)).filter_map(|(_, score)| *score).collect()
@@ -65,9 +65,9 @@ pub fn detect(
     near.sort_by(f64::total_cmp);
     let median = analysis::quantile(&near, 0.5);
     let limit = match rule {
-        Some(Rule::Threshold(limit)) => Some(limit),
+        Some(DetectionRule::Threshold(limit)) => Some(limit),
         // A score may be infinite for all atoms of an element, which tells nothing.
-        Some(Rule::TimesMedian(factor)) => {
+        Some(DetectionRule::TimesMedian(factor)) => {
             median.map(|median| factor * median).filter(|limit| limit.is_finite())
         }
         None => None,
@@ -115,23 +115,23 @@ mod tests {
         (0..=45).map(|k| 1.5 + 0.1 * f64::from(k)).map(|d| (d, score(d))).collect()
     }
 
-    fn verdicts(score: impl Fn(f64) -> Option<f64>, rule: Rule) -> [Option<bool>; 3] {
+    fn verdicts(score: impl Fn(f64) -> Option<f64>, rule: DetectionRule) -> [Option<bool>; 3] {
         let found = detect(&scan(&score), 2.5, score(2.5), Some(rule));
         [found.compression, found.interpolation, found.stretching]
     }
 
     #[test]
     fn a_score_without_finite_values_decides_nothing() {
-        assert_eq!(verdicts(|_| Some(f64::INFINITY), Rule::TENFOLD), [None; 3]);
+        assert_eq!(verdicts(|_| Some(f64::INFINITY), DetectionRule::TENFOLD), [None; 3]);
         assert_eq!(
-            verdicts(|_| Some(f64::INFINITY), Rule::Threshold(1.0)),
+            verdicts(|_| Some(f64::INFINITY), DetectionRule::Threshold(1.0)),
             [Some(true), Some(false), Some(true)]
         );
     }
 
     #[test]
     fn regimes_are_where_the_paper_says() {
-        let rule = Rule::Threshold(1.0);
+        let rule = DetectionRule::Threshold(1.0);
         let valley = |d: f64| Some(0.5 + 2.0 * (d - 2.5).abs());
         assert_eq!(verdicts(valley, rule), [Some(true); 3]);
         // Compression is below 2.0 Å, stretching above 3.5 Å and below 6 Å.
@@ -148,7 +148,7 @@ mod tests {
 
     #[test]
     fn a_spread_is_compared_with_its_own_median() {
-        let rule = Rule::TimesMedian(10.0);
+        let rule = DetectionRule::TimesMedian(10.0);
         let rising = |factor: f64| move |d: f64| Some(if d > 3.5 { 0.01 * factor } else { 0.01 });
         assert_eq!(verdicts(rising(9.9), rule)[2], Some(false));
         assert_eq!(verdicts(rising(10.1), rule)[2], Some(true));
@@ -156,11 +156,12 @@ mod tests {
 
     #[test]
     fn what_is_not_in_the_scan_is_unknown() {
-        let found = detect(&scan(|_| Some(2.0)), 1.6, None, Some(Rule::Threshold(1.0)));
+        let found = detect(&scan(|_| Some(2.0)), 1.6, None, Some(DetectionRule::Threshold(1.0)));
         assert_eq!((found.compression, found.stretching), (None, Some(true)));
-        let found = detect(&scan(|_| Some(2.0)), 5.0, None, Some(Rule::Threshold(1.0)));
+        let found = detect(&scan(|_| Some(2.0)), 5.0, None, Some(DetectionRule::Threshold(1.0)));
         assert_eq!((found.compression, found.stretching), (Some(true), None));
-        let found = detect(&scan(|d| (d > 2.0).then_some(2.0)), 2.5, None, Some(Rule::Threshold(1.0)));
+        let found =
+            detect(&scan(|d| (d > 2.0).then_some(2.0)), 2.5, None, Some(DetectionRule::Threshold(1.0)));
         assert_eq!((found.compression, found.largest_in_compression), (None, None));
         let found = detect(&scan(|_| Some(2.0)), 2.5, None, None);
         assert_eq!((found.compression, found.largest_in_compression), (None, Some(2.0)));

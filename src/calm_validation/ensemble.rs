@@ -5,7 +5,7 @@ use std::sync::Arc;
 use atoms::Structure;
 use potentials::grace::GraceModel;
 
-use super::{Rule, Score};
+use super::{AtomScore, DetectionRule};
 use crate::features::FeatureCalculator;
 
 /// Scores all atoms of a structure by the standard deviation of the energy per atom over the models, eV.
@@ -22,16 +22,16 @@ impl EnergySpread {
     }
 }
 
-impl Score for EnergySpread {
+impl AtomScore for EnergySpread {
     fn name(&self) -> &str {
         "energy spread"
     }
 
-    fn rule(&self) -> Option<Rule> {
-        Some(Rule::TENFOLD)
+    fn rule(&self) -> Option<DetectionRule> {
+        Some(DetectionRule::TENFOLD)
     }
 
-    fn for_thread(&self) -> Box<dyn Score> {
+    fn for_thread(&self) -> Box<dyn AtomScore> {
         Box::new(Self::new(self.models.clone()))
     }
 

@@ -5,19 +5,19 @@ use std::sync::Arc;
 use atoms::Structure;
 use calm::{Grades, Mixture, neighbourhood_average};
 
-use super::{Rule, Subject};
+use super::{DetectionRule, Subject};
 use crate::features::FeatureCalculator;
 
 /// A score of atoms to compare γ with.
-pub trait Score: Send + Sync {
+pub trait AtomScore: Send + Sync {
     /// Its name.
     fn name(&self) -> &str;
 
     /// When it detects a regime of a bond scan; `None` for a score without zero.
-    fn rule(&self) -> Option<Rule>;
+    fn rule(&self) -> Option<DetectionRule>;
 
     /// The same score for another thread, with work arrays of its own.
-    fn for_thread(&self) -> Box<dyn Score>;
+    fn for_thread(&self) -> Box<dyn AtomScore>;
 
     /// One number for each atom, larger further outside. `elements` has the element index of each atom, `features` those that γ
     /// grades, `[atoms × D]`.
@@ -33,10 +33,10 @@ pub trait Score: Send + Sync {
 }
 
 /// The model with all scores, and work arrays.
-pub struct Grader {
+pub struct ValidationGrader {
     pub features: FeatureCalculator,
     mixture: Arc<Mixture>,
-    others: Vec<Box<dyn Score>>,
+    others: Vec<Box<dyn AtomScore>>,
     grades: Grades,
 }
 
@@ -50,7 +50,7 @@ pub struct Graded {
     pub averages: Vec<Vec<f64>>,
 }
 
-impl Grader {
+impl ValidationGrader {
     pub fn new(subject: &Subject) -> Self {
         Self {
             features: FeatureCalculator::new(subject.model.clone()),

@@ -11,7 +11,7 @@ mod tables;
 #[cfg(test)]
 mod tests;
 
-pub use self::collect::{GradedStructure, LabelledErrors, ScoreColumn};
+pub use self::collect::{LabelledErrors, LabelledStructure, ScoreColumn};
 pub use self::estimate::BOOTSTRAP;
 pub use self::figures::all as figures;
 pub use self::report::LabelledReport;

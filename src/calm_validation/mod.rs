@@ -36,17 +36,17 @@ pub use self::baseline_score::{BaselineScore, score_own_features};
 pub use self::bond_scans::BondScan;
 pub use self::collisions::Collision;
 pub use self::defects::Defect;
-pub use self::detection::{Detection, Rule};
+pub use self::detection::{Detection, DetectionRule};
 pub use self::ensemble::EnergySpread;
-pub use self::grader::{Grader, Score};
-pub use self::progress::Progress;
+pub use self::grader::{AtomScore, ValidationGrader};
+pub use self::progress::ValidationProgress;
 pub use self::solutions::Solution;
 pub use self::tables::{both, verdict};
 pub use self::text::{PAGE, files};
 
 /// What is tested, and how closely.
 #[derive(Clone, Debug, Serialize)]
-pub struct Settings {
+pub struct ValidationSettings {
     /// The elements with prototypes and defects.
     #[serde(skip)]
     pub elements: Vec<Species>,
@@ -72,7 +72,7 @@ pub struct Validation {
     /// Cutoff of the model, Å.
     pub cutoff: f64,
     /// How closely it was tested.
-    pub settings: Settings,
+    pub settings: ValidationSettings,
     /// The scores, γ first. Lists of scores below are in this order.
     pub scores: Vec<ScoreDescription>,
     /// Bond scans, of each element its ground state first.
@@ -93,7 +93,7 @@ pub struct ScoreDescription {
     /// Its name.
     pub name: String,
     /// When it detects a regime.
-    pub rule: Option<Rule>,
+    pub rule: Option<DetectionRule>,
     /// Whether it detects the regimes in the scans of all ground states.
     pub detection: Detection,
 }
@@ -104,15 +104,15 @@ pub struct Subject {
     pub model: Arc<GraceModel>,
     pub mixture: Arc<Mixture>,
     /// Scores to compare γ with.
-    pub others: Arc<[Box<dyn Score>]>,
+    pub others: Arc<[Box<dyn AtomScore>]>,
 }
 
 /// Runs all tests without labels, and adds what labelled structures say. `None` if it was stopped.
 pub fn run(
     subject: &Subject,
-    settings: Settings,
+    settings: ValidationSettings,
     labelled: Option<LabelledReport>,
-    progress: &Progress,
+    progress: &ValidationProgress,
 ) -> Result<Option<Validation>, CommandError> {
     progress.begin(
         bond_scans::count(&settings)
@@ -128,7 +128,7 @@ pub fn run(
     if progress.is_stopped() {
         return Ok(None);
     }
-    let described = |(k, (name, rule)): (usize, (String, Option<Rule>))| ScoreDescription {
+    let described = |(k, (name, rule)): (usize, (String, Option<DetectionRule>))| ScoreDescription {
         name,
         rule,
         detection: detection::of_all(&bond_scans, k),
@@ -148,8 +148,8 @@ pub fn run(
 
 impl Subject {
     /// Names and rules of all scores, γ first.
-    fn scores(&self) -> Vec<(String, Option<Rule>)> {
-        let gamma = ("γ".to_owned(), Some(Rule::Threshold(1.0)));
+    fn scores(&self) -> Vec<(String, Option<DetectionRule>)> {
+        let gamma = ("γ".to_owned(), Some(DetectionRule::Threshold(1.0)));
         let others = self.others.iter().map(|score| (score.name().to_owned(), score.rule()));
         [gamma].into_iter().chain(others).collect()
     }

@@ -7,14 +7,14 @@ use tokio_util::sync::CancellationToken;
 use crate::output::{Bar, count};
 
 /// Counts finished structures.
-pub struct Progress {
+pub struct ValidationProgress {
     bar: Bar,
     total: AtomicU64,
     done: AtomicU64,
     stop: CancellationToken,
 }
 
-impl Progress {
+impl ValidationProgress {
     pub fn new(bar: Bar, stop: CancellationToken) -> Self {
         Self { bar, total: AtomicU64::new(0), done: AtomicU64::new(0), stop }
     }

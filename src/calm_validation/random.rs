@@ -3,13 +3,13 @@
 use md::philox;
 
 /// A sequence of random numbers.
-pub struct Random {
+pub struct RandomSequence {
     key: [u32; 2],
     sequence: [u32; 2],
     position: u64,
 }
 
-impl Random {
+impl RandomSequence {
     /// Sequence number `sequence` of this random seed.
     pub fn new(seed: u64, sequence: u64) -> Self {
         Self { key: halves(seed), sequence: halves(sequence), position: 0 }

@@ -7,8 +7,8 @@ use atoms::{NeighbourList, Repetition, Species, Structure};
 use serde::Serialize;
 
 use super::bond_scans::scaled;
-use super::random::Random;
-use super::{Grader, Progress, Settings, Subject, minimum};
+use super::random::RandomSequence;
+use super::{Subject, ValidationGrader, ValidationProgress, ValidationSettings, minimum};
 use crate::all_cores;
 use crate::exit_status::CommandError;
 
@@ -67,7 +67,7 @@ pub struct FirstShell {
 }
 
 /// An atom of a solution.
-struct Atom {
+struct SolutionAtom {
     is_second: bool,
     /// Nearest neighbours of the second element.
     neighbours: usize,
@@ -75,7 +75,7 @@ struct Atom {
 }
 
 /// Number of compositions.
-pub fn count(settings: &Settings) -> usize {
+pub fn count(settings: &ValidationSettings) -> usize {
     settings.pairs.len() * COMPOSITIONS
 }
 
@@ -90,15 +90,15 @@ fn lattice([first, _]: [Species; 2]) -> (Prototype, Repetition, usize) {
 /// Scans all pairs of elements, with the equilibrium distances of the elements, Å.
 pub fn run(
     subject: &Subject,
-    settings: &Settings,
+    settings: &ValidationSettings,
     distances: &BTreeMap<String, f64>,
-    progress: &Progress,
+    progress: &ValidationProgress,
 ) -> Result<Vec<Solution>, CommandError> {
     let tasks = (0..settings.pairs.len()).flat_map(|pair| (0..COMPOSITIONS).map(move |step| (pair, step)));
     let tasks: Vec<_> = tasks.collect();
     let graded = all_cores::map(
         tasks.into_iter(),
-        || Grader::new(subject),
+        || ValidationGrader::new(subject),
         |grader, (pair, step)| {
             let found = composition(grader, settings, distances, progress, (pair, step));
             progress.advance();
@@ -120,12 +120,12 @@ pub fn run(
 
 /// One composition, with its atoms.
 fn composition(
-    grader: &mut Grader,
-    settings: &Settings,
+    grader: &mut ValidationGrader,
+    settings: &ValidationSettings,
     distances: &BTreeMap<String, f64>,
-    progress: &Progress,
+    progress: &ValidationProgress,
     (pair, step): (usize, usize),
-) -> Result<(Composition, Vec<Atom>), CommandError> {
+) -> Result<(Composition, Vec<SolutionAtom>), CommandError> {
     let elements = settings.pairs[pair];
     let fraction = step as f64 / (COMPOSITIONS - 1) as f64;
     let [first, second] = elements.map(|species| distances[species.symbol()]);
@@ -134,7 +134,7 @@ fn composition(
     let crystal = prototype.structure(elements[0], expected).repeated(repetition);
     let random = |structure: usize| {
         let sequence = (pair * COMPOSITIONS + step) * settings.solution_structures + structure;
-        Random::new(settings.seed, sequence as u64)
+        RandomSequence::new(settings.seed, sequence as u64)
     };
     let occupied = occupied(&crystal, elements[1], fraction, &mut random(0));
     let relaxed = minimum::nearest(1.0, SEARCHED.0, SEARCHED.1, |factor| {
@@ -157,7 +157,7 @@ fn composition(
         let Ok(graded) = grader.grade(&structure) else { continue };
         sums.add(&graded.scores, &graded.averages);
         let is_second = |atom: &usize| structure.species[*atom] == elements[1];
-        atoms.extend(graded.scores[0].iter().enumerate().map(|(atom, gamma)| Atom {
+        atoms.extend(graded.scores[0].iter().enumerate().map(|(atom, gamma)| SolutionAtom {
             is_second: is_second(&atom),
             neighbours: neighbours[atom].iter().filter(|atom| is_second(atom)).count(),
             gamma: *gamma,
@@ -168,7 +168,7 @@ fn composition(
 }
 
 /// The crystal with a random part of its sites occupied by another element.
-fn occupied(crystal: &Structure, other: Species, fraction: f64, random: &mut Random) -> Structure {
+fn occupied(crystal: &Structure, other: Species, fraction: f64, random: &mut RandomSequence) -> Structure {
     let mut structure = crystal.clone();
     let mut sites: Vec<_> = (0..crystal.len()).collect();
     // The first sites of a shuffled list (Fisher & Yates).
@@ -188,7 +188,7 @@ fn nearest_neighbours(crystal: &Structure, distance: f64) -> Result<Vec<Vec<usiz
 }
 
 /// Groups atoms by element and first shell, which has `shell` neighbours.
-fn first_shells(elements: &[String; 2], atoms: &[Atom], shell: usize) -> Vec<FirstShell> {
+fn first_shells(elements: &[String; 2], atoms: &[SolutionAtom], shell: usize) -> Vec<FirstShell> {
     let mut groups: BTreeMap<(bool, usize), (usize, f64)> = BTreeMap::new();
     for atom in atoms {
         let (number, sum) = groups.entry((atom.is_second, atom.neighbours)).or_default();
@@ -258,7 +258,8 @@ mod tests {
             assert_eq!((crystal.len(), expected), (128, shell));
             assert!(nearest_neighbours(&crystal, 2.7).unwrap().iter().all(|of| of.len() == shell));
             for (step, number) in [(0, 0), (1, 13), (5, 64), (10, 128)] {
-                let mixed = occupied(&crystal, pair[1], f64::from(step) / 10.0, &mut Random::new(3, 4));
+                let mixed =
+                    occupied(&crystal, pair[1], f64::from(step) / 10.0, &mut RandomSequence::new(3, 4));
                 assert_eq!(mixed.species.iter().filter(|species| **species == pair[1]).count(), number);
             }
         }
@@ -269,19 +270,20 @@ mod tests {
         let crystal = Prototype::Bcc.structure(elements()[0], 2.7).repeated(Repetition([4; 3]));
         let mut occupations = vec![0; crystal.len()];
         for number in 0..400 {
-            let mixed = occupied(&crystal, elements()[1], 0.25, &mut Random::new(1, number));
+            let mixed = occupied(&crystal, elements()[1], 0.25, &mut RandomSequence::new(1, number));
             let second = mixed.species.iter().map(|species| usize::from(*species == elements()[1]));
             occupations.iter_mut().zip(second).for_each(|(sum, second)| *sum += second);
         }
         // Binomial, 100 ± 8.7 of 400: five standard deviations.
         assert!(occupations.iter().all(|number| (57..143).contains(number)), "{occupations:?}");
-        let same = |number| occupied(&crystal, elements()[1], 0.25, &mut Random::new(1, number)).species;
+        let same =
+            |number| occupied(&crystal, elements()[1], 0.25, &mut RandomSequence::new(1, number)).species;
         assert!(same(7) == same(7) && same(7) != same(8));
     }
 
     #[test]
     fn atoms_are_grouped_by_their_first_shell() {
-        let atom = |is_second, neighbours, gamma| Atom { is_second, neighbours, gamma };
+        let atom = |is_second, neighbours, gamma| SolutionAtom { is_second, neighbours, gamma };
         let atoms = [atom(true, 2, 1.0), atom(false, 2, 9.0), atom(true, 2, 3.0), atom(true, 8, 5.0)];
         let found = first_shells(&elements().map(|species| species.to_string()), &atoms, 8);
         let of = |element: &str, fraction, atoms, gamma| FirstShell {

@@ -1,7 +1,7 @@
 //! The tables of the page.
 
 use super::detection::Detection;
-use super::{Rule, Validation, labelled};
+use super::{DetectionRule, Validation, labelled};
 use crate::page::{Cell, Table, count, percent, real, text};
 
 /// All tables with rows, in the order of the page.
@@ -50,8 +50,8 @@ fn detection(validation: &Validation) -> Table {
         table.rows.push(vec![
             text(&*score.name),
             text(match score.rule {
-                Some(Rule::Threshold(limit)) => format!("above {limit}"),
-                Some(Rule::TimesMedian(factor)) => format!("above {factor} × median at equilibrium"),
+                Some(DetectionRule::Threshold(limit)) => format!("above {limit}"),
+                Some(DetectionRule::TimesMedian(factor)) => format!("above {factor} × median at equilibrium"),
                 None => "no rule".into(),
             }),
             text(both(found)),

@@ -2,9 +2,9 @@
 
 use figures::{Axis, Colour, Figure, LegendKey, Panel, Rectangle, Scale};
 
-use super::super::detection::{COMPRESSION, LONGEST, Rule, STRETCHING};
+use super::super::detection::{COMPRESSION, DetectionRule, LONGEST, STRETCHING};
 use super::super::{BondScan, Validation};
-use super::layout::{Grid, axis, legend_height, legend_rows, letter, line, panel_name};
+use super::layout::{PanelGrid, axis, legend_height, legend_rows, letter, line, panel_name};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
 use crate::page::style::WIDTH;
@@ -22,7 +22,7 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
     }
     let keys = keys(validation);
     let top = 20.0 + legend_height(&keys);
-    let grid = Grid { number: scans.len(), height: ENERGIES + GAP + 110.0, top };
+    let grid = PanelGrid { number: scans.len(), height: ENERGIES + GAP + 110.0, top };
     let description = "Energy and extrapolation scores along bond scans of elemental crystals";
     let mut figure = Figure::new("bond-scans", description, WIDTH, grid.total_height());
     legend_rows(&mut figure, &keys);
@@ -73,8 +73,8 @@ fn draw_energies(figure: &mut Figure, scan: &BondScan, place: Rectangle, letter:
 /// What the scores of a scan are divided by, so that 1 is the limit of detection.
 fn limit(validation: &Validation, scan: &BondScan, score: usize) -> Option<f64> {
     match validation.scores[score].rule? {
-        Rule::Threshold(limit) => Some(limit),
-        Rule::TimesMedian(factor) => Some(factor * scan.detection[score].median_near_equilibrium?),
+        DetectionRule::Threshold(limit) => Some(limit),
+        DetectionRule::TimesMedian(factor) => Some(factor * scan.detection[score].median_near_equilibrium?),
     }
 }
 
@@ -118,7 +118,8 @@ fn draw_scores(
 }
 
 fn caption(validation: &Validation) -> String {
-    let relative = validation.scores.iter().any(|score| matches!(score.rule, Some(Rule::TimesMedian(_))));
+    let relative =
+        validation.scores.iter().any(|score| matches!(score.rule, Some(DetectionRule::TimesMedian(_))));
     let relative = match relative {
         true => {
             " Scores without a threshold are divided by ten times their median within 5 % of equilibrium."

@@ -4,7 +4,7 @@ use figures::{Axis, Colour, Figure, LegendKey, Marker, Panel, Rectangle, Scale, 
 
 use super::super::defects::{DefectKind, Shell};
 use super::super::{Defect, Validation};
-use super::layout::{Grid, axis, legend_height, legend_rows, letter, line, panel_name};
+use super::layout::{PanelGrid, axis, legend_height, legend_rows, letter, line, panel_name};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
 use crate::page::style::WIDTH;
@@ -21,7 +21,7 @@ pub fn draw(validation: &Validation, name: &'static str, kind: DefectKind) -> Re
     // One panel for each element; the facets of a surface share it.
     let panels: Vec<_> = graded.chunk_by(|a, b| a.element == b.element).collect();
     let keys = keys(kind, &panels);
-    let grid = Grid { number: panels.len(), height: 140.0, top: 20.0 + legend_height(&keys) };
+    let grid = PanelGrid { number: panels.len(), height: 140.0, top: 20.0 + legend_height(&keys) };
     let description = format!("Extrapolation grade by the distance to the defect: {name}");
     let mut figure = Figure::new(name, &description, WIDTH, grid.total_height());
     legend_rows(&mut figure, &keys);

@@ -5,7 +5,7 @@ use figures::{Anchor, Axis, Colour, Figure, LegendKey, Rectangle, Scale, Stroke,
 use crate::page::style::WIDTH;
 
 /// Panels in rows of at most three.
-pub struct Grid {
+pub struct PanelGrid {
     pub number: usize,
     /// Height of a panel, points.
     pub height: f64,
@@ -20,7 +20,7 @@ const RIGHT: f64 = 8.0;
 /// Widest single panel, points.
 const WIDEST: f64 = 330.0;
 
-impl Grid {
+impl PanelGrid {
     /// Height of the figure.
     pub fn total_height(&self) -> f64 {
         let rows = self.number.div_ceil(self.columns()) as f64;

@@ -4,7 +4,7 @@ use figures::{Axis, Colour, Figure, LegendKey, Marker, Panel, Scale};
 
 use super::super::solutions::{Composition, FirstShell};
 use super::super::{Solution, Validation};
-use super::layout::{Grid, axis, legend_rows, letter, line};
+use super::layout::{PanelGrid, axis, legend_rows, letter, line};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
 use crate::page::style::WIDTH;
@@ -21,7 +21,7 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
             false => "No structure could be graded.".into(),
         });
     }
-    let grid = Grid { number: 3 * solutions.len(), height: 120.0, top: 36.0 };
+    let grid = PanelGrid { number: 3 * solutions.len(), height: 120.0, top: 36.0 };
     let description = "Extrapolation grade of random solid solutions against composition";
     let mut figure = Figure::new("solutions", description, WIDTH, grid.total_height());
     let keys = [
@@ -37,7 +37,7 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
     Ok(FigureContent { figure, caption: caption(validation), numbers: numbers(validation) })
 }
 
-fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &Grid, first: usize) {
+fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &PanelGrid, first: usize) {
     let [a, b] = &solution.elements;
     let compositions = || solution.compositions.iter().filter(|of| of.structures > 0);
     let shares = |title: &str| Axis::new(title, Scale::Linear, 0.0, 100.0);

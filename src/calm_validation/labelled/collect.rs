@@ -30,7 +30,7 @@ pub struct ScoreColumn {
 
 /// A structure with its scores, predictions and labels.
 #[derive(Clone, Copy, Debug)]
-pub struct GradedStructure<'a> {
+pub struct LabelledStructure<'a> {
     /// Elements of the atoms, `[n]`.
     pub species: &'a [Species],
     /// Scores of the atoms, `[n]` for each column.
@@ -123,7 +123,7 @@ impl LabelledErrors {
     ///
     /// # Panics
     /// If the lengths of arrays differ, or if there is not one array of scores for each column.
-    pub fn add(&mut self, graded: &GradedStructure) {
+    pub fn add(&mut self, graded: &LabelledStructure) {
         let atoms = graded.species.len();
         let is_complete = graded.scores.iter().all(|scores| scores.len() == atoms);
         assert!(graded.scores.len() == self.columns.len() && is_complete, "a score of each atom and column");
@@ -144,7 +144,7 @@ impl LabelledErrors {
         self.structures += 1;
     }
 
-    fn add_atom(&mut self, graded: &GradedStructure, atom: usize, error: f64) {
+    fn add_atom(&mut self, graded: &LabelledStructure, atom: usize, error: f64) {
         let scores = || graded.scores.iter().map(|scores| scores[atom]);
         if !(error.is_finite() && scores().all(f64::is_finite)) {
             self.left_out += 1;
@@ -164,7 +164,7 @@ impl LabelledErrors {
 }
 
 impl SampledStructure {
-    fn of(graded: &GradedStructure) -> Self {
+    fn of(graded: &LabelledStructure) -> Self {
         let mut found = Self::default();
         let (predicted, labels) = (graded.predicted, graded.labels);
         if let (Some(model), Some(label)) = (predicted.energy, labels.energy) {

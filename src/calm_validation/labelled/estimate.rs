@@ -8,7 +8,9 @@ use analysis::{Bootstrap, ForceErrors};
 use self::atoms::AtomStatistics;
 use self::structures::StructureStatistics;
 use super::collect::{LabelledErrors, SampledAtom, THRESHOLDS};
-use super::report::{BootstrapSettings, Confident, ElementAuc, Estimate, LabelledReport, ScoreReport};
+use super::report::{
+    BootstrapSettings, Confident, ElementAuc, IntervalEstimate, LabelledReport, ScoreReport,
+};
 use super::report::{ErrorHistograms, MeanErrors};
 use crate::all_cores;
 
@@ -61,8 +63,8 @@ impl LabelledErrors {
             let (of, intervals) = (exact[k], &intervals[2 * k..]);
             MeanErrors {
                 number: of.number,
-                mean_absolute: Estimate { value: of.mean_absolute(), interval: intervals[0] },
-                root_mean_square: Estimate { value: of.root_mean_square(), interval: intervals[1] },
+                mean_absolute: IntervalEstimate { value: of.mean_absolute(), interval: intervals[0] },
+                root_mean_square: IntervalEstimate { value: of.root_mean_square(), interval: intervals[1] },
             }
         })
     }
@@ -77,7 +79,7 @@ impl LabelledErrors {
             intervals(bootstrap, |draw| atoms.values(&bootstrap.multiplicities(draw, atoms.structures)));
         let values = atoms.values(&vec![1; atoms.structures]);
         let estimates =
-            values.into_iter().zip(intervals).map(|(value, interval)| Estimate { value, interval });
+            values.into_iter().zip(intervals).map(|(value, interval)| IntervalEstimate { value, interval });
         let estimates: Vec<_> = estimates.collect();
         let of_columns = estimates.chunks(atoms.values_of_column());
         self.columns
@@ -86,7 +88,8 @@ impl LabelledErrors {
             .enumerate()
             .map(|(k, (column, estimates))| {
                 let mut next = estimates.iter().copied();
-                let mut take = |number: usize| -> Vec<Estimate> { next.by_ref().take(number).collect() };
+                let mut take =
+                    |number: usize| -> Vec<IntervalEstimate> { next.by_ref().take(number).collect() };
                 let [spearman, worst_decile, retention] = std::array::from_fn(|_| take(1)[0]);
                 let (auc, contamination) = (take(THRESHOLDS.len()), take(THRESHOLDS.len()));
                 let worst_decile_by_element = atoms.elements().zip(take(usize::MAX));
@@ -109,12 +112,17 @@ impl LabelledErrors {
     }
 
     /// Exact values with the intervals of these estimates.
-    fn confident(&self, column: usize, retention: Estimate, contamination: Vec<Estimate>) -> Confident {
+    fn confident(
+        &self,
+        column: usize,
+        retention: IntervalEstimate,
+        contamination: Vec<IntervalEstimate>,
+    ) -> Confident {
         let found = &self.exceedance[column];
         let exact = found.contamination().into_iter().zip(contamination);
         Confident {
-            retention: Estimate { value: found.retention(), ..retention },
-            contamination: exact.map(|(value, estimate)| Estimate { value, ..estimate }).collect(),
+            retention: IntervalEstimate { value: found.retention(), ..retention },
+            contamination: exact.map(|(value, estimate)| IntervalEstimate { value, ..estimate }).collect(),
         }
     }
 }

@@ -5,7 +5,7 @@ mod reliability;
 
 use ::figures::{Colour, Stroke};
 
-use super::report::{Estimate, LabelledReport};
+use super::report::{IntervalEstimate, LabelledReport};
 use crate::page::FigureEntry;
 
 /// The figures, none without force labels.
@@ -30,8 +30,8 @@ fn stroke(number: usize) -> Stroke {
 }
 
 /// Curve of estimates over thresholds, in runs without undefined values: (threshold, low, value, high).
-fn runs(thresholds: &[f64], estimates: &[Estimate]) -> Vec<Vec<(f64, f64, f64, f64)>> {
-    let point = |(x, estimate): (&f64, &Estimate)| {
+fn runs(thresholds: &[f64], estimates: &[IntervalEstimate]) -> Vec<Vec<(f64, f64, f64, f64)>> {
+    let point = |(x, estimate): (&f64, &IntervalEstimate)| {
         let value = estimate.value?;
         let (low, high) = estimate.interval.unwrap_or((value, value));
         Some((*x, low, value, high))

@@ -46,7 +46,7 @@ pub struct BootstrapSettings {
 
 /// A value with its confidence interval.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Estimate {
+pub struct IntervalEstimate {
     pub value: Option<f64>,
     pub interval: Option<(f64, f64)>,
 }
@@ -56,8 +56,8 @@ pub struct Estimate {
 pub struct MeanErrors {
     /// Number of differences.
     pub number: f64,
-    pub mean_absolute: Estimate,
-    pub root_mean_square: Estimate,
+    pub mean_absolute: IntervalEstimate,
+    pub root_mean_square: IntervalEstimate,
 }
 
 /// Offset of an element, eV/atom.
@@ -76,11 +76,11 @@ pub struct ScoreReport {
     /// Atoms with at most this score are taken to be reliable.
     pub limit: Option<f64>,
     /// Spearman's ρ of score and force error.
-    pub spearman: Estimate,
+    pub spearman: IntervalEstimate,
     /// Area under the ROC curve for force errors above each threshold.
-    pub auc: Vec<Estimate>,
+    pub auc: Vec<IntervalEstimate>,
     /// Area under the ROC curve for the tenth of the atoms of an element with the largest force errors: mean over elements.
-    pub worst_decile: Estimate,
+    pub worst_decile: IntervalEstimate,
     /// The same for each element.
     pub worst_decile_by_element: Vec<ElementAuc>,
     /// What the limit keeps.
@@ -100,16 +100,16 @@ pub struct ElementAuc {
     pub atoms: usize,
     /// The 90 % quantile of their force errors, eV/Å.
     pub threshold: f64,
-    pub auc: Estimate,
+    pub auc: IntervalEstimate,
 }
 
 /// The atoms with a score within its limit.
 #[derive(Clone, Debug, Serialize)]
 pub struct Confident {
     /// Their share of all atoms.
-    pub retention: Estimate,
+    pub retention: IntervalEstimate,
     /// Share of them with a force error above each threshold.
-    pub contamination: Vec<Estimate>,
+    pub contamination: Vec<IntervalEstimate>,
 }
 
 /// Force errors of the atoms in a bin of the score, eV/Å.

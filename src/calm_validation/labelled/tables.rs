@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use super::collect::LARGE_ERROR;
-use super::report::{Bin, Estimate, LabelledReport, MeanErrors, ScoreReport};
+use super::report::{Bin, IntervalEstimate, LabelledReport, MeanErrors, ScoreReport};
 use crate::output::{self, range};
 use crate::page::{Cell, Table, count, percent, real, text};
 
@@ -94,7 +94,7 @@ fn confident(report: &LabelledReport) -> Table {
     };
     let mut rows: Vec<_> = report.scores.iter().filter_map(row).collect();
     if !rows.is_empty() {
-        let estimate = |value| Estimate { value, interval: None };
+        let estimate = |value| IntervalEstimate { value, interval: None };
         let mut all = vec![text("all atoms")];
         all.extend(cells(estimate(Some(1.0)), 100.0, 1));
         let unfiltered = places.map(|place| estimate(place.and_then(|k| report.unfiltered[k])));
@@ -135,7 +135,7 @@ fn name(score: &ScoreReport) -> Cell {
 }
 
 /// Value and interval.
-fn cells(estimate: Estimate, factor: f64, digits: usize) -> [Cell; 2] {
+fn cells(estimate: IntervalEstimate, factor: f64, digits: usize) -> [Cell; 2] {
     let interval = estimate.interval.map(|(low, high)| [low, high].map(|x| real(factor * x, digits)));
     let text = |of: fn(&Cell) -> &String| {
         interval.as_ref().map_or(String::new(), |[low, high]| format!("{} to {}", of(low), of(high)))

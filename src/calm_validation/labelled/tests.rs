@@ -58,7 +58,7 @@ fn columns() -> Vec<ScoreColumn> {
 
 fn collected(mut errors: LabelledErrors, samples: &[Sample]) -> LabelledErrors {
     for Sample { species, scores: [a, b], predicted, labels } in samples {
-        errors.add(&GradedStructure { species, scores: &[a, b], predicted, labels });
+        errors.add(&LabelledStructure { species, scores: &[a, b], predicted, labels });
     }
     errors
 }

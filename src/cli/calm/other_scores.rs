@@ -12,7 +12,7 @@ use potentials::grace::{GraceModel, PullBack};
 
 use super::scorer::Scorer;
 use crate::calm_validation::labelled::ScoreColumn;
-use crate::calm_validation::{BaselineScore, Score, score_own_features};
+use crate::calm_validation::{AtomScore, BaselineScore, score_own_features};
 use crate::cli::CommandError;
 use crate::feature_variant::FeatureModel;
 use crate::features::{FeatureCalculator, FeatureError};
@@ -94,13 +94,13 @@ impl OtherScores {
     }
 
     /// The baselines as scores that `calm validate` compares γ with, named as in [`Self::score_columns`].
-    pub fn baselines(&self) -> Vec<Box<dyn Score>> {
-        let of_file = |file: &Scores| -> Vec<Box<dyn Score>> {
+    pub fn baselines(&self) -> Vec<Box<dyn AtomScore>> {
+        let of_file = |file: &Scores| -> Vec<Box<dyn AtomScore>> {
             let of = |(name, baseline): &(String, Arc<Baseline>)| {
                 let needs_own = !file.is_graded || baseline.kind().has_force_form();
                 let own = needs_own.then(|| file.model.clone());
                 let score = BaselineScore::new(name.replace('_', "-"), Arc::clone(baseline), own);
-                Box::new(score) as Box<dyn Score>
+                Box::new(score) as Box<dyn AtomScore>
             };
             file.baselines.iter().map(of).collect()
         };

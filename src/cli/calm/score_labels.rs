@@ -10,7 +10,7 @@ use super::score_table::ScoreTable;
 use super::scorer::Scorer;
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::calm_validation::labelled::{
-    self, BOOTSTRAP, GradedStructure, LabelledErrors, LabelledReport, ScoreColumn,
+    self, BOOTSTRAP, LabelledErrors, LabelledReport, LabelledStructure, ScoreColumn,
 };
 use crate::cli::CommandError;
 use crate::output::{count, log_and_warn, print};
@@ -57,7 +57,7 @@ impl ScoreLabels {
         let own = [scorer.grades.gamma.as_slice(), &scorer.gamma_nbr];
         let scores: Vec<_> =
             own.into_iter().chain(others.iter().map(|(_, values)| values.as_slice())).collect();
-        self.errors.add(&GradedStructure {
+        self.errors.add(&LabelledStructure {
             species: &frame.structure.species,
             scores: &scores,
             predicted: &predicted,

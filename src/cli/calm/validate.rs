@@ -15,7 +15,8 @@ use super::scorer::Scorer;
 use super::validate_labels;
 use crate::atomic_file::refuse_to_replace;
 use crate::calm_validation::{
-    self, EnergySpread, PAGE, Progress, Score, Settings, Subject, Validation, both, labelled, verdict,
+    self, AtomScore, EnergySpread, PAGE, Subject, Validation, ValidationProgress, ValidationSettings, both,
+    labelled, verdict,
 };
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
@@ -101,7 +102,7 @@ impl CalmValidateArgs {
                 found
             }
         };
-        let progress = Progress::new(Bar::new(Some(1), BAR), stop);
+        let progress = ValidationProgress::new(Bar::new(Some(1), BAR), stop);
         let subject = Subject { model, mixture, others };
         let Some(validation) = calm_validation::run(&subject, settings, labelled, &progress)? else {
             return Ok(stopped());
@@ -136,7 +137,7 @@ impl CalmValidateArgs {
     }
 
     /// The spread of the energies, if there are further models.
-    fn ensemble(&self, model: &Arc<GraceModel>) -> Result<Option<Box<dyn Score>>, CommandError> {
+    fn ensemble(&self, model: &Arc<GraceModel>) -> Result<Option<Box<dyn AtomScore>>, CommandError> {
         let mut models = vec![Arc::clone(model)];
         for path in &self.ensemble {
             let other = GraceModel::load(path).map_err(CommandError::input)?;
@@ -147,10 +148,10 @@ impl CalmValidateArgs {
             }
             models.push(Arc::new(other));
         }
-        Ok((models.len() > 1).then(|| Box::new(EnergySpread::new(models)) as Box<dyn Score>))
+        Ok((models.len() > 1).then(|| Box::new(EnergySpread::new(models)) as Box<dyn AtomScore>))
     }
 
-    fn settings(&self, model: &GraceModel) -> Result<Settings, CommandError> {
+    fn settings(&self, model: &GraceModel) -> Result<ValidationSettings, CommandError> {
         let known = model.elements();
         let names = || known.iter().map(|species| species.symbol()).collect::<Vec<_>>().join(", ");
         for species in self.elements.iter().chain(self.pairs.iter().flatten()) {
@@ -170,7 +171,7 @@ impl CalmValidateArgs {
                 elements.push(*species);
             }
         }
-        Ok(Settings {
+        Ok(ValidationSettings {
             elements,
             pairs,
             scan_steps: self.scan_steps.get(),

@@ -2,7 +2,7 @@
 
 use ::figures::{Anchor, Axis, Colour, Figure, Panel, Rectangle, Scale, Stroke};
 
-use super::super::report::{Estimate, LabelledReport};
+use super::super::report::{IntervalEstimate, LabelledReport};
 use super::{runs, stroke};
 use crate::csv::{Csv, number};
 use crate::page::style::WIDTH;
@@ -23,7 +23,7 @@ pub fn contamination(report: &LabelledReport) -> FigureEntry {
     let y = Axis::new("probability of a larger error", Scale::Linear, 0.0, 1.0);
     let mut chart = Chart::new("contamination", "Contamination of the confident set", x, y);
     chart.panel.vertical_line(0.5);
-    let all = report.unfiltered.iter().map(|value| Estimate { value: *value, interval: None });
+    let all = report.unfiltered.iter().map(|value| IntervalEstimate { value: *value, interval: None });
     chart.curve("no filter", Colour::INK.dashed(1.1), &report.thresholds, &all.collect::<Vec<_>>());
     for (k, score) in report.scores.iter().enumerate() {
         let (Some(limit), Some(confident)) = (score.limit, &score.confident) else { continue };
@@ -87,7 +87,7 @@ impl Chart {
     }
 
     /// Draws a curve with its interval, and its entry of the legend.
-    fn curve(&mut self, name: &str, stroke: Stroke, thresholds: &[f64], estimates: &[Estimate]) {
+    fn curve(&mut self, name: &str, stroke: Stroke, thresholds: &[f64], estimates: &[IntervalEstimate]) {
         for run in runs(thresholds, estimates) {
             let band: Vec<_> = run.iter().map(|(x, low, _, high)| (*x, *low, *high)).collect();
             if run.iter().any(|(_, low, _, high)| low < high) {
