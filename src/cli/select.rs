@@ -15,8 +15,8 @@ use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::file_hash;
 use crate::output::{Table, count, decimals, print, print_json, print_stderr};
 use crate::selection::{
-    CampaignCandidates, GradedPool, Grading, Part, Pick, Picks, PoolFiles, Rules, Source, Strategy, frames,
-    pick,
+    CampaignCandidates, GradedPool, Pick, Picks, PoolFiles, PoolGrading, Rules, Strategy, StrategyQuota,
+    StructureSource, frames, pick,
 };
 use crate::signals::stop_token;
 use crate::structure_files::StructureReadingArgs;
@@ -63,7 +63,7 @@ pub struct SelectArgs {
     declined: bool,
     /// Strategies in order, each with its number of structures: greedy, fps, fps-all, d-optimal, random, random-extrap
     #[arg(long, value_name = "NAME[:N]", num_args = 1.., value_delimiter = ',', default_value = "greedy")]
-    strategy: Vec<Part>,
+    strategy: Vec<StrategyQuota>,
     /// Number of structures, for a single strategy [default for greedy: all that it finds]
     #[arg(long, short = 'n', value_name = "N")]
     number: Option<usize>,
@@ -114,8 +114,9 @@ impl SelectArgs {
         let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
         let (model, mixture) = (features.model, Arc::new(artifact.mixture));
 
-        let needed =
-            parts.iter().find_map(|Part { strategy, .. }| Some((strategy, strategy.use_of_statistics()?)));
+        let needed = parts
+            .iter()
+            .find_map(|StrategyQuota { strategy, .. }| Some((strategy, strategy.use_of_statistics()?)));
         if let Some((strategy, uses)) = needed
             && !mixture.can_be_updated()
         {
@@ -126,7 +127,7 @@ impl SelectArgs {
             )));
         }
         let mut pool = PoolFiles { files, campaigns: self.campaigns()? };
-        let grading = Grading {
+        let grading = PoolGrading {
             model: Arc::clone(&model),
             mixture: Arc::clone(&mixture),
             window,
@@ -145,7 +146,7 @@ impl SelectArgs {
         let rules = Rules { parts, update_target: target, floor, seed: self.rng_seed };
         let Some(picks) = pick(&graded, &mixture, &rules, &grading.stop)? else { return interrupted() };
         self.write(&pool, &graded, &picks.picks)?;
-        let report = Report {
+        let report = SelectionReport {
             command: &self,
             model: &model,
             files: &pool,
@@ -158,7 +159,7 @@ impl SelectArgs {
     }
 
     /// The strategies with the numbers of structures that they pick.
-    fn parts(&self) -> Result<Vec<Part>, CommandError> {
+    fn parts(&self) -> Result<Vec<StrategyQuota>, CommandError> {
         let mut parts = self.strategy.clone();
         match (parts.as_mut_slice(), self.number) {
             (_, Some(0)) => return Err(CommandError::Input("-n 0: expected a number above 0".to_owned())),
@@ -210,7 +211,7 @@ impl SelectArgs {
         parent.unwrap_or(Path::new(".")).to_owned()
     }
 
-    fn floor(&self, parts: &[Part], dimension: usize) -> Option<u64> {
+    fn floor(&self, parts: &[StrategyQuota], dimension: usize) -> Option<u64> {
         let greedy_only = parts.iter().all(|part| part.strategy == Strategy::Greedy);
         match self.min_per_element {
             _ if self.no_element_floors => None,
@@ -245,7 +246,7 @@ fn all_cores() -> usize {
 }
 
 /// What is said of a selection.
-struct Report<'a> {
+struct SelectionReport<'a> {
     command: &'a SelectArgs,
     model: &'a GraceModel,
     files: &'a PoolFiles,
@@ -262,7 +263,7 @@ struct Element {
     is_short: bool,
 }
 
-impl Report<'_> {
+impl SelectionReport<'_> {
     fn print(&self) -> Result<(), CommandError> {
         if self.command.json { print_json(&self.json()) } else { self.print_tables() }
     }
@@ -398,11 +399,11 @@ impl Report<'_> {
     fn pick(&self, pick: &Pick, rank: u64) -> Value {
         let mut value = json!({ "rank": rank, "strategy": pick.strategy, "gamma_max": pick.gamma_max });
         match self.pool.structures[pick.structure].source {
-            Source::File { file, frame } => {
+            StructureSource::File { file, frame } => {
                 value["source_file"] = json!(self.files.files.files[file as usize].path.to_string_lossy());
                 value["source_frame"] = json!(frame);
             }
-            Source::Candidate { campaign, decision } => {
+            StructureSource::Candidate { campaign, decision } => {
                 value["campaign"] = json!(self.files.campaigns[campaign as usize].id);
                 value["decision"] = json!(decision);
             }

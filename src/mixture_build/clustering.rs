@@ -5,10 +5,10 @@ use std::sync::{Mutex, PoisonError};
 
 use calm::build::{BuildSettings, Partitioner, ShardClustering};
 
-use super::Build;
+use super::MixtureBuild;
 use super::cluster_log::KnownShards;
 use super::passes::ShardResult;
-use super::progress::Progress;
+use super::progress::PassProgress;
 use super::state::Partition;
 use super::stream::{Shard, ShardHash};
 use super::workers::{Counters, run_pass};
@@ -24,7 +24,7 @@ pub(super) struct Clustered {
     pub known: KnownShards,
 }
 
-impl Build {
+impl MixtureBuild {
     /// Pass 1. `None` once it was stopped.
     pub(super) fn partition(&mut self) -> Result<Option<Partition>, CommandError> {
         if let Some(partition) = self.state.partition()? {
@@ -51,7 +51,7 @@ impl Build {
             (0..elements).map(|element| ShardClustering::new(settings, shard, element).map(Some)).collect()
         };
         let counters = Counters::default();
-        let progress = Progress::new(1, work.part, None, *bytes, &counters);
+        let progress = PassProgress::new(1, work.part, None, *bytes, &counters);
         let ended = run_pass(
             work,
             is_finished,

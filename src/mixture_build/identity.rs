@@ -27,14 +27,14 @@ pub struct Identity {
     /// BLAKE3 of the projection of the features, which a model without one gets from the random seed.
     projection: String,
     pub settings: BuildSettings,
-    files: Vec<FileIdentity>,
+    files: Vec<DataFileIdentity>,
     /// `--where`
     filter: Option<String>,
     dump_elements: Vec<Species>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct FileIdentity {
+struct DataFileIdentity {
     /// As given.
     path: String,
     weight: f64,
@@ -47,7 +47,7 @@ impl Identity {
         settings: BuildSettings,
         data: &StructureFiles,
     ) -> Self {
-        let named = |file: &StructureFile| FileIdentity {
+        let named = |file: &StructureFile| DataFileIdentity {
             path: file.path.display().to_string(),
             weight: file.weight,
         };
@@ -86,7 +86,7 @@ impl Identity {
         same(PROJECTION, &began.projection, &self.projection)?;
         same("its --candidates", list(&old.candidates), list(&new.candidates))?;
         same("its --shard-size", old.shard_size, new.shard_size)?;
-        let names = |files: &[FileIdentity]| -> String {
+        let names = |files: &[DataFileIdentity]| -> String {
             files.iter().map(|file| file.path.as_str()).collect::<Vec<_>>().join(" ")
         };
         same("its list of data files", names(&began.files), names(&self.files))?;
@@ -122,7 +122,7 @@ mod tests {
     #[test]
     fn every_difference_is_named() {
         let settings = BuildSettings { dimension: 3, seed: 42, candidates: vec![1, 2], shard_size: 10 };
-        let file = FileIdentity { path: "a.xyz".into(), weight: 1.0 };
+        let file = DataFileIdentity { path: "a.xyz".into(), weight: 1.0 };
         let began = Identity {
             format: FORMAT,
             instructions: "x86_64 avx2".into(),

@@ -10,13 +10,13 @@ use potentials::grace::GraceModel;
 use super::clustering::Clustered;
 use super::identity::Identity;
 use super::mixture;
-use super::part::Part;
+use super::part::BuildPart;
 use super::state::{BuildState, PartEnd, Partition, RunningSums};
 use super::sums::{components_from_sums, histograms_from_sums};
 use crate::exit_status::CommandError;
 
 /// The state of a build in parts.
-pub struct Merge {
+pub struct PartsMerge {
     state: BuildState,
     identity: Identity,
 }
@@ -29,7 +29,7 @@ pub enum Merged {
     Mixture(Box<BuiltMixture>),
 }
 
-impl Merge {
+impl PartsMerge {
     /// Opens the state of the build of `output`, whose model's file has the BLAKE3 hash `model_hash`.
     ///
     /// # Errors
@@ -84,7 +84,7 @@ impl Merge {
     /// What all parts found in pass 1.
     fn pass_1(&self) -> Result<Clustered, CommandError> {
         let ends = self.state.part_ends()?;
-        let done = |part: Part| ends.contains_key(&part);
+        let done = |part: BuildPart| ends.contains_key(&part);
         let parts = complete(1, ends.keys().copied(), done)?;
         let (mut structures, mut hashes) = (None, BTreeMap::new());
         for part in parts {
@@ -108,8 +108,9 @@ impl Merge {
     fn sums(&self, pass: usize, partition: &Partition) -> Result<RunningSums, CommandError> {
         let shards = partition.hashes.len() as u64;
         let mut found = self.state.part_sums(pass)?;
-        let done =
-            |part: Part| part.count(shards) == found.get(&part).map_or(0, |sums| sums.finished.len() as u64);
+        let done = |part: BuildPart| {
+            part.count(shards) == found.get(&part).map_or(0, |sums| sums.finished.len() as u64)
+        };
         let parts = complete(pass, found.keys().copied(), done)?;
         let mut all =
             RunningSums { elements: vec![None; partition.elements.len()], ..RunningSums::default() };
@@ -130,14 +131,14 @@ impl Merge {
 /// The parts of a division of which all are done, of those that have begun.
 fn complete(
     pass: usize,
-    begun: impl Iterator<Item = Part>,
-    done: impl Fn(Part) -> bool,
-) -> Result<Vec<Part>, CommandError> {
-    let mut divisions: Vec<u64> = begun.map(Part::of).collect();
+    begun: impl Iterator<Item = BuildPart>,
+    done: impl Fn(BuildPart) -> bool,
+) -> Result<Vec<BuildPart>, CommandError> {
+    let mut divisions: Vec<u64> = begun.map(BuildPart::of).collect();
     divisions.sort_unstable();
     divisions.dedup();
-    if let Some(of) = divisions.iter().find(|of| Part::all(**of).all(&done)) {
-        return Ok(Part::all(*of).collect());
+    if let Some(of) = divisions.iter().find(|of| BuildPart::all(**of).all(&done)) {
+        return Ok(BuildPart::all(*of).collect());
     }
     let Some(of) = divisions.last() else {
         return Err(CommandError::Failed(format!(
@@ -145,7 +146,7 @@ fn complete(
         )));
     };
     let missing: Vec<String> =
-        Part::all(*of).filter(|part| !done(*part)).take(10).map(|part| part.to_string()).collect();
+        BuildPart::all(*of).filter(|part| !done(*part)).take(10).map(|part| part.to_string()).collect();
     Err(CommandError::Failed(format!(
         "pass {pass} is not done: missing are the parts {}",
         missing.join(", ")

@@ -25,15 +25,15 @@ use calm::build::{
 use potentials::grace::GraceModel;
 
 use self::identity::Identity;
-pub use self::merge::{Merge, Merged};
-pub use self::part::Part;
+pub use self::merge::{Merged, PartsMerge};
+pub use self::part::BuildPart;
 use self::state::{BuildState, PartEnd};
 pub use self::workers::Work;
 use crate::exit_status::CommandError;
 use crate::output::print_stderr;
 
 /// A build under way.
-pub struct Build {
+pub struct MixtureBuild {
     work: Work,
     settings: BuildSettings,
     state: BuildState,
@@ -41,7 +41,7 @@ pub struct Build {
     bytes: u64,
 }
 
-impl Build {
+impl MixtureBuild {
     /// Begins a build, or continues the one whose state lies beside `output`. Of a part of the work, other parts may be under way.
     ///
     /// `model_hash` is the BLAKE3 hash of the model's file, `projection` that of its features.
@@ -59,7 +59,7 @@ impl Build {
         ShardClustering::new(&settings, 0, 0).map_err(CommandError::input)?;
         let identity = Identity::new(model_hash, projection, settings.clone(), &work.files);
         let (state, exists) = match work.part {
-            Part::WHOLE => BuildState::open(output, &identity, restart)?,
+            BuildPart::WHOLE => BuildState::open(output, &identity, restart)?,
             part => BuildState::open_part(output, &identity, part)?,
         };
         if exists {

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 /// Every n-th shard, from shard i − 1: part i of n.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-pub struct Part {
+pub struct BuildPart {
     /// i, from 1.
     number: u64,
     /// n
@@ -17,7 +17,7 @@ pub struct Part {
 /// More parts than any cluster has.
 const MAX_PARTS: u64 = 100_000;
 
-impl Part {
+impl BuildPart {
     /// All shards.
     pub const WHOLE: Self = Self { number: 1, of: 1 };
 
@@ -58,13 +58,13 @@ impl Part {
 }
 
 /// `2/8`
-impl fmt::Display for Part {
+impl fmt::Display for BuildPart {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}/{}", self.number, self.of)
     }
 }
 
-impl FromStr for Part {
+impl FromStr for BuildPart {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -82,9 +82,9 @@ mod tests {
     fn every_shard_is_in_one_part() {
         for of in 1..8 {
             for shards in 0..20 {
-                let counts: Vec<u64> = Part::all(of).map(|part| part.count(shards)).collect();
+                let counts: Vec<u64> = BuildPart::all(of).map(|part| part.count(shards)).collect();
                 assert_eq!(counts.iter().sum::<u64>(), shards);
-                for (part, count) in Part::all(of).zip(counts) {
+                for (part, count) in BuildPart::all(of).zip(counts) {
                     assert_eq!((0..shards).filter(|shard| part.has(*shard)).count() as u64, count);
                 }
             }
@@ -93,12 +93,12 @@ mod tests {
 
     #[test]
     fn names_are_read_back() {
-        let part: Part = "2/8".parse().unwrap();
+        let part: BuildPart = "2/8".parse().unwrap();
         assert_eq!((part.to_string(), part.file_name()), ("2/8".to_owned(), "2of8".to_owned()));
-        assert_eq!(Part::from_file_name("2of8"), Some(part));
+        assert_eq!(BuildPart::from_file_name("2of8"), Some(part));
         for wrong in ["", "2", "0/8", "9/8", "1/0", "-1/2", "a/b", "1/100001", "1.5/2"] {
-            assert!(wrong.parse::<Part>().is_err(), "{wrong}");
+            assert!(wrong.parse::<BuildPart>().is_err(), "{wrong}");
         }
-        assert_eq!(Part::from_file_name("0of2"), None);
+        assert_eq!(BuildPart::from_file_name("0of2"), None);
     }
 }

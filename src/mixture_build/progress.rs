@@ -4,7 +4,7 @@ use std::cell::Cell;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use super::part::Part;
+use super::part::BuildPart;
 use super::workers::Counters;
 use crate::output::{self, Bar, print_stderr};
 
@@ -20,7 +20,7 @@ const PASSES: usize = 3;
 const PARTS: u64 = 10_000;
 
 /// The progress of one pass.
-pub struct Progress<'a> {
+pub struct PassProgress<'a> {
     pass: usize,
     /// Passes that this process takes after it.
     later: usize,
@@ -34,12 +34,12 @@ pub struct Progress<'a> {
     line: Cell<Instant>,
 }
 
-impl<'a> Progress<'a> {
+impl<'a> PassProgress<'a> {
     /// Begins a pass. A part of the work ends with it, and has no `total`.
-    pub fn new(pass: usize, part: Part, total: Option<u64>, bytes: u64, counters: &'a Counters) -> Self {
+    pub fn new(pass: usize, part: BuildPart, total: Option<u64>, bytes: u64, counters: &'a Counters) -> Self {
         let now = Instant::now();
         let bar = Bar::new(Some(PARTS), BAR);
-        let whole = part == Part::WHOLE;
+        let whole = part == BuildPart::WHOLE;
         let (later, total) = (if whole { PASSES - pass } else { 0 }, total.filter(|_| whole));
         Self { pass, later, total, bytes, counters, bar, begun: now, line: Cell::new(now) }
     }

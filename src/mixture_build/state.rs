@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 
 use super::cluster_log::KnownShards;
 use super::identity::Identity;
-use super::part::Part;
+use super::part::BuildPart;
 use super::stream::ShardHash;
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::exit_status::CommandError;
@@ -34,7 +34,7 @@ const PAUSE: u32 = 19;
 /// The directory, which this process alone uses; or the files of a part in it.
 pub struct BuildState {
     directory: PathBuf,
-    part: Part,
+    part: BuildPart,
     _locks: Vec<File>,
     /// When it was last saved, and how long that took.
     saved: Instant,
@@ -78,7 +78,7 @@ impl BuildState {
         let directory = directory(output);
         fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
         let lock = lock(&directory.join(LOCK), output, File::try_lock)?;
-        let state = Self::new(directory, Part::WHOLE, vec![lock]);
+        let state = Self::new(directory, BuildPart::WHOLE, vec![lock]);
         let path = state.path(IDENTITY);
         // Nothing is lost with a state without results.
         if path.exists() && !restart && state.names()?.iter().any(|name| is_result(name)) {
@@ -96,7 +96,11 @@ impl BuildState {
     ///
     /// # Errors
     /// A process uses this part or the whole; the state belongs to another build.
-    pub fn open_part(output: &Path, identity: &Identity, part: Part) -> Result<(Self, bool), CommandError> {
+    pub fn open_part(
+        output: &Path,
+        identity: &Identity,
+        part: BuildPart,
+    ) -> Result<(Self, bool), CommandError> {
         let directory = directory(output);
         fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
         let whole = lock(&directory.join(LOCK), output, File::try_lock_shared)?;
@@ -132,12 +136,12 @@ impl BuildState {
             )));
         }
         let lock = lock(&directory.join(LOCK), output, File::try_lock)?;
-        let state = Self::new(directory, Part::WHOLE, vec![lock]);
+        let state = Self::new(directory, BuildPart::WHOLE, vec![lock]);
         let identity = state.identity()?;
         Ok((state, identity))
     }
 
-    fn new(directory: PathBuf, part: Part, locks: Vec<File>) -> Self {
+    fn new(directory: PathBuf, part: BuildPart, locks: Vec<File>) -> Self {
         Self { directory, part, _locks: locks, saved: Instant::now(), cost: Duration::ZERO }
     }
 
@@ -168,7 +172,7 @@ impl BuildState {
     /// The shards whose clusters are known.
     pub fn known_shards(&self) -> Result<KnownShards, CommandError> {
         let is_log = |name: &&String| {
-            let of_part = || Part::from_file_name(name.strip_prefix(CLUSTERS)?.strip_prefix('-')?);
+            let of_part = || BuildPart::from_file_name(name.strip_prefix(CLUSTERS)?.strip_prefix('-')?);
             name.as_str() == CLUSTERS || of_part().is_some()
         };
         let names = self.names()?;
@@ -190,20 +194,20 @@ impl BuildState {
     }
 
     /// The parts that are through pass 1.
-    pub fn part_ends(&self) -> Result<BTreeMap<Part, PartEnd>, CommandError> {
+    pub fn part_ends(&self) -> Result<BTreeMap<BuildPart, PartEnd>, CommandError> {
         self.parts(END)
     }
 
     /// The sums of all parts in pass 2 or 3.
-    pub fn part_sums(&self, pass: usize) -> Result<BTreeMap<Part, RunningSums>, CommandError> {
+    pub fn part_sums(&self, pass: usize) -> Result<BTreeMap<BuildPart, RunningSums>, CommandError> {
         self.parts(&format!("pass-{pass}-"))
     }
 
     /// The files of parts whose names begin with `prefix`.
-    fn parts<T: DeserializeOwned>(&self, prefix: &str) -> Result<BTreeMap<Part, T>, CommandError> {
+    fn parts<T: DeserializeOwned>(&self, prefix: &str) -> Result<BTreeMap<BuildPart, T>, CommandError> {
         let mut found = BTreeMap::new();
         for name in self.names()? {
-            if let Some(part) = name.strip_prefix(prefix).and_then(Part::from_file_name)
+            if let Some(part) = name.strip_prefix(prefix).and_then(BuildPart::from_file_name)
                 && let Some(value) = self.read(&name)?
             {
                 found.insert(part, value);
@@ -240,7 +244,7 @@ impl BuildState {
     /// The name of a file of this process.
     fn own_name(&self, name: &str) -> String {
         match self.part {
-            Part::WHOLE => name.to_owned(),
+            BuildPart::WHOLE => name.to_owned(),
             part => format!("{name}-{}", part.file_name()),
         }
     }

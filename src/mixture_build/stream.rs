@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicU64;
 
 use atoms::Structure;
 
-use super::part::Part;
+use super::part::BuildPart;
 use crate::exit_status::CommandError;
 use crate::structure_files::{Place, StructureFiles, StructureReader};
 
@@ -32,14 +32,14 @@ pub type ShardHash = [u8; 32];
 pub struct ShardReader {
     structures: StructureReader,
     shard_size: u64,
-    part: Part,
+    part: BuildPart,
     next: u64,
     count: u64,
 }
 
 impl ShardReader {
     /// Begins with the first file; `bytes` counts what is read of all of them.
-    pub fn new(files: &StructureFiles, shard_size: u64, part: Part, bytes: Arc<AtomicU64>) -> Self {
+    pub fn new(files: &StructureFiles, shard_size: u64, part: BuildPart, bytes: Arc<AtomicU64>) -> Self {
         Self { structures: files.reader(bytes), shard_size, part, next: 0, count: 0 }
     }
 

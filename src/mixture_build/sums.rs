@@ -5,9 +5,9 @@ use calm::build::{
     ScatterPass, components,
 };
 
-use super::Build;
+use super::MixtureBuild;
 use super::passes::ElementPass;
-use super::progress::Progress;
+use super::progress::PassProgress;
 use super::state::{Partition, RunningSums};
 use super::stream::Shard;
 use super::workers::{Counters, run_pass};
@@ -17,7 +17,7 @@ use crate::output;
 /// The sums of each element, by element index.
 type ElementTotals = Vec<Option<ExactSums>>;
 
-impl Build {
+impl MixtureBuild {
     /// Pass 2, and the components of each element.
     pub(super) fn components(
         &mut self,
@@ -88,7 +88,7 @@ impl Build {
         let elements = partition.elements.len();
         sums.elements.resize(elements, None);
         let counters = Counters::default();
-        let progress = Progress::new(pass, work.part, Some(partition.structures), *bytes, &counters);
+        let progress = PassProgress::new(pass, work.part, Some(partition.structures), *bytes, &counters);
         let finished = sums.finished.clone();
         let is_finished = |shard: &Shard| {
             if partition.hashes.get(shard.index as usize) != Some(&shard.hash) {

@@ -11,7 +11,7 @@ use calm::build::BuildError;
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
-use super::part::Part;
+use super::part::BuildPart;
 use super::passes::{ElementPass, ShardResult, run_shard};
 use super::stream::{Shard, ShardReader};
 use crate::exit_status::CommandError;
@@ -27,7 +27,7 @@ pub struct Work {
     pub files: StructureFiles,
     pub shard_size: u64,
     /// The shards of this process.
-    pub part: Part,
+    pub part: BuildPart,
     pub seed: u64,
     pub threads: usize,
     pub stop: CancellationToken,

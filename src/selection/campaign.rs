@@ -4,7 +4,7 @@ use serde_json::Value;
 use store::records::{Fate, StoredCandidate};
 use store::{Location, Store};
 
-use super::{Item, ItemPlace, Source};
+use super::{ItemPlace, PoolItem, StructureSource};
 use crate::exit_status::CommandError;
 
 /// Candidates per read; each has up to megabytes of features.
@@ -51,7 +51,7 @@ impl CampaignCandidates {
     }
 
     /// The next candidates; none at the end.
-    pub(super) fn next_page(&mut self) -> Result<Vec<Item>, CommandError> {
+    pub(super) fn next_page(&mut self) -> Result<Vec<PoolItem>, CommandError> {
         loop {
             let page = self.runtime.block_on(self.store.candidates(self.last, false, PAGE))?;
             let Some(last) = page.last() else { return Ok(Vec::new()) };
@@ -64,11 +64,11 @@ impl CampaignCandidates {
         }
     }
 
-    fn item(&self, found: StoredCandidate) -> Item {
+    fn item(&self, found: StoredCandidate) -> PoolItem {
         let view = found.block.view();
-        Item {
+        PoolItem {
             structure: view.structure(),
-            source: Source::Candidate { campaign: self.number, decision: found.decision },
+            source: StructureSource::Candidate { campaign: self.number, decision: found.decision },
             features: found.features.filter(|_| self.same_model),
             place: ItemPlace::Candidate(view.id().to_string()),
         }

@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 use wire::ContentHash;
 
 use super::campaign::CampaignCandidates;
-use super::{GradedPool, Item, ItemPlace, PoolStructure, Source};
+use super::{GradedPool, ItemPlace, PoolItem, PoolStructure, StructureSource};
 use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar};
@@ -32,7 +32,7 @@ pub struct PoolFiles {
 }
 
 /// How a pool is graded, and what is kept of it.
-pub struct Grading {
+pub struct PoolGrading {
     pub model: Arc<GraceModel>,
     pub mixture: Arc<Mixture>,
     pub window: Window,
@@ -60,13 +60,13 @@ struct GradedStructure {
     evaluated: bool,
 }
 
-impl Grading {
+impl PoolGrading {
     /// Grades every structure of the files, then of the campaigns; `None` after a cancellation of `stop`.
     pub fn run(&self, pool: &mut PoolFiles) -> Result<Option<GradedPool>, CommandError> {
         let bytes = Arc::new(AtomicU64::new(0));
         let total = pool.files.total_bytes()?;
         let bar = Bar::new((total > 0).then_some(total), BAR);
-        let mut reader = Reader {
+        let mut reader = PoolReader {
             files: (!pool.files.files.is_empty()).then(|| pool.files.reader(Arc::clone(&bytes))),
             paths: &pool.files,
             campaigns: &mut pool.campaigns,
@@ -101,7 +101,11 @@ impl Grading {
     }
 
     /// In the order of the block.
-    fn grade(&self, workers: &mut [Worker], block: &[Item]) -> Vec<Result<GradedStructure, CommandError>> {
+    fn grade(
+        &self,
+        workers: &mut [Worker],
+        block: &[PoolItem],
+    ) -> Vec<Result<GradedStructure, CommandError>> {
         let items = Mutex::new(block.iter().enumerate());
         let next = || items.lock().unwrap_or_else(PoisonError::into_inner).next();
         let share = |worker: &mut Worker| {
@@ -129,7 +133,7 @@ impl Grading {
 }
 
 impl Worker {
-    fn grade(&mut self, mixture: &Mixture, item: &Item) -> Result<GradedStructure, CommandError> {
+    fn grade(&mut self, mixture: &Mixture, item: &PoolItem) -> Result<GradedStructure, CommandError> {
         let wrong = |error: &dyn std::fmt::Display| CommandError::Input(format!("{}: {error}", item.place));
         let size = item.structure.len() * mixture.dimension();
         let known = item.features.as_ref().filter(|features| features.len() == size);
@@ -154,7 +158,7 @@ impl Worker {
 impl GradedPool {
     fn add(
         &mut self,
-        item: &Item,
+        item: &PoolItem,
         graded: &GradedStructure,
         compositions: &mut HashMap<Vec<u32>, u32>,
         elements: usize,
@@ -188,17 +192,17 @@ pub(super) fn hash(structure: &atoms::Structure) -> u64 {
 }
 
 /// Reads blocks of structures.
-struct Reader<'a> {
+struct PoolReader<'a> {
     files: Option<StructureReader>,
     paths: &'a StructureFiles,
     campaigns: &'a mut Vec<CampaignCandidates>,
     /// Structures of a page that did not fit the last block, in reverse order.
-    waiting: Vec<Item>,
+    waiting: Vec<PoolItem>,
 }
 
-impl Reader<'_> {
+impl PoolReader<'_> {
     /// At most `size` structures; none at the end.
-    fn block(&mut self, size: usize) -> Result<Vec<Item>, CommandError> {
+    fn block(&mut self, size: usize) -> Result<Vec<PoolItem>, CommandError> {
         let mut block = Vec::with_capacity(size);
         while block.len() < size {
             match self.next()? {
@@ -209,14 +213,15 @@ impl Reader<'_> {
         Ok(block)
     }
 
-    fn next(&mut self) -> Result<Option<Item>, CommandError> {
+    fn next(&mut self) -> Result<Option<PoolItem>, CommandError> {
         if let Some(reader) = &mut self.files {
             if let Some((frame, file)) = reader.next()? {
                 let number = self.paths.files.iter().position(|known| known.path == file.path);
                 let frame_index = u32::try_from(reader.frame_index()).map_err(CommandError::failed)?;
-                let source = Source::File { file: number.unwrap_or_default() as u32, frame: frame_index };
+                let source =
+                    StructureSource::File { file: number.unwrap_or_default() as u32, frame: frame_index };
                 let place = ItemPlace::Line(file.path, frame.line);
-                return Ok(Some(Item { structure: frame.structure, source, features: None, place }));
+                return Ok(Some(PoolItem { structure: frame.structure, source, features: None, place }));
             }
             self.files = None;
         }

@@ -12,10 +12,10 @@ use std::sync::Arc;
 use calm::selection::Pool;
 
 pub use self::campaign::CampaignCandidates;
-pub use self::grading::{Grading, PoolFiles};
+pub use self::grading::{PoolFiles, PoolGrading};
 pub use self::output::frames;
 pub use self::picks::{Pick, Picks, Rules, pick};
-pub use self::strategy::{Part, Strategy};
+pub use self::strategy::{Strategy, StrategyQuota};
 
 /// Structures of a pool with the grades of their atoms.
 pub struct GradedPool {
@@ -29,7 +29,7 @@ pub struct GradedPool {
 
 /// What is kept of every structure, 40 bytes.
 pub struct PoolStructure {
-    pub source: Source,
+    pub source: StructureSource,
     /// Begin of its hash: files must not change before the picked structures are read again.
     pub hash: u64,
     pub composition: u32,
@@ -39,7 +39,7 @@ pub struct PoolStructure {
 
 /// Where a structure comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Source {
+pub enum StructureSource {
     /// Structure `frame` of a file, both counted from 0.
     File { file: u32, frame: u32 },
     /// The candidate of a decision of a campaign.
@@ -59,9 +59,9 @@ impl GradedPool {
 }
 
 /// A structure to be graded.
-struct Item {
+struct PoolItem {
     structure: atoms::Structure,
-    source: Source,
+    source: StructureSource,
     /// Features that are known, `[n × D]`.
     features: Option<Vec<f64>>,
     place: ItemPlace,

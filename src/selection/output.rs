@@ -8,7 +8,7 @@ use store::records::Fate;
 
 use super::grading::{PoolFiles, hash};
 use super::picks::Pick;
-use super::{GradedPool, Source};
+use super::{GradedPool, StructureSource};
 use crate::exit_status::CommandError;
 
 /// The frames of the picks, in order: what the files have, read again, and what the campaigns have, with `selection_strategy`,
@@ -21,8 +21,10 @@ pub fn frames(files: &PoolFiles, pool: &GradedPool, picks: &[Pick]) -> Result<Ve
         let structure = &pool.structures[pick.structure];
         let mut frame = match (frame, structure.source) {
             (Some(frame), _) => frame,
-            (None, Source::Candidate { campaign, decision }) => candidate(files, campaign, decision)?,
-            (None, Source::File { file, .. }) => {
+            (None, StructureSource::Candidate { campaign, decision }) => {
+                candidate(files, campaign, decision)?
+            }
+            (None, StructureSource::File { file, .. }) => {
                 let path = files.files.files[file as usize].path.display();
                 return Err(CommandError::Failed(format!(
                     "{path}: the file became shorter during the selection"
@@ -46,7 +48,8 @@ fn read_files(
     frames: &mut [Option<Frame>],
 ) -> Result<(), CommandError> {
     // Structures of files are numbered first, in the order in which they are read.
-    let is_file = |pick: &Pick| matches!(pool.structures[pick.structure].source, Source::File { .. });
+    let is_file =
+        |pick: &Pick| matches!(pool.structures[pick.structure].source, StructureSource::File { .. });
     let mut wanted: Vec<(usize, usize)> = picks
         .iter()
         .enumerate()

@@ -6,7 +6,7 @@ use calm::selection::{DOptimal, FarthestPoints, Greedy, Metric, floors, random_s
 use tokio_util::sync::CancellationToken;
 
 use super::GradedPool;
-use super::strategy::{Part, Strategy};
+use super::strategy::{Strategy, StrategyQuota};
 use crate::exit_status::CommandError;
 use crate::output::Bar;
 
@@ -14,7 +14,7 @@ const BAR: &str = "{bar:32} {pos}/{len}  {msg}";
 
 /// What a selection obeys.
 pub struct Rules {
-    pub parts: Vec<Part>,
+    pub parts: Vec<StrategyQuota>,
     /// γ below which an update brings a picked structure.
     pub update_target: Positive,
     /// Atoms of each element in what is picked; `None`: any number.

@@ -21,7 +21,7 @@ pub enum Strategy {
 
 /// A strategy and how many structures it picks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Part {
+pub struct StrategyQuota {
     pub strategy: Strategy,
     /// `None`: all that a greedy selection finds.
     pub number: Option<usize>,
@@ -54,7 +54,7 @@ impl Strategy {
     }
 }
 
-impl FromStr for Part {
+impl FromStr for StrategyQuota {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -81,10 +81,13 @@ mod tests {
 
     #[test]
     fn strategies_have_names_and_numbers() {
-        let part = |text: &str| text.parse::<Part>();
-        assert_eq!(part("greedy"), Ok(Part { strategy: Strategy::Greedy, number: None }));
-        assert_eq!(part("fps-extrap:25"), Ok(Part { strategy: Strategy::FarthestPoints, number: Some(25) }));
-        assert_eq!(part("d-optimal:9"), Ok(Part { strategy: Strategy::DOptimal, number: Some(9) }));
+        let part = |text: &str| text.parse::<StrategyQuota>();
+        assert_eq!(part("greedy"), Ok(StrategyQuota { strategy: Strategy::Greedy, number: None }));
+        assert_eq!(
+            part("fps-extrap:25"),
+            Ok(StrategyQuota { strategy: Strategy::FarthestPoints, number: Some(25) })
+        );
+        assert_eq!(part("d-optimal:9"), Ok(StrategyQuota { strategy: Strategy::DOptimal, number: Some(9) }));
         for (strategy, names) in Strategy::NAMES {
             assert!(names.iter().all(|name| part(name).unwrap().strategy == strategy));
         }

@@ -15,7 +15,7 @@ use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 use crate::file_hash;
-use crate::mixture_build::{self, Part, Work};
+use crate::mixture_build::{self, BuildPart, Work};
 use crate::output::{Table, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{StructureArgs, StructureFiles};
@@ -78,7 +78,7 @@ pub struct CalmBuildArgs {
     pass: Option<u8>,
     /// The part of this process: every n-th shard, from shard i. When all parts of a pass are done, run `calmwalk calm merge`
     #[arg(long, value_name = "i/n", requires = "pass")]
-    part: Option<Part>,
+    part: Option<BuildPart>,
 }
 
 impl CalmBuildArgs {
@@ -114,13 +114,13 @@ impl CalmBuildArgs {
             model,
             files,
             shard_size: self.shard_size,
-            part: self.part.unwrap_or(Part::WHOLE),
+            part: self.part.unwrap_or(BuildPart::WHOLE),
             seed: self.rng_seed,
             threads: self.threads.map_or(cores, usize::from),
             stop: stop_token()?,
         };
         let mut build =
-            mixture_build::Build::open(work, settings, hash, &projection, &self.output, self.restart)?;
+            mixture_build::MixtureBuild::open(work, settings, hash, &projection, &self.output, self.restart)?;
         if let (Some(pass), Some(part)) = (self.pass, self.part) {
             return end_part(pass, part, build.run_part(pass)?);
         }
@@ -151,7 +151,7 @@ impl CalmBuildArgs {
     }
 }
 
-fn end_part(pass: u8, part: Part, done: bool) -> Result<ExitStatus, CommandError> {
+fn end_part(pass: u8, part: BuildPart, done: bool) -> Result<ExitStatus, CommandError> {
     if !done {
         print_stderr("stopped; the same command continues");
         return Ok(ExitStatus::Interrupted);

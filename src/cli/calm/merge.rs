@@ -10,7 +10,7 @@ use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
-use crate::mixture_build::{Merge as PartsMerge, Merged};
+use crate::mixture_build::{Merged, PartsMerge};
 use crate::output::print;
 
 /// Merge the parts of a pass of `calmwalk calm build --part`
