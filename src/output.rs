@@ -90,13 +90,13 @@ pub fn wrapped<'a>(width: usize) -> textwrap::Options<'a> {
 }
 
 /// Rows with aligned columns.
-pub struct Table {
+pub struct TextTable {
     /// Width of each column and whether it is right-aligned, as numbers are.
     columns: Vec<(usize, bool)>,
     rows: Vec<Vec<String>>,
 }
 
-impl Table {
+impl TextTable {
     /// A table with these column titles. Titles of numeric columns begin with `>`.
     pub fn new(titles: &[&str]) -> Self {
         let columns = titles.iter().map(|title| (0, title.starts_with('>'))).collect();
@@ -181,7 +181,7 @@ mod tests {
 
     #[test]
     fn columns_are_aligned_by_characters() {
-        let mut table = Table::new(&["name", ">γ_max"]);
+        let mut table = TextTable::new(&["name", ">γ_max"]);
         table.push(vec!["é".into(), "1.50".into()]);
         table.push(vec!["fcc".into(), "12.00".into()]);
         let mut text = Vec::new();

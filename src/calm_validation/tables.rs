@@ -2,10 +2,10 @@
 
 use super::detection::Detection;
 use super::{DetectionRule, Validation, labelled};
-use crate::page::{Cell, Table, count, percent, real, text};
+use crate::page::{PageTable, TableCell, count, percent, real, text};
 
 /// All tables with rows, in the order of the page.
-pub fn all(validation: &Validation) -> Vec<Table> {
+pub fn all(validation: &Validation) -> Vec<PageTable> {
     let mut tables = vec![
         detection(validation),
         bond_scans(validation),
@@ -32,7 +32,7 @@ pub fn both(detection: &Detection) -> String {
     format!("{}/{}", verdict(detection.compression), verdict(detection.stretching))
 }
 
-fn detection(validation: &Validation) -> Table {
+fn detection(validation: &Validation) -> PageTable {
     let caption = "Whether each score detects compression and stretching in the bond scans of all elements, but not \
                    the crystals at equilibrium. The largest value of each regime is that of the element where it is smallest.";
     let titles = [
@@ -44,7 +44,7 @@ fn detection(validation: &Validation) -> Table {
         "largest, stretched",
         "largest at equilibrium",
     ];
-    let mut table = Table::new("detection", caption, &titles).whole();
+    let mut table = PageTable::new("detection", caption, &titles).whole();
     for score in &validation.scores {
         let found = &score.detection;
         table.rows.push(vec![
@@ -65,7 +65,7 @@ fn detection(validation: &Validation) -> Table {
 }
 
 /// A number with three significant digits on the page.
-fn significant(x: Option<f64>) -> Cell {
+fn significant(x: Option<f64>) -> TableCell {
     let exact = real(x, 0);
     let shown = x.map_or("–".to_owned(), |x| match x.abs() {
         size if !x.is_finite() || (size > 0.0 && !(1e-2..1e4).contains(&size)) => format!("{x:.1e}"),
@@ -73,10 +73,10 @@ fn significant(x: Option<f64>) -> Cell {
         size if size >= 10.0 => format!("{x:.1}"),
         _ => format!("{x:.2}"),
     });
-    Cell { shown, ..exact }
+    TableCell { shown, ..exact }
 }
 
-fn bond_scans(validation: &Validation) -> Table {
+fn bond_scans(validation: &Validation) -> PageTable {
     let caption = "Bond scans. The equilibrium distance is that of the model’s lowest energy near the published one, unless it has none \
                    there. Only ground states count for detection, and no crystals that stand in.";
     let titles = [
@@ -91,7 +91,7 @@ fn bond_scans(validation: &Validation) -> Table {
         "at d_{eq}",
         "largest, stretched",
     ];
-    let mut table = Table::new("bond-scans", caption, &titles);
+    let mut table = PageTable::new("bond-scans", caption, &titles);
     for scan in &validation.bond_scans {
         for (score, found) in validation.scores.iter().zip(&scan.detection) {
             let state = match (scan.is_ground_state, scan.is_own) {
@@ -116,7 +116,7 @@ fn bond_scans(validation: &Validation) -> Table {
     table
 }
 
-fn defects(validation: &Validation) -> Table {
+fn defects(validation: &Validation) -> PageTable {
     let caption = "Grades at defects: of the perfect crystal, next to the defect and farthest from it. The longest displacement is that of the \
                    relaxation.";
     let titles = [
@@ -132,7 +132,7 @@ fn defects(validation: &Validation) -> Table {
         "γ_{nbr} next to it",
         "atoms γ > 1 (%)",
     ];
-    let mut table = Table::new("defects", caption, &titles).whole();
+    let mut table = PageTable::new("defects", caption, &titles).whole();
     for defect in &validation.defects {
         let (near, far) = (defect.shells.first(), defect.shells.last());
         let atoms: usize = defect.shells.iter().map(|shell| shell.atoms).sum();
@@ -162,7 +162,7 @@ fn defects(validation: &Validation) -> Table {
     table
 }
 
-fn solutions(validation: &Validation) -> Table {
+fn solutions(validation: &Validation) -> PageTable {
     let caption = "Random solid solutions by composition.";
     let titles = [
         "elements",
@@ -175,7 +175,7 @@ fn solutions(validation: &Validation) -> Table {
         "atoms γ > 1 (%)",
         "atoms γ_{nbr} > 1 (%)",
     ];
-    let mut table = Table::new("solutions", caption, &titles);
+    let mut table = PageTable::new("solutions", caption, &titles);
     for solution in &validation.solutions {
         for of in &solution.compositions {
             table.rows.push(vec![
@@ -194,7 +194,7 @@ fn solutions(validation: &Validation) -> Table {
     table
 }
 
-fn collisions(validation: &Validation) -> Table {
+fn collisions(validation: &Validation) -> PageTable {
     let caption = "Colliding environments: an atom in the middle of an octagon, with neighbours at the places 0, 1, 3, 4 (A) or 0, 1, 2, 5 (B). \
                    Distances and angles are the same, so features of pairs and triples of atoms would have no distance. Rounding is the \
                    relative distance between A and its mirror image.";
@@ -207,7 +207,7 @@ fn collisions(validation: &Validation) -> Table {
         "γ_{A}",
         "γ_{B}",
     ];
-    let mut table = Table::new("collisions", caption, &titles);
+    let mut table = PageTable::new("collisions", caption, &titles);
     for collision in &validation.collisions {
         for features in &collision.features {
             let [a, b] =

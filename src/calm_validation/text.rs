@@ -6,31 +6,31 @@ use super::labelled::LabelledReport;
 use super::tables::both;
 use super::{Defect, Validation, figures, tables};
 use crate::exit_status::CommandError;
-use crate::page::{self, Block, File, Section};
+use crate::page::{self, PageBlock, PageFile, Section};
 
 /// File name of the page.
 pub const PAGE: &str = "validation.html";
 
 /// All files, the page first.
-pub fn files(validation: &Validation) -> Result<Vec<File>, CommandError> {
+pub fn files(validation: &Validation) -> Result<Vec<PageFile>, CommandError> {
     let (parts, tables) = (figures::all(validation), tables::all(validation));
     let title = format!("Validation of the extrapolation grade: {}", validation.elements.join(", "));
     let text = page::write(&title, &lead(validation), sections(&parts, &tables));
     let json = serde_json::to_vec_pretty(validation).map_err(CommandError::failed)?;
     let mut files = vec![
-        File { path: PAGE.to_owned(), bytes: text.into_bytes() },
-        File { path: "validation.json".into(), bytes: json },
-        File { path: "structures.extxyz".into(), bytes: structures(&validation.defects)? },
+        PageFile { path: PAGE.to_owned(), bytes: text.into_bytes() },
+        PageFile { path: "validation.json".into(), bytes: json },
+        PageFile { path: "structures.extxyz".into(), bytes: structures(&validation.defects)? },
     ];
     files.extend(page::files(parts, &tables)?);
     Ok(files)
 }
 
-fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::Table]) -> Vec<Section<'a>> {
-    let figure = |name: &str| Block::figure(parts, name);
-    let table = |name: &str| Block::table(tables, name);
-    let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
-    let words = |words: &str| Some(Block::Paragraph(words.into()));
+fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -> Vec<Section<'a>> {
+    let figure = |name: &str| PageBlock::figure(parts, name);
+    let table = |name: &str| PageBlock::table(tables, name);
+    let blocks = |blocks: Vec<Option<PageBlock<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
+    let words = |words: &str| Some(PageBlock::Paragraph(words.into()));
     vec![
         (
             "Compression and stretching",

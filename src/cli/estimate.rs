@@ -12,7 +12,7 @@ use store::{Location, Store};
 use super::{CommandError, ExitStatus, block_on, campaign_location};
 use crate::campaign::{LoadedCampaign, StepTimes, WalkTime};
 use crate::disk_forecast;
-use crate::output::{Table, count, print, print_json};
+use crate::output::{TextTable, count, print, print_json};
 use crate::wording;
 use crate::wording::cost::{core_hours, two_digits, wall_time};
 
@@ -180,7 +180,7 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
     let walks = walks.map_or("no step could be measured".to_owned(), wording::cost::walks);
     writeln!(out, "  walks    {walks}")?;
     writeln!(out, "  disk     {}", wording::disk::forecast(disk))?;
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         "seed structure",
         ">labels",
         ">atoms",

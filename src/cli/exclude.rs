@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use store::{ExcludedLabel, ExclusionChange, Store, unix_milliseconds};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::output::{Table, print, print_json, warn_if_unencrypted};
+use crate::output::{TextTable, print, print_json, warn_if_unencrypted};
 
 /// Exclude bad labels from exports and statistics, or include them again
 ///
@@ -101,7 +101,7 @@ fn write_list(out: &mut dyn Write, excluded: &[ExcludedLabel]) -> io::Result<()>
     if excluded.is_empty() {
         return writeln!(out, "no excluded labels");
     }
-    let mut table = Table::new(&["id", "protocol", "reason"]);
+    let mut table = TextTable::new(&["id", "protocol", "reason"]);
     for ExcludedLabel { id, protocol, exclusion } in excluded {
         table.push(vec![id.clone(), protocol.clone(), exclusion.reason.clone()]);
     }

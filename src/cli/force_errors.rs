@@ -7,7 +7,7 @@ use monitor::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelSta
 use store::{Protocol, Store};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::output::{Table, count, decimals, print, print_json, range};
+use crate::output::{TextTable, count, decimals, print, print_json, range};
 use crate::wording;
 
 /// Failed structures listed per line.
@@ -98,7 +98,7 @@ fn write(out: &mut dyn Write, protocol: &Protocol, statistics: &LabelStatistics)
 }
 
 fn write_correlations(out: &mut dyn Write, statistics: &LabelStatistics) -> io::Result<()> {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         "",
         ">structures",
         ">atoms",
@@ -137,7 +137,7 @@ fn write_energies(out: &mut dyn Write, statistics: &LabelStatistics) -> io::Resu
 
 fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<()> {
     let large = format!(">above {LARGE_FORCE_ERROR} eV/Å (%)");
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         name,
         ">atoms",
         ">atoms (%)",
@@ -170,7 +170,7 @@ fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<
 
 fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<String>]) -> io::Result<()> {
     let mut table =
-        Table::new(&[name, ">attempted", ">labelled", ">share (%)", ">95 %", "failed (without label)"]);
+        TextTable::new(&[name, ">attempted", ">labelled", ">share (%)", ">95 %", "failed (without label)"]);
     for bin in bins {
         let percent = |share: f64| format!("{:.0}", 100.0 * share);
         let interval = bin.interval.map(|(low, high)| format!("{} to {}", percent(low), percent(high)));

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use store::{LowerState, LowerStateChange, StateResult, Store, unix_milliseconds};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::output::{Table, decimals, print, print_json, warn_if_unencrypted};
+use crate::output::{TextTable, decimals, print, print_json, warn_if_unencrypted};
 
 /// List labels for which a lower magnetic state is known, or replace them by it
 ///
@@ -80,7 +80,7 @@ fn write_list(out: &mut dyn Write, states: &[LowerState]) -> io::Result<()> {
     if states.is_empty() {
         return writeln!(out, "every label is the lowest known state of its structure");
     }
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         "id",
         "result",
         ">energy (eV/atom)",

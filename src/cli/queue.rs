@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::output::{Table, count, decimals, print, print_json};
+use crate::output::{TextTable, count, decimals, print, print_json};
 use crate::wording;
 
 /// List, show, drop, retry or prioritise structures in the label queue
@@ -180,7 +180,7 @@ fn write_list(out: &mut dyn Write, jobs: &[Job], list: &QueueListArgs) -> io::Re
             offset => writeln!(out, "no {state}jobs after the first {offset}"),
         };
     }
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         "id",
         "state",
         ">priority",

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use store::Store;
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::output::{Table, count, decimals, print, print_json};
+use crate::output::{TextTable, count, decimals, print, print_json};
 use crate::replay::{
     self, FateChange, FateCounts, MissingFeatures, RelocatedFilesArgs, Report, RuleOverride,
 };
@@ -126,8 +126,15 @@ fn write_changes(out: &mut dyn Write, title: &str, changes: &[FateChange]) -> io
         return Ok(());
     }
     writeln!(out, "\n{title}:")?;
-    let mut table =
-        Table::new(&[">decision", "candidate", ">walk", ">step", ">γ_max before", ">now", "decline reason"]);
+    let mut table = TextTable::new(&[
+        ">decision",
+        "candidate",
+        ">walk",
+        ">step",
+        ">γ_max before",
+        ">now",
+        "decline reason",
+    ]);
     for change in changes.iter().take(SHOWN) {
         table.push(vec![
             change.decision.to_string(),

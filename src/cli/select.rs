@@ -13,7 +13,7 @@ use super::calm::load;
 use super::{CommandError, ExitStatus, campaign_location};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::file_hash;
-use crate::output::{Table, count, decimals, print, print_json, print_stderr};
+use crate::output::{TextTable, count, decimals, print, print_json, print_stderr};
 use crate::selection::{
     CampaignCandidates, GradedPool, Pick, Picks, PoolFiles, PoolGrading, Rules, Strategy, StrategyQuota,
     StructureSource, frames, pick,
@@ -306,7 +306,8 @@ impl SelectionReport<'_> {
     }
 
     fn print_tables(&self) -> Result<(), CommandError> {
-        let mut strategies = Table::new(&["strategy", ">structures", ">atoms", ">largest γ", ">smallest γ"]);
+        let mut strategies =
+            TextTable::new(&["strategy", ">structures", ">atoms", ">largest γ", ">smallest γ"]);
         for (name, picks) in self.strategies() {
             let gamma = || picks.iter().map(|pick| pick.gamma_max);
             strategies.push(vec![
@@ -317,7 +318,7 @@ impl SelectionReport<'_> {
                 decimals(gamma().reduce(f64::min), 2),
             ]);
         }
-        let mut elements = Table::new(&["element", ">atoms selected", ">of the pool"]);
+        let mut elements = TextTable::new(&["element", ">atoms selected", ">of the pool"]);
         for Element { symbol, selected, pool, .. } in self.elements() {
             elements.push(vec![symbol, selected.to_string(), pool.to_string()]);
         }

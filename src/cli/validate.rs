@@ -12,7 +12,7 @@ use super::{CommandError, ExitStatus};
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::campaign::{LoadedCampaign, PairRange, Remark, SeedTriage, StepTimes, triage};
 use crate::disk_forecast;
-use crate::output::{Bar, Table, count, decimals, print};
+use crate::output::{Bar, TextTable, count, decimals, print};
 use crate::runtime;
 use crate::wording;
 
@@ -132,7 +132,7 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &LoadedCampaign) -> io::Res
 
 /// The pairs of elements in the seed structures with their limits and windows.
 fn write_short_range(out: &mut dyn Write, ranges: &[PairRange], shown: usize) -> io::Result<()> {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         "pair",
         ">sum of radii (Å)",
         ">shortest (Å)",

@@ -118,17 +118,17 @@ impl Config {
     /// Reads the `[label]` section alone, of a configuration that needs no other.
     pub fn load_label(path: &Path) -> Result<LabelSection, ConfigError> {
         #[derive(Deserialize)]
-        struct Labels {
+        struct LabelDocument {
             label: LabelSection,
         }
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
-        let labels: Option<Labels> = document.read(PLACEHOLDERS, &Self::known_keys());
+        let labels: Option<LabelDocument> = document.read(PLACEHOLDERS, &Self::known_keys());
         document.check_ranges("walk");
         document
             .check_rules(|| labels.as_ref().map(|all| check::check_label(&all.label)).unwrap_or_default());
         document.finish()?;
-        let Labels { mut label } = labels.ok_or_else(|| ConfigError::unreadable(path))?;
+        let LabelDocument { mut label } = labels.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         label.method.paths().into_iter().for_each(|path| *path = directory.join(&*path));
         Ok(label)

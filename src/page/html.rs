@@ -5,7 +5,7 @@ use std::fmt::Write;
 use figures::{BOLD, REGULAR, escape, to_html, to_svg};
 
 use super::style::grouped;
-use super::{Block, Cell, FigureContent, FigureEntry, Section, Table};
+use super::{FigureContent, FigureEntry, PageBlock, PageTable, Section, TableCell};
 
 const STYLE: &str = include_str!("page.css");
 
@@ -28,11 +28,11 @@ pub fn write(title: &str, lead: &str, sections: Vec<Section<'_>>) -> String {
         let _ = writeln!(html, "<section>\n<h2>{}</h2>", escape(heading));
         for block in blocks {
             match block {
-                Block::Paragraph(words) => {
+                PageBlock::Paragraph(words) => {
                     let _ = writeln!(html, "<p>{}</p>", to_html(&words));
                 }
-                Block::Figure(part, number) => write_figure(&mut html, part, number),
-                Block::Table(table, number) => write_table(&mut html, table, number),
+                PageBlock::Figure(part, number) => write_figure(&mut html, part, number),
+                PageBlock::Table(table, number) => write_table(&mut html, table, number),
             }
         }
         html.push_str("</section>\n");
@@ -61,8 +61,8 @@ fn write_figure(html: &mut String, part: &FigureEntry, number: usize) {
     };
 }
 
-fn write_table(html: &mut String, table: &Table, number: usize) {
-    let Table { name, caption, titles, rows, shown } = table;
+fn write_table(html: &mut String, table: &PageTable, number: usize) {
+    let PageTable { name, caption, titles, rows, shown } = table;
     let more = match rows.len().saturating_sub(*shown) {
         0 => String::new(),
         more => format!(" The file has {} more rows.", grouped(more as u64)),
@@ -97,7 +97,7 @@ fn write_table(html: &mut String, table: &Table, number: usize) {
     html.push_str("</tbody>\n</table></div>\n");
 }
 
-fn write_cell(column: usize, cell: &Cell) -> String {
+fn write_cell(column: usize, cell: &TableCell) -> String {
     let shown = escape(&cell.shown);
     match (column, cell.is_number) {
         (0, _) => format!("<th scope=\"row\">{shown}</th>"),

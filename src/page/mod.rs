@@ -12,7 +12,7 @@ use std::path::Path;
 use ::figures::{to_png, to_svg};
 
 pub use self::html::write;
-pub use self::table::{Cell, Table, count, percent, real, text};
+pub use self::table::{PageTable, TableCell, count, percent, real, text};
 use crate::atomic_file::{AtomicFile, cannot_create, cannot_write};
 use crate::csv::Csv;
 use crate::exit_status::CommandError;
@@ -39,7 +39,7 @@ pub struct FigureContent {
 }
 
 /// A file that belongs to a page.
-pub struct File {
+pub struct PageFile {
     /// Its path in the page's directory.
     pub path: String,
     /// Its content.
@@ -47,16 +47,16 @@ pub struct File {
 }
 
 /// A heading and what is below it.
-pub type Section<'a> = (&'static str, Vec<Block<'a>>);
+pub type Section<'a> = (&'static str, Vec<PageBlock<'a>>);
 
 /// Content of a section. Figures and tables have numbers.
-pub enum Block<'a> {
+pub enum PageBlock<'a> {
     Paragraph(String),
     Figure(&'a FigureEntry, usize),
-    Table(&'a Table, usize),
+    Table(&'a PageTable, usize),
 }
 
-impl<'a> Block<'a> {
+impl<'a> PageBlock<'a> {
     /// The figure of this name, numbered among those that exist.
     pub fn figure(all: &'a [FigureEntry], name: &str) -> Option<Self> {
         let place = all.iter().position(|part| part.name == name)?;
@@ -65,34 +65,34 @@ impl<'a> Block<'a> {
     }
 
     /// The table of this name, numbered.
-    pub fn table(all: &'a [Table], name: &str) -> Option<Self> {
+    pub fn table(all: &'a [PageTable], name: &str) -> Option<Self> {
         let place = all.iter().position(|table| table.name == name)?;
         Some(Self::Table(&all[place], place + 1))
     }
 }
 
 /// The files of figures and tables.
-pub fn files(figures: Vec<FigureEntry>, tables: &[Table]) -> Result<Vec<File>, CommandError> {
+pub fn files(figures: Vec<FigureEntry>, tables: &[PageTable]) -> Result<Vec<PageFile>, CommandError> {
     let mut files = Vec::new();
     for part in figures {
         let Ok(drawn) = part.drawn else { continue };
         let path = |ending: &str| format!("figures/{}.{ending}", part.name);
         let image = to_png(&drawn.figure, RESOLUTION).map_err(CommandError::failed)?;
         let svg = to_svg(&drawn.figure);
-        files.push(File { path: path("svg"), bytes: svg.into_bytes() });
-        files.push(File { path: path("png"), bytes: image });
-        files.push(File { path: path("csv"), bytes: drawn.numbers.into_bytes() });
+        files.push(PageFile { path: path("svg"), bytes: svg.into_bytes() });
+        files.push(PageFile { path: path("png"), bytes: image });
+        files.push(PageFile { path: path("csv"), bytes: drawn.numbers.into_bytes() });
     }
     for table in tables {
         let path = format!("tables/{}.csv", table.name);
-        files.push(File { path, bytes: table.csv().into_bytes() });
+        files.push(PageFile { path, bytes: table.csv().into_bytes() });
     }
     Ok(files)
 }
 
 /// Writes the files into a directory, replacing those of an earlier page.
-pub fn write_files(directory: &Path, files: &[File]) -> Result<(), CommandError> {
-    for File { path, bytes } in files {
+pub fn write_files(directory: &Path, files: &[PageFile]) -> Result<(), CommandError> {
+    for PageFile { path, bytes } in files {
         let path = directory.join(path);
         path.parent().map_or(Ok(()), create_directory)?;
         let mut file = AtomicFile::create(&path)?;

@@ -6,7 +6,7 @@ use crate::csv::{self, Csv};
 const MAX_PAGE_ROWS: usize = 60;
 
 /// A table.
-pub struct Table {
+pub struct PageTable {
     /// Name of its file and its anchor on the page.
     pub name: &'static str,
     /// Caption. Supports `_{…}` and `^{…}`, as the titles do.
@@ -14,14 +14,14 @@ pub struct Table {
     /// Column titles.
     pub titles: Vec<&'static str>,
     /// Rows. A row of a single cell is a heading and is not written to the file.
-    pub rows: Vec<Vec<Cell>>,
+    pub rows: Vec<Vec<TableCell>>,
     /// Largest number of rows on the page. The file has all.
     pub shown: usize,
 }
 
 /// A cell.
 #[derive(Clone, Debug)]
-pub struct Cell {
+pub struct TableCell {
     /// Rounded, for the page.
     pub shown: String,
     /// Full precision, for the file.
@@ -30,7 +30,7 @@ pub struct Cell {
     pub is_number: bool,
 }
 
-impl Table {
+impl PageTable {
     /// A table without rows.
     pub fn new(name: &'static str, caption: &str, titles: &[&'static str]) -> Self {
         Self {
@@ -61,23 +61,23 @@ impl Table {
 }
 
 /// A text.
-pub fn text(words: impl Into<String>) -> Cell {
+pub fn text(words: impl Into<String>) -> TableCell {
     let words = words.into();
-    Cell { shown: words.clone(), exact: words, is_number: false }
+    TableCell { shown: words.clone(), exact: words, is_number: false }
 }
 
 /// A count.
-pub fn count(number: u64) -> Cell {
-    Cell { shown: super::style::grouped(number), exact: number.to_string(), is_number: true }
+pub fn count(number: u64) -> TableCell {
+    TableCell { shown: super::style::grouped(number), exact: number.to_string(), is_number: true }
 }
 
 /// A number with a fixed number of decimals, or a dash.
-pub fn real(x: impl Into<Option<f64>>, decimals: usize) -> Cell {
+pub fn real(x: impl Into<Option<f64>>, decimals: usize) -> TableCell {
     let x = x.into();
-    Cell { shown: crate::output::decimals(x, decimals), exact: csv::number(x), is_number: true }
+    TableCell { shown: crate::output::decimals(x, decimals), exact: csv::number(x), is_number: true }
 }
 
 /// A share, in percent on the page and in the file.
-pub fn percent(share: Option<f64>) -> Cell {
+pub fn percent(share: Option<f64>) -> TableCell {
     real(share.map(|share| 100.0 * share), 1)
 }

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use super::{FilterReport, Metrics, Step};
 use crate::csv::{Csv, number};
-use crate::output::{Table, count, decimals};
+use crate::output::{TextTable, count, decimals};
 
 pub fn write(report: &FilterReport, out: &mut dyn Write) -> io::Result<()> {
     let shown = if report.has_classes() { 4 } else { 1 };
@@ -20,7 +20,7 @@ pub fn write(report: &FilterReport, out: &mut dyn Write) -> io::Result<()> {
     let names = ["MAE", "precision", "recall", "F1"];
     let mut titles = vec![">threshold".to_owned(), ">kept".into(), ">kept (%)".into()];
     titles.extend(names[..shown].iter().flat_map(|name| [format!(">{name}"), ">random".into()]));
-    let mut table = Table::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
+    let mut table = TextTable::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
     for step in &report.steps {
         let mut row = vec![step.threshold.to_string(), step.kept.to_string(), percent(step.share)];
         let random = step.random_mean.columns().into_iter().zip(step.random_deviation.columns());

@@ -8,7 +8,7 @@ use atoms::{NeighbourList, Species, Structure, shortest_distance};
 use store::{CollectedStructure, JobState, SeedStructure, Store, StoreError};
 use wire::{ContentHash, Origin};
 
-use super::features::Features;
+use super::features::FeaturesByElement;
 
 /// Rows read at a time.
 const PAGE_ROWS: u32 = 256;
@@ -32,7 +32,7 @@ pub struct Collections {
     /// Structures of both origins. They say nothing about the difference, so everything but the counts excludes them.
     pub shared: u64,
     /// Features of atoms, by element.
-    pub features: Features,
+    pub features: FeaturesByElement,
 }
 
 /// The collected structures of one origin.
@@ -40,18 +40,18 @@ pub struct OriginCollection {
     /// Sizes of structures.
     pub structures: SystematicSample<StructureSize>,
     /// Grades and errors of atoms.
-    pub atoms: SystematicSample<Atom>,
+    pub atoms: SystematicSample<GradedAtom>,
     /// Number of atoms of each element.
     pub elements: BTreeMap<Species, u64>,
     /// Numbers of structures by seed structure and status of their labels.
-    pub labels: BTreeMap<u32, Counts>,
+    pub labels: BTreeMap<u32, LabelCounts>,
     /// Decisions about the structures whose features are read.
     sampled: SystematicSample<i64>,
 }
 
 /// Numbers of structures by status of their labels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Counts {
+pub struct LabelCounts {
     /// All structures.
     pub structures: u64,
     /// With a label.
@@ -71,7 +71,7 @@ pub struct StructureSize {
 
 /// Grades and error of an atom.
 #[derive(Clone, Copy, Debug)]
-pub struct Atom {
+pub struct GradedAtom {
     /// γ under the original mixture.
     pub gamma: f64,
     /// γ_nbr under the original mixture.
@@ -106,8 +106,8 @@ impl Collections {
                 }
             }
         }
-        let elements = Features::most_frequent(&biased.elements, &control.elements);
-        let mut features = Features::new(&elements);
+        let elements = FeaturesByElement::most_frequent(&biased.elements, &control.elements);
+        let mut features = FeaturesByElement::new(&elements);
         for (origin, collection) in [(Origin::Biased, &biased), (Origin::Control, &control)] {
             for decision in collection.sampled.items() {
                 let found = store.candidates(decision - 1, true, 1).await?;
@@ -182,7 +182,7 @@ impl OriginCollection {
         let stretches = shortest.filter(|_| is_labelled).map(|shortest| stretches(structure, shortest));
         for (k, gamma) in row.original.gamma.iter().enumerate() {
             let label = row.label_forces.as_ref().and_then(|label| label.get(k));
-            self.atoms.add(Atom {
+            self.atoms.add(GradedAtom {
                 gamma: *gamma,
                 gamma_nbr: row.original.gamma_nbr.get(k).copied().unwrap_or(f64::NAN),
                 error: label.zip(forces.get(k)).map(|(label, model)| norm(sub(*model, *label))),

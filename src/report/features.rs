@@ -12,7 +12,7 @@ pub const MAX_ELEMENTS: usize = 6;
 const MAX_ATOMS: usize = 4096;
 
 /// Features of atoms, by element.
-pub struct Features(BTreeMap<Species, [FeatureSample; 2]>);
+pub struct FeaturesByElement(BTreeMap<Species, [FeatureSample; 2]>);
 
 /// Features of one element and origin.
 pub struct FeatureSample {
@@ -28,14 +28,14 @@ pub struct Plane {
     /// Share of the variance along each component.
     pub shares: [f64; 2],
     /// Biased walks.
-    pub biased: Points,
+    pub biased: ProjectedPoints,
     /// Control walks.
-    pub control: Points,
+    pub control: ProjectedPoints,
 }
 
 /// Projected points.
 #[derive(Default)]
-pub struct Points {
+pub struct ProjectedPoints {
     /// Number of atoms before sampling.
     pub seen: u64,
     /// Atoms.
@@ -44,7 +44,7 @@ pub struct Points {
     pub centroids: Vec<[f64; 2]>,
 }
 
-impl Features {
+impl FeaturesByElement {
     /// Starts empty, for these elements.
     pub fn new(elements: &[Species]) -> Self {
         let sample = || FeatureSample { atoms: SystematicSample::new(MAX_ATOMS), centroids: Vec::new() };
@@ -96,7 +96,7 @@ impl Plane {
             let along = axes.project(row);
             [along[0], along[1]]
         };
-        let points = |sample: &FeatureSample| Points {
+        let points = |sample: &FeatureSample| ProjectedPoints {
             seen: sample.atoms.total(),
             atoms: sample.atoms.items().map(place).collect(),
             centroids: sample.centroids.iter().map(place).collect(),
@@ -121,8 +121,8 @@ mod tests {
     fn elements_have_planes_of_their_own() {
         let [al, mg]: [Species; 2] = ["Al", "Mg"].map(|symbol| symbol.parse().unwrap());
         let counts = |al_atoms, mg_atoms| BTreeMap::from([(al, al_atoms), (mg, mg_atoms)]);
-        assert_eq!(Features::most_frequent(&counts(1, 5), &counts(3, 0)), [mg, al]);
-        let mut features = Features::new(&[al, mg]);
+        assert_eq!(FeaturesByElement::most_frequent(&counts(1, 5), &counts(3, 0)), [mg, al]);
+        let mut features = FeaturesByElement::new(&[al, mg]);
         for k in 0..20 {
             let (x, y) = (f64::from(k), f64::from(k % 2));
             // Aluminium differs along (1, 0), magnesium not at all.

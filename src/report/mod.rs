@@ -17,15 +17,15 @@ use store::Store;
 use self::report_data::ReportData;
 use crate::csv::{self, Csv};
 use crate::exit_status::CommandError;
-use crate::page::{self, FigureContent, FigureEntry, File};
+use crate::page::{self, FigureContent, FigureEntry, PageFile};
 
 /// Reads the campaign and builds all files of its report, the page first.
-pub async fn build(store: &Store) -> Result<Vec<File>, CommandError> {
+pub async fn build(store: &Store) -> Result<Vec<PageFile>, CommandError> {
     let data = ReportData::read(store).await?;
     let parts = figures::all(&data);
     let tables = tables::all(&data);
     let text = self::text::write(&data, &parts, &tables);
-    let mut files = vec![File { path: PAGE.to_owned(), bytes: text.into_bytes() }];
+    let mut files = vec![PageFile { path: PAGE.to_owned(), bytes: text.into_bytes() }];
     files.extend(page::files(parts, &tables)?);
     Ok(files)
 }

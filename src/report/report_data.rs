@@ -35,13 +35,13 @@ pub struct ReportData {
     /// The collected structures.
     pub collections: Collections,
     /// `None` without a label protocol.
-    pub labels: Option<Labels>,
+    pub labels: Option<ProtocolLabels>,
     /// Start of the campaign, ms since 1970.
     pub started: Option<i64>,
 }
 
 /// Labels of the protocol in force.
-pub struct Labels {
+pub struct ProtocolLabels {
     /// The protocol.
     pub protocol: Protocol,
     /// Statistics of force errors and completion.
@@ -67,7 +67,7 @@ impl ReportData {
         let collections =
             Collections::read(store, protocol.as_ref().map(|protocol| protocol.hash), &seeds).await?;
         let labels = match protocol {
-            Some(protocol) => Some(Labels::read(store, protocol).await?),
+            Some(protocol) => Some(ProtocolLabels::read(store, protocol).await?),
             None => None,
         };
         let first = store.operations(0, 1).await?;
@@ -86,7 +86,7 @@ impl ReportData {
     }
 }
 
-impl Labels {
+impl ProtocolLabels {
     async fn read(store: &Store, protocol: Protocol) -> Result<Self, StoreError> {
         let hash = protocol.hash;
         Ok(Self {

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use store::WalkStatus;
 
 use super::report_data::ReportData;
-use crate::page::{Cell, Table, count, percent, real, text};
+use crate::page::{PageTable, TableCell, count, percent, real, text};
 
 pub use facts::collection_rule;
 
@@ -30,7 +30,7 @@ fn states<'a>(walks: impl Iterator<Item = &'a WalkStatus>) -> (u64, String) {
 }
 
 /// All tables with rows, in the order of the page.
-pub fn all(data: &ReportData) -> Vec<Table> {
+pub fn all(data: &ReportData) -> Vec<PageTable> {
     let mut tables =
         vec![facts::summary(data), conditions::conditions(data), seed_structures::seed_structures(data)];
     if let Some(found) = &data.labels {

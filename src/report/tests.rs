@@ -112,7 +112,7 @@ fn words(text: &str) -> String {
     words
 }
 
-fn file<'a>(files: &'a [File], path: &str) -> &'a str {
+fn file<'a>(files: &'a [PageFile], path: &str) -> &'a str {
     let file = files.iter().find(|file| file.path == path);
     std::str::from_utf8(&file.unwrap_or_else(|| panic!("no {path}")).bytes).unwrap()
 }

@@ -3,20 +3,20 @@
 use super::report_data::ReportData;
 use super::tables::collection_rule;
 use crate::page::style::grouped;
-use crate::page::{self, Block, FigureEntry, Section, Table};
+use crate::page::{self, FigureEntry, PageBlock, PageTable, Section};
 
 /// Writes the page.
-pub fn write(data: &ReportData, parts: &[FigureEntry], tables: &[Table]) -> String {
+pub fn write(data: &ReportData, parts: &[FigureEntry], tables: &[PageTable]) -> String {
     let title = format!("Campaign {}", data.campaign.id);
     page::write(&title, &lead(data), sections(data, parts, tables))
 }
 
-fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [Table]) -> Vec<Section<'a>> {
-    let numbered = |name: &str| Block::figure(parts, name);
-    let table = |name: &str| Block::table(tables, name);
-    let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
+fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTable]) -> Vec<Section<'a>> {
+    let numbered = |name: &str| PageBlock::figure(parts, name);
+    let table = |name: &str| PageBlock::table(tables, name);
+    let blocks = |blocks: Vec<Option<PageBlock<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
     let why = collection_rule(&data.configuration).map(|rule| {
-        Block::Paragraph(format!(
+        PageBlock::Paragraph(format!(
             "A structure of a biased walk becomes a candidate when {rule}, under the walker’s mixture. The selector decides with the \
              newest mixture."
         ))

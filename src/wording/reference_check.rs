@@ -2,12 +2,12 @@
 
 use monitor::reference_check::{CheckState, DifferenceBounds, FrameDifference, Overall, ReferenceCheck};
 
-use crate::output::{Table, count, decimals};
+use crate::output::{TextTable, count, decimals};
 
 /// A row for each frame, and one with the root mean square over the frames.
 pub fn table(check: &ReferenceCheck) -> String {
     let mut table =
-        Table::new(&["frame", "formula", ">energy (eV/atom)", ">force (eV/Å)", ">stress (eV/Å³)", ""]);
+        TextTable::new(&["frame", "formula", ">energy (eV/atom)", ">force (eV/Å)", ">stress (eV/Å³)", ""]);
     for FrameDifference { frame, formula, energy, force, stress, failure, .. } in &check.frames {
         table.push(vec![
             frame.clone(),

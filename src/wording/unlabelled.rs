@@ -2,7 +2,7 @@
 
 use store::{Unlabelled, ValueRange};
 
-use crate::output::Table;
+use crate::output::TextTable;
 
 /// A line with a title of `width` characters, then one line for each seed structure and formula, at most `most`.
 /// Empty if no label failed.
@@ -11,7 +11,7 @@ pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String 
         return String::new();
     }
     let failed: u64 = unlabelled.iter().map(|part| part.failed).sum();
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         "  seed structure",
         "formula",
         ">failed",

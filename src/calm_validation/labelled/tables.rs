@@ -5,13 +5,13 @@ use std::io::{self, Write};
 use super::collect::LARGE_ERROR;
 use super::report::{Bin, IntervalEstimate, LabelledReport, MeanErrors, ScoreReport};
 use crate::output::{self, range};
-use crate::page::{Cell, Table, count, percent, real, text};
+use crate::page::{PageTable, TableCell, count, percent, real, text};
 
 /// The force error of the paper's table of contamination, eV/Å.
 const CONTAMINATION: f64 = 0.5;
 
 /// All tables that have rows.
-pub fn all(report: &LabelledReport) -> Vec<Table> {
+pub fn all(report: &LabelledReport) -> Vec<PageTable> {
     let mut tables = vec![errors(report)];
     if report.atoms > 0 {
         tables.extend([ranks(report), confident(report), quantiles(report)]);
@@ -36,11 +36,11 @@ pub fn write(report: &LabelledReport, out: &mut dyn Write) -> io::Result<()> {
         writeln!(out, "ranks, quantiles and intervals are from {sampled} atoms of {structures} structures")?;
     }
     for table in all(report) {
-        let align = |(title, cell): (&&str, &Cell)| {
+        let align = |(title, cell): (&&str, &TableCell)| {
             format!("{}{}", if cell.is_number { ">" } else { "" }, ::figures::plain(title))
         };
         let titles: Vec<_> = table.titles.iter().zip(&table.rows[0]).map(align).collect();
-        let mut aligned = output::Table::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
+        let mut aligned = output::TextTable::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
         for row in &table.rows {
             aligned.push(row.iter().map(|cell| cell.shown.clone()).collect());
         }
@@ -50,7 +50,7 @@ pub fn write(report: &LabelledReport, out: &mut dyn Write) -> io::Result<()> {
     Ok(())
 }
 
-fn errors(report: &LabelledReport) -> Table {
+fn errors(report: &LabelledReport) -> PageTable {
     let row = |name: &str, of: &MeanErrors| {
         let mut row = vec![text(name), count(of.number as u64)];
         for estimate in [of.mean_absolute, of.root_mean_square] {
@@ -66,10 +66,13 @@ fn errors(report: &LabelledReport) -> Table {
     ];
     let caption = format!("Errors of the model against the labels, {}", intervals(report));
     let titles = ["", "number", "MAE", INTERVAL, "RMSE", INTERVAL];
-    Table { rows: rows.into_iter().flatten().collect(), ..Table::new("label-errors", &caption, &titles) }
+    PageTable {
+        rows: rows.into_iter().flatten().collect(),
+        ..PageTable::new("label-errors", &caption, &titles)
+    }
 }
 
-fn ranks(report: &LabelledReport) -> Table {
+fn ranks(report: &LabelledReport) -> PageTable {
     let row = |score: &ScoreReport| {
         let area = report.threshold(LARGE_ERROR).map(|k| score.auc[k]).unwrap_or_default();
         let estimates = [score.spearman, area, score.worst_decile];
@@ -79,10 +82,10 @@ fn ranks(report: &LabelledReport) -> Table {
     let caption = "Scores and force errors |F_{model} − F_{label}| of atoms: Spearman’s ρ, ROC-AUC for errors above 1 eV/Å and for the \
                    worst decile of each element (mean over elements)";
     let titles = ["score", "ρ", INTERVAL, "AUC > 1 eV/Å", INTERVAL, "AUC worst decile", INTERVAL];
-    Table { rows: report.scores.iter().map(row).collect(), ..Table::new("ranks", caption, &titles) }
+    PageTable { rows: report.scores.iter().map(row).collect(), ..PageTable::new("ranks", caption, &titles) }
 }
 
-fn confident(report: &LabelledReport) -> Table {
+fn confident(report: &LabelledReport) -> PageTable {
     let places = [CONTAMINATION, LARGE_ERROR].map(|error| report.threshold(error));
     let row = |score: &ScoreReport| {
         let (limit, found) = (score.limit?, score.confident.as_ref()?);
@@ -104,10 +107,10 @@ fn confident(report: &LabelledReport) -> Table {
     let caption = "Atoms within the limit of a score: their share of all atoms, and the share of them with a force error above 0.5 and \
                    1 eV/Å";
     let titles = ["", "kept (%)", INTERVAL, "above 0.5 (%)", INTERVAL, "above 1 (%)", INTERVAL];
-    Table { rows, ..Table::new("confident", caption, &titles) }
+    PageTable { rows, ..PageTable::new("confident", caption, &titles) }
 }
 
-fn quantiles(report: &LabelledReport) -> Table {
+fn quantiles(report: &LabelledReport) -> PageTable {
     let row = |score: &ScoreReport, bin: &Bin| {
         let mut row = vec![name(score), text(range(bin.above, bin.up_to)), count(bin.atoms)];
         row.push(percent(Some(bin.share)));
@@ -118,7 +121,7 @@ fn quantiles(report: &LabelledReport) -> Table {
     let rows = report.scores.iter().flat_map(|score| score.bins.iter().map(move |bin| row(score, bin)));
     let caption = "Force errors (eV/Å) by bins of a score";
     let titles = ["score", "bin", "atoms", "atoms (%)", "median", "p90", "p99", "above 1 eV/Å (%)"];
-    Table { rows: rows.collect(), ..Table::new("quantiles", caption, &titles) }
+    PageTable { rows: rows.collect(), ..PageTable::new("quantiles", caption, &titles) }
 }
 
 /// Title of the columns with intervals.
@@ -130,16 +133,17 @@ fn intervals(report: &LabelledReport) -> String {
 }
 
 /// The name of a score without markup, which cells do not support.
-fn name(score: &ScoreReport) -> Cell {
+fn name(score: &ScoreReport) -> TableCell {
     text(::figures::plain(&score.name))
 }
 
 /// Value and interval.
-fn cells(estimate: IntervalEstimate, factor: f64, digits: usize) -> [Cell; 2] {
+fn cells(estimate: IntervalEstimate, factor: f64, digits: usize) -> [TableCell; 2] {
     let interval = estimate.interval.map(|(low, high)| [low, high].map(|x| real(factor * x, digits)));
-    let text = |of: fn(&Cell) -> &String| {
+    let text = |of: fn(&TableCell) -> &String| {
         interval.as_ref().map_or(String::new(), |[low, high]| format!("{} to {}", of(low), of(high)))
     };
-    let interval = Cell { shown: text(|cell| &cell.shown), exact: text(|cell| &cell.exact), is_number: true };
+    let interval =
+        TableCell { shown: text(|cell| &cell.shown), exact: text(|cell| &cell.exact), is_number: true };
     [real(estimate.value.map(|value| factor * value), digits), interval]
 }

@@ -14,7 +14,7 @@ use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::features::FeatureCalculator;
-use crate::output::{self, Bar, Table, print, print_stderr};
+use crate::output::{self, Bar, TextTable, print, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{Place, StructureArgs, StructureFiles};
 
@@ -222,7 +222,7 @@ fn read(
 
 /// A table of what was built.
 fn report(file: &BaselineFile, output: &Path) -> Result<(), CommandError> {
-    let mut table = Table::new(&["score", ">features", ">active sets", ">rows of each", "remark"]);
+    let mut table = TextTable::new(&["score", ">features", ">active sets", ">rows of each", "remark"]);
     for baseline in &file.baselines {
         let (kind, dimension) = (baseline.kind().to_string(), baseline.dimension().to_string());
         let [sets, rows, remark] = match baseline {

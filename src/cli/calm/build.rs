@@ -16,7 +16,7 @@ use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 use crate::file_hash;
 use crate::mixture_build::{self, BuildPart, Work};
-use crate::output::{Table, log_and_warn, print, print_stderr};
+use crate::output::{TextTable, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{StructureArgs, StructureFiles};
 
@@ -236,7 +236,7 @@ pub(super) fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), Comman
         ">thresholds",
         ">γ > 1",
     ];
-    let mut table = Table::new(&titles);
+    let mut table = TextTable::new(&titles);
     for ((symbol, element), thresholds) in
         artifact.symbols.iter().zip(mixture.elements()).zip(mixture.thresholds())
     {

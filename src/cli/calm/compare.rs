@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::artifact_checks::load_artifact;
 use crate::cli::{CommandError, ExitStatus};
 use crate::features::FeatureCalculator;
-use crate::output::{self, Bar, Table, decimals, print, print_json};
+use crate::output::{self, Bar, TextTable, decimals, print, print_json};
 use crate::structure_files::{Place, StructureArgs};
 
 /// Atoms of each element whose grades are kept for quantiles and ranks.
@@ -128,7 +128,7 @@ impl CalmCompareArgs {
             ">only B",
             ">ρ",
         ];
-        let mut table = Table::new(&titles);
+        let mut table = TextTable::new(&titles);
         for one in found {
             let mut row = vec![one.element.clone(), one.atoms.to_string()];
             row.extend(

@@ -10,7 +10,7 @@ use potentials::grace::GraceModel;
 use serde::Serialize;
 
 use crate::cli::{CommandError, ExitStatus};
-use crate::output::{Table, decimals, print, print_json};
+use crate::output::{TextTable, decimals, print, print_json};
 
 /// Components printed without --json.
 const SHOWN: usize = 40;
@@ -250,7 +250,7 @@ impl MixtureInfo {
             line(out, "UNUSABLE", fault)?;
         }
         writeln!(out)?;
-        let mut table = Table::new(&[
+        let mut table = TextTable::new(&[
             "element",
             ">component",
             ">θ",

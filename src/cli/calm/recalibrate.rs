@@ -10,7 +10,7 @@ use calm::build::{ElementHistograms, Recalibration, ThresholdRule, read_histogra
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
-use crate::output::{Table, print};
+use crate::output::{TextTable, print};
 
 /// Set new thresholds from the histograms of a CALM artifact, without its training data
 ///
@@ -103,7 +103,7 @@ fn report(
 ) -> Result<(), CommandError> {
     let titles =
         ["element", ">atoms", ">components", ">thresholds before", ">after", ">γ > 1 before", ">after"];
-    let mut table = Table::new(&titles);
+    let mut table = TextTable::new(&titles);
     for (element, (symbol, found)) in before.symbols.iter().zip(histograms).enumerate() {
         let Some(found) = found else { continue };
         let filled: Vec<_> = found.components.iter().filter(|histogram| histogram.count() > 0).collect();

@@ -20,7 +20,7 @@ use crate::calm_validation::{
 };
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
-use crate::output::{self, Bar, Table, decimals, print, print_stderr};
+use crate::output::{self, Bar, TextTable, decimals, print, print_stderr};
 use crate::page::{create_directory, write_files};
 use crate::signals::stop_token;
 
@@ -211,8 +211,8 @@ fn pair(text: &str) -> Result<[Species; 2], String> {
     if pair[0] == pair[1] { Err("expected two different elements".into()) } else { Ok(pair) }
 }
 
-fn bond_scans(validation: &Validation) -> Table {
-    let mut table = Table::new(&[
+fn bond_scans(validation: &Validation) -> TextTable {
+    let mut table = TextTable::new(&[
         "element",
         "crystal",
         ">d_eq (Å)",
@@ -240,8 +240,8 @@ fn bond_scans(validation: &Validation) -> Table {
     table
 }
 
-fn defects(validation: &Validation) -> Table {
-    let mut table = Table::new(&["element", "defect", ">crystal γ", ">γ next to it", ">γ far away"]);
+fn defects(validation: &Validation) -> TextTable {
+    let mut table = TextTable::new(&["element", "defect", ">crystal γ", ">γ next to it", ">γ far away"]);
     for defect in &validation.defects {
         let gamma = |of: Option<&f64>| decimals(of.copied(), 2);
         let near = defect.shells.first().and_then(|shell| shell.scores.first());

@@ -7,7 +7,7 @@ use monitor::candidate_details::{Coverage, DecisionDetails, Update};
 
 use super::grades::block;
 use super::{SHOWN, line, shortened_list};
-use crate::output::{self, Table, decimals};
+use crate::output::{self, TextTable, decimals};
 
 pub fn write(out: &mut dyn Write, decision: &DecisionDetails, atoms: usize) -> io::Result<()> {
     let DecisionDetails { number, round, kind, mixture_version, .. } = decision;
@@ -52,7 +52,7 @@ fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Resul
         None => ("rule not recorded".to_owned(), f64::NAN),
     };
     line(out, "update", &format!("{combination}, until {rule}"))?;
-    let mut table = Table::new(&[">α", ">γ_max reached", &format!(">atoms γ > {counted}")]);
+    let mut table = TextTable::new(&[">α", ">γ_max reached", &format!(">atoms γ > {counted}")]);
     for trial in &found.trials {
         table.push(vec![
             trial.alpha.to_string(),

@@ -5,10 +5,10 @@ use std::io::{self, Write};
 use monitor::candidate_details::{Atom, CandidateGrades, Trigger};
 
 use super::{INDENT, SHOWN, line};
-use crate::output::{Table, count, decimals};
+use crate::output::{TextTable, count, decimals};
 
 pub fn write(out: &mut dyn Write, grades: &CandidateGrades) -> io::Result<()> {
-    let mut table = Table::new(&["mixture", ">version", ">γ_max", ">γ_nbr max", ">atoms γ > 1"]);
+    let mut table = TextTable::new(&["mixture", ">version", ">γ_max", ">γ_nbr max", ">atoms γ > 1"]);
     for (name, grade) in
         [("walker's", &grades.walker), ("selector's", &grades.selector), ("original", &grades.original)]
     {
@@ -47,7 +47,7 @@ fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &CandidateGrade
     if triggered.is_empty() {
         return Ok(());
     }
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         ">atom",
         "element",
         ">γ walker's",
@@ -78,7 +78,7 @@ fn row(atom: &Atom) -> Vec<String> {
 }
 
 /// A table with a title before its first line.
-pub fn block(out: &mut dyn Write, title: &str, table: &Table) -> io::Result<()> {
+pub fn block(out: &mut dyn Write, title: &str, table: &TextTable) -> io::Result<()> {
     let mut text = Vec::new();
     table.write(&mut text)?;
     for (k, row) in String::from_utf8_lossy(&text).lines().enumerate() {

@@ -11,7 +11,7 @@ use tokio::time::timeout;
 
 use super::page::Page;
 use crate::cli::launch::{FOLDER, job_names};
-use crate::output::Table;
+use crate::output::TextTable;
 
 /// How long `calmwalk status` waits for the batch system.
 const TIMEOUT: Duration = Duration::from_secs(4);
@@ -70,7 +70,7 @@ impl BatchJobs {
             shown.truncate(page.others);
             shown.sort_by_key(|(job, _)| (job.role, job.id));
         }
-        let mut table = Table::new(&["job", ">id", "state", "node", "since", ">time left", "remark"]);
+        let mut table = TextTable::new(&["job", ">id", "state", "node", "since", ">time left", "remark"]);
         for (job, code) in &shown {
             table.push(line(job, code.as_deref()));
         }

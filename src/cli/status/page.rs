@@ -2,7 +2,7 @@
 
 use std::io::{self, IsTerminal, Write};
 
-use crate::output::{self, Table};
+use crate::output::{self, TextTable};
 
 /// Width of titles, columns.
 const TITLE: usize = 12;
@@ -66,7 +66,7 @@ impl Page {
     pub fn table(
         &self,
         out: &mut dyn Write,
-        table: &Table,
+        table: &TextTable,
         shown: usize,
         of: usize,
         what: &str,

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use store::{ProcessRecord, Status, this_host, unix_milliseconds};
 
 use super::page::Page;
-use crate::output::{Table, count};
+use crate::output::{TextTable, count};
 
 /// A description of what the campaign does.
 pub fn state(status: &Status) -> String {
@@ -55,7 +55,7 @@ pub fn write(out: &mut dyn Write, processes: &[ProcessRecord], page: &Page) -> i
         shown.truncate(page.others);
         shown.sort_by_key(|(place, _)| *place);
     }
-    let mut table = Table::new(&["process", ">pid", "state", ">restarts", ">last seen", "remark"]);
+    let mut table = TextTable::new(&["process", ">pid", "state", ">restarts", ">last seen", "remark"]);
     for (_, process) in &shown {
         table.push(line(process, now));
     }

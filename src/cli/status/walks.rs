@@ -7,12 +7,12 @@ use store::WalkStatus;
 use wire::conditions::VariedConditions;
 
 use super::page::{Page, cut};
-use crate::output::{Table, decimals};
+use crate::output::{TextTable, decimals};
 
 /// Width of the name of a seed structure, unless everything is shown.
 pub const NAME: usize = 14;
 
-/// Titles of the columns in the format of [`Table::new`].
+/// Titles of the columns in the format of [`TextTable::new`].
 pub const TITLES: [&str; 9] =
     [">walk", "seed structure", "state", ">step", ">steps/s", ">T (K)", ">V/V₀", ">γ_max", ">taken"];
 
@@ -38,7 +38,7 @@ pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &Page) 
     if shown.is_empty() {
         return Ok(());
     }
-    let mut table = Table::new(&TITLES);
+    let mut table = TextTable::new(&TITLES);
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
     let name = if page.walks == usize::MAX { usize::MAX } else { NAME };
     for walk in &shown {

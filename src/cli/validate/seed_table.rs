@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::campaign::{LoadedCampaign, Remark, SeedTriage, SkippedStructure, StepTimes};
 use crate::csv::{Csv, number};
-use crate::output::{Table, decimals};
+use crate::output::{TextTable, decimals};
 use crate::wording::cost::wall_time;
 
 const SECONDS_PER_HOUR: f64 = 3600.0;
@@ -36,7 +36,7 @@ pub fn write(
     times: &StepTimes,
     shown: usize,
 ) -> io::Result<()> {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         "seed structure",
         ">atoms",
         "formula",

@@ -17,7 +17,7 @@ use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, Text, WALKS, Wat
 use crate::cli::status as cli_status;
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
-use crate::output::{self, Table, count, decimals};
+use crate::output::{self, TextTable, count, decimals};
 
 /// Height of the header with the line below it.
 const HEADER_HEIGHT: u16 = 5;
@@ -162,7 +162,7 @@ fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut WatchState, index: u
     let style = if has_focus { Modifier::REVERSED | Modifier::BOLD } else { Modifier::UNDERLINED };
     frame.render_widget(Paragraph::new(Line::styled(format!("{text:<width$}"), style)), title);
     let (visible, selected) = (pane.visible(rows.height.into()), pane.index());
-    let mut table = Table::new(titles);
+    let mut table = TextTable::new(titles);
     pane.entries[visible.clone()].iter().for_each(|entry| table.push(entry.columns.clone()));
     let mut text = Vec::new();
     // Writing to memory cannot fail.

@@ -5,7 +5,7 @@ use analysis::{Density2d, contours};
 use wire::Origin;
 
 use super::super::collections::Collections;
-use super::super::features::{MAX_ELEMENTS, Plane, Points};
+use super::super::features::{MAX_ELEMENTS, Plane, ProjectedPoints};
 use super::super::style::{WIDTH, grouped, origin_style, origins};
 use super::super::{Csv, FigureContent, csv};
 use super::NOTHING_COLLECTED;
@@ -55,7 +55,7 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
 }
 
 impl Plane {
-    fn points(&self, origin: Origin) -> &Points {
+    fn points(&self, origin: Origin) -> &ProjectedPoints {
         if origin == Origin::Biased { &self.biased } else { &self.control }
     }
 }

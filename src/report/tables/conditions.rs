@@ -4,10 +4,10 @@ use store::WalkStatus;
 use wire::WalkConditions;
 
 use super::super::report_data::ReportData;
-use super::{Table, count, real, states, text};
+use super::{PageTable, count, real, states, text};
 
 /// The biased walks under the same conditions, from any seed structure. Without rows if all walks have the same.
-pub fn conditions(data: &ReportData) -> Table {
+pub fn conditions(data: &ReportData) -> PageTable {
     let titles = [
         "group",
         "T (K)",
@@ -23,7 +23,7 @@ pub fn conditions(data: &ReportData) -> Table {
     ];
     let caption = "Results by the conditions of biased walks: temperature of the thermostat, volume ramp and τ at the start; accepted \
                    structures, structures rejected by the guard, and roll-backs to a checkpoint.";
-    let mut table = Table::new("conditions", caption, &titles);
+    let mut table = PageTable::new("conditions", caption, &titles);
     let all = by_conditions(&data.status.walks);
     for (conditions, walks) in all.iter().filter(|_| all.len() > 1) {
         let sum = |of: fn(&WalkStatus) -> u64| walks.iter().map(|walk| of(walk)).sum::<u64>();

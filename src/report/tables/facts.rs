@@ -10,15 +10,15 @@ use store::records::LEFT_OUT;
 use super::super::report_data::ReportData;
 use super::super::style::grouped;
 use super::settings::flatten;
-use super::{Table, text};
+use super::{PageTable, text};
 use crate::wording;
 
 /// Elements in the summary, those first whose training data are forgotten most.
 const MAX_ELEMENTS: usize = 6;
 
 /// The campaign in a few lines.
-pub fn summary(data: &ReportData) -> Table {
-    let mut table = Table::new("summary", "The campaign in numbers.", &["", "value"]);
+pub fn summary(data: &ReportData) -> PageTable {
+    let mut table = PageTable::new("summary", "The campaign in numbers.", &["", "value"]);
     let status = &data.status;
     let mut row = |name: &str, value: String| table.rows.push(vec![text(name), text(value)]);
     row("campaign", format!("{}, {} mode", data.campaign.id, data.campaign.mode));
@@ -95,8 +95,8 @@ pub fn collection_rule(configuration: &Value) -> Option<String> {
 }
 
 /// Versions, hashes and sources.
-pub fn provenance(data: &ReportData) -> Table {
-    let mut table = Table::new("provenance", "Provenance of the campaign.", &["", "value"]).whole();
+pub fn provenance(data: &ReportData) -> PageTable {
+    let mut table = PageTable::new("provenance", "Provenance of the campaign.", &["", "value"]).whole();
     let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
     let campaign = &data.campaign;
     row("campaign".into(), campaign.id.to_string());

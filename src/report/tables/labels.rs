@@ -4,11 +4,11 @@ use analysis::ForceErrors;
 use monitor::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use store::{FailureCount, Unlabelled, ValueRange};
 
-use super::{Cell, Table, count, percent, real, text};
+use super::{PageTable, TableCell, count, percent, real, text};
 use crate::output::range;
 
 /// Correlation of grades and errors.
-pub fn correlations(statistics: &LabelStatistics) -> Table {
+pub fn correlations(statistics: &LabelStatistics) -> PageTable {
     let caption = format!(
         "Force error |F_{{model}} − F_{{label}}| and the grades under the original mixture: mean error, Spearman’s ρ between grade and \
          error, and ROC-AUC of the grade as a test for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}."
@@ -26,7 +26,7 @@ pub fn correlations(statistics: &LabelStatistics) -> Table {
         "ROC-AUC(γ_{nbr})",
         "sampled atoms",
     ];
-    let mut table = Table::new("correlations", &caption, &titles);
+    let mut table = PageTable::new("correlations", &caption, &titles);
     for (name, grades) in
         [("all", &statistics.all), ("biased", &statistics.biased), ("control", &statistics.control)]
     {
@@ -51,7 +51,7 @@ pub fn correlations(statistics: &LabelStatistics) -> Table {
 }
 
 /// The table of quantiles by one of the grades, as in the paper.
-pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) -> Table {
+pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) -> PageTable {
     let caption = format!(
         "Force errors of all labelled atoms (n = {}) by {grade} under the original mixture: percentiles in eV Å^{{−1}}, the share of atoms \
          in each bin, and the share with an error above {LARGE_FORCE_ERROR} eV Å^{{−1}}. Without label: atoms of structures whose labels failed \
@@ -70,7 +70,7 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
         "possible from (%)",
         "to (%)",
     ];
-    let mut table = Table::new(name, &caption, &titles);
+    let mut table = PageTable::new(name, &caption, &titles);
     for bin in errors.bins().iter().filter(|_| errors.atoms() > 0) {
         let (least, most) = bin.large_between.unzip();
         table.rows.push(vec![
@@ -90,7 +90,7 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
 }
 
 /// Element offsets that are removed from energies before errors are shown.
-pub fn energy_offsets(statistics: &LabelStatistics) -> Table {
+pub fn energy_offsets(statistics: &LabelStatistics) -> PageTable {
     let offsets = statistics.energies.summary().offsets;
     let caption = format!(
         "Offsets between the energy references of labels and potential: E_{{label}} − E_{{model}} per atom of each element, by least squares \
@@ -98,7 +98,7 @@ pub fn energy_offsets(statistics: &LabelStatistics) -> Table {
          determine the offsets separately, only their sums are meaningful.",
         offsets.structures, offsets.left_out
     );
-    let mut table = Table::new("energy-offsets", &caption, &["element", "offset (eV)", "separate"]);
+    let mut table = PageTable::new("energy-offsets", &caption, &["element", "offset (eV)", "separate"]);
     for offset in offsets.elements {
         let separate = if offset.separate { "yes" } else { "no" };
         table.rows.push(vec![text(offset.element), real(offset.offset, 4), text(separate)]);
@@ -107,11 +107,11 @@ pub fn energy_offsets(statistics: &LabelStatistics) -> Table {
 }
 
 /// Failures by class.
-pub fn failures(failures: &[FailureCount]) -> Table {
+pub fn failures(failures: &[FailureCount]) -> PageTable {
     let caption = "Label jobs with a failure, by its class: those labelled later, those that failed for good, and those that are \
                    unfinished.";
     let mut table =
-        Table::new("failures", caption, &["class", "jobs", "labelled later", "failed", "unfinished"]);
+        PageTable::new("failures", caption, &["class", "jobs", "labelled later", "failed", "unfinished"]);
     for FailureCount { class, labelled, failed, unfinished } in failures {
         let all = labelled + failed + unfinished;
         let counts = [all, *labelled, *failed, *unfinished].map(count);
@@ -121,7 +121,7 @@ pub fn failures(failures: &[FailureCount]) -> Table {
 }
 
 /// The part of the collected space without labels because of failures.
-pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
+pub fn unlabelled(unlabelled: &[Unlabelled]) -> PageTable {
     let caption = "Collected structures without a label because all attempts failed, by seed structure: ranges of the largest γ under the \
                    original mixture and of V/V_{0}, compared with those of labelled structures.";
     let titles = [
@@ -138,7 +138,7 @@ pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
         "of labelled: from",
         "to",
     ];
-    let mut table = Table::new("unlabelled", caption, &titles);
+    let mut table = PageTable::new("unlabelled", caption, &titles);
     for part in unlabelled {
         let mut row =
             vec![text(&part.seed_structure), text(&part.formula), count(part.failed), count(part.labelled)];
@@ -151,6 +151,6 @@ pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
     table
 }
 
-fn range_cells(range: &ValueRange, decimals: usize) -> [Cell; 2] {
+fn range_cells(range: &ValueRange, decimals: usize) -> [TableCell; 2] {
     [range.low, range.high].map(|end| real(end, decimals))
 }

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use store::WalkStatus;
 
 use super::super::report_data::ReportData;
-use super::{Table, count, states, text};
+use super::{PageTable, count, states, text};
 
 /// Walks, candidates by fate and labels of each seed structure.
-pub fn seed_structures(data: &ReportData) -> Table {
+pub fn seed_structures(data: &ReportData) -> PageTable {
     let caption = "Results by seed structure: biased walks and their states, candidates by fate, frames of its control walks, and labels of \
                    both.";
     let titles = [
@@ -27,7 +27,7 @@ pub fn seed_structures(data: &ReportData) -> Table {
         "labelled",
         "failed",
     ];
-    let mut table = Table::new("seed-structures", caption, &titles);
+    let mut table = PageTable::new("seed-structures", caption, &titles);
     let mut fates: BTreeMap<u64, BTreeMap<&str, u64>> = BTreeMap::new();
     for fate in &data.fates_by_seed {
         fates.entry(fate.part).or_default().insert(&fate.fate, fate.number);

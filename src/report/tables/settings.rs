@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use super::super::report_data::ReportData;
-use super::{Cell, Table, text};
+use super::{PageTable, TableCell, text};
 
 /// Sections in the order of the configuration file. Other sections follow.
 const SECTIONS: [&str; 11] = [
@@ -23,17 +23,17 @@ const SECTIONS: [&str; 11] = [
 const EXCLUDED_SECTIONS: [&str; 2] = ["files", "seed_structures"];
 
 /// The table: a heading for each section, then its keys. A key without a value is shown as not set.
-pub fn settings(data: &ReportData) -> Table {
+pub fn settings(data: &ReportData) -> PageTable {
     let caption = "The configuration in force, with every default filled in. Units are those of the documentation: eV, Å, fs, K. \
                    Files are named by their BLAKE3 hashes under Versions and provenance.";
-    let mut table = Table::new("settings", caption, &["key", "value"]).whole();
+    let mut table = PageTable::new("settings", caption, &["key", "value"]).whole();
     for (section, pairs) in sections(&data.configuration) {
         table.rows.push(vec![text(format!("[{section}]"))]);
         table.rows.extend(pairs.into_iter().map(|(key, value)| {
             let name = key.strip_prefix(&format!("{section}.")).unwrap_or(&key).to_owned();
             let shown = value.clone().unwrap_or_else(|| "not set".into());
-            let key = Cell { shown: name, exact: key, is_number: false };
-            vec![key, Cell { shown, exact: value.unwrap_or_default(), is_number: false }]
+            let key = TableCell { shown: name, exact: key, is_number: false };
+            vec![key, TableCell { shown, exact: value.unwrap_or_default(), is_number: false }]
         }));
     }
     table
