@@ -31,7 +31,8 @@ impl DashboardArgs {
             let listener = web::listen(self.address).await?;
             let store = Store::open_read_only(&self.location.get()?).await?;
             let address = listener.local_addr().map_err(CommandError::failed)?;
-            let serving = web::Server::start(listener, dashboard::Dashboard::new(store, None, None).router());
+            let serving =
+                web::HttpServer::start(listener, dashboard::Dashboard::new(store, None, None).router());
             log_and_print(format_args!("dashboard at http://{address}/"));
             tokio::signal::ctrl_c().await.map_err(CommandError::failed)?;
             serving.end();

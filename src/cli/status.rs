@@ -20,7 +20,7 @@ use monitor::walk_ends::WalkEnds;
 use store::{Candidates, Location, Status, Store, unix_milliseconds};
 
 use self::batch_jobs::BatchJobs;
-use self::page::{Page, cut};
+use self::page::{StatusLayout, cut};
 pub use self::processes::state;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, decimals, print, print_json};
@@ -57,7 +57,7 @@ impl StatusArgs {
             jobs.add_to(&mut json);
             print_json(&json)?;
         } else {
-            let page = if self.all { Page::unlimited() } else { Page::unlimited().screen() };
+            let page = if self.all { StatusLayout::unlimited() } else { StatusLayout::unlimited().screen() };
             print(|out| write(out, &snapshot, &jobs, page, self.walks))?;
         }
         Ok(ExitStatus::Done)
@@ -73,7 +73,7 @@ async fn read(location: &Location) -> Result<Snapshot, CommandError> {
 
 /// The output of `--all` in lines of at most `width` columns, without the jobs of a batch system.
 pub fn text(snapshot: &Snapshot, width: usize) -> String {
-    let (mut text, page) = (Vec::new(), Page { width, ..Page::unlimited() });
+    let (mut text, page) = (Vec::new(), StatusLayout { width, ..StatusLayout::unlimited() });
     // Writing to memory cannot fail.
     let _ = write(&mut text, snapshot, &BatchJobs::None, page, None);
     String::from_utf8_lossy(&text).into_owned()
@@ -83,7 +83,7 @@ fn write(
     out: &mut dyn Write,
     snapshot: &Snapshot,
     jobs: &BatchJobs,
-    page: Page,
+    page: StatusLayout,
     walks: Option<usize>,
 ) -> io::Result<()> {
     let mut head = Vec::new();
@@ -97,7 +97,7 @@ fn write(
     jobs.write(out, &page)
 }
 
-fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Result<()> {
+fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> io::Result<()> {
     let Snapshot { campaign, origin, status, mixture, disk, labels, end, check } = snapshot;
     let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
     let id = campaign.id.to_string();
@@ -139,13 +139,13 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &Page) -> io::Resu
 }
 
 /// The check of the reference with its differences.
-fn write_check(out: &mut dyn Write, page: &Page, check: &ReferenceCheck) -> io::Result<()> {
+fn write_check(out: &mut dyn Write, page: &StatusLayout, check: &ReferenceCheck) -> io::Result<()> {
     page.titled(out, "check", &format!("reference {}", reference_check::summary(check)))?;
     check.faults().try_for_each(|fault| page.titled(out, "", &fault))?;
     reference_check::table(check).lines().try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
 }
 
-fn describe_disk(disk: &DiskUse, page: &Page, status: &Status) -> String {
+fn describe_disk(disk: &DiskUse, page: &StatusLayout, status: &Status) -> String {
     let now = megabytes(disk.bytes);
     let Some((forecast, end)) = disk.forecast.zip(disk.at_the_end(status)) else {
         return format!("{now} now");
@@ -185,7 +185,7 @@ fn describe_walks(status: &Status, ends: &WalkEnds) -> String {
 
 fn write_candidates(
     out: &mut dyn Write,
-    page: &Page,
+    page: &StatusLayout,
     candidates: &Candidates,
     left_out: u64,
     shared: Option<u64>,

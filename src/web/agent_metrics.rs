@@ -12,7 +12,7 @@ use axum::routing::get;
 use orchestrator::supervisor::{ChildState, ChildStatus};
 use workers::agent::AgentMetrics;
 
-use super::exposition::{CONTENT_TYPE, Text};
+use super::exposition::{CONTENT_TYPE, MetricsText};
 
 /// State of an agent. Clones share it.
 #[derive(Clone, Debug, Default)]
@@ -35,7 +35,7 @@ async fn metrics(State(state): State<AgentState>) -> Response {
 }
 
 fn text(metrics: &AgentMetrics, walkers: &[ChildStatus]) -> String {
-    let mut text = Text::default();
+    let mut text = MetricsText::default();
     let host = store::this_host();
     let labels = [("host", host.as_str()), ("version", env!("CARGO_PKG_VERSION"))];
     text.gauge("calmwalk_agent_info", "Information about the agent; always 1.", &[(&labels, 1.0)]);
@@ -52,7 +52,7 @@ fn text(metrics: &AgentMetrics, walkers: &[ChildStatus]) -> String {
     text.into_string()
 }
 
-fn walker_metrics(text: &mut Text, metrics: &AgentMetrics, walkers: &[ChildStatus]) {
+fn walker_metrics(text: &mut MetricsText, metrics: &AgentMetrics, walkers: &[ChildStatus]) {
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
     walkers.iter().for_each(|walker| *states.entry(state_name(walker.state)).or_default() += 1);
     let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
@@ -72,7 +72,7 @@ fn walker_metrics(text: &mut Text, metrics: &AgentMetrics, walkers: &[ChildStatu
     );
 }
 
-fn assignment_metrics(text: &mut Text, metrics: &AgentMetrics) {
+fn assignment_metrics(text: &mut MetricsText, metrics: &AgentMetrics) {
     let taken = metrics.assignments_received as f64;
     text.counter(
         "calmwalk_agent_assignments_received_total",
@@ -99,7 +99,7 @@ fn assignment_metrics(text: &mut Text, metrics: &AgentMetrics) {
     text.counter("calmwalk_agent_steps_total", "Steps of the walkers of this host.", &[(&[], steps)]);
 }
 
-fn link_metrics(text: &mut Text, metrics: &AgentMetrics) {
+fn link_metrics(text: &mut MetricsText, metrics: &AgentMetrics) {
     let linked = f64::from(metrics.is_linked());
     text.gauge("calmwalk_agent_link_up", "Whether the orchestrator answers.", &[(&[], linked)]);
     optional_gauge(
@@ -128,7 +128,7 @@ fn link_metrics(text: &mut Text, metrics: &AgentMetrics) {
 }
 
 /// Omits the gauge if there is no value.
-fn optional_gauge(text: &mut Text, name: &str, help: &str, value: Option<f64>) {
+fn optional_gauge(text: &mut MetricsText, name: &str, help: &str, value: Option<f64>) {
     if let Some(value) = value {
         text.gauge(name, help, &[(&[], value)]);
     }

@@ -21,7 +21,7 @@ const MIN_RESERVED_DESCRIPTORS: u64 = 64;
 
 /// The open connections. Clones share them.
 #[derive(Clone, Debug, Default)]
-pub struct Connections(Arc<Mutex<Open>>);
+pub struct HttpConnections(Arc<Mutex<Open>>);
 
 #[derive(Debug, Default)]
 struct Open {
@@ -51,7 +51,7 @@ pub enum ConnectionState {
 /// Registration of a connection, removed on drop.
 #[derive(Debug)]
 pub struct ConnectionGuard {
-    connections: Connections,
+    connections: HttpConnections,
     number: u64,
 }
 
@@ -68,7 +68,7 @@ pub enum Admission {
     Refuse,
 }
 
-impl Connections {
+impl HttpConnections {
     /// Decides whether to serve a new connection, and which one to close for it.
     pub fn admit(&self, stream: &TcpStream) -> Admission {
         let mut open = self.open();

@@ -7,9 +7,9 @@ pub const CONTENT_TYPE: &str = "text/plain; version=0.0.4; charset=utf-8";
 
 /// Metrics as text, grouped by name.
 #[derive(Debug, Default)]
-pub struct Text(String);
+pub struct MetricsText(String);
 
-impl Text {
+impl MetricsText {
     /// Adds a counter. Its name ends with `_total`.
     pub fn counter(&mut self, name: &str, help: &str, samples: &[(&[(&str, &str)], f64)]) {
         self.metric(name, "counter", help, samples);
@@ -64,7 +64,7 @@ mod tests {
 
     #[test]
     fn labels_and_help_are_escaped_and_numbers_are_whole() {
-        let mut text = Text::default();
+        let mut text = MetricsText::default();
         text.counter("a_total", "One\nline.", &[(&[("k", "a\"b\\c\n")], 3.0), (&[], 0.25)]);
         text.gauge("b", "Two.", &[]);
         text.gauge("c", "Three.", &[(&[], f64::NAN), (&[], f64::INFINITY)]);

@@ -17,7 +17,7 @@ use store::{Location, Store};
 use tokio::net::TcpListener;
 
 use self::dashboard::{Dashboard, Mutations};
-pub use self::server::Server;
+pub use self::server::HttpServer;
 use crate::exit_status::CommandError;
 use crate::output::{log_and_print, print_stderr};
 
@@ -54,14 +54,14 @@ pub struct BoundListeners {
 /// The running servers. They stop on drop.
 #[derive(Debug, Default)]
 pub struct RunningServers {
-    servers: Vec<Server>,
+    servers: Vec<HttpServer>,
     read_store: Option<Store>,
 }
 
 impl RunningServers {
     /// Stops the servers and closes their store. The last process that closes a database cleans it up.
     pub async fn end(self) {
-        self.servers.iter().for_each(Server::end);
+        self.servers.iter().for_each(HttpServer::end);
         if let Some(read_store) = &self.read_store {
             read_store.close().await;
         }
@@ -70,7 +70,7 @@ impl RunningServers {
 
 impl Drop for RunningServers {
     fn drop(&mut self) {
-        self.servers.iter().for_each(Server::end);
+        self.servers.iter().for_each(HttpServer::end);
     }
 }
 
@@ -115,7 +115,7 @@ impl BoundListeners {
             // Print the token, but do not log it.
             print_stderr(format_args!("dashboard at http://{address}/#token={}", mutations.token()));
             let router = Dashboard::new(read_store, Some(mutations), Some(original)).router();
-            serving.servers.push(Server::start(listener, router));
+            serving.servers.push(HttpServer::start(listener, router));
         }
         Ok(serving)
     }
@@ -138,10 +138,10 @@ pub async fn listen(address: SocketAddr) -> Result<TcpListener, CommandError> {
 }
 
 /// Prints the address of the metrics and serves them.
-pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, CommandError> {
+pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<HttpServer, CommandError> {
     let address = listener.local_addr().map_err(CommandError::failed)?;
     log_and_print(format_args!("metrics at http://{address}/metrics"));
-    Ok(Server::start(listener, router))
+    Ok(HttpServer::start(listener, router))
 }
 
 #[cfg(test)]

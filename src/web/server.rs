@@ -1,4 +1,4 @@
-//! Serves a listener with limits on the number of connections ([`Connections`]), on the time and length of requests,
+//! Serves a listener with limits on the number of connections ([`HttpConnections`]), on the time and length of requests,
 //! and on the time to send responses.
 
 use std::convert::Infallible;
@@ -18,7 +18,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use super::connections::{Admission, ConnectionGuard, ConnectionState, Connections};
+use super::connections::{Admission, ConnectionGuard, ConnectionState, HttpConnections};
 use super::security;
 
 /// Time to receive the headers of a request, from the connection or the previous response.
@@ -37,16 +37,16 @@ const ACCEPT_RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A server with its connections.
 #[derive(Debug)]
-pub struct Server {
+pub struct HttpServer {
     listening: AbortHandle,
-    connections: Connections,
+    connections: HttpConnections,
 }
 
-impl Server {
+impl HttpServer {
     /// Serves in a background task until [`Self::end`].
     pub fn start(listener: TcpListener, router: Router) -> Self {
         let router = router.layer(middleware::from_fn(security::require_local_host));
-        let connections = Connections::default();
+        let connections = HttpConnections::default();
         let listening = tokio::spawn(accept(listener, router, connections.clone())).abort_handle();
         Self { listening, connections }
     }
@@ -58,7 +58,7 @@ impl Server {
     }
 }
 
-async fn accept(listener: TcpListener, router: Router, connections: Connections) {
+async fn accept(listener: TcpListener, router: Router, connections: HttpConnections) {
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
@@ -78,7 +78,7 @@ async fn accept(listener: TcpListener, router: Router, connections: Connections)
 }
 
 /// Waits until the connection may be served. `None` if it is refused.
-async fn admit(stream: TcpStream, connections: &Connections) -> Option<TcpStream> {
+async fn admit(stream: TcpStream, connections: &HttpConnections) -> Option<TcpStream> {
     loop {
         match connections.admit(&stream) {
             Admission::Now => return Some(stream),

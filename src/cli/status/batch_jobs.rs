@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use store::Location;
 use tokio::time::timeout;
 
-use super::page::Page;
+use super::page::StatusLayout;
 use crate::cli::launch::{FOLDER, job_names};
 use crate::output::TextTable;
 
@@ -57,7 +57,7 @@ impl BatchJobs {
     }
 
     /// Writes a table of the jobs; if they do not fit, jobs that are not running have priority.
-    pub fn write(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
+    pub fn write(&self, out: &mut dyn Write, page: &StatusLayout) -> io::Result<()> {
         let jobs = match self {
             Self::None => return Ok(()),
             Self::Unknown(why) => return writeln!(out, "\njobs        no answer from Slurm: {why}"),
@@ -137,7 +137,7 @@ fn as_json(job: &Job, code: &Option<String>) -> Value {
 mod tests {
     use super::*;
 
-    const PAGE: Page = Page { walks: 8, others: 8, few: 8, width: 120 };
+    const PAGE: StatusLayout = StatusLayout { walks: 8, others: 8, few: 8, width: 120 };
 
     fn job(id: u64, role: Role, state: &str) -> Job {
         Job {

@@ -6,14 +6,19 @@ use monitor::label_cost::QueueCost;
 use monitor::label_queue::{LabelQueue, ProtocolJobs, labels_per_hour};
 use store::{FailureCount, Labels, Status};
 
-use super::page::{Page, cut};
+use super::page::{StatusLayout, cut};
 use super::processes::since;
 use crate::output::count;
 use crate::wording::cost::{core_hours, two_digits};
 use crate::wording::unlabelled;
 
 /// Writes the state of the queue, costs, failures and the structures without labels.
-pub fn write(out: &mut dyn Write, queue: &LabelQueue, page: &Page, status: &Status) -> io::Result<()> {
+pub fn write(
+    out: &mut dyn Write,
+    queue: &LabelQueue,
+    page: &StatusLayout,
+    status: &Status,
+) -> io::Result<()> {
     page.titled(out, "labels", &describe_queue(status))?;
     if let Some(relabelling) = describe_relabelling(&status.labels) {
         page.titled(out, "", &relabelling)?;

@@ -5,10 +5,10 @@ use std::io::{self, Write};
 use calm::forgetting::ElementForgetting;
 use monitor::mixture_values::MixtureValues;
 
-use super::page::Page;
+use super::page::StatusLayout;
 
 /// Writes the lines below the version of the mixture.
-pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &Page, mode: &str) -> io::Result<()> {
+pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &StatusLayout, mode: &str) -> io::Result<()> {
     let training = values.training_frames();
     let number = |key: &str| training[key].as_f64();
     if let (Some(median), Some(share)) = (number("median"), number("share_above_one")) {
@@ -73,7 +73,7 @@ mod tests {
 
     fn text(values: &MixtureValues, mode: &str) -> String {
         let mut out = Vec::new();
-        let page = Page { walks: 8, others: 8, few: 8, width: 120 };
+        let page = StatusLayout { walks: 8, others: 8, few: 8, width: 120 };
         write(&mut out, values, &page, mode).unwrap();
         String::from_utf8(out).unwrap()
     }

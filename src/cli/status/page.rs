@@ -17,7 +17,7 @@ const FEW: usize = 2;
 
 /// Limits of the output.
 #[derive(Clone, Copy, Debug)]
-pub struct Page {
+pub struct StatusLayout {
     /// Maximum number of walks.
     pub walks: usize,
     /// Maximum number of processes, and of jobs.
@@ -28,14 +28,14 @@ pub struct Page {
     pub width: usize,
 }
 
-impl Page {
+impl StatusLayout {
     /// No limits, except for the width of a terminal.
     pub fn unlimited() -> Self {
         let (is_screen, all) = (io::stdout().is_terminal(), usize::MAX);
         Self { walks: all, others: all, few: all, width: WIDTHS[usize::from(!is_screen)] }
     }
 
-    /// Limits for the lists above the tables; [`Page::fitted`] sets those of the tables.
+    /// Limits for the lists above the tables; [`StatusLayout::fitted`] sets those of the tables.
     pub fn screen(self) -> Self {
         Self { walks: 0, others: 0, few: FEW, ..self }
     }
@@ -106,7 +106,7 @@ mod tests {
 
     #[test]
     fn long_lines_are_wrapped() {
-        let page = Page { width: 24, ..Page::unlimited() };
+        let page = StatusLayout { width: 24, ..StatusLayout::unlimited() };
         let mut text = Vec::new();
         page.titled(&mut text, "labels", "1 queued, 2 leased, extraordinarily long").unwrap();
         let expected =

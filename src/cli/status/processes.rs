@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use store::{ProcessRecord, Status, this_host, unix_milliseconds};
 
-use super::page::Page;
+use super::page::StatusLayout;
 use crate::output::{TextTable, count};
 
 /// A description of what the campaign does.
@@ -42,7 +42,7 @@ fn is_failed(state: &str) -> bool {
 }
 
 /// Writes a table of the processes; if they do not fit, those that are not running have priority.
-pub fn write(out: &mut dyn Write, processes: &[ProcessRecord], page: &Page) -> io::Result<()> {
+pub fn write(out: &mut dyn Write, processes: &[ProcessRecord], page: &StatusLayout) -> io::Result<()> {
     if processes.is_empty() {
         return Ok(());
     }
@@ -125,7 +125,7 @@ mod tests {
     fn text(processes: &[ProcessRecord], all: bool) -> String {
         let mut out = Vec::new();
         let most = if all { usize::MAX } else { 20 };
-        write(&mut out, processes, &Page { walks: most, others: most, few: 8, width: 120 }).unwrap();
+        write(&mut out, processes, &StatusLayout { walks: most, others: most, few: 8, width: 120 }).unwrap();
         String::from_utf8(out).unwrap()
     }
 

@@ -180,7 +180,7 @@ fn job() -> (Job, Option<String>) {
 #[test]
 fn the_status_of_a_large_campaign_fits_a_screen() {
     for (jobs, lines) in [(BatchJobs::None, 40), (BatchJobs::Known(vec![job(); 100]), 45)] {
-        let page = Page { width: 80, ..Page::unlimited().screen() };
+        let page = StatusLayout { width: 80, ..StatusLayout::unlimited().screen() };
         let mut text = Vec::new();
         write(&mut text, &large(), &jobs, page, None).unwrap();
         let text = String::from_utf8(text).unwrap();
@@ -195,7 +195,8 @@ fn the_status_of_a_large_campaign_fits_a_screen() {
 #[test]
 fn all_walks_are_shown_on_request() {
     let mut text = Vec::new();
-    write(&mut text, &large(), &BatchJobs::None, Page::unlimited().screen(), Some(usize::MAX)).unwrap();
+    write(&mut text, &large(), &BatchJobs::None, StatusLayout::unlimited().screen(), Some(usize::MAX))
+        .unwrap();
     let text = String::from_utf8(text).unwrap();
     assert!(text.contains("a-long-name-of-a-seed-structure-999") && !text.contains("more walks"));
     assert!(text.contains("more processes"));

@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use store::WalkStatus;
 use wire::conditions::VariedConditions;
 
-use super::page::{Page, cut};
+use super::page::{StatusLayout, cut};
 use crate::output::{TextTable, decimals};
 
 /// Width of the name of a seed structure, unless everything is shown.
@@ -33,7 +33,7 @@ fn select(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
 }
 
 /// Writes a table of the walks.
-pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &Page) -> io::Result<()> {
+pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &StatusLayout) -> io::Result<()> {
     let shown = select(walks, page.walks);
     if shown.is_empty() {
         return Ok(());

@@ -13,7 +13,7 @@ use store::{Candidates, Labels};
 use super::entries;
 use super::messages::WINDOW;
 use super::pane::{Pane, Tone};
-use super::state::{DECISIONS, Message, Mode, PromptKind, QUEUE, Text, WALKS, WatchState};
+use super::state::{DECISIONS, InputMode, PromptKind, QUEUE, StatusMessage, TextView, WALKS, WatchState};
 use crate::cli::status as cli_status;
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
@@ -65,7 +65,7 @@ pub fn draw(frame: &mut Frame<'_>, state: &mut WatchState, theme: &Theme) {
     let area = frame.area();
     let [above, message, keys] =
         Layout::vertical([Constraint::Fill(1), Constraint::Length(1), Constraint::Length(1)]).areas(area);
-    if let Mode::Text(text) = &mut state.mode {
+    if let InputMode::Text(text) = &mut state.mode {
         draw_text(frame, above, text);
     } else {
         draw_panes(frame, above, state, theme);
@@ -242,7 +242,7 @@ fn axis(width: u16, end: f64) -> String {
     line.into_iter().collect()
 }
 
-fn draw_text(frame: &mut Frame<'_>, area: Rect, text: &mut Text) {
+fn draw_text(frame: &mut Frame<'_>, area: Rect, text: &mut TextView) {
     let [title, rows] = Layout::vertical([Constraint::Length(1), Constraint::Fill(1)]).areas(area);
     let width = usize::from(area.width);
     let lines: Vec<Cow<'_, str>> = match &text.text {
@@ -274,11 +274,13 @@ fn draw_message(frame: &mut Frame<'_>, area: Rect, state: &WatchState, theme: &T
     let attention = theme.style(Tone::Attention);
     let width = usize::from(area.width);
     let line = match (&state.mode, &state.message, &state.read_error) {
-        (_, Some(Message::Error(error)), _) => Line::styled(cut(error, width), attention),
-        (Mode::Confirm(question, _), ..) => {
+        (_, Some(StatusMessage::Error(error)), _) => Line::styled(cut(error, width), attention),
+        (InputMode::Confirm(question, _), ..) => {
             Line::styled(cut(&format!("{question}  y: yes, any other key: no"), width), attention)
         }
-        (_, Some(Message::Success(text)), _) => Line::styled(cut(text, width), theme.style(Tone::Active)),
+        (_, Some(StatusMessage::Success(text)), _) => {
+            Line::styled(cut(text, width), theme.style(Tone::Active))
+        }
         (_, _, Some(error)) => {
             Line::styled(cut(&format!("outdated, cannot read the campaign: {error}"), width), attention)
         }
@@ -290,21 +292,21 @@ fn draw_message(frame: &mut Frame<'_>, area: Rect, state: &WatchState, theme: &T
 /// The last line: the available keys, or the prompt.
 fn key_hints(state: &WatchState) -> String {
     match (&state.mode, state.focus) {
-        (Mode::Text(_), _) => "↑↓ PgUp PgDn scroll  q back".to_owned(),
-        (Mode::Prompt(prompt), _) => match &prompt.kind {
+        (InputMode::Text(_), _) => "↑↓ PgUp PgDn scroll  q back".to_owned(),
+        (InputMode::Prompt(prompt), _) => match &prompt.kind {
             PromptKind::Filter => format!("filter: {}▏", prompt.text),
             PromptKind::Priority(id) => {
                 format!("priority of {}: {}▏", entries::without_campaign(id), prompt.text)
             }
         },
-        (Mode::Confirm(..), _) => String::new(),
-        (Mode::Panes, WALKS) => {
+        (InputMode::Confirm(..), _) => String::new(),
+        (InputMode::Panes, WALKS) => {
             "Tab pane  / filter  Enter decisions  p pause  r resume  i all  ? keys  q quit".into()
         }
-        (Mode::Panes, QUEUE) => {
+        (InputMode::Panes, QUEUE) => {
             "Tab pane  ↑↓  / filter  Enter open  = priority  d drop  t retry  s view  ? keys".into()
         }
-        (Mode::Panes, _) => "Tab pane  ↑↓  / filter  Enter open  i all  ? keys  q quit".into(),
+        (InputMode::Panes, _) => "Tab pane  ↑↓  / filter  Enter open  i all  ? keys  q quit".into(),
     }
 }
 

@@ -5,7 +5,7 @@ use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus, words};
 use wire::WalkConditions;
 use wire::conditions::VariedConditions;
 
-use super::pane::{Entry, Tone};
+use super::pane::{PaneEntry, Tone};
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
 use crate::filter::{self, Filter, StructureProperties};
@@ -36,7 +36,7 @@ pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
 ];
 
 /// The entries of walks that match the filter. `led`: whether an orchestrator runs.
-pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) -> Vec<Entry> {
+pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) -> Vec<PaneEntry> {
     let matches = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.matches(&facts_of_walk(walk)));
     let tone = |walk: &WalkStatus| match walk.state.as_str() {
         _ if walk.paused => Tone::Attention,
@@ -47,7 +47,7 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) ->
         _ => Tone::Ended,
     };
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
-    let entry = |walk: &WalkStatus| Entry {
+    let entry = |walk: &WalkStatus| PaneEntry {
         key: walk.walk.to_string(),
         columns: walks::line(walk, &varied, led, walks::NAME),
         tone: tone(walk),
@@ -57,7 +57,7 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) ->
 }
 
 /// The entries of label jobs that match the filter.
-pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&Filter>) -> Vec<Entry> {
+pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&Filter>) -> Vec<PaneEntry> {
     let matches = |job: &&Job| {
         let species = filter::species(&job.formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species, walks)))
@@ -68,7 +68,7 @@ pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&Filter>) 
         JobState::Failed => Tone::Attention,
         JobState::Dropped | JobState::Superseded => Tone::Ended,
     };
-    let entry = |job: &Job| Entry {
+    let entry = |job: &Job| PaneEntry {
         key: job.job.to_string(),
         columns: vec![
             without_campaign(&job.candidate).to_owned(),
@@ -90,7 +90,7 @@ pub fn decision_entries<'a>(
     decisions: impl Iterator<Item = &'a RecentDecision>,
     walks: &[WalkStatus],
     filter: Option<&Filter>,
-) -> Vec<Entry> {
+) -> Vec<PaneEntry> {
     let matches = |decision: &&RecentDecision| {
         let formula = decision.candidate.as_ref().map_or("", |found| &found.formula);
         let species = filter::species(formula);
@@ -99,7 +99,7 @@ pub fn decision_entries<'a>(
     decisions.filter(matches).map(decision_entry).collect()
 }
 
-fn decision_entry(decision: &RecentDecision) -> Entry {
+fn decision_entry(decision: &RecentDecision) -> PaneEntry {
     let RecentDecision { sequence, kind, walk, detail, candidate, .. } = decision;
     let found = candidate.as_ref();
     let number = |of: fn(&DecidedCandidate) -> Option<f64>, digits| match found {
@@ -113,7 +113,7 @@ fn decision_entry(decision: &RecentDecision) -> Entry {
     };
     let name = found.map(|found| found.seed_structure.as_str()).or_else(|| detail["seed_structure"].as_str());
     let step = found.map(|found| found.step).or_else(|| detail["step"].as_u64());
-    Entry {
+    PaneEntry {
         key: sequence.to_string(),
         columns: vec![
             sequence.to_string(),

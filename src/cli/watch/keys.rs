@@ -5,8 +5,10 @@ use store::JobState;
 
 use super::super::ExitStatus;
 use super::entries::{UNKNOWN_QUANTITIES, without_campaign};
-use super::messages::Request;
-use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, Text, WALKS, WatchState};
+use super::messages::WatchRequest;
+use super::state::{
+    DECISIONS, InputMode, Prompt, PromptKind, QUEUE, StatusMessage, TextView, WALKS, WatchState,
+};
 use crate::cli::queue::QueueCommand;
 use crate::cli::status;
 use crate::cli::walks::{WalkSelectionArgs, WalksCommand};
@@ -33,32 +35,32 @@ paused walk.";
 
 impl WatchState {
     /// Handles a key.
-    pub fn key(&mut self, key: KeyEvent) -> Option<Request> {
+    pub fn key(&mut self, key: KeyEvent) -> Option<WatchRequest> {
         if key.kind == KeyEventKind::Release {
             return None;
         }
         let control = key.modifiers.contains(KeyModifiers::CONTROL);
         if control && key.code == KeyCode::Char('c') {
-            return Some(Request::Quit(ExitStatus::Interrupted));
+            return Some(WatchRequest::Quit(ExitStatus::Interrupted));
         }
         self.message = None;
         match std::mem::take(&mut self.mode) {
-            Mode::Panes => self.key_in_panes(key.code),
-            Mode::Text(text) => self.key_in_text(text, key.code),
-            Mode::Prompt(prompt) => self.key_in_prompt(prompt, key.code, control),
-            Mode::Confirm(_, request) => match key.code {
+            InputMode::Panes => self.key_in_panes(key.code),
+            InputMode::Text(text) => self.key_in_text(text, key.code),
+            InputMode::Prompt(prompt) => self.key_in_prompt(prompt, key.code, control),
+            InputMode::Confirm(_, request) => match key.code {
                 KeyCode::Char('y' | 'Y') => Some(request),
                 _ => {
-                    self.message = Some(Message::Success("cancelled".into()));
+                    self.message = Some(StatusMessage::Success("cancelled".into()));
                     None
                 }
             },
         }
     }
 
-    fn key_in_panes(&mut self, code: KeyCode) -> Option<Request> {
+    fn key_in_panes(&mut self, code: KeyCode) -> Option<WatchRequest> {
         match code {
-            KeyCode::Char('q') => return Some(Request::Quit(ExitStatus::Done)),
+            KeyCode::Char('q') => return Some(WatchRequest::Quit(ExitStatus::Done)),
             KeyCode::Tab => self.focus = (self.focus + 1) % self.panes.len(),
             KeyCode::BackTab => self.focus = (self.focus + self.panes.len() - 1) % self.panes.len(),
             KeyCode::Char('1') => self.focus = WALKS,
@@ -70,7 +72,7 @@ impl WatchState {
             }
             KeyCode::Char('/') => {
                 let text = self.pane().filter.as_ref().map_or(String::new(), ToString::to_string);
-                self.mode = Mode::Prompt(Prompt { kind: PromptKind::Filter, text });
+                self.mode = InputMode::Prompt(Prompt { kind: PromptKind::Filter, text });
             }
             KeyCode::Esc => self.filter(None),
             KeyCode::Enter => return self.open(),
@@ -78,7 +80,7 @@ impl WatchState {
             KeyCode::Char('s') => {
                 self.focus = QUEUE;
                 self.next_view();
-                return Some(Request::Refresh);
+                return Some(WatchRequest::Refresh);
             }
             KeyCode::Char('d' | 't' | '=') if self.focus == QUEUE => self.change(code),
             KeyCode::Char('p' | 'r' | 'P' | 'R') => self.report_wrong_pane("walks", '1'),
@@ -94,12 +96,14 @@ impl WatchState {
     }
 
     fn report_wrong_pane(&mut self, pane: &str, key: char) {
-        self.message =
-            Some(Message::Error(format!("this key works only in the pane of the {pane}: press {key} first")));
+        self.message = Some(StatusMessage::Error(format!(
+            "this key works only in the pane of the {pane}: press {key} first"
+        )));
     }
 
     fn show(&mut self, title: &str, text: String) {
-        self.mode = Mode::Text(Text { title: title.to_owned(), text: Some(text), ..Text::default() });
+        self.mode =
+            InputMode::Text(TextView { title: title.to_owned(), text: Some(text), ..TextView::default() });
     }
 
     fn filter(&mut self, filter: Option<Filter>) {
@@ -108,7 +112,7 @@ impl WatchState {
     }
 
     /// Opens the history of a candidate, or the decisions of a walk.
-    fn open(&mut self) -> Option<Request> {
+    fn open(&mut self) -> Option<WatchRequest> {
         if let Some(walk) = self.walk().filter(|_| self.focus == WALKS) {
             self.focus = DECISIONS;
             // The same filter as if typed.
@@ -116,63 +120,63 @@ impl WatchState {
             return None;
         }
         let Some(id) = self.pane().selected().and_then(|entry| entry.candidate.clone()) else {
-            self.message = Some(Message::Error("no candidate is selected".into()));
+            self.message = Some(StatusMessage::Error("no candidate is selected".into()));
             return None;
         };
-        self.mode = Mode::Text(Text { title: id.clone(), ..Text::default() });
-        Some(Request::Explain(id))
+        self.mode = InputMode::Text(TextView { title: id.clone(), ..TextView::default() });
+        Some(WatchRequest::Explain(id))
     }
 
-    fn pause(&mut self, code: KeyCode) -> Option<Request> {
+    fn pause(&mut self, code: KeyCode) -> Option<WatchRequest> {
         let all = matches!(code, KeyCode::Char('P' | 'R'));
         let pauses = matches!(code, KeyCode::Char('p' | 'P'));
         let walks: Vec<u32> = self.walk().filter(|_| !all).into_iter().collect();
         if !all && walks.is_empty() {
-            self.message = Some(Message::Error("no walk is selected".into()));
+            self.message = Some(StatusMessage::Error("no walk is selected".into()));
             return None;
         }
         let selection = WalkSelectionArgs { walks, all };
         let action = if pauses { WalksCommand::Pause(selection) } else { WalksCommand::Resume(selection) };
-        let request = Request::Walks(action);
+        let request = WatchRequest::Walks(action);
         if !all {
             return Some(request);
         }
         let what = if pauses { "pause" } else { "resume" };
-        self.mode = Mode::Confirm(format!("{what} all walks that have not ended?"), request);
+        self.mode = InputMode::Confirm(format!("{what} all walks that have not ended?"), request);
         None
     }
 
     fn change(&mut self, code: KeyCode) {
         let Some(job) = self.job() else {
-            self.message = Some(Message::Error("no structure is selected".into()));
+            self.message = Some(StatusMessage::Error("no structure is selected".into()));
             return;
         };
         let (id, state, priority) = (job.candidate.clone(), job.state, job.priority);
         let short = without_campaign(&id).to_owned();
         let is_over = matches!(state, JobState::Failed | JobState::Dropped);
         self.mode = match code {
-            KeyCode::Char('d') => Mode::Confirm(
+            KeyCode::Char('d') => InputMode::Confirm(
                 format!("drop {short} ({state})? It will not be labelled or exported"),
-                Request::Queue(QueueCommand::Drop { ids: vec![id] }),
+                WatchRequest::Queue(QueueCommand::Drop { ids: vec![id] }),
             ),
             KeyCode::Char('=') => {
-                Mode::Prompt(Prompt { kind: PromptKind::Priority(id), text: priority.to_string() })
+                InputMode::Prompt(Prompt { kind: PromptKind::Priority(id), text: priority.to_string() })
             }
-            _ if is_over => Mode::Confirm(
+            _ if is_over => InputMode::Confirm(
                 format!("queue {short} ({state}) again?"),
-                Request::Queue(QueueCommand::Retry { ids: vec![id] }),
+                WatchRequest::Queue(QueueCommand::Retry { ids: vec![id] }),
             ),
             _ => {
                 let message = format!(
                     "{short} is {state}: only failed or dropped structures can be retried (press s to show them)"
                 );
-                self.message = Some(Message::Error(message));
-                Mode::Panes
+                self.message = Some(StatusMessage::Error(message));
+                InputMode::Panes
             }
         };
     }
 
-    fn key_in_text(&mut self, mut text: Text, code: KeyCode) -> Option<Request> {
+    fn key_in_text(&mut self, mut text: TextView, code: KeyCode) -> Option<WatchRequest> {
         if matches!(code, KeyCode::Char('q') | KeyCode::Esc | KeyCode::Enter) {
             return None;
         }
@@ -180,11 +184,11 @@ impl WatchState {
             // Limited to the end of the text when drawn.
             text.top = text.top.saturating_add_signed(lines);
         }
-        self.mode = Mode::Text(text);
+        self.mode = InputMode::Text(text);
         None
     }
 
-    fn key_in_prompt(&mut self, mut prompt: Prompt, code: KeyCode, control: bool) -> Option<Request> {
+    fn key_in_prompt(&mut self, mut prompt: Prompt, code: KeyCode, control: bool) -> Option<WatchRequest> {
         match code {
             KeyCode::Esc => return None,
             KeyCode::Enter => return self.submit(prompt),
@@ -194,12 +198,12 @@ impl WatchState {
             KeyCode::Char(character) => prompt.text.push(character),
             _ => {}
         }
-        self.mode = Mode::Prompt(prompt);
+        self.mode = InputMode::Prompt(prompt);
         None
     }
 
     /// Applies a line of input. If it is invalid, shows the error and lets the user correct it.
-    fn submit(&mut self, prompt: Prompt) -> Option<Request> {
+    fn submit(&mut self, prompt: Prompt) -> Option<WatchRequest> {
         let text = prompt.text.trim();
         let error = match &prompt.kind {
             PromptKind::Filter if text.is_empty() => {
@@ -215,13 +219,13 @@ impl WatchState {
             },
             PromptKind::Priority(id) => match text.parse() {
                 Ok(priority) => {
-                    return Some(Request::Queue(QueueCommand::Prioritise { id: id.clone(), priority }));
+                    return Some(WatchRequest::Queue(QueueCommand::Prioritise { id: id.clone(), priority }));
                 }
                 Err(_) => format!("'{text}' is not a priority: expected an integer (larger values first)"),
             },
         };
-        self.message = Some(Message::Error(error));
-        self.mode = Mode::Prompt(prompt);
+        self.message = Some(StatusMessage::Error(error));
+        self.mode = InputMode::Prompt(prompt);
         None
     }
 }

@@ -51,7 +51,7 @@ pub struct Reading {
 
 /// An action outside the state.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Request {
+pub enum WatchRequest {
     /// Exit.
     Quit(ExitStatus),
     /// Poll at once, because another view was selected.

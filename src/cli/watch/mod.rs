@@ -22,8 +22,8 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use self::draw::Theme;
-use self::messages::{Completed, JobView, Request};
-use self::reader::{Poller, Reader};
+use self::messages::{Completed, JobView, WatchRequest};
+use self::reader::{CampaignReader, Poller};
 use self::screen::Screen;
 use self::state::WatchState;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on, duration_between, explain, queue, walks};
@@ -59,7 +59,7 @@ impl WatchArgs {
 
 /// Polls, draws and handles keys until the user quits.
 async fn watch(location: Location, interval: std::time::Duration) -> Result<ExitStatus, CommandError> {
-    let mut reader = Reader::new(location.clone());
+    let mut reader = CampaignReader::new(location.clone());
     // Before the screen opens, so that an error is printed normally.
     let mut state = WatchState::new(reader.poll(JobView::default()).await?);
     let mut interrupt = signal(SignalKind::interrupt()).map_err(CommandError::failed)?;
@@ -95,32 +95,32 @@ async fn watch(location: Location, interval: std::time::Duration) -> Result<Exit
         };
         match request {
             None => {}
-            Some(Request::Quit(ended)) => return Ok(ended),
-            Some(Request::Refresh) => poller.poll_now(state.view),
+            Some(WatchRequest::Quit(ended)) => return Ok(ended),
+            Some(WatchRequest::Refresh) => poller.poll_now(state.view),
             Some(request) => drop(requests.spawn(perform(location.clone(), request))),
         }
     }
 }
 
 /// Does what the commands of the same names do.
-async fn perform(location: Location, request: Request) -> Completed {
+async fn perform(location: Location, request: WatchRequest) -> Completed {
     let message = |failure: CommandError| failure.to_string();
     match request {
-        Request::Explain(id) => {
+        WatchRequest::Explain(id) => {
             let history = explain::text(location, &id).await.map_err(message);
             Completed::Explain(id, history)
         }
-        Request::Queue(action) => {
+        WatchRequest::Queue(action) => {
             let mut changed = Vec::new();
             let result = queue::change(&location, &action, &mut changed).await.map_err(message);
             let messages = changed.iter().map(|job| queue::message(&action, job));
             Completed::Change(result.map(|()| messages.collect::<Vec<_>>().join("; ")))
         }
-        Request::Walks(action) => {
+        WatchRequest::Walks(action) => {
             let messages = walks::change(&location, &action).await.map_err(message);
             Completed::Change(messages.map(|lines| lines.join("; ")))
         }
-        Request::Quit(_) | Request::Refresh => Completed::Change(Ok(String::new())),
+        WatchRequest::Quit(_) | WatchRequest::Refresh => Completed::Change(Ok(String::new())),
     }
 }
 

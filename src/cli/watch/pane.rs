@@ -20,7 +20,7 @@ pub enum Tone {
 
 /// A line of a list.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Entry {
+pub struct PaneEntry {
     /// Identifies the entry in its list, also after later polls.
     pub key: String,
     /// Columns.
@@ -35,7 +35,7 @@ pub struct Entry {
 #[derive(Debug, Default)]
 pub struct Pane {
     /// Entries that match the filter.
-    pub entries: Vec<Entry>,
+    pub entries: Vec<PaneEntry>,
     /// Number of entries without the filter.
     pub all: usize,
     /// Filter.
@@ -50,7 +50,7 @@ pub struct Pane {
 
 impl Pane {
     /// Replaces the entries; `all` is their number without the filter.
-    pub fn set_entries(&mut self, entries: Vec<Entry>, all: usize) {
+    pub fn set_entries(&mut self, entries: Vec<PaneEntry>, all: usize) {
         (self.entries, self.all) = (entries, all);
         if let Some((key, at)) = &mut self.selected
             && let Some(found) = self.entries.iter().position(|entry| entry.key == *key)
@@ -66,7 +66,7 @@ impl Pane {
     }
 
     /// The selected entry.
-    pub fn selected(&self) -> Option<&Entry> {
+    pub fn selected(&self) -> Option<&PaneEntry> {
         self.entries.get(self.index())
     }
 
@@ -95,8 +95,8 @@ impl Pane {
 mod tests {
     use super::*;
 
-    fn entries(keys: impl IntoIterator<Item = u32>) -> Vec<Entry> {
-        keys.into_iter().map(|key| Entry { key: key.to_string(), ..Entry::default() }).collect()
+    fn entries(keys: impl IntoIterator<Item = u32>) -> Vec<PaneEntry> {
+        keys.into_iter().map(|key| PaneEntry { key: key.to_string(), ..PaneEntry::default() }).collect()
     }
 
     /// The selected entry and the visible range.

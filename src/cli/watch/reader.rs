@@ -14,7 +14,7 @@ use crate::exit_status::CommandError;
 const MAX_JOBS: u32 = 300;
 
 /// Reads a campaign.
-pub struct Reader {
+pub struct CampaignReader {
     location: Location,
     /// Connections to a server stay open. A file is opened for each poll, because it may have been replaced, or a run may have
     /// started.
@@ -22,7 +22,7 @@ pub struct Reader {
     last: i64,
 }
 
-impl Reader {
+impl CampaignReader {
     /// Reads nothing yet.
     pub fn new(location: Location) -> Self {
         Self { location, server: None, last: 0 }
@@ -62,7 +62,7 @@ pub struct Poller {
 
 impl Poller {
     /// Starts the task.
-    pub fn start(reader: Reader, interval: Duration) -> Self {
+    pub fn start(reader: CampaignReader, interval: Duration) -> Self {
         let (view, requested) = watch::channel(JobView::default());
         let (sender, readings) = mpsc::channel(1);
         tokio::spawn(poll_repeatedly(reader, interval, requested, sender));
@@ -81,7 +81,7 @@ impl Poller {
 }
 
 async fn poll_repeatedly(
-    mut reader: Reader,
+    mut reader: CampaignReader,
     interval: Duration,
     mut requested: watch::Receiver<JobView>,
     sender: mpsc::Sender<Result<Reading, CommandError>>,

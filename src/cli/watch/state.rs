@@ -7,7 +7,7 @@ use store::{Job, RecentDecision};
 
 use super::charts::Charts;
 use super::entries;
-use super::messages::{Completed, JobView, Reading, Request, WINDOW};
+use super::messages::{Completed, JobView, Reading, WINDOW, WatchRequest};
 use super::pane::Pane;
 use crate::exit_status::CommandError;
 
@@ -20,21 +20,21 @@ pub const DECISIONS: usize = 2;
 
 /// What receives the keys.
 #[derive(Debug, Default)]
-pub enum Mode {
+pub enum InputMode {
     /// The panes.
     #[default]
     Panes,
     /// A full-screen text.
-    Text(Text),
+    Text(TextView),
     /// A line of input.
     Prompt(Prompt),
     /// A yes-no question, and the request to send on yes.
-    Confirm(String, Request),
+    Confirm(String, WatchRequest),
 }
 
 /// A scrollable text.
 #[derive(Debug, Default)]
-pub struct Text {
+pub struct TextView {
     /// Title.
     pub title: String,
     /// Content; `None` until it is read.
@@ -65,7 +65,7 @@ pub enum PromptKind {
 
 /// A message, shown until the next key.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Message {
+pub enum StatusMessage {
     /// The result of a request.
     Success(String),
     /// Why a request failed.
@@ -83,9 +83,9 @@ pub struct WatchState {
     /// The pane that receives the keys.
     pub focus: usize,
     /// What receives the keys.
-    pub mode: Mode,
+    pub mode: InputMode,
     /// The current message.
-    pub message: Option<Message>,
+    pub message: Option<StatusMessage>,
     /// Why the last poll failed, if it did.
     pub read_error: Option<String>,
     /// Charts of the decisions.
@@ -104,7 +104,7 @@ impl WatchState {
             view,
             panes: Default::default(),
             focus: WALKS,
-            mode: Mode::default(),
+            mode: InputMode::default(),
             message: None,
             read_error: None,
             charts: Charts::default(),
@@ -141,15 +141,15 @@ impl WatchState {
     pub fn complete(&mut self, completed: Completed) {
         match completed {
             Completed::Explain(id, history) => {
-                if let Mode::Text(text) = &mut self.mode
+                if let InputMode::Text(text) = &mut self.mode
                     && text.text.is_none()
                     && text.title == id
                 {
                     text.text = Some(history.unwrap_or_else(|error| error));
                 }
             }
-            Completed::Change(Ok(message)) => self.message = Some(Message::Success(message)),
-            Completed::Change(Err(error)) => self.message = Some(Message::Error(error)),
+            Completed::Change(Ok(message)) => self.message = Some(StatusMessage::Success(message)),
+            Completed::Change(Err(error)) => self.message = Some(StatusMessage::Error(error)),
         }
     }
 

@@ -6,8 +6,8 @@ use store::{DecidedCandidate, Job, JobState, RecentDecision};
 use wire::Origin;
 
 use super::draw::{Theme, draw};
-use super::messages::{Completed, JobView, Reading, Request};
-use super::state::{DECISIONS, Message, Mode, QUEUE, WALKS, WatchState};
+use super::messages::{Completed, JobView, Reading, WatchRequest};
+use super::state::{DECISIONS, InputMode, QUEUE, StatusMessage, WALKS, WatchState};
 use super::*;
 use crate::cli::queue::QueueCommand;
 use crate::cli::status;
@@ -81,7 +81,7 @@ fn state() -> WatchState {
     WatchState::new(reading(jobs, 1..101))
 }
 
-fn press(state: &mut WatchState, keys: &str) -> Option<Request> {
+fn press(state: &mut WatchState, keys: &str) -> Option<WatchRequest> {
     let code = |key: &str| match key {
         "Tab" => KeyCode::Tab,
         "Enter" => KeyCode::Enter,
@@ -178,7 +178,7 @@ fn filters_apply_to_their_pane_and_errors_are_shown() {
     press(&mut state, "/");
     write(&mut state, "gamma >");
     press(&mut state, "Enter");
-    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("expected a number")));
+    assert!(matches!(&state.message, Some(StatusMessage::Error(why)) if why.contains("expected a number")));
     write(&mut state, " 1.45");
     press(&mut state, "Enter");
     assert_eq!((state.panes[QUEUE].entries.len(), &state.message), (1, &None));
@@ -187,7 +187,7 @@ fn filters_apply_to_their_pane_and_errors_are_shown() {
     write(&mut state, "max_force > 5");
     press(&mut state, "Enter");
     assert!(
-        matches!(&state.message, Some(Message::Error(why)) if why.contains("max_force is not available for label jobs")),
+        matches!(&state.message, Some(StatusMessage::Error(why)) if why.contains("max_force is not available for label jobs")),
         "{:?}",
         state.message
     );
@@ -195,7 +195,7 @@ fn filters_apply_to_their_pane_and_errors_are_shown() {
     press(&mut state, "Esc");
     // Another view is empty until its jobs are read.
     press(&mut state, "Esc");
-    assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(Request::Refresh), 0));
+    assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(WatchRequest::Refresh), 0));
     state.apply(Ok(reading(vec![job(4, JobState::Queued)], 103..103)));
     assert_eq!(state.panes[QUEUE].all, 0);
     state.apply(Ok(Reading { view: JobView::Failed, ..reading(vec![job(4, JobState::Failed)], 103..103) }));
@@ -219,35 +219,44 @@ fn irreversible_changes_need_confirmation() {
     // New jobs do not change the pending request.
     state.apply(Ok(reading(vec![job(9, JobState::Leased), job(8, JobState::Queued)], 101..101)));
     let id = |number| job(number, JobState::Queued).candidate;
-    assert_eq!(press(&mut state, "y"), Some(Request::Queue(QueueCommand::Drop { ids: vec![id(2)] })));
+    assert_eq!(press(&mut state, "y"), Some(WatchRequest::Queue(QueueCommand::Drop { ids: vec![id(2)] })));
     assert_eq!(press(&mut state, "d n"), None);
-    assert_eq!(state.message, Some(Message::Success("cancelled".into())));
+    assert_eq!(state.message, Some(StatusMessage::Success("cancelled".into())));
     assert_eq!(press(&mut state, "t"), None);
-    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("only failed or dropped")));
+    assert!(
+        matches!(&state.message, Some(StatusMessage::Error(why)) if why.contains("only failed or dropped"))
+    );
 
     press(&mut state, "g =");
     write(&mut state, "x");
     assert_eq!(press(&mut state, "Enter"), None);
-    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("'10x' is not a priority")));
+    assert!(
+        matches!(&state.message, Some(StatusMessage::Error(why)) if why.contains("'10x' is not a priority"))
+    );
     let request = press(&mut state, "Back Back Back - 5 Enter");
-    assert_eq!(request, Some(Request::Queue(QueueCommand::Prioritise { id: id(9), priority: -5 })));
+    assert_eq!(request, Some(WatchRequest::Queue(QueueCommand::Prioritise { id: id(9), priority: -5 })));
 
     let walks = |walks: &[u32], all| walks::WalkSelectionArgs { walks: walks.to_vec(), all };
     assert_eq!(press(&mut state, "d"), None);
     press(&mut state, "n");
     let request = press(&mut state, "1 Down p");
-    assert_eq!(request, Some(Request::Walks(walks::WalksCommand::Pause(walks(&[1], false)))));
+    assert_eq!(request, Some(WatchRequest::Walks(walks::WalksCommand::Pause(walks(&[1], false)))));
     assert_eq!(press(&mut state, "R"), None);
-    assert_eq!(press(&mut state, "y"), Some(Request::Walks(walks::WalksCommand::Resume(walks(&[], true)))));
+    assert_eq!(
+        press(&mut state, "y"),
+        Some(WatchRequest::Walks(walks::WalksCommand::Resume(walks(&[], true))))
+    );
     assert_eq!(press(&mut state, "3 p"), None);
-    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("the pane of the walks")));
+    assert!(
+        matches!(&state.message, Some(StatusMessage::Error(why)) if why.contains("the pane of the walks"))
+    );
 }
 
 #[test]
 fn a_history_is_shown_if_its_text_view_is_still_open() {
     let mut state = state();
     let id = job(2, JobState::Queued).candidate;
-    assert_eq!(press(&mut state, "2 Down Enter"), Some(Request::Explain(id.clone())));
+    assert_eq!(press(&mut state, "2 Down Enter"), Some(WatchRequest::Explain(id.clone())));
     assert!(screen(&mut state, 80, 24).contains("reading …"));
     state.complete(Completed::Explain("another".into(), Ok("wrong".into())));
     let lines: Vec<_> = (1..=50).map(|k| format!("line {k}.")).collect();
@@ -261,8 +270,8 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
     assert!(screen(&mut state, 80, 24).contains("line 29."), "one line up from the end");
     press(&mut state, "q");
     state.complete(Completed::Explain(id, Ok("late".into())));
-    assert!(matches!(state.mode, Mode::Panes));
-    assert_eq!(press(&mut state, "q"), Some(Request::Quit(ExitStatus::Done)));
+    assert!(matches!(state.mode, InputMode::Panes));
+    assert_eq!(press(&mut state, "q"), Some(WatchRequest::Quit(ExitStatus::Done)));
 }
 
 #[test]
@@ -278,7 +287,7 @@ fn the_last_state_stays_while_the_campaign_cannot_be_read() {
     assert!(!screen(&mut state, 80, 24).contains("outdated"));
     assert_eq!((state.focus, state.panes[QUEUE].entries.len()), (WALKS, 0));
     let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-    assert_eq!(state.key(control_c), Some(Request::Quit(ExitStatus::Interrupted)));
+    assert_eq!(state.key(control_c), Some(WatchRequest::Quit(ExitStatus::Interrupted)));
 }
 
 #[test]

@@ -22,7 +22,7 @@ const MAX_SCANNED: usize = 10_000;
 
 /// Parameters of a request.
 #[derive(Debug, Default)]
-struct Query {
+struct CandidateQuery {
     order: Order,
     ascending: bool,
     fate: Option<String>,
@@ -45,7 +45,7 @@ enum Order {
 
 /// A page of the table.
 #[derive(Debug, Default)]
-struct Page {
+struct CandidatePage {
     rows: Vec<ListedCandidate>,
     /// Cursor of the next page. `None` at the end.
     next: Option<ListCursor>,
@@ -54,13 +54,13 @@ struct Page {
 
 /// `GET /api/candidates?order=…&ascending=…&fate=…&state=…&where=…&after=…&limit=…`
 pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery) -> ApiResult {
-    let query = Query::parse(query.as_deref().unwrap_or_default())?;
-    let Page { rows, next, scanned } = query.page(&dashboard.store).await?;
+    let query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
+    let CandidatePage { rows, next, scanned } = query.page(&dashboard.store).await?;
     let next = next.map(|place| format!("{:?}:{}", place.value, place.decision));
     json(&json!({ "candidates": rows, "next": next, "looked_at": scanned }))
 }
 
-impl Query {
+impl CandidateQuery {
     fn parse(text: &str) -> Result<Self, ApiError> {
         let mut query = Self::default();
         for (key, value) in form_urlencoded::parse(text.as_bytes()).filter(|(_, value)| !value.is_empty()) {
@@ -92,10 +92,10 @@ impl Query {
         Ok(query)
     }
 
-    async fn page(&self, store: &Store) -> Result<Page, StoreError> {
+    async fn page(&self, store: &Store) -> Result<CandidatePage, StoreError> {
         let limit = self.limit.unwrap_or(50);
         let window = if self.filters_rows() { SCAN_ROWS } else { limit };
-        let (mut page, mut place, mut elements) = (Page::default(), self.after, HashMap::new());
+        let (mut page, mut place, mut elements) = (CandidatePage::default(), self.after, HashMap::new());
         let conditions = match self.filter {
             Some(_) => store.walk_conditions().await?,
             None => BTreeMap::new(),
@@ -250,7 +250,8 @@ mod tests {
 
     #[test]
     fn queries_are_parsed_or_refused_with_a_reason() {
-        let query = Query::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17").unwrap();
+        let query =
+            CandidateQuery::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17").unwrap();
         assert!(query.order == Order::Gamma && query.ascending && query.fate.is_none());
         assert_eq!(query.filter.unwrap().to_string(), "gamma > 2.0");
         assert_eq!(query.after, Some(ListCursor { value: 2.5, decision: 17 }));
@@ -262,7 +263,7 @@ mod tests {
             ("where=gamma", "expected one of = != <"),
             ("sort=gamma", "unknown parameter 'sort'"),
         ] {
-            let refused = format!("{:?}", Query::parse(query).unwrap_err());
+            let refused = format!("{:?}", CandidateQuery::parse(query).unwrap_err());
             assert!(refused.contains(why), "{query}: {refused}");
         }
     }

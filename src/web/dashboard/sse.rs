@@ -15,7 +15,7 @@ use tokio::task::JoinHandle;
 
 use super::Dashboard;
 use super::response::{self, ApiResult};
-use super::time_series::{Sample, TimeSeries};
+use super::time_series::{TimeSeries, TimeSeriesPoint};
 
 /// Shortest interval between polls while a client listens.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
@@ -60,7 +60,7 @@ async fn poll(store: Store, publish: watch::Sender<Option<Arc<str>>>, samples: A
         let begun = Instant::now();
         let text = match Snapshot::read(&store).await {
             Ok(snapshot) => {
-                let sample = Sample::new(&snapshot.status, unix_milliseconds());
+                let sample = TimeSeriesPoint::new(&snapshot.status, unix_milliseconds());
                 let status = snapshot.to_json().unwrap_or_default();
                 let text = json!({ "status": status, "sample": sample }).to_string();
                 samples.lock().unwrap_or_else(PoisonError::into_inner).add(sample);

@@ -12,7 +12,7 @@ const MAX_WALKS: usize = 12;
 
 /// State of a campaign at one time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Sample {
+pub struct TimeSeriesPoint {
     /// ms since 1970.
     pub time: i64,
     /// Candidates of biased walks so far.
@@ -34,13 +34,13 @@ pub struct Sample {
 /// Samples by time, thinned out.
 #[derive(Clone, Debug, Default)]
 pub struct TimeSeries {
-    samples: Vec<Sample>,
+    samples: Vec<TimeSeriesPoint>,
     /// One of this many samples is kept.
     every: usize,
     passed: usize,
 }
 
-impl Sample {
+impl TimeSeriesPoint {
     /// The current state of a campaign.
     pub fn new(status: &Status, time: i64) -> Self {
         let under_way =
@@ -61,7 +61,7 @@ impl Sample {
 
 impl TimeSeries {
     /// Adds the newest sample.
-    pub fn add(&mut self, sample: Sample) {
+    pub fn add(&mut self, sample: TimeSeriesPoint) {
         let every = self.every.max(1);
         if self.passed == 0 {
             self.samples.push(sample);
@@ -78,7 +78,7 @@ impl TimeSeries {
     }
 
     /// The samples, oldest first.
-    pub fn samples(&self) -> &[Sample] {
+    pub fn samples(&self) -> &[TimeSeriesPoint] {
         &self.samples
     }
 }
@@ -91,7 +91,7 @@ mod tests {
     fn many_samples_reach_back_to_the_first_at_even_distances() {
         let mut samples = TimeSeries::default();
         for time in 0..100_000 {
-            samples.add(Sample::new(&Status::default(), time));
+            samples.add(TimeSeriesPoint::new(&Status::default(), time));
         }
         let times: Vec<_> = samples.samples().iter().map(|sample| sample.time).collect();
         assert!((MAX_SAMPLES / 2..=MAX_SAMPLES).contains(&times.len()), "{}", times.len());
