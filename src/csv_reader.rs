@@ -15,7 +15,7 @@ pub struct CsvReader<R> {
 
 /// A row of the table.
 #[derive(Debug, PartialEq)]
-pub struct Row {
+pub struct CsvRow {
     /// Where it begins, from 1.
     pub line: usize,
     /// As many as there are titles.
@@ -91,10 +91,10 @@ impl<R: BufRead> CsvReader<R> {
     }
 
     /// The next row; empty lines are skipped.
-    pub fn next(&mut self) -> Result<Option<Row>, CsvError> {
+    pub fn next(&mut self) -> Result<Option<CsvRow>, CsvError> {
         let Some((line, cells)) = self.record()? else { return Ok(None) };
         match cells.len() == self.titles.len() {
-            true => Ok(Some(Row { line, cells })),
+            true => Ok(Some(CsvRow { line, cells })),
             false => Err(Fault::Cells { found: cells.len(), expected: self.titles.len() }.at(line)),
         }
     }

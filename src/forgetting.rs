@@ -23,7 +23,7 @@ pub struct ForgettingRule {
 
 /// What the selector measured after an update.
 #[derive(Clone, Debug, Default, Deserialize)]
-pub struct Measured {
+pub struct ForgettingMeasurement {
     /// How near the alarm is: it is raised above 1.
     #[serde(default)]
     pub level: f64,
@@ -64,7 +64,7 @@ impl ForgettingRule {
     }
 
     /// Message when the alarm is raised, with advice.
-    pub fn raised_message(&self, measured: &Measured) -> String {
+    pub fn raised_message(&self, measured: &ForgettingMeasurement) -> String {
         let other = match self.covariance_update {
             CovarianceUpdateKind::Convex => {
                 "covariance_update = \"additive\", which forgets nothing, or with smaller values in calm.alpha_values"
@@ -87,12 +87,12 @@ impl ForgettingRule {
     }
 
     /// Message when the alarm is cleared.
-    pub fn cleared_message(&self, measured: &Measured) -> String {
+    pub fn cleared_message(&self, measured: &ForgettingMeasurement) -> String {
         format!("the mixture covers its training data again: {}", self.describe(measured))
     }
 
     /// What was measured, and the limit.
-    fn describe(&self, measured: &Measured) -> String {
+    fn describe(&self, measured: &ForgettingMeasurement) -> String {
         let worst = |of: fn(&ElementForgetting) -> Option<f64>| {
             let known = measured.elements.iter().filter_map(|element| Some((element, of(element)?)));
             known.max_by(|a, b| a.1.total_cmp(&b.1)).map(|(element, value)| (&element.element, value))
@@ -135,7 +135,7 @@ impl AlarmState {
     }
 
     /// Takes the values of a decision. Returns a message if the alarm is raised or cleared.
-    pub fn update(&mut self, measured: &Measured) -> Option<String> {
+    pub fn update(&mut self, measured: &ForgettingMeasurement) -> Option<String> {
         let holds = self.forgetting.evaluate(measured.level)?;
         match (std::mem::replace(&mut self.raised, holds), holds) {
             (false, true) => Some(format!("ALARM: {}", self.forgetting.raised_message(measured))),
@@ -168,7 +168,11 @@ mod tests {
             .into_iter()
             .map(|share| {
                 let elements = vec![element("Al", 1.5, Some(share))];
-                alarm.update(&Measured { level: share / 0.2, share_above_one: Some(share), elements })
+                alarm.update(&ForgettingMeasurement {
+                    level: share / 0.2,
+                    share_above_one: Some(share),
+                    elements,
+                })
             })
             .collect();
         let begins = [1, 7].map(|index: usize| said[index].clone().unwrap());
@@ -182,7 +186,7 @@ mod tests {
     fn the_worst_element_is_named() {
         let elements =
             vec![element("O", 2.0, Some(0.3)), element("H", 3.0, Some(0.45)), element("U", 5.5, None)];
-        let said = RULE.describe(&Measured { level: 2.2, share_above_one: Some(0.1), elements });
+        let said = RULE.describe(&ForgettingMeasurement { level: 2.2, share_above_one: Some(0.1), elements });
         assert!(said.contains("10.0 % of the training atoms have γ > 1, 45.0 % of those of H"), "{said}");
         assert!(said.contains("of U is 5.5 times what it was (calm.max_mean_square_growth: 4)"), "{said}");
     }

@@ -11,7 +11,7 @@ use store::Protocol;
 use wire::ContentHash;
 use workers::labeller::{ExecutionSettings, Method};
 
-use crate::config::{LabelMethod, LabelSection, PotentialFile, PotentialKind, changed_keys};
+use crate::config::{LabelMethod, LabelSection, PotentialConfig, PotentialKind, changed_keys};
 use crate::exit_status::CommandError;
 use crate::file_hash::{hash, verify_hash};
 
@@ -45,7 +45,7 @@ impl MethodConfig {
     pub fn from_section(label: &LabelSection) -> Result<Self, CommandError> {
         let absolute = |path: &Path| std::path::absolute(path).map_err(CommandError::failed);
         match &label.method {
-            LabelMethod::Potential(PotentialFile { kind, file }) => {
+            LabelMethod::Potential(PotentialConfig { kind, file }) => {
                 let file = file.get_ref();
                 let file_hash = hash(file).map_err(|error| {
                     CommandError::Input(format!("cannot read {}: {error}", file.display()))
@@ -119,7 +119,7 @@ pub fn potential_identity(kind: PotentialKind, file_hash: &str) -> Value {
 /// the paths of files may change.
 pub fn resolved_method(label: &LabelSection, protocol: &Protocol) -> Value {
     match &label.method {
-        LabelMethod::Potential(PotentialFile { kind, .. }) => {
+        LabelMethod::Potential(PotentialConfig { kind, .. }) => {
             json!({ "potential": { "kind": kind, "file": null } })
         }
         LabelMethod::Code(settings) => json!({ settings.name(): protocol.settings }),

@@ -39,7 +39,7 @@ pub struct LogArgs {
     level: LogLevel,
     /// Log format
     #[arg(long = "log-format", value_name = "FORMAT", requires = "file", default_value = "text")]
-    format: Format,
+    format: LogFormat,
 }
 
 /// The least serious level that is logged.
@@ -59,7 +59,7 @@ pub enum LogLevel {
 /// Format of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Format {
+pub enum LogFormat {
     /// One line of text per event
     Text,
     /// One JSON object per line
@@ -73,7 +73,7 @@ pub struct LogConfig {
     /// Absolute path of the file.
     file: PathBuf,
     level: LogLevel,
-    format: Format,
+    format: LogFormat,
 }
 
 impl LogArgs {
@@ -118,7 +118,7 @@ fn cannot_write(file: &Path, error: &std::io::Error) -> CommandError {
 /// Writes events to the file.
 struct Log {
     file: File,
-    format: Format,
+    format: LogFormat,
     /// Name of the process, such as `walker 3`.
     process: String,
 }

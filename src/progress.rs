@@ -12,7 +12,7 @@ use store::{Fate, words};
 use tokio_util::sync::CancellationToken;
 use wire::{Origin, WalkId};
 
-use crate::forgetting::{AlarmState, ForgettingRule, Measured};
+use crate::forgetting::{AlarmState, ForgettingMeasurement, ForgettingRule};
 use crate::output::{count, print_stderr};
 use crate::wording::walk_ends;
 
@@ -20,7 +20,7 @@ use crate::wording::walk_ends;
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Display of a run.
-pub struct Display {
+pub struct RunDisplay {
     bars: Option<Bars>,
     names: BTreeMap<WalkId, String>,
     steps: BTreeMap<WalkId, u64>,
@@ -44,7 +44,7 @@ struct Bars {
     all: MultiProgress,
 }
 
-impl Display {
+impl RunDisplay {
     /// Displays walks of `walk_steps` steps each. `walks` are (walk, seed structure, current step), `ends` those of
     /// earlier runs.
     pub fn new(
@@ -127,9 +127,13 @@ impl Display {
             self.show_lasting(&line);
         }
         for decision in &commit.decisions {
-            let Ok(measured) = Measured::deserialize(&decision.detail["forgetting"]) else { continue };
+            let Ok(measured) = ForgettingMeasurement::deserialize(&decision.detail["forgetting"]) else {
+                continue;
+            };
             let share_above_one = decision.detail["training_frames"]["share_above_one"].as_f64();
-            if let Some(alarm) = self.forgetting.update(&Measured { share_above_one, ..measured }) {
+            if let Some(alarm) =
+                self.forgetting.update(&ForgettingMeasurement { share_above_one, ..measured })
+            {
                 tracing::warn!("{alarm}");
                 self.show_lasting(&alarm);
                 if self.forgetting.pauses() {

@@ -9,7 +9,7 @@ use analysis::{FilterStep, GradedRow, Quality, filter_sweep};
 use serde::Serialize;
 
 pub use self::figure::draw;
-pub use self::read::{Columns, ErrorColumns, read};
+pub use self::read::{ErrorColumns, InputColumns, read};
 pub use self::text::{csv, write};
 
 /// The sweep over thresholds.
@@ -24,12 +24,12 @@ pub struct FilterReport {
     pub seed: u64,
     /// All rows.
     pub unfiltered: Metrics,
-    pub steps: Vec<Step>,
+    pub steps: Vec<ThresholdResult>,
 }
 
 /// What a threshold keeps.
 #[derive(Debug, Serialize)]
-pub struct Step {
+pub struct ThresholdResult {
     pub threshold: f64,
     /// Rows with at most this grade.
     pub kept: usize,
@@ -76,7 +76,7 @@ impl FilterReport {
         let mut thresholds = thresholds.to_vec();
         thresholds.sort_by(f64::total_cmp);
         thresholds.dedup();
-        let step = |step: FilterStep| Step {
+        let step = |step: FilterStep| ThresholdResult {
             threshold: step.threshold,
             kept: step.kept,
             share: step.kept as f64 / rows.len().max(1) as f64,

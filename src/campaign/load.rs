@@ -17,7 +17,7 @@ use super::seed_structures::{SeedStructures, SourcedStructure};
 use super::training_sample::{self, SampledFrame};
 use crate::all_cores;
 use crate::artifact_checks::{check_belongs_to, check_sound};
-use crate::config::{ConfigError, LabelMethod, OnInvalid, PotentialFile, Warning, location};
+use crate::config::{ConfigError, LabelMethod, OnInvalid, PotentialConfig, Warning, location};
 use crate::feature_variant::with_projection;
 use crate::label_method::{self, REFERENCE_FILE};
 
@@ -222,7 +222,7 @@ impl Loader<'_> {
 
     fn reference(
         &self,
-        reference: &PotentialFile,
+        reference: &PotentialConfig,
         seeds: &mut SeedStructures,
     ) -> Result<(Value, Vec<(String, String)>), ConfigError> {
         let wrong = |message: String| self.file_error(REFERENCE_FILE, &reference.file, message);

@@ -24,7 +24,7 @@ pub struct SampledFrame {
 }
 
 /// Species of the atoms of a frame, with their numbers.
-type Counts = Vec<(Species, usize)>;
+type ElementCounts = Vec<(Species, usize)>;
 
 /// The sample of a file, which is read frame by frame, twice. Each element has the same number of atoms, or all there
 /// are, spread evenly over the file.
@@ -49,7 +49,7 @@ pub fn read(path: &Path) -> Result<Vec<SampledFrame>, String> {
     Ok(sample)
 }
 
-fn count(structure: &Structure) -> Counts {
+fn count(structure: &Structure) -> ElementCounts {
     let mut counts: BTreeMap<Species, usize> = BTreeMap::new();
     structure.species.iter().for_each(|species| *counts.entry(*species).or_default() += 1);
     counts.into_iter().collect()
@@ -62,7 +62,7 @@ fn wanted(elements: usize) -> usize {
 
 /// Whether each frame has atoms of the sample. Frames with rare elements come first; those of an element are spread evenly
 /// over the file.
-fn select(frames: &[Counts]) -> Vec<bool> {
+fn select(frames: &[ElementCounts]) -> Vec<bool> {
     let mut with: BTreeMap<Species, (usize, Vec<usize>)> = BTreeMap::new();
     for (frame, counts) in frames.iter().enumerate() {
         for &(species, count) in counts {
@@ -104,7 +104,7 @@ struct Thinning {
 }
 
 impl Thinning {
-    fn new(frames: &[Counts], selected: &[bool]) -> Self {
+    fn new(frames: &[ElementCounts], selected: &[bool]) -> Self {
         let mut atoms: BTreeMap<Species, (usize, usize)> = BTreeMap::new();
         for (frame, _) in frames.iter().zip(selected).filter(|(_, selected)| **selected) {
             frame.iter().for_each(|(species, count)| atoms.entry(*species).or_default().0 += count);
@@ -131,10 +131,10 @@ mod tests {
     }
 
     /// Number of sampled atoms of each element in each frame.
-    fn sampled(frames: &[Counts]) -> Vec<Counts> {
+    fn sampled(frames: &[ElementCounts]) -> Vec<ElementCounts> {
         let selected = select(frames);
         let mut thinning = Thinning::new(frames, &selected);
-        let sampled = |(frame, selected): (&Counts, bool)| {
+        let sampled = |(frame, selected): (&ElementCounts, bool)| {
             let count = |&(species, count): &(Species, usize)| {
                 let atoms = if selected { count } else { 0 };
                 (species, (0..atoms).filter(|_| thinning.keeps(species)).count())
@@ -144,7 +144,7 @@ mod tests {
         frames.iter().zip(selected).map(sampled).collect()
     }
 
-    fn atoms_of(frames: &[Counts], symbol: &str) -> usize {
+    fn atoms_of(frames: &[ElementCounts], symbol: &str) -> usize {
         frames.iter().flatten().filter(|(other, _)| *other == species(symbol)).map(|(_, count)| count).sum()
     }
 

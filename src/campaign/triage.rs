@@ -26,7 +26,7 @@ pub enum Remark {
 
 /// The shortest distance of a pair of elements.
 #[derive(Clone, Copy, Debug)]
-pub struct PairDistance {
+pub struct ShortestPairDistance {
     /// The elements.
     pub pair: ElementPair,
     /// Å.
@@ -40,7 +40,7 @@ pub struct SeedTriage<'a> {
     /// The structure.
     pub seed: &'a SourcedStructure,
     /// All pairs of its elements with neighbours, those closest to their limits first.
-    pub pairs: Vec<PairDistance>,
+    pub pairs: Vec<ShortestPairDistance>,
     /// Its largest grade; `None` if it cannot be graded.
     pub gamma_max: Option<f64>,
     /// Number of its atoms above the threshold of the collection rule.
@@ -113,17 +113,18 @@ impl<'a> Examiner<'a> {
             .map_err(|error| error.to_string())
     }
 
-    fn pairs(&self, SourcedStructure { geometry, .. }: &SourcedStructure) -> Vec<PairDistance> {
+    fn pairs(&self, SourcedStructure { geometry, .. }: &SourcedStructure) -> Vec<ShortestPairDistance> {
         let limits = self.campaign.config.guard.min_distances.limits(&geometry.shortest);
         let distances = geometry.shortest.iter().zip(limits.iter());
-        let pairs = distances.map(|((pair, distance), (_, limit))| PairDistance { pair, distance, limit });
+        let pairs =
+            distances.map(|((pair, distance), (_, limit))| ShortestPairDistance { pair, distance, limit });
         let mut pairs: Vec<_> = pairs.filter(|pair| pair.distance.is_finite()).collect();
         pairs.sort_by(|a, b| a.relative().total_cmp(&b.relative()));
         pairs
     }
 }
 
-impl PairDistance {
+impl ShortestPairDistance {
     /// The distance divided by its limit.
     pub fn relative(&self) -> f64 {
         self.distance / self.limit

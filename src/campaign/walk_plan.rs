@@ -11,7 +11,7 @@ use super::seed_structures::{SeedStructures, SourcedStructure, listed};
 use crate::config::{
     ConfigError, OnInvalid, VolumeRampSection, WalkGroupSection, WalkSection, Warning, location,
 };
-use crate::filter::{Filter, StructureProperties};
+use crate::filter::{StructureFilter, StructureProperties};
 
 /// Largest number of biased walks.
 const MAX_WALKS: usize = 1_000_000;
@@ -122,9 +122,9 @@ impl Loader<'_> {
         }
     }
 
-    fn seed_filter(&self, number: usize, text: &str) -> Result<Filter, ConfigError> {
+    fn seed_filter(&self, number: usize, text: &str) -> Result<StructureFilter, ConfigError> {
         let key = format!("walks.{number}.seed_structures");
-        let filter: Filter =
+        let filter: StructureFilter =
             text.parse().map_err(|error| self.walks_error(&key, format!("'{text}': {error}")))?;
         match filter.names().into_iter().find(|name| !PROPERTIES.contains(name)) {
             Some(name) => {
@@ -140,7 +140,7 @@ impl Loader<'_> {
     }
 }
 
-fn is_selected(filter: &Filter, name: &str, structure: &Structure) -> bool {
+fn is_selected(filter: &StructureFilter, name: &str, structure: &Structure) -> bool {
     let properties = StructureProperties {
         species: &structure.species,
         seed_structure: Some(name),

@@ -44,14 +44,14 @@ pub struct ImportArgs {
 }
 
 /// The frames of one file with their numbers in it.
-struct File {
+struct ImportedFile {
     name: String,
     frames: Vec<(u64, Structure, Label)>,
     /// First line of each frame, from 1.
     lines: Vec<usize>,
 }
 
-impl File {
+impl ImportedFile {
     /// Applies the campaign's bounds for its own labels.
     fn check(&self, bounds: &LabelBounds) -> Result<(), CommandError> {
         for ((_, _, label), line) in self.frames.iter().zip(&self.lines) {
@@ -103,7 +103,7 @@ impl ImportArgs {
         Ok(queued)
     }
 
-    async fn import(&self, files: &[File]) -> Result<(Protocol, ImportCounts), CommandError> {
+    async fn import(&self, files: &[ImportedFile]) -> Result<(Protocol, ImportCounts), CommandError> {
         let location = self.location.get()?;
         let store = Store::open(&location).await?;
         // Imported structures change which candidates are duplicates: exclude a run.
@@ -115,7 +115,7 @@ impl ImportArgs {
             None => current_protocol(&store).await?,
         };
         let mut all = ImportCounts::default();
-        for File { name, frames, .. } in files {
+        for ImportedFile { name, frames, .. } in files {
             let imported = store.import(protocol.hash, name, frames, unix_milliseconds()).await?;
             all.labels += imported.labels;
             all.checks += imported.checks;
@@ -126,7 +126,7 @@ impl ImportArgs {
     }
 }
 
-fn read(path: &Path) -> Result<File, CommandError> {
+fn read(path: &Path) -> Result<ImportedFile, CommandError> {
     let name = path.display().to_string();
     let (mut frames, mut lines) = (Vec::new(), Vec::new());
     for (number, frame) in XyzReader::open(path).map_err(CommandError::input)?.enumerate() {
@@ -139,7 +139,7 @@ fn read(path: &Path) -> Result<File, CommandError> {
     if frames.is_empty() {
         return Err(CommandError::input(FileError::Empty(path.to_owned())));
     }
-    Ok(File { name, frames, lines })
+    Ok(ImportedFile { name, frames, lines })
 }
 
 /// The structures of a file with its name and their numbers in it.

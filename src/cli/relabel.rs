@@ -15,7 +15,7 @@ use self::protocol_change::ProtocolChange;
 use self::selection::Selection;
 use super::campaign_location::shell_argument;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
-use crate::filter::Filter;
+use crate::filter::StructureFilter;
 use crate::output::{count, print, print_json, warn_if_unencrypted};
 use crate::wording;
 
@@ -40,7 +40,7 @@ pub struct RelabelArgs {
     all: bool,
     /// As --all, but only structures that match a filter, such as 'max_force > 20'; see `calmwalk export --help` for its syntax
     #[arg(long = "where", value_name = "FILTER")]
-    condition: Option<Filter>,
+    condition: Option<StructureFilter>,
     /// With --all or --where: also relabel structures labelled by the current protocol
     #[arg(long)]
     include_current: bool,

@@ -7,7 +7,7 @@ use store::Store;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{TextTable, count, decimals, print, print_json};
 use crate::replay::{
-    self, FateChange, FateCounts, MissingFeatures, RelocatedFilesArgs, Report, RuleOverride,
+    self, FateChange, FateCounts, MissingFeatures, RelocatedFilesArgs, ReplayReport, RuleOverride,
 };
 
 /// Changed decisions printed without --json.
@@ -52,7 +52,7 @@ impl ReplayArgs {
         }
     }
 
-    async fn replay(&self) -> Result<Report, CommandError> {
+    async fn replay(&self) -> Result<ReplayReport, CommandError> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let report = replay::replay(&store, &self.settings, &self.moved).await;
         store.close().await;
@@ -60,8 +60,8 @@ impl ReplayArgs {
     }
 }
 
-fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
-    let Report { recorded, replayed, seconds, before, now, .. } = report;
+fn write_report(out: &mut dyn Write, report: &ReplayReport) -> io::Result<()> {
+    let ReplayReport { recorded, replayed, seconds, before, now, .. } = report;
     writeln!(out, "replayed    {replayed} of {recorded} decisions in {seconds:.2} s")?;
     for (key, value) in &report.set {
         writeln!(out, "            {key} = {value}")?;
@@ -91,7 +91,7 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     write_changes(out, "newly accepted", &report.newly_accepted)
 }
 
-fn write_verification(out: &mut dyn Write, report: &Report) -> io::Result<()> {
+fn write_verification(out: &mut dyn Write, report: &ReplayReport) -> io::Result<()> {
     if report.difference.is_some() {
         if report.other_processor {
             writeln!(

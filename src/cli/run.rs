@@ -29,7 +29,7 @@ use super::{CommandError, ExitStatus, block_on, duration_between};
 use crate::campaign::LoadedCampaign;
 use crate::disk_forecast;
 use crate::duration::Duration;
-use crate::forgetting::{ForgettingRule, Measured};
+use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
 use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
 use crate::runtime::notify::{self, Notifier};
@@ -360,7 +360,7 @@ async fn warn_if_disk_is_too_small(
 /// Why the campaign does not go on, and how it does.
 async fn paused_by_alarm(campaign: &LoadedCampaign, store: &Store) -> Result<CommandError, CommandError> {
     let values = MixtureValues(store.values().await?).training_frames();
-    let measured = Measured::deserialize(values).map_err(CommandError::failed)?;
+    let measured = ForgettingMeasurement::deserialize(values).map_err(CommandError::failed)?;
     Ok(CommandError::Failed(format!(
         "the campaign is paused: {}, then run it again",
         ForgettingRule::new(&campaign.config.calm).raised_message(&measured)

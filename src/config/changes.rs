@@ -67,7 +67,7 @@ const BONDS: &str = "label.guard.min_bond_lengths";
 
 /// A change that takes effect when the campaign is resumed.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Change {
+pub enum ConfigChange {
     /// A key with a new value.
     Key {
         /// Dotted key.
@@ -171,7 +171,7 @@ impl Refused {
     }
 }
 
-impl Change {
+impl ConfigChange {
     /// Key, value before and value after, for the operations log.
     pub fn detail(&self) -> Value {
         match self {
@@ -183,7 +183,7 @@ impl Change {
     }
 }
 
-impl fmt::Display for Change {
+impl fmt::Display for ConfigChange {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Key { key, before, after } => {
@@ -201,12 +201,12 @@ impl fmt::Display for Change {
 ///
 /// # Errors
 /// The first change that is not possible.
-pub fn compare(before: &Value, after: &Value) -> Result<Vec<Change>, Refused> {
+pub fn compare(before: &Value, after: &Value) -> Result<Vec<ConfigChange>, Refused> {
     let changes = changed_keys(before, after).into_iter();
     changes.map(|(key, before, after)| classify(key, before, after)).collect()
 }
 
-fn classify(key: String, before: Value, after: Value) -> Result<Change, Refused> {
+fn classify(key: String, before: Value, after: Value) -> Result<ConfigChange, Refused> {
     if key == "seed_structures" {
         return seed_structures(&before, &after);
     }
@@ -221,13 +221,13 @@ fn classify(key: String, before: Value, after: Value) -> Result<Change, Refused>
     // The pairs of elements are keys as well.
     let whole = if key.starts_with(BONDS) { BONDS } else { &key };
     if CHANGEABLE.contains(&whole) {
-        Ok(Change::Key { key, before, after })
+        Ok(ConfigChange::Key { key, before, after })
     } else {
         Err(Refused::Key { key, before, after })
     }
 }
 
-fn seed_structures(before: &Value, after: &Value) -> Result<Change, Refused> {
+fn seed_structures(before: &Value, after: &Value) -> Result<ConfigChange, Refused> {
     let list = |value: &Value| -> Vec<String> {
         let values = value.as_array().into_iter().flatten();
         values.map(|seed| seed.as_str().unwrap_or_default().to_owned()).collect()
@@ -238,7 +238,7 @@ fn seed_structures(before: &Value, after: &Value) -> Result<Change, Refused> {
         return Err(Refused::SeedStructure { number, before: short(&before[number]), after });
     }
     let added = after.split_off(before.len());
-    Ok(Change::SeedStructures { before: before.len(), added })
+    Ok(ConfigChange::SeedStructures { before: before.len(), added })
 }
 
 /// The configuration with all changeable keys set to null.
@@ -320,7 +320,7 @@ mod tests {
         let before = json!({ "run": { "walkers": 1 }, "seed_structures": ["a 1"] });
         let after = json!({ "run": { "walkers": 2 }, "seed_structures": ["a 1", "b 2"] });
         let changes = compare(&before, &after).unwrap();
-        let shown: Vec<_> = changes.iter().map(Change::to_string).collect();
+        let shown: Vec<_> = changes.iter().map(ConfigChange::to_string).collect();
         assert_eq!(
             shown,
             ["run.walkers is now 2 (was 1)", "seed structures added to the existing 1: 'b' (content 2)"]

@@ -27,7 +27,7 @@ pub enum PotentialKind {
 /// `{ kind, file }`
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct PotentialFile {
+pub struct PotentialConfig {
     /// What it holds.
     pub kind: PotentialKind,
     /// Where it is.
@@ -35,7 +35,7 @@ pub struct PotentialFile {
     pub file: Spanned<PathBuf>,
 }
 
-impl PotentialFile {
+impl PotentialConfig {
     /// Reads it; an error names the file and what is wrong with it.
     pub fn load(&self) -> Result<Box<dyn Potential>, String> {
         self.kind.load(self.file.get_ref())

@@ -8,7 +8,7 @@ use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDes
 use serde::{Deserialize, Deserializer, Serialize};
 use toml::Spanned;
 
-use super::PotentialFile;
+use super::PotentialConfig;
 
 /// Names of programs that ASE has calculators for.
 const THROUGH_ASE: [&str; 27] = [
@@ -46,7 +46,7 @@ const THROUGH_ASE: [&str; 27] = [
 #[serde(rename_all = "snake_case")]
 pub enum LabelMethod {
     /// A potential that calmwalk evaluates.
-    Potential(PotentialFile),
+    Potential(PotentialConfig),
     /// A program.
     #[serde(untagged)]
     Code(Box<dft::Settings>),

@@ -28,11 +28,11 @@ use store::{Location, StoreError};
 use toml::Spanned;
 use workers::labeller::LabelGuard;
 
-pub use changes::{Change, Refused, changed_keys, compare, without_changeable};
+pub use changes::{ConfigChange, Refused, changed_keys, compare, without_changeable};
 pub use check::wrong_thermostat;
 pub use document::Document;
 pub use error::{ConfigError, location, location_of_offset, read_text, user_message};
-pub use files::{PotentialFile, PotentialKind};
+pub use files::{PotentialConfig, PotentialKind};
 pub use hints::KnownKeys;
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};

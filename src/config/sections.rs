@@ -263,7 +263,7 @@ pub struct LabelSection {
     pub min_state_difference: Positive,
     /// What to do when a result has a lower energy than the label by more than that: propose it, or make it the label.
     #[serde(default)]
-    pub on_lower_state: OnLowerState,
+    pub on_lower_state: LowerStatePolicy,
     /// Number of cores of one calculation.
     #[serde(default = "defaults::cores")]
     pub cores: NonZeroU32,
@@ -330,7 +330,7 @@ pub enum QueueFull {
 /// What happens when a result for a structure is a lower state than its label.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum OnLowerState {
+pub enum LowerStatePolicy {
     /// It is proposed; the user decides.
     #[default]
     Propose,
@@ -404,8 +404,8 @@ impl LabelSection {
     /// The rule for two states of a structure that the store applies.
     pub fn lower_state_rule(&self) -> LowerStateRule {
         let on_lower_state = match self.on_lower_state {
-            OnLowerState::Propose => store::OnLowerState::Propose,
-            OnLowerState::Supersede => store::OnLowerState::Supersede,
+            LowerStatePolicy::Propose => store::OnLowerState::Propose,
+            LowerStatePolicy::Supersede => store::OnLowerState::Supersede,
         };
         LowerStateRule { min_difference: self.min_state_difference.get(), on_lower_state }
     }

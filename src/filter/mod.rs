@@ -47,22 +47,22 @@ pub struct StructureProperties<'a> {
 
 /// A filter expression.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Filter {
+pub enum StructureFilter {
     /// Compares a number.
-    Number(NumberField, Comparison, f64),
+    Number(NumberField, ComparisonOperator, f64),
     /// Whether a text equals (`true`) or differs from (`false`) a value.
     Text(TextField, bool, String),
     /// Negation.
-    Not(Box<Filter>),
+    Not(Box<StructureFilter>),
     /// Conjunction.
-    And(Box<Filter>, Box<Filter>),
+    And(Box<StructureFilter>, Box<StructureFilter>),
     /// Disjunction.
-    Or(Box<Filter>, Box<Filter>),
+    Or(Box<StructureFilter>, Box<StructureFilter>),
 }
 
 /// Comparison operators for numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Comparison {
+pub enum ComparisonOperator {
     /// `=`
     Equal,
     /// `!=`
@@ -112,7 +112,7 @@ names! {
     }
 }
 
-impl Filter {
+impl StructureFilter {
     /// Whether a structure passes the filter.
     pub fn matches(&self, properties: &StructureProperties<'_>) -> bool {
         match self {
@@ -129,7 +129,7 @@ impl Filter {
     }
 }
 
-impl Filter {
+impl StructureFilter {
     /// The property names in the expression, in order.
     pub fn names(&self) -> Vec<&'static str> {
         match self {
@@ -141,7 +141,7 @@ impl Filter {
     }
 }
 
-impl Comparison {
+impl ComparisonOperator {
     fn holds(self, a: f64, b: f64) -> bool {
         match self {
             Self::Equal => a == b,
@@ -218,7 +218,7 @@ pub fn species(formula: &str) -> Vec<Species> {
     species
 }
 
-impl FromStr for Filter {
+impl FromStr for StructureFilter {
     type Err = FilterError;
 
     fn from_str(text: &str) -> Result<Self, FilterError> {
@@ -227,7 +227,7 @@ impl FromStr for Filter {
 }
 
 /// Writes the expression so that it can be parsed again.
-impl fmt::Display for Filter {
+impl fmt::Display for StructureFilter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Number(field, comparison, value) => {

@@ -3,7 +3,7 @@
 use atoms::Species;
 use dft::RetryAdjustment;
 
-use super::{Comparison, Filter, NumberField, TextField};
+use super::{ComparisonOperator, NumberField, StructureFilter, TextField};
 use crate::nearest_name::nearest;
 
 /// Maximum nesting of parentheses and `not`, which limits recursion.
@@ -60,7 +60,7 @@ struct Parser {
 /// Longer ones first.
 const SYMBOLS: [&str; 8] = ["!=", "<=", ">=", "=", "<", ">", "(", ")"];
 
-pub(super) fn parse(text: &str) -> Result<Filter, FilterError> {
+pub(super) fn parse(text: &str) -> Result<StructureFilter, FilterError> {
     let mut parser = Parser { tokens: tokenize(text)?, next: 0, depth: 0 };
     let filter = parser.disjunction()?;
     match parser.peek() {
@@ -145,29 +145,29 @@ impl Parser {
         is_next
     }
 
-    fn disjunction(&mut self) -> Result<Filter, FilterError> {
+    fn disjunction(&mut self) -> Result<StructureFilter, FilterError> {
         let mut left = self.conjunction()?;
         while self.keyword("or") {
-            left = Filter::Or(Box::new(left), Box::new(self.conjunction()?));
+            left = StructureFilter::Or(Box::new(left), Box::new(self.conjunction()?));
         }
         Ok(left)
     }
 
-    fn conjunction(&mut self) -> Result<Filter, FilterError> {
+    fn conjunction(&mut self) -> Result<StructureFilter, FilterError> {
         let mut left = self.operand()?;
         while self.keyword("and") {
-            left = Filter::And(Box::new(left), Box::new(self.operand()?));
+            left = StructureFilter::And(Box::new(left), Box::new(self.operand()?));
         }
         Ok(left)
     }
 
-    fn operand(&mut self) -> Result<Filter, FilterError> {
+    fn operand(&mut self) -> Result<StructureFilter, FilterError> {
         if self.depth == MAX_DEPTH {
             return Err(self.error(format!("at most {MAX_DEPTH} nested parentheses and 'not'")));
         }
         self.depth += 1;
         let filter = if self.keyword("not") {
-            Filter::Not(Box::new(self.operand()?))
+            StructureFilter::Not(Box::new(self.operand()?))
         } else if *self.peek() == Token::Symbol("(") {
             self.take();
             let inside = self.disjunction()?;
@@ -183,7 +183,7 @@ impl Parser {
         Ok(filter)
     }
 
-    fn comparison(&mut self) -> Result<Filter, FilterError> {
+    fn comparison(&mut self) -> Result<StructureFilter, FilterError> {
         let name = match self.peek() {
             Token::Word(name) => name.clone(),
             _ => return Err(self.error(names())),
@@ -191,7 +191,7 @@ impl Parser {
         if let Some((field, _)) = NumberField::ALL.iter().find(|(_, known)| *known == name) {
             self.take();
             let comparison = self.comparison_operator()?;
-            return Ok(Filter::Number(*field, comparison, self.number()?));
+            return Ok(StructureFilter::Number(*field, comparison, self.number()?));
         }
         let Some((field, _)) = TextField::ALL.iter().find(|(_, known)| *known == name) else {
             return Err(self.error(format!("{}{}", names(), hint(&name, all_names()))));
@@ -203,17 +203,17 @@ impl Parser {
             _ => return Err(self.error(format!("= or != after {name}"))),
         };
         self.take();
-        Ok(Filter::Text(*field, wanted, self.text(*field)?))
+        Ok(StructureFilter::Text(*field, wanted, self.text(*field)?))
     }
 
-    fn comparison_operator(&mut self) -> Result<Comparison, FilterError> {
+    fn comparison_operator(&mut self) -> Result<ComparisonOperator, FilterError> {
         let comparison = match self.peek() {
-            Token::Symbol("=") => Comparison::Equal,
-            Token::Symbol("!=") => Comparison::Different,
-            Token::Symbol("<") => Comparison::Below,
-            Token::Symbol("<=") => Comparison::AtMost,
-            Token::Symbol(">") => Comparison::Above,
-            Token::Symbol(">=") => Comparison::AtLeast,
+            Token::Symbol("=") => ComparisonOperator::Equal,
+            Token::Symbol("!=") => ComparisonOperator::Different,
+            Token::Symbol("<") => ComparisonOperator::Below,
+            Token::Symbol("<=") => ComparisonOperator::AtMost,
+            Token::Symbol(">") => ComparisonOperator::Above,
+            Token::Symbol(">=") => ComparisonOperator::AtLeast,
             _ => return Err(self.error("one of = != < <= > >=")),
         };
         self.take();

@@ -22,7 +22,7 @@ fn properties() -> StructureProperties<'static> {
 
 fn matches(text: &str) -> bool {
     let species: Vec<Species> = ["Mo", "Mo", "C"].map(|symbol| symbol.parse().unwrap()).to_vec();
-    text.parse::<Filter>().unwrap().matches(&StructureProperties {
+    text.parse::<StructureFilter>().unwrap().matches(&StructureProperties {
         species: &species,
         energy: Some(-6.0),
         ..properties()
@@ -80,7 +80,7 @@ fn help_and_docs_name_every_property() {
 
 #[test]
 fn names_are_those_in_the_expression() {
-    let condition: Filter = "not (gamma > 2 or element = Mo) and max_force < 5".parse().unwrap();
+    let condition: StructureFilter = "not (gamma > 2 or element = Mo) and max_force < 5".parse().unwrap();
     assert_eq!(condition.names(), ["gamma", "element", "max_force"]);
 }
 
@@ -102,31 +102,32 @@ fn errors_have_positions() {
         ("γ > 2", 1, "'γ'", "one of gamma,"),
         ("gamma > 2 && step = 1", 11, "'&'", "a name"),
     ] {
-        let error = text.parse::<Filter>().unwrap_err();
+        let error = text.parse::<StructureFilter>().unwrap_err();
         assert_eq!((error.position, error.found.as_str()), (position, found), "{text}");
         assert!(error.expected.contains(expected), "{text}: {error}");
     }
     let deep = "not ".repeat(100_000) + "gamma > 1";
-    assert!(deep.parse::<Filter>().unwrap_err().expected.contains("at most 100"));
+    assert!(deep.parse::<StructureFilter>().unwrap_err().expected.contains("at most 100"));
 }
 
-fn conditions() -> impl Strategy<Value = Filter> {
-    use Comparison::*;
+fn conditions() -> impl Strategy<Value = StructureFilter> {
+    use ComparisonOperator::*;
     let number =
         proptest::sample::select(NumberField::ALL.iter().map(|(field, _)| *field).collect::<Vec<_>>());
     let comparison = proptest::sample::select(vec![Equal, Different, Below, AtMost, Above, AtLeast]);
     let finite = any::<f64>().prop_filter("finite", |x| x.is_finite());
-    let numbers = (number, comparison, finite).prop_map(|(a, b, c)| Filter::Number(a, b, c));
+    let numbers = (number, comparison, finite).prop_map(|(a, b, c)| StructureFilter::Number(a, b, c));
     let seed = ("[a-zé' ()=0-9]{0,12}", any::<bool>())
-        .prop_map(|(name, equal)| Filter::Text(TextField::SeedStructure, equal, name));
+        .prop_map(|(name, equal)| StructureFilter::Text(TextField::SeedStructure, equal, name));
     let element = proptest::sample::select(vec!["Al", "Mo"]);
-    let element = element.prop_map(|symbol| Filter::Text(TextField::Element, true, symbol.to_owned()));
+    let element =
+        element.prop_map(|symbol| StructureFilter::Text(TextField::Element, true, symbol.to_owned()));
     prop_oneof![numbers, seed, element].prop_recursive(5, 40, 2, |inner| {
         let pair = (inner.clone(), inner.clone());
         prop_oneof![
-            inner.prop_map(|a| Filter::Not(Box::new(a))),
-            pair.clone().prop_map(|(a, b)| Filter::And(Box::new(a), Box::new(b))),
-            pair.prop_map(|(a, b)| Filter::Or(Box::new(a), Box::new(b))),
+            inner.prop_map(|a| StructureFilter::Not(Box::new(a))),
+            pair.clone().prop_map(|(a, b)| StructureFilter::And(Box::new(a), Box::new(b))),
+            pair.prop_map(|(a, b)| StructureFilter::Or(Box::new(a), Box::new(b))),
         ]
     })
 }
@@ -136,12 +137,12 @@ proptest! {
 
     #[test]
     fn displayed_filters_parse_back(condition in conditions()) {
-        prop_assert_eq!(condition.to_string().parse::<Filter>(), Ok(condition));
+        prop_assert_eq!(condition.to_string().parse::<StructureFilter>(), Ok(condition));
     }
 
     #[test]
     fn any_text_is_a_filter_or_an_error_inside_it(text in "([a-z_]{1,9}|[ ()<>=!'\"γ.0-9-]|and|or|not|gamma > 1){0,12}") {
-        if let Err(error) = text.parse::<Filter>() {
+        if let Err(error) = text.parse::<StructureFilter>() {
             prop_assert!((1..=text.chars().count() + 1).contains(&error.position), "{error}");
         }
     }

@@ -6,23 +6,23 @@ use serde_json::{Map, Value, json};
 use tracing::Event;
 use tracing_serde::fields::AsMap;
 
-use super::Format;
+use super::LogFormat;
 
 /// zenoh adds this hint whenever it cannot accept a connection, even if a certificate was refused.
 const FILE_LIMIT_HINT: &str = ". Hint: increase the system open file limit.";
 
 /// The line of an event that happens now. `process` is the name of this process.
-pub fn line(format: Format, process: &str, event: &Event<'_>) -> String {
+pub fn line(format: LogFormat, process: &str, event: &Event<'_>) -> String {
     let time = humantime::format_rfc3339_millis(SystemTime::now().max(SystemTime::UNIX_EPOCH));
     let (level, target, pid) = (event.metadata().level(), event.metadata().target(), std::process::id());
     let (message, fields) = message_and_fields(event);
     match format {
-        Format::Text => {
+        LogFormat::Text => {
             let message = escape_control_characters(&message);
             let fields: String = fields.iter().map(|(name, value)| format!(" {name}={value}")).collect();
             format!("{time} {level:<5} {process} [{pid}] {message}{fields}\n")
         }
-        Format::Json => {
+        LogFormat::Json => {
             let object = json!({
                 "time": time.to_string(), "level": level.as_str().to_lowercase(), "process": process, "pid": pid,
                 "target": target, "message": message, "fields": fields,

@@ -7,7 +7,7 @@ use tracing::{debug, info, warn};
 
 use super::*;
 
-fn log(file: &Path, format: Format, level: LogLevel) -> impl Subscriber + Send + Sync + use<> {
+fn log(file: &Path, format: LogFormat, level: LogLevel) -> impl Subscriber + Send + Sync + use<> {
     let file = OpenOptions::new().append(true).create(true).open(file).unwrap();
     Log { file, format, process: "walker 3".to_owned() }.with_level(level)
 }
@@ -15,14 +15,14 @@ fn log(file: &Path, format: Format, level: LogLevel) -> impl Subscriber + Send +
 #[test]
 fn an_event_is_one_line_whatever_it_says() {
     let (directory, started) = (tempfile::tempdir().unwrap(), SystemTime::now());
-    for format in [Format::Text, Format::Json] {
+    for format in [LogFormat::Text, LogFormat::Json] {
         let path = directory.path().join("log");
         let said = || warn!(walk = 3_u64, gamma = 1.5, name = "a \"b\"\nc", "two\nlines, é");
         tracing::subscriber::with_default(log(&path, format, LogLevel::Info), said);
         let text = fs::read_to_string(&path).unwrap();
         assert_eq!(text.lines().count(), 1, "{text}");
         fs::remove_file(&path).unwrap();
-        if format == Format::Text {
+        if format == LogFormat::Text {
             let pid = std::process::id();
             let (time, rest) = text.split_once(' ').unwrap();
             let time = humantime::parse_rfc3339(time).unwrap();
@@ -46,7 +46,7 @@ fn an_event_is_one_line_whatever_it_says() {
 fn lower_levels_and_events_of_libraries_are_omitted() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("log");
-    tracing::subscriber::with_default(log(&path, Format::Text, LogLevel::Info), || {
+    tracing::subscriber::with_default(log(&path, LogFormat::Text, LogLevel::Info), || {
         debug!("too fine");
         info!("just right");
         info!(target: "zenoh::net", "of a library");
@@ -68,7 +68,7 @@ fn lines_of_several_writers_do_not_interleave() {
             let long = "x".repeat(500 * writer as usize);
             thread::spawn(move || {
                 // Each has opened the file for itself, as processes do.
-                tracing::subscriber::with_default(log(&path, Format::Json, LogLevel::Info), || {
+                tracing::subscriber::with_default(log(&path, LogFormat::Json, LogLevel::Info), || {
                     (0..200_u64).for_each(|line| info!(writer, line, "{long}"));
                 });
             })
@@ -99,7 +99,7 @@ fn a_refused_connection_does_not_blame_the_limit_of_open_files() {
         ("Too many open files (os error 24)", "Too many open files (os error 24). Hint: increase"),
     ] {
         let said = || warn!("{why}. {hint}");
-        tracing::subscriber::with_default(log(&path, Format::Text, LogLevel::Info), said);
+        tracing::subscriber::with_default(log(&path, LogFormat::Text, LogLevel::Info), said);
         let text = fs::read_to_string(&path).unwrap();
         assert!(text.contains(expected), "{text}");
         fs::remove_file(&path).unwrap();

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use store::Status;
 
 use crate::config::{NotifyEvent, NotifySection};
-use crate::forgetting::{ForgettingRule, Measured};
+use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
 use crate::output::count;
 use crate::wording::walk_ends;
 
@@ -82,7 +82,7 @@ impl NotificationTracker {
     pub fn check_training(
         &mut self,
         forgetting: &ForgettingRule,
-        measured: &Measured,
+        measured: &ForgettingMeasurement,
     ) -> Option<Notification> {
         let event = NotifyEvent::Forgetting;
         let (holds, was) = (forgetting.evaluate(measured.level)?, self.sent.0.get(event.name()));

@@ -2,7 +2,7 @@
 
 use figures::{Anchor, Axis, Colour, Figure, Panel, Rectangle, Scale, Stroke};
 
-use super::{FilterReport, Metrics, Step};
+use super::{FilterReport, Metrics, ThresholdResult};
 
 const WIDTH: f64 = 510.0;
 const HEIGHT: f64 = 218.0;
@@ -17,7 +17,7 @@ pub fn draw(report: &FilterReport, grade: &str) -> Figure {
     let (left, gap) = (46.0, 50.0);
     let width = (WIDTH - left - 12.0 - gap * (number - 1) as f64) / number as f64;
     let place = |k: usize| Rectangle { x: left + k as f64 * (width + gap), y: 32.0, width, height: 140.0 };
-    let threshold = |step: &Step| step.threshold;
+    let threshold = |step: &ThresholdResult| step.threshold;
     let ends = (report.steps.first().map_or(0.0, threshold), report.steps.last().map_or(1.0, threshold));
     let scale = if ends.0 > 0.0 { Scale::Logarithmic } else { Scale::Linear };
     let x = Axis::new(&format!("threshold of {grade}"), scale, ends.0, ends.1);
@@ -61,7 +61,7 @@ fn finish(mut panel: Panel, letter: char, figure: &mut Figure) {
 /// What is kept, the band of one standard deviation of the random subsets, and a thin line for all rows.
 fn curve(panel: &mut Panel, report: &FilterReport, of: Of, stroke: Stroke) {
     let colour = stroke.paint.colour;
-    let band = |step: &Step| {
+    let band = |step: &ThresholdResult| {
         let (mean, deviation) = (of(&step.random_mean)?, of(&step.random_deviation)?);
         Some((step.threshold, mean - deviation, mean + deviation))
     };
@@ -71,7 +71,7 @@ fn curve(panel: &mut Panel, report: &FilterReport, of: Of, stroke: Stroke) {
     if let Some(value) = of(&report.unfiltered) {
         panel.line([[panel.x.low, value], [panel.x.high, value]], colour.line(0.5));
     }
-    let point = |step: &Step| of(&step.metrics).map(|value| [step.threshold, value]);
+    let point = |step: &ThresholdResult| of(&step.metrics).map(|value| [step.threshold, value]);
     for run in report.steps.iter().map(point).collect::<Vec<_>>().split(Option::is_none) {
         panel.line(run.iter().flatten().copied(), stroke);
     }
@@ -81,7 +81,7 @@ fn curve(panel: &mut Panel, report: &FilterReport, of: Of, stroke: Stroke) {
 fn axis(title: &str, report: &FilterReport, quantities: &[Of]) -> Axis {
     let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
     for of in quantities {
-        let of_step = |step: &Step| {
+        let of_step = |step: &ThresholdResult| {
             let (mean, deviation) = (of(&step.random_mean), of(&step.random_deviation).unwrap_or(0.0));
             [of(&step.metrics), mean.map(|mean| mean - deviation), mean.map(|mean| mean + deviation)]
         };

@@ -6,14 +6,14 @@ use std::path::Path;
 
 use analysis::GradedRow;
 
-use crate::csv_reader::{CsvReader, Row};
+use crate::csv_reader::{CsvReader, CsvRow};
 use crate::exit_status::CommandError;
 
 /// Cells that stand for a missing number, besides empty ones.
 const MISSING: [&str; 5] = ["nan", "na", "n/a", "null", "none"];
 
 /// Titles of the columns to read.
-pub struct Columns<'a> {
+pub struct InputColumns<'a> {
     pub grade: &'a str,
     pub errors: ErrorColumns<'a>,
 }
@@ -29,7 +29,7 @@ pub enum ErrorColumns<'a> {
 /// Reads all rows, and counts those without one of the numbers, which is an error unless `skip_missing`.
 pub fn read(
     path: &Path,
-    columns: &Columns,
+    columns: &InputColumns,
     skip_missing: bool,
 ) -> Result<(Vec<GradedRow>, usize), CommandError> {
     let file = File::open(path)
@@ -68,7 +68,7 @@ pub fn read(
 }
 
 /// The number of a cell; `None` if it is missing.
-fn number(row: &Row, title: &str, place: usize, path: &Path) -> Result<Option<f64>, CommandError> {
+fn number(row: &CsvRow, title: &str, place: usize, path: &Path) -> Result<Option<f64>, CommandError> {
     let cell = row.cells[place].trim();
     if cell.is_empty() || MISSING.contains(&cell.to_lowercase().as_str()) {
         return Ok(None);

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use super::{FilterReport, Metrics, Step};
+use super::{FilterReport, Metrics, ThresholdResult};
 use crate::csv::{Csv, number};
 use crate::output::{TextTable, count, decimals};
 
@@ -58,7 +58,7 @@ pub fn csv(report: &FilterReport) -> Csv {
         }
         csv.push(&row);
     };
-    for Step { threshold, kept, share, metrics, random_mean, random_deviation } in &report.steps {
+    for ThresholdResult { threshold, kept, share, metrics, random_mean, random_deviation } in &report.steps {
         let head = [threshold.to_string(), kept.to_string(), number(*share)];
         push(head, [metrics, random_mean, random_deviation]);
     }

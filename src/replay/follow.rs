@@ -8,7 +8,7 @@ use orchestrator::selector::{RegradedCandidate, Regrader, Replay, SelectorError}
 use store::{Store, StoredCandidate};
 
 use super::failure;
-use super::report::{LogEntry, Report};
+use super::report::{LogEntry, ReplayReport};
 use crate::all_cores;
 use crate::exit_status::CommandError;
 use crate::output::Bar;
@@ -24,7 +24,7 @@ const CANDIDATES_PER_CORE: u32 = 8;
 pub async fn follow(
     store: &Store,
     replay: &mut Replay,
-    report: &mut Report,
+    report: &mut ReplayReport,
     last: i64,
     bar: &Bar,
 ) -> Result<(), CommandError> {

@@ -22,7 +22,7 @@ use crate::output::Bar;
 
 pub use overrides::RuleOverride;
 pub use relocated::{ARTIFACT, MODEL, RelocatedFilesArgs, find_one};
-pub use report::{FateChange, FateCounts, MissingFeatures, Report};
+pub use report::{FateChange, FateCounts, MissingFeatures, ReplayReport};
 pub use version::mixture_of;
 
 const BAR: &str = "{bar:32} {pos}/{len} decisions  {eta} left";
@@ -32,7 +32,7 @@ pub async fn replay(
     store: &Store,
     settings: &[RuleOverride],
     moved: &RelocatedFilesArgs,
-) -> Result<Report, CommandError> {
+) -> Result<ReplayReport, CommandError> {
     let begun = Instant::now();
     let campaign = store.campaign().await?;
     let resolved = resolved(&campaign)?;
@@ -40,7 +40,7 @@ pub async fn replay(
     relocated::find(&mut config, &resolved, &store.grade_files().await?, moved)?;
     let mut replay = open(store, &config, settings).await?;
     let end = store.newest_mixture().await?;
-    let mut report = Report::new(&campaign, settings, is_other_processor(&resolved), end.decision);
+    let mut report = ReplayReport::new(&campaign, settings, is_other_processor(&resolved), end.decision);
     let bar = Bar::new(Some(end.decision.unsigned_abs()), BAR);
     follow::follow(store, &mut replay, &mut report, end.decision, &bar).await?;
     report.close(&replay, &end).map_err(failure)?;

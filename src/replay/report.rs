@@ -11,7 +11,7 @@ use super::RuleOverride;
 
 /// Result of a replay.
 #[derive(Clone, Debug, Serialize)]
-pub struct Report {
+pub struct ReplayReport {
     /// Id of the campaign.
     pub campaign: String,
     /// Overridden keys with their values.
@@ -106,7 +106,7 @@ pub struct LogEntry<'a> {
     pub candidate: Option<&'a StoredCandidate>,
 }
 
-impl Report {
+impl ReplayReport {
     /// An empty report.
     pub fn new(
         campaign: &store::Campaign,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use calm::Mixture;
 use store::Store;
 
-use super::report::{MissingFeatures, Report};
+use super::report::{MissingFeatures, ReplayReport};
 use super::{BAR, RelocatedFilesArgs, follow, is_other_processor, open, overrides, relocated, resolved};
 use crate::exit_status::CommandError;
 use crate::output::Bar;
@@ -30,7 +30,7 @@ pub async fn mixture_of(
             "mixture version {version}: no decision made it: the database is damaged"
         ))
     })?;
-    let mut report = Report::new(&campaign, &[], is_other_processor(&resolved), last);
+    let mut report = ReplayReport::new(&campaign, &[], is_other_processor(&resolved), last);
     let bar = Bar::new(Some(last.unsigned_abs()), BAR);
     follow::follow(store, &mut replay, &mut report, last, &bar).await?;
     drop(bar);

@@ -52,7 +52,7 @@ pub async fn run(
     let mut manager = PoolManager {
         store,
         labellers: Labellers::new(children(pool), Default::default(), attempts),
-        display: Display { bar: Bar::new(None, BAR), labels: 0, queue: String::new() },
+        display: LabelPoolDisplay { bar: Bar::new(None, BAR), labels: 0, queue: String::new() },
         unreachable: false,
     };
     let mut ticks = interval(HEARTBEAT_INTERVAL);
@@ -104,7 +104,7 @@ fn children(pool: LabelPool) -> Children {
 struct PoolManager<'a> {
     store: &'a Store,
     labellers: Labellers,
-    display: Display,
+    display: LabelPoolDisplay,
     /// Whether the last attempt to reach the database failed.
     unreachable: bool,
 }
@@ -155,14 +155,14 @@ impl PoolManager<'_> {
 }
 
 /// Shows a bar on a terminal, otherwise a line for each label.
-struct Display {
+struct LabelPoolDisplay {
     bar: Bar,
     labels: u64,
     /// The last message about the queue.
     queue: String,
 }
 
-impl Display {
+impl LabelPoolDisplay {
     fn child_line(&mut self, slot: u32, line: &str) {
         if line.starts_with("labelled ") {
             self.labels += 1;

@@ -34,7 +34,7 @@ use crate::campaign::LoadedCampaign;
 use crate::config::{Config, QueueFull};
 use crate::exit_status::CommandError;
 use crate::forgetting::ForgettingRule;
-use crate::progress::Display;
+use crate::progress::RunDisplay;
 use crate::signals::cancel_on_signal;
 pub use listen::Listen;
 
@@ -98,7 +98,7 @@ fn start_reactor(
     let mut ends = WalkEnds::default();
     selector.ended_walks().for_each(|(walk, end, reason)| ends.add(walk.0, end, reason));
     let (walks, forgetting) = (selector.walk_progress(walk_steps), ForgettingRule::new(&config.calm));
-    let mut display = Display::new(walk_steps, walks, ends, forgetting, run.stop.clone());
+    let mut display = RunDisplay::new(walk_steps, walks, ends, forgetting, run.stop.clone());
     let queue_limit = u64::from(config.label.queue_limit.get());
     if config.label.on_queue_full == QueueFull::Raise {
         selector.raise_threshold_above(queue_limit);

@@ -17,7 +17,7 @@ use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::config::{Config, NotifyEvent};
 use crate::exit_status::CommandError;
-use crate::forgetting::{ForgettingRule, Measured};
+use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
 use crate::notify::{METADATA_KEY, Notification, NotificationTracker};
 use crate::output::log_and_warn;
 
@@ -80,7 +80,7 @@ impl<'a> Notifier<'a> {
     async fn check(&mut self) -> Result<(), CommandError> {
         let mut due = self.tracker.check(&self.store.status().await?, unix_milliseconds());
         let values = MixtureValues(self.store.values().await?);
-        if let Ok(measured) = Measured::deserialize(values.training_frames()) {
+        if let Ok(measured) = ForgettingMeasurement::deserialize(values.training_frames()) {
             due.extend(self.tracker.check_training(&self.forgetting, &measured));
         }
         if due.is_empty() {

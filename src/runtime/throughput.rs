@@ -22,7 +22,7 @@ const AVERAGING_TIME: f64 = 30.0;
 /// Throughput of the walks of a run.
 #[derive(Debug, Default)]
 pub struct Throughput {
-    walks: BTreeMap<u32, Walk>,
+    walks: BTreeMap<u32, WalkThroughput>,
     /// Walks with changes since the last write.
     changed: BTreeSet<u32>,
     all: Speed,
@@ -32,7 +32,7 @@ pub struct Throughput {
 }
 
 #[derive(Debug, Default)]
-struct Walk {
+struct WalkThroughput {
     pace: WalkProgress,
     speed: Speed,
     /// Steps in this run, including repeated ones.

@@ -7,7 +7,7 @@ use atoms::Species;
 use super::format::check_format;
 use super::{StructureFile, StructureFiles};
 use crate::exit_status::CommandError;
-use crate::filter::Filter;
+use crate::filter::StructureFilter;
 
 /// Properties that structures of files have.
 const PROPERTIES: [&str; 5] = ["atoms", "element", "energy", "energy_per_atom", "max_force"];
@@ -29,7 +29,7 @@ pub struct StructureReadingArgs {
     /// Use only structures that match FILTER, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
     /// and of labels energy, energy_per_atom (eV), max_force (eV/Å)
     #[arg(long = "where", value_name = "FILTER")]
-    filter: Option<Filter>,
+    filter: Option<StructureFilter>,
     /// Elements of the atom types 1, 2, … of LAMMPS dumps without the column 'element'
     #[arg(long, value_name = "SYMBOL,…", value_delimiter = ',')]
     dump_elements: Vec<Species>,

@@ -14,31 +14,31 @@ use crate::exit_status::CommandError;
 
 /// The structures of a file, in order.
 pub enum Structures {
-    Extxyz(Box<extxyz::Reader<Input>>),
+    Extxyz(Box<extxyz::Reader<BoxedReader>>),
     /// One structure.
-    Poscar(Option<Input>),
-    LammpsDump(Box<lammps_dump::Reader<Input>>),
+    Poscar(Option<BoxedReader>),
+    LammpsDump(Box<lammps_dump::Reader<BoxedReader>>),
 }
 
-type Input = Box<dyn BufRead + Send>;
+type BoxedReader = Box<dyn BufRead + Send>;
 
 /// Format of a file.
-enum Format {
+enum StructureFormat {
     Extxyz,
     Poscar,
     LammpsDump,
 }
 
 /// The format that the name shows, with or without the extension of a compression.
-fn format(path: &Path) -> Option<Format> {
+fn format(path: &Path) -> Option<StructureFormat> {
     let name = path.file_name()?.to_string_lossy().to_lowercase();
     let name = name.strip_suffix(".gz").or_else(|| name.strip_suffix(".zst")).unwrap_or(&name);
     let ends = |endings: &[&str]| endings.iter().any(|ending| name.ends_with(ending));
     let begins = |beginnings: &[&str]| beginnings.iter().any(|beginning| name.starts_with(beginning));
     match () {
-        () if ends(&[".xyz", ".extxyz"]) => Some(Format::Extxyz),
-        () if ends(&[".poscar", ".vasp"]) || begins(&["poscar", "contcar"]) => Some(Format::Poscar),
-        () if ends(&[".dump", ".lammpstrj"]) || begins(&["dump."]) => Some(Format::LammpsDump),
+        () if ends(&[".xyz", ".extxyz"]) => Some(StructureFormat::Extxyz),
+        () if ends(&[".poscar", ".vasp"]) || begins(&["poscar", "contcar"]) => Some(StructureFormat::Poscar),
+        () if ends(&[".dump", ".lammpstrj"]) || begins(&["dump."]) => Some(StructureFormat::LammpsDump),
         () => None,
     }
 }
@@ -61,9 +61,9 @@ impl Structures {
         let input =
             unpacked(path, bytes).map_err(|source| FileError::Open { path: path.to_path_buf(), source })?;
         match format(path) {
-            Some(Format::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::Reader::new(input)))),
-            Some(Format::Poscar) => Ok(Self::Poscar(Some(input))),
-            Some(Format::LammpsDump) => {
+            Some(StructureFormat::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::Reader::new(input)))),
+            Some(StructureFormat::Poscar) => Ok(Self::Poscar(Some(input))),
+            Some(StructureFormat::LammpsDump) => {
                 Ok(Self::LammpsDump(Box::new(lammps_dump::Reader::new(input, dump_elements.to_vec()))))
             }
             None => Err(FileError::Format(path.to_path_buf())),
@@ -95,7 +95,7 @@ impl Structures {
     }
 }
 
-fn unpacked(path: &Path, bytes: &Arc<AtomicU64>) -> io::Result<Input> {
+fn unpacked(path: &Path, bytes: &Arc<AtomicU64>) -> io::Result<BoxedReader> {
     let file = BufReader::new(Counting(File::open(path)?, Arc::clone(bytes)));
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     Ok(match extension.as_str() {

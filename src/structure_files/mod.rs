@@ -14,14 +14,14 @@ use atoms::Species;
 pub use self::arguments::{StructureArgs, StructureReadingArgs};
 pub use self::reader::{Place, StructureReader};
 use crate::exit_status::CommandError;
-use crate::filter::Filter;
+use crate::filter::StructureFilter;
 
 /// Files of structures, in order.
 #[derive(Debug, Clone)]
 pub struct StructureFiles {
     pub files: Vec<StructureFile>,
     /// Structures that do not match are left out.
-    pub filter: Option<Filter>,
+    pub filter: Option<StructureFilter>,
     /// Elements of the atom types of LAMMPS dumps, from type 1.
     pub dump_elements: Vec<Species>,
 }

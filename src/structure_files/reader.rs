@@ -11,7 +11,7 @@ use atoms::extxyz::Frame;
 use super::format::Structures;
 use super::{StructureFile, StructureFiles};
 use crate::exit_status::CommandError;
-use crate::filter::{Filter, StructureProperties};
+use crate::filter::{StructureFilter, StructureProperties};
 
 /// Reads one structure after another.
 pub struct StructureReader {
@@ -117,7 +117,11 @@ impl StructureReader {
 }
 
 /// Whether a structure matches the filter.
-fn matches(filter: Option<&Filter>, frame: &Frame, file: &StructureFile) -> Result<bool, CommandError> {
+fn matches(
+    filter: Option<&StructureFilter>,
+    frame: &Frame,
+    file: &StructureFile,
+) -> Result<bool, CommandError> {
     let Some(filter) = filter else { return Ok(true) };
     let labels =
         frame.labels().map_err(|error| CommandError::Input(format!("{}: {error}", file.path.display())))?;

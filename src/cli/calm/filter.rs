@@ -8,7 +8,7 @@ use figures::{to_png, to_svg};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::output::{print, print_json};
-use crate::reliability_filter::{self, Columns, ErrorColumns, FilterReport};
+use crate::reliability_filter::{self, ErrorColumns, FilterReport, InputColumns};
 
 /// Resolution of a PNG, dots per inch.
 const RESOLUTION: f64 = 300.0;
@@ -103,7 +103,7 @@ impl CalmFilterArgs {
         Ok(ExitStatus::Done)
     }
 
-    fn columns(&self) -> Columns<'_> {
+    fn columns(&self) -> InputColumns<'_> {
         let errors = match (&self.predicted, &self.actual) {
             (Some(predicted), Some(actual)) => ErrorColumns::Values {
                 predicted,
@@ -113,7 +113,7 @@ impl CalmFilterArgs {
             },
             _ => ErrorColumns::Error(self.error.as_deref().unwrap_or("error")),
         };
-        Columns { grade: &self.grade, errors }
+        InputColumns { grade: &self.grade, errors }
     }
 }
 

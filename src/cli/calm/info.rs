@@ -51,7 +51,7 @@ struct Model {
     basis_dimension: usize,
     feature_dimension: usize,
     weights: usize,
-    radial_tables: Vec<RadialTable>,
+    radial_tables: Vec<RadialTableInfo>,
     mixture: Option<MixtureInfo>,
 }
 
@@ -64,7 +64,7 @@ struct PairCutoff {
 }
 
 #[derive(Debug, Serialize)]
-struct RadialTable {
+struct RadialTableInfo {
     intervals: usize,
     /// The larger of the errors of values and derivatives, each relative to the largest value.
     error: f64,
@@ -166,7 +166,7 @@ impl Model {
             feature_dimension: description.feature_dimension,
             weights: description.weights,
             radial_tables: tables
-                .map(|(intervals, error)| RadialTable {
+                .map(|(intervals, error)| RadialTableInfo {
                     intervals: *intervals,
                     error: error[0].max(error[1]),
                 })
@@ -192,7 +192,7 @@ impl Model {
         let basis = self.basis_functions.join(", ");
         line(out, "invariants", format!("{} of {basis}", self.basis_dimension))?;
         line(out, "weights", self.weights)?;
-        for RadialTable { intervals, error } in &self.radial_tables {
+        for RadialTableInfo { intervals, error } in &self.radial_tables {
             line(
                 out,
                 "radial table",

@@ -14,7 +14,7 @@ use store::{DATABASE, ExportCursor, ExportFilter, ExportSource, JobState, LOCK, 
 use self::split::Shares;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::filter::Filter;
+use crate::filter::StructureFilter;
 use crate::output::{self, Bar, print};
 
 /// Structures per read.
@@ -56,7 +56,7 @@ pub struct ExportArgs {
     /// seed_structure (its name, in quotes if it contains spaces), group (of the walk, see [[walks]]), retry_adjustment (any of
     /// those with which the label was computed after failures, such as other_moments). A comparison with a missing value is false.
     #[arg(long = "where", value_name = "FILTER")]
-    condition: Option<Filter>,
+    condition: Option<StructureFilter>,
     /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test
     ///
     /// Assigns the seed structures at random to the files in these proportions. All structures found from one seed structure go
@@ -102,7 +102,7 @@ struct Exported {
 }
 
 /// A file to write.
-struct Part {
+struct ExportFile {
     path: PathBuf,
     file: AtomicFile,
     count: Count,
@@ -222,7 +222,7 @@ impl ExportArgs {
             return Err(CommandError::Input(format!("no labelled structure matches --where '{condition}'")));
         }
         let mut counts = Vec::new();
-        for Part { path, file, count, assigned } in parts {
+        for ExportFile { path, file, count, assigned } in parts {
             file.finish()?;
             counts.push((path, count, assigned));
         }
@@ -236,7 +236,7 @@ impl ExportArgs {
     }
 
     /// The files to write, and the index of the file of each seed structure.
-    async fn parts(&self, store: &Store) -> Result<(Vec<Part>, BTreeMap<u32, usize>), CommandError> {
+    async fn parts(&self, store: &Store) -> Result<(Vec<ExportFile>, BTreeMap<u32, usize>), CommandError> {
         let Some(shares) = &self.split else {
             return Ok((vec![self.part(self.output.clone(), 0)?], BTreeMap::new()));
         };
@@ -253,12 +253,12 @@ impl ExportArgs {
         Ok((parts, assigned))
     }
 
-    fn part(&self, path: PathBuf, assigned: usize) -> Result<Part, CommandError> {
+    fn part(&self, path: PathBuf, assigned: usize) -> Result<ExportFile, CommandError> {
         let files = [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()];
         let [database, log, lock] = files.map(|name| self.location.location.join(name));
         let own = [&database, &log, &lock].map(|file| (file.as_path(), "a file of the campaign itself"));
         refuse_to_replace(&path, own)?;
-        Ok(Part { file: AtomicFile::create(&path)?, path, count: Count::default(), assigned })
+        Ok(ExportFile { file: AtomicFile::create(&path)?, path, count: Count::default(), assigned })
     }
 
     fn filter(&self, protocol: &Protocol) -> ExportFilter {
@@ -323,7 +323,7 @@ impl From<KeyNames> for LabelKeys {
     }
 }
 
-impl Part {
+impl ExportFile {
     fn write(&mut self, frame: &Frame, seed: Option<u32>, has_stress: bool) -> Result<(), CommandError> {
         self.count.frames += 1;
         self.count.without_stress += u64::from(!has_stress);

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use orchestrator::slurm::{DesiredJobs, Job, JobNames, JobOptions, JobPhase, Plan, Role};
 use wire::net::Tls;
 
-use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
+use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, TemplateValues, fill, quoted, template};
 use super::{FOLDER, LaunchArgs, absolute};
 use crate::atomic_file::cannot_write;
 use crate::campaign::LoadedCampaign;
@@ -54,7 +54,7 @@ impl JobSpecs {
             ]
         };
         let site = launch.template.as_deref();
-        let script = |name: &'static str, values: &Values<'_>| {
+        let script = |name: &'static str, values: &TemplateValues<'_>| {
             template(site, name).and_then(|template| fill(name, &template, values)).map(|text| (name, text))
         };
         let mut scripts = vec![script(ORCHESTRATOR, &values(cores, commands.orchestrator(wanted)?))?];

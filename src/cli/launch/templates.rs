@@ -21,7 +21,7 @@ pub const LABELLER: &str = "labeller.sbatch";
 pub const COMMON: &str = "job.sh";
 
 /// Placeholders of a template with their values.
-pub type Values<'a> = [(&'a str, String)];
+pub type TemplateValues<'a> = [(&'a str, String)];
 
 /// The template of this name: from the site's directory if given, else the built-in one.
 pub fn template(site: Option<&Path>, name: &str) -> Result<String, CommandError> {
@@ -47,7 +47,7 @@ pub fn template(site: Option<&Path>, name: &str) -> Result<String, CommandError>
 ///
 /// # Errors
 /// A name has no value.
-pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, CommandError> {
+pub fn fill(name: &str, template: &str, values: &TemplateValues<'_>) -> Result<String, CommandError> {
     let mut text = String::with_capacity(template.len());
     let mut rest = template;
     while let Some(begin) = rest.find('{') {

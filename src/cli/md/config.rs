@@ -10,7 +10,7 @@ use serde::Deserialize;
 use toml::Spanned;
 
 use crate::config::{
-    ConfigError, Document, KnownKeys, PotentialFile, location_of_offset, read_text, wrong_thermostat,
+    ConfigError, Document, KnownKeys, PotentialConfig, location_of_offset, read_text, wrong_thermostat,
 };
 use crate::output::log_and_warn;
 
@@ -29,7 +29,7 @@ pub struct MdConfig {
     /// The dynamics starts from the first frame of this file.
     pub structure: Spanned<PathBuf>,
     /// The potential.
-    pub potential: PotentialFile,
+    pub potential: PotentialConfig,
     /// Integration.
     pub dynamics: DynamicsSection,
     /// Output files.

@@ -52,7 +52,7 @@ impl MdArgs {
         let stopping = signals::stop_token()?;
         let mut trajectory = Trajectory::create(&path)?;
         let started = Instant::now();
-        let progress = Progress::new(&config);
+        let progress = MdProgress::new(&config);
         let outcome = integrate(&mut dynamics, &mut *potential, config.dynamics.steps, |dynamics| {
             progress.update(dynamics);
             if dynamics.state().step.is_multiple_of(config.output.every.get()) {
@@ -111,12 +111,12 @@ fn integrate(
 }
 
 /// Reports progress: with a bar on a terminal, otherwise with lines.
-struct Progress {
+struct MdProgress {
     every: u64,
     bar: Option<Bar>,
 }
 
-impl Progress {
+impl MdProgress {
     fn new(config: &MdConfig) -> Self {
         let OutputSection { every, log_every, .. } = config.output;
         let bar = std::io::stderr().is_terminal().then(|| Bar::new(Some(config.dynamics.steps), BAR));

@@ -8,7 +8,7 @@ use monitor::provenance::{self, Provenance};
 use store::{Protocol, Store, StoreError};
 
 use super::CommandError;
-use crate::config::{Change, Config, LabelSection, changed_keys};
+use crate::config::{Config, ConfigChange, LabelSection, changed_keys};
 use crate::label_method::{self, MethodConfig};
 use crate::label_setup::LABEL_METHOD_KEY;
 
@@ -19,7 +19,7 @@ pub struct ProtocolChange {
     /// The new configuration of the campaign, JSON.
     pub configuration: String,
     /// Its differences from the current configuration.
-    pub changes: Vec<Change>,
+    pub changes: Vec<ConfigChange>,
     /// Metadata for labellers on other hosts.
     pub notes: Vec<(&'static str, String)>,
 }
@@ -40,7 +40,7 @@ impl ProtocolChange {
             .map_err(|error| StoreError::damaged("the configuration in force", error))?;
         let after = label_method::with_protocol(&before, &section, &protocol);
         let changed = changed_keys(&before, &after).into_iter();
-        let changes = changed.map(|(key, before, after)| Change::Key { key, before, after }).collect();
+        let changes = changed.map(|(key, before, after)| ConfigChange::Key { key, before, after }).collect();
         let note = serde_json::to_string(&method).map_err(CommandError::failed)?;
         let mut notes = vec![(LABEL_METHOD_KEY, note)];
         notes.extend(origin_note(store, path).await?);

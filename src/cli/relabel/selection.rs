@@ -7,7 +7,7 @@ use wire::ContentHash;
 
 use super::CommandError;
 use crate::cli::export::frame::facts;
-use crate::filter::Filter;
+use crate::filter::StructureFilter;
 use crate::output;
 
 /// Structures per read.
@@ -112,7 +112,7 @@ impl Selection {
 pub async fn matching(
     store: &Store,
     all: Vec<Relabellable>,
-    condition: &Filter,
+    condition: &StructureFilter,
 ) -> Result<Vec<Relabellable>, CommandError> {
     let mut matching = HashSet::new();
     let conditions = store.walk_conditions().await?;

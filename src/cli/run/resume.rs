@@ -7,7 +7,7 @@ use serde_json::Value;
 use store::{Location, Store, unix_milliseconds};
 
 use crate::campaign::LoadedCampaign;
-use crate::config::{self, Change, Refused, compare};
+use crate::config::{self, ConfigChange, Refused, compare};
 use crate::exit_status::CommandError;
 use crate::output::{count, log_and_print};
 
@@ -54,7 +54,7 @@ pub async fn resume(
     }
     changes.iter().for_each(|change| log_and_print(format_args!("configuration: {change}")));
     store.add_seed_structures(&campaign.stored_seed_structures()).await?;
-    let details: Vec<_> = changes.iter().map(Change::detail).collect();
+    let details: Vec<_> = changes.iter().map(ConfigChange::detail).collect();
     Ok(store.set_configuration_in_force(&resolved.to_string(), &details, unix_milliseconds()).await?)
 }
 

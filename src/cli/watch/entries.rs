@@ -8,7 +8,7 @@ use wire::conditions::VariedConditions;
 use super::pane::{PaneEntry, Tone};
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
-use crate::filter::{self, Filter, StructureProperties};
+use crate::filter::{self, StructureFilter, StructureProperties};
 use crate::output::decimals;
 
 /// Columns of the queue: `>` marks numbers, trailing blanks reserve width.
@@ -36,7 +36,7 @@ pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
 ];
 
 /// The entries of walks that match the filter. `led`: whether an orchestrator runs.
-pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) -> Vec<PaneEntry> {
+pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&StructureFilter>) -> Vec<PaneEntry> {
     let matches = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.matches(&facts_of_walk(walk)));
     let tone = |walk: &WalkStatus| match walk.state.as_str() {
         _ if walk.paused => Tone::Attention,
@@ -57,7 +57,7 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) ->
 }
 
 /// The entries of label jobs that match the filter.
-pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&Filter>) -> Vec<PaneEntry> {
+pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&StructureFilter>) -> Vec<PaneEntry> {
     let matches = |job: &&Job| {
         let species = filter::species(&job.formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species, walks)))
@@ -89,7 +89,7 @@ pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&Filter>) 
 pub fn decision_entries<'a>(
     decisions: impl Iterator<Item = &'a RecentDecision>,
     walks: &[WalkStatus],
-    filter: Option<&Filter>,
+    filter: Option<&StructureFilter>,
 ) -> Vec<PaneEntry> {
     let matches = |decision: &&RecentDecision| {
         let formula = decision.candidate.as_ref().map_or("", |found| &found.formula);

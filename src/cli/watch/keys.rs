@@ -12,7 +12,7 @@ use super::state::{
 use crate::cli::queue::QueueCommand;
 use crate::cli::status;
 use crate::cli::walks::{WalkSelectionArgs, WalksCommand};
-use crate::filter::Filter;
+use crate::filter::StructureFilter;
 
 /// The text of F1.
 pub const HELP: &str = "\
@@ -106,7 +106,7 @@ impl WatchState {
             InputMode::Text(TextView { title: title.to_owned(), text: Some(text), ..TextView::default() });
     }
 
-    fn filter(&mut self, filter: Option<Filter>) {
+    fn filter(&mut self, filter: Option<StructureFilter>) {
         self.pane().filter = filter;
         self.update_panes();
     }
@@ -232,8 +232,8 @@ impl WatchState {
 
 impl WatchState {
     /// Parses a filter, and checks that the pane has its quantities.
-    fn parse_filter(&self, text: &str) -> Result<Filter, String> {
-        let condition: Filter = text.parse().map_err(|error| format!("invalid filter: {error}"))?;
+    fn parse_filter(&self, text: &str) -> Result<StructureFilter, String> {
+        let condition: StructureFilter = text.parse().map_err(|error| format!("invalid filter: {error}"))?;
         let is_not_known = |name: &&str| UNKNOWN_QUANTITIES[self.focus].contains(name);
         match condition.names().into_iter().find(is_not_known) {
             None => Ok(condition),

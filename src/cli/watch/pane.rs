@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use crate::filter::Filter;
+use crate::filter::StructureFilter;
 
 /// The colour of a line. Its text carries the same information.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -39,7 +39,7 @@ pub struct Pane {
     /// Number of entries without the filter.
     pub all: usize,
     /// Filter.
-    pub filter: Option<Filter>,
+    pub filter: Option<StructureFilter>,
     /// Key and last index of the selected entry. `None` selects the first, whichever that is.
     selected: Option<(String, usize)>,
     /// First visible line.

@@ -12,7 +12,7 @@ use wire::{WalkConditions, WalkId};
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult, json};
-use crate::filter::{Filter, StructureProperties, species};
+use crate::filter::{StructureFilter, StructureProperties, species};
 
 /// Largest number of rows of a page.
 const MAX_PAGE_ROWS: u32 = 200;
@@ -27,7 +27,7 @@ struct CandidateQuery {
     ascending: bool,
     fate: Option<String>,
     state: Option<JobState>,
-    filter: Option<Filter>,
+    filter: Option<StructureFilter>,
     after: Option<ListCursor>,
     limit: Option<u32>,
 }
