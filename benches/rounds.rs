@@ -24,7 +24,7 @@ use orchestrator::selector::{
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use rustix::time::{ClockId, clock_gettime};
-use wire::messages::{Outcome, Report};
+use wire::messages::{AssignmentReport, Outcome};
 use wire::{CampaignId, CandidateBlock, Origin, WalkConditions};
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
@@ -92,7 +92,7 @@ struct Campaign {
 }
 
 /// A running assignment: when it ends, the order of start for ties, and its report.
-struct RunningAssignment(Duration, u64, Report);
+struct RunningAssignment(Duration, u64, AssignmentReport);
 
 impl Campaign {
     fn run(settings: Settings, walkers: usize, seeds: Vec<SeedStructure>) -> Self {

@@ -14,7 +14,7 @@ use store::{Campaign, Store, StoreError};
 use tempfile::TempDir;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
-use wire::messages::{Outcome, Report, WalkEnd};
+use wire::messages::{AssignmentReport, Outcome, WalkEnd};
 use wire::transport::{Incoming, WorkItem};
 
 use crate::common::memory::MemoryStore;
@@ -59,7 +59,7 @@ fn any_settings() -> impl Strategy<Value = Settings> {
 }
 
 /// The report on the next assignment for this event, if there is an assignment.
-fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Report> {
+fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<AssignmentReport> {
     let Scheduling::Assign(assignment) = selector.next_assignment(0) else { return None };
     let progress = at(10 * (number as u64 + 1));
     let outcome = match *event {
@@ -163,7 +163,7 @@ impl Live {
     }
 
     /// A report of each walk, with a structure that is new to the mixture. The walker has the number of its walk.
-    fn reports(&mut self) -> Vec<Report> {
+    fn reports(&mut self) -> Vec<AssignmentReport> {
         let assignments: Vec<_> =
             (0..WALKS as u32).map(|walker| next_assignment_of(walker, &mut self.selector)).collect();
         let offer = |(k, assignment)| {
@@ -199,9 +199,9 @@ async fn create(directory: &Path) -> Store {
 }
 
 impl Arrived {
-    fn new(reports: Vec<Report>) -> Self {
+    fn new(reports: Vec<AssignmentReport>) -> Self {
         let (to_reactor, incoming) = mpsc::channel(8);
-        let send = |report: Report| {
+        let send = |report: AssignmentReport| {
             let (reply, answer) = oneshot::channel();
             let walker = report.walk.0;
             to_reactor.try_send(Incoming::Idle { walker, report: Some(report), reply }).unwrap();

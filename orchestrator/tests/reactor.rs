@@ -11,7 +11,7 @@ use orchestrator::selector::{Mode, SelectorSnapshot, Settings};
 use store::{Campaign, JobState, Protocol, SeedStructure, Store};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use wire::messages::{Progress, Report};
+use wire::messages::{AssignmentReport, WalkProgress};
 use wire::transport::{InProcess, Incoming, Transport, WorkItem};
 use wire::{ContentHash, WalkId};
 
@@ -99,7 +99,7 @@ async fn reactor(store: &Store, stopping: &CancellationToken) -> (Reactor, mpsc:
 }
 
 /// Works on an assignment like a scripted walker: interrupted after a few steps if asked to stop.
-fn work_on(work: &WorkItem, transport: &InProcess) -> Report {
+fn work_on(work: &WorkItem, transport: &InProcess) -> AssignmentReport {
     let assignment = &work.assignment;
     let seed = (0..3).find(|number| seed(*number).structure == assignment.seed_structure).unwrap();
     let pause = transport.stopping().then_some(2);
@@ -284,7 +284,7 @@ async fn waiting_walkers_are_shut_down_when_the_campaign_stops() {
     let walker = start_walkers(1, to_reactor, &stopping).remove(0);
     let talking = thread::spawn(move || {
         while !walker.is_finished() {
-            talker.progress(WalkId(0), Progress::default());
+            talker.progress(WalkId(0), WalkProgress::default());
             thread::sleep(Duration::from_millis(2));
         }
     });

@@ -2,7 +2,7 @@
 
 use orchestrator::selector::{Mode, Scheduling, Selector, SelectorSnapshot, Settings, UpdateProtocol};
 use store::records::{ComponentRecord, Fate};
-use wire::messages::{Outcome, Progress, WalkEnd};
+use wire::messages::{Outcome, WalkEnd, WalkProgress};
 use wire::{Origin, WalkId};
 
 use crate::common;
@@ -98,8 +98,8 @@ fn unsolicited_reports_change_nothing() {
         assert!(selector.report(report).unwrap().is_none());
     };
     let report = common::report(&assignment, Outcome::StepsDone, at(10));
-    unasked(&mut selector, wire::messages::Report { walk: WalkId(1), ..report.clone() });
-    unasked(&mut selector, wire::messages::Report { assignment: 1, ..report.clone() });
+    unasked(&mut selector, wire::messages::AssignmentReport { walk: WalkId(1), ..report.clone() });
+    unasked(&mut selector, wire::messages::AssignmentReport { assignment: 1, ..report.clone() });
     decided(&mut selector, report.clone());
     unasked(&mut selector, report.clone());
     next_assignment(&mut selector);
@@ -155,8 +155,8 @@ fn assignments_of_lost_walkers_are_assigned_again() {
     }
 }
 
-fn returned(segment: u32, step: u64) -> Progress {
-    Progress { segment, returns: segment, tau: 0.125, last_return: Some((7, 3)), ..at(step) }
+fn returned(segment: u32, step: u64) -> WalkProgress {
+    WalkProgress { segment, returns: segment, tau: 0.125, last_return: Some((7, 3)), ..at(step) }
 }
 
 #[test]

@@ -75,7 +75,7 @@ pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 pub use report::{CollectedStructure, FateCount};
 pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
 pub use store::Store;
-pub use walk_progress::{TotalThroughput, WalkProgress};
+pub use walk_progress::{TotalThroughput, WalkProgressRecord};
 
 /// The current time, ms since 1970.
 pub fn unix_milliseconds() -> i64 {

@@ -5,7 +5,7 @@ use std::fmt;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
-use wire::messages::{DeclineReason, Progress};
+use wire::messages::{DeclineReason, WalkProgress};
 use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 /// Name of the value with the grades of the training frames under the newest mixture (JSON of
@@ -217,7 +217,7 @@ pub struct WalkRecord {
     /// Structures accepted from it.
     pub accepted: u32,
     /// Its progress.
-    pub progress: Progress,
+    pub progress: WalkProgress,
     /// The selector's own state of the walk (undelivered decision, requested steps …), JSON.
     pub selector_state: String,
     /// The walker's checkpoint; `None` before the first assignment.

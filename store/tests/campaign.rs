@@ -3,7 +3,7 @@
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
 };
-use wire::messages::{DeclineReason, Progress};
+use wire::messages::{DeclineReason, WalkProgress};
 use wire::{Origin, WalkConditions, WalkId};
 
 use crate::common::*;
@@ -213,14 +213,14 @@ async fn status_counts_everything_once() {
 async fn unknown_values_of_a_walk_are_not_zero() {
     let home = Home::new();
     let store = home.create().await;
-    let progress = |tau, gamma_max| Progress {
+    let progress = |tau, gamma_max| WalkProgress {
         tau,
         gamma_max,
         temperature: 300.0,
         relative_volume: 1.1,
-        ..Progress::default()
+        ..WalkProgress::default()
     };
-    let walks = [progress(0.5, 1.2), progress(0.0, 0.0), Progress::default()];
+    let walks = [progress(0.5, 1.2), progress(0.0, 0.0), WalkProgress::default()];
     let walks = (0..).zip(walks).map(|(number, progress)| WalkRecord { progress, ..walk(number, 1) });
     store.commit(&Commit { walks: walks.collect(), ..Commit::default() }).await.unwrap();
     let known = |walk: store::WalkStatus| (walk.tau, walk.temperature, walk.relative_volume, walk.gamma_max);

@@ -14,7 +14,7 @@ use orchestrator::selector::{
 use store::{Campaign, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
-use wire::messages::{Assignment, Outcome, Report, WalkEnd};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd};
 use wire::transport::Incoming;
 use wire::{CandidateBlock, ContentHash, WalkConditions};
 
@@ -104,10 +104,10 @@ pub async fn create_store(location: Location, walks: usize) -> Store {
 }
 
 /// The next candidate of a walk, or its end.
-pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Report {
+pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> AssignmentReport {
     let mut checkpoint = vec![0; CHECKPOINT];
     checkpoint[..8].copy_from_slice(&assignment.number.to_le_bytes());
-    Report {
+    AssignmentReport {
         walk: assignment.walk,
         assignment: assignment.number,
         outcome: block.map_or(Outcome::Ended(WalkEnd::Steps), Outcome::Candidate),

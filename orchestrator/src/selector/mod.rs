@@ -30,7 +30,7 @@ use std::sync::Arc;
 use calm::Mixture;
 use store::records::{Commit, WalkRecord};
 use wire::conditions::VariedConditions;
-use wire::messages::{Outcome, Report, WalkEnd};
+use wire::messages::{AssignmentReport, Outcome, WalkEnd};
 use wire::{CampaignId, WalkId};
 
 use crate::grader::Grader;
@@ -138,7 +138,7 @@ impl Selector {
     /// Further reports may be taken before that, if their commits are written together with it or afterwards. Reports
     /// on an earlier assignment change nothing. A report on the current assignment counts even if it is not assigned as
     /// far as is known here: the walker was considered lost, or the orchestrator was restarted.
-    pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
+    pub fn report(&mut self, report: AssignmentReport) -> Result<Option<Commit>, SelectorError> {
         let regraded = self.decisions.regrader.regrade(report, &self.decisions.mixture);
         self.report_regraded(regraded)
     }
@@ -149,7 +149,7 @@ impl Selector {
         let WalkRecord { turn: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::BlewUp { reason }));
-        self.report(Report { walk: id, assignment: number, outcome, checkpoint, progress })
+        self.report(AssignmentReport { walk: id, assignment: number, outcome, checkpoint, progress })
     }
 
     /// Regrades reports for [`Selector::report_regraded`], for example on other threads.

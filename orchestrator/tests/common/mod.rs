@@ -17,7 +17,7 @@ use orchestrator::selector::{
     UpdateProtocol,
 };
 use store::records::{AtomGrades, Commit};
-use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, WalkConditions};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
@@ -145,7 +145,7 @@ pub fn gamma_max(mixture: &Mixture, z: [f64; DIMENSION]) -> f64 {
 pub fn block(
     assignment: &Assignment,
     mixture: &Mixture,
-    progress: &Progress,
+    progress: &WalkProgress,
     structure: Structure,
     z: [f64; DIMENSION],
 ) -> CandidateBlock {
@@ -176,13 +176,13 @@ pub fn block(
     })
 }
 
-pub fn at(step: u64) -> Progress {
-    Progress { step, temperature: 300.0, relative_volume: 1.0, ..Progress::default() }
+pub fn at(step: u64) -> WalkProgress {
+    WalkProgress { step, temperature: 300.0, relative_volume: 1.0, ..WalkProgress::default() }
 }
 
-pub fn report(assignment: &Assignment, outcome: Outcome, progress: Progress) -> Report {
+pub fn report(assignment: &Assignment, outcome: Outcome, progress: WalkProgress) -> AssignmentReport {
     let checkpoint = format!("step {}", progress.step).into_bytes();
-    Report { walk: assignment.walk, assignment: assignment.number, outcome, checkpoint, progress }
+    AssignmentReport { walk: assignment.walk, assignment: assignment.number, outcome, checkpoint, progress }
 }
 
 /// A report with a candidate at a step: the structure with this number and these features.
@@ -192,17 +192,17 @@ pub fn offer(
     step: u64,
     structure: Structure,
     z: [f64; DIMENSION],
-) -> Report {
+) -> AssignmentReport {
     let block = block(assignment, selector.mixture(), &at(step), structure, z);
     report(assignment, Outcome::Candidate(block), at(step))
 }
 
-pub fn ended(assignment: &Assignment, step: u64, end: WalkEnd) -> Report {
+pub fn ended(assignment: &Assignment, step: u64, end: WalkEnd) -> AssignmentReport {
     report(assignment, Outcome::Ended(end), at(step))
 }
 
 /// The selector's decision on a report that completes its round.
-pub fn decided(selector: &mut Selector, report: Report) -> Commit {
+pub fn decided(selector: &mut Selector, report: AssignmentReport) -> Commit {
     selector.report(report).unwrap().expect("no other report is waited for")
 }
 

@@ -1,6 +1,6 @@
 //! The state from which a selector continues, and complete candidates.
 
-use wire::messages::{DeclineReason, Progress};
+use wire::messages::{DeclineReason, WalkProgress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkConditions, WalkId};
 
 use super::walk_conditions;
@@ -218,7 +218,7 @@ impl WalkRow {
             reason: self.reason,
             turn: self.turn,
             accepted: self.accepted,
-            progress: Progress {
+            progress: WalkProgress {
                 step: self.step,
                 segment: self.segment,
                 tau: number(self.tau),

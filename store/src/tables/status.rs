@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::processes::ProcessRecord;
 use crate::status::{Candidates, Labels, Status, WalkStatus};
 use crate::unix_milliseconds;
-use crate::walk_progress::{TotalThroughput, WalkProgress};
+use crate::walk_progress::{TotalThroughput, WalkProgressRecord};
 
 const END_BY_BUDGET: &str = "budget";
 
@@ -108,7 +108,7 @@ impl Store {
 }
 
 /// Adds the speed of running walks, and their progress since the last checkpoint.
-fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
+fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgressRecord]) {
     for walk in walks.iter_mut().filter(|walk| walk.is_active()) {
         let Ok(found) = progress.binary_search_by_key(&walk.walk, |latest| latest.walk) else { continue };
         let latest = &progress[found];

@@ -6,7 +6,7 @@ use super::protocols::set_campaign_value;
 use crate::Store;
 use crate::database::{Transaction, Value, execute_rows, query};
 use crate::error::Result;
-use crate::walk_progress::{TotalThroughput, WalkProgress};
+use crate::walk_progress::{TotalThroughput, WalkProgressRecord};
 
 /// Progress older than this (ms) is ignored.
 const MAX_AGE: i64 = 60_000;
@@ -33,11 +33,11 @@ impl Store {
     /// Stores the progress of these walks and the throughput of all together.
     pub async fn set_walk_progress(
         &self,
-        walks: &[WalkProgress],
+        walks: &[WalkProgressRecord],
         all: TotalThroughput,
         now: i64,
     ) -> Result<()> {
-        let row = |walk: &WalkProgress| {
+        let row = |walk: &WalkProgressRecord| {
             let integer = |number: i64| Value::Integer(Some(number));
             let step = i64::try_from(walk.step).unwrap_or(i64::MAX);
             vec![
@@ -68,7 +68,7 @@ fn finite(number: Option<f64>) -> Option<f64> {
 }
 
 /// Progress reported within the last minute; empty for tables of an earlier version.
-pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgress>> {
+pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgressRecord>> {
     if !transaction.has_table("pace").await? {
         return Ok(Vec::new());
     }

@@ -9,7 +9,7 @@ use store::{
     AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Location, Protocol, SeedStructure,
     Store, WalkRecord,
 };
-use wire::messages::Progress;
+use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 pub use home::{Home, server};
@@ -137,12 +137,12 @@ pub fn walk(walk: u32, turn: u64) -> WalkRecord {
         reason: String::new(),
         turn,
         accepted: 1,
-        progress: Progress {
+        progress: WalkProgress {
             step: 100 * turn,
             tau: 0.5,
             temperature: 310.0,
             refused: 2,
-            ..Progress::default()
+            ..WalkProgress::default()
         },
         selector_state: "{}".into(),
         checkpoint: Some(turn.to_le_bytes().to_vec()),

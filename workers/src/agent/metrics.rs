@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use wire::WalkId;
-use wire::messages::{Assignment, Outcome, Progress};
+use wire::messages::{Assignment, Outcome, WalkProgress};
 use wire::net::SlotReport;
 
 use super::UNRESPONSIVE_AFTER;
@@ -78,7 +78,7 @@ impl AgentMetrics {
     }
 
     /// Records the progress of a walk.
-    pub(super) fn record_progress(&mut self, walk: WalkId, progress: &Progress) {
+    pub(super) fn record_progress(&mut self, walk: WalkId, progress: &WalkProgress) {
         let Some(position) = self.walks.get_mut(&walk) else { return };
         let now = (progress.segment, progress.step);
         // A roll back to a checkpoint is no step.
@@ -108,7 +108,7 @@ impl AgentMetrics {
 #[cfg(test)]
 mod tests {
     use atoms::{Cell, Structure};
-    use wire::messages::{Report, WalkEnd};
+    use wire::messages::{AssignmentReport, WalkEnd};
     use wire::{CampaignId, Origin, WalkConditions};
 
     use super::*;
@@ -135,8 +135,8 @@ mod tests {
         }
     }
 
-    fn at(segment: u32, step: u64) -> Progress {
-        Progress { segment, step, ..Progress::default() }
+    fn at(segment: u32, step: u64) -> WalkProgress {
+        WalkProgress { segment, step, ..WalkProgress::default() }
     }
 
     #[test]
@@ -167,7 +167,13 @@ mod tests {
         let mut metrics = AgentMetrics::default();
         let report = |outcome| {
             let checkpoint = Vec::new();
-            SlotReport::Report(Report { walk: WALK, assignment: 0, outcome, checkpoint, progress: at(0, 1) })
+            SlotReport::Report(AssignmentReport {
+                walk: WALK,
+                assignment: 0,
+                outcome,
+                checkpoint,
+                progress: at(0, 1),
+            })
         };
         let ended = || report(Outcome::Ended(WalkEnd::Steps));
         for told in [
