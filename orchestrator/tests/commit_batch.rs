@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use orchestrator::reactor::{Reactor, ReactorError, RunOutcome, commit_batch};
-use orchestrator::selector::{Mode, Scheduling, Selector, Settings, UpdateProtocol};
+use orchestrator::selector::{CampaignMode, Scheduling, Selector, SelectorSettings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use sqlx::ConnectOptions;
@@ -22,8 +22,8 @@ use crate::common::*;
 
 const WALKS: usize = 3;
 
-fn live_settings() -> Settings {
-    Settings { max_per_walk: 100, ..settings(Mode::Live) }
+fn live_settings() -> SelectorSettings {
+    SelectorSettings { max_per_walk: 100, ..settings(CampaignMode::Live) }
 }
 
 /// What a walker may report on an assignment.
@@ -45,10 +45,10 @@ fn event() -> impl Strategy<Value = Event> {
     ]
 }
 
-fn any_settings() -> impl Strategy<Value = Settings> {
+fn any_settings() -> impl Strategy<Value = SelectorSettings> {
     let update = prop::sample::select(vec![UpdateProtocol::Cumulative, UpdateProtocol::PerSeedStructure]);
     (update, 1..5_u32, prop::option::of(1..9_u32), any::<bool>()).prop_map(
-        |(update, max_per_walk, total, control)| Settings {
+        |(update, max_per_walk, total, control)| SelectorSettings {
             update,
             max_per_walk,
             max_structures: total,
@@ -77,7 +77,7 @@ fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Assignm
 }
 
 /// Commits of a live campaign, in order.
-fn commits(settings: &Settings, events: &[Event]) -> Vec<Commit> {
+fn commits(settings: &SelectorSettings, events: &[Event]) -> Vec<Commit> {
     let mut selector = restore(settings, WALKS, Default::default());
     let mut commits = vec![selector.start_walks()];
     for (number, event) in events.iter().enumerate() {
@@ -191,7 +191,7 @@ async fn create(directory: &Path) -> Store {
         configuration_in_force: "{}".into(),
     };
     let stored = |index| {
-        let orchestrator::selector::SeedStructure { name, structure, .. } = seed(index as usize);
+        let orchestrator::selector::SeedPlan { name, structure, .. } = seed(index as usize);
         store::SeedStructure { index, name, source: "seeds.extxyz".into(), structure }
     };
     let seeds: Vec<_> = (0..WALKS as u32).map(stored).collect();

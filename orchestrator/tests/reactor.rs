@@ -7,7 +7,7 @@ use std::thread;
 use std::time::Duration;
 
 use orchestrator::reactor::{Notice, Reactor, RunOutcome};
-use orchestrator::selector::{Mode, SelectorSnapshot, Settings};
+use orchestrator::selector::{CampaignMode, SelectorSettings, SelectorSnapshot};
 use store::{Campaign, JobState, Protocol, SeedStructure, Store};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -48,8 +48,8 @@ async fn a_stop_before_the_first_message_ends_the_reactor() {
     assert_eq!(ended.unwrap().unwrap(), RunOutcome::Stopped);
 }
 
-fn rounds() -> Settings {
-    Settings { max_per_walk: 9, control: true, ..settings(Mode::Reproducible) }
+fn rounds() -> SelectorSettings {
+    SelectorSettings { max_per_walk: 9, control: true, ..settings(CampaignMode::Reproducible) }
 }
 
 /// Opens or creates the campaign's database.

@@ -44,7 +44,7 @@ pub fn advance(
     on_progress: impl Fn(WalkProgress),
 ) -> AssignmentReport<Candidate> {
     let (walk, number) = (assignment.walk, assignment.number);
-    let mut running = match Walk::start_or_resume(context, assignment, mixture) {
+    let mut running = match RunningWalk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(error) => {
             let end = WalkEnd::BadStart { reason: error.to_string() };
@@ -71,7 +71,7 @@ pub fn advance(
 }
 
 /// A walk during an assignment.
-struct Walk<'a> {
+struct RunningWalk<'a> {
     settings: &'a WalkSettings,
     assignment: &'a Assignment,
     model: &'a GraceModel,
@@ -83,7 +83,7 @@ struct Walk<'a> {
     state: WalkState,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> RunningWalk<'a> {
     fn start_or_resume(
         context: &'a WalkContext,
         assignment: &'a Assignment,

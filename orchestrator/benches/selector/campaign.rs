@@ -9,7 +9,7 @@ use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{
-    Mode, OnForgetting, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+    CampaignMode, OnForgetting, SeedPlan, Selector, SelectorSettings, SelectorSnapshot, UpdateProtocol,
 };
 use store::{Campaign, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
@@ -26,10 +26,10 @@ pub const CHECKPOINT: usize = 27_000;
 const CHANNEL: usize = 64;
 
 /// The paper's rules for aluminium; structures are collected above `threshold` (in the paper, γ_max > 1.5).
-pub fn settings(threshold: f64) -> Settings {
+pub fn settings(threshold: f64) -> SelectorSettings {
     let positive = |number: f64| Positive::try_from(number).unwrap();
-    Settings {
-        mode: Mode::Live,
+    SelectorSettings {
+        mode: CampaignMode::Live,
         walks_per_round: 1,
         steps_per_assignment: 1000,
         update: UpdateProtocol::Cumulative,
@@ -52,7 +52,7 @@ pub fn settings(threshold: f64) -> Settings {
 }
 
 /// A selector at the start of the campaign, with one seed structure per walk.
-pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
+pub fn selector(model: &Model, walks: usize, settings: &SelectorSettings) -> Selector {
     let seeds = seeds(walks);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
     let training = Some(model.training.clone());
@@ -69,9 +69,9 @@ pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
 }
 
 /// The seed structures.
-pub fn seeds(walks: usize) -> Vec<SeedStructure> {
+pub fn seeds(walks: usize) -> Vec<SeedPlan> {
     (0..walks)
-        .map(|k| SeedStructure {
+        .map(|k| SeedPlan {
             name: format!("fcc-{k}"),
             structure: crystal(),
             walks: vec![WalkConditions::default()],
@@ -131,7 +131,7 @@ pub struct Run {
 /// Sends every recorded candidate from concurrent walkers through the reactor to the database.
 pub async fn run(
     model: &Model,
-    settings: &Settings,
+    settings: &SelectorSettings,
     recording: &[Vec<CandidateBlock>],
     location: Location,
 ) -> Run {

@@ -39,11 +39,11 @@ pub enum AdoptError {
 
 /// A process that is running, or was not waited for.
 #[derive(Debug)]
-pub(super) struct Process {
+pub(super) struct ProcessHandle {
     handle: OwnedFd,
 }
 
-impl Process {
+impl ProcessHandle {
     /// The handle of a child process that was not waited for.
     pub fn from_child(pid: u32) -> io::Result<Self> {
         Ok(Self { handle: open(pid)? })
@@ -83,7 +83,7 @@ impl Process {
 /// Asks the process `pid`, which started at `birth` ([`store::process_start_time`]), to exit (SIGTERM), without waiting for
 /// it. Used for a labeller of an earlier run that cannot be adopted because it uses another label protocol.
 pub fn request_exit(pid: u32, birth: &str) -> Result<(), AdoptError> {
-    let sent = Process::open_running(pid, birth)?.signal(Signal::TERM);
+    let sent = ProcessHandle::open_running(pid, birth)?.signal(Signal::TERM);
     sent.map_err(|error| AdoptError::Refused { pid, error })
 }
 

@@ -40,14 +40,16 @@ pub use error::SelectorError;
 pub use regrade::{RegradedCandidate, RegradedReport, Regrader};
 pub use replay::{Replay, ReplayError, ReplayedDecision};
 pub use scheduling::Scheduling;
-pub use settings::{Mode, OnForgetting, SeedStructure, SelectorSnapshot, Settings, UpdateProtocol};
+pub use settings::{
+    CampaignMode, OnForgetting, SeedPlan, SelectorSettings, SelectorSnapshot, UpdateProtocol,
+};
 pub use training_frames::TrainingFrames;
 use walk::Walk;
 
 /// The selector. See the [module](self).
 pub struct Selector {
     campaign: CampaignId,
-    seeds: Vec<SeedStructure>,
+    seeds: Vec<SeedPlan>,
     decisions: DecisionState,
     /// The walker that has each assigned walk in hand, until it reports or is lost.
     in_hand: BTreeMap<WalkId, u32>,
@@ -61,9 +63,9 @@ impl Selector {
     /// A selector that continues from the state in a store, which is empty at the start of a campaign. New seed
     /// structures get their walks by [`Selector::start_walks`].
     pub fn restore(
-        settings: Settings,
+        settings: SelectorSettings,
         campaign: CampaignId,
-        seeds: Vec<SeedStructure>,
+        seeds: Vec<SeedPlan>,
         grader: Grader,
         original: Arc<Mixture>,
         training: Option<TrainingFrames>,
@@ -163,8 +165,8 @@ impl Selector {
         let (id, number) = (report.walk, report.assignment);
         let mode = self.decisions.settings.mode;
         let in_round = match mode {
-            Mode::Live => true,
-            Mode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
+            CampaignMode::Live => true,
+            CampaignMode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
         };
         let is_current = |walk: &&Walk| in_round && walk.record.turn == number && !walk.has_ended();
         if self.decisions.walks.get(id).filter(is_current).is_none() {
@@ -177,8 +179,8 @@ impl Selector {
             return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
         }
         let reports = match mode {
-            Mode::Live => vec![report],
-            Mode::Reproducible => {
+            CampaignMode::Live => vec![report],
+            CampaignMode::Reproducible => {
                 self.in_round.insert(id, Some(report));
                 if self.in_round.values().any(Option::is_none) {
                     return Ok(None);

@@ -8,7 +8,7 @@ use wire::CandidateBlock;
 use wire::messages::AssignmentReport;
 
 use super::error::SelectorError;
-use crate::grader::{Bonds, Grader};
+use crate::grader::{Grader, StructureBonds};
 
 /// Grades candidates ahead of the decisions about them. Cheap to clone.
 #[derive(Clone)]
@@ -20,7 +20,7 @@ pub struct Regrader {
 /// A candidate with its grades.
 pub struct RegradedCandidate {
     pub(super) block: CandidateBlock,
-    pub(super) bonds: Bonds,
+    pub(super) bonds: StructureBonds,
     /// Grades under the original mixture.
     pub(super) original: AtomGrades,
     /// The mixture of the selector's grades.

@@ -13,8 +13,8 @@ use calm::{
 };
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    Mode, OnForgetting, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, TrainingFrames,
-    UpdateProtocol,
+    CampaignMode, OnForgetting, Scheduling, SeedPlan, Selector, SelectorSettings, SelectorSnapshot,
+    TrainingFrames, UpdateProtocol,
 };
 use store::records::{AtomGrades, Commit};
 use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
@@ -55,8 +55,8 @@ pub fn structure(number: u64, distance: f64) -> Structure {
     }
 }
 
-pub fn seed(number: usize) -> SeedStructure {
-    SeedStructure {
+pub fn seed(number: usize) -> SeedPlan {
+    SeedPlan {
         name: format!("seed-{number}"),
         structure: structure(1_000_000 + number as u64, SHORTEST),
         walks: vec![WalkConditions::default()],
@@ -71,8 +71,8 @@ pub fn positive(number: f64) -> Positive {
     number.try_into().unwrap()
 }
 
-pub fn settings(mode: Mode) -> Settings {
-    Settings {
+pub fn settings(mode: CampaignMode) -> SelectorSettings {
+    SelectorSettings {
         mode,
         walks_per_round: 2,
         steps_per_assignment: 10,
@@ -95,12 +95,12 @@ pub fn settings(mode: Mode) -> Settings {
     }
 }
 
-pub fn restore(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
+pub fn restore(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     try_restore(settings, seeds, None, snapshot).unwrap()
 }
 
 pub fn try_restore(
-    settings: &Settings,
+    settings: &SelectorSettings,
     seeds: usize,
     training: Option<TrainingFrames>,
     snapshot: SelectorSnapshot,
@@ -110,7 +110,7 @@ pub fn try_restore(
 }
 
 /// A selector at the start of a campaign, with its walks.
-pub fn begin(settings: &Settings, seeds: usize) -> Selector {
+pub fn begin(settings: &SelectorSettings, seeds: usize) -> Selector {
     let mut selector = restore(settings, seeds, SelectorSnapshot::default());
     selector.start_walks();
     selector

@@ -9,7 +9,7 @@ use monitor::label_queue::LabelQueue;
 use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
 use monitor::snapshot::FORMAT;
-use orchestrator::slurm::{Job, Role};
+use orchestrator::slurm::{Role, SlurmJob};
 use serde_json::{Value, json};
 use store::records::{STALENESS, TRAINING_FRAMES};
 use store::{
@@ -163,8 +163,8 @@ fn status() -> CampaignStatus {
     }
 }
 
-fn job() -> (Job, Option<String>) {
-    let job = Job {
+fn job() -> (SlurmJob, Option<String>) {
+    let job = SlurmJob {
         id: 1_234_567,
         role: Role::Agent(3),
         state: "PENDING".into(),
