@@ -10,7 +10,7 @@ use proptest::test_runner::RngSeed;
 use sqlx::ConnectOptions;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use store::records::Commit;
-use store::{Campaign, Store, StoreError};
+use store::{CampaignRecord, Store, StoreError};
 use tempfile::TempDir;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -182,7 +182,7 @@ impl Live {
 }
 
 async fn create(directory: &Path) -> Store {
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CAMPAIGN,
         program_version: "0.1.0".into(),
         mode: "live".into(),

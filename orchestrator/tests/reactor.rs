@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use orchestrator::reactor::{Notice, Reactor, RunOutcome};
 use orchestrator::selector::{CampaignMode, SelectorSettings, SelectorSnapshot};
-use store::{Campaign, JobState, Protocol, SeedStructure, Store};
+use store::{CampaignRecord, JobState, Protocol, SeedStructure, Store};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use wire::messages::{AssignmentReport, WalkProgress};
@@ -57,7 +57,7 @@ async fn open(directory: &Path) -> Store {
     if directory.join(store::DATABASE).exists() {
         return Store::open(directory).await.unwrap();
     }
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CAMPAIGN,
         program_version: "0.1.0".into(),
         mode: "reproducible".into(),

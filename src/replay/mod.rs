@@ -49,7 +49,7 @@ pub async fn replay(
 }
 
 /// The configuration with its defaults and the hashes of its files.
-pub fn resolved(campaign: &store::Campaign) -> Result<Value, Failure> {
+pub fn resolved(campaign: &store::CampaignRecord) -> Result<Value, Failure> {
     serde_json::from_str(&campaign.resolved_configuration)
         .map_err(|error| Failure::Failed(format!("damaged database: the configuration: {error}")))
 }

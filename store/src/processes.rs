@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::database::{FromRow, Row};
+use crate::database::{FromRow, SqlRow};
 use crate::error::Result;
 use crate::process_start::{self, process_start_time};
 
@@ -48,7 +48,7 @@ pub struct ProcessRecord {
 }
 
 impl FromRow for ProcessRecord {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         Ok(Self {
             id: row.get("id")?,
             kind: row.get("kind")?,

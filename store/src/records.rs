@@ -18,7 +18,7 @@ pub const LEFT_OUT: &str = "left_out";
 
 /// Properties of a campaign, written when it is created.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Campaign {
+pub struct CampaignRecord {
     /// Its id.
     pub id: CampaignId,
     /// Version of the program that created it.
@@ -162,7 +162,7 @@ pub struct LoggedDecision {
 
 /// An entry of the operations log.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Operation {
+pub struct LoggedOperation {
     /// Its number.
     pub number: i64,
     /// ms since 1970.

@@ -255,7 +255,8 @@ async fn walks_can_be_paused_and_resumed_at_any_time() {
 
     let reader = home.open_read_only().await;
     assert_eq!(reader.paused_walks().await.unwrap(), [WalkId(1)].into());
-    let paused = |status: store::Status| status.walks.iter().map(|walk| walk.paused).collect::<Vec<_>>();
+    let paused =
+        |status: store::CampaignStatus| status.walks.iter().map(|walk| walk.paused).collect::<Vec<_>>();
     assert_eq!(paused(reader.status().await.unwrap()), [false, true, false]);
     assert!(reader.walk(WalkId(1)).await.unwrap().unwrap().0.paused);
     assert!(matches!(reader.pause_walks(&[WalkId(1)], false, 5).await, Err(StoreError::ReadOnly)));

@@ -11,7 +11,7 @@ use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{
     CampaignMode, OnForgetting, SeedPlan, Selector, SelectorSettings, SelectorSnapshot, UpdateProtocol,
 };
-use store::{Campaign, Fate, Location, Protocol, Store};
+use store::{CampaignRecord, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd};
@@ -81,7 +81,7 @@ pub fn seeds(walks: usize) -> Vec<SeedPlan> {
 
 /// The campaign's database, with a label protocol, so that every accept queues a job.
 pub async fn create_store(location: Location, walks: usize) -> Store {
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CAMPAIGN,
         program_version: "bench".into(),
         mode: "live".into(),

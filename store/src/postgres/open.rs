@@ -7,11 +7,11 @@ use sqlx::postgres::PgConnection;
 use sqlx::{AssertSqlSafe, Executor};
 use wire::CampaignId;
 
-use super::server::Server;
+use super::server::PostgresServer;
 use crate::database::{Database, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
-use crate::migrations::{Step, migrator, schema_error};
+use crate::migrations::{MigrationSource, migrator, schema_error};
 use crate::tables::checksums;
 
 /// The newest migration.
@@ -20,7 +20,7 @@ const SCHEMA: i64 = 13;
 const FIRST_WITH_CHECKSUMS: i64 = 9;
 
 /// The migrations in order.
-pub(crate) static STEPS: [Step; 12] = [
+pub(crate) static STEPS: [MigrationSource; 12] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -37,7 +37,7 @@ pub(crate) static STEPS: [Step; 12] = [
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
 
-impl Server {
+impl PostgresServer {
     /// Creates the tables, which must not hold a campaign yet.
     pub async fn create(url: &ServerUrl, campaign: CampaignId) -> Result<Self> {
         let server = Self::connect(url, true);
@@ -93,7 +93,7 @@ impl Server {
 }
 
 /// Creates the schema and its tables if they do not exist.
-pub(super) async fn make_tables(url: &ServerUrl, server: &Server) -> Result<()> {
+pub(super) async fn make_tables(url: &ServerUrl, server: &PostgresServer) -> Result<()> {
     let mut connection = server.connection().await?;
     if version(url, &mut connection).await? == Some(SCHEMA) {
         return Ok(());

@@ -17,7 +17,7 @@ use crate::database::{Database, Transaction};
 use crate::error::{Result, StoreError};
 use crate::file_names::DATABASE;
 use crate::filesystem::check_directory;
-use crate::migrations::{Step, migrator, schema_error};
+use crate::migrations::{MigrationSource, migrator, schema_error};
 use crate::tables::checksums;
 
 /// `PRAGMA application_id` of a campaign: "CALM".
@@ -32,7 +32,7 @@ const MIGRATION_ATTEMPTS: u32 = 50;
 const OPEN_RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The migrations in order.
-pub(crate) static STEPS: [Step; 13] = [
+pub(crate) static STEPS: [MigrationSource; 13] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),

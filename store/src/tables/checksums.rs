@@ -4,7 +4,7 @@ use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
     LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK, WALK_CONDITIONS,
 };
-use crate::database::{Row, Transaction, Value, execute_rows, query};
+use crate::database::{SqlRow, SqlValue, Transaction, execute_rows, query};
 use crate::error::Result;
 
 /// Rows read at a time: a row of a large structure has megabytes.
@@ -118,8 +118,8 @@ impl Paged {
     }
 
     /// Key of the row, and its checksums.
-    fn checksums(&self, row: &Row, long: &[&CheckedColumn]) -> Result<Vec<Value>> {
-        let mut values: Vec<Value> =
+    fn checksums(&self, row: &SqlRow, long: &[&CheckedColumn]) -> Result<Vec<SqlValue>> {
+        let mut values: Vec<SqlValue> =
             vec![row.get::<i64>(self.key)?.into(), self.table.compute(row, Names::Plain)?.into()];
         for column in long {
             values.push(column.compute(row)?.into());
@@ -188,7 +188,7 @@ async fn next(
     sql: &'static str,
     [first, second]: [&str; 2],
     after: (i64, i64),
-) -> Result<Option<(Row, (i64, i64))>> {
+) -> Result<Option<(SqlRow, (i64, i64))>> {
     let found = query(sql).bind(after.0).bind(after.1).rows(transaction).await?;
     let Some(row) = found.into_iter().next() else { return Ok(None) };
     let key = (row.get(first)?, row.get(second)?);

@@ -6,8 +6,8 @@ mod home;
 use atoms::{Cell, Structure};
 use serde_json::json;
 use store::{
-    AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Location, Protocol, SeedStructure,
-    Store, WalkRecord,
+    AtomGrades, CampaignRecord, CandidateRecord, Commit, Decision, Fate, Label, Location, Protocol,
+    SeedStructure, Store, WalkRecord,
 };
 use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
@@ -17,8 +17,8 @@ pub use home::{Home, server};
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const ATOMS: usize = 2;
 
-pub fn campaign() -> Campaign {
-    Campaign {
+pub fn campaign() -> CampaignRecord {
+    CampaignRecord {
         id: CAMPAIGN,
         program_version: "0.1.0".into(),
         mode: "reproducible".into(),
