@@ -14,7 +14,8 @@ const UNRESPONSIVE_AFTER: i64 = 60 * 1000;
 
 /// A process that works for the campaign.
 ///
-/// Columns that schema version 1 lacks are filled in when such a database is read.
+/// Columns that schema version 1 lacks are filled in when such a database is read, and `start_time` is read by the
+/// name that it had before version 14.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ProcessRecord {
     /// Unique name, never reused and without `/`.
@@ -54,7 +55,7 @@ impl FromRow for ProcessRecord {
             kind: row.get("kind")?,
             number: row.get_or_default("number")?,
             pid: row.get("pid")?,
-            start_time: row.get_or_default("birth")?,
+            start_time: row.get_renamed("start_time", "birth")?,
             host: row.get("host")?,
             started: row.get("started")?,
             last_seen: row.get("last_seen")?,

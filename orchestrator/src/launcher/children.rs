@@ -82,11 +82,11 @@ impl Children {
         }
     }
 
-    /// Adopts process `pid`, which started at `birth` ([`store::process_start_time`]), as a child that was never started. It
-    /// need not be a child of this process, but then the reason of its exit remains unknown. Must be called in a tokio
-    /// runtime.
-    pub fn adopt(&mut self, number: u32, pid: u32, birth: &str) -> Result<(), AdoptError> {
-        let process = ProcessHandle::open_running(pid, birth)?;
+    /// Adopts process `pid`, which started at `start_time` ([`store::process_start_time`]), as a child that was never
+    /// started. It need not be a child of this process, but then the reason of its exit remains unknown. Must be called
+    /// in a tokio runtime.
+    pub fn adopt(&mut self, number: u32, pid: u32, start_time: &str) -> Result<(), AdoptError> {
+        let process = ProcessHandle::open_running(pid, start_time)?;
         let end = process.end().map_err(|error| AdoptError::Refused { pid, error })?;
         if !self.supervisor.adopt(number, self.heartbeats.now()) {
             return Err(AdoptError::NotAdoptable { pid, number });

@@ -34,11 +34,19 @@ impl SqlRow {
 
     /// The value of a column that tables of earlier versions lack.
     pub fn get_or_default<T: FromColumn + Default>(&self, name: &str) -> Result<T> {
-        let is_there = match self {
+        if self.has_column(name) { self.get(name) } else { Ok(T::default()) }
+    }
+
+    /// The value of a column that tables of earlier versions call `former`, or lack.
+    pub fn get_renamed<T: FromColumn + Default>(&self, name: &str, former: &str) -> Result<T> {
+        self.get_or_default(if self.has_column(name) { name } else { former })
+    }
+
+    fn has_column(&self, name: &str) -> bool {
+        match self {
             Self::Sqlite(row) => row.try_column(name).is_ok(),
             Self::Postgres(row) => row.try_column(name).is_ok(),
-        };
-        if is_there { self.get(name) } else { Ok(T::default()) }
+        }
     }
 }
 

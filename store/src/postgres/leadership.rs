@@ -57,8 +57,7 @@ impl Leadership {
             tokio::time::sleep(RELEASE_POLL_INTERVAL).await;
         }
         let pid = std::process::id();
-        let sql =
-            "UPDATE leader SET generation = generation + 1, holder = $1, birth = $2 RETURNING generation";
+        let sql = "UPDATE leader SET generation = generation + 1, holder = $1, start_time = $2 RETURNING generation";
         let query = sqlx::query_scalar(sql).bind(format!("process {pid} ({who}) on {}", this_host()));
         let query = query.bind(process_start_time(pid).unwrap_or_default());
         let generation = query.fetch_one(&mut connection).await?;

@@ -15,12 +15,12 @@ use crate::migrations::{MigrationSource, migrator, schema_error};
 use crate::tables::checksums;
 
 /// The newest migration.
-const SCHEMA: i64 = 13;
+const SCHEMA: i64 = 14;
 /// The first version whose rows have checksums.
 const FIRST_WITH_CHECKSUMS: i64 = 9;
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 12] = [
+pub(crate) static STEPS: [MigrationSource; 13] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -33,6 +33,7 @@ pub(crate) static STEPS: [MigrationSource; 12] = [
     (11, "walk conditions", include_str!("../../migrations/postgres/0011_walk_conditions.sql")),
     (12, "lower states", include_str!("../../migrations/postgres/0012_lower_states.sql")),
     (13, "queued imports", include_str!("../../migrations/postgres/0013_queued_imports.sql")),
+    (14, "start time", include_str!("../../migrations/postgres/0014_start_time.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

@@ -23,7 +23,7 @@ use crate::tables::checksums;
 /// `PRAGMA application_id` of a campaign: "CALM".
 pub(super) const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` after the newest migration.
-pub(super) const SCHEMA: i64 = 13;
+pub(super) const SCHEMA: i64 = 14;
 /// The first version whose rows have checksums.
 const FIRST_WITH_CHECKSUMS: i64 = 9;
 /// Tries to migrate a database while other processes try the same.
@@ -32,7 +32,7 @@ const MIGRATION_ATTEMPTS: u32 = 50;
 const OPEN_RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 13] = [
+pub(crate) static STEPS: [MigrationSource; 14] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
@@ -46,6 +46,7 @@ pub(crate) static STEPS: [MigrationSource; 13] = [
     (11, "walk conditions", include_str!("../../migrations/sqlite/0011_walk_conditions.sql")),
     (12, "lower states", include_str!("../../migrations/sqlite/0012_lower_states.sql")),
     (13, "queued imports", include_str!("../../migrations/sqlite/0013_queued_imports.sql")),
+    (14, "start time", include_str!("../../migrations/sqlite/0014_start_time.sql")),
 ];
 
 pub(super) static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
