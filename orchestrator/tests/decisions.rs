@@ -49,7 +49,7 @@ fn accepted_structures_are_covered_afterwards() {
     assert_eq!(commit.decisions[0].candidate, Some(candidate.block.view().id()));
     // Both atoms belong to one component; the other is unchanged.
     assert_eq!(commit.components.iter().map(|c| (c.element, c.slot)).collect::<Vec<_>>(), [(0, 0)]);
-    assert_eq!((commit.walks.len(), commit.walks[0].accepted, commit.walks[0].turn), (1, 1, 1));
+    assert_eq!((commit.walks.len(), commit.walks[0].accepted, commit.walks[0].assignments), (1, 1, 1));
     assert!(gamma_max(selector.mixture(), NEW) < 1.25);
     assert!(
         gamma_max(selector.mixture(), NEW)
@@ -262,7 +262,7 @@ fn imports_are_logged_once_when_they_begin_to_count() {
 
 #[test]
 fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
-    // It is not the turn of control walks.
+    // No control walk is due.
     let limited = SelectorSettings {
         update: UpdateProtocol::Never,
         max_structures: Some(1),

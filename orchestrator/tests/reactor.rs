@@ -385,7 +385,7 @@ async fn pausing_a_walk_does_not_change_decisions() {
     let running = tokio::spawn(end_of(reactor, |_| {}));
     let assignments = async || {
         let walks = store.load_walks().await.unwrap();
-        walks.iter().map(|walk| walk.turn).collect::<Vec<_>>()
+        walks.iter().map(|walk| walk.assignments).collect::<Vec<_>>()
     };
     tokio::time::sleep(Duration::from_millis(700)).await;
     assert_eq!((assignments().await, running.is_finished()), (vec![0; 3], false), "the first round waits");

@@ -125,7 +125,7 @@ fn late_reports_of_lost_walkers_count_once() {
         let report = common::report(&assignment, Outcome::StepsDone, at(10));
         selector.assignment_lost(assignment.walk);
         let commit = decided(&mut selector, report.clone());
-        assert_eq!(commit.walks[0].turn, assignment.number + 1);
+        assert_eq!(commit.walks[0].assignments, assignment.number + 1);
         assert!(selector.report(report.clone()).unwrap().is_none());
         assert_eq!(next_assignment(&mut selector).number, assignment.number + 1);
         assert!(selector.report(report).unwrap().is_none());

@@ -101,9 +101,9 @@ pub static COMPONENT: CheckedTable =
 
 /// Walks, without their checkpoints (see [`CHECKPOINT`]).
 pub static WALK: CheckedTable = checked!("walk" by walk Integer {
-    walk: Integer, origin: Text, partner: Integer, seed_structure: Integer, state: Text, reason: Text, turn: Integer,
-    accepted: Integer, step: Integer, segment: Integer, tau: Real, temperature: Real, relative_volume: Real,
-    gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
+    walk: Integer, origin: Text, partner: Integer, seed_structure: Integer, state: Text, reason: Text,
+    assignments: Integer, accepted: Integer, step: Integer, segment: Integer, tau: Real, temperature: Real,
+    relative_volume: Real, gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
 });
 
 /// Conditions of walks, which have never been without checksums.
@@ -204,12 +204,13 @@ macro_rules! joined {
         import.checksum AS import__checksum"
     };
     (walk) => {
-        "walk.walk AS walk__walk, walk.origin AS walk__origin, walk.partner AS walk__partner, walk.seed_structure AS
-        walk__seed_structure, walk.state AS walk__state, walk.reason AS walk__reason, walk.turn AS walk__turn, walk.accepted
-        AS walk__accepted, walk.step AS walk__step, walk.segment AS walk__segment, walk.tau AS walk__tau, walk.temperature AS
-        walk__temperature, walk.relative_volume AS walk__relative_volume, walk.gamma_max AS walk__gamma_max, walk.refused AS
-        walk__refused, walk.returns AS walk__returns, walk.selector_state AS walk__selector_state, walk.checksum AS
-        walk__checksum"
+        "walk.walk AS walk__walk, walk.origin AS walk__origin, walk.partner AS walk__partner,
+        walk.seed_structure AS walk__seed_structure, walk.state AS walk__state, walk.reason AS walk__reason,
+        walk.assignments AS walk__assignments, walk.accepted AS walk__accepted, walk.step AS walk__step,
+        walk.segment AS walk__segment, walk.tau AS walk__tau, walk.temperature AS walk__temperature,
+        walk.relative_volume AS walk__relative_volume, walk.gamma_max AS walk__gamma_max,
+        walk.refused AS walk__refused, walk.returns AS walk__returns, walk.selector_state AS walk__selector_state,
+        walk.checksum AS walk__checksum"
     };
     (structure) => {
         "structure.number AS structure__number, structure.hash AS structure__hash, structure.atoms AS structure__atoms,

@@ -25,6 +25,7 @@ mod lock;
 mod lower_states;
 mod migrations;
 mod numbers;
+mod old_schema;
 mod outcomes;
 mod postgres;
 mod process_start;

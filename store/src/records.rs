@@ -208,12 +208,12 @@ pub struct WalkRecord {
     pub seed_structure: u32,
     /// Its conditions; those of the default in campaigns of early versions.
     pub conditions: WalkConditions,
-    /// `waiting`, `running`, or the name of its [`wire::messages::End`].
+    /// `waiting`, `running`, or the name of its [`wire::messages::WalkEnd`].
     pub state: String,
     /// Why it ended, as text; empty while it runs.
     pub reason: String,
-    /// Assignments done.
-    pub turn: u64,
+    /// Number of its assignments that were reported.
+    pub assignments: u64,
     /// Structures accepted from it.
     pub accepted: u32,
     /// Its progress.

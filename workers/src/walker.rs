@@ -32,8 +32,8 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) -> WalkerExit 
         }
         // A panic is a defect of this program. It ends the walk that caused it, not the campaign.
         let started = Instant::now();
-        let turn = catch_unwind(AssertUnwindSafe(|| run_assignment(context, &work, transport)));
-        let made = turn.unwrap_or_else(|_| crash_report(&work));
+        let result = catch_unwind(AssertUnwindSafe(|| run_assignment(context, &work, transport)));
+        let made = result.unwrap_or_else(|_| crash_report(&work));
         log_outcome(&work, &made, started.elapsed());
         report = Some(made);
     }

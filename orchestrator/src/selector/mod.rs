@@ -148,7 +148,7 @@ impl Selector {
     /// Ends a walk whose current assignment cannot be completed, as if it had been reported.
     pub fn abandon_walk(&mut self, id: WalkId, reason: String) -> Result<Option<Commit>, SelectorError> {
         let Some(walk) = self.decisions.walks.get(id) else { return Ok(None) };
-        let WalkRecord { turn: number, checkpoint, progress, .. } = walk.record.clone();
+        let WalkRecord { assignments: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::BlewUp { reason }));
         self.report(AssignmentReport { walk: id, assignment: number, outcome, checkpoint, progress })
@@ -168,7 +168,7 @@ impl Selector {
             CampaignMode::Live => true,
             CampaignMode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
         };
-        let is_current = |walk: &&Walk| in_round && walk.record.turn == number && !walk.has_ended();
+        let is_current = |walk: &&Walk| in_round && walk.record.assignments == number && !walk.has_ended();
         if self.decisions.walks.get(id).filter(is_current).is_none() {
             return Ok(None);
         }

@@ -101,7 +101,7 @@ impl Selector {
         Assignment {
             campaign: self.campaign,
             walk: id,
-            number: walk.record.turn,
+            number: walk.record.assignments,
             origin: walk.record.origin,
             random_walk: walk.record.partner.unwrap_or(id),
             seed_structure: self.seeds[walk.record.seed_structure as usize].structure.clone(),

@@ -40,7 +40,7 @@ impl Walk {
             conditions,
             state: "waiting".to_owned(),
             reason: String::new(),
-            turn: 0,
+            assignments: 0,
             accepted: 0,
             progress: WalkProgress::default(),
             selector_state: String::new(),

@@ -65,7 +65,7 @@ const TABLES: [CopiedTable; 17] = [
     table!("candidate_data" { decision: I, block: B, features: B, selector_grades: B, original_grades: B }),
     table!("component" { element: I, slot: I, bytes: B, checksum: I }),
     table!("walk" {
-        walk: I, origin: T, partner: I, seed_structure: I, state: T, reason: T, turn: I, accepted: I, step: I,
+        walk: I, origin: T, partner: I, seed_structure: I, state: T, reason: T, assignments: I, accepted: I, step: I,
         segment: I, tau: R, temperature: R, relative_volume: R, gamma_max: R, refused: I, returns: I,
         selector_state: T, checkpoint: B, checksum: I, checkpoint_checksum: I,
     }),

@@ -12,15 +12,14 @@ use crate::database::{Database, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
 use crate::migrations::{MigrationSource, migrator, schema_error};
+use crate::old_schema::{self, FIRST_WITH_CHECKSUMS};
 use crate::tables::checksums;
 
 /// The newest migration.
-const SCHEMA: i64 = 14;
-/// The first version whose rows have checksums.
-const FIRST_WITH_CHECKSUMS: i64 = 9;
+const SCHEMA: i64 = 15;
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 13] = [
+pub(crate) static STEPS: [MigrationSource; 14] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -34,6 +33,7 @@ pub(crate) static STEPS: [MigrationSource; 13] = [
     (12, "lower states", include_str!("../../migrations/postgres/0012_lower_states.sql")),
     (13, "queued imports", include_str!("../../migrations/postgres/0013_queued_imports.sql")),
     (14, "start time", include_str!("../../migrations/postgres/0014_start_time.sql")),
+    (15, "assignments", include_str!("../../migrations/postgres/0015_assignments.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
@@ -62,8 +62,8 @@ impl PostgresServer {
         if found < SCHEMA && writes {
             server.migrate(url).await?;
         }
-        if found < FIRST_WITH_CHECKSUMS && !writes {
-            server = server.with_views(url, checksums::views(&url.schema).into());
+        if let Some(views) = old_schema::views(&url.schema, found).filter(|_| !writes) {
+            server = server.with_views(url, views.into());
         }
         server.campaign().await?.ok_or_else(missing)?;
         Ok(server)

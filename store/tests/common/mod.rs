@@ -126,7 +126,7 @@ pub fn commit_of(candidates: Vec<CandidateRecord>) -> Commit {
     Commit { decisions: decisions.collect(), candidates, ..Commit::default() }
 }
 
-pub fn walk(walk: u32, turn: u64) -> WalkRecord {
+pub fn walk(walk: u32, assignments: u64) -> WalkRecord {
     WalkRecord {
         walk: WalkId(walk),
         origin: Origin::Biased,
@@ -135,17 +135,17 @@ pub fn walk(walk: u32, turn: u64) -> WalkRecord {
         conditions: WalkConditions::default(),
         state: "running".into(),
         reason: String::new(),
-        turn,
+        assignments,
         accepted: 1,
         progress: WalkProgress {
-            step: 100 * turn,
+            step: 100 * assignments,
             tau: 0.5,
             temperature: 310.0,
             refused: 2,
             ..WalkProgress::default()
         },
         selector_state: "{}".into(),
-        checkpoint: Some(turn.to_le_bytes().to_vec()),
+        checkpoint: Some(assignments.to_le_bytes().to_vec()),
     }
 }
 

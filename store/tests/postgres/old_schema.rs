@@ -19,6 +19,7 @@ const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
     DROP TABLE walk_conditions;
     ALTER TABLE process RENAME COLUMN start_time TO birth; ALTER TABLE leader RENAME COLUMN start_time TO birth;
+    ALTER TABLE walk RENAME COLUMN assignments TO turn;
     DELETE FROM _sqlx_migrations WHERE version > 8";
 
 async fn exported(location: impl Into<Location>) -> Vec<String> {

@@ -115,14 +115,14 @@ mod tests {
 
     const WALK: WalkId = WalkId(3);
 
-    fn turn(turn: u64, checkpoint: Option<Vec<u8>>) -> Assignment {
+    fn assignment(number: u64, checkpoint: Option<Vec<u8>>) -> Assignment {
         let cell = Cell::orthorhombic(1.0, 1.0, 1.0);
         let seed_structure =
             Structure { species: Vec::new(), positions: Vec::new(), cell, periodic: [true; 3] };
         Assignment {
             campaign: CampaignId([1; 16]),
             walk: WALK,
-            number: turn,
+            number,
             origin: Origin::Biased,
             random_walk: WALK,
             seed_structure,
@@ -142,11 +142,11 @@ mod tests {
     #[test]
     fn steps_count_those_made_here() {
         let mut metrics = AgentMetrics::default();
-        metrics.received(&turn(0, None), 7);
+        metrics.received(&assignment(0, None), 7);
         metrics.record_progress(WALK, &at(0, 10));
         metrics.record_progress(WALK, &at(0, 40));
         // It continues where it was.
-        metrics.received(&turn(1, Some(Vec::new())), 7);
+        metrics.received(&assignment(1, Some(Vec::new())), 7);
         metrics.record_progress(WALK, &at(0, 45));
         assert_eq!(metrics.steps, 45);
         // It rolls back to step 20 and continues.
@@ -154,7 +154,7 @@ mod tests {
         metrics.record_progress(WALK, &at(1, 25));
         assert_eq!(metrics.steps, 50);
         // It ran elsewhere for some assignments.
-        metrics.received(&turn(9, Some(Vec::new())), 7);
+        metrics.received(&assignment(9, Some(Vec::new())), 7);
         metrics.record_progress(WALK, &at(1, 900));
         metrics.record_progress(WALK, &at(1, 901));
         assert_eq!((metrics.steps, metrics.assignments_received, metrics.mixture_version), (51, 3, Some(7)));

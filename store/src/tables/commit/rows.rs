@@ -63,7 +63,7 @@ pub(super) const WALK: [&str; 20] = [
     "seed_structure",
     "state",
     "reason",
-    "turn",
+    "assignments",
     "accepted",
     "step",
     "segment",
@@ -114,7 +114,7 @@ impl CommitRows {
                 .collect(),
             walks: newest(&commit.walks, |walk| walk.walk).map(walk).collect::<Result<_>>()?,
             walk_conditions: newest(&commit.walks, |walk| walk.walk)
-                .filter(|walk| walk.turn == 0)
+                .filter(|walk| walk.assignments == 0)
                 .map(walk_conditions)
                 .collect(),
             values: newest(&commit.values, |(name, _)| name)
@@ -318,7 +318,7 @@ fn walk(walk: &WalkRecord) -> Result<Row> {
         walk.seed_structure.into(),
         (&walk.state).into(),
         (&walk.reason).into(),
-        integer("turn", walk.turn)?.into(),
+        integer("number of assignments", walk.assignments)?.into(),
         walk.accepted.into(),
         integer("step", progress.step)?.into(),
         progress.segment.into(),
