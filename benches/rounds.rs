@@ -19,12 +19,13 @@ use calm::{Artifact, UpdateSettings};
 use md::{LangevinSettings, ThermostatSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    Mode, OnForgetting, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+    CampaignMode, OnForgetting, Scheduling, SeedPlan, Selector, SelectorSettings, SelectorSnapshot,
+    UpdateProtocol,
 };
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
 use rustix::time::{ClockId, clock_gettime};
-use wire::messages::{Outcome, Report};
+use wire::messages::{AssignmentReport, Outcome};
 use wire::{CampaignId, CandidateBlock, Origin, WalkConditions};
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
@@ -46,10 +47,11 @@ fn main() {
         std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(STEPS_PER_ASSIGNMENT);
     println!("assignments of {steps_per_assignment} steps");
     println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
-    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| {
+    let [live, rounds] = [CampaignMode::Live, CampaignMode::Reproducible].map(|mode| {
         // As many walkers as walks, so that every assignment starts at once.
         let walks = seeds(&[600.0]);
-        let settings = Settings { mode, walks_per_round: walks.len(), steps_per_assignment, ..settings() };
+        let settings =
+            SelectorSettings { mode, walks_per_round: walks.len(), steps_per_assignment, ..settings() };
         let campaign = Campaign::run(settings, walks.len(), walks);
         let Campaign { candidates, accepted, time, .. } = campaign;
         let (seconds, busy) = (time.as_secs_f64(), 100.0 * campaign.busy);
@@ -62,13 +64,13 @@ fn main() {
 
 /// Rounds of several sizes, and live mode with several shares of control walks.
 fn compare_schedules() {
-    let base = Settings { control: true, max_per_walk: 3, ..settings() };
+    let base = SelectorSettings { control: true, max_per_walk: 3, ..settings() };
     let rounds = [1, 8, 32].map(|walks_per_round| {
-        let settings = Settings { mode: Mode::Reproducible, walks_per_round, ..base.clone() };
+        let settings = SelectorSettings { mode: CampaignMode::Reproducible, walks_per_round, ..base.clone() };
         (format!("reproducible, walks_per_round = {walks_per_round}"), settings)
     });
     let live = [0.25, 0.5].map(|control_share| {
-        (format!("live, control_share = {control_share}"), Settings { control_share, ..base.clone() })
+        (format!("live, control_share = {control_share}"), SelectorSettings { control_share, ..base.clone() })
     });
     println!("{:<36} {:>8} {:>14} {:>32}", "", "seconds", "walkers busy", "begun before the first control");
     for (name, settings) in rounds.into_iter().chain(live) {
@@ -92,10 +94,10 @@ struct Campaign {
 }
 
 /// A running assignment: when it ends, the order of start for ties, and its report.
-struct RunningAssignment(Duration, u64, Report);
+struct RunningAssignment(Duration, u64, AssignmentReport);
 
 impl Campaign {
-    fn run(settings: Settings, walkers: usize, seeds: Vec<SeedStructure>) -> Self {
+    fn run(settings: SelectorSettings, walkers: usize, seeds: Vec<SeedPlan>) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
         let context = WalkContext {
             model: Arc::clone(&model),
@@ -141,10 +143,10 @@ fn processor_time() -> Duration {
 }
 
 /// Live mode without control walks.
-fn settings() -> Settings {
+fn settings() -> SelectorSettings {
     let rule = "rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3\n";
-    Settings {
-        mode: Mode::Live,
+    SelectorSettings {
+        mode: CampaignMode::Live,
         walks_per_round: 1,
         steps_per_assignment: STEPS_PER_ASSIGNMENT,
         update: UpdateProtocol::Cumulative,
@@ -166,7 +168,7 @@ fn settings() -> Settings {
     }
 }
 
-fn selector(settings: Settings, seeds: Vec<SeedStructure>, model: &GraceModel) -> Selector {
+fn selector(settings: SelectorSettings, seeds: Vec<SeedPlan>, model: &GraceModel) -> Selector {
     let n = model.elements().len();
     let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
     let grader = Grader::new(model.elements().to_vec(), cutoffs);
@@ -202,7 +204,7 @@ fn walk_settings() -> WalkSettings {
 }
 
 /// The seed structures, with a walk at each of these temperatures, K.
-fn seeds(temperatures: &[f64]) -> Vec<SeedStructure> {
+fn seeds(temperatures: &[f64]) -> Vec<SeedPlan> {
     let frames = atoms::read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
     let conditions = |temperature: &f64| WalkConditions {
         temperature: *temperature,
@@ -210,7 +212,7 @@ fn seeds(temperatures: &[f64]) -> Vec<SeedStructure> {
         volume_ramp: Some((1.0, 1.4)),
         ..WalkConditions::default()
     };
-    let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedStructure {
+    let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedPlan {
         name: number.to_string(),
         structure: frame.structure,
         walks: temperatures.iter().map(conditions).collect(),

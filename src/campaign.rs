@@ -20,7 +20,7 @@ use calm::Artifact;
 use calm::forgetting::ForgettingAlarm;
 use monitor::reference_check::{self, KnownStructure};
 use orchestrator::grader::Grader;
-use orchestrator::selector::{self, Mode, TrainingFrames};
+use orchestrator::selector::{CampaignMode, SelectorSettings, TrainingFrames};
 use potentials::grace::{GraceModel, Precision};
 use serde_json::{Value, json};
 use store::Protocol;
@@ -223,7 +223,7 @@ impl LoadedCampaign {
         }
         // The location of the store is not part of the campaign's identity.
         value["run"].as_object_mut().map(|run| run.remove("store"));
-        if self.config.campaign.mode == Mode::Reproducible {
+        if self.config.campaign.mode == CampaignMode::Reproducible {
             value["instructions"] = json!(instructions());
         }
         let seed = |named: &SourcedStructure| {
@@ -314,7 +314,7 @@ impl LoadedCampaign {
     }
 
     /// The part of the configuration that the selector needs.
-    pub fn selector_settings(&self) -> selector::Settings {
+    pub fn selector_settings(&self) -> SelectorSettings {
         selector_settings(&self.config)
     }
 }
@@ -353,9 +353,9 @@ pub fn grader(model: &GraceModel) -> Grader {
 }
 
 /// The part of a configuration that the selector needs.
-pub fn selector_settings(config: &Config) -> selector::Settings {
+pub fn selector_settings(config: &Config) -> SelectorSettings {
     let Config { campaign, calm, collect, guard, run, .. } = config;
-    selector::Settings {
+    SelectorSettings {
         mode: campaign.mode,
         walks_per_round: run.walks_per_round.get(),
         steps_per_assignment: run.steps_per_assignment.get(),

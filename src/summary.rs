@@ -5,7 +5,7 @@ use std::fmt;
 use calm::forgetting::GradeDistribution;
 use monitor::label_statistics::{self, ErrorsByGrade, LabelStatistics};
 use monitor::walk_ends::WalkEnds;
-use store::{Status, Store, StoreError, Unlabelled};
+use store::{CampaignStatus, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
 use crate::output::{count, decimals};
@@ -17,7 +17,7 @@ const MAX_SHOWN: usize = 8;
 /// Summary of a campaign.
 #[derive(Clone, Debug)]
 pub struct Summary {
-    status: Status,
+    status: CampaignStatus,
     statistics: LabelStatistics,
     /// Structures whose labels failed for good.
     unlabelled: Vec<Unlabelled>,
@@ -38,7 +38,11 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, Store
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { status: Status { candidates, labels, walks, mixture_version, .. }, statistics, .. } = self;
+        let Self {
+            status: CampaignStatus { candidates, labels, walks, mixture_version, .. },
+            statistics,
+            ..
+        } = self;
         let of = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
         writeln!(f, "walks            {} biased, {} control", of("biased"), of("control"))?;
         let ends = WalkEnds::from_walks(walks);

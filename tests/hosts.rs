@@ -68,7 +68,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     hosts.assert_cleaned_up();
 }
 
-/// 200 ms each way, so an agent with a turn ahead works through it as ever.
+/// 200 ms each way, so an agent with an assignment ahead works through it as ever.
 #[test]
 fn a_slow_line_changes_nothing() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };

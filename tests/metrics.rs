@@ -149,9 +149,9 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     let taken = number("calmwalk_agent_assignments_received_total");
     assert!(
         came > 0.0 && came <= taken && taken <= came + 1.0,
-        "one walker has one turn in hand: {metrics:?}"
+        "one walker has one assignment in hand: {metrics:?}"
     );
-    // A turn has 40 steps at most.
+    // An assignment has 40 steps at most.
     let steps = number("calmwalk_agent_steps_total");
     assert!(steps > 0.0 && steps <= 40.0 * taken, "{metrics:?}");
 

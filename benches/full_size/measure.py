@@ -66,11 +66,11 @@ def run(name, calmwalk, config, directory, seconds):
     cpu, peak = cpu_and_peak(child.pid)
     print(f"{name + ': start':24} {time.monotonic() - began:8.2f} s  {cpu:8.2f} s CPU  {peak:7.0f} MB", flush=True)
     before, cpu_before = decided(calmwalk, directory), cpu_and_peak(child.pid)[0]
-    turns_before, walkers_before = turns(directory), cpu_of_walkers(child.pid)
+    assignments_before, walkers_before = assignments(directory), cpu_of_walkers(child.pid)
     time.sleep(seconds)
     after, (cpu, peak) = decided(calmwalk, directory), cpu_and_peak(child.pid)
-    made, used = turns(directory) - turns_before, cpu_of_walkers(child.pid) - walkers_before
-    print(f"  {made} turns in {seconds:.0f} s: {used / max(1, made):.2f} s CPU of a walker each")
+    made, used = assignments(directory) - assignments_before, cpu_of_walkers(child.pid) - walkers_before
+    print(f"  {made} assignments in {seconds:.0f} s: {used / max(1, made):.2f} s CPU of a walker each")
     walkers = [cpu_and_peak(walker)[1] for walker in children(child.pid)]
     each = 1e3 * (cpu - cpu_before) / max(1, after - before)
     print(f"  {after - before} candidates in {seconds:.0f} s: {each:.1f} ms CPU of the orchestrator each; peak memory of the "
@@ -81,10 +81,10 @@ def run(name, calmwalk, config, directory, seconds):
     print(f"{name + ': interrupted':24} {time.monotonic() - began:8.2f} s  exit code {child.returncode}", flush=True)
 
 
-def turns(directory):
+def assignments(directory):
     """Number of assignments that walkers have reported on."""
     with sqlite3.connect(f"file:{directory / 'campaign.sqlite'}?mode=ro", uri=True) as database:
-        return database.execute("SELECT COALESCE(SUM(turn), 0) FROM walk").fetchone()[0]
+        return database.execute("SELECT COALESCE(SUM(assignments), 0) FROM walk").fetchone()[0]
 
 
 def cpu_of_walkers(pid):

@@ -67,7 +67,7 @@ const MORE: [&str; 12] = [
         WHERE key IN ('labels_made', 'core_milliseconds', 'label_core_milliseconds')",
     "WITH RECURSIVE n(i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 999)
         INSERT OR IGNORE INTO walk SELECT i, origin, partner, seed_structure, CASE WHEN i % 10 = 0 THEN 'running' ELSE state END, reason,
-            turn, accepted, step, segment, tau, temperature, relative_volume, gamma_max, refused, returns, selector_state, checkpoint,
+            assignments, accepted, step, segment, tau, temperature, relative_volume, gamma_max, refused, returns, selector_state, checkpoint,
             NULL, NULL
         FROM n CROSS JOIN (SELECT * FROM walk LIMIT 1)",
 ];

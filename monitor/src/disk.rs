@@ -1,7 +1,7 @@
 //! Disk space of a campaign: its current use, and the forecast for its end.
 
 use serde::{Deserialize, Serialize};
-use store::{Candidates, Status};
+use store::{CampaignStatus, Candidates};
 
 /// Metadata key of the forecast in the store.
 pub const METADATA_KEY: &str = "forecast";
@@ -31,7 +31,7 @@ pub struct DiskUse {
 
 impl DiskUse {
     /// Expected size at the end, bytes. `None` if it is unknown or the campaign is finished.
-    pub fn at_the_end(&self, status: &Status) -> Option<u64> {
+    pub fn at_the_end(&self, status: &CampaignStatus) -> Option<u64> {
         let Candidates { accepted, control, .. } = status.candidates;
         let forecast = self.forecast.filter(|_| !status.finished)?;
         Some(self.bytes + forecast.remaining_bytes(accepted + control, self.bytes))

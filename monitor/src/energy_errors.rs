@@ -16,7 +16,7 @@ const MAX_SAMPLES: usize = 1 << 20;
 
 /// Element offsets between the energies of one label protocol and those of the potential.
 #[derive(Clone, Debug)]
-pub struct EnergyReference(Result<EnergyOffsets, TooFewLabels>);
+pub struct ProtocolEnergyOffsets(Result<EnergyOffsets, TooFewLabels>);
 
 /// The fitted offsets, for display and JSON.
 #[derive(Clone, Debug, Serialize)]
@@ -46,7 +46,7 @@ pub struct OffsetEntry {
 /// Energy errors of labelled structures.
 #[derive(Clone, Debug)]
 pub struct EnergyErrors {
-    reference: EnergyReference,
+    reference: ProtocolEnergyOffsets,
     /// Absolute errors, eV/atom.
     errors: SystematicSample<f64>,
     sum: f64,
@@ -74,7 +74,7 @@ pub struct EnergySummary {
     pub offsets: OffsetSummary,
 }
 
-impl EnergyReference {
+impl ProtocolEnergyOffsets {
     /// Fits the element offsets to the labels of this protocol.
     pub async fn fit(store: &Store, protocol: ContentHash) -> Result<Self, StoreError> {
         energy_offsets(store, protocol).await.map(Self)
@@ -147,7 +147,7 @@ impl EnergyReference {
 
 impl EnergyErrors {
     /// Starts without errors.
-    pub fn new(reference: EnergyReference) -> Self {
+    pub fn new(reference: ProtocolEnergyOffsets) -> Self {
         Self { reference, errors: SystematicSample::new(MAX_SAMPLES), sum: 0.0, largest: 0.0, left_out: 0 }
     }
 

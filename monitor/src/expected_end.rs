@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 use serde_json::Value;
-use store::{Status, unix_milliseconds};
+use store::{CampaignStatus, unix_milliseconds};
 
 use crate::label_cost::{QueueCost, SECONDS_PER_HOUR};
 
@@ -21,7 +21,7 @@ pub struct ExpectedEnd {
 
 impl ExpectedEnd {
     /// Extrapolates from the status of a campaign with this configuration.
-    pub fn extrapolate(status: &Status, configuration: &Value, queue: &QueueCost) -> Self {
+    pub fn extrapolate(status: &CampaignStatus, configuration: &Value, queue: &QueueCost) -> Self {
         if status.finished {
             return Self::default();
         }
@@ -54,13 +54,13 @@ mod tests {
 
     use super::*;
 
-    fn campaign() -> (Status, Value, QueueCost) {
+    fn campaign() -> (CampaignStatus, Value, QueueCost) {
         let walk = |state: &str, step| WalkStatus { state: state.into(), step, ..WalkStatus::default() };
-        let status = Status {
+        let status = CampaignStatus {
             walks: vec![walk("running", 4_000), walk("waiting", 0), walk("quota_reached", 7)],
             steps_per_second: Some(10.0),
             led: true,
-            ..Status::default()
+            ..CampaignStatus::default()
         };
         (
             status,

@@ -1,7 +1,7 @@
 //! The label queue of a campaign: its costs, failures, and the structures without labels.
 
 use serde_json::{Value, json};
-use store::{FailureCount, JobState, Status, Store, StoreError, Unlabelled};
+use store::{CampaignStatus, FailureCount, JobState, Store, StoreError, Unlabelled};
 
 use crate::label_cost::{self, QueueCost};
 
@@ -36,7 +36,7 @@ pub struct ProtocolJobs {
 
 impl LabelQueue {
     /// Reads the store. Empty if there is no protocol yet.
-    pub async fn read(store: &Store, status: &Status) -> Result<Self, StoreError> {
+    pub async fn read(store: &Store, status: &CampaignStatus) -> Result<Self, StoreError> {
         let shared = match status.candidates.control <= MAX_STRUCTURES {
             true => Some(store.structures_of_both_origins().await?.len() as u64),
             false => None,
@@ -58,7 +58,7 @@ impl LabelQueue {
     }
 
     /// Adds it to the JSON of a status.
-    pub(crate) fn add_to(&self, json: &mut Value, status: &Status) {
+    pub(crate) fn add_to(&self, json: &mut Value, status: &CampaignStatus) {
         json["labels_per_hour"] = json!(labels_per_hour(status));
         json["cost"] = json!({ "core_hours": status.budget.used.core_hours, "queue": self.cost });
         json["failures"] = json!(self.failures);
@@ -68,7 +68,7 @@ impl LabelQueue {
 }
 
 /// Average number of labels per hour of running time.
-pub fn labels_per_hour(status: &Status) -> Option<f64> {
+pub fn labels_per_hour(status: &CampaignStatus) -> Option<f64> {
     let used = &status.budget.used;
     (used.wall_hours > 0.0).then(|| used.labels as f64 / used.wall_hours)
 }

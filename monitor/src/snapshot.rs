@@ -1,7 +1,7 @@
 //! The state of a campaign, which `status`, the dashboard, metrics and notifications show.
 
 use serde_json::{Value, json};
-use store::{Campaign, Status, Store, StoreError};
+use store::{CampaignRecord, CampaignStatus, Store, StoreError};
 
 use crate::disk::{self, DiskUse};
 use crate::expected_end::ExpectedEnd;
@@ -18,11 +18,11 @@ pub const FORMAT: u32 = 1;
 #[derive(Debug)]
 pub struct Snapshot {
     /// Identity and configuration.
-    pub campaign: Campaign,
+    pub campaign: CampaignRecord,
     /// Its name and configuration files. `None` for campaigns of early versions.
     pub origin: Option<Provenance>,
     /// Counts, walks and processes.
-    pub status: Status,
+    pub status: CampaignStatus,
     /// Forgetting and staleness.
     pub mixture: MixtureValues,
     /// Size of the store and its forecast.

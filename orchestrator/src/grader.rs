@@ -57,11 +57,12 @@ impl Grader {
     }
 
     /// The bonds of a structure within the pair cutoffs, for γ_nbr, and its shortest distances.
-    pub fn bonds(&self, structure: &Structure) -> Result<Bonds, GraderError> {
+    pub fn bonds(&self, structure: &Structure) -> Result<StructureBonds, GraderError> {
         let elements = self.element_indices(structure)?;
         let mut list = NeighbourList::new(self.largest_cutoff, 0.0);
         list.update(structure)?;
-        let mut bonds = Bonds { elements, pairs: Vec::new(), shortest: ShortestDistances::new(structure) };
+        let mut bonds =
+            StructureBonds { elements, pairs: Vec::new(), shortest: ShortestDistances::new(structure) };
         self.compute_pairs(structure, &list, &mut bonds);
         Ok(bonds)
     }
@@ -71,8 +72,8 @@ impl Grader {
     /// Visiting the atoms in order fills the pairs of each atom starting from its first neighbour. The images of a
     /// neighbour are in ascending order on both sides, so the first on one side is the reverse of the last on the
     /// other.
-    fn compute_pairs(&self, structure: &Structure, list: &NeighbourList, bonds: &mut Bonds) {
-        let Bonds { elements, pairs, shortest } = bonds;
+    fn compute_pairs(&self, structure: &Structure, list: &NeighbourList, bonds: &mut StructureBonds) {
+        let StructureBonds { elements, pairs, shortest } = bonds;
         let cutoff = |i: usize, j: usize| self.pair_cutoffs[elements[i] * self.elements.len() + elements[j]];
         let mut next = Vec::with_capacity(list.len());
         let mut directed = 0;
@@ -115,7 +116,7 @@ impl Grader {
 
 /// The data of a structure that grading needs, independent of the mixture.
 #[derive(Clone, Debug)]
-pub struct Bonds {
+pub struct StructureBonds {
     /// Element index of each atom.
     pub elements: Vec<usize>,
     /// Directed pairs within the largest cutoff, with weights; the weight is 0 beyond the cutoff of the pair.
@@ -124,7 +125,7 @@ pub struct Bonds {
     pub shortest: ShortestDistances,
 }
 
-impl Bonds {
+impl StructureBonds {
     /// γ and γ_nbr under `mixture`, for atoms with these features ([n × D]).
     pub fn grade(&self, mixture: &Mixture, features: &[f64]) -> Result<AtomGrades, GraderError> {
         let mut grades = Grades::default();

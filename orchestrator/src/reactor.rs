@@ -23,7 +23,7 @@ use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
 use wire::WalkId;
-use wire::messages::Progress;
+use wire::messages::WalkProgress;
 use wire::transport::{Incoming, WorkItem};
 
 use self::events::{EventStream, ReactorEvent};
@@ -49,7 +49,7 @@ pub enum ReactorError {
 #[derive(Debug)]
 pub enum Notice<'a> {
     /// Current state of a walk.
-    Progress(WalkId, Progress),
+    Progress(WalkId, WalkProgress),
     /// A commit that has been written.
     Committed(&'a Commit),
     /// Walkers wait because this many label jobs are unfinished.

@@ -4,17 +4,17 @@ use std::path::Path;
 use std::time::Duration;
 
 use orchestrator::reactor::{Reactor, ReactorError, RunOutcome, commit_batch};
-use orchestrator::selector::{Mode, Scheduling, Selector, Settings, UpdateProtocol};
+use orchestrator::selector::{CampaignMode, Scheduling, Selector, SelectorSettings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use sqlx::ConnectOptions;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use store::records::Commit;
-use store::{Campaign, Store, StoreError};
+use store::{CampaignRecord, Store, StoreError};
 use tempfile::TempDir;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
-use wire::messages::{Outcome, Report, WalkEnd};
+use wire::messages::{AssignmentReport, Outcome, WalkEnd};
 use wire::transport::{Incoming, WorkItem};
 
 use crate::common::memory::MemoryStore;
@@ -22,8 +22,8 @@ use crate::common::*;
 
 const WALKS: usize = 3;
 
-fn live_settings() -> Settings {
-    Settings { max_per_walk: 100, ..settings(Mode::Live) }
+fn live_settings() -> SelectorSettings {
+    SelectorSettings { max_per_walk: 100, ..settings(CampaignMode::Live) }
 }
 
 /// What a walker may report on an assignment.
@@ -45,10 +45,10 @@ fn event() -> impl Strategy<Value = Event> {
     ]
 }
 
-fn any_settings() -> impl Strategy<Value = Settings> {
+fn any_settings() -> impl Strategy<Value = SelectorSettings> {
     let update = prop::sample::select(vec![UpdateProtocol::Cumulative, UpdateProtocol::PerSeedStructure]);
     (update, 1..5_u32, prop::option::of(1..9_u32), any::<bool>()).prop_map(
-        |(update, max_per_walk, total, control)| Settings {
+        |(update, max_per_walk, total, control)| SelectorSettings {
             update,
             max_per_walk,
             max_structures: total,
@@ -59,7 +59,7 @@ fn any_settings() -> impl Strategy<Value = Settings> {
 }
 
 /// The report on the next assignment for this event, if there is an assignment.
-fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Report> {
+fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<AssignmentReport> {
     let Scheduling::Assign(assignment) = selector.next_assignment(0) else { return None };
     let progress = at(10 * (number as u64 + 1));
     let outcome = match *event {
@@ -77,7 +77,7 @@ fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Report>
 }
 
 /// Commits of a live campaign, in order.
-fn commits(settings: &Settings, events: &[Event]) -> Vec<Commit> {
+fn commits(settings: &SelectorSettings, events: &[Event]) -> Vec<Commit> {
     let mut selector = restore(settings, WALKS, Default::default());
     let mut commits = vec![selector.start_walks()];
     for (number, event) in events.iter().enumerate() {
@@ -163,7 +163,7 @@ impl Live {
     }
 
     /// A report of each walk, with a structure that is new to the mixture. The walker has the number of its walk.
-    fn reports(&mut self) -> Vec<Report> {
+    fn reports(&mut self) -> Vec<AssignmentReport> {
         let assignments: Vec<_> =
             (0..WALKS as u32).map(|walker| next_assignment_of(walker, &mut self.selector)).collect();
         let offer = |(k, assignment)| {
@@ -182,7 +182,7 @@ impl Live {
 }
 
 async fn create(directory: &Path) -> Store {
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CAMPAIGN,
         program_version: "0.1.0".into(),
         mode: "live".into(),
@@ -191,7 +191,7 @@ async fn create(directory: &Path) -> Store {
         configuration_in_force: "{}".into(),
     };
     let stored = |index| {
-        let orchestrator::selector::SeedStructure { name, structure, .. } = seed(index as usize);
+        let orchestrator::selector::SeedPlan { name, structure, .. } = seed(index as usize);
         store::SeedStructure { index, name, source: "seeds.extxyz".into(), structure }
     };
     let seeds: Vec<_> = (0..WALKS as u32).map(stored).collect();
@@ -199,9 +199,9 @@ async fn create(directory: &Path) -> Store {
 }
 
 impl Arrived {
-    fn new(reports: Vec<Report>) -> Self {
+    fn new(reports: Vec<AssignmentReport>) -> Self {
         let (to_reactor, incoming) = mpsc::channel(8);
-        let send = |report: Report| {
+        let send = |report: AssignmentReport| {
             let (reply, answer) = oneshot::channel();
             let walker = report.walk.0;
             to_reactor.try_send(Incoming::Idle { walker, report: Some(report), reply }).unwrap();

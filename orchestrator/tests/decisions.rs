@@ -8,7 +8,7 @@ use calm::forgetting::ForgettingAlarm;
 use calm::grade::maximum;
 use calm::rules::MaximumGradeUpdate;
 use orchestrator::selector::{
-    Mode, OnForgetting, Selector, SelectorSnapshot, Settings, TrainingFrames, UpdateProtocol,
+    CampaignMode, OnForgetting, Selector, SelectorSettings, SelectorSnapshot, TrainingFrames, UpdateProtocol,
 };
 use store::records::{Commit, Fate};
 use wire::messages::{DeclineReason, Verdict, WalkEnd};
@@ -24,8 +24,8 @@ const NEW: [f64; 3] = [0.0, 3.0, 0.0];
 /// γ = 1 in the first component.
 const KNOWN: [f64; 3] = [0.0, 1.0, 0.0];
 
-fn live() -> Settings {
-    settings(Mode::Live)
+fn live() -> SelectorSettings {
+    settings(CampaignMode::Live)
 }
 
 /// A walk's next candidate: the structure with this number and these features.
@@ -49,7 +49,7 @@ fn accepted_structures_are_covered_afterwards() {
     assert_eq!(commit.decisions[0].candidate, Some(candidate.block.view().id()));
     // Both atoms belong to one component; the other is unchanged.
     assert_eq!(commit.components.iter().map(|c| (c.element, c.slot)).collect::<Vec<_>>(), [(0, 0)]);
-    assert_eq!((commit.walks.len(), commit.walks[0].accepted, commit.walks[0].turn), (1, 1, 1));
+    assert_eq!((commit.walks.len(), commit.walks[0].accepted, commit.walks[0].assignments), (1, 1, 1));
     assert!(gamma_max(selector.mixture(), NEW) < 1.25);
     assert!(
         gamma_max(selector.mixture(), NEW)
@@ -113,7 +113,7 @@ fn a_candidate_that_cannot_be_graded_is_left_out() {
 /// The second walk ends when the first has collected all that its seed structure may give, and goes on when that is more.
 #[test]
 fn walks_of_one_seed_structure_share_a_limit() {
-    let limited = Settings {
+    let limited = SelectorSettings {
         update: UpdateProtocol::Never,
         max_per_walk: 3,
         max_per_seed_structure: Some(2),
@@ -121,7 +121,7 @@ fn walks_of_one_seed_structure_share_a_limit() {
     };
     let mut seed = common::seed(0);
     seed.walks = vec![seed.walks[0].clone(); 2];
-    let start = |settings: &Settings, snapshot| {
+    let start = |settings: &SelectorSettings, snapshot| {
         let (grader, original) = (common::grader(), mixture());
         let seeds = vec![seed.clone()];
         Selector::restore(settings.clone(), common::CAMPAIGN, seeds, grader, original, None, snapshot)
@@ -136,7 +136,7 @@ fn walks_of_one_seed_structure_share_a_limit() {
         store.commit(&commit);
     }
     assert!(selector.is_done());
-    let more = Settings { max_per_seed_structure: Some(4), ..limited };
+    let more = SelectorSettings { max_per_seed_structure: Some(4), ..limited };
     let mut selector = start(&more, store.snapshot());
     let resumed = kinds(&selector.start_walks());
     assert_eq!(resumed.iter().filter(|kind| *kind == "resumed").count(), 2, "{resumed:?}");
@@ -166,7 +166,7 @@ fn pairs_of_elements_have_their_own_minimum_distances() {
 }
 
 fn check_limit_of_2_5(min_distances: MinDistanceRule) {
-    let mut selector = begin(&Settings { min_distances, ..live() }, 1);
+    let mut selector = begin(&SelectorSettings { min_distances, ..live() }, 1);
     let assignment = next_assignment(&mut selector);
     let report = offer(&selector, &assignment, 1, structure(1, 2.45), NEW);
     assert_eq!(kinds(&decided(&mut selector, report)), ["declined guard"]);
@@ -174,7 +174,7 @@ fn check_limit_of_2_5(min_distances: MinDistanceRule) {
 
 #[test]
 fn a_known_structure_is_declined() {
-    let never = Settings { update: UpdateProtocol::Never, ..live() };
+    let never = SelectorSettings { update: UpdateProtocol::Never, ..live() };
     let mut selector = begin(&never, 2);
     assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
     let commit = next_candidate(&mut selector, 6, 1, NEW);
@@ -189,7 +189,7 @@ fn a_known_structure_is_declined() {
 
 #[test]
 fn without_updates_everything_new_to_the_original_mixture_is_accepted() {
-    let mut selector = begin(&Settings { update: UpdateProtocol::Never, ..live() }, 1);
+    let mut selector = begin(&SelectorSettings { update: UpdateProtocol::Never, ..live() }, 1);
     for number in 1..=2 {
         let commit = next_candidate(&mut selector, number, number, NEW);
         assert_eq!(kinds(&commit), ["accepted"]);
@@ -200,7 +200,8 @@ fn without_updates_everything_new_to_the_original_mixture_is_accepted() {
 
 #[test]
 fn the_limit_per_seed_structure_is_enforced() {
-    let mut selector = begin(&Settings { update: UpdateProtocol::Never, max_per_walk: 2, ..live() }, 2);
+    let mut selector =
+        begin(&SelectorSettings { update: UpdateProtocol::Never, max_per_walk: 2, ..live() }, 2);
     assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
     let commit = next_candidate(&mut selector, 6, 2, NEW);
     assert_eq!(kinds(&commit), ["accepted", "ended"]);
@@ -212,13 +213,13 @@ fn the_limit_per_seed_structure_is_enforced() {
 #[test]
 fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
     let mut store = common::memory::MemoryStore::default();
-    let more = Settings { update: UpdateProtocol::Never, max_per_walk: 3, ..live() };
+    let more = SelectorSettings { update: UpdateProtocol::Never, max_per_walk: 3, ..live() };
     let mut selector = common::restore(&more, 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
     for number in 1..=2 {
         store.commit(&next_candidate(&mut selector, number, number, NEW));
     }
-    let mut selector = common::restore(&Settings { max_per_walk: 2, ..more }, 1, store.snapshot());
+    let mut selector = common::restore(&SelectorSettings { max_per_walk: 2, ..more }, 1, store.snapshot());
     let commit = next_candidate(&mut selector, 3, 3, NEW);
     assert_eq!(kinds(&commit), ["declined budget", "ended"]);
     assert!(selector.is_done());
@@ -226,7 +227,7 @@ fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
 
 #[test]
 fn the_campaign_limit_is_enforced() {
-    let limited = Settings { update: UpdateProtocol::Never, max_structures: Some(2), ..live() };
+    let limited = SelectorSettings { update: UpdateProtocol::Never, max_structures: Some(2), ..live() };
     let mut selector = begin(&limited, 3);
     let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     let kinds: Vec<_> = (1..)
@@ -261,8 +262,8 @@ fn imports_are_logged_once_when_they_begin_to_count() {
 
 #[test]
 fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
-    // It is not the turn of control walks.
-    let limited = Settings {
+    // No control walk is due.
+    let limited = SelectorSettings {
         update: UpdateProtocol::Never,
         max_structures: Some(1),
         control: true,
@@ -284,7 +285,7 @@ fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
     assert!(same.start_walks().decisions.is_empty());
     assert_eq!(next_assignment(&mut same).walk, wire::WalkId(2));
     // With a larger limit both walks continue from where they ended, and only new structures get another control walk.
-    let mut larger = common::restore(&Settings { max_structures: Some(2), ..limited }, 2, stored);
+    let mut larger = common::restore(&SelectorSettings { max_structures: Some(2), ..limited }, 2, stored);
     assert_eq!(kinds(&larger.start_walks()), ["configuration", "resumed", "resumed"]);
     let assignment = next_assignment(&mut larger);
     assert_eq!((assignment.number, assignment.verdict.clone()), (1, Some(Verdict::Accepted)));
@@ -296,7 +297,7 @@ fn walks_that_ended_by_a_limit_resume_when_it_is_raised() {
 
 #[test]
 fn the_first_reason_applies() {
-    let limited = Settings { max_per_walk: 1, max_structures: Some(1), ..live() };
+    let limited = SelectorSettings { max_per_walk: 1, max_structures: Some(1), ..live() };
     let known = vec![
         wire::ContentHash::from_structure(&structure(1, 1.0)),
         wire::ContentHash::from_structure(&structure(2, SHORTEST)),
@@ -349,7 +350,7 @@ fn the_verdict_is_part_of_the_next_assignment() {
 #[test]
 fn features_of_declined_candidates_are_limited() {
     let size = size_of_val(features(NEW).as_slice()) as u64;
-    let limited = Settings { declined_feature_bytes: 2 * size + 1, ..live() };
+    let limited = SelectorSettings { declined_feature_bytes: 2 * size + 1, ..live() };
     let mut store = common::memory::MemoryStore::default();
     let mut selector = common::restore(&limited, 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
@@ -368,7 +369,7 @@ fn features_of_declined_candidates_are_limited() {
 
 #[test]
 fn updates_accumulate_over_seed_structures() {
-    let mut selector = begin(&settings(Mode::Reproducible), 2);
+    let mut selector = begin(&settings(CampaignMode::Reproducible), 2);
     end_first_walk_after_a_collection(&mut selector);
     assert_eq!(selector.mixture().version(), 1);
     assert!(gamma_max(selector.mixture(), NEW) < 1.25);
@@ -376,10 +377,10 @@ fn updates_accumulate_over_seed_structures() {
 
 #[test]
 fn each_seed_structure_starts_from_the_original_mixture() {
-    let restarted = Settings {
+    let restarted = SelectorSettings {
         update: UpdateProtocol::PerSeedStructure,
         walks_per_round: 1,
-        ..settings(Mode::Reproducible)
+        ..settings(CampaignMode::Reproducible)
     };
     let training = TrainingFrames::new(&[0], &[0.0, 0.0, 0.9], &mixture()).unwrap();
     let mut selector = try_restore(&restarted, 2, Some(training), SelectorSnapshot::default()).unwrap();
@@ -423,14 +424,14 @@ fn training_frames() -> TrainingFrames {
 }
 
 /// Settings under which every candidate of [`offer_far_ones`] is accepted.
-fn patient() -> Settings {
-    let mut patient = Settings { max_per_walk: 50, ..live() };
+fn patient() -> SelectorSettings {
+    let mut patient = SelectorSettings { max_per_walk: 50, ..live() };
     patient.search.stop = UpdateRule::MaximumGrade(MaximumGradeUpdate { target: positive(2.9) });
     patient
 }
 
 /// Offers candidates along another direction than the training frames, each farther than the one before.
-fn offer_far_ones(settings: &Settings, training: Option<TrainingFrames>) -> (Selector, Vec<Commit>) {
+fn offer_far_ones(settings: &SelectorSettings, training: Option<TrainingFrames>) -> (Selector, Vec<Commit>) {
     let mut selector = try_restore(settings, 1, training, SelectorSnapshot::default()).unwrap();
     selector.start_walks();
     let far = |number| [0.0, 1.5 * 2_f64.powi(number as i32), 0.0];
@@ -469,7 +470,8 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
 #[test]
 fn forgetting_raises_an_alarm_without_training_frames() {
     let limit = ForgettingAlarm { mean_square_growth: positive(1.5), ..ForgettingAlarm::default() };
-    let (selector, commits) = offer_far_ones(&Settings { forgetting_alarm: limit, ..patient() }, None);
+    let (selector, commits) =
+        offer_far_ones(&SelectorSettings { forgetting_alarm: limit, ..patient() }, None);
     let growth: Vec<f64> = commits
         .iter()
         .map(|commit| {
@@ -486,7 +488,7 @@ fn forgetting_raises_an_alarm_without_training_frames() {
 
 #[test]
 fn updates_become_additive_when_the_campaign_asks_for_it() {
-    let settings = Settings { on_forgetting: OnForgetting::Additive, ..patient() };
+    let settings = SelectorSettings { on_forgetting: OnForgetting::Additive, ..patient() };
     let (selector, commits) = offer_far_ones(&settings, Some(training_frames()));
     let switch = commits.iter().position(|commit| kinds(commit).len() > 1).unwrap();
     assert_eq!(kinds(&commits[switch]), ["accepted", "forgetting"]);

@@ -7,11 +7,11 @@ use std::thread;
 use std::time::Duration;
 
 use orchestrator::reactor::{Notice, Reactor, RunOutcome};
-use orchestrator::selector::{Mode, SelectorSnapshot, Settings};
-use store::{Campaign, JobState, Protocol, SeedStructure, Store};
+use orchestrator::selector::{CampaignMode, SelectorSettings, SelectorSnapshot};
+use store::{CampaignRecord, JobState, Protocol, SeedStructure, Store};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use wire::messages::{Progress, Report};
+use wire::messages::{AssignmentReport, WalkProgress};
 use wire::transport::{InProcess, Incoming, Transport, WorkItem};
 use wire::{ContentHash, WalkId};
 
@@ -48,8 +48,8 @@ async fn a_stop_before_the_first_message_ends_the_reactor() {
     assert_eq!(ended.unwrap().unwrap(), RunOutcome::Stopped);
 }
 
-fn rounds() -> Settings {
-    Settings { max_per_walk: 9, control: true, ..settings(Mode::Reproducible) }
+fn rounds() -> SelectorSettings {
+    SelectorSettings { max_per_walk: 9, control: true, ..settings(CampaignMode::Reproducible) }
 }
 
 /// Opens or creates the campaign's database.
@@ -57,7 +57,7 @@ async fn open(directory: &Path) -> Store {
     if directory.join(store::DATABASE).exists() {
         return Store::open(directory).await.unwrap();
     }
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CAMPAIGN,
         program_version: "0.1.0".into(),
         mode: "reproducible".into(),
@@ -99,7 +99,7 @@ async fn reactor(store: &Store, stopping: &CancellationToken) -> (Reactor, mpsc:
 }
 
 /// Works on an assignment like a scripted walker: interrupted after a few steps if asked to stop.
-fn work_on(work: &WorkItem, transport: &InProcess) -> Report {
+fn work_on(work: &WorkItem, transport: &InProcess) -> AssignmentReport {
     let assignment = &work.assignment;
     let seed = (0..3).find(|number| seed(*number).structure == assignment.seed_structure).unwrap();
     let pause = transport.stopping().then_some(2);
@@ -284,7 +284,7 @@ async fn waiting_walkers_are_shut_down_when_the_campaign_stops() {
     let walker = start_walkers(1, to_reactor, &stopping).remove(0);
     let talking = thread::spawn(move || {
         while !walker.is_finished() {
-            talker.progress(WalkId(0), Progress::default());
+            talker.progress(WalkId(0), WalkProgress::default());
             thread::sleep(Duration::from_millis(2));
         }
     });
@@ -385,7 +385,7 @@ async fn pausing_a_walk_does_not_change_decisions() {
     let running = tokio::spawn(end_of(reactor, |_| {}));
     let assignments = async || {
         let walks = store.load_walks().await.unwrap();
-        walks.iter().map(|walk| walk.turn).collect::<Vec<_>>()
+        walks.iter().map(|walk| walk.assignments).collect::<Vec<_>>()
     };
     tokio::time::sleep(Duration::from_millis(700)).await;
     assert_eq!((assignments().await, running.is_finished()), (vec![0; 3], false), "the first round waits");

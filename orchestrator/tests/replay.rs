@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashSet};
 use atoms::{MinDistanceRule, Uniform};
 use calm::CollectionRule;
 use calm::rules::MaximumGrade;
-use orchestrator::selector::{Mode, Replay, ReplayedDecision, Settings, UpdateProtocol};
+use orchestrator::selector::{CampaignMode, Replay, ReplayedDecision, SelectorSettings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
@@ -37,7 +37,7 @@ fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a Candid
     campaign.store.decisions.iter().zip(1..).map(logged).collect()
 }
 
-fn open(campaign: &Campaign<'_>, settings: &Settings, seeds: usize, set: &[&str]) -> Replay {
+fn open(campaign: &Campaign<'_>, settings: &SelectorSettings, seeds: usize, set: &[&str]) -> Replay {
     let set: HashSet<String> = set.iter().map(|key| (*key).to_owned()).collect();
     let seeds = (0..seeds).map(seed).collect();
     let imported = campaign.store.imported.clone();
@@ -60,7 +60,7 @@ fn follow(
 }
 
 /// Replays a campaign with its own rules and checks that all decisions are equal.
-fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
+fn check_exact(campaign: &Campaign<'_>, settings: &SelectorSettings, seeds: usize) {
     let log = log(campaign);
     let mut replay = open(campaign, settings, seeds, &[]);
     let replayed = follow(&mut replay, &log);
@@ -94,8 +94,8 @@ proptest! {
     fn every_decision_is_reproduced(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
     ) {
-        let mode = if live { Mode::Live } else { Mode::Reproducible };
-        let settings = Settings { mode, ..settings };
+        let mode = if live { CampaignMode::Live } else { CampaignMode::Reproducible };
+        let settings = SelectorSettings { mode, ..settings };
         let mut campaign = Campaign::begin(&settings, &scripts, walkers);
         acts.into_iter().for_each(|act| campaign.act(act));
         check_exact(&campaign.finish(false), &settings, scripts.len());
@@ -108,10 +108,10 @@ proptest! {
         parts in prop::array::uniform3(acts()), limits in prop::array::uniform2((1..6_u32, prop::option::of(1..12_u32))),
         imports in prop::collection::vec(0..12_u64, 0..6),
     ) {
-        let mode = if live { Mode::Live } else { Mode::Reproducible };
-        let settings = Settings { mode, ..settings };
+        let mode = if live { CampaignMode::Live } else { CampaignMode::Reproducible };
+        let settings = SelectorSettings { mode, ..settings };
         let [second, third] =
-            limits.map(|(max_per_walk, total)| Settings { max_per_walk, max_structures: total, ..settings.clone() });
+            limits.map(|(max_per_walk, total)| SelectorSettings { max_per_walk, max_structures: total, ..settings.clone() });
         let [first, middle, last] = parts;
         let mut campaign = Campaign::begin(&settings, &scripts, walkers);
         first.into_iter().for_each(|act| campaign.act(act));
@@ -129,11 +129,11 @@ proptest! {
     fn a_stricter_rule_accepts_structures_above_its_threshold(
         settings in any_settings(), scripts in scripts(), threshold in 1.5..9.0,
     ) {
-        let settings = Settings { update: UpdateProtocol::Never, max_per_walk: 100, max_per_seed_structure: None, max_structures: None, ..settings };
+        let settings = SelectorSettings { update: UpdateProtocol::Never, max_per_walk: 100, max_per_seed_structure: None, max_structures: None, ..settings };
         let campaign = Campaign::begin(&settings, &scripts, 1).finish(false);
         let log = log(&campaign);
         let collection = CollectionRule::MaximumGrade(MaximumGrade { threshold: positive(threshold) });
-        let strict = Settings { collection, ..settings.clone() };
+        let strict = SelectorSettings { collection, ..settings.clone() };
         let replayed = follow(&mut open(&campaign, &strict, scripts.len(), &["collect.criterion"]), &log);
         for ((recorded, candidate), now) in log.iter().zip(replayed) {
             let (Some(candidate), true) = (candidate, recorded.kind != "control") else { continue };
@@ -157,8 +157,8 @@ proptest! {
 fn control_frames_that_were_labelled_although_too_close_are_left_out_in_a_replay() {
     let lax = MinDistanceRule::Uniform(Uniform { min_distance: 0.1, fraction: 0.1 });
     let never = UpdateProtocol::Never;
-    let strict = Settings { control: true, update: never, ..settings(Mode::Reproducible) };
-    let before = Settings { min_distances: lax, ..strict.clone() };
+    let strict = SelectorSettings { control: true, update: never, ..settings(CampaignMode::Reproducible) };
+    let before = SelectorSettings { min_distances: lax, ..strict.clone() };
     let event = |number: u64| match number {
         5..8 => Event::Structure { number, z: [0.0, 3.0 * number as f64, 0.0], close: false },
         _ => Event::Nothing,
@@ -185,10 +185,14 @@ fn the_campaigns_cover_the_intended_cases() {
     let mut seen = HashSet::new();
     for _ in 0..60 {
         let settings = any_settings().new_tree(&mut runner).unwrap().current();
-        let settings = Settings { mode: Mode::Live, update: UpdateProtocol::Cumulative, ..settings };
+        let settings =
+            SelectorSettings { mode: CampaignMode::Live, update: UpdateProtocol::Cumulative, ..settings };
         let scripts: Vec<Script> = scripts().new_tree(&mut runner).unwrap().current();
-        let more =
-            Settings { max_per_walk: settings.max_per_walk + 3, max_structures: None, ..settings.clone() };
+        let more = SelectorSettings {
+            max_per_walk: settings.max_per_walk + 3,
+            max_structures: None,
+            ..settings.clone()
+        };
         let mut campaign = Campaign::begin(&settings, &scripts, 2);
         for act in acts().new_tree(&mut runner).unwrap().current() {
             campaign.act(act);

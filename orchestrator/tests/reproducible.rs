@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use orchestrator::selector::{Mode, Settings, UpdateProtocol};
+use orchestrator::selector::{CampaignMode, SelectorSettings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
@@ -16,7 +16,7 @@ use crate::common::scripted::Script;
 use crate::common::{SHORTEST, grader, kinds};
 
 /// One walker and no incidents.
-fn calm_run<'a>(settings: &'a Settings, scripts: &'a [Script]) -> Campaign<'a> {
+fn calm_run<'a>(settings: &'a SelectorSettings, scripts: &'a [Script]) -> Campaign<'a> {
     Campaign::begin(settings, scripts, 1).finish(false)
 }
 
@@ -46,7 +46,7 @@ proptest! {
     /// Live mode depends on the order of reports, but not on crashes while no walker is busy.
     #[test]
     fn a_live_campaign_survives_crashes(settings in any_settings(), scripts in scripts()) {
-        let settings = Settings { mode: Mode::Live, ..settings };
+        let settings = SelectorSettings { mode: CampaignMode::Live, ..settings };
         let crashing = Campaign::begin(&settings, &scripts, 1).finish(true);
         prop_assert_eq!(crashing.content(), calm_run(&settings, &scripts).content());
     }
@@ -56,8 +56,8 @@ proptest! {
     fn budgets_versions_and_rounds_hold(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
     ) {
-        let mode = if live { Mode::Live } else { Mode::Reproducible };
-        let settings = Settings { mode, ..settings };
+        let mode = if live { CampaignMode::Live } else { CampaignMode::Reproducible };
+        let settings = SelectorSettings { mode, ..settings };
         let mut campaign = Campaign::begin(&settings, &scripts, walkers);
         for act in acts {
             campaign.act(act);
@@ -98,8 +98,8 @@ proptest! {
     fn control_frames_are_matched_by_step_or_left_out(
         settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
     ) {
-        let mode = if live { Mode::Live } else { Mode::Reproducible };
-        let settings = Settings { mode, control: true, ..settings };
+        let mode = if live { CampaignMode::Live } else { CampaignMode::Reproducible };
+        let settings = SelectorSettings { mode, control: true, ..settings };
         let mut campaign = Campaign::begin(&settings, &scripts, walkers);
         acts.into_iter().for_each(|act| campaign.act(act));
         let campaign = campaign.finish(false);

@@ -1,13 +1,13 @@
 //! Submitted and cancelled jobs: explicit cases, then arbitrary launches while jobs start, end and are requeued.
 
-use orchestrator::slurm::{DesiredJobs, Job, JobNames, JobPhase, Plan, Role, Submission, plan};
+use orchestrator::slurm::{DesiredJobs, JobNames, JobPhase, Plan, Role, SlurmJob, Submission, plan};
 use proptest::prelude::*;
 
 const WANTED: DesiredJobs = DesiredJobs { agents: 2, walkers: 4, labellers: 1 };
 
-fn job(id: u64, role: Role, state: &str) -> Job {
+fn job(id: u64, role: Role, state: &str) -> SlurmJob {
     let walkers = matches!(role, Role::Agent(_)).then_some(WANTED.walkers);
-    Job {
+    SlurmJob {
         id,
         role,
         state: state.into(),
@@ -98,7 +98,7 @@ fn job_names_match_the_plan() {
 /// A job in a batch system that supports `singleton` and `afterany`.
 #[derive(Clone, Debug)]
 struct Known {
-    job: Job,
+    job: SlurmJob,
     after: Vec<u64>,
     requeue: bool,
 }
@@ -160,7 +160,7 @@ impl System {
         };
     }
 
-    fn shown(&self) -> Vec<Job> {
+    fn shown(&self) -> Vec<SlurmJob> {
         self.jobs.iter().map(|known| known.job.clone()).collect()
     }
 

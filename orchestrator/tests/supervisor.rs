@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use orchestrator::supervisor::{Action, ChildExit, ChildState, ChildStatus, ExitReason, Limits, Supervisor};
+use orchestrator::supervisor::{
+    ChildExit, ChildState, ChildStatus, ExitReason, Limits, Supervisor, SupervisorAction,
+};
 use proptest::prelude::*;
 
 const LIMITS: Limits = Limits {
@@ -31,8 +33,8 @@ fn signal(signal: i32) -> ExitReason {
     ExitReason::Signal { signal, last_line: None }
 }
 
-fn start(number: u32, incarnation: u32) -> Action {
-    Action::Start { number, incarnation }
+fn start(number: u32, incarnation: u32) -> SupervisorAction {
+    SupervisorAction::Start { number, incarnation }
 }
 
 fn status(supervisor: &Supervisor, number: u32, now: Duration) -> ChildStatus {
@@ -54,7 +56,10 @@ fn detached_children_are_not_killed() {
     let left = supervisor.ended(0, finished(), s(5)).unwrap();
     assert_eq!(left.then, ChildState::BackingOff { left: s(1) });
     assert_eq!(supervisor.due_actions(s(6)), [start(0, 2)]);
-    assert_eq!(supervisor.stop(s(10)), [Action::Terminate { number: 0 }, Action::Terminate { number: 1 }]);
+    assert_eq!(
+        supervisor.stop(s(10)),
+        [SupervisorAction::Terminate { number: 0 }, SupervisorAction::Terminate { number: 1 }]
+    );
     assert_eq!(
         supervisor.ended(0, ExitReason::Exit { code: 130, last_line: None }, s(11)).unwrap().then,
         ChildState::Exited
@@ -161,7 +166,7 @@ fn unresponsive_children_are_killed_once_and_restarted() {
             supervisor.heartbeat(0, heard - s(10));
         }
         assert_eq!(supervisor.due_actions(heard + s(119)), []);
-        assert_eq!(supervisor.due_actions(heard + s(120)), [Action::Kill { number: 0 }]);
+        assert_eq!(supervisor.due_actions(heard + s(120)), [SupervisorAction::Kill { number: 0 }]);
         assert_eq!(status(&supervisor, 0, heard).state, ChildState::Stopping);
         // It may take time to die, and earlier heartbeats arrive late.
         supervisor.heartbeat(0, heard + s(121));
@@ -180,7 +185,11 @@ fn missed_heartbeats_during_a_suspension_do_not_count() {
     // The orchestrator was suspended from 20 s to 1,000 s.
     assert_eq!(supervisor.due_actions(s(1000)), []);
     assert_eq!(supervisor.next_deadline(), Some(s(1120)));
-    assert_eq!(supervisor.due_actions(s(1121)), [Action::Kill { number: 0 }], "a little late is no excuse");
+    assert_eq!(
+        supervisor.due_actions(s(1121)),
+        [SupervisorAction::Kill { number: 0 }],
+        "a little late is no excuse"
+    );
 }
 
 #[test]
@@ -189,7 +198,7 @@ fn a_stop_terminates_and_then_kills() {
     supervisor.ended(1, crash(), s(1));
     supervisor.ended(2, finished(), s(1));
     supervisor.due_actions(s(1));
-    let terminate = [0, 3, 4].map(|number| Action::Terminate { number });
+    let terminate = [0, 3, 4].map(|number| SupervisorAction::Terminate { number });
     assert_eq!(supervisor.stop(s(1)), terminate);
     assert_eq!(status(&supervisor, 1, s(1)).state, ChildState::Exited, "it is not started again");
     assert_eq!(supervisor.ended(0, signal(15), s(2)).unwrap().then, ChildState::Exited);
@@ -197,7 +206,7 @@ fn a_stop_terminates_and_then_kills() {
     assert_eq!(supervisor.ended(3, signal(11), s(2)).unwrap().then, ChildState::Exited);
     assert_eq!(status(&supervisor, 3, s(2)).last_failure, Some(signal(11)));
     assert_eq!(supervisor.next_deadline(), Some(s(31)));
-    assert_eq!(supervisor.due_actions(s(31)), [Action::Kill { number: 4 }]);
+    assert_eq!(supervisor.due_actions(s(31)), [SupervisorAction::Kill { number: 4 }]);
     assert_eq!(supervisor.ended(4, signal(9), s(31)).unwrap().reason, ExitReason::StopTimeout(s(30)));
     assert!(supervisor.is_over());
 }
@@ -260,7 +269,11 @@ fn running_processes_are_adopted() {
     assert_eq!(supervisor.due_actions(s(0)), [start(0, 1)]);
     assert!(!supervisor.adopt(0, s(0)), "it was started");
     supervisor.heartbeat(0, s(100));
-    assert_eq!(supervisor.due_actions(s(120)), [Action::Kill { number: 1 }], "it must speak like any other");
+    assert_eq!(
+        supervisor.due_actions(s(120)),
+        [SupervisorAction::Kill { number: 1 }],
+        "it must speak like any other"
+    );
     let ended = supervisor.ended(1, ExitReason::Unknown, s(120)).unwrap();
     assert_eq!((ended.incarnation, ended.reason), (0, ExitReason::Unresponsive(s(120))));
     assert!(!supervisor.adopt(1, s(120)), "its next process is one of ours");
@@ -333,10 +346,10 @@ struct World {
 }
 
 impl World {
-    fn obey(&mut self, actions: Vec<Action>) {
+    fn obey(&mut self, actions: Vec<SupervisorAction>) {
         for action in actions {
             match action {
-                Action::Start { number, incarnation } => {
+                SupervisorAction::Start { number, incarnation } => {
                     assert!(!self.stopped, "a start after the stop");
                     assert!(number < CHILDREN);
                     assert_eq!(self.alive.insert(number, false), None, "two processes of number {number}");
@@ -346,8 +359,8 @@ impl World {
                     *starts += 1;
                     assert!(*starts <= LIMITS.max_restarts + 1, "started too often");
                 }
-                Action::Terminate { number } => assert_eq!(self.alive.get(&number), Some(&false)),
-                Action::Kill { number } => {
+                SupervisorAction::Terminate { number } => assert_eq!(self.alive.get(&number), Some(&false)),
+                SupervisorAction::Kill { number } => {
                     assert_eq!(self.alive.insert(number, true), Some(false), "one kill for one process");
                 }
             }
@@ -417,7 +430,7 @@ proptest! {
         while let Some(now) = supervisor.next_deadline() {
             for action in supervisor.due_actions(now) {
                 match action {
-                    Action::Start { number, .. } => {
+                    SupervisorAction::Start { number, .. } => {
                         starts += 1;
                         let death = now + Duration::from_millis(deaths.next().unwrap());
                         supervisor.ended(number, crash(), death).unwrap();

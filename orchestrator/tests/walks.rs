@@ -1,8 +1,10 @@
 //! Walks in assignments and rounds: starts, waiting, control walks, rollbacks, losses, ends.
 
-use orchestrator::selector::{Mode, Scheduling, Selector, SelectorSnapshot, Settings, UpdateProtocol};
+use orchestrator::selector::{
+    CampaignMode, Scheduling, Selector, SelectorSettings, SelectorSnapshot, UpdateProtocol,
+};
 use store::records::{ComponentRecord, Fate};
-use wire::messages::{Outcome, Progress, WalkEnd};
+use wire::messages::{Outcome, WalkEnd, WalkProgress};
 use wire::{Origin, WalkId};
 
 use crate::common;
@@ -21,7 +23,7 @@ fn is_waiting(selector: &mut Selector) -> bool {
 #[test]
 fn every_seed_structure_gets_one_walk() {
     let mut store = MemoryStore::default();
-    let mut selector = restore(&settings(Mode::Live), 2, SelectorSnapshot::default());
+    let mut selector = restore(&settings(CampaignMode::Live), 2, SelectorSnapshot::default());
     assert!(selector.is_done(), "no walks yet");
     let commit = selector.start_walks();
     assert_eq!(kinds(&commit), ["begun", "begun"]);
@@ -29,7 +31,7 @@ fn every_seed_structure_gets_one_walk() {
     store.commit(&commit);
     assert!(selector.start_walks().walks.is_empty());
     // Another seed structure is added to the campaign.
-    let mut selector = restore(&settings(Mode::Live), 3, store.snapshot());
+    let mut selector = restore(&settings(CampaignMode::Live), 3, store.snapshot());
     let commit = selector.start_walks();
     assert_eq!(
         (kinds(&commit), commit.walks[0].walk, commit.walks[0].seed_structure),
@@ -48,7 +50,7 @@ fn every_seed_structure_gets_one_walk() {
 
 #[test]
 fn complete_rounds_are_decided_in_walk_order() {
-    let mut selector = begin(&settings(Mode::Reproducible), 3);
+    let mut selector = begin(&settings(CampaignMode::Reproducible), 3);
     let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
     assert!(is_waiting(&mut selector), "the third walk is not in the round");
     let reports = [
@@ -75,7 +77,7 @@ fn complete_rounds_are_decided_in_walk_order() {
 
 #[test]
 fn live_walks_do_not_wait_for_each_other() {
-    let mut selector = begin(&settings(Mode::Live), 3);
+    let mut selector = begin(&settings(CampaignMode::Live), 3);
     let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     for assignment in assignments.iter().rev() {
         let report = offer(&selector, assignment, 5, structure(assignment.walk.0.into(), SHORTEST), NEW);
@@ -92,20 +94,20 @@ fn live_walks_do_not_wait_for_each_other() {
 
 #[test]
 fn unsolicited_reports_change_nothing() {
-    let mut selector = begin(&settings(Mode::Live), 1);
+    let mut selector = begin(&settings(CampaignMode::Live), 1);
     let assignment = next_assignment(&mut selector);
     let unasked = |selector: &mut Selector, report| {
         assert!(selector.report(report).unwrap().is_none());
     };
     let report = common::report(&assignment, Outcome::StepsDone, at(10));
-    unasked(&mut selector, wire::messages::Report { walk: WalkId(1), ..report.clone() });
-    unasked(&mut selector, wire::messages::Report { assignment: 1, ..report.clone() });
+    unasked(&mut selector, wire::messages::AssignmentReport { walk: WalkId(1), ..report.clone() });
+    unasked(&mut selector, wire::messages::AssignmentReport { assignment: 1, ..report.clone() });
     decided(&mut selector, report.clone());
     unasked(&mut selector, report.clone());
     next_assignment(&mut selector);
     unasked(&mut selector, report);
     // Reported twice in one round.
-    let mut selector = begin(&settings(Mode::Reproducible), 2);
+    let mut selector = begin(&settings(CampaignMode::Reproducible), 2);
     let [first, second] = [(); 2]
         .map(|()| next_assignment(&mut selector))
         .map(|a| common::report(&a, Outcome::StepsDone, at(10)));
@@ -117,13 +119,13 @@ fn unsolicited_reports_change_nothing() {
 
 #[test]
 fn late_reports_of_lost_walkers_count_once() {
-    for mode in [Mode::Live, Mode::Reproducible] {
+    for mode in [CampaignMode::Live, CampaignMode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
         let assignment = next_assignment(&mut selector);
         let report = common::report(&assignment, Outcome::StepsDone, at(10));
         selector.assignment_lost(assignment.walk);
         let commit = decided(&mut selector, report.clone());
-        assert_eq!(commit.walks[0].turn, assignment.number + 1);
+        assert_eq!(commit.walks[0].assignments, assignment.number + 1);
         assert!(selector.report(report.clone()).unwrap().is_none());
         assert_eq!(next_assignment(&mut selector).number, assignment.number + 1);
         assert!(selector.report(report).unwrap().is_none());
@@ -137,7 +139,7 @@ fn late_reports_of_lost_walkers_count_once() {
 
 #[test]
 fn assignments_of_lost_walkers_are_assigned_again() {
-    for mode in [Mode::Live, Mode::Reproducible] {
+    for mode in [CampaignMode::Live, CampaignMode::Reproducible] {
         let mut selector = begin(&settings(mode), 1);
         let first = next_assignment(&mut selector);
         assert!(is_waiting(&mut selector));
@@ -155,13 +157,13 @@ fn assignments_of_lost_walkers_are_assigned_again() {
     }
 }
 
-fn returned(segment: u32, step: u64) -> Progress {
-    Progress { segment, returns: segment, tau: 0.125, last_return: Some((7, 3)), ..at(step) }
+fn returned(segment: u32, step: u64) -> WalkProgress {
+    WalkProgress { segment, returns: segment, tau: 0.125, last_return: Some((7, 3)), ..at(step) }
 }
 
 #[test]
 fn rollbacks_are_logged_once() {
-    let mut selector = begin(&settings(Mode::Live), 1);
+    let mut selector = begin(&settings(CampaignMode::Live), 1);
     let assignment = next_assignment(&mut selector);
     let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(2, 8)));
     assert_eq!(kinds(&commit), ["segment"]);
@@ -178,11 +180,11 @@ fn rollbacks_are_logged_once() {
 #[test]
 fn rollbacks_before_an_interruption_are_logged() {
     let mut store = MemoryStore::default();
-    let mut selector = restore(&settings(Mode::Live), 1, SelectorSnapshot::default());
+    let mut selector = restore(&settings(CampaignMode::Live), 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
     let assignment = next_assignment(&mut selector);
     store.commit(&decided(&mut selector, common::report(&assignment, Outcome::Interrupted, returned(1, 4))));
-    let mut selector = restore(&settings(Mode::Live), 1, store.snapshot());
+    let mut selector = restore(&settings(CampaignMode::Live), 1, store.snapshot());
     let assignment = next_assignment(&mut selector);
     let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(1, 10)));
     assert_eq!(kinds(&commit), ["segment"]);
@@ -201,7 +203,7 @@ fn every_end_is_logged_with_its_reason() {
         (WalkEnd::BlewUp { reason: reason() }, "blew_up", "forces are not finite"),
         (WalkEnd::BadStart { reason: reason() }, "bad_start", "forces are not finite"),
     ];
-    let mut selector = begin(&settings(Mode::Live), ends.len());
+    let mut selector = begin(&settings(CampaignMode::Live), ends.len());
     let assignments = [(); 4].map(|()| next_assignment(&mut selector));
     for (assignment, (end, name, reason)) in assignments.iter().zip(ends) {
         let commit = decided(&mut selector, ended(assignment, 3, end));
@@ -219,11 +221,11 @@ fn every_end_is_logged_with_its_reason() {
 
 /// With control walks: collects at these steps, and then ends the biased walk.
 fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
-    let controlled = Settings {
+    let controlled = SelectorSettings {
         control: true,
         max_per_walk: 9,
         update: UpdateProtocol::Never,
-        ..settings(Mode::Reproducible)
+        ..settings(CampaignMode::Reproducible)
     };
     let mut selector = restore(&controlled, 1, SelectorSnapshot::default());
     store.commit(&selector.start_walks());
@@ -241,12 +243,12 @@ fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
 /// Control walks get their share of the assignments, and biased walks the rest.
 #[test]
 fn control_walks_do_not_wait_behind_all_seed_structures() {
-    let live = |control_share| Settings {
+    let live = |control_share| SelectorSettings {
         control: true,
         max_per_walk: 1,
         control_share,
         update: UpdateProtocol::Never,
-        ..settings(Mode::Live)
+        ..settings(CampaignMode::Live)
     };
     for (share, expected) in
         [(0.5, [0, 1, 1, 2, 2, 3]), (0.25, [0, 0, 0, 1, 1, 1]), (1.0, [1, 2, 3, 4, 4, 4])]
@@ -341,7 +343,8 @@ fn a_walk_that_collected_nothing_has_no_control() {
 fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
     let mut store = MemoryStore::default();
     drop(with_control(&mut store, &[5]));
-    let limited = Settings { control: true, max_structures: Some(2), ..settings(Mode::Reproducible) };
+    let limited =
+        SelectorSettings { control: true, max_structures: Some(2), ..settings(CampaignMode::Reproducible) };
     let mut selector = restore(&limited, 2, store.snapshot());
     store.commit(&selector.start_walks());
     let (control, biased) = (next_assignment(&mut selector), next_assignment(&mut selector));
@@ -365,15 +368,15 @@ fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
 #[test]
 fn a_mismatched_database_is_rejected() {
     let mut store = MemoryStore::default();
-    store.commit(&restore(&settings(Mode::Live), 2, SelectorSnapshot::default()).start_walks());
+    store.commit(&restore(&settings(CampaignMode::Live), 2, SelectorSnapshot::default()).start_walks());
     let good = store.snapshot();
     let refused = |seeds: usize, change: &dyn Fn(&mut SelectorSnapshot)| {
         let mut snapshot = good.clone();
         change(&mut snapshot);
-        let error = try_restore(&settings(Mode::Live), seeds, None, snapshot).err();
+        let error = try_restore(&settings(CampaignMode::Live), seeds, None, snapshot).err();
         error.expect("refused").to_string()
     };
-    assert!(try_restore(&settings(Mode::Live), 2, None, good.clone()).is_ok());
+    assert!(try_restore(&settings(CampaignMode::Live), 2, None, good.clone()).is_ok());
     assert!(refused(1, &|_| ()).contains("walk 1 starts from seed structure 1, but there are only 1"));
     assert!(refused(2, &|s| drop(s.walks.remove(0))).contains("found walk 1 in place of walk 0"));
     assert!(refused(2, &|s| s.walks[1].selector_state.clear()).contains("state of walk 1 is damaged"));
@@ -389,7 +392,7 @@ fn a_seed_structure_that_cannot_be_graded_is_named() {
     let mut seed = common::seed(0);
     seed.structure.species[1] = "Cu".parse().unwrap();
     let found = Selector::restore(
-        settings(Mode::Live),
+        settings(CampaignMode::Live),
         common::CAMPAIGN,
         vec![seed],
         common::grader(),
@@ -403,7 +406,7 @@ fn a_seed_structure_that_cannot_be_graded_is_named() {
 
 #[test]
 fn paused_walks_get_no_assignments_while_others_continue_in_live_mode() {
-    let mut selector = restore(&settings(Mode::Live), 3, SelectorSnapshot::default());
+    let mut selector = restore(&settings(CampaignMode::Live), 3, SelectorSnapshot::default());
     let _ = selector.start_walks();
     selector.set_paused([WalkId(0), WalkId(2)].into());
     assert_eq!(next_assignment(&mut selector).walk, WalkId(1));

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use atoms::{CloseContact, Repetition, Structure, extxyz, read_structures};
 use calm::rules::Positive;
-use orchestrator::selector::SeedStructure;
+use orchestrator::selector::SeedPlan;
 use potentials::grace::GraceModel;
 use toml::Spanned;
 use wire::ContentHash;
@@ -32,7 +32,7 @@ const MAX_SUPERCELL_ATOMS: u64 = 100_000;
 /// A seed structure and its source.
 pub struct SourcedStructure {
     /// Name and structure.
-    pub seed: SeedStructure,
+    pub seed: SeedPlan,
     /// `file:line`, and the repetition of a supercell.
     pub source: String,
     /// Repetition of the cell in the file.
@@ -53,7 +53,7 @@ pub struct SeedStructures {
 /// A seed structure that is left out.
 pub struct SkippedStructure {
     /// Name and structure.
-    pub seed: SeedStructure,
+    pub seed: SeedPlan,
     /// `file:line`
     pub source: String,
     /// Why no walk can start from it.
@@ -84,7 +84,7 @@ impl SkippedStructure {
 
 /// A frame of a file.
 struct SourcedFrame<'a> {
-    seed: SeedStructure,
+    seed: SeedPlan,
     /// `file:line`, and the repetition of a supercell.
     source: String,
     repetition: Repetition,
@@ -148,7 +148,7 @@ impl Loader<'_> {
                          (name=… in its comment line)",
                     )));
                 }
-                let seed = SeedStructure { name, structure: frame.structure, walks: Vec::new() };
+                let seed = SeedPlan { name, structure: frame.structure, walks: Vec::new() };
                 all.push(SourcedFrame { seed, source, repetition: Repetition::ONE, file });
             }
         }
@@ -233,8 +233,7 @@ impl Loader<'_> {
         let warning = |message| Warning { at: at.clone(), key: FILES.to_owned(), message };
         let (mut same, mut strange, mut first) = (Vec::new(), Vec::new(), HashMap::new());
         for named in &seeds.valid {
-            let SourcedStructure { seed: SeedStructure { name, structure, .. }, source, geometry, .. } =
-                named;
+            let SourcedStructure { seed: SeedPlan { name, structure, .. }, source, geometry, .. } = named;
             if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
                 same.push(format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use atoms::Structure;
-use orchestrator::selector::SeedStructure;
+use orchestrator::selector::SeedPlan;
 use wire::WalkConditions;
 
 use super::loader::Loader;
@@ -48,7 +48,7 @@ impl Loader<'_> {
             without_volume.get(&seed.name).filter(|_| seed.walks.is_empty()).cloned()
         });
         let (mut fewer, mut no_group) = (Vec::new(), Vec::new());
-        for SourcedStructure { seed: SeedStructure { name, walks, .. }, source, .. } in &seeds.valid {
+        for SourcedStructure { seed: SeedPlan { name, walks, .. }, source, .. } in &seeds.valid {
             if let Some(reason) = without_volume.get(name) {
                 let message =
                     format!("seed structure '{name}' ({source}) walks at its own volume only: {reason}");
@@ -80,7 +80,7 @@ impl Loader<'_> {
             Some(text) => Some(self.seed_filter(number, text)?),
             None => None,
         };
-        let selects = |SeedStructure { name, structure, .. }: &SeedStructure| {
+        let selects = |SeedPlan { name, structure, .. }: &SeedPlan| {
             filter.as_ref().is_none_or(|filter| is_selected(filter, name, structure))
         };
         let conditions = combinations(&self.config.walk, group);

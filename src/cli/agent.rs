@@ -69,7 +69,7 @@ impl AgentArgs {
         })?;
         let process =
             ProcessRecord::new(ProcessRecord::AGENT, None, std::process::id(), store::unix_milliseconds());
-        let agent = net::Agent {
+        let agent = net::AgentInfo {
             // The directory tells cloned hosts apart, which have the same name, process ids and clock.
             id: blake3::hash(format!("{process:?} {}", scratch.path().display()).as_bytes()).to_hex()[..32]
                 .to_owned(),

@@ -8,7 +8,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use orchestrator::slurm::{DesiredJobs, JobNames, JobPhase, Plan, Slurm, SlurmError, plan};
+use orchestrator::slurm::{DesiredJobs, JobNames, JobPhase, Plan, SlurmCommands, SlurmError, plan};
 use store::Location;
 
 use self::job_specs::JobSpecs;
@@ -110,7 +110,7 @@ impl LaunchArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let System::Slurm = self.on;
         let directory = self.directory()?;
-        let slurm = Slurm::with_timeout(COMMAND_TIMEOUT);
+        let slurm = SlurmCommands::with_timeout(COMMAND_TIMEOUT);
         if self.stop {
             let config = Config::load(&self.config)?.config;
             let names = job_names(&config.location(&directory)?);
@@ -163,7 +163,7 @@ impl LaunchArgs {
 
     async fn launch(
         &self,
-        slurm: &Slurm,
+        slurm: &SlurmCommands,
         names: &JobNames,
         specs: &JobSpecs,
         wanted: DesiredJobs,
@@ -211,7 +211,7 @@ impl LaunchArgs {
         Ok(())
     }
 
-    async fn stop(&self, slurm: &Slurm, names: &JobNames) -> Result<(), CommandError> {
+    async fn stop(&self, slurm: &SlurmCommands, names: &JobNames) -> Result<(), CommandError> {
         // A job of the campaign that runs this command must not wait for its own end.
         let own = std::env::var("SLURM_JOB_ID").ok().and_then(|id| id.parse().ok());
         let cancelled = if self.pending { slurm.withdraw(names).await } else { slurm.stop(names, own).await };

@@ -5,7 +5,7 @@ mod files;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
+use store::{Attempt, JobDetails, JobState, Location, QueueEntry, Store, unix_milliseconds};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{TextTable, count, decimals, print, print_json};
@@ -117,7 +117,7 @@ impl QueueArgs {
     }
 }
 
-async fn read_list(location: &Location, list: &QueueListArgs) -> Result<Vec<Job>, CommandError> {
+async fn read_list(location: &Location, list: &QueueListArgs) -> Result<Vec<QueueEntry>, CommandError> {
     let store = Store::open_read_only(location).await?;
     Ok(store.queue_list(list.state, list.limit, list.offset).await?)
 }
@@ -131,7 +131,7 @@ async fn read_details(location: &Location, id: &str) -> Result<JobDetails, Comma
 pub async fn change(
     location: &Location,
     action: &QueueCommand,
-    changed: &mut Vec<Job>,
+    changed: &mut Vec<QueueEntry>,
 ) -> Result<(), CommandError> {
     let store = Store::open(location).await?;
     let ids = match action {
@@ -154,8 +154,8 @@ pub async fn change(
 }
 
 /// The message for a changed job.
-pub fn message(action: &QueueCommand, job: &Job) -> String {
-    let Job { candidate, state, priority, .. } = job;
+pub fn message(action: &QueueCommand, job: &QueueEntry) -> String {
+    let QueueEntry { candidate, state, priority, .. } = job;
     match action {
         QueueCommand::Drop { .. } => format!("{candidate} is dropped: it will not be labelled or exported"),
         QueueCommand::Prioritise { .. } => format!("{candidate} now has priority {priority}"),
@@ -164,7 +164,7 @@ pub fn message(action: &QueueCommand, job: &Job) -> String {
 }
 
 /// The state of a job; "again" if it already has a label that another one will replace; "excluded" if that label is excluded.
-fn state_of(job: &Job) -> String {
+fn state_of(job: &QueueEntry) -> String {
     let excluded = if job.excluded.is_some() { ", excluded" } else { "" };
     match (&job.relabel, job.state) {
         (Some(_), JobState::Queued | JobState::Leased) => format!("{} again{excluded}", job.state),
@@ -172,7 +172,7 @@ fn state_of(job: &Job) -> String {
     }
 }
 
-fn write_list(out: &mut dyn Write, jobs: &[Job], list: &QueueListArgs) -> io::Result<()> {
+fn write_list(out: &mut dyn Write, jobs: &[QueueEntry], list: &QueueListArgs) -> io::Result<()> {
     if jobs.is_empty() {
         let state = list.state.map_or(String::new(), |state| format!("{state} "));
         return match list.offset {
@@ -213,7 +213,7 @@ fn write_list(out: &mut dyn Write, jobs: &[Job], list: &QueueListArgs) -> io::Re
 }
 
 fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
-    let Job {
+    let QueueEntry {
         job,
         candidate,
         protocol,

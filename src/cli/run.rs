@@ -292,7 +292,7 @@ async fn open_store(
     let resolved = campaign.resolved();
     let store = match Store::open(location).await {
         Err(StoreError::Missing { .. }) => {
-            let record = store::Campaign {
+            let record = store::CampaignRecord {
                 id: campaign.id(),
                 program_version: env!("CARGO_PKG_VERSION").to_owned(),
                 mode: campaign.config.campaign.mode.name().to_owned(),

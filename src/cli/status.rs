@@ -17,7 +17,7 @@ use monitor::expected_end::ExpectedEnd;
 use monitor::label_cost::SECONDS_PER_HOUR;
 use monitor::reference_check::ReferenceCheck;
 use monitor::walk_ends::WalkEnds;
-use store::{Candidates, Location, Status, Store, unix_milliseconds};
+use store::{CampaignStatus, Candidates, Location, Store, unix_milliseconds};
 
 use self::batch_jobs::BatchJobs;
 use self::page::{StatusLayout, cut};

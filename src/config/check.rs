@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use atoms::MinDistanceRule;
 use md::{ThermostatSettings, WrongSetting};
-use orchestrator::selector::{Mode, UpdateProtocol};
+use orchestrator::selector::{CampaignMode, UpdateProtocol};
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
 
@@ -81,7 +81,7 @@ fn check_budget(config: &Config) -> Result<(), InvalidValue> {
 
 /// The length of the queue depends on the speed of the labellers, which is not reproducible.
 fn check_queue(config: &Config) -> Result<(), InvalidValue> {
-    if config.label.on_queue_full == QueueFull::Raise && config.campaign.mode == Mode::Reproducible {
+    if config.label.on_queue_full == QueueFull::Raise && config.campaign.mode == CampaignMode::Reproducible {
         let expected = "\"wait\", or mode = \"live\": with \"raise\", the collected structures depend on the speed of the labellers, \
                         which is not reproducible";
         return wrong("label.on_queue_full", "\"raise\"", expected);
@@ -137,7 +137,7 @@ fn is_option(text: &str) -> bool {
 
 fn check_mixture(config: &Config) -> Result<(), InvalidValue> {
     let Config { campaign, calm, run, .. } = config;
-    let one_by_one = campaign.mode == Mode::Reproducible && run.walks_per_round.get() == 1;
+    let one_by_one = campaign.mode == CampaignMode::Reproducible && run.walks_per_round.get() == 1;
     if calm.update == UpdateProtocol::PerSeedStructure && !one_by_one {
         let expected = "mode = \"reproducible\" and run.walks_per_round = 1: the mixture can be restarted for each seed \
                         structure only if walks follow one another";

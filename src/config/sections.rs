@@ -9,7 +9,7 @@ use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use dft::PassedEnvironment;
 use md::ThermostatSettings;
 use monitor::reference_check::DifferenceBounds;
-use orchestrator::selector::{Mode, OnForgetting, UpdateProtocol};
+use orchestrator::selector::{CampaignMode, OnForgetting, UpdateProtocol};
 use potentials::ZblWindows;
 use potentials::grace::Precision;
 use schemars::JsonSchema;
@@ -26,7 +26,7 @@ use crate::duration::Duration;
 #[serde(deny_unknown_fields, default)]
 pub struct CampaignSection {
     /// `reproducible`: rounds of a fixed number of walks. `live`: every walk goes on as soon as it can.
-    pub mode: Mode,
+    pub mode: CampaignMode,
     /// Seed of all random numbers of the campaign.
     pub rng_seed: u64,
     /// Whether each biased walk that collected a structure is followed by its unbiased control walk.
@@ -449,7 +449,12 @@ impl Default for ReferenceCheckSection {
 
 impl Default for CampaignSection {
     fn default() -> Self {
-        Self { mode: Mode::Reproducible, rng_seed: 1, control: true, control_share: defaults::fraction(0.5) }
+        Self {
+            mode: CampaignMode::Reproducible,
+            rng_seed: 1,
+            control: true,
+            control_share: defaults::fraction(0.5),
+        }
     }
 }
 

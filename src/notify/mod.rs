@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use monitor::walk_ends::WalkEnds;
 use serde::{Deserialize, Serialize};
-use store::Status;
+use store::CampaignStatus;
 
 use crate::config::{NotifyEvent, NotifySection};
 use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
@@ -54,7 +54,7 @@ impl NotificationTracker {
     }
 
     /// Returns the events of a campaign with this status at the time `now`, ms since 1970.
-    pub fn check(&mut self, status: &Status, now: i64) -> Vec<Notification> {
+    pub fn check(&mut self, status: &CampaignStatus, now: i64) -> Vec<Notification> {
         let candidates = status.candidates.seen + status.candidates.control;
         let labels = status.budget.used.labels + status.labels.failed;
         let mut due = Vec::new();
@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn a_stall_is_reported_once_and_again_after_the_next_candidate() {
-        let (mut watch, mut status) = (watch(), Status::default());
+        let (mut watch, mut status) = (watch(), CampaignStatus::default());
         for (minute, seen, expected) in [
             (0, 5, 0),
             (119, 5, 0),
@@ -193,7 +193,7 @@ mod tests {
 
     #[test]
     fn failures_are_reported_in_batches() {
-        let (mut watch, mut status) = (watch(), Status::default());
+        let (mut watch, mut status) = (watch(), CampaignStatus::default());
         for (failed, expected) in [(9, 0), (10, 1), (11, 0), (3, 0), (12, 0), (39, 1), (40, 1)] {
             status.labels.failed = failed;
             assert_eq!(watch.check(&status, 0).len(), expected, "{failed}");
@@ -202,7 +202,7 @@ mod tests {
 
     #[test]
     fn repeated_early_ends_are_reported_once() {
-        let (mut watch, mut status) = (watch(), Status::default());
+        let (mut watch, mut status) = (watch(), CampaignStatus::default());
         let walk = |state: &str| store::WalkStatus { state: state.into(), ..store::WalkStatus::default() };
         for (state, expected) in
             [("diverged", 0), ("quota_reached", 0), ("trapped", 0), ("diverged", 1), ("diverged", 0)]
@@ -217,7 +217,8 @@ mod tests {
     #[test]
     fn a_budget_and_its_end_are_reported_and_a_larger_budget_again() {
         use NotifyEvent::{Budget, End};
-        let (mut watch, mut status) = (watch(), Status { finished: true, ..Status::default() });
+        let (mut watch, mut status) =
+            (watch(), CampaignStatus { finished: true, ..CampaignStatus::default() });
         status.budget.used_up = Some("budget.labels".into());
         status.budget.limits.labels = Some(5);
         assert_eq!(events(&watch.check(&status, 0)), [Budget, End]);

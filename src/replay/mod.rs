@@ -11,7 +11,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-use orchestrator::selector::{Replay, ReplayError, SeedStructure};
+use orchestrator::selector::{Replay, ReplayError, SeedPlan};
 use serde_json::Value;
 use store::Store;
 
@@ -49,7 +49,7 @@ pub async fn replay(
 }
 
 /// The configuration with its defaults and the hashes of its files.
-pub fn resolved(campaign: &store::Campaign) -> Result<Value, CommandError> {
+pub fn resolved(campaign: &store::CampaignRecord) -> Result<Value, CommandError> {
     serde_json::from_str(&campaign.resolved_configuration)
         .map_err(|error| CommandError::Failed(format!("damaged database: the configuration: {error}")))
 }
@@ -59,8 +59,7 @@ async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Resu
     let (model, artifact, training) = campaign::load_for_grades(config, Path::new("(the campaign)"))?;
     let seeds = store.seed_structures().await?.into_iter();
     // The log has the conditions of walks.
-    let seeds =
-        seeds.map(|seed| SeedStructure { name: seed.name, structure: seed.structure, walks: Vec::new() });
+    let seeds = seeds.map(|seed| SeedPlan { name: seed.name, structure: seed.structure, walks: Vec::new() });
     let seeds = seeds.collect();
     let set = settings.iter().map(|setting| setting.rule().to_owned()).collect();
     let replay = Replay::new(

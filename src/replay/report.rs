@@ -109,7 +109,7 @@ pub struct LogEntry<'a> {
 impl ReplayReport {
     /// An empty report.
     pub fn new(
-        campaign: &store::Campaign,
+        campaign: &store::CampaignRecord,
         settings: &[RuleOverride],
         other_processor: bool,
         recorded: i64,

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use monitor::label_statistics::{self, LabelStatistics};
 use serde_json::Value;
 use store::{
-    Campaign, FailureCount, FateCount, LabelCost, Protocol, SeedStructure, Status, Store, StoreError,
-    Unlabelled,
+    CampaignRecord, CampaignStatus, FailureCount, FateCount, LabelCost, Protocol, SeedStructure, Store,
+    StoreError, Unlabelled,
 };
 
 use super::collections::Collections;
@@ -19,9 +19,9 @@ const MAX_PARTS: u64 = 200;
 /// Data of a campaign.
 pub struct ReportData {
     /// Id and configuration.
-    pub campaign: Campaign,
+    pub campaign: CampaignRecord,
     /// Counts, walks, budget.
-    pub status: Status,
+    pub status: CampaignStatus,
     /// The configuration in force with every default filled in.
     pub configuration: Value,
     /// Values that the selector stores about its mixture, by name.

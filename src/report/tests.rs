@@ -3,7 +3,8 @@ use quick_xml::Reader;
 use quick_xml::events::Event;
 use serde_json::json;
 use store::{
-    AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Protocol, SeedStructure, Store,
+    AtomGrades, CampaignRecord, CandidateRecord, Commit, Decision, Fate, Label, Protocol, SeedStructure,
+    Store,
 };
 use wire::messages::DeclineReason;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
@@ -25,7 +26,7 @@ fn structure(distance: f64) -> Structure {
 }
 
 async fn begin(directory: &std::path::Path, configuration: &str) -> Store {
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CAMPAIGN,
         program_version: "0.1.0".into(),
         mode: "reproducible".into(),

@@ -14,12 +14,12 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
-use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
+use wire::ipc::{self, IpcError, IpcServer, Sizes, space_needed};
 use wire::mixture::SharedMixture;
 use wire::net::{self, Address, AgentClient, LinkError, Membership, NetError, Tls};
 use wire::shm_dir::ShmDir;
 use wire::transport::Incoming;
-use workers::agent::{self, Agent, AgentEvent};
+use workers::agent::{self, Agent, OrchestratorEvent};
 
 use super::process_manager::all_failed_message;
 use super::{CHANNEL, STOP_MESSAGE};
@@ -40,7 +40,7 @@ const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 pub async fn run(
     address: &Address,
     tls: Option<&Tls>,
-    agent: net::Agent,
+    agent: net::AgentInfo,
     threads: usize,
     timeout: Duration,
     directory: &Path,
@@ -72,11 +72,11 @@ pub async fn run(
     let metrics = Arc::clone(&state.metrics);
     let dispatch = |incoming| {
         tokio::spawn(Agent { client, joined, incoming, stopping, orchestrator_timeout: timeout, metrics }.run(move |event| match event {
-            AgentEvent::Stop => asked.cancel(),
-            AgentEvent::Unresponsive { unsent, idle } => log_and_warn(format_args!(
+            OrchestratorEvent::Stop => asked.cancel(),
+            OrchestratorEvent::Unresponsive { unsent, idle } => log_and_warn(format_args!(
                 "the orchestrator does not answer: {unsent} unsent reports, {idle} of {walkers} walkers idle"
             )),
-            AgentEvent::Recovered => log_and_print("the orchestrator answers again"),
+            OrchestratorEvent::Recovered => log_and_print("the orchestrator answers again"),
         }))
     };
     let ended = run_in(&shm_dir, &setup, (walkers, threads), &mixture, dispatch, &stop, state).await;
@@ -90,7 +90,7 @@ pub async fn run(
 async fn join(
     address: &Address,
     tls: Option<&Tls>,
-    agent: net::Agent,
+    agent: net::AgentInfo,
     directory: &Path,
 ) -> Result<(Arc<AgentClient>, Membership, AgentConfig), CommandError> {
     let waiting = |why: &NetError| log_and_warn(format_args!("waiting for the orchestrator: {why}"));
@@ -178,7 +178,7 @@ async fn run_in(
         SharedMixture::space_needed(mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
     let _prepared = shm_dir.prepare(needed).map_err(CommandError::failed)?;
     let shared = SharedMixture::create(&shm_dir.mixture(), mixture, walkers).map_err(CommandError::failed)?;
-    let server = Server::open(shm_dir, sizes, u64::from(std::process::id())).map_err(CommandError::failed)?;
+    let server = IpcServer::open(shm_dir, sizes, u64::from(std::process::id())).map_err(CommandError::failed)?;
     let line = server.handle();
     let limits = Limits {
         heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),

@@ -23,7 +23,7 @@ use std::thread;
 
 use monitor::walk_ends::WalkEnds;
 use orchestrator::reactor::{self, Notice, Reactor};
-use orchestrator::selector::{Mode, Selector};
+use orchestrator::selector::{CampaignMode, Selector};
 use store::{ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -138,7 +138,7 @@ pub fn idle_walkers(campaign: &LoadedCampaign) -> Option<String> {
     let Config { campaign: section, run, .. } = &campaign.config;
     let walkers = wanted_walkers(campaign) as usize;
     let walks = run.walks_per_round.get() * (1 + usize::from(section.control));
-    (section.mode == Mode::Reproducible && walkers > walks).then(|| {
+    (section.mode == CampaignMode::Reproducible && walkers > walks).then(|| {
         let control = if section.control { ", and as many control walks" } else { "" };
         format!(
             "at most {walks} of the {walkers} walkers have something to do at a time: a round has {} biased walks \

@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Sleep, sleep};
 use tokio_util::sync::CancellationToken;
-use wire::ipc::{Server, Sizes, space_needed};
+use wire::ipc::{IpcServer, Sizes, space_needed};
 use wire::mixture::SharedMixture;
 use wire::net::StopTokens;
 use wire::shm_dir::ShmDir;
@@ -57,7 +57,7 @@ async fn run_in(
     let _prepared = place.prepare(needed).map_err(CommandError::failed)?;
     let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
     let shared = shared.map_err(CommandError::failed)?;
-    let server = Server::open(place, sizes, session(process)).map_err(CommandError::failed)?;
+    let server = IpcServer::open(place, sizes, session(process)).map_err(CommandError::failed)?;
 
     // The manager cancels it too, when the run cannot go on.
     let stopping = run.stop.child_token();

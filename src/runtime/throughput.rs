@@ -7,10 +7,10 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use orchestrator::reactor::Notice;
-use store::{Store, TotalThroughput, WalkProgress, unix_milliseconds};
+use store::{Store, TotalThroughput, WalkProgressRecord, unix_milliseconds};
 use tokio::time::{MissedTickBehavior, interval};
 use wire::WalkId;
-use wire::messages::Progress;
+use wire::messages::WalkProgress;
 
 /// Interval between writes.
 const WRITE_INTERVAL: Duration = Duration::from_secs(3);
@@ -33,7 +33,7 @@ pub struct Throughput {
 
 #[derive(Debug, Default)]
 struct WalkThroughput {
-    pace: WalkProgress,
+    pace: WalkProgressRecord,
     speed: Speed,
     /// Steps in this run, including repeated ones.
     steps: u64,
@@ -99,7 +99,7 @@ impl Throughput {
         }
     }
 
-    fn update(&mut self, walk: WalkId, progress: &Progress, now: i64) {
+    fn update(&mut self, walk: WalkId, progress: &WalkProgress, now: i64) {
         let known = self.walks.contains_key(&walk.0);
         let entry = self.walks.entry(walk.0).or_default();
         // The steps of earlier runs do not count, and neither does a rollback to a checkpoint.
@@ -109,7 +109,7 @@ impl Throughput {
             self.steps += made;
         }
         entry.speed.update(entry.steps, now);
-        entry.pace = WalkProgress {
+        entry.pace = WalkProgressRecord {
             walk: walk.0,
             seen: now,
             segment: progress.segment,
@@ -124,7 +124,7 @@ impl Throughput {
     }
 
     /// The changed walks, and the throughput of all.
-    fn take_changes(&mut self, now: i64) -> (Vec<WalkProgress>, TotalThroughput) {
+    fn take_changes(&mut self, now: i64) -> (Vec<WalkProgressRecord>, TotalThroughput) {
         self.all.update(self.steps, now);
         self.busy.update(None, now);
         let changed = std::mem::take(&mut self.changed);
@@ -149,8 +149,8 @@ pub async fn record(store: &Store, throughput: &Mutex<Throughput>) -> Infallible
 mod tests {
     use super::*;
 
-    fn at(segment: u32, step: u64) -> Progress {
-        Progress { segment, step, temperature: 300.0, ..Progress::default() }
+    fn at(segment: u32, step: u64) -> WalkProgress {
+        WalkProgress { segment, step, temperature: 300.0, ..WalkProgress::default() }
     }
 
     #[test]

@@ -8,7 +8,7 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use monitor::Snapshot;
-use store::{Status, Store, unix_milliseconds};
+use store::{CampaignStatus, Store, unix_milliseconds};
 
 use super::exposition::{CONTENT_TYPE, MetricsText};
 
@@ -69,7 +69,7 @@ pub fn text(snapshot: &Snapshot) -> String {
     text.into_string()
 }
 
-fn candidates(text: &mut MetricsText, status: &Status) {
+fn candidates(text: &mut MetricsText, status: &CampaignStatus) {
     let candidates = &status.candidates;
     let declined = &candidates.declined;
     let fates = [
@@ -96,7 +96,7 @@ fn candidates(text: &mut MetricsText, status: &Status) {
     text.gauge("calmwalk_mixture_version", "Version of the mixture in force.", &[(&[], version)]);
 }
 
-fn walks(text: &mut MetricsText, status: &Status) {
+fn walks(text: &mut MetricsText, status: &CampaignStatus) {
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
     status.walks.iter().for_each(|walk| *states.entry(&walk.state).or_default() += 1);
     let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
@@ -123,7 +123,7 @@ fn walks(text: &mut MetricsText, status: &Status) {
     }
 }
 
-fn label_queue(text: &mut MetricsText, status: &Status) {
+fn label_queue(text: &mut MetricsText, status: &CampaignStatus) {
     let labels = &status.labels;
     let states = [
         ("queued", labels.queued),
@@ -159,7 +159,7 @@ fn label_queue(text: &mut MetricsText, status: &Status) {
     text.counter("calmwalk_under_way_seconds_total", "Running time of the campaign.", &[(&[], seconds)]);
 }
 
-fn processes(text: &mut MetricsText, status: &Status) {
+fn processes(text: &mut MetricsText, status: &CampaignStatus) {
     let mut kinds: BTreeMap<(&str, &str), u64> = BTreeMap::new();
     for process in &status.processes {
         // Other states contain free text.

@@ -9,8 +9,8 @@
 
 use crc32fast::Hasher;
 
-use crate::database::row::Row;
-use crate::database::value::{Kind, Value, replace_nul};
+use crate::database::row::SqlRow;
+use crate::database::value::{ColumnType, SqlValue, replace_nul};
 use crate::error::{Result, StoreError};
 
 /// Stands for the missing checksums of tables of an earlier version that are opened read-only.
@@ -21,17 +21,17 @@ pub struct CheckedTable {
     /// Its name.
     pub name: &'static str,
     /// The column that names a row in messages.
-    key: Column,
+    key: RowColumn,
     /// The columns covered by the checksum, in its order.
-    columns: &'static [Column],
-    checksum: Column,
+    columns: &'static [RowColumn],
+    checksum: RowColumn,
 }
 
 /// A column, with its name in joins (`table__column`, see [`joined`]) and its type.
-struct Column {
+struct RowColumn {
     name: &'static str,
     joined: &'static str,
-    kind: Kind,
+    kind: ColumnType,
 }
 
 /// The naming of the columns of a row.
@@ -53,10 +53,10 @@ macro_rules! checked {
         }
     };
     (@ $table:literal, $column:ident, $kind:ident) => {
-        Column {
+        RowColumn {
             name: stringify!($column),
             joined: concat!($table, "__", stringify!($column)),
-            kind: Kind::$kind,
+            kind: ColumnType::$kind,
         }
     };
 }
@@ -101,9 +101,9 @@ pub static COMPONENT: CheckedTable =
 
 /// Walks, without their checkpoints (see [`CHECKPOINT`]).
 pub static WALK: CheckedTable = checked!("walk" by walk Integer {
-    walk: Integer, origin: Text, partner: Integer, seed_structure: Integer, state: Text, reason: Text, turn: Integer,
-    accepted: Integer, step: Integer, segment: Integer, tau: Real, temperature: Real, relative_volume: Real,
-    gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
+    walk: Integer, origin: Text, partner: Integer, seed_structure: Integer, state: Text, reason: Text,
+    assignments: Integer, accepted: Integer, step: Integer, segment: Integer, tau: Real, temperature: Real,
+    relative_volume: Real, gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
 });
 
 /// Conditions of walks, which have never been without checksums.
@@ -204,12 +204,13 @@ macro_rules! joined {
         import.checksum AS import__checksum"
     };
     (walk) => {
-        "walk.walk AS walk__walk, walk.origin AS walk__origin, walk.partner AS walk__partner, walk.seed_structure AS
-        walk__seed_structure, walk.state AS walk__state, walk.reason AS walk__reason, walk.turn AS walk__turn, walk.accepted
-        AS walk__accepted, walk.step AS walk__step, walk.segment AS walk__segment, walk.tau AS walk__tau, walk.temperature AS
-        walk__temperature, walk.relative_volume AS walk__relative_volume, walk.gamma_max AS walk__gamma_max, walk.refused AS
-        walk__refused, walk.returns AS walk__returns, walk.selector_state AS walk__selector_state, walk.checksum AS
-        walk__checksum"
+        "walk.walk AS walk__walk, walk.origin AS walk__origin, walk.partner AS walk__partner,
+        walk.seed_structure AS walk__seed_structure, walk.state AS walk__state, walk.reason AS walk__reason,
+        walk.assignments AS walk__assignments, walk.accepted AS walk__accepted, walk.step AS walk__step,
+        walk.segment AS walk__segment, walk.tau AS walk__tau, walk.temperature AS walk__temperature,
+        walk.relative_volume AS walk__relative_volume, walk.gamma_max AS walk__gamma_max,
+        walk.refused AS walk__refused, walk.returns AS walk__returns, walk.selector_state AS walk__selector_state,
+        walk.checksum AS walk__checksum"
     };
     (structure) => {
         "structure.number AS structure__number, structure.hash AS structure__hash, structure.atoms AS structure__atoms,
@@ -221,14 +222,14 @@ pub(crate) use joined;
 
 impl CheckedTable {
     /// The values of a row, followed by their checksum.
-    pub fn with_checksum(&self, mut row: Vec<Value>) -> Vec<Value> {
+    pub fn with_checksum(&self, mut row: Vec<SqlValue>) -> Vec<SqlValue> {
         debug_assert_eq!(row.len(), self.columns.len(), "{}", self.name);
         row.push(checksum(&row).into());
         row
     }
 
     /// Computes the checksum of a row whose columns have these names.
-    pub fn compute(&self, row: &Row, names: Names) -> Result<i64> {
+    pub fn compute(&self, row: &SqlRow, names: Names) -> Result<i64> {
         let values = self.columns.iter().map(|column| column.kind.read(row, column.called(names)));
         Ok(checksum(&values.collect::<Result<Vec<_>>>()?))
     }
@@ -237,7 +238,7 @@ impl CheckedTable {
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if the row differs from what was written.
-    pub fn verify(&self, row: &Row, names: Names) -> Result<()> {
+    pub fn verify(&self, row: &SqlRow, names: Names) -> Result<()> {
         let found: Option<i64> = row.get(self.checksum.called(names))?;
         if found == Some(UNKNOWN) {
             return Ok(());
@@ -249,7 +250,7 @@ impl CheckedTable {
     }
 }
 
-impl Column {
+impl RowColumn {
     fn called(&self, names: Names) -> &'static str {
         match names {
             Names::Plain => self.name,
@@ -262,13 +263,13 @@ impl CheckedColumn {
     /// Checksum of the column in the row with this number.
     pub fn checksum(number: i64, bytes: Option<&[u8]>) -> i64 {
         let mut hasher = Hasher::new();
-        add(&mut hasher, &Value::Integer(Some(number)));
+        add(&mut hasher, &SqlValue::Integer(Some(number)));
         add_bytes(&mut hasher, bytes);
         hasher.finalize().into()
     }
 
     /// Computes the checksum of the column in a row.
-    pub fn compute(&self, row: &Row) -> Result<i64> {
+    pub fn compute(&self, row: &SqlRow) -> Result<i64> {
         let (number, bytes): (i64, Option<Vec<u8>>) = (row.get(self.key)?, row.get(self.name)?);
         Ok(Self::checksum(number, bytes.as_deref()))
     }
@@ -277,7 +278,7 @@ impl CheckedColumn {
     ///
     /// # Errors
     /// [`StoreError::Damaged`] if the bytes differ from what was written.
-    pub fn verify(&self, row: &Row) -> Result<()> {
+    pub fn verify(&self, row: &SqlRow) -> Result<()> {
         let found: Option<i64> = row.get(self.checksum)?;
         if found == Some(UNKNOWN) {
             return Ok(());
@@ -300,29 +301,29 @@ fn compare(found: Option<i64>, computed: i64, what: impl FnOnce() -> String) -> 
 }
 
 /// The checksum of values, in the form in which the store keeps it.
-pub fn checksum(values: &[Value]) -> i64 {
+pub fn checksum(values: &[SqlValue]) -> i64 {
     let mut hasher = Hasher::new();
     values.iter().for_each(|value| add(&mut hasher, value));
     hasher.finalize().into()
 }
 
 /// Databases drop the sign of zero and NUL bytes in text.
-fn add(hasher: &mut Hasher, value: &Value) {
+fn add(hasher: &mut Hasher, value: &SqlValue) {
     let number = |hasher: &mut Hasher, kind: u8, bits: Option<[u8; 8]>| {
         hasher.update(&[kind, u8::from(bits.is_some())]);
         hasher.update(&bits.unwrap_or_default());
     };
     match value {
-        Value::Integer(value) => number(hasher, b'i', value.map(i64::to_le_bytes)),
-        Value::Real(value) => {
+        SqlValue::Integer(value) => number(hasher, b'i', value.map(i64::to_le_bytes)),
+        SqlValue::Real(value) => {
             let value = value.filter(|x| !x.is_nan()).map(|x| if x == 0.0 { 0.0 } else { x });
             number(hasher, b'r', value.map(f64::to_le_bytes));
         }
-        Value::Text(Some(text)) if text.contains('\0') => {
+        SqlValue::Text(Some(text)) if text.contains('\0') => {
             add_bytes(hasher, Some(replace_nul(text.clone()).as_bytes()));
         }
-        Value::Text(text) => add_bytes(hasher, text.as_ref().map(String::as_bytes)),
-        Value::Bytes(bytes) => add_bytes(hasher, bytes.as_deref()),
+        SqlValue::Text(text) => add_bytes(hasher, text.as_ref().map(String::as_bytes)),
+        SqlValue::Bytes(bytes) => add_bytes(hasher, bytes.as_deref()),
     }
 }
 
@@ -333,10 +334,10 @@ fn add_bytes(hasher: &mut Hasher, bytes: Option<&[u8]>) {
     hasher.update(bytes);
 }
 
-fn show(value: &Value) -> String {
+fn show(value: &SqlValue) -> String {
     match value {
-        Value::Integer(value) => value.map_or_else(|| "?".into(), |value| value.to_string()),
-        Value::Text(value) => value.clone().unwrap_or_else(|| "?".into()),
+        SqlValue::Integer(value) => value.map_or_else(|| "?".into(), |value| value.to_string()),
+        SqlValue::Text(value) => value.clone().unwrap_or_else(|| "?".into()),
         _ => "?".into(),
     }
 }
@@ -348,20 +349,20 @@ mod tests {
     /// What databases drop must not change the checksum; everything else must.
     #[test]
     fn values_that_read_back_equal_have_equal_checksums() {
-        let of = |value: Value| checksum(&[value]);
+        let of = |value: SqlValue| checksum(&[value]);
         assert_eq!(of(0.0.into()), of((-0.0).into()));
-        assert_eq!(of(f64::NAN.into()), of(Value::Real(None)));
+        assert_eq!(of(f64::NAN.into()), of(SqlValue::Real(None)));
         assert_eq!(of("a\0b".into()), of("a\u{fffd}b".into()));
-        let values: [Value; 10] = [
+        let values: [SqlValue; 10] = [
             0_i64.into(),
             1_i64.into(),
             0.0.into(),
             1.0.into(),
             "".into(),
             "a".into(),
-            Value::Integer(None),
-            Value::Real(None),
-            Value::Text(None),
+            SqlValue::Integer(None),
+            SqlValue::Real(None),
+            SqlValue::Text(None),
             "ab".into(),
         ];
         for (k, value) in values.iter().enumerate() {

@@ -4,7 +4,7 @@ use atoms::{Cell, Matrix3, Species, Structure, Vec3};
 use wire::ContentHash;
 
 use crate::checksum::{Names, STRUCTURE};
-use crate::database::Row;
+use crate::database::SqlRow;
 use crate::error::{Result, StoreError};
 
 /// Size of periodicity and lattice vectors.
@@ -29,7 +29,7 @@ pub fn decode_structure(bytes: &[u8], hash: &[u8]) -> Result<Structure> {
 }
 
 /// Reads the structure of a row that selects `joined!(structure)`, and checks its checksum and hash.
-pub fn read_structure(row: &Row) -> Result<Structure> {
+pub fn read_structure(row: &SqlRow) -> Result<Structure> {
     STRUCTURE.verify(row, Names::Joined)?;
     let (data, hash): (Vec<u8>, Vec<u8>) = (row.get("structure__data")?, row.get("structure__hash")?);
     decode_structure(&data, &hash)

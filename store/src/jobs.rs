@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use crate::database::{FromRow, Row, from_columns};
+use crate::database::{FromRow, SqlRow, from_columns};
 use crate::error::Result;
 use crate::exclude::Exclusion;
 use crate::records::{JobState, Label};
@@ -72,7 +72,7 @@ pub struct PastCalculation {
 
 /// The packed work directory of a calculation.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Archive {
+pub struct CalculationArchive {
     /// Attempt number.
     pub attempt: u32,
     /// A tar file, compressed with zstd.
@@ -103,7 +103,7 @@ pub struct QueuedImports {
 
 /// An entry of the queue.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Job {
+pub struct QueueEntry {
     /// Id of the job.
     pub job: i64,
     /// Name of the candidate, or `import-N`.
@@ -194,7 +194,7 @@ pub struct CalculationRecord {
 }
 
 impl FromRow for Attempt {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         Ok(Self {
             attempt: row.get("attempt")?,
             holder: row.get("holder")?,
@@ -222,7 +222,7 @@ impl FromRow for Attempt {
 pub struct JobDetails {
     /// The job.
     #[serde(flatten)]
-    pub job: Job,
+    pub job: QueueEntry,
     /// Every attempt, oldest first.
     pub attempts_made: Vec<Attempt>,
     /// Energies of its structure's labels and checks, oldest first, eV.

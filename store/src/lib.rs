@@ -25,6 +25,7 @@ mod lock;
 mod lower_states;
 mod migrations;
 mod numbers;
+mod old_schema;
 mod outcomes;
 mod postgres;
 mod process_start;
@@ -53,9 +54,9 @@ pub use export::{ExportCursor, ExportFilter, ExportRow, ExportSource};
 pub use file_names::{DATABASE, LOCK};
 pub use filesystem::{check_directory, free_space, network_file_system};
 pub use jobs::{
-    Archive, Attempt, CalculationRecord, CompleteOutcome, FailOutcome, ImportCounts, Job, JobDetails,
-    LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, QueuedImports,
-    Supersession,
+    Attempt, CalculationArchive, CalculationRecord, CompleteOutcome, FailOutcome, ImportCounts, JobDetails,
+    LabelRecord, LabelSource, LabelStatus, LeaseStatus, OldestLease, PastCalculation, QueueEntry,
+    QueuedImports, Supersession,
 };
 pub use listing::{ListCursor, ListOrder, ListedCandidate};
 pub use location::{Location, ServerUrl};
@@ -73,9 +74,9 @@ pub use recent::{DecidedCandidate, RecentDecision};
 pub use records::*;
 pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 pub use report::{CollectedStructure, FateCount};
-pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
+pub use status::{CampaignStatus, Candidates, Declined, LabelJobCounts, WalkStatus};
 pub use store::Store;
-pub use walk_progress::{TotalThroughput, WalkProgress};
+pub use walk_progress::{TotalThroughput, WalkProgressRecord};
 
 /// The current time, ms since 1970.
 pub fn unix_milliseconds() -> i64 {

@@ -9,10 +9,10 @@ use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use crate::error::StoreError;
 
 /// Version, name and SQL of a migration, from its file `<version>_<name>.sql`.
-pub type Step = (i64, &'static str, &'static str);
+pub type MigrationSource = (i64, &'static str, &'static str);
 
 /// A migrator for these steps, in order.
-pub fn migrator(steps: &[Step]) -> Migrator {
+pub fn migrator(steps: &[MigrationSource]) -> Migrator {
     let migrations = steps.iter().map(|(version, name, text)| {
         Migration::new(*version, (*name).into(), MigrationType::Simple, text.into_sql_str(), false)
     });

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::database::{FromRow, Row};
+use crate::database::{FromRow, SqlRow};
 use crate::error::Result;
 use crate::process_start::{self, process_start_time};
 
@@ -14,7 +14,8 @@ const UNRESPONSIVE_AFTER: i64 = 60 * 1000;
 
 /// A process that works for the campaign.
 ///
-/// Columns that schema version 1 lacks are filled in when such a database is read.
+/// Columns that schema version 1 lacks are filled in when such a database is read, and `start_time` is read by the
+/// name that it had before version 14.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ProcessRecord {
     /// Unique name, never reused and without `/`.
@@ -48,13 +49,13 @@ pub struct ProcessRecord {
 }
 
 impl FromRow for ProcessRecord {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         Ok(Self {
             id: row.get("id")?,
             kind: row.get("kind")?,
             number: row.get_or_default("number")?,
             pid: row.get("pid")?,
-            start_time: row.get_or_default("birth")?,
+            start_time: row.get_renamed("start_time", "birth")?,
             host: row.get("host")?,
             started: row.get("started")?,
             last_seen: row.get("last_seen")?,

@@ -5,7 +5,7 @@ use std::fmt;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
-use wire::messages::{DeclineReason, Progress};
+use wire::messages::{DeclineReason, WalkProgress};
 use wire::{CampaignId, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 /// Name of the value with the grades of the training frames under the newest mixture (JSON of
@@ -18,7 +18,7 @@ pub const LEFT_OUT: &str = "left_out";
 
 /// Properties of a campaign, written when it is created.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Campaign {
+pub struct CampaignRecord {
     /// Its id.
     pub id: CampaignId,
     /// Version of the program that created it.
@@ -162,7 +162,7 @@ pub struct LoggedDecision {
 
 /// An entry of the operations log.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Operation {
+pub struct LoggedOperation {
     /// Its number.
     pub number: i64,
     /// ms since 1970.
@@ -208,16 +208,16 @@ pub struct WalkRecord {
     pub seed_structure: u32,
     /// Its conditions; those of the default in campaigns of early versions.
     pub conditions: WalkConditions,
-    /// `waiting`, `running`, or the name of its [`wire::messages::End`].
+    /// `waiting`, `running`, or the name of its [`wire::messages::WalkEnd`].
     pub state: String,
     /// Why it ended, as text; empty while it runs.
     pub reason: String,
-    /// Assignments done.
-    pub turn: u64,
+    /// Number of its assignments that were reported.
+    pub assignments: u64,
     /// Structures accepted from it.
     pub accepted: u32,
     /// Its progress.
-    pub progress: Progress,
+    pub progress: WalkProgress,
     /// The selector's own state of the walk (undelivered decision, requested steps …), JSON.
     pub selector_state: String,
     /// The walker's checkpoint; `None` before the first assignment.

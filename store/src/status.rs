@@ -5,7 +5,7 @@ use wire::WalkConditions;
 
 use crate::budget::BudgetStatus;
 use crate::checksum::{Names, WALK};
-use crate::database::{FromRow, Row};
+use crate::database::{FromRow, SqlRow};
 use crate::error::Result;
 use crate::jobs::OldestLease;
 use crate::processes::ProcessRecord;
@@ -13,11 +13,11 @@ use crate::words;
 
 /// Everything that `status` shows.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Status {
+pub struct CampaignStatus {
     /// Candidates.
     pub candidates: Candidates,
     /// The label queue.
-    pub labels: Labels,
+    pub labels: LabelJobCounts,
     /// The running label attempt that started first.
     pub oldest_lease: Option<OldestLease>,
     /// Labels made within the last hour.
@@ -76,7 +76,7 @@ pub struct Declined {
 
 /// Number of label jobs, by state.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Labels {
+pub struct LabelJobCounts {
     /// Waiting.
     pub queued: u64,
     /// In work.
@@ -149,7 +149,7 @@ impl WalkStatus {
 }
 
 impl FromRow for WalkStatus {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         WALK.verify(row, Names::Joined)?;
         Ok(Self {
             walk: row.get("walk")?,

@@ -6,7 +6,7 @@ use crate::database::Database;
 use crate::error::Result;
 use crate::location::Location;
 use crate::lock::CampaignLock;
-use crate::postgres::server::{Clock, Server};
+use crate::postgres::server::{Clock, PostgresServer};
 use crate::sqlite::file::DatabaseFile;
 
 /// The database of one campaign. Clones share its connections.
@@ -20,7 +20,7 @@ impl Store {
     pub async fn open(location: impl Into<Location>) -> Result<Self> {
         let database = match location.into() {
             Location::Directory(directory) => Database::Sqlite(DatabaseFile::open(&directory).await?),
-            Location::Server(url) => Database::Postgres(Server::open(&url, true).await?),
+            Location::Server(url) => Database::Postgres(PostgresServer::open(&url, true).await?),
         };
         Ok(Self { database })
     }
@@ -32,7 +32,7 @@ impl Store {
             Location::Directory(directory) => {
                 Database::Sqlite(DatabaseFile::open_read_only(&directory).await?)
             }
-            Location::Server(url) => Database::Postgres(Server::open(&url, false).await?),
+            Location::Server(url) => Database::Postgres(PostgresServer::open(&url, false).await?),
         };
         Ok(Self { database })
     }

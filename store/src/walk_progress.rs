@@ -6,7 +6,7 @@ use crate::database::from_columns;
 
 /// The last reported progress of a walk.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct WalkProgress {
+pub struct WalkProgressRecord {
     /// Its number.
     pub walk: u32,
     /// When its walker last reported, ms since 1970.
@@ -36,7 +36,7 @@ pub struct TotalThroughput {
     pub walkers_busy: Option<f64>,
 }
 
-from_columns!(WalkProgress {
+from_columns!(WalkProgressRecord {
     walk,
     seen,
     segment,

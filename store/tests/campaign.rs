@@ -3,7 +3,7 @@
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
 };
-use wire::messages::{DeclineReason, Progress};
+use wire::messages::{DeclineReason, WalkProgress};
 use wire::{Origin, WalkConditions, WalkId};
 
 use crate::common::*;
@@ -213,14 +213,14 @@ async fn status_counts_everything_once() {
 async fn unknown_values_of_a_walk_are_not_zero() {
     let home = Home::new();
     let store = home.create().await;
-    let progress = |tau, gamma_max| Progress {
+    let progress = |tau, gamma_max| WalkProgress {
         tau,
         gamma_max,
         temperature: 300.0,
         relative_volume: 1.1,
-        ..Progress::default()
+        ..WalkProgress::default()
     };
-    let walks = [progress(0.5, 1.2), progress(0.0, 0.0), Progress::default()];
+    let walks = [progress(0.5, 1.2), progress(0.0, 0.0), WalkProgress::default()];
     let walks = (0..).zip(walks).map(|(number, progress)| WalkRecord { progress, ..walk(number, 1) });
     store.commit(&Commit { walks: walks.collect(), ..Commit::default() }).await.unwrap();
     let known = |walk: store::WalkStatus| (walk.tau, walk.temperature, walk.relative_volume, walk.gamma_max);
@@ -255,7 +255,8 @@ async fn walks_can_be_paused_and_resumed_at_any_time() {
 
     let reader = home.open_read_only().await;
     assert_eq!(reader.paused_walks().await.unwrap(), [WalkId(1)].into());
-    let paused = |status: store::Status| status.walks.iter().map(|walk| walk.paused).collect::<Vec<_>>();
+    let paused =
+        |status: store::CampaignStatus| status.walks.iter().map(|walk| walk.paused).collect::<Vec<_>>();
     assert_eq!(paused(reader.status().await.unwrap()), [false, true, false]);
     assert!(reader.walk(WalkId(1)).await.unwrap().unwrap().0.paused);
     assert!(matches!(reader.pause_walks(&[WalkId(1)], false, 5).await, Err(StoreError::ReadOnly)));

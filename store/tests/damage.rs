@@ -54,7 +54,7 @@ const COLUMNS: [(&str, &[&str]); 12] = [
     (
         "walk",
         &[
-            "turn",
+            "assignments",
             "accepted",
             "step",
             "segment",
@@ -346,11 +346,12 @@ async fn a_database_of_an_earlier_version_gets_checksums() {
     assert_eq!((exported(directory.path()).await.unwrap(), missing), (expected, 0));
 }
 
-/// Turns it into a database of version 8 by removing what later versions add.
+/// Turns it into a database of version 8 by undoing what later versions add and rename.
 async fn without_checksums(directory: &Path) {
     let mut connection = connect(directory).await;
     let mut sql = "DROP TABLE walk_conditions; DROP TRIGGER label_has_checksum; DROP INDEX label_excluded;
         DROP INDEX label_other;
+        ALTER TABLE process RENAME COLUMN start_time TO birth; ALTER TABLE walk RENAME COLUMN assignments TO turn;
         ALTER TABLE label DROP COLUMN excluded; ALTER TABLE label DROP COLUMN exclusion; "
         .to_owned();
     for table in [

@@ -6,7 +6,7 @@ use std::path::Path;
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
-use store::{DATABASE, JobState, ProcessRecord, Store};
+use store::{Commit, DATABASE, JobState, ProcessRecord, Store, WalkRecord};
 
 use crate::common::*;
 
@@ -62,7 +62,8 @@ async fn version_1(directory: &Path) -> String {
         if columns.is_empty() {
             continue;
         }
-        let columns = columns.join(", ");
+        let renamed = |name: &String| if name == "turn" { "assignments".to_owned() } else { name.clone() };
+        let columns = columns.iter().map(renamed).collect::<Vec<_>>().join(", ");
         let copy = format!("INSERT INTO main.{table} SELECT {columns} FROM other.{table}");
         sqlx::query(AssertSqlSafe(copy)).execute(&mut connection).await.unwrap();
     }
@@ -110,7 +111,7 @@ async fn a_campaign_of_version_1_continues() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 13);
+    assert_eq!(version(directory.path()).await, 15);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
@@ -126,6 +127,33 @@ async fn a_campaign_of_version_1_continues() {
     assert!(!found.iter().any(|finding| finding.what.contains("counted")), "{found:?}");
     store.close().await;
     Store::open(directory.path()).await.unwrap();
+}
+
+#[tokio::test]
+async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let walks = vec![WalkRecord { accepted: 0, ..walk(0, 3) }, WalkRecord { accepted: 0, ..walk(1, 0) }];
+    store.commit(&Commit { walks: walks.clone(), ..Commit::default() }).await.unwrap();
+    let process = ProcessRecord { start_time: "another-boot/1/1".into(), ..old_process() };
+    store.upsert_process(&process).await.unwrap();
+    store.close().await;
+    let mut connection = connect(&directory.path().join(DATABASE)).await;
+    let sql = "ALTER TABLE process RENAME COLUMN start_time TO birth;
+        ALTER TABLE walk RENAME COLUMN assignments TO turn; PRAGMA user_version = 13;
+        DELETE FROM _sqlx_migrations WHERE version > 13;";
+    sqlx::raw_sql(sql).execute(&mut connection).await.unwrap();
+    connection.close().await.unwrap();
+    for (writes, expected) in [(false, 13), (true, 15)] {
+        let path = directory.path();
+        let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
+        assert_eq!(store.load_walks().await.unwrap(), walks);
+        assert_eq!(store.processes(None).await.unwrap(), [process.clone()]);
+        assert_eq!(store.status().await.unwrap().walks.len(), 2);
+        assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+        store.close().await;
+        assert_eq!(version(path).await, expected);
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

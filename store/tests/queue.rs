@@ -3,9 +3,9 @@
 use std::collections::BTreeSet;
 
 use store::{
-    Archive, CalculationRecord, CompleteOutcome, ExportCursor, ExportFilter, ExportSource, FailOutcome, Fate,
-    ImportCounts, JobState, Label, LabelDetails, LabelSource, LabelStatus, Lease, LeaseStatus, QueuedImports,
-    Store, StoreError,
+    CalculationArchive, CalculationRecord, CompleteOutcome, ExportCursor, ExportFilter, ExportSource,
+    FailOutcome, Fate, ImportCounts, JobState, Label, LabelDetails, LabelSource, LabelStatus, Lease,
+    LeaseStatus, QueuedImports, Store, StoreError,
 };
 use wire::{ContentHash, Origin};
 
@@ -525,8 +525,11 @@ async fn archives_are_stored_with_their_attempts() {
     }
     store.fail(&lease, "crashed", "", 1, 5).await.unwrap();
     assert_eq!((past().await.wanted, past().await.failed), (false, true));
-    let archive =
-        Archive { attempt: 1, bytes: b"second".to_vec(), left_out: "work/large (5 bytes)\n".into() };
+    let archive = CalculationArchive {
+        attempt: 1,
+        bytes: b"second".to_vec(),
+        left_out: "work/large (5 bytes)\n".into(),
+    };
     assert_eq!(store.archives(lease.job).await.unwrap(), std::slice::from_ref(&archive));
     assert_eq!(store.past_calculation(lease.job, 2).await.unwrap(), None);
     // A copy keeps the limits and their use.

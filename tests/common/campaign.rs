@@ -150,7 +150,7 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
         Outcome {
             decisions: store.decision_log_text().await.expect("decisions"),
             components: store.load_components().await.expect("components"),
-            walks: walks.map(|walk| (walk.walk.0, walk.state, walk.turn, walk.checkpoint)).collect(),
+            walks: walks.map(|walk| (walk.walk.0, walk.state, walk.assignments, walk.checkpoint)).collect(),
             dataset: fs::read(&output).expect("the exported data set"),
         }
     })

@@ -36,16 +36,16 @@ fn main() {
 fn report(name: &str, folder: &Path, edge: f64, steps: u64) {
     let model = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
     let mixture = Arc::new(Artifact::load_export(folder.join("kokkos.npz")).expect("a CALM mixture").mixture);
-    let mut turn = TimedWalk::new(&model, &mixture, crystal(model.elements(), edge));
-    let mut call = Call::new(model, mixture, turn.structure.clone());
+    let mut timed = TimedWalk::new(&model, &mixture, crystal(model.elements(), edge));
+    let mut call = Call::new(model, mixture, timed.structure.clone());
     let (mut ratios, mut step_times, mut call_times) = (Vec::new(), Vec::new(), Vec::new());
     for round in 0..=ROUNDS {
         let (step, alone) = if round % 2 == 0 {
-            let step = turn.seconds(steps);
+            let step = timed.seconds(steps);
             (step, call.seconds(steps))
         } else {
             let alone = call.seconds(steps);
-            (turn.seconds(steps), alone)
+            (timed.seconds(steps), alone)
         };
         // The first round is a warm-up.
         if round > 0 {
@@ -54,7 +54,7 @@ fn report(name: &str, folder: &Path, edge: f64, steps: u64) {
             call_times.push(1e3 * alone);
         }
     }
-    println!("{name}, {} atoms, turns of {steps} steps", turn.structure.len());
+    println!("{name}, {} atoms, assignments of {steps} steps", timed.structure.len());
     for (what, values) in [("step, ms", step_times), ("call, ms", call_times), ("step / call", ratios)] {
         let [low, median, high] = quartiles(values);
         println!("  {what}: {median:.4} ({low:.4} to {high:.4})");

@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
 use wire::WalkId;
-use wire::messages::{Progress, Report};
+use wire::messages::{AssignmentReport, WalkProgress};
 use wire::net::{AgentClient, LinkError, Membership, Slot, SlotReport};
 use wire::transport::{Incoming, WorkItem};
 
@@ -42,7 +42,7 @@ pub enum AgentExit {
 
 /// Events of an agent, for monitoring.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum AgentEvent {
+pub enum OrchestratorEvent {
     /// The orchestrator wants its agents to stop.
     Stop,
     /// The orchestrator does not respond.
@@ -79,7 +79,7 @@ type ExchangeResult = (Slot, SlotReport, Result<Option<WorkItem>, LinkError>);
 type StopReply = (Result<Option<bool>, LinkError>, Duration);
 
 /// State of the agent's exchange with the orchestrator.
-struct AgentState {
+struct ExchangeState {
     client: Arc<AgentClient>,
     joined: Arc<Membership>,
     pool: AssignmentPool,
@@ -96,7 +96,7 @@ struct AgentState {
     heard: Instant,
     metrics: Arc<Mutex<AgentMetrics>>,
     /// The last event reported about its silence.
-    silence: Option<AgentEvent>,
+    silence: Option<OrchestratorEvent>,
     /// When progress of a walk was last sent.
     last_progress: BTreeMap<WalkId, Instant>,
 }
@@ -106,12 +106,12 @@ impl Agent {
     ///
     /// # Errors
     /// The orchestrator is unresponsive, or its program is incompatible with this one.
-    pub async fn run(mut self, mut watch: impl FnMut(AgentEvent)) -> Result<AgentExit, LinkError> {
+    pub async fn run(mut self, mut watch: impl FnMut(OrchestratorEvent)) -> Result<AgentExit, LinkError> {
         let slots = self.joined.slots();
         let client = Arc::clone(&self.client);
         let mut over = pin!(client.address().wait_until_over());
         let mut stop = pin!(self.stopping.cancelled().fuse());
-        let mut state = AgentState::new(self.client, self.joined, self.metrics);
+        let mut state = ExchangeState::new(self.client, self.joined, self.metrics);
         state.metrics().mixture_version = Some(state.joined.newest().await.version());
         state.start(slots);
         let mut ticks = interval(POLL_INTERVAL);
@@ -124,7 +124,7 @@ impl Agent {
                 },
                 Some(exchanged) = state.in_flight.next() => state.exchanged(exchanged)?,
                 joined = answer_to(&mut state.joining) => state.has_joined(joined?),
-                (told, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(told, took)? { watch(AgentEvent::Stop) },
+                (told, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(told, took)? { watch(OrchestratorEvent::Stop) },
                 _ = ticks.tick() => state.poll(self.orchestrator_timeout)?.into_iter().for_each(&mut watch),
                 () = &mut stop => {}
                 // The orchestrator no longer knew of this agent, or it would have waited.
@@ -165,7 +165,7 @@ async fn answer_to<T>(stop_query: &mut Option<BoxFuture<'static, T>>) -> T {
     }
 }
 
-impl AgentState {
+impl ExchangeState {
     fn new(client: Arc<AgentClient>, joined: Membership, metrics: Arc<Mutex<AgentMetrics>>) -> Self {
         Self {
             client,
@@ -219,7 +219,7 @@ impl AgentState {
                 None
             }
             Incoming::Idle { walker, report, reply } => {
-                if let Some(Report { walk, progress, .. }) = &report {
+                if let Some(AssignmentReport { walk, progress, .. }) = &report {
                     self.metrics().record_progress(*walk, progress);
                 }
                 self.pool.walker_idle(walker, report, reply)
@@ -293,7 +293,7 @@ impl AgentState {
 
     /// Queries whether to stop. Fails if the orchestrator has been unresponsive for longer than
     /// `orchestrator_timeout`. Returns an event if its responsiveness changed.
-    fn poll(&mut self, orchestrator_timeout: Duration) -> Result<Option<AgentEvent>, LinkError> {
+    fn poll(&mut self, orchestrator_timeout: Duration) -> Result<Option<OrchestratorEvent>, LinkError> {
         let silence = self.heard.elapsed();
         if silence > orchestrator_timeout {
             return Err(LinkError::Timeout { minutes: orchestrator_timeout.as_secs_f64() / 60.0 });
@@ -306,9 +306,13 @@ impl AgentState {
             })
         });
         let now = (silence > UNRESPONSIVE_AFTER)
-            .then(|| AgentEvent::Unresponsive { unsent: self.unsent(), idle: self.pool.idle() });
+            .then(|| OrchestratorEvent::Unresponsive { unsent: self.unsent(), idle: self.pool.idle() });
         let before = std::mem::replace(&mut self.silence, now);
-        Ok(if now.is_none() { before.map(|_| AgentEvent::Recovered) } else { now.filter(|_| now != before) })
+        Ok(if now.is_none() {
+            before.map(|_| OrchestratorEvent::Recovered)
+        } else {
+            now.filter(|_| now != before)
+        })
     }
 
     fn handle_stop_reply(
@@ -328,7 +332,7 @@ impl AgentState {
     }
 
     /// Sends the progress of a walk, once a second.
-    fn forward_progress(&mut self, walk: WalkId, progress: Progress) {
+    fn forward_progress(&mut self, walk: WalkId, progress: WalkProgress) {
         let now = Instant::now();
         if self.last_progress.get(&walk).is_some_and(|last| now.duration_since(*last) < PROGRESS_INTERVAL) {
             return;

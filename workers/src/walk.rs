@@ -14,7 +14,7 @@ use calm::{CollectionRule, Mixture};
 use md::{Dynamics, Stream};
 use potentials::Zbl;
 use potentials::grace::{Grace, GraceModel, Instructions, Threads};
-use wire::messages::{Assignment, Outcome, Progress, Report, Verdict, WalkEnd};
+use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd, WalkProgress};
 use wire::{Candidate, Origin};
 
 use crate::bias::{BiasedPotential, UngradedError};
@@ -41,31 +41,37 @@ pub fn advance(
     assignment: &Assignment,
     mixture: Arc<Mixture>,
     stopping: impl Fn() -> bool,
-    on_progress: impl Fn(Progress),
-) -> Report<Candidate> {
+    on_progress: impl Fn(WalkProgress),
+) -> AssignmentReport<Candidate> {
     let (walk, number) = (assignment.walk, assignment.number);
-    let mut running = match Walk::start_or_resume(context, assignment, mixture) {
+    let mut running = match RunningWalk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(error) => {
             let end = WalkEnd::BadStart { reason: error.to_string() };
             let checkpoint = assignment.checkpoint.clone().unwrap_or_default();
-            return Report {
+            return AssignmentReport {
                 walk,
                 assignment: number,
                 outcome: Outcome::Ended(end),
                 checkpoint,
-                progress: Progress::default(),
+                progress: WalkProgress::default(),
             };
         }
     };
     let outcome = running.run(&stopping, &on_progress).unwrap_or_else(|error| {
         Outcome::Ended(WalkEnd::BlewUp { reason: format!("at step {}: {error}", running.step()) })
     });
-    Report { walk, assignment: number, outcome, checkpoint: running.encode(), progress: running.progress() }
+    AssignmentReport {
+        walk,
+        assignment: number,
+        outcome,
+        checkpoint: running.encode(),
+        progress: running.progress(),
+    }
 }
 
 /// A walk during an assignment.
-struct Walk<'a> {
+struct RunningWalk<'a> {
     settings: &'a WalkSettings,
     assignment: &'a Assignment,
     model: &'a GraceModel,
@@ -77,7 +83,7 @@ struct Walk<'a> {
     state: WalkState,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> RunningWalk<'a> {
     fn start_or_resume(
         context: &'a WalkContext,
         assignment: &'a Assignment,
@@ -125,7 +131,7 @@ impl<'a> Walk<'a> {
     fn run(
         &mut self,
         stopping: &impl Fn() -> bool,
-        on_progress: &impl Fn(Progress),
+        on_progress: &impl Fn(WalkProgress),
     ) -> Result<Outcome<Candidate>, WalkError> {
         let last = self.settings.equilibration + self.settings.steps;
         loop {
@@ -253,8 +259,8 @@ impl<'a> Walk<'a> {
         ramp.map_or(1.0, |ramp| ramp.relative_volume(self.step()))
     }
 
-    fn progress(&self) -> Progress {
-        Progress {
+    fn progress(&self) -> WalkProgress {
+        WalkProgress {
             step: self.step(),
             segment: self.state.segment,
             tau: self.state.tau,

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use tracing::debug;
 use wire::Candidate;
-use wire::messages::{Outcome, Progress, Report, WalkEnd};
+use wire::messages::{AssignmentReport, Outcome, WalkEnd, WalkProgress};
 use wire::transport::{Transport, WorkItem};
 
 use crate::walk::{WalkContext, advance};
@@ -32,15 +32,19 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) -> WalkerExit 
         }
         // A panic is a defect of this program. It ends the walk that caused it, not the campaign.
         let started = Instant::now();
-        let turn = catch_unwind(AssertUnwindSafe(|| run_assignment(context, &work, transport)));
-        let made = turn.unwrap_or_else(|_| crash_report(&work));
+        let result = catch_unwind(AssertUnwindSafe(|| run_assignment(context, &work, transport)));
+        let made = result.unwrap_or_else(|_| crash_report(&work));
         log_outcome(&work, &made, started.elapsed());
         report = Some(made);
     }
     WalkerExit::Dismissed
 }
 
-fn run_assignment(context: &WalkContext, work: &WorkItem, transport: &impl Transport) -> Report<Candidate> {
+fn run_assignment(
+    context: &WalkContext,
+    work: &WorkItem,
+    transport: &impl Transport,
+) -> AssignmentReport<Candidate> {
     let walk = work.assignment.walk;
     let stopping = || transport.stopping();
     let last = Cell::new(Instant::now());
@@ -54,9 +58,9 @@ fn run_assignment(context: &WalkContext, work: &WorkItem, transport: &impl Trans
 }
 
 /// Logs the outcome of an assignment.
-fn log_outcome(work: &WorkItem, made: &Report<Candidate>, time: Duration) {
+fn log_outcome(work: &WorkItem, made: &AssignmentReport<Candidate>, time: Duration) {
     let (walk, assignment, seconds) = (made.walk.0, made.assignment, time.as_secs_f64());
-    let Progress { step, gamma_max, .. } = made.progress;
+    let WalkProgress { step, gamma_max, .. } = made.progress;
     let version = work.mixture.version();
     let outcome = match &made.outcome {
         Outcome::Candidate(_) => "candidate",
@@ -76,13 +80,13 @@ fn log_outcome(work: &WorkItem, made: &Report<Candidate>, time: Duration) {
     );
 }
 
-fn crash_report(work: &WorkItem) -> Report<Candidate> {
+fn crash_report(work: &WorkItem) -> AssignmentReport<Candidate> {
     let end = WalkEnd::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
-    Report {
+    AssignmentReport {
         walk: work.assignment.walk,
         assignment: work.assignment.number,
         outcome: Outcome::Ended(end),
         checkpoint: work.assignment.checkpoint.clone().unwrap_or_default(),
-        progress: Progress::default(),
+        progress: WalkProgress::default(),
     }
 }

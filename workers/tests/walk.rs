@@ -11,7 +11,7 @@ use calm::{Artifact, CollectionRule, Grades, Mixture};
 use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{Grace, GraceModel, PullBack, Threads};
 use potentials::{ZblWindow, ZblWindows};
-use wire::messages::{Assignment, Outcome, Report, Verdict, WalkEnd};
+use wire::messages::{Assignment, AssignmentReport, Outcome, Verdict, WalkEnd};
 use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
 use workers::bias::BiasedPotential;
 use workers::settings::{GuardSettings, WalkSettings};
@@ -91,7 +91,7 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
     }
 }
 
-fn run(settings: &WalkSettings, assignment: &Assignment) -> Report<Candidate> {
+fn run(settings: &WalkSettings, assignment: &Assignment) -> AssignmentReport<Candidate> {
     let context =
         WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
     advance(&context, assignment, mixture(), || false, |_| {})
@@ -103,7 +103,7 @@ fn first_of(seed: &str, conditions: WalkConditions) -> Assignment {
 }
 
 /// Runs a walk, one assignment as long as the first after the other, with every candidate accepted, until it ends.
-fn whole_walk(settings: &WalkSettings, first: Assignment) -> Vec<Report<Candidate>> {
+fn whole_walk(settings: &WalkSettings, first: Assignment) -> Vec<AssignmentReport<Candidate>> {
     let steps_per_assignment = first.last_step;
     let mut next = first;
     let mut reports = Vec::new();
@@ -250,7 +250,7 @@ fn the_interval_between_collections_holds_across_roll_backs() {
     let guard = GuardSettings { tau_factor: 0.8, max_rollbacks: 6, ..settings().guard };
     let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), gap: 120, guard, ..settings() };
     let reports = whole_walk(&settings, first_of("fcc-097", WalkConditions { tau: 2.0, ..conditions() }));
-    let candidate = |report: &Report<Candidate>| match &report.outcome {
+    let candidate = |report: &AssignmentReport<Candidate>| match &report.outcome {
         Outcome::Candidate(candidate) => Some((candidate.id.segment, candidate.id.step)),
         _ => None,
     };
@@ -347,8 +347,9 @@ fn a_control_walk_gives_the_requested_frames_and_follows_the_biased_one_until_th
         let biased = run(&quiet, &assignment(seed_structure("slab-111"), last_step));
         let mut control = Assignment { frame_steps: Vec::new(), ..control.clone() };
         control.last_step = last_step;
-        let state =
-            |report: &Report<Candidate>| (report.progress.temperature, report.progress.relative_volume);
+        let state = |report: &AssignmentReport<Candidate>| {
+            (report.progress.temperature, report.progress.relative_volume)
+        };
         state(&biased) == state(&run(&quiet, &control))
     };
     assert!(same(30));

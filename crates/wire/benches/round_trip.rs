@@ -17,8 +17,8 @@ use atoms::{Cell, Species, Structure};
 use calm::{Component, Mixture};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use wire::ipc::{ConnectInfo, IpcWalker, Server, Sizes, space_needed};
-use wire::messages::{Assignment, Outcome, Progress, Report};
+use wire::ipc::{ConnectInfo, IpcServer, IpcWalker, Sizes, space_needed};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkProgress};
 use wire::mixture::SharedMixture;
 use wire::shm_dir::ShmDir;
 use wire::transport::{Incoming, Transport, WorkItem};
@@ -100,8 +100,9 @@ fn walk(door: &ConnectInfo) {
         for trip in 0..WARM_UP + TRIPS {
             let outcome = Outcome::Candidate(candidate.clone());
             let checkpoint = vec![0; CHECKPOINT];
-            let progress = Progress::default();
-            let report = Report { walk: WalkId(0), assignment: trip as u64, outcome, checkpoint, progress };
+            let progress = WalkProgress::default();
+            let report =
+                AssignmentReport { walk: WalkId(0), assignment: trip as u64, outcome, checkpoint, progress };
             let (begin, encoding) = (Instant::now(), walker.encoding());
             let work = walker.exchange(Some(report)).expect("an assignment");
             let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);
@@ -142,7 +143,7 @@ async fn orchestrate() {
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
     let prepared = place.prepare(space_needed(&sizes)).expect("enough shared memory");
     let mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
-    let server = Server::open(&place, sizes, 1).expect("a transport");
+    let server = IpcServer::open(&place, sizes, 1).expect("a transport");
     let handle = server.handle();
     handle.expect(0, 1);
     let door = serde_json::to_string(&handle.connect_info(0, 1)).expect("plain data");

@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 use zerocopy::IntoBytes;
 
-use layout::{Counts, HEADER, Header, VERSION, length, write_checksum};
+use layout::{BlockDimensions, CandidateBlockHeader, HEADER, VERSION, length, write_checksum};
 
 pub use candidate::Candidate;
 pub use view::CandidateView;
@@ -73,7 +73,7 @@ pub enum BlockError {
 pub struct CandidateBlock {
     owner: Arc<dyn AsRef<[u8]> + Send + Sync>,
     /// Kept from validation, so that a later write of a walker to its memory cannot change the extent of an array.
-    counts: Counts,
+    counts: BlockDimensions,
 }
 
 /// Memory of this process, aligned to 8 bytes.
@@ -87,7 +87,8 @@ impl CandidateBlock {
     pub fn encode(candidate: &Candidate) -> Self {
         let mut words = vec![0_u64; candidate.encoded_len() / 8];
         candidate.encode_into(words.as_mut_bytes());
-        let counts = Counts { atoms: candidate.structure.len(), features: candidate.feature_dimension() };
+        let counts =
+            BlockDimensions { atoms: candidate.structure.len(), features: candidate.feature_dimension() };
         Self { owner: Arc::new(AlignedBytes(words)), counts }
     }
 
@@ -131,7 +132,7 @@ impl CandidateBlock {
             let value = format!("{} numbers for {atoms} atoms", features.len());
             return Err(BlockError::Field { field: "features", value });
         }
-        let counts = Counts { atoms, features: features.len() / atoms };
+        let counts = BlockDimensions { atoms, features: features.len() / atoms };
         let length = length(atoms as u64, counts.features as u64);
         let mut words = vec![0_u64; length as usize / 8];
         let bytes = words.as_mut_bytes();
@@ -139,7 +140,7 @@ impl CandidateBlock {
         let (before, tail) = bytes.split_at_mut(bytes.len() - size_of_val(features));
         before.copy_from_slice(&self.as_bytes()[..before.len()]);
         tail.copy_from_slice(features.as_bytes());
-        let header = Header { length, features: counts.features as u64, ..header.clone() };
+        let header = CandidateBlockHeader { length, features: counts.features as u64, ..header.clone() };
         bytes[..HEADER].copy_from_slice(header.as_bytes());
         write_checksum(bytes);
         Ok(Self { owner: Arc::new(AlignedBytes(words)), counts })

@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::block::CandidateBlock;
 use crate::ids::{CandidateId, Origin, WalkId};
-use crate::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
+use crate::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
 
 const MAGIC: [u8; 4] = *b"CALM";
 const VERSION: u8 = 3;
@@ -94,7 +94,7 @@ pub(crate) enum ControlError {
     UnexpectedCandidate(usize),
 }
 
-/// A [`Report`] with the candidate replaced by its id.
+/// A [`AssignmentReport`] with the candidate replaced by its id.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct EncodedReport<'a> {
     walk: WalkId,
@@ -102,7 +102,7 @@ pub(crate) struct EncodedReport<'a> {
     outcome: EncodedOutcome<'a>,
     #[serde(serialize_with = "crate::bytes::serialize")]
     checkpoint: &'a [u8],
-    progress: Cow<'a, Progress>,
+    progress: Cow<'a, WalkProgress>,
 }
 
 /// An [`Outcome`] with the candidate replaced by its id.
@@ -116,7 +116,7 @@ enum EncodedOutcome<'a> {
 
 impl<'a> EncodedReport<'a> {
     /// Encodes a report; `id` gives the id of its candidate.
-    pub(crate) fn new<C>(report: &'a Report<C>, id: impl FnOnce(&C) -> CandidateId) -> Self {
+    pub(crate) fn new<C>(report: &'a AssignmentReport<C>, id: impl FnOnce(&C) -> CandidateId) -> Self {
         let outcome = match &report.outcome {
             Outcome::Candidate(candidate) => EncodedOutcome::Candidate(id(candidate)),
             Outcome::StepsDone => EncodedOutcome::StepsDone,
@@ -128,10 +128,13 @@ impl<'a> EncodedReport<'a> {
     }
 
     /// The report with its candidate, which arrived separately.
-    pub(crate) fn attach_candidate(self, candidate: Option<CandidateBlock>) -> Result<Report, ControlError> {
+    pub(crate) fn attach_candidate(
+        self,
+        candidate: Option<CandidateBlock>,
+    ) -> Result<AssignmentReport, ControlError> {
         let Self { walk, assignment, outcome, checkpoint, progress } = self;
         let outcome = checked_outcome(walk, outcome, candidate)?;
-        Ok(Report {
+        Ok(AssignmentReport {
             walk,
             assignment,
             outcome,

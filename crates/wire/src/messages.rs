@@ -1,6 +1,6 @@
 //! Control messages. Walkers are stateless between messages: an [`Assignment`] is all a walker needs to continue a
-//! walk, and a [`Report`] is the complete result. The same checkpoint gives the same report on any walker, any number
-//! of times, which makes a campaign crash-only.
+//! walk, and an [`AssignmentReport`] is the complete result. The same checkpoint gives the same report on any walker,
+//! any number of times, which makes a campaign crash-only.
 
 use atoms::Structure;
 use serde::{Deserialize, Serialize};
@@ -142,7 +142,7 @@ impl WalkEnd {
 
 /// The result of an assignment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Report<C = CandidateBlock> {
+pub struct AssignmentReport<C = CandidateBlock> {
     /// The walk.
     pub walk: WalkId,
     /// Number of the assignment that this report answers.
@@ -152,12 +152,12 @@ pub struct Report<C = CandidateBlock> {
     /// The walker's checkpoint of the walk, from which the next assignment continues.
     pub checkpoint: Vec<u8>,
     /// Current state of the walk.
-    pub progress: Progress,
+    pub progress: WalkProgress,
 }
 
-impl<C> Report<C> {
+impl<C> AssignmentReport<C> {
     /// Converts the candidate of the report.
-    pub fn map_candidate<D>(self, form: impl FnOnce(C) -> D) -> Report<D> {
+    pub fn map_candidate<D>(self, form: impl FnOnce(C) -> D) -> AssignmentReport<D> {
         let outcome = match self.outcome {
             Outcome::Candidate(candidate) => Outcome::Candidate(form(candidate)),
             Outcome::StepsDone => Outcome::StepsDone,
@@ -165,13 +165,13 @@ impl<C> Report<C> {
             Outcome::Ended(end) => Outcome::Ended(end),
         };
         let Self { walk, assignment, checkpoint, progress, .. } = self;
-        Report { walk, assignment, outcome, checkpoint, progress }
+        AssignmentReport { walk, assignment, outcome, checkpoint, progress }
     }
 }
 
 /// Current state of a walk. Walkers also send it while they work, for display.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Progress {
+pub struct WalkProgress {
     /// Step, including equilibration.
     pub step: u64,
     /// Segment.

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::block::{Candidate, CandidateBlock};
 use crate::ids::WalkId;
-use crate::messages::{Assignment, Progress, Report};
+use crate::messages::{Assignment, AssignmentReport, WalkProgress};
 
 /// An assignment with its mixture.
 #[derive(Clone, Debug)]
@@ -25,10 +25,10 @@ pub struct WorkItem {
 pub trait Transport: Send {
     /// Delivers the last report (`None` at first) and waits for the next assignment. Returns `None` when there is no
     /// more work or the orchestrator is gone. The report is committed only if this returns `Some`.
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem>;
+    fn exchange(&mut self, report: Option<AssignmentReport<Candidate>>) -> Option<WorkItem>;
 
     /// Sends the current state of a walk, for display. May be lost.
-    fn progress(&self, walk: WalkId, progress: Progress);
+    fn progress(&self, walk: WalkId, progress: WalkProgress);
 
     /// Whether the walker was asked to stop after the current step.
     fn stopping(&self) -> bool;
@@ -42,12 +42,12 @@ pub enum Incoming {
         /// Number of the walker.
         walker: u32,
         /// Report on its last assignment.
-        report: Option<Report>,
+        report: Option<AssignmentReport>,
         /// Receives the next assignment; `None` shuts the walker down.
         reply: oneshot::Sender<Option<WorkItem>>,
     },
     /// Current state of a walk.
-    Progress(WalkId, Progress),
+    Progress(WalkId, WalkProgress),
     /// A walker has exited, with or without an assignment.
     Lost {
         /// Number of the walker.
@@ -74,7 +74,7 @@ impl InProcess {
 }
 
 impl Transport for InProcess {
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem> {
+    fn exchange(&mut self, report: Option<AssignmentReport<Candidate>>) -> Option<WorkItem> {
         let report =
             report.map(|report| report.map_candidate(|candidate| CandidateBlock::encode(&candidate)));
         let (reply, answer) = oneshot::channel();
@@ -83,7 +83,7 @@ impl Transport for InProcess {
         answer.blocking_recv().ok().flatten()
     }
 
-    fn progress(&self, walk: WalkId, progress: Progress) {
+    fn progress(&self, walk: WalkId, progress: WalkProgress) {
         // A full channel means that the reactor is busy. Progress may be lost.
         let _ = self.to_reactor.try_send(Incoming::Progress(walk, progress));
     }

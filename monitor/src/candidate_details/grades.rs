@@ -11,22 +11,22 @@ use wire::Origin;
 #[derive(Clone, Debug, Serialize)]
 pub struct CandidateGrades {
     /// Under the walker's mixture.
-    pub walker: Grade,
+    pub walker: GradeSummary,
     /// Under the selector's mixture before the update. For a control frame it decides nothing.
-    pub selector: Grade,
+    pub selector: GradeSummary,
     /// Under the original mixture, with which errors are compared.
-    pub original: Grade,
+    pub original: GradeSummary,
     /// Number of versions by which the selector's mixture was newer than the walker's.
     pub staleness: u64,
     /// The rule that made it a candidate. `None` for a control frame, which is collected for its step.
     pub trigger: Option<Trigger>,
     /// Every atom, in the order of the structure.
-    pub atoms: Vec<Atom>,
+    pub atoms: Vec<GradedAtom>,
 }
 
 /// The grade of a structure under one mixture.
 #[derive(Clone, Debug, Serialize)]
-pub struct Grade {
+pub struct GradeSummary {
     /// Version of the mixture; 0 is the original one.
     pub mixture_version: u64,
     /// Largest γ.
@@ -54,7 +54,7 @@ pub struct Trigger {
 
 /// Grades of one atom.
 #[derive(Clone, Debug, Serialize)]
-pub struct Atom {
+pub struct GradedAtom {
     /// Its index, from 0.
     pub atom: usize,
     /// Its element.
@@ -87,7 +87,7 @@ impl CandidateGrades {
         let trigger = rule.map(|rule| Trigger::new(rule, view.gamma, &selector.gamma));
         let threshold = trigger.as_ref().map_or(f64::INFINITY, |trigger| trigger.threshold);
         let species = view.structure().species;
-        let atoms = species.iter().enumerate().map(|(atom, species)| Atom {
+        let atoms = species.iter().enumerate().map(|(atom, species)| GradedAtom {
             atom,
             element: species.symbol(),
             triggered: view.gamma[atom] > threshold,
@@ -99,9 +99,9 @@ impl CandidateGrades {
             gamma_nbr_original: original.gamma_nbr.get(atom).copied(),
         });
         Self {
-            walker: Grade::new(view.mixture_version(), view.gamma, view.gamma_nbr),
-            selector: Grade::new(decided, &selector.gamma, &selector.gamma_nbr),
-            original: Grade::new(0, &original.gamma, &original.gamma_nbr),
+            walker: GradeSummary::new(view.mixture_version(), view.gamma, view.gamma_nbr),
+            selector: GradeSummary::new(decided, &selector.gamma, &selector.gamma_nbr),
+            original: GradeSummary::new(0, &original.gamma, &original.gamma_nbr),
             staleness: decided.saturating_sub(view.mixture_version()),
             trigger,
             atoms: atoms.collect(),
@@ -109,14 +109,14 @@ impl CandidateGrades {
     }
 
     /// The atoms that triggered, by decreasing γ under the walker's mixture.
-    pub fn triggered(&self) -> Vec<&Atom> {
+    pub fn triggered(&self) -> Vec<&GradedAtom> {
         let mut atoms: Vec<_> = self.atoms.iter().filter(|atom| atom.triggered).collect();
         atoms.sort_by(|a, b| b.gamma_walker.total_cmp(&a.gamma_walker));
         atoms
     }
 }
 
-impl Grade {
+impl GradeSummary {
     fn new(mixture_version: u64, gamma: &[f64], gamma_nbr: &[f64]) -> Self {
         let largest = |grades: &[f64]| grades.iter().copied().reduce(f64::max);
         Self {

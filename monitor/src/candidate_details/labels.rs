@@ -7,12 +7,12 @@ use atoms::Vec3;
 use atoms::cell::{norm, sub};
 use serde::Serialize;
 use store::{
-    Exclusion, JobDetails, LabelDetails, LabelRecord, LabelStatus, Operation, Store, StoreError,
+    Exclusion, JobDetails, LabelDetails, LabelRecord, LabelStatus, LoggedOperation, Store, StoreError,
     StructureLabel, Supersession,
 };
 use wire::{CandidateView, ContentHash};
 
-use crate::energy_errors::{EnergyReference, OffsetSummary};
+use crate::energy_errors::{OffsetSummary, ProtocolEnergyOffsets};
 
 /// A label job and its history.
 #[derive(Clone, Debug, Serialize)]
@@ -119,7 +119,7 @@ pub(super) async fn labels(
         let protocol = label.protocol.hash;
         let references = match references.entry(protocol.0) {
             Entry::Occupied(known) => known.into_mut(),
-            Entry::Vacant(new) => new.insert(EnergyReference::fit(store, protocol).await?),
+            Entry::Vacant(new) => new.insert(ProtocolEnergyOffsets::fit(store, protocol).await?),
         };
         let made = &label.record.label;
         let model = ForceError::new(view, made.energy, &made.forces, references);
@@ -129,7 +129,7 @@ pub(super) async fn labels(
 }
 
 impl ManualAction {
-    fn from_operation(operation: Operation) -> Self {
+    fn from_operation(operation: LoggedOperation) -> Self {
         let priority = operation.detail["priority"].as_i64();
         let reason = operation.detail["reason"].as_str().map(str::to_owned);
         Self { time: operation.time, action: operation.kind, priority, reason }
@@ -160,7 +160,12 @@ impl CandidateLabel {
 }
 
 impl ForceError {
-    fn new(view: &CandidateView<'_>, energy: f64, forces: &[Vec3], references: &EnergyReference) -> Self {
+    fn new(
+        view: &CandidateView<'_>,
+        energy: f64,
+        forces: &[Vec3],
+        references: &ProtocolEnergyOffsets,
+    ) -> Self {
         let pairs = view.forces.iter().zip(forces);
         let atoms: Vec<f64> = pairs.map(|(model, label)| norm(sub(*model, *label))).collect();
         let (atom, largest) =

@@ -18,9 +18,9 @@ use store::{CandidateRef, CoveredCandidate, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
 pub use decision::{Coverage, DecisionDetails, ELEMENTS_KEY, Update};
-pub use grades::{Atom, CandidateGrades, Trigger};
+pub use grades::{CandidateGrades, GradedAtom, Trigger};
 pub use labels::{CandidateLabel, ForceError, LabelJob};
-pub use walk::{Discovery, Distances, PairDistance};
+pub use walk::{Discovery, GuardDistances, GuardPairDistance};
 
 /// Version of the JSON form. Adding fields keeps the version; removing or changing them increments it.
 pub const FORMAT: u32 = 1;

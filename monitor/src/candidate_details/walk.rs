@@ -37,25 +37,25 @@ pub struct Discovery {
     /// The accepted candidate of that walk at the same step, if it belongs to the steps of the same segment.
     pub partner: Option<CandidateRef>,
     /// Distances that the guards check.
-    pub distances: Distances,
+    pub distances: GuardDistances,
     /// Current state of the walk, with the rejections by its guard.
     pub walk_now: Option<WalkStatus>,
 }
 
 /// Shortest distances, and the limits of the selector's guard.
 #[derive(Clone, Debug, Serialize)]
-pub struct Distances {
+pub struct GuardDistances {
     /// Å. `None` if no two atoms are within 8 Å.
     pub shortest: Option<f64>,
     /// The pair of atoms at this distance.
     pub atoms: Option<[usize; 2]>,
     /// Each pair of elements with atoms within 8 Å.
-    pub pairs: Vec<PairDistance>,
+    pub pairs: Vec<GuardPairDistance>,
 }
 
 /// The atoms of a pair of elements.
 #[derive(Clone, Debug, Serialize)]
-pub struct PairDistance {
+pub struct GuardPairDistance {
     /// The elements: `Al-O`.
     pub pair: ElementPair,
     /// Their shortest distance, Å.
@@ -93,20 +93,20 @@ impl Discovery {
             energy: view.energy(),
             control_of: control_of.map(|walk| walk.0),
             partner,
-            distances: Distances::new(&view.structure(), of_seed, rules),
+            distances: GuardDistances::new(&view.structure(), of_seed, rules),
             walk_now,
         })
     }
 }
 
-impl Distances {
+impl GuardDistances {
     fn new(structure: &Structure, seed_structure: Option<ShortestDistances>, rules: &Value) -> Self {
         let rule: Option<MinDistanceRule> =
             serde_json::from_value(rules["guard"]["min_distances"].clone()).ok();
         let limits = rule.zip(seed_structure.as_ref()).map(|(rule, seed)| rule.limits(seed));
         let limits: BTreeMap<_, _> = limits.iter().flat_map(MinDistances::iter).collect();
         let in_seed: BTreeMap<_, _> = seed_structure.iter().flat_map(ShortestDistances::iter).collect();
-        let pair = |(pair, shortest): (ElementPair, f64)| PairDistance {
+        let pair = |(pair, shortest): (ElementPair, f64)| GuardPairDistance {
             pair,
             shortest,
             seed_structure: in_seed.get(&pair).copied().filter(|d| d.is_finite()),

@@ -9,7 +9,7 @@ use serde_json::Value;
 use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Protocol, Store, StoreError};
 use wire::{ContentHash, Origin};
 
-use crate::energy_errors::{EnergyErrors, EnergyReference};
+use crate::energy_errors::{EnergyErrors, ProtocolEnergyOffsets};
 
 /// Force errors above this count as large, eV/Å, as in the paper.
 pub const LARGE_FORCE_ERROR: f64 = 1.0;
@@ -56,7 +56,7 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
         all: ErrorsByGrade::new(),
         biased: ErrorsByGrade::new(),
         control: ErrorsByGrade::new(),
-        energies: EnergyErrors::new(EnergyReference::fit(store, protocol).await?),
+        energies: EnergyErrors::new(ProtocolEnergyOffsets::fit(store, protocol).await?),
         shared: 0,
         by_gamma: Completion::new(Bins::for_grades()),
         by_expansion: Completion::new(Bins::for_volume_ratio()),

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use orchestrator::reactor::{Notice, Reactor};
-use orchestrator::selector::Settings;
+use orchestrator::selector::SelectorSettings;
 use store::Fate;
 use tokio::sync::mpsc;
 use tokio::time::{interval, sleep};
@@ -32,7 +32,7 @@ pub async fn lead(plan: Plan) {
     let model = Model::load();
     let database = *Database::all().last().expect("SQLite at least");
     let room = database.room().await;
-    let settings = Settings { declined_feature_bytes: 0, ..campaign::settings(1.5) };
+    let settings = SelectorSettings { declined_feature_bytes: 0, ..campaign::settings(1.5) };
     let mut selector = campaign::selector(&model, WALKERS, &settings);
     let store = campaign::create_store(room.location, WALKERS).await;
     store.commit(&selector.start_walks()).await.unwrap();

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use tokio::time::{Instant, sleep};
 use wire::messages::Assignment;
 use wire::mixture::SharedMixture;
-use wire::net::{Address, Agent, AgentClient, Membership, Slot, SlotReport};
+use wire::net::{Address, AgentClient, AgentInfo, Membership, Slot, SlotReport};
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash};
 
 use crate::random::Random;
@@ -71,7 +71,7 @@ pub async fn agents(plan: Plan) {
 impl Host {
     async fn join(number: usize, plan: Plan, directory: &Path) -> Self {
         let walkers = (WALKERS / AGENTS) as u32;
-        let agent = Agent {
+        let agent = AgentInfo {
             id: format!("{:032x}", Random::new(number as u64).next()),
             host: "simulated".into(),
             pid: std::process::id(),

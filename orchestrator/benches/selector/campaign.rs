@@ -9,12 +9,12 @@ use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{
-    Mode, OnForgetting, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+    CampaignMode, OnForgetting, SeedPlan, Selector, SelectorSettings, SelectorSnapshot, UpdateProtocol,
 };
-use store::{Campaign, Fate, Location, Protocol, Store};
+use store::{CampaignRecord, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
-use wire::messages::{Assignment, Outcome, Report, WalkEnd};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd};
 use wire::transport::Incoming;
 use wire::{CandidateBlock, ContentHash, WalkConditions};
 
@@ -26,10 +26,10 @@ pub const CHECKPOINT: usize = 27_000;
 const CHANNEL: usize = 64;
 
 /// The paper's rules for aluminium; structures are collected above `threshold` (in the paper, γ_max > 1.5).
-pub fn settings(threshold: f64) -> Settings {
+pub fn settings(threshold: f64) -> SelectorSettings {
     let positive = |number: f64| Positive::try_from(number).unwrap();
-    Settings {
-        mode: Mode::Live,
+    SelectorSettings {
+        mode: CampaignMode::Live,
         walks_per_round: 1,
         steps_per_assignment: 1000,
         update: UpdateProtocol::Cumulative,
@@ -52,7 +52,7 @@ pub fn settings(threshold: f64) -> Settings {
 }
 
 /// A selector at the start of the campaign, with one seed structure per walk.
-pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
+pub fn selector(model: &Model, walks: usize, settings: &SelectorSettings) -> Selector {
     let seeds = seeds(walks);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
     let training = Some(model.training.clone());
@@ -69,9 +69,9 @@ pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
 }
 
 /// The seed structures.
-pub fn seeds(walks: usize) -> Vec<SeedStructure> {
+pub fn seeds(walks: usize) -> Vec<SeedPlan> {
     (0..walks)
-        .map(|k| SeedStructure {
+        .map(|k| SeedPlan {
             name: format!("fcc-{k}"),
             structure: crystal(),
             walks: vec![WalkConditions::default()],
@@ -81,7 +81,7 @@ pub fn seeds(walks: usize) -> Vec<SeedStructure> {
 
 /// The campaign's database, with a label protocol, so that every accept queues a job.
 pub async fn create_store(location: Location, walks: usize) -> Store {
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CAMPAIGN,
         program_version: "bench".into(),
         mode: "live".into(),
@@ -104,10 +104,10 @@ pub async fn create_store(location: Location, walks: usize) -> Store {
 }
 
 /// The next candidate of a walk, or its end.
-pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Report {
+pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> AssignmentReport {
     let mut checkpoint = vec![0; CHECKPOINT];
     checkpoint[..8].copy_from_slice(&assignment.number.to_le_bytes());
-    Report {
+    AssignmentReport {
         walk: assignment.walk,
         assignment: assignment.number,
         outcome: block.map_or(Outcome::Ended(WalkEnd::Steps), Outcome::Candidate),
@@ -131,7 +131,7 @@ pub struct Run {
 /// Sends every recorded candidate from concurrent walkers through the reactor to the database.
 pub async fn run(
     model: &Model,
-    settings: &Settings,
+    settings: &SelectorSettings,
     recording: &[Vec<CandidateBlock>],
     location: Location,
 ) -> Run {

@@ -12,7 +12,7 @@ mod stages;
 use std::time::Duration;
 
 use database::Database;
-use orchestrator::selector::Settings;
+use orchestrator::selector::SelectorSettings;
 use recording::{Model, Plan};
 use stages::{Stages, plain_inserts};
 use wire::CandidateBlock;
@@ -38,7 +38,7 @@ fn main() {
     println!("mostly covered");
     runtime.block_on(measure(&model, &recording, campaign::settings(THRESHOLD)));
     println!("\nmostly covered, features of declined candidates no longer kept");
-    let settings = Settings { declined_feature_bytes: 0, ..campaign::settings(THRESHOLD) };
+    let settings = SelectorSettings { declined_feature_bytes: 0, ..campaign::settings(THRESHOLD) };
     runtime.block_on(measure(&model, &recording, settings));
     println!("\nall accepted");
     let plan = Plan { kinds: 320, of_kind: 1, ..plan };
@@ -46,7 +46,7 @@ fn main() {
 }
 
 /// Measures one setting with every database.
-async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], settings: Settings) {
+async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], settings: SelectorSettings) {
     for database in Database::all() {
         measure_with(database, model, recording, &settings).await;
     }
@@ -57,7 +57,7 @@ async fn measure_with(
     database: Database,
     model: &Model,
     recording: &[Vec<CandidateBlock>],
-    settings: &Settings,
+    settings: &SelectorSettings,
 ) {
     let room = database.room().await;
     let run = campaign::run(model, settings, recording, room.location).await;

@@ -10,7 +10,7 @@ use calm::{Artifact, CollectionRule, Mixture};
 use orchestrator::grader::Grader;
 use orchestrator::selector::TrainingFrames;
 use potentials::grace::{Grace, GraceModel, PullBack};
-use wire::messages::Progress;
+use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 use crate::random::Random;
@@ -161,8 +161,13 @@ impl Model {
 }
 
 /// State of a walk at its candidate with this number.
-pub fn progress(number: u64) -> Progress {
-    Progress { step: 20 * (number + 1), temperature: 600.0, relative_volume: 1.0, ..Progress::default() }
+pub fn progress(number: u64) -> WalkProgress {
+    WalkProgress {
+        step: 20 * (number + 1),
+        temperature: 600.0,
+        relative_volume: 1.0,
+        ..WalkProgress::default()
+    }
 }
 
 /// Face-centred cubic aluminium, 108 atoms.

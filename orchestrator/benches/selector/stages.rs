@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use calm::Mixture;
 use orchestrator::reactor::commit_batch;
-use orchestrator::selector::{Scheduling, Settings};
+use orchestrator::selector::{Scheduling, SelectorSettings};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection};
 use store::{Commit, Location};
@@ -39,7 +39,7 @@ impl Stages {
     /// writes the commits to a database in groups of this size.
     pub async fn measure(
         model: &Model,
-        settings: &Settings,
+        settings: &SelectorSettings,
         recording: &[Vec<CandidateBlock>],
         group: usize,
         location: Location,
@@ -53,7 +53,7 @@ impl Stages {
     fn decide(
         &mut self,
         model: &Model,
-        settings: &Settings,
+        settings: &SelectorSettings,
         recording: &[Vec<CandidateBlock>],
     ) -> Vec<Commit> {
         let mut selector = selector(model, recording.len(), settings);
@@ -83,7 +83,7 @@ impl Stages {
     fn parts(
         &mut self,
         model: &Model,
-        settings: &Settings,
+        settings: &SelectorSettings,
         block: &CandidateBlock,
         before: &Arc<Mixture>,
         after: &Arc<Mixture>,

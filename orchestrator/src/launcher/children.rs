@@ -11,8 +11,8 @@ use tokio::sync::mpsc;
 use super::Launch;
 use super::child_monitor::{self, ChildNews, ChildReporter};
 use super::heartbeats::Heartbeats;
-use super::process::{AdoptError, Process};
-use crate::supervisor::{Action, ChildExit, ChildStatus, ExitReason, Limits, Supervisor};
+use super::process::{AdoptError, ProcessHandle};
+use crate::supervisor::{ChildExit, ChildStatus, ExitReason, Limits, Supervisor, SupervisorAction};
 
 /// Maximum number of queued lines and exits; further writers wait.
 const MAX_QUEUED: usize = 64;
@@ -53,7 +53,7 @@ pub struct Children {
     supervisor: Supervisor,
     /// How to start the process with this number and incarnation.
     launch: Box<dyn FnMut(u32, u32) -> Launch + Send>,
-    processes: BTreeMap<u32, Process>,
+    processes: BTreeMap<u32, ProcessHandle>,
     heartbeats: Heartbeats,
     reporter: mpsc::Sender<(u32, ChildNews)>,
     news: mpsc::Receiver<(u32, ChildNews)>,
@@ -82,11 +82,11 @@ impl Children {
         }
     }
 
-    /// Adopts process `pid`, which started at `birth` ([`store::process_start_time`]), as a child that was never started. It
-    /// need not be a child of this process, but then the reason of its exit remains unknown. Must be called in a tokio
-    /// runtime.
-    pub fn adopt(&mut self, number: u32, pid: u32, birth: &str) -> Result<(), AdoptError> {
-        let process = Process::open_running(pid, birth)?;
+    /// Adopts process `pid`, which started at `start_time` ([`store::process_start_time`]), as a child that was never
+    /// started. It need not be a child of this process, but then the reason of its exit remains unknown. Must be called
+    /// in a tokio runtime.
+    pub fn adopt(&mut self, number: u32, pid: u32, start_time: &str) -> Result<(), AdoptError> {
+        let process = ProcessHandle::open_running(pid, start_time)?;
         let end = process.end().map_err(|error| AdoptError::Refused { pid, error })?;
         if !self.supervisor.adopt(number, self.heartbeats.now()) {
             return Err(AdoptError::NotAdoptable { pid, number });
@@ -173,15 +173,15 @@ impl Children {
         }
     }
 
-    fn execute(&mut self, actions: Vec<Action>) {
+    fn execute(&mut self, actions: Vec<SupervisorAction>) {
         for action in actions {
             match action {
-                Action::Start { number, incarnation } => match self.start(number, incarnation) {
+                SupervisorAction::Start { number, incarnation } => match self.start(number, incarnation) {
                     Ok(pid) => self.events.push_back(ChildEvent::Started { number, incarnation, pid }),
                     Err(error) => self.ended(number, start_failure(&error)),
                 },
-                Action::Terminate { number } => self.signal(number, Signal::TERM),
-                Action::Kill { number } => self.signal(number, Signal::KILL),
+                SupervisorAction::Terminate { number } => self.signal(number, Signal::TERM),
+                SupervisorAction::Kill { number } => self.signal(number, Signal::KILL),
             }
         }
     }
@@ -189,7 +189,7 @@ impl Children {
     fn start(&mut self, number: u32, incarnation: u32) -> io::Result<u32> {
         let (mut child, setup) = (self.launch)(number, incarnation).start()?;
         let pid = child.id().ok_or_else(|| io::Error::other("it exited before it could be monitored"))?;
-        let process = Process::from_child(pid).inspect_err(|_| {
+        let process = ProcessHandle::from_child(pid).inspect_err(|_| {
             // A process that cannot be signalled later must not live.
             let _ = child.start_kill();
         })?;

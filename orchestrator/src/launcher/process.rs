@@ -39,25 +39,25 @@ pub enum AdoptError {
 
 /// A process that is running, or was not waited for.
 #[derive(Debug)]
-pub(super) struct Process {
+pub(super) struct ProcessHandle {
     handle: OwnedFd,
 }
 
-impl Process {
+impl ProcessHandle {
     /// The handle of a child process that was not waited for.
     pub fn from_child(pid: u32) -> io::Result<Self> {
         Ok(Self { handle: open(pid)? })
     }
 
     /// The handle of the process with this id and start time ([`store::process_start_time`]).
-    pub fn open_running(pid: u32, birth: &str) -> Result<Self, AdoptError> {
+    pub fn open_running(pid: u32, start_time: &str) -> Result<Self, AdoptError> {
         let handle = open(pid).map_err(|error| match error {
             Errno::SRCH | Errno::INVAL => AdoptError::Gone { pid },
             error => AdoptError::Refused { pid, error: error.into() },
         })?;
         // Checked only now, since the handle belongs to one process whatever happens to the id.
         match store::process_start_time(pid) {
-            Some(found) if found == birth => Ok(Self { handle }),
+            Some(found) if found == start_time => Ok(Self { handle }),
             _ => Err(AdoptError::Gone { pid }),
         }
     }
@@ -80,10 +80,10 @@ impl Process {
     }
 }
 
-/// Asks the process `pid`, which started at `birth` ([`store::process_start_time`]), to exit (SIGTERM), without waiting for
-/// it. Used for a labeller of an earlier run that cannot be adopted because it uses another label protocol.
-pub fn request_exit(pid: u32, birth: &str) -> Result<(), AdoptError> {
-    let sent = Process::open_running(pid, birth)?.signal(Signal::TERM);
+/// Asks the process `pid`, which started at `start_time` ([`store::process_start_time`]), to exit (SIGTERM), without
+/// waiting for it. Used for a labeller of an earlier run that cannot be adopted because it uses another label protocol.
+pub fn request_exit(pid: u32, start_time: &str) -> Result<(), AdoptError> {
+    let sent = ProcessHandle::open_running(pid, start_time)?.signal(Signal::TERM);
     sent.map_err(|error| AdoptError::Refused { pid, error })
 }
 

@@ -11,7 +11,7 @@ use futures_util::stream::{self, Stream, StreamExt};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::{JoinHandle, JoinSet, spawn_blocking};
 use wire::WalkId;
-use wire::messages::Progress;
+use wire::messages::WalkProgress;
 use wire::transport::{Incoming, WorkItem};
 
 use crate::selector::{RegradedReport, Regrader};
@@ -32,7 +32,7 @@ pub(super) struct EventStream {
 /// Like [`Incoming`], with a report that is regraded, or being regraded.
 pub(super) enum ReactorEvent<R = RegradedReport> {
     Idle { walker: u32, report: Option<R>, reply: oneshot::Sender<Option<WorkItem>> },
-    Progress(WalkId, Progress),
+    Progress(WalkId, WalkProgress),
     Lost { walker: u32, crashed: bool },
 }
 

@@ -15,7 +15,7 @@ use super::error::SelectorError;
 use super::forgetting::Forgetting;
 use super::regrade::Regrader;
 use super::rules::{ChangeableRules, RULES};
-use super::settings::{SeedStructure, SelectorSnapshot, Settings};
+use super::settings::{SeedPlan, SelectorSettings, SelectorSnapshot};
 use super::training_frames::TrainingFrames;
 use super::walk::Walk;
 use super::walk_table::WalkTable;
@@ -26,7 +26,7 @@ const ADDITIVE: &str = "additive_updates";
 
 /// Decides on candidates and walks.
 pub(super) struct DecisionState {
-    pub settings: Settings,
+    pub settings: SelectorSettings,
     /// How close atoms may come in candidates of each seed structure.
     pub min_distances: Vec<MinDistances>,
     pub regrader: Regrader,
@@ -61,8 +61,8 @@ pub(super) struct DecisionState {
 impl DecisionState {
     /// Restores the state from a store.
     pub fn restore(
-        settings: Settings,
-        seeds: &[SeedStructure],
+        settings: SelectorSettings,
+        seeds: &[SeedPlan],
         grader: Grader,
         original: Arc<Mixture>,
         training: Option<TrainingFrames>,
@@ -148,11 +148,11 @@ impl DecisionState {
 
 /// How close atoms may come in walks from each seed structure.
 fn min_distances(
-    settings: &Settings,
-    seeds: &[SeedStructure],
+    settings: &SelectorSettings,
+    seeds: &[SeedPlan],
     grader: &Grader,
 ) -> Result<Vec<MinDistances>, SelectorError> {
-    let of = |seed: &SeedStructure| match grader.bonds(&seed.structure) {
+    let of = |seed: &SeedPlan| match grader.bonds(&seed.structure) {
         Ok(bonds) => Ok(settings.min_distances.limits(&bonds.shortest)),
         Err(source) => Err(SelectorError::SeedStructure { name: seed.name.clone(), source }),
     };

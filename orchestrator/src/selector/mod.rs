@@ -30,7 +30,7 @@ use std::sync::Arc;
 use calm::Mixture;
 use store::records::{Commit, WalkRecord};
 use wire::conditions::VariedConditions;
-use wire::messages::{Outcome, Report, WalkEnd};
+use wire::messages::{AssignmentReport, Outcome, WalkEnd};
 use wire::{CampaignId, WalkId};
 
 use crate::grader::Grader;
@@ -40,14 +40,16 @@ pub use error::SelectorError;
 pub use regrade::{RegradedCandidate, RegradedReport, Regrader};
 pub use replay::{Replay, ReplayError, ReplayedDecision};
 pub use scheduling::Scheduling;
-pub use settings::{Mode, OnForgetting, SeedStructure, SelectorSnapshot, Settings, UpdateProtocol};
+pub use settings::{
+    CampaignMode, OnForgetting, SeedPlan, SelectorSettings, SelectorSnapshot, UpdateProtocol,
+};
 pub use training_frames::TrainingFrames;
 use walk::Walk;
 
 /// The selector. See the [module](self).
 pub struct Selector {
     campaign: CampaignId,
-    seeds: Vec<SeedStructure>,
+    seeds: Vec<SeedPlan>,
     decisions: DecisionState,
     /// The walker that has each assigned walk in hand, until it reports or is lost.
     in_hand: BTreeMap<WalkId, u32>,
@@ -61,9 +63,9 @@ impl Selector {
     /// A selector that continues from the state in a store, which is empty at the start of a campaign. New seed
     /// structures get their walks by [`Selector::start_walks`].
     pub fn restore(
-        settings: Settings,
+        settings: SelectorSettings,
         campaign: CampaignId,
-        seeds: Vec<SeedStructure>,
+        seeds: Vec<SeedPlan>,
         grader: Grader,
         original: Arc<Mixture>,
         training: Option<TrainingFrames>,
@@ -138,7 +140,7 @@ impl Selector {
     /// Further reports may be taken before that, if their commits are written together with it or afterwards. Reports
     /// on an earlier assignment change nothing. A report on the current assignment counts even if it is not assigned as
     /// far as is known here: the walker was considered lost, or the orchestrator was restarted.
-    pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
+    pub fn report(&mut self, report: AssignmentReport) -> Result<Option<Commit>, SelectorError> {
         let regraded = self.decisions.regrader.regrade(report, &self.decisions.mixture);
         self.report_regraded(regraded)
     }
@@ -146,10 +148,10 @@ impl Selector {
     /// Ends a walk whose current assignment cannot be completed, as if it had been reported.
     pub fn abandon_walk(&mut self, id: WalkId, reason: String) -> Result<Option<Commit>, SelectorError> {
         let Some(walk) = self.decisions.walks.get(id) else { return Ok(None) };
-        let WalkRecord { turn: number, checkpoint, progress, .. } = walk.record.clone();
+        let WalkRecord { assignments: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
             (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::BlewUp { reason }));
-        self.report(Report { walk: id, assignment: number, outcome, checkpoint, progress })
+        self.report(AssignmentReport { walk: id, assignment: number, outcome, checkpoint, progress })
     }
 
     /// Regrades reports for [`Selector::report_regraded`], for example on other threads.
@@ -163,10 +165,10 @@ impl Selector {
         let (id, number) = (report.walk, report.assignment);
         let mode = self.decisions.settings.mode;
         let in_round = match mode {
-            Mode::Live => true,
-            Mode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
+            CampaignMode::Live => true,
+            CampaignMode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
         };
-        let is_current = |walk: &&Walk| in_round && walk.record.turn == number && !walk.has_ended();
+        let is_current = |walk: &&Walk| in_round && walk.record.assignments == number && !walk.has_ended();
         if self.decisions.walks.get(id).filter(is_current).is_none() {
             return Ok(None);
         }
@@ -177,8 +179,8 @@ impl Selector {
             return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
         }
         let reports = match mode {
-            Mode::Live => vec![report],
-            Mode::Reproducible => {
+            CampaignMode::Live => vec![report],
+            CampaignMode::Reproducible => {
                 self.in_round.insert(id, Some(report));
                 if self.in_round.values().any(Option::is_none) {
                     return Ok(None);

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use calm::Mixture;
 use store::records::AtomGrades;
 use wire::CandidateBlock;
-use wire::messages::Report;
+use wire::messages::AssignmentReport;
 
 use super::error::SelectorError;
-use crate::grader::{Bonds, Grader};
+use crate::grader::{Grader, StructureBonds};
 
 /// Grades candidates ahead of the decisions about them. Cheap to clone.
 #[derive(Clone)]
@@ -20,7 +20,7 @@ pub struct Regrader {
 /// A candidate with its grades.
 pub struct RegradedCandidate {
     pub(super) block: CandidateBlock,
-    pub(super) bonds: Bonds,
+    pub(super) bonds: StructureBonds,
     /// Grades under the original mixture.
     pub(super) original: AtomGrades,
     /// The mixture of the selector's grades.
@@ -29,12 +29,12 @@ pub struct RegradedCandidate {
 }
 
 /// A report with a regraded candidate, or the error, which is returned only if the candidate comes to a decision.
-pub type RegradedReport = Report<Result<RegradedCandidate, SelectorError>>;
+pub type RegradedReport = AssignmentReport<Result<RegradedCandidate, SelectorError>>;
 
 impl Regrader {
     /// Grades the candidate of a report, if it has one. `mixture` should be the mixture at the time of the decision;
     /// under another one, the candidate is graded again.
-    pub fn regrade(&self, report: Report, mixture: &Arc<Mixture>) -> RegradedReport {
+    pub fn regrade(&self, report: AssignmentReport, mixture: &Arc<Mixture>) -> RegradedReport {
         report.map_candidate(|block| self.regrade_block(block, mixture))
     }
 

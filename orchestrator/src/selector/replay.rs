@@ -18,7 +18,7 @@ use super::decide::{FORGETTING, LEFT_OUT};
 use super::decision_state::{DecisionState, restored_mixture};
 use super::rules::CONFIGURATION;
 use super::{
-    RegradedCandidate, Regrader, SeedStructure, SelectorError, SelectorSnapshot, Settings, TrainingFrames,
+    RegradedCandidate, Regrader, SeedPlan, SelectorError, SelectorSettings, SelectorSnapshot, TrainingFrames,
 };
 use crate::grader::Grader;
 
@@ -60,7 +60,7 @@ pub struct ReplayedDecision {
 /// A replay.
 pub struct Replay {
     decisions: DecisionState,
-    seeds: Vec<SeedStructure>,
+    seeds: Vec<SeedPlan>,
     /// Imported structures in order of import.
     imported: Vec<ContentHash>,
     /// Configuration keys that differ from the campaign's.
@@ -74,9 +74,9 @@ impl Replay {
     /// A replay before the first decision. `settings` are those at the start of the campaign, except for the keys in
     /// `set`, which the log does not change.
     pub fn new(
-        settings: Settings,
+        settings: SelectorSettings,
         set: HashSet<String>,
-        seeds: Vec<SeedStructure>,
+        seeds: Vec<SeedPlan>,
         grader: Grader,
         original: Arc<Mixture>,
         training: Option<TrainingFrames>,

@@ -6,7 +6,7 @@ use calm::rules::{Fraction, Positive};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::settings::Settings;
+use super::settings::SelectorSettings;
 
 /// Key under which the rules are committed, and kind of the decision that records a change.
 pub(super) const RULES: &str = "rules";
@@ -15,13 +15,13 @@ pub(super) const CONFIGURATION: &str = "configuration";
 /// The settings that may change and that affect decisions, by configuration key.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ChangeableRules {
-    /// See [`Settings::max_per_walk`].
+    /// See [`SelectorSettings::max_per_walk`].
     #[serde(rename = "collect.max_per_walk")]
     pub max_per_walk: u32,
-    /// See [`Settings::max_per_seed_structure`].
+    /// See [`SelectorSettings::max_per_seed_structure`].
     #[serde(rename = "collect.max_per_seed_structure")]
     pub max_per_seed_structure: Option<u32>,
-    /// See [`Settings::max_structures`]: the smallest of the configured limits.
+    /// See [`SelectorSettings::max_structures`]: the smallest of the configured limits.
     #[serde(rename = "collect.max_structures")]
     pub max_structures: Option<u32>,
     /// See [`ForgettingAlarm`].
@@ -40,7 +40,7 @@ impl ChangeableRules {
     }
 }
 
-impl Settings {
+impl SelectorSettings {
     /// The rules that may change.
     pub fn changeable_rules(&self) -> ChangeableRules {
         ChangeableRules {

@@ -3,7 +3,7 @@
 use wire::WalkId;
 use wire::messages::Assignment;
 
-use super::{Mode, Selector};
+use super::{CampaignMode, Selector};
 
 /// What an idle walker does next.
 #[derive(Debug)]
@@ -19,7 +19,7 @@ pub enum Scheduling {
 impl Selector {
     /// The next assignment for an idle walker, which has it in hand from then on.
     pub fn next_assignment(&mut self, walker: u32) -> Scheduling {
-        if self.decisions.settings.mode == Mode::Reproducible && self.in_round.is_empty() {
+        if self.decisions.settings.mode == CampaignMode::Reproducible && self.in_round.is_empty() {
             self.start_round();
         }
         match self.next_walk() {
@@ -36,11 +36,11 @@ impl Selector {
         let walks = &self.decisions.walks;
         match self.decisions.settings.mode {
             // A round has as many control walks as biased ones.
-            Mode::Reproducible => {
+            CampaignMode::Reproducible => {
                 let outstanding = self.in_round.iter().filter(|(_, report)| report.is_none());
                 outstanding.map(|(id, _)| *id).find(is_ready)
             }
-            Mode::Live => match [true, false].map(|biased| walks.unfinished(biased).find(is_ready)) {
+            CampaignMode::Live => match [true, false].map(|biased| walks.unfinished(biased).find(is_ready)) {
                 [Some(biased), Some(control)] => {
                     Some(if self.is_turn_of_controls() { control } else { biased })
                 }
@@ -101,7 +101,7 @@ impl Selector {
         Assignment {
             campaign: self.campaign,
             walk: id,
-            number: walk.record.turn,
+            number: walk.record.assignments,
             origin: walk.record.origin,
             random_walk: walk.record.partner.unwrap_or(id),
             seed_structure: self.seeds[walk.record.seed_structure as usize].structure.clone(),

@@ -10,14 +10,14 @@ use wire::{ContentHash, WalkConditions};
 /// Whether a campaign is reproducible bit by bit, or walks never wait for each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Mode {
+pub enum CampaignMode {
     /// Walks advance in rounds. Decisions do not depend on the number of walkers or on their speed.
     Reproducible,
     /// The mixture is updated as candidates arrive.
     Live,
 }
 
-impl Mode {
+impl CampaignMode {
     /// The serialized name: `"reproducible"` or `"live"`.
     pub fn name(self) -> &'static str {
         match self {
@@ -54,9 +54,9 @@ pub enum OnForgetting {
 
 /// The settings of the selector.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub struct SelectorSettings {
     /// Reproducible or live.
-    pub mode: Mode,
+    pub mode: CampaignMode,
     /// Number of biased walks that advance together in a round.
     pub walks_per_round: usize,
     /// Number of steps in an assignment.
@@ -89,7 +89,7 @@ pub struct Settings {
 
 /// The start of walks.
 #[derive(Clone, Debug)]
-pub struct SeedStructure {
+pub struct SeedPlan {
     /// Name.
     pub name: String,
     /// Structure.

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use store::records::WalkRecord;
-use wire::messages::{Progress, Report, Verdict, WalkEnd};
+use wire::messages::{AssignmentReport, Verdict, WalkEnd, WalkProgress};
 use wire::{Origin, WalkConditions, WalkId};
 
 use super::error::SelectorError;
@@ -40,9 +40,9 @@ impl Walk {
             conditions,
             state: "waiting".to_owned(),
             reason: String::new(),
-            turn: 0,
+            assignments: 0,
             accepted: 0,
-            progress: Progress::default(),
+            progress: WalkProgress::default(),
             selector_state: String::new(),
             checkpoint: None,
         };
@@ -102,7 +102,7 @@ impl Walk {
 
     /// Records where an assignment was interrupted; it continues from there. The checkpoint already accounts for the
     /// verdict with which it started.
-    pub fn interrupt<C>(&mut self, report: Report<C>) {
+    pub fn interrupt<C>(&mut self, report: AssignmentReport<C>) {
         self.record.checkpoint = Some(report.checkpoint);
         self.record.progress = report.progress;
         self.state.verdict = None;

@@ -33,7 +33,7 @@ impl WalkTable {
         } else if walk.needs_control() {
             self.without_control.insert(id);
         }
-        self.reported += walk.record.turn;
+        self.reported += walk.record.assignments;
         self.walks.insert(id, walk);
     }
 
@@ -50,7 +50,7 @@ impl WalkTable {
     pub fn count_report(&mut self, id: WalkId) -> &mut Walk {
         self.reported += 1;
         let walk = self.get_mut(id);
-        walk.record.turn += 1;
+        walk.record.assignments += 1;
         walk
     }
 
@@ -172,7 +172,7 @@ mod tests {
             Step::Accept(number) => {
                 if let Some(id) = one(table, number, |walk| !walk.has_ended() && walk.is_biased()) {
                     let walk = table.count_report(id);
-                    walk.state.accepted_steps.push(walk.record.turn);
+                    walk.state.accepted_steps.push(walk.record.assignments);
                 }
             }
             Step::End(number) => {
@@ -218,7 +218,7 @@ mod tests {
                 }
                 prop_assert_eq!(table.without_control(), every(&Walk::needs_control));
                 prop_assert_eq!(table.have_all_ended(), table.iter().all(Walk::has_ended));
-                prop_assert_eq!(table.reported(), table.iter().map(|walk| walk.record.turn).sum::<u64>());
+                prop_assert_eq!(table.reported(), table.iter().map(|walk| walk.record.assignments).sum::<u64>());
             }
         }
     }

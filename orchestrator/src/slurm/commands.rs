@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use ::slurm::{SlurmClient, SlurmError};
 
-use super::job::{Job, JobNames, Role, comment};
+use super::job::{JobNames, Role, SlurmJob, comment};
 use super::plan::Submission;
 
 /// Slurm's commands on this host.
 #[derive(Clone, Debug)]
-pub struct Slurm {
+pub struct SlurmCommands {
     commands: SlurmClient,
 }
 
@@ -32,7 +32,7 @@ pub struct JobOptions<'a> {
     pub options: &'a [String],
 }
 
-impl Slurm {
+impl SlurmCommands {
     /// With a timeout for each command.
     pub fn with_timeout(timeout: Duration) -> Self {
         Self { commands: SlurmClient::with_timeout(timeout) }
@@ -40,12 +40,12 @@ impl Slurm {
 
     /// The jobs of a campaign that belong to this user: all pending and running ones, and those that ended within the
     /// last minutes (`MinJobAge` in Slurm's configuration).
-    pub async fn jobs(&self, names: &JobNames) -> Result<Vec<Job>, SlurmError> {
-        let text = self.commands.queue(Job::FORMAT, &["--states=all"]).await?;
+    pub async fn jobs(&self, names: &JobNames) -> Result<Vec<SlurmJob>, SlurmError> {
+        let text = self.commands.queue(SlurmJob::FORMAT, &["--states=all"]).await?;
         let job = |line: &str| {
             let (found, expected) = (line.to_owned(), "what --format asks for");
             let unreadable = |()| SlurmError::UnexpectedOutput { program: "squeue", found, expected };
-            Job::parse(line, names).map_err(unreadable).transpose()
+            SlurmJob::parse(line, names).map_err(unreadable).transpose()
         };
         text.lines().filter_map(job).collect()
     }

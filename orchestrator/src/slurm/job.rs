@@ -23,7 +23,7 @@ pub struct JobNames {
 
 /// A job, as shown by `squeue`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Job {
+pub struct SlurmJob {
     /// Job id.
     pub id: u64,
     /// Role.
@@ -93,7 +93,7 @@ impl JobNames {
     }
 }
 
-impl Job {
+impl SlurmJob {
     /// Format of `squeue`'s output, one line per job.
     pub(super) const FORMAT: &str = "%i|%T|%j|%N|%S|%L|%k|%r";
 
@@ -150,11 +150,11 @@ mod tests {
     fn lines_of_squeue_are_read() {
         let names = JobNames::new("1a");
         let line = "12|RUNNING|calmwalk-1a-agent-3|node7|2026-11-21T20:15:00|1-02:00:00|walkers=16|None";
-        let job = Job::parse(line, &names).unwrap().unwrap();
+        let job = SlurmJob::parse(line, &names).unwrap().unwrap();
         assert_eq!((job.id, job.role, job.phase()), (12, Role::Agent(3), JobPhase::Running));
         assert_eq!((job.walkers, job.reason), (Some(16), None));
         let line = "13|PENDING|calmwalk-1a-orchestrator||N/A|2:00|(null)|launch failed | requeued held";
-        let job = Job::parse(line, &names).unwrap().unwrap();
+        let job = SlurmJob::parse(line, &names).unwrap().unwrap();
         assert_eq!((job.role, job.phase(), job.walkers), (Role::Orchestrator, JobPhase::Pending, None));
         assert_eq!(job.reason.as_deref(), Some("launch failed | requeued held"));
     }
@@ -163,11 +163,11 @@ mod tests {
     fn other_jobs_are_skipped_and_incomplete_lines_are_errors() {
         let names = JobNames::new("1a");
         for line in ["", "12|RUNNING|relax|node7|N/A|1:00|(null)|None", "12_[1-3]|PENDING|a|b"] {
-            assert_eq!(Job::parse(line, &names), Ok(None), "{line}");
+            assert_eq!(SlurmJob::parse(line, &names), Ok(None), "{line}");
         }
         for line in ["12|RUNNING|calmwalk-1a-agent-3|node7", "x|RUNNING|calmwalk-1a-agent-3|n|N/A|1:00||None"]
         {
-            assert_eq!(Job::parse(line, &names), Err(()), "{line}");
+            assert_eq!(SlurmJob::parse(line, &names), Err(()), "{line}");
         }
     }
 }

@@ -5,7 +5,7 @@
 //! same time, one waits for the end of the other. Slurm itself thus ensures that there is at most one orchestrator, and
 //! no more agents than requested, however often jobs are launched.
 //!
-//! A pure function, [`plan()`], decides which jobs to submit and to cancel; [`Slurm`] calls Slurm's commands.
+//! A pure function, [`plan()`], decides which jobs to submit and to cancel; [`SlurmCommands`] calls Slurm's commands.
 
 mod commands;
 mod job;
@@ -13,6 +13,6 @@ mod plan;
 mod stop;
 
 pub use ::slurm::{JobPhase, SlurmError};
-pub use commands::{JobOptions, Slurm};
-pub use job::{Job, JobNames, Role};
+pub use commands::{JobOptions, SlurmCommands};
+pub use job::{JobNames, Role, SlurmJob};
 pub use plan::{DesiredJobs, Plan, Submission, plan};

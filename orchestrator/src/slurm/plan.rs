@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 
 use ::slurm::JobPhase;
 
-use super::job::{Job, Role};
+use super::job::{Role, SlurmJob};
 
 /// The desired jobs, in addition to the orchestrator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,7 +45,7 @@ impl DesiredJobs {
     }
 
     /// Whether a job has the desired number of walkers.
-    fn fits(&self, job: &Job) -> bool {
+    fn fits(&self, job: &SlurmJob) -> bool {
         match (job.role, job.walkers) {
             // Unknown where Slurm does not keep comments.
             (Role::Agent(_), Some(walkers)) => walkers == self.walkers,
@@ -57,7 +57,7 @@ impl DesiredJobs {
 /// Decides which jobs to submit and to cancel, so that each desired job exists once.
 ///
 /// The result depends only on the arguments, so that two concurrent launches agree on which of two jobs stays.
-pub fn plan(wanted: &DesiredJobs, jobs: &[Job]) -> Plan {
+pub fn plan(wanted: &DesiredJobs, jobs: &[SlurmJob]) -> Plan {
     let mut plan = Plan::default();
     let mut living: Vec<_> = jobs.iter().filter(|job| job.phase() != JobPhase::Over).collect();
     // Running jobs before pending ones, and then the oldest first.

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use ::slurm::{JobPhase, SlurmError};
 use tokio::time::sleep;
 
-use super::commands::Slurm;
-use super::job::{Job, JobNames, Role};
+use super::commands::SlurmCommands;
+use super::job::{JobNames, Role, SlurmJob};
 
 /// Interval between checks of stopping jobs.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
@@ -14,7 +14,7 @@ const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// longer and are not waited for.
 const STOP_TIMEOUT: Duration = Duration::from_secs(90);
 
-impl Slurm {
+impl SlurmCommands {
     /// Cancels agents and labellers, waits until they have ended, and then cancels the orchestrator, except for the job
     /// of the caller. Returns the number of cancelled jobs.
     pub async fn stop(&self, names: &JobNames, own: Option<u64>) -> Result<usize, SlurmError> {
@@ -50,6 +50,6 @@ impl Slurm {
 }
 
 /// Whether it has not been asked to end, or was requeued.
-fn is_active(job: &Job) -> bool {
+fn is_active(job: &SlurmJob) -> bool {
     job.phase() != JobPhase::Completing
 }

@@ -2,7 +2,7 @@
 
 /// What to do with a process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Action {
+pub enum SupervisorAction {
     /// Start it. It counts as started from now on; if the start fails, it has exited with [`super::ExitReason::StartFailed`].
     Start {
         /// Number of the child.

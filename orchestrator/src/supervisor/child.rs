@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::action::Action;
+use super::action::SupervisorAction;
 use super::child_status::{ChildState, ChildStatus};
 use super::exit_reason::ExitReason;
 use super::limits::Limits;
@@ -101,7 +101,7 @@ impl Child {
     }
 
     /// The action that is due, which then counts as done.
-    pub fn due_action(&mut self, number: u32, limits: &Limits, now: Duration) -> Option<Action> {
+    pub fn due_action(&mut self, number: u32, limits: &Limits, now: Duration) -> Option<SupervisorAction> {
         if self.next_deadline(limits).is_none_or(|due| due > now) {
             return None;
         }
@@ -109,12 +109,12 @@ impl Child {
             ChildPhase::Waiting { .. } => {
                 self.incarnation += 1;
                 self.restarts += u32::from(self.last_failure.is_some());
-                let start = Action::Start { number, incarnation: self.incarnation };
+                let start = SupervisorAction::Start { number, incarnation: self.incarnation };
                 (ChildPhase::Running { heard: now, yet: false }, start)
             }
             ChildPhase::Running { .. } => (
                 ChildPhase::Killed { reason: KillReason::Unresponsive(limits.heartbeat_timeout) },
-                Action::Kill { number },
+                SupervisorAction::Kill { number },
             ),
             ChildPhase::Stopping { .. } if limits.detached => {
                 self.phase = ChildPhase::Exited;
@@ -122,7 +122,7 @@ impl Child {
             }
             ChildPhase::Stopping { .. } => (
                 ChildPhase::Killed { reason: KillReason::StopTimeout(limits.grace_period) },
-                Action::Kill { number },
+                SupervisorAction::Kill { number },
             ),
             ChildPhase::Killed { .. } | ChildPhase::Exited | ChildPhase::Failed => return None,
         };

@@ -18,7 +18,7 @@ mod limits;
 
 use std::time::Duration;
 
-pub use action::Action;
+pub use action::SupervisorAction;
 use child::{Child, ChildPhase};
 pub use child_status::{ChildState, ChildStatus};
 pub use exit_reason::ExitReason;
@@ -101,20 +101,20 @@ impl Supervisor {
 
     /// Stops all children: starts no more processes and asks the running ones to exit. [`Self::due_actions`] kills them
     /// after the grace period.
-    pub fn stop(&mut self, now: Duration) -> Vec<Action> {
+    pub fn stop(&mut self, now: Duration) -> Vec<SupervisorAction> {
         self.close();
         let mut actions = Vec::new();
         for (number, child) in (0..).zip(&mut self.children) {
             if let ChildPhase::Running { .. } = child.phase {
                 child.phase = ChildPhase::Stopping { since: now };
-                actions.push(Action::Terminate { number });
+                actions.push(SupervisorAction::Terminate { number });
             }
         }
         actions
     }
 
     /// The actions that are due. Call it at [`Self::next_deadline`], and after every other event.
-    pub fn due_actions(&mut self, now: Duration) -> Vec<Action> {
+    pub fn due_actions(&mut self, now: Duration) -> Vec<SupervisorAction> {
         let limits = self.limits;
         if self.was_suspended(now) {
             self.reset_heartbeats(now);

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use orchestrator::selector::{
-    Mode, OnForgetting, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, UpdateProtocol,
+    CampaignMode, OnForgetting, Scheduling, SeedPlan, Selector, SelectorSettings, SelectorSnapshot,
+    UpdateProtocol,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -19,11 +20,11 @@ use super::{CAMPAIGN, grader, mixture, seed, settings};
 /// Number of label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
 
-fn open(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
-    let seeds = (0..seeds).map(|number| SeedStructure { walks: walks_of(number), ..seed(number) }).collect();
+fn open(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
+    let seeds = (0..seeds).map(|number| SeedPlan { walks: walks_of(number), ..seed(number) }).collect();
     let selector = Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), None, snapshot);
     let mut selector = selector.unwrap();
-    if settings.mode == Mode::Live {
+    if settings.mode == CampaignMode::Live {
         selector.raise_threshold_above(QUEUE_LIMIT);
     }
     selector
@@ -94,7 +95,7 @@ pub fn scripts() -> impl Strategy<Value = Vec<Script>> {
     vec(vec(event(), 5..60), 1..6)
 }
 
-pub fn any_settings() -> impl Strategy<Value = Settings> {
+pub fn any_settings() -> impl Strategy<Value = SelectorSettings> {
     let update = prop::sample::select(vec![
         UpdateProtocol::Cumulative,
         UpdateProtocol::PerSeedStructure,
@@ -105,7 +106,7 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
     (1..5_usize, update, limits, any::<bool>(), 0..300_u64, on_forgetting).prop_map(
         |(walks, update, limits, control, declined_feature_bytes, on_forgetting)| {
             let (max_per_walk, max_per_seed_structure, total) = limits;
-            Settings {
+            SelectorSettings {
                 walks_per_round: if update == UpdateProtocol::PerSeedStructure { 1 } else { walks },
                 update,
                 max_per_walk,
@@ -114,7 +115,7 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
                 control,
                 declined_feature_bytes,
                 on_forgetting,
-                ..settings(Mode::Reproducible)
+                ..settings(CampaignMode::Reproducible)
             }
         },
     )
@@ -122,7 +123,7 @@ pub fn any_settings() -> impl Strategy<Value = Settings> {
 
 /// A running campaign: the selector, its store, and busy walkers.
 pub struct Campaign<'a> {
-    settings: &'a Settings,
+    settings: &'a SelectorSettings,
     scripts: &'a [Script],
     walkers: usize,
     pub selector: Selector,
@@ -133,7 +134,7 @@ pub struct Campaign<'a> {
 }
 
 impl<'a> Campaign<'a> {
-    pub fn begin(settings: &'a Settings, scripts: &'a [Script], walkers: usize) -> Self {
+    pub fn begin(settings: &'a SelectorSettings, scripts: &'a [Script], walkers: usize) -> Self {
         let selector = open(settings, scripts.len(), SelectorSnapshot::default());
         let (store, at_work, commits) = (MemoryStore::default(), Vec::new(), Vec::new());
         let mut campaign = Self { settings, scripts, walkers, selector, store, at_work, commits };
@@ -194,7 +195,7 @@ impl<'a> Campaign<'a> {
     }
 
     /// All processes die, and the campaign continues with other settings.
-    pub fn go_on(&mut self, settings: &'a Settings) {
+    pub fn go_on(&mut self, settings: &'a SelectorSettings) {
         self.at_work.clear();
         self.settings = settings;
         self.selector = open(self.settings, self.scripts.len(), self.store.snapshot());

@@ -13,11 +13,11 @@ use calm::{
 };
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    Mode, OnForgetting, Scheduling, SeedStructure, Selector, SelectorSnapshot, Settings, TrainingFrames,
-    UpdateProtocol,
+    CampaignMode, OnForgetting, Scheduling, SeedPlan, Selector, SelectorSettings, SelectorSnapshot,
+    TrainingFrames, UpdateProtocol,
 };
 use store::records::{AtomGrades, Commit};
-use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, WalkConditions};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
@@ -55,8 +55,8 @@ pub fn structure(number: u64, distance: f64) -> Structure {
     }
 }
 
-pub fn seed(number: usize) -> SeedStructure {
-    SeedStructure {
+pub fn seed(number: usize) -> SeedPlan {
+    SeedPlan {
         name: format!("seed-{number}"),
         structure: structure(1_000_000 + number as u64, SHORTEST),
         walks: vec![WalkConditions::default()],
@@ -71,8 +71,8 @@ pub fn positive(number: f64) -> Positive {
     number.try_into().unwrap()
 }
 
-pub fn settings(mode: Mode) -> Settings {
-    Settings {
+pub fn settings(mode: CampaignMode) -> SelectorSettings {
+    SelectorSettings {
         mode,
         walks_per_round: 2,
         steps_per_assignment: 10,
@@ -95,12 +95,12 @@ pub fn settings(mode: Mode) -> Settings {
     }
 }
 
-pub fn restore(settings: &Settings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
+pub fn restore(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
     try_restore(settings, seeds, None, snapshot).unwrap()
 }
 
 pub fn try_restore(
-    settings: &Settings,
+    settings: &SelectorSettings,
     seeds: usize,
     training: Option<TrainingFrames>,
     snapshot: SelectorSnapshot,
@@ -110,7 +110,7 @@ pub fn try_restore(
 }
 
 /// A selector at the start of a campaign, with its walks.
-pub fn begin(settings: &Settings, seeds: usize) -> Selector {
+pub fn begin(settings: &SelectorSettings, seeds: usize) -> Selector {
     let mut selector = restore(settings, seeds, SelectorSnapshot::default());
     selector.start_walks();
     selector
@@ -145,7 +145,7 @@ pub fn gamma_max(mixture: &Mixture, z: [f64; DIMENSION]) -> f64 {
 pub fn block(
     assignment: &Assignment,
     mixture: &Mixture,
-    progress: &Progress,
+    progress: &WalkProgress,
     structure: Structure,
     z: [f64; DIMENSION],
 ) -> CandidateBlock {
@@ -176,13 +176,13 @@ pub fn block(
     })
 }
 
-pub fn at(step: u64) -> Progress {
-    Progress { step, temperature: 300.0, relative_volume: 1.0, ..Progress::default() }
+pub fn at(step: u64) -> WalkProgress {
+    WalkProgress { step, temperature: 300.0, relative_volume: 1.0, ..WalkProgress::default() }
 }
 
-pub fn report(assignment: &Assignment, outcome: Outcome, progress: Progress) -> Report {
+pub fn report(assignment: &Assignment, outcome: Outcome, progress: WalkProgress) -> AssignmentReport {
     let checkpoint = format!("step {}", progress.step).into_bytes();
-    Report { walk: assignment.walk, assignment: assignment.number, outcome, checkpoint, progress }
+    AssignmentReport { walk: assignment.walk, assignment: assignment.number, outcome, checkpoint, progress }
 }
 
 /// A report with a candidate at a step: the structure with this number and these features.
@@ -192,17 +192,17 @@ pub fn offer(
     step: u64,
     structure: Structure,
     z: [f64; DIMENSION],
-) -> Report {
+) -> AssignmentReport {
     let block = block(assignment, selector.mixture(), &at(step), structure, z);
     report(assignment, Outcome::Candidate(block), at(step))
 }
 
-pub fn ended(assignment: &Assignment, step: u64, end: WalkEnd) -> Report {
+pub fn ended(assignment: &Assignment, step: u64, end: WalkEnd) -> AssignmentReport {
     report(assignment, Outcome::Ended(end), at(step))
 }
 
 /// The selector's decision on a report that completes its round.
-pub fn decided(selector: &mut Selector, report: Report) -> Commit {
+pub fn decided(selector: &mut Selector, report: AssignmentReport) -> Commit {
     selector.report(report).unwrap().expect("no other report is waited for")
 }
 

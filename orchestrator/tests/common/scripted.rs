@@ -4,7 +4,7 @@
 use calm::Mixture;
 use serde::{Deserialize, Serialize};
 use wire::Origin;
-use wire::messages::{Assignment, Outcome, Progress, Report, WalkEnd};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};
 
 use super::{DIMENSION, SHORTEST, at, block, gamma_max, structure};
 
@@ -45,7 +45,7 @@ pub fn advance(
     assignment: &Assignment,
     mixture: &Mixture,
     pause_after: Option<u64>,
-) -> Report {
+) -> AssignmentReport {
     let mut state = assignment
         .checkpoint
         .as_ref()
@@ -67,7 +67,7 @@ pub fn advance(
         }
     };
     let checkpoint = serde_json::to_vec(&state).unwrap();
-    Report {
+    AssignmentReport {
         walk: assignment.walk,
         assignment: assignment.number,
         outcome,
@@ -107,6 +107,6 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
     }
 }
 
-fn progress(state: &State) -> Progress {
-    Progress { segment: state.segment, returns: state.segment, ..at(state.step) }
+fn progress(state: &State) -> WalkProgress {
+    WalkProgress { segment: state.segment, returns: state.segment, ..at(state.step) }
 }

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use monitor::candidate_details::{Atom, CandidateGrades, Trigger};
+use monitor::candidate_details::{CandidateGrades, GradedAtom, Trigger};
 
 use super::{INDENT, SHOWN, line};
 use crate::output::{TextTable, count, decimals};
@@ -63,7 +63,7 @@ fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &CandidateGrade
     if more > 0 { line(out, "", &format!("… and {more} more atoms (use --json)")) } else { Ok(()) }
 }
 
-fn row(atom: &Atom) -> Vec<String> {
+fn row(atom: &GradedAtom) -> Vec<String> {
     let grade = |gamma| decimals(gamma, 3);
     vec![
         atom.atom.to_string(),

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use monitor::candidate_details::{CandidateDetails, CandidateLabel, ForceError, LabelJob};
-use store::{Attempt, Exclusion, Job, Supersession, unix_milliseconds};
+use store::{Attempt, Exclusion, QueueEntry, Supersession, unix_milliseconds};
 
 use super::line;
 use crate::output::count;
@@ -21,8 +21,18 @@ pub fn write(out: &mut dyn Write, details: &CandidateDetails) -> io::Result<()> 
 }
 
 fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
-    let Job { job: number, protocol, state, priority, attempts, holder, expires, overruled, relabel, .. } =
-        &job.details.job;
+    let QueueEntry {
+        job: number,
+        protocol,
+        state,
+        priority,
+        attempts,
+        holder,
+        expires,
+        overruled,
+        relabel,
+        ..
+    } = &job.details.job;
     let cost = job.core_seconds.map_or(String::new(), |seconds| format!(", {seconds:.1} core-seconds"));
     line(
         out,

@@ -7,7 +7,7 @@ mod labels;
 use std::io::{self, Write};
 
 use monitor::candidate_details::{
-    self, CandidateDetails, Discovery, Distances, PairDistance, StructureSummary,
+    self, CandidateDetails, Discovery, GuardDistances, GuardPairDistance, StructureSummary,
 };
 use store::{Location, Store};
 
@@ -149,11 +149,11 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
     )
 }
 
-fn write_distances(out: &mut dyn Write, distances: &Distances) -> io::Result<()> {
-    let Distances { shortest, atoms, pairs } = distances;
+fn write_distances(out: &mut dyn Write, distances: &GuardDistances) -> io::Result<()> {
+    let GuardDistances { shortest, atoms, pairs } = distances;
     let pair = atoms.map_or(String::new(), |[i, j]| format!(" (atoms {i} and {j})"));
     line(out, "guard", &format!("shortest distance {} Å{pair}", decimals(*shortest, 3)))?;
-    for PairDistance { pair, shortest, seed_structure, limit } in pairs {
+    for GuardPairDistance { pair, shortest, seed_structure, limit } in pairs {
         let Some(limit) = limit else { continue };
         let position = if shortest < limit { "below" } else { "at least" };
         let seed = decimals(*seed_structure, 3);

@@ -96,7 +96,7 @@ struct Count {
 struct Exported {
     /// Files with their contents and the number of seed structures assigned to each.
     counts: Vec<(PathBuf, Count, usize)>,
-    labels: store::Labels,
+    labels: store::LabelJobCounts,
     /// Structures with labels of other protocols, which are not exported.
     others: u64,
 }
@@ -165,7 +165,9 @@ impl ExportArgs {
                     "not exported: {others} with labels of other protocols (select with --protocol)"
                 )?;
             }
-            let store::Labels { queued, leased, failed, dropped, again, failed_again, excluded, .. } = labels;
+            let store::LabelJobCounts {
+                queued, leased, failed, dropped, again, failed_again, excluded, ..
+            } = labels;
             if excluded > 0 {
                 writeln!(out, "not exported: {excluded} with excluded labels (see calmwalk exclude --list)")?;
             }
@@ -297,8 +299,8 @@ impl ExportArgs {
         }
     }
 
-    fn nothing_to_export(&self, status: &store::Status) -> String {
-        let store::Labels { queued, leased, failed, dropped, excluded, .. } = status.labels;
+    fn nothing_to_export(&self, status: &store::CampaignStatus) -> String {
+        let store::LabelJobCounts { queued, leased, failed, dropped, excluded, .. } = status.labels;
         let imported = if self.imported || status.imported == 0 {
             ""
         } else {

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use orchestrator::slurm::{DesiredJobs, Job, JobNames, JobOptions, JobPhase, Plan, Role};
+use orchestrator::slurm::{DesiredJobs, JobNames, JobOptions, JobPhase, Plan, Role, SlurmJob};
 use wire::net::Tls;
 
 use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, TemplateValues, fill, quoted, template};
@@ -101,8 +101,8 @@ impl JobSpecs {
     }
 
     /// The existing job of the orchestrator that is not cancelled, if there is one.
-    pub fn orchestrator_job(&self, jobs: &[Job], cancelled: &[u64]) -> Option<u64> {
-        let is_active = |job: &&Job| matches!(job.phase(), JobPhase::Pending | JobPhase::Running);
+    pub fn orchestrator_job(&self, jobs: &[SlurmJob], cancelled: &[u64]) -> Option<u64> {
+        let is_active = |job: &&SlurmJob| matches!(job.phase(), JobPhase::Pending | JobPhase::Running);
         let mut active = jobs.iter().filter(|job| job.role == Role::Orchestrator).filter(is_active);
         active.find(|job| !cancelled.contains(&job.id)).map(|job| job.id)
     }
@@ -125,7 +125,13 @@ impl JobSpecs {
     }
 
     /// Prints what would be written and submitted.
-    pub fn print(&self, out: &mut dyn Write, names: &JobNames, plan: &Plan, jobs: &[Job]) -> io::Result<()> {
+    pub fn print(
+        &self,
+        out: &mut dyn Write,
+        names: &JobNames,
+        plan: &Plan,
+        jobs: &[SlurmJob],
+    ) -> io::Result<()> {
         for (name, text) in &self.scripts {
             writeln!(out, "==> {}\n{text}", self.folder.join(name).display())?;
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::time::Duration;
 
-use orchestrator::slurm::{Job, JobPhase, Role, Slurm, SlurmError};
+use orchestrator::slurm::{JobPhase, Role, SlurmCommands, SlurmError, SlurmJob};
 use serde_json::{Value, json};
 use store::Location;
 use tokio::time::timeout;
@@ -22,7 +22,7 @@ pub enum BatchJobs {
     /// There is no batch system, or it has no jobs of this campaign.
     None,
     /// Jobs with the exit codes of failed ones.
-    Known(Vec<(Job, Option<String>)>),
+    Known(Vec<(SlurmJob, Option<String>)>),
     /// The batch system gives no answer, for this reason.
     Unknown(String),
 }
@@ -63,7 +63,7 @@ impl BatchJobs {
             Self::Unknown(why) => return writeln!(out, "\njobs        no answer from Slurm: {why}"),
             Self::Known(jobs) => jobs,
         };
-        let runs = |job: &Job| job.role != Role::Orchestrator && job.phase() == JobPhase::Running;
+        let runs = |job: &SlurmJob| job.role != Role::Orchestrator && job.phase() == JobPhase::Running;
         let mut shown: Vec<_> = jobs.iter().collect();
         if shown.len() > page.others {
             shown.sort_by_key(|(job, _)| (runs(job), job.role));
@@ -79,8 +79,8 @@ impl BatchJobs {
 }
 
 /// Active jobs, and for each role without an active job the last one that ended.
-async fn query_slurm(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmError> {
-    let slurm = Slurm::with_timeout(TIMEOUT);
+async fn query_slurm(location: &Location) -> Result<Vec<(SlurmJob, Option<String>)>, SlurmError> {
+    let slurm = SlurmCommands::with_timeout(TIMEOUT);
     let mut jobs = slurm.jobs(&job_names(location)).await?;
     let mut last: BTreeMap<Role, (bool, u64)> = BTreeMap::new();
     for job in &jobs {
@@ -100,7 +100,7 @@ async fn query_slurm(location: &Location) -> Result<Vec<(Job, Option<String>)>, 
     Ok(known)
 }
 
-fn line(job: &Job, code: Option<&str>) -> Vec<String> {
+fn line(job: &SlurmJob, code: Option<&str>) -> Vec<String> {
     let has_started = job.phase() != JobPhase::Pending;
     let reason = job.reason.clone().unwrap_or_default();
     let remark = match (job.phase(), code) {
@@ -120,8 +120,8 @@ fn line(job: &Job, code: Option<&str>) -> Vec<String> {
     ]
 }
 
-fn as_json(job: &Job, code: &Option<String>) -> Value {
-    let Job { id, role, state, nodes, start, time_left, walkers, reason } = job;
+fn as_json(job: &SlurmJob, code: &Option<String>) -> Value {
+    let SlurmJob { id, role, state, nodes, start, time_left, walkers, reason } = job;
     let (kind, number) = match role {
         Role::Orchestrator => ("orchestrator", None),
         Role::Agent(number) => ("agent", Some(number)),
@@ -139,8 +139,8 @@ mod tests {
 
     const PAGE: StatusLayout = StatusLayout { walks: 8, others: 8, few: 8, width: 120 };
 
-    fn job(id: u64, role: Role, state: &str) -> Job {
-        Job {
+    fn job(id: u64, role: Role, state: &str) -> SlurmJob {
+        SlurmJob {
             id,
             role,
             state: state.into(),

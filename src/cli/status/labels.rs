@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use monitor::label_cost::QueueCost;
 use monitor::label_queue::{LabelQueue, ProtocolJobs, labels_per_hour};
-use store::{FailureCount, Labels, Status};
+use store::{CampaignStatus, FailureCount, LabelJobCounts};
 
 use super::page::{StatusLayout, cut};
 use super::processes::since;
@@ -17,7 +17,7 @@ pub fn write(
     out: &mut dyn Write,
     queue: &LabelQueue,
     page: &StatusLayout,
-    status: &Status,
+    status: &CampaignStatus,
 ) -> io::Result<()> {
     page.titled(out, "labels", &describe_queue(status))?;
     if let Some(relabelling) = describe_relabelling(&status.labels) {
@@ -76,8 +76,9 @@ fn describe_cost(cost: &QueueCost, used: f64) -> String {
     )
 }
 
-fn describe_queue(status: &Status) -> String {
-    let Labels { queued, leased, labelled, failed, dropped, superseded, excluded, .. } = &status.labels;
+fn describe_queue(status: &CampaignStatus) -> String {
+    let LabelJobCounts { queued, leased, labelled, failed, dropped, superseded, excluded, .. } =
+        &status.labels;
     let oldest = status.oldest_lease.as_ref();
     let oldest = oldest.map_or(String::new(), |lease| format!(" (oldest for {})", since(lease.started)));
     let superseded = if *superseded > 0 { format!(", {superseded} superseded") } else { String::new() };
@@ -91,7 +92,7 @@ fn describe_queue(status: &Status) -> String {
 }
 
 /// Structures that are relabelled, and failed attempts at it.
-fn describe_relabelling(labels: &Labels) -> Option<String> {
+fn describe_relabelling(labels: &LabelJobCounts) -> Option<String> {
     let parts = [
         (labels.again, "being relabelled keep their labels until then"),
         (labels.again_in_vain, "failed to be relabelled and keep their labels"),
@@ -108,7 +109,7 @@ fn describe_protocol(jobs: &ProtocolJobs) -> String {
     format!("'{protocol}'{current}: {}", counts.join(", "))
 }
 
-fn describe_rate(status: &Status) -> String {
+fn describe_rate(status: &CampaignStatus) -> String {
     let average = labels_per_hour(status)
         .map_or(String::new(), |average| format!("; {} per hour on average", two_digits(average)));
     format!("{} made in the last hour{average}", status.labels_last_hour)

@@ -2,13 +2,13 @@
 
 use std::io::{self, Write};
 
-use store::{ProcessRecord, Status, this_host, unix_milliseconds};
+use store::{CampaignStatus, ProcessRecord, this_host, unix_milliseconds};
 
 use super::page::StatusLayout;
 use crate::output::{TextTable, count};
 
 /// A description of what the campaign does.
-pub fn state(status: &Status) -> String {
+pub fn state(status: &CampaignStatus) -> String {
     let number = |kind, holds: fn(&str) -> bool| {
         let processes = status.processes.iter().filter(|process| process.kind == kind);
         processes.filter(|process| holds(&process.state)).count()
@@ -166,7 +166,7 @@ mod tests {
     #[test]
     fn the_state_of_a_campaign_is_described() {
         let describe = |processes: &[ProcessRecord], finished| {
-            state(&Status { processes: processes.to_vec(), finished, ..Status::default() })
+            state(&CampaignStatus { processes: processes.to_vec(), finished, ..CampaignStatus::default() })
         };
         let run = process("orchestrator", None, "running");
         let lost = process("orchestrator", None, "dead");

@@ -9,12 +9,12 @@ use monitor::label_queue::LabelQueue;
 use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
 use monitor::snapshot::FORMAT;
-use orchestrator::slurm::{Job, Role};
+use orchestrator::slurm::{Role, SlurmJob};
 use serde_json::{Value, json};
 use store::records::{STALENESS, TRAINING_FRAMES};
 use store::{
-    Budget, BudgetStatus, BudgetUse, Declined, FailureCount, Labels, OldestLease, ProcessRecord, Unlabelled,
-    ValueRange, WalkStatus, unix_milliseconds,
+    Budget, BudgetStatus, BudgetUse, Declined, FailureCount, LabelJobCounts, OldestLease, ProcessRecord,
+    Unlabelled, ValueRange, WalkStatus, unix_milliseconds,
 };
 use wire::{CampaignId, WalkConditions};
 
@@ -52,7 +52,7 @@ pub fn large() -> Snapshot {
         relative_volume_labelled: range(0.8, 1.2),
     };
     Snapshot {
-        campaign: store::Campaign {
+        campaign: store::CampaignRecord {
             id: CampaignId([7; 16]),
             program_version: String::new(),
             mode: "reproducible".into(),
@@ -132,13 +132,13 @@ fn status() -> Status {
             control: 80_000,
             rejected_by_guards: 123_456,
         },
-        labels: Labels {
+        labels: LabelJobCounts {
             queued: 12_345,
             leased: 1024,
             labelled: 140_000,
             failed: 2000,
             dropped: 12,
-            ..Labels::default()
+            ..LabelJobCounts::default()
         },
         oldest_lease: Some(OldestLease { job: 17, holder: "node7-17-0/3".into(), started: 0 }),
         labels_last_hour: 512,
@@ -163,8 +163,8 @@ fn status() -> Status {
     }
 }
 
-fn job() -> (Job, Option<String>) {
-    let job = Job {
+fn job() -> (SlurmJob, Option<String>) {
+    let job = SlurmJob {
         id: 1_234_567,
         role: Role::Agent(3),
         state: "PENDING".into(),

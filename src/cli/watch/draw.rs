@@ -8,7 +8,7 @@ use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Paragraph, Sparkline};
-use store::{Candidates, Labels};
+use store::{Candidates, LabelJobCounts};
 
 use super::entries;
 use super::messages::WINDOW;
@@ -109,7 +109,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState) {
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {speed:.1} steps/s"));
     let Candidates { seen, accepted, control, .. } = &status.candidates;
-    let Labels { queued, leased, labelled, failed, .. } = &status.labels;
+    let LabelJobCounts { queued, leased, labelled, failed, .. } = &status.labels;
     let lines = [
         ("campaign", format!("{}, {} mode: {}", campaign.id, campaign.mode, cli_status::state(status))),
         (

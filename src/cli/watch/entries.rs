@@ -1,7 +1,7 @@
 //! Walks, label jobs and decisions as entries of the panes, and their quantities for filters.
 
 use atoms::Species;
-use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus, words};
+use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus, words};
 use wire::WalkConditions;
 use wire::conditions::VariedConditions;
 
@@ -57,8 +57,8 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&StructureFi
 }
 
 /// The entries of label jobs that match the filter.
-pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&StructureFilter>) -> Vec<PaneEntry> {
-    let matches = |job: &&Job| {
+pub fn job_entries(jobs: &[QueueEntry], walks: &[WalkStatus], filter: Option<&StructureFilter>) -> Vec<PaneEntry> {
+    let matches = |job: &&QueueEntry| {
         let species = filter::species(&job.formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species, walks)))
     };
@@ -68,7 +68,7 @@ pub fn job_entries(jobs: &[Job], walks: &[WalkStatus], filter: Option<&Structure
         JobState::Failed => Tone::Attention,
         JobState::Dropped | JobState::Superseded => Tone::Ended,
     };
-    let entry = |job: &Job| PaneEntry {
+    let entry = |job: &QueueEntry| PaneEntry {
         key: job.job.to_string(),
         columns: vec![
             without_campaign(&job.candidate).to_owned(),
@@ -159,7 +159,7 @@ fn conditions_of(walks: &[WalkStatus], walk: u32) -> Option<&WalkConditions> {
 }
 
 fn facts_of_job<'a>(
-    job: &'a Job,
+    job: &'a QueueEntry,
     species: &'a [Species],
     walks: &'a [WalkStatus],
 ) -> StructureProperties<'a> {

@@ -1,7 +1,7 @@
 //! What the reader, the state and the loop say to each other.
 
 use monitor::Snapshot;
-use store::{Job, JobState, RecentDecision};
+use store::{JobState, QueueEntry, RecentDecision};
 
 use crate::cli::queue::QueueCommand;
 use crate::cli::walks::WalksCommand;
@@ -44,7 +44,7 @@ pub struct Reading {
     /// The requested view of jobs.
     pub view: JobView,
     /// The first jobs of the view, in the order in which labellers take them.
-    pub jobs: Vec<Job>,
+    pub jobs: Vec<QueueEntry>,
     /// Decisions since the last poll, newest first.
     pub decisions: Vec<RecentDecision>,
 }

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use monitor::Snapshot;
-use store::{Job, RecentDecision};
+use store::{QueueEntry, RecentDecision};
 
 use super::charts::Charts;
 use super::entries;
@@ -90,7 +90,7 @@ pub struct WatchState {
     pub read_error: Option<String>,
     /// Charts of the decisions.
     pub charts: Charts,
-    jobs: Vec<Job>,
+    jobs: Vec<QueueEntry>,
     /// Newest first.
     decisions: VecDeque<RecentDecision>,
 }
@@ -162,7 +162,7 @@ impl WatchState {
 
     /// Updates the panes and charts.
     pub fn update_panes(&mut self) {
-        let store::Status { walks, led, .. } = &self.snapshot.status;
+        let store::CampaignStatus { walks, led, .. } = &self.snapshot.status;
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
         of_walks.set_entries(entries::walk_entries(walks, *led, of_walks.filter.as_ref()), walks.len());
         of_queue
@@ -178,7 +178,7 @@ impl WatchState {
     }
 
     /// The selected label job.
-    pub fn job(&self) -> Option<&Job> {
+    pub fn job(&self) -> Option<&QueueEntry> {
         let key = &self.panes[QUEUE].selected()?.key;
         self.jobs.iter().find(|job| job.job.to_string() == *key)
     }

@@ -2,7 +2,7 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 use ratatui::style::{Color, Modifier};
-use store::{DecidedCandidate, Job, JobState, RecentDecision};
+use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision};
 use wire::Origin;
 
 use super::draw::{Theme, draw};
@@ -14,8 +14,8 @@ use crate::cli::status;
 
 const PLAIN: Theme = Theme { colours: false };
 
-fn job(number: i64, state: JobState) -> Job {
-    Job {
+fn job(number: i64, state: JobState) -> QueueEntry {
+    QueueEntry {
         excluded: None,
         job: number,
         candidate: format!("07070707-3.0.{number}-0123456789abcdef"),
@@ -67,7 +67,7 @@ fn decision(sequence: i64) -> RecentDecision {
     }
 }
 
-fn reading(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Reading {
+fn reading(jobs: Vec<QueueEntry>, decisions: std::ops::Range<i64>) -> Reading {
     Reading {
         snapshot: status::tests::large(),
         view: JobView::Waiting,

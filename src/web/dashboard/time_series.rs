@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use store::Status;
+use store::CampaignStatus;
 
 /// Largest number of samples. Beyond it every second one is dropped, so that they always reach back to the first.
 const MAX_SAMPLES: usize = 600;
@@ -42,7 +42,7 @@ pub struct TimeSeries {
 
 impl TimeSeriesPoint {
     /// The current state of a campaign.
-    pub fn new(status: &Status, time: i64) -> Self {
+    pub fn new(status: &CampaignStatus, time: i64) -> Self {
         let under_way =
             status.walks.iter().filter(|walk| matches!(walk.state.as_str(), "waiting" | "running"));
         let gamma = under_way.filter_map(|walk| Some((walk.walk, walk.gamma_max?))).take(MAX_WALKS).collect();
@@ -91,7 +91,7 @@ mod tests {
     fn many_samples_reach_back_to_the_first_at_even_distances() {
         let mut samples = TimeSeries::default();
         for time in 0..100_000 {
-            samples.add(TimeSeriesPoint::new(&Status::default(), time));
+            samples.add(TimeSeriesPoint::new(&CampaignStatus::default(), time));
         }
         let times: Vec<_> = samples.samples().iter().map(|sample| sample.time).collect();
         assert!((MAX_SAMPLES / 2..=MAX_SAMPLES).contains(&times.len()), "{}", times.len());

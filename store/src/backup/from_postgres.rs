@@ -4,10 +4,10 @@ use std::path::Path;
 
 use sqlx::{AssertSqlSafe, Executor, Postgres};
 
-use crate::database::value::Kind;
-use crate::database::{Database, Row, Transaction, Value, execute_rows, query};
+use crate::database::value::ColumnType;
+use crate::database::{Database, SqlRow, SqlValue, Transaction, execute_rows, query};
 use crate::error::{Result, StoreError};
-use crate::postgres::server::Server;
+use crate::postgres::server::PostgresServer;
 use crate::sqlite::file::DatabaseFile;
 use crate::tables::budget::rebuild_totals;
 use crate::tables::checksums;
@@ -15,12 +15,12 @@ use crate::tables::checksums;
 /// Pages per transaction of the copy.
 const PAGES: usize = 32;
 
-use Kind::{Bytes as B, Integer as I, Real as R, Text as T};
+use ColumnType::{Bytes as B, Integer as I, Real as R, Text as T};
 
-struct Table {
+struct CopiedTable {
     name: &'static str,
     columns: &'static [&'static str],
-    kinds: &'static [Kind],
+    kinds: &'static [ColumnType],
     insert: &'static str,
     /// Rows fetched at a time: a row of a large structure has megabytes.
     page: usize,
@@ -31,7 +31,7 @@ struct Table {
 macro_rules! table {
     ($name:literal { $($columns:tt)* }) => { table!($name 64 { $($columns)* }) };
     ($name:literal $page:literal { $($column:ident: $kind:ident),* $(,)? }) => {
-        Table {
+        CopiedTable {
             name: $name,
             columns: &[$(stringify!($column)),*],
             kinds: &[$($kind),*],
@@ -44,7 +44,7 @@ macro_rules! table {
 
 /// All tables except those of the leader, of processes and their progress, and of job counts, which triggers count
 /// again. Each table comes after those that it references. A new database already has some rows of `campaign`.
-const TABLES: [Table; 17] = [
+const TABLES: [CopiedTable; 17] = [
     table!("campaign" { key: T, value: T, checksum: I }),
     table!("value" { name: T, value: T, checksum: I }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B, checksum: I }),
@@ -65,7 +65,7 @@ const TABLES: [Table; 17] = [
     table!("candidate_data" { decision: I, block: B, features: B, selector_grades: B, original_grades: B }),
     table!("component" { element: I, slot: I, bytes: B, checksum: I }),
     table!("walk" {
-        walk: I, origin: T, partner: I, seed_structure: I, state: T, reason: T, turn: I, accepted: I, step: I,
+        walk: I, origin: T, partner: I, seed_structure: I, state: T, reason: T, assignments: I, accepted: I, step: I,
         segment: I, tau: R, temperature: R, relative_volume: R, gamma_max: R, refused: I, returns: I,
         selector_state: T, checkpoint: B, checksum: I, checkpoint_checksum: I,
     }),
@@ -86,10 +86,14 @@ const TABLES: [Table; 17] = [
     table!("import" { number: I, structure: I, file: T, frame: I, checksum: I }),
     table!("archive" 1 { job: I, attempt: I, bytes: B, left_out: T, checksum: I }),
 ];
-const OPERATIONS: Table = table!("operation" { number: I, time: I, kind: T, detail: T });
+const OPERATIONS: CopiedTable = table!("operation" { number: I, time: I, kind: T, detail: T });
 
 /// Writes the copy into a directory.
-pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
+pub(super) async fn copy(
+    server: &PostgresServer,
+    directory: &Path,
+    mut tell: impl FnMut(u64, u64),
+) -> Result<()> {
     let mut from = Transaction::Postgres(server.begin_read().await?, server.clock);
     // Their checksums are marked as unknown.
     let without_checksums = !from.has_column("label", "checksum").await?;
@@ -119,7 +123,7 @@ pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut
     Ok(())
 }
 
-async fn count(from: &mut Transaction, table: &Table) -> Result<u64> {
+async fn count(from: &mut Transaction, table: &CopiedTable) -> Result<u64> {
     if !exists(from, table).await? {
         return Ok(0);
     }
@@ -131,7 +135,7 @@ async fn count(from: &mut Transaction, table: &Table) -> Result<u64> {
 async fn copy_table(
     from: &mut Transaction,
     into: &Database,
-    table: &Table,
+    table: &CopiedTable,
     mut told: impl FnMut(u64),
 ) -> Result<()> {
     let name = table.name;
@@ -164,19 +168,19 @@ fn postgres(transaction: &mut Transaction) -> Result<&mut sqlx::Transaction<'sta
 }
 
 /// Columns that tables of an earlier version lack are NULL.
-fn values(row: &Row, table: &Table) -> Result<Vec<Value>> {
-    let value = |(name, kind): (&&str, &Kind)| {
+fn values(row: &SqlRow, table: &CopiedTable) -> Result<Vec<SqlValue>> {
+    let value = |(name, kind): (&&str, &ColumnType)| {
         Ok(match kind {
-            I => Value::Integer(row.get_or_default(name)?),
-            R => Value::Real(row.get_or_default(name)?),
-            T => Value::Text(row.get_or_default(name)?),
-            B => Value::Bytes(row.get_or_default(name)?),
+            I => SqlValue::Integer(row.get_or_default(name)?),
+            R => SqlValue::Real(row.get_or_default(name)?),
+            T => SqlValue::Text(row.get_or_default(name)?),
+            B => SqlValue::Bytes(row.get_or_default(name)?),
         })
     };
     table.columns.iter().zip(table.kinds).map(value).collect()
 }
 
 /// Whether the server has the table; earlier versions lack some.
-async fn exists(from: &mut Transaction, table: &Table) -> Result<bool> {
+async fn exists(from: &mut Transaction, table: &CopiedTable) -> Result<bool> {
     query("SELECT to_regclass($1) IS NOT NULL").bind(table.name).fetch_one(from).await
 }

@@ -3,20 +3,20 @@
 use std::io::{self, Read};
 
 use crate::checksum::{ARCHIVE, Names};
-use crate::database::{FromRow, Row, Transaction, query};
+use crate::database::{FromRow, SqlRow, Transaction, query};
 use crate::error::Result;
 use crate::tables::checksums::NEXT_ARCHIVE;
 
 /// A packed directory.
-pub(super) struct Packed {
+pub(super) struct ArchiveRow {
     pub job: i64,
     pub attempt: u32,
     bytes: Vec<u8>,
     verified: Result<()>,
 }
 
-impl FromRow for Packed {
-    fn from_row(row: &Row) -> Result<Self> {
+impl FromRow for ArchiveRow {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         Ok(Self {
             job: row.get("job")?,
             attempt: row.get("attempt")?,
@@ -26,7 +26,7 @@ impl FromRow for Packed {
     }
 }
 
-impl Packed {
+impl ArchiveRow {
     /// The first archive after this attempt.
     pub async fn after(transaction: &mut Transaction, job: i64, attempt: u32) -> Result<Option<Self>> {
         query(NEXT_ARCHIVE).bind(job).bind(attempt).fetch_optional(transaction).await

@@ -2,12 +2,12 @@
 
 use wire::{CandidateBlock, ContentHash};
 
-use super::archives::Packed;
+use super::archives::ArchiveRow;
 use super::finding::Finding;
 use crate::checksum::{
     CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG_COLUMNS, Names, PROTOCOL, STRUCTURE,
 };
-use crate::database::{FromRow, Row, Transaction, from_columns, query};
+use crate::database::{FromRow, SqlRow, Transaction, from_columns, query};
 use crate::encoding::decode_structure;
 use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
@@ -39,12 +39,12 @@ const ROWS: &str = "SELECT (SELECT count(*) FROM structure) + (SELECT count(*) F
     + (SELECT count(*) FROM label) + (SELECT count(*) FROM decision) + (SELECT count(*) FROM protocol)
     + (SELECT count(*) FROM archive)";
 
-struct Structure {
+struct StructureContent {
     hash: Vec<u8>,
     data: Vec<u8>,
 }
 
-struct Candidate {
+struct CandidateContent {
     id: String,
     content: Vec<u8>,
     block: Vec<u8>,
@@ -53,7 +53,7 @@ struct Candidate {
     original_grades: Option<Vec<u8>>,
 }
 
-struct Label {
+struct LabelContent {
     atoms: u64,
     energy: f64,
     forces: Vec<u8>,
@@ -61,14 +61,14 @@ struct Label {
     details: Option<String>,
 }
 
-struct Text {
+struct TextContent {
     text: String,
 }
 
-from_columns!(Structure { hash, data });
-from_columns!(Candidate { id, content, block, features, selector_grades, original_grades });
-from_columns!(Label { atoms, energy, forces, stress, details });
-from_columns!(Text { text });
+from_columns!(StructureContent { hash, data });
+from_columns!(CandidateContent { id, content, block, features, selector_grades, original_grades });
+from_columns!(LabelContent { atoms, energy, forces, stress, details });
+from_columns!(TextContent { text });
 
 /// A row whose content can be checked.
 trait Content: FromRow {
@@ -80,7 +80,7 @@ trait Content: FromRow {
 type Checked = (&'static CheckedTable, &'static [&'static CheckedColumn]);
 
 /// The fault of a row: invalid content or a wrong checksum.
-fn fault<C: Content>(row: &Row, (table, columns): Checked) -> Option<String> {
+fn fault<C: Content>(row: &SqlRow, (table, columns): Checked) -> Option<String> {
     let content = match C::from_row(row) {
         Ok(content) => content.fault(),
         Err(error) => Some(error.to_string()),
@@ -112,11 +112,11 @@ impl<'a> Contents<'a> {
     ) -> Result<Vec<Finding>> {
         let all = query(ROWS).fetch_one(&mut *transaction).await?;
         let mut contents = Self { transaction, tell, read: 0, all, findings: Vec::new() };
-        contents.table::<Structure>((&STRUCTURE, &[]), STRUCTURES).await?;
-        contents.table::<Candidate>((&CANDIDATE, &LONG_COLUMNS), CANDIDATES).await?;
-        contents.table::<Label>((&LABEL, &[]), LABELS).await?;
-        contents.table::<Text>((&DECISION, &[]), DECISIONS).await?;
-        contents.table::<Text>((&PROTOCOL, &[]), PROTOCOLS).await?;
+        contents.table::<StructureContent>((&STRUCTURE, &[]), STRUCTURES).await?;
+        contents.table::<CandidateContent>((&CANDIDATE, &LONG_COLUMNS), CANDIDATES).await?;
+        contents.table::<LabelContent>((&LABEL, &[]), LABELS).await?;
+        contents.table::<TextContent>((&DECISION, &[]), DECISIONS).await?;
+        contents.table::<TextContent>((&PROTOCOL, &[]), PROTOCOLS).await?;
         contents.archives().await?;
         let others = checksums::verify_others(contents.transaction).await?;
         contents.found(others);
@@ -143,7 +143,7 @@ impl<'a> Contents<'a> {
     /// One at a time: each may be as large as the work directory of a calculation.
     async fn archives(&mut self) -> Result<()> {
         let (mut last, mut faults) = ((0, 0), Vec::new());
-        while let Some(packed) = Packed::after(self.transaction, last.0, last.1).await? {
+        while let Some(packed) = ArchiveRow::after(self.transaction, last.0, last.1).await? {
             last = (packed.job, packed.attempt);
             self.have_read(1);
             let fault = packed.fault();
@@ -168,13 +168,13 @@ impl<'a> Contents<'a> {
     }
 }
 
-impl Content for Structure {
+impl Content for StructureContent {
     fn fault(&self) -> Option<String> {
         decode_structure(&self.data, &self.hash).err().map(|_| "it does not match its hash".to_owned())
     }
 }
 
-impl Content for Candidate {
+impl Content for CandidateContent {
     fn fault(&self) -> Option<String> {
         let block = match CandidateBlock::from_bytes(&self.block) {
             Ok(block) => block,
@@ -203,7 +203,7 @@ impl Content for Candidate {
     }
 }
 
-impl Content for Label {
+impl Content for LabelContent {
     fn fault(&self) -> Option<String> {
         let label =
             match decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref()) {
@@ -223,7 +223,7 @@ impl Content for Label {
     }
 }
 
-impl Content for Text {
+impl Content for TextContent {
     fn fault(&self) -> Option<String> {
         let parsed: serde_json::Result<serde_json::Value> = serde_json::from_str(&self.text);
         parsed.err().map(|error| format!("its text is not valid JSON ({error})"))

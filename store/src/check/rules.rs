@@ -10,13 +10,13 @@ use crate::tables::processes::{LEASED, all};
 use crate::tables::relabel;
 
 /// A query that counts violations, with an example.
-pub(super) struct Rule {
+pub(super) struct ConsistencyRule {
     pub finds: &'static str,
     pub what: &'static str,
     pub then: &'static str,
 }
 
-impl Rule {
+impl ConsistencyRule {
     pub async fn find(&self, transaction: &mut Transaction) -> Result<Option<Finding>> {
         let (count, example): (u64, Option<String>) = query(self.finds).fetch_one(&mut *transaction).await?;
         let what = || format!("{count} {} (such as {})", self.what, example.unwrap_or_default());
@@ -29,38 +29,38 @@ const QUEUE: &str =
     "the label queue was changed by hand; calmwalk queue shows the jobs; a backup has the original ones";
 
 /// Violations that make structures or labels missing in an export without being noticed there.
-const LOSSES: [Rule; 7] = [
-    Rule {
+const LOSSES: [ConsistencyRule; 7] = [
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence > 1
                 AND NOT EXISTS (SELECT 1 FROM decision AS before WHERE before.sequence = decision.sequence - 1)",
         what: "gaps in the decision log, before the decision",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence < 1",
         what: "decisions with numbers below 1",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), min(candidate) FROM decision WHERE candidate IS NOT NULL
                 AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.decision = decision.sequence)",
         what: "decisions on missing candidates",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM import
                 WHERE NOT EXISTS (SELECT 1 FROM label WHERE label.structure = import.structure)
                 AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = import.structure)",
         what: "imported structures without any label or label job",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM label WHERE file IS NOT NULL
                 AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = label.structure)",
         what: "labels imported with structures that are missing",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(label.number) AS TEXT) FROM label
                 LEFT JOIN job ON job.number = label.job
                 LEFT JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
@@ -69,7 +69,7 @@ const LOSSES: [Rule; 7] = [
         what: "labels that do not belong to their job",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
                 SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.standing IN ('label', 'excluded'))",
         what: "superseded labels of structures without another label, of the structure",
@@ -78,8 +78,8 @@ const LOSSES: [Rule; 7] = [
 ];
 
 /// Everything else.
-const RULES: [Rule; 11] = [
-    Rule {
+const RULES: [ConsistencyRule; 11] = [
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job
                 WHERE NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.decision = job.decision)
                 AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = job.structure
@@ -87,64 +87,64 @@ const RULES: [Rule; 11] = [
         what: "label jobs of neither a candidate nor an imported structure",
         then: QUEUE,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), min(id) FROM candidate JOIN decision ON sequence = decision
                 WHERE candidate.id IS DISTINCT FROM decision.candidate OR kind <>
                 CASE origin WHEN 'control' THEN 'control' ELSE fate END",
         what: "candidates that contradict their decision",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), min(id) FROM candidate
                 WHERE NOT EXISTS (SELECT 1 FROM decision WHERE sequence = candidate.decision)",
         what: "candidates without a decision",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), min(id) FROM candidate
                 WHERE NOT EXISTS (SELECT 1 FROM candidate_data WHERE candidate_data.decision = candidate.decision)",
         what: "candidates without their structure and grades",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), min(id) FROM candidate JOIN structure ON structure.number = candidate.structure
                 WHERE content <> hash",
         what: "candidates that refer to another structure than their own",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), min(id) FROM candidate WHERE structure IS NOT NULL
                 AND EXISTS (SELECT 1 FROM campaign WHERE key = 'protocol')
                 AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure)",
         what: "accepted candidates without a label job",
         then: "they will not be labelled; the next calmwalk run queues them",
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(walk.walk) AS TEXT) FROM walk WHERE accepted <>
                 (SELECT count(*) FROM candidate WHERE candidate.walk = walk.walk AND fate = 'accepted')",
         what: "walks with a wrong count of accepted structures",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), min(id) FROM candidate
                 WHERE NOT EXISTS (SELECT 1 FROM walk WHERE walk.walk = candidate.walk)",
         what: "candidates of missing walks",
         then: LOST,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job WHERE state = 'superseded' AND NOT EXISTS (
                 SELECT 1 FROM job AS other WHERE other.structure = job.structure AND other.state <> 'superseded')",
         what: "superseded jobs of structures without another job",
         then: QUEUE,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job
                 WHERE attempts <> (SELECT coalesce(max(attempt), 0) FROM attempt WHERE attempt.job = job.number)
                 OR attempts <> (SELECT count(*) FROM attempt WHERE attempt.job = job.number)",
         what: "jobs with a wrong count of attempts",
         then: QUEUE,
     },
-    Rule {
+    ConsistencyRule {
         finds: "SELECT count(*), CAST(min(attempt.job) AS TEXT) FROM attempt JOIN job ON job.number = attempt.job
                 WHERE outcome IS NULL AND NOT (state = 'leased' AND attempt = attempts)",
         what: "running attempts at jobs that are not leased",
@@ -152,7 +152,7 @@ const RULES: [Rule; 11] = [
     },
 ];
 
-pub(super) fn all_rules() -> impl Iterator<Item = &'static Rule> {
+pub(super) fn all_rules() -> impl Iterator<Item = &'static ConsistencyRule> {
     LOSSES.iter().chain(&RULES)
 }
 

@@ -15,19 +15,19 @@ use sqlx::{Postgres, Sqlite};
 
 pub use query::{Query, query};
 pub(crate) use row::from_columns;
-pub use row::{FromRow, Row};
+pub use row::{FromRow, SqlRow};
 pub use rows::execute_rows;
-pub use value::Value;
+pub use value::SqlValue;
 
 use crate::error::{Result, StoreError};
-use crate::postgres::server::{Clock, Server};
+use crate::postgres::server::{Clock, PostgresServer};
 use crate::sqlite::file::DatabaseFile;
 
 /// An open database. Clones share its connections.
 #[derive(Clone, Debug)]
 pub enum Database {
     Sqlite(DatabaseFile),
-    Postgres(Server),
+    Postgres(PostgresServer),
 }
 
 /// A transaction. Dropped without [`Transaction::commit`], it is rolled back.

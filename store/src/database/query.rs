@@ -5,18 +5,18 @@ use std::time::Instant;
 
 use sqlx::{AssertSqlSafe, Executor, Postgres, Sqlite};
 
-use super::row::{FromRow, Row};
-use super::value::Value;
+use super::row::{FromRow, SqlRow};
+use super::value::SqlValue;
 use super::{Database, Target, Transaction, missing_row};
 use crate::error::{Result, StoreError};
-use crate::postgres::server::{RETRY_INTERVAL, Server};
+use crate::postgres::server::{PostgresServer, RETRY_INTERVAL};
 
 /// SQL with its bound values.
 #[derive(Clone)]
 pub struct Query {
     sql: &'static str,
     lock: &'static str,
-    values: Vec<Value>,
+    values: Vec<SqlValue>,
 }
 
 /// A statement; `$1` is the first bound value.
@@ -26,13 +26,13 @@ pub fn query(sql: &'static str) -> Query {
 
 impl Query {
     /// Binds the next value.
-    pub fn bind(mut self, value: impl Into<Value>) -> Self {
+    pub fn bind(mut self, value: impl Into<SqlValue>) -> Self {
         self.values.push(value.into());
         self
     }
 
     /// Binds several values in order.
-    pub fn bind_all(mut self, values: Vec<Value>) -> Self {
+    pub fn bind_all(mut self, values: Vec<SqlValue>) -> Self {
         self.values.extend(values);
         self
     }
@@ -69,7 +69,7 @@ impl Query {
     }
 
     /// What it finds, as it is.
-    pub async fn rows(self, target: impl Into<Target<'_>>) -> Result<Vec<Row>> {
+    pub async fn rows(self, target: impl Into<Target<'_>>) -> Result<Vec<SqlRow>> {
         match target.into() {
             Target::Database(Database::Sqlite(file)) => self.fetch_sqlite(&file.readers).await,
             Target::Database(Database::Postgres(server)) => self.read_from(server).await,
@@ -92,7 +92,7 @@ impl Query {
     }
 
     /// Reads again over another connection if one breaks.
-    async fn read_from(self, server: &Server) -> Result<Vec<Row>> {
+    async fn read_from(self, server: &PostgresServer) -> Result<Vec<SqlRow>> {
         let started = Instant::now();
         loop {
             let read = match server.connection().await {
@@ -114,10 +114,10 @@ impl Query {
         Ok(query.execute(on).await?.rows_affected())
     }
 
-    async fn fetch_sqlite(self, on: impl Executor<'_, Database = Sqlite>) -> Result<Vec<Row>> {
+    async fn fetch_sqlite(self, on: impl Executor<'_, Database = Sqlite>) -> Result<Vec<SqlRow>> {
         let query =
             self.values.into_iter().fold(sqlx::query(self.sql), |query, value| value.bind_sqlite(query));
-        Ok(query.fetch_all(on).await?.into_iter().map(Row::Sqlite).collect())
+        Ok(query.fetch_all(on).await?.into_iter().map(SqlRow::Sqlite).collect())
     }
 
     async fn execute_postgres(self, on: impl Executor<'_, Database = Postgres>) -> Result<u64> {
@@ -126,10 +126,10 @@ impl Query {
         Ok(query.execute(on).await?.rows_affected())
     }
 
-    async fn fetch_postgres(self, on: impl Executor<'_, Database = Postgres>) -> Result<Vec<Row>> {
+    async fn fetch_postgres(self, on: impl Executor<'_, Database = Postgres>) -> Result<Vec<SqlRow>> {
         let query = sqlx::query(AssertSqlSafe(for_postgres(self.sql, self.lock)));
         let query = self.values.into_iter().fold(query, |query, value| value.bind_postgres(query));
-        Ok(query.fetch_all(on).await?.into_iter().map(Row::Postgres).collect())
+        Ok(query.fetch_all(on).await?.into_iter().map(SqlRow::Postgres).collect())
     }
 }
 

@@ -10,7 +10,7 @@ use sqlx::query::Query;
 use sqlx::{AssertSqlSafe, Postgres};
 
 use super::Transaction;
-use super::value::{Value, replace_nul};
+use super::value::{SqlValue, replace_nul};
 use crate::error::{Result, StoreError};
 
 /// Approximate number of bytes sent at once: PostgreSQL arrays hold up to 1 GB, and the server copies them.
@@ -23,7 +23,7 @@ pub async fn execute_rows(
     transaction: &mut Transaction,
     sql: &'static str,
     columns: &'static [&'static str],
-    rows: Vec<Vec<Value>>,
+    rows: Vec<Vec<SqlValue>>,
 ) -> Result<u64> {
     let Some(first) = rows.first() else { return Ok(0) };
     let excluded: Vec<_> = columns.iter().skip(1).map(|name| format!("{name} = excluded.{name}")).collect();
@@ -61,13 +61,13 @@ fn one_row(columns: &[&str]) -> String {
 }
 
 /// A table of as many rows as each array has, for PostgreSQL.
-fn arrays(columns: &[&str], first: &[Value]) -> String {
-    let array = |(value, k): (&Value, usize)| {
+fn arrays(columns: &[&str], first: &[SqlValue]) -> String {
+    let array = |(value, k): (&SqlValue, usize)| {
         let kind = match value {
-            Value::Integer(_) => "BIGINT",
-            Value::Real(_) => "DOUBLE PRECISION",
-            Value::Text(_) => "TEXT",
-            Value::Bytes(_) => "BYTEA",
+            SqlValue::Integer(_) => "BIGINT",
+            SqlValue::Real(_) => "DOUBLE PRECISION",
+            SqlValue::Text(_) => "TEXT",
+            SqlValue::Bytes(_) => "BYTEA",
         };
         format!("${k}::{kind}[]")
     };
@@ -76,19 +76,19 @@ fn arrays(columns: &[&str], first: &[Value]) -> String {
 }
 
 /// The next rows to send at once.
-fn next_batch(rows: &mut impl Iterator<Item = Vec<Value>>) -> Vec<Vec<Value>> {
+fn next_batch(rows: &mut impl Iterator<Item = Vec<SqlValue>>) -> Vec<Vec<SqlValue>> {
     let (mut load, mut bytes) = (Vec::new(), 0);
     while bytes < BATCH_BYTES
         && let Some(row) = rows.next()
     {
-        bytes += row.iter().map(Value::len).sum::<usize>();
+        bytes += row.iter().map(SqlValue::len).sum::<usize>();
         load.push(row);
     }
     load
 }
 
-fn transpose(columns: usize, rows: Vec<Vec<Value>>) -> Vec<Vec<Value>> {
-    let mut transposed: Vec<Vec<Value>> = (0..columns).map(|_| Vec::with_capacity(rows.len())).collect();
+fn transpose(columns: usize, rows: Vec<Vec<SqlValue>>) -> Vec<Vec<SqlValue>> {
+    let mut transposed: Vec<Vec<SqlValue>> = (0..columns).map(|_| Vec::with_capacity(rows.len())).collect();
     for row in rows {
         transposed.iter_mut().zip(row).for_each(|(column, value)| column.push(value));
     }
@@ -98,24 +98,24 @@ fn transpose(columns: usize, rows: Vec<Vec<Value>>) -> Vec<Vec<Value>> {
 type PostgresQuery<'q> = Query<'q, Postgres, PgArguments>;
 
 /// Binds a column as an array; its values have the type of the first.
-fn bind_column(query: PostgresQuery<'_>, column: Vec<Value>) -> Result<PostgresQuery<'_>> {
+fn bind_column(query: PostgresQuery<'_>, column: Vec<SqlValue>) -> Result<PostgresQuery<'_>> {
     macro_rules! array {
         ($variant:ident) => {{
             let value = |value| match value {
-                Value::$variant(value) => Ok(value),
+                SqlValue::$variant(value) => Ok(value),
                 _ => Err(StoreError::Inconsistent("values of two types in one column".into())),
             };
             column.into_iter().map(value).collect::<Result<Vec<_>>>()?
         }};
     }
     Ok(match column.first() {
-        Some(Value::Integer(_)) => query.bind(array!(Integer)),
-        Some(Value::Real(_)) => query.bind(array!(Real)),
-        Some(Value::Text(_)) => {
+        Some(SqlValue::Integer(_)) => query.bind(array!(Integer)),
+        Some(SqlValue::Real(_)) => query.bind(array!(Real)),
+        Some(SqlValue::Text(_)) => {
             let texts = array!(Text);
             query.bind(texts.into_iter().map(|text| text.map(replace_nul)).collect::<Vec<_>>())
         }
-        Some(Value::Bytes(_)) => query.bind(array!(Bytes)),
+        Some(SqlValue::Bytes(_)) => query.bind(array!(Bytes)),
         None => query,
     })
 }

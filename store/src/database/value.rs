@@ -7,12 +7,12 @@ use sqlx::query::Query;
 use sqlx::sqlite::SqliteArguments;
 use sqlx::{Postgres, Sqlite};
 
-use super::row::Row;
+use super::row::SqlRow;
 use crate::error::Result;
 
 /// A value of a type that both databases have. `None` is NULL.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Value {
+pub enum SqlValue {
     Integer(Option<i64>),
     /// NaN is stored as NULL, as in SQLite.
     Real(Option<f64>),
@@ -22,7 +22,7 @@ pub enum Value {
 
 /// The type of a column.
 #[derive(Clone, Copy, Debug)]
-pub enum Kind {
+pub enum ColumnType {
     /// BIGINT.
     Integer,
     /// DOUBLE PRECISION.
@@ -33,19 +33,19 @@ pub enum Kind {
     Bytes,
 }
 
-impl Kind {
+impl ColumnType {
     /// The value of a column of this type.
-    pub fn read(self, row: &Row, name: &str) -> Result<Value> {
+    pub fn read(self, row: &SqlRow, name: &str) -> Result<SqlValue> {
         Ok(match self {
-            Self::Integer => Value::Integer(row.get(name)?),
-            Self::Real => Value::Real(row.get(name)?),
-            Self::Text => Value::Text(row.get(name)?),
-            Self::Bytes => Value::Bytes(row.get(name)?),
+            Self::Integer => SqlValue::Integer(row.get(name)?),
+            Self::Real => SqlValue::Real(row.get(name)?),
+            Self::Text => SqlValue::Text(row.get(name)?),
+            Self::Bytes => SqlValue::Bytes(row.get(name)?),
         })
     }
 }
 
-impl Value {
+impl SqlValue {
     pub(super) fn bind_sqlite(
         self,
         query: Query<'_, Sqlite, SqliteArguments>,
@@ -87,12 +87,12 @@ pub fn replace_nul(text: String) -> String {
 
 macro_rules! values {
     ($($from:ty => $variant:ident, $convert:expr;)*) => {$(
-        impl From<$from> for Value {
+        impl From<$from> for SqlValue {
             fn from(value: $from) -> Self {
                 Self::from(Some(value))
             }
         }
-        impl From<Option<$from>> for Value {
+        impl From<Option<$from>> for SqlValue {
             fn from(value: Option<$from>) -> Self {
                 Self::$variant(value.map($convert))
             }
@@ -113,13 +113,13 @@ values! {
     &[u8] => Bytes, <[u8]>::to_vec;
 }
 
-impl From<f64> for Value {
+impl From<f64> for SqlValue {
     fn from(value: f64) -> Self {
         Self::from(Some(value))
     }
 }
 
-impl From<Option<f64>> for Value {
+impl From<Option<f64>> for SqlValue {
     fn from(value: Option<f64>) -> Self {
         Self::Real(value.filter(|value| !value.is_nan()))
     }

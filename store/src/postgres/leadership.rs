@@ -2,7 +2,7 @@
 //!
 //! A connection may break while its process lives, and another process may then take the lock. Each new holder
 //! therefore increments the generation in the table `leader`, a fencing token under which it writes
-//! ([`Server::begin_as_leader`]): holders of an earlier generation can no longer write. A process that loses the
+//! ([`PostgresServer::begin_as_leader`]): holders of an earlier generation can no longer write. A process that loses the
 //! connection takes the lock again if no other process had it meanwhile.
 
 use std::time::{Duration, Instant};
@@ -14,7 +14,7 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use super::open::make_tables;
-use super::server::{Server, options};
+use super::server::{PostgresServer, options};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
 use crate::process_start::process_start_time;
@@ -43,7 +43,7 @@ pub struct Leadership {
 
 impl Leadership {
     pub async fn take(url: &ServerUrl, who: &str) -> Result<Self> {
-        let server = Server::connect(url, true);
+        let server = PostgresServer::connect(url, true);
         make_tables(url, &server).await?;
         server.close().await;
         let (options, started) = (options(url), Instant::now());
@@ -57,8 +57,7 @@ impl Leadership {
             tokio::time::sleep(RELEASE_POLL_INTERVAL).await;
         }
         let pid = std::process::id();
-        let sql =
-            "UPDATE leader SET generation = generation + 1, holder = $1, birth = $2 RETURNING generation";
+        let sql = "UPDATE leader SET generation = generation + 1, holder = $1, start_time = $2 RETURNING generation";
         let query = sqlx::query_scalar(sql).bind(format!("process {pid} ({who}) on {}", this_host()));
         let query = query.bind(process_start_time(pid).unwrap_or_default());
         let generation = query.fetch_one(&mut connection).await?;

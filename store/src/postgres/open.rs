@@ -7,20 +7,19 @@ use sqlx::postgres::PgConnection;
 use sqlx::{AssertSqlSafe, Executor};
 use wire::CampaignId;
 
-use super::server::Server;
+use super::server::PostgresServer;
 use crate::database::{Database, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
-use crate::migrations::{Step, migrator, schema_error};
+use crate::migrations::{MigrationSource, migrator, schema_error};
+use crate::old_schema::{self, FIRST_WITH_CHECKSUMS};
 use crate::tables::checksums;
 
 /// The newest migration.
-const SCHEMA: i64 = 13;
-/// The first version whose rows have checksums.
-const FIRST_WITH_CHECKSUMS: i64 = 9;
+const SCHEMA: i64 = 15;
 
 /// The migrations in order.
-pub(crate) static STEPS: [Step; 12] = [
+pub(crate) static STEPS: [MigrationSource; 14] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -33,11 +32,13 @@ pub(crate) static STEPS: [Step; 12] = [
     (11, "walk conditions", include_str!("../../migrations/postgres/0011_walk_conditions.sql")),
     (12, "lower states", include_str!("../../migrations/postgres/0012_lower_states.sql")),
     (13, "queued imports", include_str!("../../migrations/postgres/0013_queued_imports.sql")),
+    (14, "start time", include_str!("../../migrations/postgres/0014_start_time.sql")),
+    (15, "assignments", include_str!("../../migrations/postgres/0015_assignments.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
 
-impl Server {
+impl PostgresServer {
     /// Creates the tables, which must not hold a campaign yet.
     pub async fn create(url: &ServerUrl, campaign: CampaignId) -> Result<Self> {
         let server = Self::connect(url, true);
@@ -61,8 +62,8 @@ impl Server {
         if found < SCHEMA && writes {
             server.migrate(url).await?;
         }
-        if found < FIRST_WITH_CHECKSUMS && !writes {
-            server = server.with_views(url, checksums::views(&url.schema).into());
+        if let Some(views) = old_schema::views(&url.schema, found).filter(|_| !writes) {
+            server = server.with_views(url, views.into());
         }
         server.campaign().await?.ok_or_else(missing)?;
         Ok(server)
@@ -93,7 +94,7 @@ impl Server {
 }
 
 /// Creates the schema and its tables if they do not exist.
-pub(super) async fn make_tables(url: &ServerUrl, server: &Server) -> Result<()> {
+pub(super) async fn make_tables(url: &ServerUrl, server: &PostgresServer) -> Result<()> {
     let mut connection = server.connection().await?;
     if version(url, &mut connection).await? == Some(SCHEMA) {
         return Ok(());

@@ -39,7 +39,7 @@ pub enum Clock {
 
 /// A campaign on a server. Clones share its connections.
 #[derive(Clone)]
-pub struct Server {
+pub struct PostgresServer {
     pub(super) pool: PgPool,
     /// URL without password.
     shown: Arc<str>,
@@ -52,7 +52,7 @@ pub struct Server {
     jobs: Arc<Jobs>,
 }
 
-impl Server {
+impl PostgresServer {
     /// Connects when a connection is needed first.
     pub(super) fn connect(url: &ServerUrl, writes: bool) -> Self {
         let options = options(url);
@@ -179,9 +179,12 @@ impl Server {
     }
 }
 
-impl fmt::Debug for Server {
+impl fmt::Debug for PostgresServer {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Server").field("url", &self.shown).field("generation", &self.generation).finish()
+        f.debug_struct("PostgresServer")
+            .field("url", &self.shown)
+            .field("generation", &self.generation)
+            .finish()
     }
 }
 

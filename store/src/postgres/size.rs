@@ -1,10 +1,10 @@
 //! The size of a campaign on a server.
 
-use super::server::Server;
+use super::server::PostgresServer;
 use crate::database::{Database, query};
 use crate::error::Result;
 
-impl Server {
+impl PostgresServer {
     /// Size of the tables in bytes, with their indexes and long columns.
     pub async fn size(&self) -> Result<u64> {
         let sql =

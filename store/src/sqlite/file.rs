@@ -4,12 +4,13 @@ use std::fs::{self, OpenOptions};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::pin::pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::sqlite::{
     Sqlite, SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous,
 };
-use sqlx::{Connection, Executor};
+use sqlx::{AssertSqlSafe, Connection, Executor};
 
 use super::disk_space;
 use super::file_identity::FileIdentity;
@@ -129,12 +130,13 @@ pub(super) async fn writer(path: &Path) -> Result<SqlitePool> {
 }
 
 /// Each connection creates `views`, see `old_schema`.
-pub(super) fn readers(options: SqliteConnectOptions, views: Option<&'static str>) -> SqlitePool {
+pub(super) fn readers(options: SqliteConnectOptions, views: Option<Arc<str>>) -> SqlitePool {
     let pool = SqlitePoolOptions::new().max_connections(MAX_READERS).max_lifetime(None);
     let pool = pool.after_connect(move |connection, _| {
+        let views = views.clone();
         Box::pin(async move {
             match views {
-                Some(views) => connection.execute(views).await.map(drop),
+                Some(views) => connection.execute(AssertSqlSafe(views.to_string())).await.map(drop),
                 None => Ok(()),
             }
         })

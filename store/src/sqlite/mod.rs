@@ -3,7 +3,6 @@
 mod disk_space;
 pub mod file;
 mod file_identity;
-mod old_schema;
 pub mod open;
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
 use sqlx::ConnectOptions;
@@ -12,27 +12,25 @@ use sqlx::sqlite::{SqliteConnection, SqlitePool};
 
 use super::file::{BUSY_TIMEOUT, DatabaseFile, UNFINISHED, make_private, options, readers, writer};
 use super::file_identity::FileIdentity;
-use super::old_schema;
 use crate::database::{Database, Transaction};
 use crate::error::{Result, StoreError};
 use crate::file_names::DATABASE;
 use crate::filesystem::check_directory;
-use crate::migrations::{Step, migrator, schema_error};
+use crate::migrations::{MigrationSource, migrator, schema_error};
+use crate::old_schema::{self, FIRST_WITH_CHECKSUMS};
 use crate::tables::checksums;
 
 /// `PRAGMA application_id` of a campaign: "CALM".
 pub(super) const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` after the newest migration.
-pub(super) const SCHEMA: i64 = 13;
-/// The first version whose rows have checksums.
-const FIRST_WITH_CHECKSUMS: i64 = 9;
+pub(super) const SCHEMA: i64 = 15;
 /// Tries to migrate a database while other processes try the same.
 const MIGRATION_ATTEMPTS: u32 = 50;
 /// Time between two tries to open a database.
 const OPEN_RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The migrations in order.
-pub(crate) static STEPS: [Step; 13] = [
+pub(crate) static STEPS: [MigrationSource; 15] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
@@ -46,6 +44,8 @@ pub(crate) static STEPS: [Step; 13] = [
     (11, "walk conditions", include_str!("../../migrations/sqlite/0011_walk_conditions.sql")),
     (12, "lower states", include_str!("../../migrations/sqlite/0012_lower_states.sql")),
     (13, "queued imports", include_str!("../../migrations/sqlite/0013_queued_imports.sql")),
+    (14, "start time", include_str!("../../migrations/sqlite/0014_start_time.sql")),
+    (15, "assignments", include_str!("../../migrations/sqlite/0015_assignments.sql")),
 ];
 
 pub(super) static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
@@ -116,10 +116,9 @@ impl DatabaseFile {
             Err(StoreError::Directory { .. }) => !directory.join(format!("{DATABASE}-wal")).exists(),
             Err(error) => return Err(error),
         };
-        identify(&path, immutable).await?;
+        let version = identify(&path, immutable).await?;
         let options = options(&path).read_only(true).immutable(immutable);
-        let views = old_schema::views(&options).await?;
-        let readers = readers(options, views);
+        let readers = readers(options, old_schema::views("main", version).map(Arc::from));
         Ok(Self { writer: None, readers, file: FileIdentity::read(&path)? })
     }
 }

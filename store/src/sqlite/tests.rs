@@ -11,7 +11,7 @@ use crate::Store;
 use crate::check;
 use crate::database::Database;
 use crate::error::StoreError;
-use crate::records::{Campaign, Commit, ComponentRecord};
+use crate::records::{CampaignRecord, Commit, ComponentRecord};
 use crate::tables::{
     attempt_end, candidate_history, exclude, export, job_counts, listing, lower_states, outcomes, queue,
     queue_admin, recent, status, structures,
@@ -19,7 +19,7 @@ use crate::tables::{
 
 /// The store in a directory, and its file.
 async fn store(directory: &Path) -> (Store, DatabaseFile) {
-    let campaign = Campaign {
+    let campaign = CampaignRecord {
         id: CampaignId([1; 16]),
         program_version: "0".into(),
         mode: "live".into(),

@@ -2,9 +2,9 @@
 
 use crate::Store;
 use crate::checksum::{ARCHIVE, Names};
-use crate::database::{self, FromRow, from_columns, query};
+use crate::database::{FromRow, SqlRow, from_columns, query};
 use crate::error::Result;
-use crate::jobs::{Archive, PastCalculation};
+use crate::jobs::{CalculationArchive, PastCalculation};
 
 impl Store {
     /// Stores the packed directory of an attempt's calculation, replacing an earlier one. `left_out` names the
@@ -20,7 +20,7 @@ impl Store {
     }
 
     /// Packed directories of a job's calculations, by attempt.
-    pub async fn archives(&self, job: i64) -> Result<Vec<Archive>> {
+    pub async fn archives(&self, job: i64) -> Result<Vec<CalculationArchive>> {
         let sql = "SELECT * FROM archive WHERE job = $1 ORDER BY attempt";
         query(sql).bind(job).fetch_all(&self.database).await
     }
@@ -50,8 +50,8 @@ struct Row {
 
 from_columns!(Row { calculation, failed, wanted });
 
-impl FromRow for Archive {
-    fn from_row(row: &database::Row) -> Result<Self> {
+impl FromRow for CalculationArchive {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         ARCHIVE.verify(row, Names::Plain)?;
         Ok(Self { attempt: row.get("attempt")?, bytes: row.get("bytes")?, left_out: row.get("left_out")? })
     }

@@ -10,11 +10,11 @@ use crate::candidate_history::{
     CoveredCandidate, ImportedStructure, LaterCoveredCandidates, SameStructure, StructureLabel,
 };
 use crate::checksum::{IMPORT, Names, joined};
-use crate::database::{FromRow, Row, from_columns, query};
+use crate::database::{FromRow, SqlRow, from_columns, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::jobs::JobDetails;
-use crate::records::{CandidateRef, Operation, Protocol};
+use crate::records::{CandidateRef, LoggedOperation, Protocol};
 use crate::status::WalkStatus;
 
 /// Number of candidates shown if a name fits none or several.
@@ -79,7 +79,7 @@ const MANUAL_OPERATIONS: &str = "SELECT number, time, kind, detail FROM operatio
 from_columns!(CandidateRef { decision, candidate });
 
 impl FromRow for ImportedStructure {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         IMPORT.verify(row, Names::Joined)?;
         Ok(Self {
             number: row.get("place")?,
@@ -192,7 +192,7 @@ impl Store {
     }
 
     /// Manual changes of a job, oldest first.
-    pub async fn manual_operations(&self, job: i64) -> Result<Vec<Operation>> {
+    pub async fn manual_operations(&self, job: i64) -> Result<Vec<LoggedOperation>> {
         let rows: Vec<(i64, i64, String, String)> =
             query(MANUAL_OPERATIONS).fetch_all(&self.database).await?;
         let mut operations = Vec::new();
@@ -202,7 +202,7 @@ impl Store {
             // The campaign's rule makes lower states labels as well.
             let is_by_rule = detail.get("by").is_some_and(|by| by != "user");
             if detail["job"] == job && !is_by_rule {
-                operations.push(Operation { number, time, kind, detail });
+                operations.push(LoggedOperation { number, time, kind, detail });
             }
         }
         Ok(operations)
@@ -288,7 +288,7 @@ impl After {
 }
 
 impl FromRow for StructureLabel {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         let (hash, settings): (Vec<u8>, String) = (row.get("protocol_hash")?, row.get("settings")?);
         let settings = serde_json::from_str(&settings);
         let protocol = Protocol {

@@ -2,29 +2,13 @@
 
 use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
-    LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK, WALK_CONDITIONS,
+    LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, VALUE, WALK, WALK_CONDITIONS,
 };
-use crate::database::{Row, Transaction, Value, execute_rows, query};
+use crate::database::{SqlRow, SqlValue, Transaction, execute_rows, query};
 use crate::error::Result;
 
 /// Rows read at a time: a row of a large structure has megabytes.
 const PAGE: u32 = 64;
-
-/// Tables that have no checksums in earlier versions, with their checksum columns.
-const WITHOUT: [(&str, &[&str]); 12] = [
-    ("campaign", &["checksum"]),
-    ("value", &["checksum"]),
-    ("structure", &["checksum"]),
-    ("seed_structure", &["checksum"]),
-    ("protocol", &["checksum"]),
-    ("decision", &["checksum"]),
-    ("candidate", &["checksum", "features_checksum", "selector_checksum", "original_checksum"]),
-    ("component", &["checksum"]),
-    ("walk", &["checksum", "checkpoint_checksum"]),
-    ("label", &["checksum"]),
-    ("import", &["checksum"]),
-    ("archive", &["checksum"]),
-];
 
 /// Keys of campaign values that change rarely and only through this program.
 pub(crate) const CAMPAIGN_KEYS: [&str; 7] = [
@@ -118,8 +102,8 @@ impl Paged {
     }
 
     /// Key of the row, and its checksums.
-    fn checksums(&self, row: &Row, long: &[&CheckedColumn]) -> Result<Vec<Value>> {
-        let mut values: Vec<Value> =
+    fn checksums(&self, row: &SqlRow, long: &[&CheckedColumn]) -> Result<Vec<SqlValue>> {
+        let mut values: Vec<SqlValue> =
             vec![row.get::<i64>(self.key)?.into(), self.table.compute(row, Names::Plain)?.into()];
         for column in long {
             values.push(column.compute(row)?.into());
@@ -188,7 +172,7 @@ async fn next(
     sql: &'static str,
     [first, second]: [&str; 2],
     after: (i64, i64),
-) -> Result<Option<(Row, (i64, i64))>> {
+) -> Result<Option<(SqlRow, (i64, i64))>> {
     let found = query(sql).bind(after.0).bind(after.1).rows(transaction).await?;
     let Some(row) = found.into_iter().next() else { return Ok(None) };
     let key = (row.get(first)?, row.get(second)?);
@@ -220,15 +204,4 @@ pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<S
         last = key;
     }
     Ok(faults)
-}
-
-/// SQL that creates temporary views which replace tables without checksums. They have the names of the tables in
-/// `schema`.
-pub(crate) fn views(schema: &str) -> String {
-    let view = |(table, columns): &(&str, &[&str])| {
-        let columns: String =
-            columns.iter().map(|name| format!(", CAST({UNKNOWN} AS BIGINT) AS {name}")).collect();
-        format!("CREATE TEMP VIEW \"{table}\" AS SELECT *{columns} FROM \"{schema}\".\"{table}\"; ")
-    };
-    WITHOUT.iter().map(view).collect()
 }

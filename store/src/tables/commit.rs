@@ -7,7 +7,7 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use self::rows::{
-    CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, COMPONENT, DECISION, Rows, STRUCTURE, VALUE, WALK,
+    CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, COMPONENT, CommitRows, DECISION, STRUCTURE, VALUE, WALK,
     WALK_CONDITIONS,
 };
 use super::new_jobs::insert_jobs;
@@ -79,7 +79,7 @@ impl Store {
     /// Tries once; `again` is set if an earlier try may have succeeded.
     async fn commit_once(&self, commit: &Commit, mark: i64, again: bool) -> Result<Range<i64>> {
         // Copies everything before the transaction begins, so that no other writer waits for the copying.
-        let mut rows = Rows::from_commit(commit)?;
+        let mut rows = CommitRows::from_commit(commit)?;
         let (mut transaction, made) = self.database.begin_commit(mark, again).await?;
         let last = query("SELECT coalesce(max(sequence), 0) FROM decision");
         let last: i64 = last.fetch_one(&mut transaction).await?;
@@ -97,7 +97,7 @@ impl Store {
 }
 
 /// `last` is the sequence number of the previous decision.
-async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last: i64) -> Result<()> {
+async fn write(transaction: &mut Transaction, commit: &Commit, rows: CommitRows, last: i64) -> Result<()> {
     execute_rows(transaction, INSERT_DECISIONS, &DECISION, rows.decisions).await?;
     execute_rows(transaction, INSERT_STRUCTURES, &STRUCTURE, rows.structures).await?;
     let written = execute_rows(transaction, INSERT_CANDIDATES, &CANDIDATE, rows.candidates).await?;

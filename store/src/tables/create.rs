@@ -6,8 +6,8 @@ use crate::Store;
 use crate::database::Database;
 use crate::error::Result;
 use crate::location::Location;
-use crate::postgres::server::Server;
-use crate::records::{Campaign, SeedStructure};
+use crate::postgres::server::PostgresServer;
+use crate::records::{CampaignRecord, SeedStructure};
 use crate::sqlite::file::DatabaseFile;
 
 impl Store {
@@ -15,7 +15,7 @@ impl Store {
     /// The campaign is created as a whole or not at all.
     pub async fn create(
         location: impl Into<Location>,
-        campaign: &Campaign,
+        campaign: &CampaignRecord,
         seed_structures: &[SeedStructure],
         now: i64,
     ) -> Result<Self> {
@@ -23,7 +23,7 @@ impl Store {
         let database = match location.into() {
             Location::Directory(directory) => Database::Sqlite(DatabaseFile::create(&directory, fill).await?),
             Location::Server(url) => {
-                let database = Database::Postgres(Server::create(&url, campaign.id).await?);
+                let database = Database::Postgres(PostgresServer::create(&url, campaign.id).await?);
                 fill(&database).await?;
                 database
             }
@@ -35,7 +35,7 @@ impl Store {
 /// Writes the initial rows of a database.
 async fn write_campaign(
     database: &Database,
-    campaign: &Campaign,
+    campaign: &CampaignRecord,
     seed_structures: &[SeedStructure],
     now: i64,
 ) -> Result<()> {

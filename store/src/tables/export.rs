@@ -8,7 +8,7 @@ use super::label_row::LabelRow;
 use super::restore::{block, grades, origin};
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_STRUCTURE, joined};
-use crate::database::{FromRow, Row, query};
+use crate::database::{FromRow, SqlRow, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::export::{ExportCursor, ExportFilter, ExportRow, ExportSource};
@@ -103,7 +103,7 @@ impl Store {
     }
 }
 
-fn candidate(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
+fn candidate(row: &SqlRow, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
     CANDIDATE.verify(row, Names::Joined)?;
     DECISION.verify(row, Names::Joined)?;
     ORIGINAL_GRADES.verify(row)?;
@@ -130,14 +130,14 @@ fn candidate(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<Ex
     labelled(row, ExportCursor::Candidate(row.get("decision")?), source, protocol_name, protocol)
 }
 
-fn import(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
+fn import(row: &SqlRow, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
     IMPORT.verify(row, Names::Joined)?;
     let source = ExportSource::Import { file: row.get("import__file")?, frame: row.get("import__frame")? };
     labelled(row, ExportCursor::Import(row.get("place")?), source, protocol_name, protocol)
 }
 
 fn labelled(
-    row: &Row,
+    row: &SqlRow,
     cursor: ExportCursor,
     source: ExportSource,
     protocol_name: &str,

@@ -3,7 +3,7 @@
 use atoms::Vec3;
 
 use crate::checksum::{LABEL, Names};
-use crate::database::{FromRow, Row};
+use crate::database::{FromRow, SqlRow};
 use crate::encoding::{decode_matrix, decode_vectors};
 use crate::error::{Result, StoreError};
 use crate::exclude::Exclusion;
@@ -29,7 +29,7 @@ pub(super) struct LabelRow {
 }
 
 impl FromRow for LabelRow {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         LABEL.verify(row, Names::Plain)?;
         Ok(Self {
             standing: row.get("standing")?,

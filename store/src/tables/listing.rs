@@ -4,14 +4,14 @@
 use super::label_row::LabelRow;
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, Names, joined};
-use crate::database::{FromRow, Row, query};
+use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
 use crate::listing::{ListCursor, ListOrder, ListedCandidate};
 use crate::records::{JobState, Label};
 use crate::words;
 
 impl FromRow for ListedCandidate {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         DECISION.verify(row, Names::Joined)?;
         let reason: Option<String> = row.get("candidate__reason")?;

@@ -8,9 +8,9 @@ use serde_json::Value;
 
 use crate::Store;
 use crate::checksum::{DECISION, Names};
-use crate::database::{self, FromRow, Transaction, query};
+use crate::database::{FromRow, SqlRow, Transaction, query};
 use crate::error::{Result, StoreError};
-use crate::records::{LoggedDecision, Operation};
+use crate::records::{LoggedDecision, LoggedOperation};
 
 /// Decisions read at a time.
 const PAGE: usize = 1000;
@@ -26,7 +26,7 @@ struct Row {
 }
 
 impl FromRow for Row {
-    fn from_row(row: &database::Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         DECISION.verify(row, Names::Plain)?;
         Ok(Self {
             sequence: row.get("sequence")?,
@@ -80,7 +80,7 @@ impl Store {
     }
 
     /// At most `limit` lines of the operations log after line `after`, in order.
-    pub async fn operations(&self, after: i64, limit: u32) -> Result<Vec<Operation>> {
+    pub async fn operations(&self, after: i64, limit: u32) -> Result<Vec<LoggedOperation>> {
         let sql =
             "SELECT number, time, kind, detail FROM operation WHERE number > $1 ORDER BY number LIMIT $2";
         let rows: Vec<(i64, i64, String, String)> =
@@ -89,7 +89,7 @@ impl Store {
             .map(|(number, time, kind, detail)| {
                 let detail = serde_json::from_str(&detail);
                 let detail = detail.map_err(|error| StoreError::damaged("the operations log", error))?;
-                Ok(Operation { number, time, kind, detail })
+                Ok(LoggedOperation { number, time, kind, detail })
             })
             .collect()
     }

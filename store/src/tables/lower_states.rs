@@ -22,7 +22,7 @@ use crate::lower_states::{
 /// The campaign's value with the rule, JSON.
 const RULE: &str = "lower_states";
 
-/// The query for [`Pair`]s; its end selects the structures.
+/// The query for [`StatePair`]s; its end selects the structures.
 macro_rules! pairs {
     ($columns:literal, $end:literal) => {
         concat!(
@@ -64,14 +64,14 @@ const MAKE_LABEL: &str =
     "UPDATE label SET standing = 'label', superseded = NULL, reason = NULL WHERE number = $1";
 
 /// Numbers of a label in force and of a lower result.
-struct Pair {
+struct StatePair {
     structure: i64,
     protocol: i64,
     own: i64,
     other: i64,
 }
 
-from_columns!(Pair { structure, protocol, own, other });
+from_columns!(StatePair { structure, protocol, own, other });
 
 /// What becomes of the higher state.
 enum Higher<'a> {
@@ -192,7 +192,7 @@ pub(super) async fn apply_rule(
 /// Makes the lower state the label, by hand.
 async fn take(
     transaction: &mut Transaction,
-    pair: &Pair,
+    pair: &StatePair,
     remark: Option<&str>,
     now: i64,
 ) -> Result<LowerState> {
@@ -207,7 +207,7 @@ async fn take(
 }
 
 /// The higher one first: a structure has one label.
-async fn swap(transaction: &mut Transaction, pair: &Pair, higher: Higher<'_>, now: i64) -> Result<()> {
+async fn swap(transaction: &mut Transaction, pair: &StatePair, higher: Higher<'_>, now: i64) -> Result<()> {
     let higher = match higher {
         Higher::Superseded { reason } => query(SUPERSEDE).bind(pair.own).bind(now).bind(reason),
         Higher::Check => query(KEEP_AS_CHECK).bind(pair.own),
@@ -220,7 +220,7 @@ async fn swap(transaction: &mut Transaction, pair: &Pair, higher: Higher<'_>, no
 /// `before` is the lower result as it was: what the label forgets by becoming one again stands in the log.
 async fn log(
     transaction: &mut Transaction,
-    pair: &Pair,
+    pair: &StatePair,
     state: &LowerState,
     before: &LabelRecord,
     by: &str,
@@ -239,7 +239,7 @@ async fn log(
 }
 
 /// The lowest result of each structure, or of one, by each of its protocols.
-async fn pairs(transaction: &mut Transaction, structure: Option<i64>) -> Result<Vec<Pair>> {
+async fn pairs(transaction: &mut Transaction, structure: Option<i64>) -> Result<Vec<StatePair>> {
     if !exclude::has_exclusion_columns(transaction).await? {
         return Ok(Vec::new());
     }
@@ -248,13 +248,13 @@ async fn pairs(transaction: &mut Transaction, structure: Option<i64>) -> Result<
         Some(structure) => query(OF_STRUCTURE).bind(difference).bind(structure),
         None => query(ALL).bind(difference),
     };
-    let mut found: Vec<Pair> = found.fetch_all(&mut *transaction).await?;
+    let mut found: Vec<StatePair> = found.fetch_all(&mut *transaction).await?;
     found.dedup_by_key(|pair| pair.own);
     Ok(found)
 }
 
 /// The pair in words, and the record of its lower result.
-async fn describe(transaction: &mut Transaction, pair: &Pair) -> Result<(LowerState, LabelRecord)> {
+async fn describe(transaction: &mut Transaction, pair: &StatePair) -> Result<(LowerState, LabelRecord)> {
     let own: LabelRow = query(LABEL).bind(pair.own).fetch_one(&mut *transaction).await?;
     let other: LabelRow = query(LABEL).bind(pair.other).fetch_one(&mut *transaction).await?;
     let (own, other) = (own.into_record()?, other.into_record()?);

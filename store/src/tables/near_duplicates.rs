@@ -4,7 +4,7 @@ use atoms::Structure;
 
 use crate::Store;
 use crate::checksum::{CANDIDATE, FEATURES, Names, joined};
-use crate::database::{FromRow, Row, query};
+use crate::database::{FromRow, SqlRow, query};
 use crate::encoding::read_structure;
 use crate::error::Result;
 use crate::numbers::decode_numbers;
@@ -48,7 +48,7 @@ struct Near {
 }
 
 impl FromRow for Own {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         FEATURES.verify(row)?;
         Ok(Self {
@@ -61,7 +61,7 @@ impl FromRow for Own {
 }
 
 impl FromRow for Near {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         FEATURES.verify(row)?;
         Ok(Self { id: row.get("id")?, structure: read_structure(row)?, features: row.get("features")? })
     }

@@ -1,6 +1,6 @@
 //! Adds label jobs.
 
-use crate::database::{Transaction, Value, execute_rows};
+use crate::database::{SqlValue, Transaction, execute_rows};
 use crate::error::Result;
 
 /// Columns of a new job.
@@ -15,7 +15,7 @@ const INSERT_JOBS: &str = "INSERT INTO job (structure, protocol, decision, prior
     ON CONFLICT (structure, protocol) DO NOTHING";
 
 /// Adds jobs with these hashes, protocols, decisions and priorities.
-pub(super) async fn insert_jobs(transaction: &mut Transaction, jobs: Vec<Vec<Value>>) -> Result<u64> {
+pub(super) async fn insert_jobs(transaction: &mut Transaction, jobs: Vec<Vec<SqlValue>>) -> Result<u64> {
     execute_rows(transaction, INSERT_JOBS, &JOB, jobs).await
 }
 

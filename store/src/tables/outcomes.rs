@@ -6,7 +6,7 @@ use super::restore::{grades, origin};
 use super::{job_counts, protocols};
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
-use crate::database::{FromRow, Row, query};
+use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
 use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
 use crate::words;
@@ -163,7 +163,7 @@ impl Store {
 }
 
 impl FromRow for LabelCost {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         let (started, ended): (i64, Option<i64>) = (row.get("started")?, row.get("ended")?);
         let cores = row.get_or_default::<Option<u32>>("cores")?.unwrap_or(1);
         let milliseconds = ended.unwrap_or(started).saturating_sub(started).max(MIN_MILLISECONDS);
@@ -180,7 +180,7 @@ impl FromRow for LabelCost {
 }
 
 impl FromRow for Unlabelled {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         let range =
             |low, high| -> Result<ValueRange> { Ok(ValueRange { low: row.get(low)?, high: row.get(high)? }) };
         Ok(Self {
@@ -197,7 +197,7 @@ impl FromRow for Unlabelled {
 }
 
 impl FromRow for FinishedCandidate {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         let labelled = row.get::<String>("job_state")? == "labelled";
         let unlabelled = match labelled {

@@ -103,9 +103,9 @@ fn select_kind(kind: Option<&str>, has_clock: bool) -> Query {
 
 async fn insert(transaction: &mut Transaction, process: &ProcessRecord) -> Result<()> {
     let sql = "INSERT INTO process
-        (id, kind, number, pid, birth, host, started, last_seen, state, restarts, setup, remark)
+        (id, kind, number, pid, start_time, host, started, last_seen, state, restarts, setup, remark)
         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12)
-        ON CONFLICT (id) DO UPDATE SET kind = $2, number = $3, pid = $4, birth = $5, host = $6, started = $7,
+        ON CONFLICT (id) DO UPDATE SET kind = $2, number = $3, pid = $4, start_time = $5, host = $6, started = $7,
             last_seen = $8, state = $9, restarts = $10, setup = $11, remark = $12";
     let query = query(sql).bind(&process.id).bind(&process.kind).bind(process.number);
     let query = query.bind(process.pid).bind(&process.start_time).bind(&process.host);

@@ -8,10 +8,10 @@ use super::new_jobs::enqueue;
 use super::structures::structure_id;
 use crate::Store;
 use crate::checksum::{CAMPAIGN, Names, PROTOCOL, SEED_STRUCTURE, joined};
-use crate::database::{FromRow, Row, Transaction, Value, query};
+use crate::database::{FromRow, SqlRow, SqlValue, Transaction, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
-use crate::records::{Campaign, Protocol, SeedStructure};
+use crate::records::{CampaignRecord, Protocol, SeedStructure};
 
 /// Priority of jobs added later than their candidate.
 const LATE_PRIORITY: i32 = 0;
@@ -30,7 +30,7 @@ macro_rules! seed_structures {
 }
 
 impl FromRow for SeedStructure {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         SEED_STRUCTURE.verify(row, Names::Joined)?;
         Ok(Self {
             index: row.get("seed_structure__seed")?,
@@ -43,9 +43,9 @@ impl FromRow for SeedStructure {
 
 impl Store {
     /// The properties of the campaign.
-    pub async fn campaign(&self) -> Result<Campaign> {
+    pub async fn campaign(&self) -> Result<CampaignRecord> {
         let id = self.campaign_value("id").await?;
-        Ok(Campaign {
+        Ok(CampaignRecord {
             id: id.parse().map_err(|error| StoreError::damaged("the campaign's id", error))?,
             program_version: self.campaign_value("program_version").await?,
             mode: self.campaign_value("mode").await?,
@@ -182,7 +182,7 @@ impl Store {
 }
 
 impl FromRow for Protocol {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         PROTOCOL.verify(row, Names::Plain)?;
         let (hash, settings): (Vec<u8>, String) = (row.get("hash")?, row.get("settings")?);
         let settings = serde_json::from_str(&settings);
@@ -220,7 +220,7 @@ pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str,
     let mut row = vec![key.into(), value.into()];
     match CAMPAIGN_KEYS.contains(&key) {
         true => row = CAMPAIGN.with_checksum(row),
-        false => row.push(Value::Integer(None)),
+        false => row.push(SqlValue::Integer(None)),
     }
     query(sql).bind_all(row).execute(&mut *transaction).await?;
     Ok(())

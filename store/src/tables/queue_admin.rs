@@ -12,9 +12,9 @@ use super::label_row::LabelRow;
 use super::logs::insert_operation;
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, STRUCTURE, joined};
-use crate::database::{self, FromRow, Transaction, query};
+use crate::database::{FromRow, SqlRow, Transaction, query};
 use crate::error::{Result, StoreError};
-use crate::jobs::{Attempt, Job, JobDetails};
+use crate::jobs::{Attempt, JobDetails, QueueEntry};
 use crate::records::JobState;
 
 /// Number of candidates shown if a name fits none or several.
@@ -118,7 +118,7 @@ struct Row {
 }
 
 impl FromRow for Row {
-    fn from_row(row: &database::Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         Ok(Self {
             number: row.get("number")?,
@@ -152,7 +152,7 @@ impl FromRow for Row {
 struct ImportRow(Row);
 
 impl FromRow for ImportRow {
-    fn from_row(row: &database::Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         STRUCTURE.verify(row, Names::Joined)?;
         Ok(Self(Row {
             number: row.get("number")?,
@@ -185,7 +185,12 @@ impl FromRow for ImportRow {
 impl Store {
     /// Jobs in a state, in the order in which they would be leased: by priority, then in decision order. Without a
     /// state, all jobs: leased first, then queued, failed, dropped and finished ones.
-    pub async fn queue_list(&self, state: Option<JobState>, limit: u32, offset: u32) -> Result<Vec<Job>> {
+    pub async fn queue_list(
+        &self,
+        state: Option<JobState>,
+        limit: u32,
+        offset: u32,
+    ) -> Result<Vec<QueueEntry>> {
         let mut transaction = self.database.begin_read().await?;
         let numbers = job_counts::states(&mut transaction).await?;
         let excluded = exclude::by_job(&mut transaction).await?;
@@ -279,7 +284,7 @@ impl Store {
         id: &str,
         allowed: &[JobState],
         allowed_text: &'static str,
-    ) -> Result<Change> {
+    ) -> Result<PendingChange> {
         let (job, candidate) = self.find(id).await?;
         let mut transaction = self.database.begin().await?;
         let state = query("SELECT state FROM job WHERE number = $1").bind(job);
@@ -287,7 +292,7 @@ impl Store {
         if !allowed.contains(&state) {
             return Err(StoreError::WrongState { action, candidate, state, allowed: allowed_text });
         }
-        Ok(Change { transaction, job, candidate })
+        Ok(PendingChange { transaction, job, candidate })
     }
 
     /// Job id, and full name of the candidate.
@@ -334,13 +339,13 @@ impl Store {
 }
 
 /// A permitted change that is not yet made.
-struct Change {
+struct PendingChange {
     transaction: Transaction,
     job: i64,
     candidate: String,
 }
 
-impl Change {
+impl PendingChange {
     async fn log(mut self, action: &str, mut detail: Value, now: i64) -> Result<String> {
         detail["candidate"] = json!(self.candidate);
         detail["job"] = json!(self.job);
@@ -351,8 +356,8 @@ impl Change {
 }
 
 impl Row {
-    fn into_job(self, excluded: &BTreeMap<i64, String>) -> Result<Job> {
-        Ok(Job {
+    fn into_job(self, excluded: &BTreeMap<i64, String>) -> Result<QueueEntry> {
+        Ok(QueueEntry {
             job: self.number,
             candidate: self.id,
             protocol: self.name,

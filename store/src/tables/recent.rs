@@ -3,7 +3,7 @@
 use super::restore::origin;
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, Names, joined};
-use crate::database::{FromRow, Row, query};
+use crate::database::{FromRow, SqlRow, query};
 use crate::error::{Result, StoreError};
 use crate::recent::{DecidedCandidate, RecentDecision};
 use crate::words;
@@ -31,7 +31,7 @@ impl Store {
 }
 
 impl FromRow for RecentDecision {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         DECISION.verify(row, Names::Joined)?;
         let candidate = candidate(row)?;
         let detail = match candidate {
@@ -50,7 +50,7 @@ impl FromRow for RecentDecision {
     }
 }
 
-fn candidate(row: &Row) -> Result<Option<DecidedCandidate>> {
+fn candidate(row: &SqlRow) -> Result<Option<DecidedCandidate>> {
     let Some(candidate) = row.get("candidate__id")? else { return Ok(None) };
     CANDIDATE.verify(row, Names::Joined)?;
     let reason: Option<String> = row.get("candidate__reason")?;

@@ -14,7 +14,7 @@ use super::logs::insert_operation;
 use super::protocols::{in_force, insert_protocol, protocol_id, set_campaign_value};
 use super::structures::has_label;
 use crate::Store;
-use crate::database::{FromRow, Row, Transaction, Value, execute_rows, from_columns, query};
+use crate::database::{FromRow, SqlRow, SqlValue, Transaction, execute_rows, from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
 use crate::jobs::{LabelSource, LabelStatus};
@@ -105,7 +105,7 @@ struct RelabelRow {
 from_columns!(RelabelRow { number, state, relabel, relabel_after });
 
 impl FromRow for Relabellable {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         let (hash, state): (Vec<u8>, Option<String>) = (row.get("hash")?, row.get("state")?);
         let named = |state: String| {
             JobState::named(&state).ok_or_else(|| StoreError::damaged("the state of a job", state))
@@ -172,7 +172,7 @@ impl Store {
         }
         let none = || StoreError::damaged("the campaign", "it has no label protocol");
         let protocol = in_force(&mut transaction).await?.ok_or_else(none)?;
-        let row = |content: &ContentHash| -> Vec<Value> {
+        let row = |content: &ContentHash| -> Vec<SqlValue> {
             vec![content.0.to_vec().into(), protocol.into(), order.reason.into()]
         };
         // A statement may write a row only once.

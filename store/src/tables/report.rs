@@ -6,7 +6,7 @@ use super::label_row::LabelRow;
 use super::restore::{block, grades, origin};
 use crate::Store;
 use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
-use crate::database::{FromRow, Row, query};
+use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
 use crate::records::JobState;
 use crate::report::{CollectedStructure, FateCount};
@@ -67,7 +67,7 @@ impl Store {
 }
 
 impl FromRow for CollectedStructure {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         ORIGINAL_GRADES.verify(row)?;
         let grades_of: Option<Vec<u8>> = row.get("original_grades")?;
@@ -87,7 +87,7 @@ impl FromRow for CollectedStructure {
 }
 
 impl FromRow for FateCount {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         Ok(Self {
             part: row.get("part")?,
             fate: words::shown(&row.get::<String>("fate")?).to_owned(),

@@ -1,6 +1,6 @@
 //! The state from which a selector continues, and complete candidates.
 
-use wire::messages::{DeclineReason, Progress};
+use wire::messages::{DeclineReason, WalkProgress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkConditions, WalkId};
 
 use super::walk_conditions;
@@ -8,7 +8,7 @@ use crate::Store;
 use crate::checksum::{
     CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG_COLUMNS, Names, STRUCTURE, VALUE, WALK, joined,
 };
-use crate::database::{FromRow, Row, Target, from_columns, query};
+use crate::database::{FromRow, SqlRow, Target, from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
@@ -50,7 +50,7 @@ struct WalkRow {
     seed_structure: u32,
     state: String,
     reason: String,
-    turn: u64,
+    assignments: u64,
     accepted: u32,
     step: u64,
     segment: u32,
@@ -71,7 +71,7 @@ from_columns!(WalkRow {
     seed_structure,
     state,
     reason,
-    turn,
+    assignments,
     accepted,
     step,
     segment,
@@ -107,7 +107,7 @@ impl Store {
     /// The selector's values, by name.
     pub async fn values(&self) -> Result<Vec<(String, String)>> {
         let rows = query("SELECT * FROM value ORDER BY name").rows(&self.database).await?;
-        let value = |row: &Row| {
+        let value = |row: &SqlRow| {
             VALUE.verify(row, Names::Plain)?;
             Ok((row.get("name")?, row.get("value")?))
         };
@@ -189,14 +189,14 @@ async fn components(from: impl Into<Target<'_>>) -> Result<Vec<ComponentRecord>>
 }
 
 impl FromRow for ComponentRecord {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         COMPONENT.verify(row, Names::Plain)?;
         Ok(Self { element: row.get("element")?, slot: row.get("slot")?, bytes: row.get("bytes")? })
     }
 }
 
 impl FromRow for WalkRecord {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         WALK.verify(row, Names::Plain)?;
         CHECKPOINT.verify(row)?;
         WalkRow::from_row(row)?.into_record()
@@ -216,9 +216,9 @@ impl WalkRow {
             conditions: WalkConditions::default(),
             state: self.state,
             reason: self.reason,
-            turn: self.turn,
+            assignments: self.assignments,
             accepted: self.accepted,
-            progress: Progress {
+            progress: WalkProgress {
                 step: self.step,
                 segment: self.segment,
                 tau: number(self.tau),
@@ -236,7 +236,7 @@ impl WalkRow {
 }
 
 impl FromRow for StoredCandidate {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Plain)?;
         LONG_COLUMNS.iter().try_for_each(|column| column.verify(row))?;
         let (fate, reason): (String, Option<String>) = (row.get("fate")?, row.get("reason")?);
@@ -261,7 +261,7 @@ impl FromRow for StoredCandidate {
 }
 
 /// The block of a row. It must belong to the candidate of this name.
-pub(super) fn block(row: &Row, id: &str) -> Result<CandidateBlock> {
+pub(super) fn block(row: &SqlRow, id: &str) -> Result<CandidateBlock> {
     let block = CandidateBlock::from_bytes(&row.get::<Vec<u8>>("block")?)?;
     let found = block.view().id().to_string();
     match found == id {

@@ -11,9 +11,9 @@ use crate::checksum::joined;
 use crate::database::query;
 use crate::error::Result;
 use crate::processes::ProcessRecord;
-use crate::status::{Candidates, Labels, Status, WalkStatus};
+use crate::status::{CampaignStatus, Candidates, LabelJobCounts, WalkStatus};
 use crate::unix_milliseconds;
-use crate::walk_progress::{TotalThroughput, WalkProgress};
+use crate::walk_progress::{TotalThroughput, WalkProgressRecord};
 
 const END_BY_BUDGET: &str = "budget";
 
@@ -47,7 +47,7 @@ impl Store {
     /// lives. A process on another host without a heartbeat for a minute is `unresponsive`. A walk stopped by a time
     /// limit has the state `budget`. While no process leads the campaign, walks are shown at their checkpoints and
     /// have no speed.
-    pub async fn status(&self) -> Result<Status> {
+    pub async fn status(&self) -> Result<CampaignStatus> {
         let now = unix_milliseconds();
         let mut transaction = self.database.begin_read().await?;
         let are_counted = transaction.has_table("candidate_count").await?;
@@ -80,7 +80,7 @@ impl Store {
             total = walk_progress::total(&mut transaction, now).await?;
         }
         transaction.commit().await?;
-        let labels = Labels { excluded, lower_states, ..labels(&states, &asked) };
+        let labels = LabelJobCounts { excluded, lower_states, ..labels(&states, &asked) };
         let time_used_up = limits.time_used_up(&used);
         set_budget_reason(&mut walks, time_used_up, &limits);
         for walk in &mut walks {
@@ -88,7 +88,7 @@ impl Store {
             walk.steps_per_second = walk.steps_per_second.filter(|_| !walk.paused);
         }
         let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.forbids_attempts(&used));
-        Ok(Status {
+        Ok(CampaignStatus {
             candidates: candidates(&fates, rejected),
             imported,
             led,
@@ -108,7 +108,7 @@ impl Store {
 }
 
 /// Adds the speed of running walks, and their progress since the last checkpoint.
-fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
+fn apply_progress(walks: &mut [WalkStatus], progress: &[WalkProgressRecord]) {
     for walk in walks.iter_mut().filter(|walk| walk.is_active()) {
         let Ok(found) = progress.binary_search_by_key(&walk.walk, |latest| latest.walk) else { continue };
         let latest = &progress[found];
@@ -162,12 +162,12 @@ fn candidates(fates: &[(String, String, u64)], rejected_by_guards: u64) -> Candi
     candidates
 }
 
-fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> Labels {
+fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> LabelJobCounts {
     let of = |states: &[(String, u64)], name: &str| {
         states.iter().find(|(state, _)| state == name).map_or(0, |(_, count)| *count)
     };
     let (number, asked) = (|name: &str| of(states, name), |name: &str| of(asked, name));
-    Labels {
+    LabelJobCounts {
         queued: number("queued"),
         leased: number("leased"),
         labelled: number("labelled"),

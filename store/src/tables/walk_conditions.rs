@@ -6,7 +6,7 @@ use wire::{WalkConditions, WalkId};
 
 use crate::Store;
 use crate::checksum::{Names, WALK_CONDITIONS};
-use crate::database::{FromRow, Row, Transaction, query};
+use crate::database::{FromRow, SqlRow, Transaction, query};
 use crate::error::{Result, StoreError};
 
 const TABLE: &str = "walk_conditions";
@@ -32,7 +32,7 @@ pub(super) async fn read(transaction: &mut Transaction) -> Result<BTreeMap<WalkI
 }
 
 impl FromRow for (WalkId, WalkConditions) {
-    fn from_row(row: &Row) -> Result<Self> {
+    fn from_row(row: &SqlRow) -> Result<Self> {
         WALK_CONDITIONS.verify(row, Names::Plain)?;
         let (walk, text): (u32, String) = (row.get("walk")?, row.get("conditions")?);
         let conditions = serde_json::from_str(&text)

@@ -1,12 +1,12 @@
 //! Progress of walks: the leader of the campaign writes it every few seconds, monitors read it.
 
-use serde_json::{Value as Json, json};
+use serde_json::{Value, json};
 
 use super::protocols::set_campaign_value;
 use crate::Store;
-use crate::database::{Transaction, Value, execute_rows, query};
+use crate::database::{SqlValue, Transaction, execute_rows, query};
 use crate::error::Result;
-use crate::walk_progress::{TotalThroughput, WalkProgress};
+use crate::walk_progress::{TotalThroughput, WalkProgressRecord};
 
 /// Progress older than this (ms) is ignored.
 const MAX_AGE: i64 = 60_000;
@@ -33,23 +33,23 @@ impl Store {
     /// Stores the progress of these walks and the throughput of all together.
     pub async fn set_walk_progress(
         &self,
-        walks: &[WalkProgress],
+        walks: &[WalkProgressRecord],
         all: TotalThroughput,
         now: i64,
     ) -> Result<()> {
-        let row = |walk: &WalkProgress| {
-            let integer = |number: i64| Value::Integer(Some(number));
+        let row = |walk: &WalkProgressRecord| {
+            let integer = |number: i64| SqlValue::Integer(Some(number));
             let step = i64::try_from(walk.step).unwrap_or(i64::MAX);
             vec![
                 integer(walk.walk.into()),
                 integer(walk.seen),
                 integer(walk.segment.into()),
                 integer(step),
-                Value::Real(finite(walk.steps_per_second)),
-                Value::Real(finite(walk.tau)),
-                Value::Real(finite(walk.temperature)),
-                Value::Real(finite(walk.relative_volume)),
-                Value::Real(finite(walk.gamma_max)),
+                SqlValue::Real(finite(walk.steps_per_second)),
+                SqlValue::Real(finite(walk.tau)),
+                SqlValue::Real(finite(walk.temperature)),
+                SqlValue::Real(finite(walk.relative_volume)),
+                SqlValue::Real(finite(walk.gamma_max)),
             ]
         };
         let mut transaction = self.database.begin_as_leader().await?;
@@ -68,7 +68,7 @@ fn finite(number: Option<f64>) -> Option<f64> {
 }
 
 /// Progress reported within the last minute; empty for tables of an earlier version.
-pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgress>> {
+pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgressRecord>> {
     if !transaction.has_table("pace").await? {
         return Ok(Vec::new());
     }
@@ -79,7 +79,7 @@ pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Ve
 pub(super) async fn total(transaction: &mut Transaction, now: i64) -> Result<TotalThroughput> {
     let found = query("SELECT value FROM campaign WHERE key = $1").bind(TOTAL_KEY);
     let found: Option<String> = found.fetch_optional(transaction).await?;
-    let found: Json = found.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
+    let found: Value = found.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
     let is_fresh = found["time"].as_i64().is_some_and(|time| time > now - MAX_AGE);
     let found = if is_fresh { serde_json::from_value(found).ok() } else { None };
     Ok(found.unwrap_or_default())

@@ -6,10 +6,10 @@ mod home;
 use atoms::{Cell, Structure};
 use serde_json::json;
 use store::{
-    AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Location, Protocol, SeedStructure,
-    Store, WalkRecord,
+    AtomGrades, CampaignRecord, CandidateRecord, Commit, Decision, Fate, Label, Location, Protocol,
+    SeedStructure, Store, WalkRecord,
 };
-use wire::messages::Progress;
+use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 pub use home::{Home, server};
@@ -17,8 +17,8 @@ pub use home::{Home, server};
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const ATOMS: usize = 2;
 
-pub fn campaign() -> Campaign {
-    Campaign {
+pub fn campaign() -> CampaignRecord {
+    CampaignRecord {
         id: CAMPAIGN,
         program_version: "0.1.0".into(),
         mode: "reproducible".into(),
@@ -126,7 +126,7 @@ pub fn commit_of(candidates: Vec<CandidateRecord>) -> Commit {
     Commit { decisions: decisions.collect(), candidates, ..Commit::default() }
 }
 
-pub fn walk(walk: u32, turn: u64) -> WalkRecord {
+pub fn walk(walk: u32, assignments: u64) -> WalkRecord {
     WalkRecord {
         walk: WalkId(walk),
         origin: Origin::Biased,
@@ -135,17 +135,17 @@ pub fn walk(walk: u32, turn: u64) -> WalkRecord {
         conditions: WalkConditions::default(),
         state: "running".into(),
         reason: String::new(),
-        turn,
+        assignments,
         accepted: 1,
-        progress: Progress {
-            step: 100 * turn,
+        progress: WalkProgress {
+            step: 100 * assignments,
             tau: 0.5,
             temperature: 310.0,
             refused: 2,
-            ..Progress::default()
+            ..WalkProgress::default()
         },
         selector_state: "{}".into(),
-        checkpoint: Some(turn.to_le_bytes().to_vec()),
+        checkpoint: Some(assignments.to_le_bytes().to_vec()),
     }
 }
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sqlx::postgres::{PgConnectOptions, PgConnection};
 use sqlx::{ConnectOptions, Executor};
-use store::{Campaign, CampaignLock, Fate, Store, StoreError};
+use store::{CampaignLock, CampaignRecord, Fate, Store, StoreError};
 use wire::{CampaignId, Origin};
 
 use super::common::*;
@@ -91,7 +91,7 @@ async fn a_process_that_lost_the_lock_stops_writing() {
 async fn another_campaign_in_the_same_schema_is_refused_with_both_ids() {
     let home = Home::new();
     home.create().await;
-    let other = Campaign { id: CampaignId([3; 16]), ..campaign() };
+    let other = CampaignRecord { id: CampaignId([3; 16]), ..campaign() };
     let error = Store::create(home.location(), &other, &[], 0).await.unwrap_err();
     assert!(matches!(error, StoreError::Occupied { .. }), "{error}");
     let message = error.to_string();

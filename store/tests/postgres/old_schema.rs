@@ -5,7 +5,7 @@ use wire::Origin;
 
 use super::common::*;
 
-/// Turns them into tables of version 8 by removing what later versions add.
+/// Turns them into tables of version 8 by undoing what later versions add and rename.
 const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE campaign DROP COLUMN checksum; ALTER TABLE value DROP COLUMN checksum;
     ALTER TABLE structure DROP COLUMN checksum; ALTER TABLE seed_structure DROP COLUMN checksum;
@@ -18,6 +18,8 @@ const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE walk DROP COLUMN checksum, DROP COLUMN checkpoint_checksum;
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
     DROP TABLE walk_conditions;
+    ALTER TABLE process RENAME COLUMN start_time TO birth; ALTER TABLE leader RENAME COLUMN start_time TO birth;
+    ALTER TABLE walk RENAME COLUMN assignments TO turn;
     DELETE FROM _sqlx_migrations WHERE version > 8";
 
 async fn exported(location: impl Into<Location>) -> Vec<String> {

@@ -1,5 +1,5 @@
 //! The link between an orchestrator and an agent breaks, as programs on two hosts see it. The agent has one walker and may be
-//! one assignment ahead, so its walker goes on for a turn or two without the link, and then waits.
+//! one assignment ahead, so its walker goes on for an assignment or two without the link, and then waits.
 
 use std::path::Path;
 use std::thread::sleep;

@@ -8,7 +8,7 @@ use calm::Mixture;
 use md::{LangevinSettings, ThermostatSettings};
 use potentials::grace::{GraceModel, Threads};
 use potentials::{ZblWindow, ZblWindows};
-use wire::messages::{Assignment, Outcome, Report};
+use wire::messages::{Assignment, AssignmentReport, Outcome};
 use wire::{CampaignId, Candidate, Origin, WalkConditions, WalkId};
 use workers::settings::{GuardSettings, WalkSettings};
 use workers::walk::{WalkContext, advance};
@@ -56,7 +56,11 @@ impl TimedWalk {
     }
 }
 
-fn run(context: &WalkContext, assignment: &Assignment, mixture: &Arc<Mixture>) -> Report<Candidate> {
+fn run(
+    context: &WalkContext,
+    assignment: &Assignment,
+    mixture: &Arc<Mixture>,
+) -> AssignmentReport<Candidate> {
     advance(context, assignment, Arc::clone(mixture), || false, |_| {})
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use wire::WalkId;
-use wire::messages::{Assignment, Outcome, Progress};
+use wire::messages::{Assignment, Outcome, WalkProgress};
 use wire::net::SlotReport;
 
 use super::UNRESPONSIVE_AFTER;
@@ -78,7 +78,7 @@ impl AgentMetrics {
     }
 
     /// Records the progress of a walk.
-    pub(super) fn record_progress(&mut self, walk: WalkId, progress: &Progress) {
+    pub(super) fn record_progress(&mut self, walk: WalkId, progress: &WalkProgress) {
         let Some(position) = self.walks.get_mut(&walk) else { return };
         let now = (progress.segment, progress.step);
         // A roll back to a checkpoint is no step.
@@ -108,21 +108,21 @@ impl AgentMetrics {
 #[cfg(test)]
 mod tests {
     use atoms::{Cell, Structure};
-    use wire::messages::{Report, WalkEnd};
+    use wire::messages::{AssignmentReport, WalkEnd};
     use wire::{CampaignId, Origin, WalkConditions};
 
     use super::*;
 
     const WALK: WalkId = WalkId(3);
 
-    fn turn(turn: u64, checkpoint: Option<Vec<u8>>) -> Assignment {
+    fn assignment(number: u64, checkpoint: Option<Vec<u8>>) -> Assignment {
         let cell = Cell::orthorhombic(1.0, 1.0, 1.0);
         let seed_structure =
             Structure { species: Vec::new(), positions: Vec::new(), cell, periodic: [true; 3] };
         Assignment {
             campaign: CampaignId([1; 16]),
             walk: WALK,
-            number: turn,
+            number,
             origin: Origin::Biased,
             random_walk: WALK,
             seed_structure,
@@ -135,18 +135,18 @@ mod tests {
         }
     }
 
-    fn at(segment: u32, step: u64) -> Progress {
-        Progress { segment, step, ..Progress::default() }
+    fn at(segment: u32, step: u64) -> WalkProgress {
+        WalkProgress { segment, step, ..WalkProgress::default() }
     }
 
     #[test]
     fn steps_count_those_made_here() {
         let mut metrics = AgentMetrics::default();
-        metrics.received(&turn(0, None), 7);
+        metrics.received(&assignment(0, None), 7);
         metrics.record_progress(WALK, &at(0, 10));
         metrics.record_progress(WALK, &at(0, 40));
         // It continues where it was.
-        metrics.received(&turn(1, Some(Vec::new())), 7);
+        metrics.received(&assignment(1, Some(Vec::new())), 7);
         metrics.record_progress(WALK, &at(0, 45));
         assert_eq!(metrics.steps, 45);
         // It rolls back to step 20 and continues.
@@ -154,7 +154,7 @@ mod tests {
         metrics.record_progress(WALK, &at(1, 25));
         assert_eq!(metrics.steps, 50);
         // It ran elsewhere for some assignments.
-        metrics.received(&turn(9, Some(Vec::new())), 7);
+        metrics.received(&assignment(9, Some(Vec::new())), 7);
         metrics.record_progress(WALK, &at(1, 900));
         metrics.record_progress(WALK, &at(1, 901));
         assert_eq!((metrics.steps, metrics.assignments_received, metrics.mixture_version), (51, 3, Some(7)));
@@ -167,7 +167,13 @@ mod tests {
         let mut metrics = AgentMetrics::default();
         let report = |outcome| {
             let checkpoint = Vec::new();
-            SlotReport::Report(Report { walk: WALK, assignment: 0, outcome, checkpoint, progress: at(0, 1) })
+            SlotReport::Report(AssignmentReport {
+                walk: WALK,
+                assignment: 0,
+                outcome,
+                checkpoint,
+                progress: at(0, 1),
+            })
         };
         let ended = || report(Outcome::Ended(WalkEnd::Steps));
         for told in [

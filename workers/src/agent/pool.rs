@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use tokio::sync::oneshot;
 use wire::WalkId;
-use wire::messages::Report;
+use wire::messages::AssignmentReport;
 use wire::net::{Slot, SlotReport};
 use wire::transport::WorkItem;
 
@@ -18,7 +18,7 @@ pub(super) struct AssignmentPool<S = Slot> {
     /// The assignment of each busy walker.
     assigned: BTreeMap<u32, (Option<S>, WalkId)>,
     /// Reports whose slots are lost.
-    unsent: VecDeque<Report>,
+    unsent: VecDeque<AssignmentReport>,
     /// Slots that may still get work.
     open_slots: usize,
 }
@@ -49,7 +49,7 @@ impl<S> AssignmentPool<S> {
     pub(super) fn walker_idle(
         &mut self,
         walker: u32,
-        report: Option<Report>,
+        report: Option<AssignmentReport>,
         reply: oneshot::Sender<Option<WorkItem>>,
     ) -> Option<(S, SlotReport)> {
         let slot = self.assigned.remove(&walker).and_then(|(slot, _)| slot);

@@ -10,7 +10,7 @@ use super::calculation_runner::CalculationEnd;
 use super::calculation_state::CalculationState;
 use super::file_error::file_error;
 use super::local::{self, LocalCalculation};
-use super::slurm::{Job, Slurm};
+use super::slurm::{CalculationJob, Slurm};
 
 /// Identifies a calculation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -19,7 +19,7 @@ pub(super) enum CalculationHandle {
     /// A process on a host.
     Local(LocalCalculation),
     /// A batch job on a cluster.
-    Slurm(Job),
+    Slurm(CalculationJob),
 }
 
 impl CalculationHandle {

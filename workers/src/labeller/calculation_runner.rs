@@ -22,7 +22,7 @@ use rustix::process::{
 use serde::{Deserialize, Serialize};
 
 use super::private_directory;
-use super::process_tree::{self, Children, MARK};
+use super::process_tree::{self, ChildReaper, MARK};
 use super::remove_tree::remove_tree;
 
 /// Working directory of the program, in the directory of the calculation.
@@ -220,7 +220,7 @@ impl Calculation {
         let program = self.start()?;
         let program = i32::try_from(program.id()).ok().and_then(Pid::from_raw);
         let program = program.ok_or(ErrorKind::InvalidInput)?;
-        let mut children = Children::new(program);
+        let mut children = ChildReaper::new(program);
         let (limit, memory) = self.wait(program, &mut children, started)?;
         let status = children.terminate()?;
         let seconds = started.elapsed().as_secs_f64();
@@ -269,7 +269,7 @@ impl Calculation {
     fn wait(
         &self,
         program: Pid,
-        children: &mut Children,
+        children: &mut ChildReaper,
         started: Instant,
     ) -> io::Result<(Option<Exit>, u64)> {
         let end = pidfd_open(program, PidfdFlags::empty())?;

@@ -54,7 +54,7 @@ struct CurrentCalculation {
 /// A calculation that is ready to start.
 enum PreparedCalculation {
     Local(local::PreparedRunner),
-    Slurm(slurm::Job),
+    Slurm(slurm::CalculationJob),
 }
 
 impl CodeMethod {
@@ -452,7 +452,7 @@ fn failed_on_node(attempt: &LabelAttempt) -> Option<CalculationHandle> {
         return None;
     };
     let may_help = matches!(failure.class, Crashed | LostNode | OutOfMemory) && node.is_some();
-    may_help.then(|| CalculationHandle::Slurm(slurm::Job { node: node.clone(), ..job.clone() }))
+    may_help.then(|| CalculationHandle::Slurm(slurm::CalculationJob { node: node.clone(), ..job.clone() }))
 }
 
 impl PreparedCalculation {

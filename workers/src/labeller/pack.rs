@@ -26,7 +26,7 @@ const MAX_LINES: usize = 1000;
 const COMPRESSION_LEVEL: i32 = 3;
 
 /// A compressed tar file.
-pub(super) struct Packed {
+pub(super) struct PackedDirectory {
     pub bytes: Vec<u8>,
     /// Files left out, with their size or the reason, one per line.
     pub left_out: String,
@@ -34,7 +34,7 @@ pub(super) struct Packed {
 
 /// Packs the files below a directory, ordered by name, unless a file or the sum becomes too large. Leaves out
 /// pseudopotentials ([`DATA`], [`LICENSED`]), which all calculations share, and unreadable files.
-pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
+pub(super) fn pack(directory: &Path) -> io::Result<PackedDirectory> {
     let mut encoder = zstd::Encoder::new(Vec::new(), COMPRESSION_LEVEL)?;
     encoder.include_checksum(true)?;
     let mut archive = tar::Builder::new(encoder);
@@ -57,7 +57,7 @@ pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
         }
     }
     let bytes = archive.into_inner()?.finish()?;
-    Ok(Packed { bytes, left_out: left_out.text() })
+    Ok(PackedDirectory { bytes, left_out: left_out.text() })
 }
 
 /// Why a file is not packed.

@@ -31,7 +31,7 @@ const TERMINATION_GRACE: Duration = Duration::from_secs(5);
 const KILL_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A running process, from `/proc/PID/stat`.
-struct Process {
+struct ProcessStat {
     pid: Pid,
     parent: Option<Pid>,
     session: Option<Pid>,
@@ -40,12 +40,12 @@ struct Process {
 }
 
 /// The children of this process: the program, and orphans of its descendants.
-pub(super) struct Children {
+pub(super) struct ChildReaper {
     program: Pid,
     ended: Option<ExitStatus>,
 }
 
-impl Children {
+impl ChildReaper {
     /// For this program, which nothing else may reap. Only one of these may exist in a process.
     pub fn new(program: Pid) -> Self {
         Self { program, ended: None }
@@ -179,11 +179,11 @@ fn send(signal: Signal, pid: Pid, is_ours: impl Fn(Pid) -> bool) -> io::Result<b
 }
 
 /// Running descendants of this process, and processes in its session.
-fn descendants() -> Vec<Process> {
+fn descendants() -> Vec<ProcessStat> {
     let own = getpid();
     let found: Vec<_> = pids().filter_map(process).collect();
     let parents: HashMap<_, _> = found.iter().map(|process| (process.pid, process.parent)).collect();
-    let descends = |process: &Process| {
+    let descends = |process: &ProcessStat| {
         let mut above = process.parent;
         // A process id may be reused while others are read, which can form a cycle.
         for _ in 0..parents.len() {
@@ -195,7 +195,7 @@ fn descendants() -> Vec<Process> {
         }
         false
     };
-    let is_ours = |process: &Process| process.session == Some(own) || descends(process);
+    let is_ours = |process: &ProcessStat| process.session == Some(own) || descends(process);
     found.into_iter().filter(|process| process.pid != own && is_ours(process)).collect()
 }
 
@@ -214,7 +214,7 @@ fn pids() -> impl Iterator<Item = Pid> {
 }
 
 /// `None` for a process that has ended.
-fn process(pid: Pid) -> Option<Process> {
+fn process(pid: Pid) -> Option<ProcessStat> {
     let stat = fs::read(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
     let stat = String::from_utf8_lossy(&stat);
     // Field 2, the name, may contain blanks and parentheses; field 3 is the state, 4 the parent, 6 the session, 24
@@ -228,7 +228,7 @@ fn process(pid: Pid) -> Option<Process> {
         Some(if number > 0 { Pid::from_raw(number) } else { None })
     };
     let (parent, session, pages) = (pid_in(1)?, pid_in(3)?, fields.get(21)?.parse().ok()?);
-    (!is_over).then_some(Process { pid, parent, session, pages })
+    (!is_over).then_some(ProcessStat { pid, parent, session, pages })
 }
 
 /// A process that has ended has no environment.

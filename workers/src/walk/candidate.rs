@@ -4,9 +4,9 @@ use atoms::NeighbourList;
 use calm::neighbourhood::{Pair, neighbourhood_average};
 use wire::{Candidate, CandidateId, ContentHash};
 
-use super::{Walk, WalkError, gamma};
+use super::{RunningWalk, WalkError, gamma};
 
-impl Walk<'_> {
+impl RunningWalk<'_> {
     /// The current state as a candidate.
     pub(super) fn candidate(&mut self) -> Result<Candidate, WalkError> {
         let gamma = gamma(&mut self.potential, &self.dynamics)?.to_vec();

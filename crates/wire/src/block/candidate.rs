@@ -3,7 +3,7 @@
 use atoms::{Matrix3, Structure, Vec3};
 use zerocopy::IntoBytes;
 
-use super::layout::{Header, MAGIC, VERSION, flatten, length, write_checksum};
+use super::layout::{CandidateBlockHeader, MAGIC, VERSION, flatten, length, write_checksum};
 use crate::ids::{CandidateId, ContentHash, Origin};
 
 /// A structure with everything that its walker computed for it.
@@ -82,10 +82,10 @@ impl Candidate {
         write_checksum(out);
     }
 
-    fn header(&self) -> Header {
+    fn header(&self) -> CandidateBlockHeader {
         let Self { id, structure, .. } = self;
         let [x, y, z] = structure.periodic.map(u8::from);
-        Header {
+        CandidateBlockHeader {
             magic: MAGIC,
             version: VERSION,
             checksum: 0,

@@ -14,7 +14,7 @@ pub(super) const LARGEST: u64 = 1 << 32;
 /// The header of a block, 288 bytes.
 #[derive(Clone, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
-pub(super) struct Header {
+pub(super) struct CandidateBlockHeader {
     pub magic: [u8; 8],
     pub version: u32,
     pub checksum: u32,
@@ -36,13 +36,13 @@ pub(super) struct Header {
     pub virial: [f64; 9],
 }
 
-pub(super) const HEADER: usize = size_of::<Header>();
+pub(super) const HEADER: usize = size_of::<CandidateBlockHeader>();
 /// The checksum covers everything after this offset.
 pub(super) const CHECKED_FROM: usize = 16;
 
 /// Number of atoms, and of features per atom.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Counts {
+pub(super) struct BlockDimensions {
     pub atoms: usize,
     pub features: usize,
 }

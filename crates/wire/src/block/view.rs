@@ -5,14 +5,16 @@ use zerocopy::{CastError, FromBytes};
 
 use super::BlockError;
 use super::candidate::Candidate;
-use super::layout::{CHECKED_FROM, Counts, Header, LARGEST, MAGIC, VERSION, length, unflatten};
+use super::layout::{
+    BlockDimensions, CHECKED_FROM, CandidateBlockHeader, LARGEST, MAGIC, VERSION, length, unflatten,
+};
 use crate::ids::{CampaignId, CandidateId, ContentHash, Origin, WalkId};
 
 /// A block read in place.
 #[derive(Clone, Debug)]
 pub struct CandidateView<'a> {
-    pub(super) header: &'a Header,
-    pub(super) counts: Counts,
+    pub(super) header: &'a CandidateBlockHeader,
+    pub(super) counts: BlockDimensions,
     /// Atomic numbers, [n].
     pub numbers: &'a [u64],
     /// Positions, [n], Å.
@@ -55,7 +57,7 @@ impl<'a> CandidateView<'a> {
     /// Locates the arrays and checks their lengths.
     fn split(bytes: &'a [u8]) -> Result<Self, BlockError> {
         let short = || BlockError::Short(bytes.len());
-        let (header, _) = Header::ref_from_prefix(bytes).map_err(|error| match error {
+        let (header, _) = CandidateBlockHeader::ref_from_prefix(bytes).map_err(|error| match error {
             CastError::Alignment(_) => BlockError::Unaligned,
             _ => short(),
         })?;
@@ -72,13 +74,13 @@ impl<'a> CandidateView<'a> {
         if !plausible || header.length != expected || found != expected {
             return Err(BlockError::Length { found, expected });
         }
-        Self::arrays(bytes, Counts { atoms: atoms as usize, features: features as usize })
+        Self::arrays(bytes, BlockDimensions { atoms: atoms as usize, features: features as usize })
     }
 
     /// Locates the arrays of a block with these counts.
-    pub(super) fn arrays(bytes: &'a [u8], counts: Counts) -> Result<Self, BlockError> {
+    pub(super) fn arrays(bytes: &'a [u8], counts: BlockDimensions) -> Result<Self, BlockError> {
         let short = || BlockError::Short(bytes.len());
-        let (header, rest) = Header::ref_from_prefix(bytes).map_err(|_| short())?;
+        let (header, rest) = CandidateBlockHeader::ref_from_prefix(bytes).map_err(|_| short())?;
         let n = counts.atoms;
         let (numbers, rest) = <[u64]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
         let (positions, rest) = <[Vec3]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;

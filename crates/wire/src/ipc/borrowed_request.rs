@@ -6,14 +6,14 @@ use std::sync::{Mutex, PoisonError};
 use zerocopy::IntoBytes;
 
 use super::IpcError;
-use super::config::Request;
+use super::config::IpcRequest;
 use crate::protocol::frame::{self, FrameError};
 
 /// A request and the slices of its parts. The memory stays mapped as long as this value lives, even if the walker that
 /// wrote it is dead and cleaned up.
 pub(super) struct BorrowedRequest {
     /// Behind a lock because the request type of iceoryx2 is `Send` but not `Sync`.
-    request: Mutex<Request>,
+    request: Mutex<IpcRequest>,
     control: NonNull<[u8]>,
     block: NonNull<[u8]>,
 }
@@ -30,7 +30,7 @@ unsafe impl Sync for BorrowedRequest {}
 
 impl BorrowedRequest {
     /// Locates the parts of a request. The length is read only here, since the walker could change it later.
-    pub(super) fn new(request: Request) -> Result<Self, FrameError> {
+    pub(super) fn new(request: IpcRequest) -> Result<Self, FrameError> {
         let (control, block) = frame::split(request.payload().as_bytes())?;
         let (control, block) = (NonNull::from(control), NonNull::from(block));
         Ok(Self { request: Mutex::new(request), control, block })

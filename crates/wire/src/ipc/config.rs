@@ -24,7 +24,7 @@ pub(super) type Service = ipc_threadsafe::Service;
 // Messages are arrays of 8-byte words: iceoryx2 reserves eight times the space for bytes aligned to 8.
 pub(super) type ServerPort = Server<Service, [u64], (), [u64], ()>;
 pub(super) type ClientPort = Client<Service, [u64], (), [u64], ()>;
-pub(super) type Request = ActiveRequest<Service, [u64], (), [u64], ()>;
+pub(super) type IpcRequest = ActiveRequest<Service, [u64], (), [u64], ()>;
 pub(super) type Pending = PendingResponse<Service, [u64], (), [u64], ()>;
 type Requests = request_response::PortFactory<Service, [u64], (), [u64], ()>;
 

@@ -37,7 +37,7 @@ pub struct Traffic {
     pub last_unsent: Option<String>,
 }
 
-pub(super) struct Connections {
+pub(super) struct WalkerConnections {
     node: Node<Service>,
     /// Wakes each walker; opened at its first answer.
     wakeups: BTreeMap<u32, Notifier<Service>>,
@@ -47,7 +47,7 @@ pub(super) struct Connections {
     message_bytes: usize,
 }
 
-impl ServerTransport for Connections {
+impl ServerTransport for WalkerConnections {
     type Request = Arc<BorrowedRequest>;
 
     /// The answer to a poll is the server's sign of life.
@@ -87,7 +87,7 @@ impl ServerTransport for Connections {
     }
 }
 
-impl Connections {
+impl WalkerConnections {
     pub(super) fn new(node: Node<Service>, traffic: Arc<Mutex<Traffic>>, message_bytes: usize) -> Self {
         Self { node, wakeups: BTreeMap::new(), in_place: Vec::new(), traffic, message_bytes }
     }

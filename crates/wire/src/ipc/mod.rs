@@ -1,4 +1,4 @@
-//! The transport between processes of one host, on [iceoryx2](https://iceoryx.io). The orchestrator has a [`Server`],
+//! The transport between processes of one host, on [iceoryx2](https://iceoryx.io). The orchestrator has an [`IpcServer`],
 //! each walker an [`IpcWalker`]; messages are in shared memory.
 //!
 //! - **Zero copy.** A walker encodes its candidate into the memory in which the selector and the store read it. The
@@ -33,7 +33,7 @@ pub use config::space_needed;
 pub use connections::Traffic;
 #[doc(hidden)]
 pub use reencode::reencode;
-pub use server::{Server, ServerHandle};
+pub use server::{IpcServer, ServerHandle};
 pub use walker::IpcWalker;
 
 /// Expected load.

@@ -12,7 +12,7 @@ use tokio::io::unix::AsyncFd;
 use tokio::sync::mpsc;
 
 use super::config::{self, ServerPort, Service};
-use super::connections::{Connections, Traffic};
+use super::connections::{Traffic, WalkerConnections};
 use super::session::IpcSession;
 use super::{ConnectInfo, IpcError, Sizes};
 use crate::mixture::SharedMixture;
@@ -23,13 +23,13 @@ use crate::transport::Incoming;
 /// Maximum number of messages handled before other events.
 const BATCH: usize = 64;
 
-/// The orchestrator's end of the transport. Walkers can connect as soon as it is open; [`Server::run`] handles their
+/// The orchestrator's end of the transport. Walkers can connect as soon as it is open; [`IpcServer::run`] handles their
 /// messages.
-pub struct Server {
+pub struct IpcServer {
     port: ServerPort,
     wakeup: Listener<Service>,
-    connections: Connections,
-    commands: mpsc::UnboundedReceiver<Command>,
+    connections: WalkerConnections,
+    commands: mpsc::UnboundedReceiver<ServerCommand>,
     handle: ServerHandle,
 }
 
@@ -37,12 +37,12 @@ pub struct Server {
 #[derive(Clone, Debug)]
 pub struct ServerHandle {
     connect_info: ConnectInfo,
-    commands: mpsc::UnboundedSender<Command>,
+    commands: mpsc::UnboundedSender<ServerCommand>,
     traffic: Arc<Mutex<Traffic>>,
 }
 
 #[derive(Debug)]
-enum Command {
+enum ServerCommand {
     Expect { walker: u32, incarnation: u32 },
     Lost { walker: u32, incarnation: u32, crashed: bool },
     Close,
@@ -58,19 +58,19 @@ impl ServerHandle {
     /// Accepts messages only of this incarnation of the walker from now on. Call it before the process is started and
     /// after the previous process has exited; it implies [`ServerHandle::lost`] for the previous one.
     pub fn expect(&self, walker: u32, incarnation: u32) {
-        self.command(Command::Expect { walker, incarnation });
+        self.command(ServerCommand::Expect { walker, incarnation });
     }
 
     /// Reports that the walker's process has exited and was waited for, and whether it crashed. Frees its resources and
     /// informs the reactor. Does nothing if another incarnation is expected, since the resources then belong to the
     /// successor.
     pub fn lost(&self, walker: u32, incarnation: u32, crashed: bool) {
-        self.command(Command::Lost { walker, incarnation, crashed });
+        self.command(ServerCommand::Lost { walker, incarnation, crashed });
     }
 
-    /// Makes [`Server::run`] return. Call it when no walker is alive and none will be started.
+    /// Makes [`IpcServer::run`] return. Call it when no walker is alive and none will be started.
     pub fn close(&self) {
-        self.command(Command::Close);
+        self.command(ServerCommand::Close);
     }
 
     /// Statistics of received messages.
@@ -78,13 +78,13 @@ impl ServerHandle {
         self.traffic.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    fn command(&self, command: Command) {
+    fn command(&self, command: ServerCommand) {
         // Fails only if the server has already ended.
         let _ = self.commands.send(command);
     }
 }
 
-impl Server {
+impl IpcServer {
     /// Opens the transport in a prepared directory. `session` distinguishes this run of the orchestrator from others.
     ///
     /// # Errors
@@ -110,7 +110,7 @@ impl Server {
         Ok(Self {
             port,
             wakeup,
-            connections: Connections::new(node, traffic, sizes.message_bytes),
+            connections: WalkerConnections::new(node, traffic, sizes.message_bytes),
             commands,
             handle,
         })
@@ -140,13 +140,13 @@ impl Server {
             tokio::select! {
                 biased;
                 command = self.commands.recv() => match command {
-                    Some(Command::Expect { walker, incarnation }) => session.expect(walker, incarnation),
-                    Some(Command::Lost { walker, incarnation, crashed }) => {
+                    Some(ServerCommand::Expect { walker, incarnation }) => session.expect(walker, incarnation),
+                    Some(ServerCommand::Lost { walker, incarnation, crashed }) => {
                         session.walker_lost(walker, incarnation, crashed);
                         // This also drops the connection.
                         more = receive_batch(&self.port, &mut session, &mut on_message)?;
                     }
-                    Some(Command::Close) | None => {
+                    Some(ServerCommand::Close) | None => {
                         // The reactor waits for the exits, even if other senders keep its channel open.
                         for incoming in session.walkers.outbox.drain(..) {
                             if to_reactor.send(incoming).await.is_err() {

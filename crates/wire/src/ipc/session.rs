@@ -5,21 +5,21 @@ use std::time::Instant;
 
 use super::IpcError;
 use super::borrowed_request::BorrowedRequest;
-use super::config::Request;
-use super::connections::Connections;
+use super::config::IpcRequest;
+use super::connections::WalkerConnections;
 use crate::control::decode;
 use crate::mixture::SharedMixture;
 use crate::protocol::message::{Envelope, Payload};
 use crate::protocol::rejected::RejectedMessage;
-use crate::protocol::server_session::{Decision, ServerSession};
+use crate::protocol::server_session::{OfferDecision, ServerSession};
 
 pub(super) struct IpcSession {
-    pub(super) walkers: ServerSession<Connections>,
+    pub(super) walkers: ServerSession<WalkerConnections>,
     mixtures: SharedMixture,
 }
 
 impl IpcSession {
-    pub(super) fn new(session: u64, mixtures: SharedMixture, connections: Connections) -> Self {
+    pub(super) fn new(session: u64, mixtures: SharedMixture, connections: WalkerConnections) -> Self {
         Self { walkers: ServerSession::new(session, connections), mixtures }
     }
 
@@ -41,14 +41,14 @@ impl IpcSession {
     }
 
     /// Handles a message. Returns its walker and whether it contains a report, unless the message is rejected.
-    pub(super) fn receive(&mut self, request: Request) -> Option<(u32, bool)> {
+    pub(super) fn receive(&mut self, request: IpcRequest) -> Option<(u32, bool)> {
         let (begin, bytes) = (Instant::now(), size_of_val(request.payload()) as u64);
         let received = self.dispatch(request);
         self.walkers.transport.record_message(bytes, begin.elapsed(), received.as_ref().err());
         received.ok()
     }
 
-    fn dispatch(&mut self, request: Request) -> Result<(u32, bool), RejectedMessage> {
+    fn dispatch(&mut self, request: IpcRequest) -> Result<(u32, bool), RejectedMessage> {
         let request = Arc::new(BorrowedRequest::new(request)?);
         let envelope: Envelope<'_> = decode(request.control())?;
         let walker = envelope.sender.walker;
@@ -60,7 +60,7 @@ impl IpcSession {
     /// Shares the mixture of a decision, and answers the walker.
     pub(super) fn handle_decision(
         &mut self,
-        decision: Decision<Arc<BorrowedRequest>>,
+        decision: OfferDecision<Arc<BorrowedRequest>>,
     ) -> Result<(), IpcError> {
         if let Some(work) = &decision.work {
             self.mixtures.publish(&work.mixture)?;

@@ -18,7 +18,7 @@ use super::{ConnectInfo, IpcError};
 use crate::block::Candidate;
 use crate::control::encode;
 use crate::ids::WalkId;
-use crate::messages::{Progress, Report};
+use crate::messages::{AssignmentReport, WalkProgress};
 use crate::mixture::{MixtureReader, SharedMixtureError};
 use crate::protocol::frame;
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
@@ -102,7 +102,10 @@ impl IpcWalker {
     }
 
     /// Sends the report until it is answered.
-    fn exchange_report(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<WorkItem>, IpcError> {
+    fn exchange_report(
+        &mut self,
+        report: Option<&AssignmentReport<Candidate>>,
+    ) -> Result<Option<WorkItem>, IpcError> {
         self.sequence += 1;
         let (mut offer, mut poll) = (self.offer(report)?, None);
         let (mut attempts, mut last_poll, mut last_answer) = (1, Instant::now(), Instant::now());
@@ -145,7 +148,7 @@ impl IpcWalker {
         Ok(())
     }
 
-    fn offer(&self, report: Option<&Report<Candidate>>) -> Result<Option<PendingAnswer>, IpcError> {
+    fn offer(&self, report: Option<&AssignmentReport<Candidate>>) -> Result<Option<PendingAnswer>, IpcError> {
         let (offer, candidate) = Payload::offer(self.sequence, report);
         self.send(offer, candidate)
     }
@@ -203,7 +206,7 @@ fn open_mixture(connect_info: &ConnectInfo) -> Result<MixtureReader, SharedMixtu
 }
 
 impl Transport for IpcWalker {
-    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<WorkItem> {
+    fn exchange(&mut self, report: Option<AssignmentReport<Candidate>>) -> Option<WorkItem> {
         let answer = self.exchange_report(report.as_ref());
         answer.unwrap_or_else(|failure| {
             self.failure = Some(failure);
@@ -211,7 +214,7 @@ impl Transport for IpcWalker {
         })
     }
 
-    fn progress(&self, walk: WalkId, progress: Progress) {
+    fn progress(&self, walk: WalkId, progress: WalkProgress) {
         // May be lost.
         let _ = self.send(Payload::Progress(walk, Cow::Owned(progress)), None);
     }

@@ -11,13 +11,13 @@ use rustix::io::{Errno, retry_on_intr};
 use zerocopy::IntoBytes;
 
 use super::error::SharedMixtureError;
-use super::layout::{BlockHeader, Layout, SPARE};
+use super::layout::{BlockHeader, SPARE, SharedMixtureLayout};
 use super::memory::Mapping;
 
 /// The blocks of the file.
 #[derive(Debug)]
 pub(super) struct BlockAllocator {
-    layout: Layout,
+    layout: SharedMixtureLayout,
     file: File,
     path: PathBuf,
     /// The reference counts of each extent.
@@ -34,7 +34,7 @@ pub(super) struct BlockAllocator {
 
 impl BlockAllocator {
     /// An allocator for a file without extents.
-    pub fn new(layout: Layout, file: File, path: PathBuf) -> Self {
+    pub fn new(layout: SharedMixtureLayout, file: File, path: PathBuf) -> Self {
         let (refcounts, references) = (Vec::new(), Vec::new());
         let (backed, unbacked, retired) = (Vec::new(), Vec::new(), Vec::new());
         Self { layout, file, path, refcounts, references, backed, unbacked, retired }

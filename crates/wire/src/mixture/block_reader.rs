@@ -10,7 +10,7 @@ use calm::Component;
 
 use super::error::SharedMixtureError;
 use super::index::MixtureIndex;
-use super::layout::{BLOCK_HEADER, BlockHeader, Layout};
+use super::layout::{BLOCK_HEADER, BlockHeader, SharedMixtureLayout};
 use super::memory::Mapping;
 
 /// Reads blocks as components.
@@ -18,14 +18,14 @@ use super::memory::Mapping;
 pub(super) struct BlockReader {
     pub path: PathBuf,
     pub file: File,
-    pub layout: Layout,
-    pub slot: Arc<Slot>,
+    pub layout: SharedMixtureLayout,
+    pub slot: Arc<ReaderSlot>,
     pub extents: Vec<Option<Arc<Extent>>>,
 }
 
 /// A reader's slot; freed when the reader and all its components are dropped.
 #[derive(Debug)]
-pub(super) struct Slot {
+pub(super) struct ReaderSlot {
     pub index: MixtureIndex,
     pub reader: u32,
 }
@@ -42,7 +42,7 @@ pub(super) struct Extent {
 struct BlockGuard {
     extent: Arc<Extent>,
     /// The slot stays taken while it has references.
-    _slot: Arc<Slot>,
+    _slot: Arc<ReaderSlot>,
     /// Offsets in the two mappings of the extent.
     refcount_at: u64,
     numbers_at: u64,
@@ -93,7 +93,7 @@ impl BlockReader {
 }
 
 impl Extent {
-    fn map(file: &File, start: u64, layout: &Layout) -> std::io::Result<Self> {
+    fn map(file: &File, start: u64, layout: &SharedMixtureLayout) -> std::io::Result<Self> {
         let blocks_bytes = layout.block_at(layout.extent_blocks);
         Ok(Self {
             refcounts: Mapping::shared(file, start, layout.refcount_bytes)?,
@@ -104,7 +104,13 @@ impl Extent {
 
 impl BlockGuard {
     /// Must be called under a pin on a version that uses the block.
-    fn new(extent: &Arc<Extent>, slot: &Arc<Slot>, refcount_at: u64, block_at: u64, layout: &Layout) -> Self {
+    fn new(
+        extent: &Arc<Extent>,
+        slot: &Arc<ReaderSlot>,
+        refcount_at: u64,
+        block_at: u64,
+        layout: &SharedMixtureLayout,
+    ) -> Self {
         extent.refcounts.word32(refcount_at).fetch_add(1, Ordering::Relaxed);
         let (extent, _slot) = (Arc::clone(extent), Arc::clone(slot));
         Self { extent, _slot, refcount_at, numbers_at: block_at + BLOCK_HEADER, numbers: layout.numbers() }
@@ -125,7 +131,7 @@ impl Drop for BlockGuard {
     }
 }
 
-impl Drop for Slot {
+impl Drop for ReaderSlot {
     fn drop(&mut self) {
         self.index.owner(self.reader).store(0, Ordering::Release);
     }

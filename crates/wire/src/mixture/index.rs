@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io;
 use std::sync::atomic::{AtomicU32, AtomicU64};
 
-use super::layout::{CACHE_LINE, Layout};
+use super::layout::{CACHE_LINE, SharedMixtureLayout};
 use super::memory::Mapping;
 use super::pinning::{NONE, Word};
 
@@ -12,11 +12,11 @@ use super::pinning::{NONE, Word};
 #[derive(Debug)]
 pub(super) struct MixtureIndex {
     map: Mapping,
-    layout: Layout,
+    layout: SharedMixtureLayout,
 }
 
 impl MixtureIndex {
-    pub fn map(file: &File, layout: &Layout) -> io::Result<Self> {
+    pub fn map(file: &File, layout: &SharedMixtureLayout) -> io::Result<Self> {
         let map = Mapping::shared(file, layout.index_at, layout.index_bytes)?;
         Ok(Self { map, layout: layout.clone() })
     }

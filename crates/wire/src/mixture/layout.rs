@@ -24,7 +24,7 @@ const SPARE_ROWS: u32 = 64;
 /// The start of the file, followed by the number of components of each element (u32).
 #[derive(Debug, Clone, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
-struct Header {
+struct SharedMixtureHeader {
     magic: [u8; 8],
     format: u32,
     /// CRC-32 of the following header fields and of the shape.
@@ -57,12 +57,12 @@ pub(super) struct BlockHeader {
 /// A whole cache line, so that S is aligned to one.
 pub(super) const BLOCK_HEADER: u64 = size_of::<BlockHeader>() as u64;
 
-const HEADER: usize = size_of::<Header>();
+const HEADER: usize = size_of::<SharedMixtureHeader>();
 const CHECKED_FROM: usize = 16;
 
 /// Sizes and offsets, in bytes from the start of the file unless stated otherwise.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Layout {
+pub(super) struct SharedMixtureLayout {
     /// Features, D.
     pub dimension: u32,
     /// Number of components of each element.
@@ -97,7 +97,7 @@ pub(super) struct Layout {
     pub extent_bytes: u64,
 }
 
-impl Layout {
+impl SharedMixtureLayout {
     /// The layout for mixtures with the shape of `mixture`. An extent has room for two versions of each component, and
     /// at least for one of each and the spare blocks, which are reserved at the start.
     pub fn for_mixture(mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
@@ -162,7 +162,8 @@ impl Layout {
             return Err(damaged("it is shorter than its header"));
         }
         file.read_exact_at(&mut bytes, 0).map_err(cannot)?;
-        let header = Header::read_from_bytes(&bytes).map_err(|_| damaged("it is shorter than its header"))?;
+        let header = SharedMixtureHeader::read_from_bytes(&bytes)
+            .map_err(|_| damaged("it is shorter than its header"))?;
         if header.magic != MAGIC {
             return Err(SharedMixtureError::Magic { path: path.into(), found: header.magic });
         }
@@ -178,7 +179,7 @@ impl Layout {
         if checksum(&header, &shape) != header.checksum {
             return Err(damaged("its header has a wrong checksum"));
         }
-        let Header { dimension, readers, rows, extent_blocks, .. } = header;
+        let SharedMixtureHeader { dimension, readers, rows, extent_blocks, .. } = header;
         let layout = Self::new(dimension, shape, readers, rows, extent_blocks)
             .ok_or_else(|| damaged("its sizes overflow"))?;
         if layout.end(1).is_none_or(|end| length < end) {
@@ -189,7 +190,7 @@ impl Layout {
 
     /// Writes the header, which makes the file valid for readers.
     pub fn write(&self, file: &File) -> std::io::Result<()> {
-        let mut header = Header {
+        let mut header = SharedMixtureHeader {
             magic: MAGIC,
             format: FORMAT,
             checksum: 0,
@@ -242,7 +243,7 @@ impl Layout {
     }
 }
 
-fn checksum(header: &Header, shape: &[u32]) -> u32 {
+fn checksum(header: &SharedMixtureHeader, shape: &[u32]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
     hasher.update(header.as_bytes().get(CHECKED_FROM..).unwrap_or_default());
     hasher.update(shape.as_bytes());

@@ -8,10 +8,10 @@ use std::sync::atomic::Ordering;
 
 use calm::{ChangedComponent, Component, Mixture};
 
-use super::block_reader::{BlockReader, Slot};
+use super::block_reader::{BlockReader, ReaderSlot};
 use super::error::SharedMixtureError;
 use super::index::MixtureIndex;
-use super::layout::Layout;
+use super::layout::SharedMixtureLayout;
 use super::pinning::{NONE, Pinned, Word};
 
 /// The shared mixture as seen by one reader.
@@ -45,7 +45,7 @@ impl MixtureReader {
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         let file = OpenOptions::new().read(true).write(true).open(path);
         let file = file.map_err(|source| failed("open", source))?;
-        let layout = Layout::read(&file, path)?;
+        let layout = SharedMixtureLayout::read(&file, path)?;
         if reader >= layout.readers {
             return Err(SharedMixtureError::NoSlot { reader, readers: layout.readers });
         }
@@ -54,7 +54,7 @@ impl MixtureReader {
         if let Err(process) = owner.compare_exchange(0, own, Ordering::AcqRel, Ordering::Acquire) {
             return Err(SharedMixtureError::SlotTaken { reader, process });
         }
-        let slot = Arc::new(Slot { index, reader });
+        let slot = Arc::new(ReaderSlot { index, reader });
         let block_reader = BlockReader { path: path.into(), file, layout, slot, extents: Vec::new() };
         Ok(Self { block_reader, current: None })
     }

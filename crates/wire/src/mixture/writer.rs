@@ -12,14 +12,14 @@ use calm::Mixture;
 use super::allocator::BlockAllocator;
 use super::error::SharedMixtureError;
 use super::index::MixtureIndex;
-use super::layout::{Layout, SPARE};
+use super::layout::{SPARE, SharedMixtureLayout};
 use super::pinning::{NONE, Word, retire_version};
 
 /// The writer's end of the mixture in shared memory. There must be only one for a file.
 ///
 /// Dropping it keeps the file, which readers may have open; the owner of the directory removes it.
 pub struct SharedMixture {
-    layout: Layout,
+    layout: SharedMixtureLayout,
     index: MixtureIndex,
     blocks: BlockAllocator,
     /// The version in each row.
@@ -53,7 +53,7 @@ impl SharedMixture {
     /// # Errors
     /// The size overflows.
     pub fn space_needed(mixture: &Mixture, readers: u32) -> Result<u64, SharedMixtureError> {
-        Layout::for_mixture(mixture, readers).map(|layout| reserved(&layout))
+        SharedMixtureLayout::for_mixture(mixture, readers).map(|layout| reserved(&layout))
     }
 
     /// Creates the file, accessible only to the user (mode 0600), with `mixture` as its newest version and slots for
@@ -62,7 +62,7 @@ impl SharedMixture {
     /// # Errors
     /// Too little shared memory, sizes that overflow, or a path that cannot be written.
     pub fn create(path: &Path, mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
-        let layout = Layout::for_mixture(mixture, readers)?;
+        let layout = SharedMixtureLayout::for_mixture(mixture, readers)?;
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         match fs::remove_file(path) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => {
@@ -79,7 +79,12 @@ impl SharedMixture {
         created
     }
 
-    fn fill(file: &File, path: &Path, layout: Layout, mixture: &Mixture) -> Result<Self, SharedMixtureError> {
+    fn fill(
+        file: &File,
+        path: &Path,
+        layout: SharedMixtureLayout,
+        mixture: &Mixture,
+    ) -> Result<Self, SharedMixtureError> {
         let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
         let copy = file.try_clone().map_err(|source| failed("open", source))?;
         file.set_len(reserved(&layout)).map_err(|source| failed("grow", source))?;
@@ -195,16 +200,16 @@ impl SharedMixture {
 }
 
 /// Initial number of blocks: one for each component, and spare ones for changes. An extent has room for them.
-fn initial_blocks(layout: &Layout) -> u32 {
+fn initial_blocks(layout: &SharedMixtureLayout) -> u32 {
     layout.components.saturating_add(SPARE)
 }
 
 /// Initial size of the file, which is reserved.
-fn reserved(layout: &Layout) -> u64 {
+fn reserved(layout: &SharedMixtureLayout) -> u64 {
     layout.extents_at + layout.refcount_bytes + layout.block_at(initial_blocks(layout))
 }
 
-fn has_shape(mixture: &Mixture, layout: &Layout) -> bool {
+fn has_shape(mixture: &Mixture, layout: &SharedMixtureLayout) -> bool {
     let count = |element| mixture.components(element).map(<[_]>::len);
     let mut shape = layout.shape.iter().enumerate();
     mixture.dimension() == layout.dimension as usize

@@ -19,8 +19,8 @@ use super::certificates::Tls;
 use super::delta::{DeltaError, DeltaReceiver};
 use super::endpoint::{self, Endpoint};
 use super::handshake;
-use super::message::{AGENTS, Agent, ORCHESTRATOR, Reply, Request};
-use super::side::Side;
+use super::message::{AGENTS, AgentInfo, AgentReply, AgentRequest, ORCHESTRATOR};
+use super::side::ConnectionSide;
 use crate::control::{ControlError, decode, encode};
 use crate::protocol::frame;
 
@@ -39,14 +39,14 @@ const MAX_VERSIONS: usize = 4;
 pub struct AgentClient {
     address: Address,
     tls: Option<Tls>,
-    agent: Agent,
-    connection: Lock<Arc<Connection>>,
+    agent: AgentInfo,
+    connection: Lock<Arc<EndpointConnection>>,
     /// Time of the last check whether the orchestrator has moved; locked during the check.
     last_poll: Mutex<Option<Instant>>,
 }
 
 /// A connection to one endpoint.
-struct Connection {
+struct EndpointConnection {
     endpoint: Endpoint,
     session: Session,
     /// The heartbeat.
@@ -98,17 +98,17 @@ impl From<DeltaError> for LinkError {
     }
 }
 
-impl Connection {
+impl EndpointConnection {
     /// Connects to the current endpoint of the orchestrator.
-    async fn find(address: &Address, tls: Option<&Tls>, agent: &Agent) -> Result<Self, NetError> {
+    async fn find(address: &Address, tls: Option<&Tls>, agent: &AgentInfo) -> Result<Self, NetError> {
         match address.resolve()? {
             Announcement::Endpoint(endpoint) => Self::open(endpoint, tls, agent).await,
             Announcement::Over => Err(NetError::CampaignOver),
         }
     }
 
-    async fn open(endpoint: Endpoint, tls: Option<&Tls>, agent: &Agent) -> Result<Self, NetError> {
-        let session = endpoint::open(Side::Agent, &endpoint, tls).await?;
+    async fn open(endpoint: Endpoint, tls: Option<&Tls>, agent: &AgentInfo) -> Result<Self, NetError> {
+        let session = endpoint::open(ConnectionSide::Agent, &endpoint, tls).await?;
         let token = session.liveliness().declare_token(format!("{AGENTS}/{}", agent.id));
         let _token = token.await.map_err(|why| NetError::open(&endpoint, why))?;
         Ok(Self { endpoint, session, _token })
@@ -134,12 +134,12 @@ impl AgentClient {
     pub async fn open(
         address: &Address,
         tls: Option<&Tls>,
-        agent: Agent,
+        agent: AgentInfo,
         waiting: impl FnOnce(&NetError),
     ) -> Result<Self, NetError> {
         let mut waiting = Some(waiting);
         let connection = loop {
-            match Connection::find(address, tls, &agent).await {
+            match EndpointConnection::find(address, tls, &agent).await {
                 Err(
                     error @ (NetError::Open { .. }
                     | NetError::EndpointFileMissing { .. }
@@ -169,12 +169,12 @@ impl AgentClient {
         &self.address
     }
 
-    fn connection(&self) -> Arc<Connection> {
+    fn connection(&self) -> Arc<EndpointConnection> {
         Arc::clone(&self.connection.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Connects to the current endpoint of the orchestrator if it has changed.
-    async fn reconnect_if_moved(&self, connection: &Arc<Connection>) {
+    async fn reconnect_if_moved(&self, connection: &Arc<EndpointConnection>) {
         // One of many concurrent requests without answer checks for all of them.
         let Ok(mut last_poll) = self.last_poll.try_lock() else { return };
         if last_poll.is_some_and(|last_poll| last_poll.elapsed() < POLL_INTERVAL)
@@ -184,7 +184,7 @@ impl AgentClient {
         }
         if let Ok(Announcement::Endpoint(endpoint)) = self.address.resolve()
             && endpoint != connection.endpoint
-            && let Ok(found) = Connection::open(endpoint, self.tls.as_ref(), &self.agent).await
+            && let Ok(found) = EndpointConnection::open(endpoint, self.tls.as_ref(), &self.agent).await
         {
             *self.connection.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(found);
         }
@@ -206,8 +206,8 @@ impl AgentClient {
     }
 
     async fn try_join(self: &Arc<Self>) -> Result<Membership, LinkError> {
-        let answer = self.request(&Request::Join(self.agent.clone())).await?;
-        let Reply::Joined(reply) = decode_reply(&answer)? else { return Err(unexpected("join")) };
+        let answer = self.request(&AgentRequest::Join(self.agent.clone())).await?;
+        let AgentReply::Joined(reply) = decode_reply(&answer)? else { return Err(unexpected("join")) };
         let membership = Membership {
             client: Arc::clone(self),
             session: reply.session,
@@ -230,7 +230,7 @@ impl AgentClient {
     }
 
     /// Sends a request until it is answered.
-    async fn request(&self, request: &Request<'_>) -> Result<Vec<u8>, LinkError> {
+    async fn request(&self, request: &AgentRequest<'_>) -> Result<Vec<u8>, LinkError> {
         let request = encode(request);
         loop {
             let sent_at = Instant::now();
@@ -259,10 +259,10 @@ pub(super) async fn delay_retry(sent_at: Instant) {
 }
 
 /// Decodes an answer; rejections are errors.
-pub(super) fn decode_reply(answer: &[u8]) -> Result<Reply<'_>, LinkError> {
+pub(super) fn decode_reply(answer: &[u8]) -> Result<AgentReply<'_>, LinkError> {
     match decode(answer)? {
-        Reply::RejoinRequired(why) => Err(LinkError::RejoinRequired(why)),
-        Reply::Rejected(why) => Err(LinkError::Rejected(why)),
+        AgentReply::RejoinRequired(why) => Err(LinkError::RejoinRequired(why)),
+        AgentReply::Rejected(why) => Err(LinkError::Rejected(why)),
         reply => Ok(reply),
     }
 }
@@ -305,9 +305,9 @@ impl Membership {
         let mut receiver: Option<DeltaReceiver> = None;
         loop {
             let skip = receiver.as_ref().map_or(0, DeltaReceiver::received);
-            let request = Request::Mixture { session: self.session, have, wanted, skip };
+            let request = AgentRequest::Mixture { session: self.session, have, wanted, skip };
             let answer = self.client.request(&request).await?;
-            let Reply::Mixture(part) = decode_reply(&answer)? else { return Err(unexpected("mixture")) };
+            let AgentReply::Mixture(part) = decode_reply(&answer)? else { return Err(unexpected("mixture")) };
             let received = match &mut receiver {
                 Some(received) if received.is_next(&part) => received,
                 // The orchestrator has discarded the base version in the meantime: start over without it.
@@ -335,9 +335,11 @@ impl Membership {
         let mut bytes = Vec::new();
         loop {
             let offset = bytes.len() as u64;
-            let request = Request::File { session: self.session, hash: hash.to_owned(), offset };
+            let request = AgentRequest::File { session: self.session, hash: hash.to_owned(), offset };
             let answer = self.client.request(&request).await?;
-            let Reply::File { length, part } = decode_reply(&answer)? else { return Err(unexpected("file")) };
+            let AgentReply::File { length, part } = decode_reply(&answer)? else {
+                return Err(unexpected("file"));
+            };
             bytes.extend_from_slice(part);
             if bytes.len() as u64 >= length || part.is_empty() {
                 return Ok(bytes);
@@ -350,17 +352,17 @@ impl Membership {
     /// # Errors
     /// The agent must join again.
     pub async fn is_stopping(&self) -> Result<Option<bool>, LinkError> {
-        let ping = encode(&Request::Ping { session: self.session });
+        let ping = encode(&AgentRequest::Ping { session: self.session });
         let Some(answer) = self.client.send_once(&ping, None).await else { return Ok(None) };
         match decode_reply(&answer)? {
-            Reply::Pong { stopping } => Ok(Some(stopping)),
+            AgentReply::Pong { stopping } => Ok(Some(stopping)),
             _ => Err(unexpected("ping")),
         }
     }
 
     /// Leaves and returns all assignments. Tries once only, since a lost agent loses its assignments as well.
     pub async fn leave(&self) {
-        let request = Request::Leave { session: self.session, id: self.client.agent.id.clone() };
+        let request = AgentRequest::Leave { session: self.session, id: self.client.agent.id.clone() };
         self.client.send_once(&encode(&request), None).await;
     }
 }

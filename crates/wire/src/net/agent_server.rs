@@ -19,7 +19,7 @@ use super::certificates::Tls;
 use super::endpoint::{self, Endpoint};
 use super::message::{AGENTS, ORCHESTRATOR};
 use super::session::AgentSession;
-use super::side::Side;
+use super::side::ConnectionSide;
 use super::{AgentBootstrap, NetError};
 use crate::transport::Incoming;
 
@@ -64,7 +64,7 @@ impl AgentServer {
     ) -> Result<Self, NetError> {
         let endpoint = endpoint.with_free_port().map_err(|why| NetError::open(endpoint, why))?;
         let (session_id, failed) = (session, |why| NetError::open(&endpoint, why));
-        let session = endpoint::open(Side::Orchestrator, &endpoint, tls).await?;
+        let session = endpoint::open(ConnectionSide::Orchestrator, &endpoint, tls).await?;
         let channel = zenoh::handlers::FifoChannel::new(QUEUE_LENGTH);
         let queries = session.declare_queryable(ORCHESTRATOR).complete(true).with(channel);
         let queries = queries.await.map_err(failed)?;

@@ -24,7 +24,7 @@ use x509_parser::prelude::FromDer;
 use x509_parser::time::ASN1Time;
 
 pub use self::error::{CertificateError, CertificateFault};
-use super::side::Side;
+use super::side::ConnectionSide;
 
 /// Warn about certificates that expire within this time.
 const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 24 * 3600);
@@ -72,7 +72,7 @@ impl Tls {
     /// # Errors
     /// See [`Self::check_for_agent`]; also a certificate without names.
     pub fn check_for_orchestrator(&self) -> Result<CheckedTls, CertificateError> {
-        self.check(Side::Orchestrator, SystemTime::now())
+        self.check(ConnectionSide::Orchestrator, SystemTime::now())
     }
 
     /// Checks that an agent can connect with these certificates.
@@ -81,10 +81,14 @@ impl Tls {
     /// A file that cannot be read or is damaged, a certificate that is not currently valid or not signed by the
     /// authority, or a key that belongs to another certificate.
     pub fn check_for_agent(&self) -> Result<CheckedTls, CertificateError> {
-        self.check(Side::Agent, SystemTime::now())
+        self.check(ConnectionSide::Agent, SystemTime::now())
     }
 
-    pub(super) fn check(&self, side: Side, now: SystemTime) -> Result<CheckedTls, CertificateError> {
+    pub(super) fn check(
+        &self,
+        side: ConnectionSide,
+        now: SystemTime,
+    ) -> Result<CheckedTls, CertificateError> {
         let credentials = self.load()?;
         let mut warnings = Vec::new();
         for (path, certificates) in [
@@ -134,7 +138,7 @@ impl Tls {
     fn check_accepted(
         &self,
         credentials: &Credentials,
-        side: Side,
+        side: ConnectionSide,
         names: &[String],
         now: SystemTime,
     ) -> Result<(), CertificateError> {
@@ -144,7 +148,7 @@ impl Tls {
         let provider = Arc::new(provider());
         let fault = |why: String| CertificateFault::Damaged(why).at(&self.authority);
         let accepted = match side {
-            Side::Orchestrator => {
+            ConnectionSide::Orchestrator => {
                 // Any name matches a wildcard.
                 let name = names.iter().find_map(|name| ServerName::try_from(name.replace('*', "host")).ok());
                 let name = name.ok_or_else(|| CertificateFault::NoNames.at(&self.certificate))?;
@@ -160,7 +164,7 @@ impl Tls {
                 )
                 .map(drop)
             }
-            Side::Agent => {
+            ConnectionSide::Agent => {
                 let verifier = WebPkiClientVerifier::builder_with_provider(roots, provider).build();
                 let verifier = verifier.map_err(|why| fault(why.to_string()))?;
                 verifier.verify_client_cert(own, between, now).map(drop)
@@ -265,9 +269,9 @@ fn names(certificate: &X509Certificate<'_>) -> Vec<String> {
     names.filter_map(text).collect()
 }
 
-fn purpose(side: Side) -> &'static str {
+fn purpose(side: ConnectionSide) -> &'static str {
     match side {
-        Side::Orchestrator => "serverAuth",
-        Side::Agent => "clientAuth",
+        ConnectionSide::Orchestrator => "serverAuth",
+        ConnectionSide::Agent => "clientAuth",
     }
 }

@@ -11,7 +11,7 @@ use zenoh::{Config, Session, Wait};
 
 use super::NetError;
 use super::certificates::Tls;
-use super::side::Side;
+use super::side::ConnectionSide;
 
 /// Where the orchestrator listens and agents connect: `tcp/HOST:PORT`. Listening on port 0 chooses a free port.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -96,7 +96,11 @@ impl fmt::Display for Endpoint {
 }
 
 /// Opens a session on an endpoint; an agent's session connects.
-pub(super) async fn open(side: Side, endpoint: &Endpoint, tls: Option<&Tls>) -> Result<Session, NetError> {
+pub(super) async fn open(
+    side: ConnectionSide,
+    endpoint: &Endpoint,
+    tls: Option<&Tls>,
+) -> Result<Session, NetError> {
     if tls.is_none() && !endpoint.is_loopback() {
         return Err(NetError::Unprotected { endpoint: endpoint.clone() });
     }
@@ -106,12 +110,12 @@ pub(super) async fn open(side: Side, endpoint: &Endpoint, tls: Option<&Tls>) -> 
     opened.map_err(|why| NetError::open(endpoint, why))?.map_err(|why| NetError::open(endpoint, why))
 }
 
-fn config(side: Side, endpoint: &Endpoint, tls: Option<&Tls>) -> Result<Config, NetError> {
+fn config(side: ConnectionSide, endpoint: &Endpoint, tls: Option<&Tls>) -> Result<Config, NetError> {
     let locators = json!([endpoint.locator(tls.is_some())]);
     let none = json!([]);
     let (mode, listen, connect) = match side {
-        Side::Orchestrator => ("router", locators, none),
-        Side::Agent => ("client", none, locators),
+        ConnectionSide::Orchestrator => ("router", locators, none),
+        ConnectionSide::Agent => ("client", none, locators),
     };
     let mut settings = vec![
         ("mode", json!(mode)),
@@ -132,8 +136,8 @@ fn config(side: Side, endpoint: &Endpoint, tls: Option<&Tls>) -> Result<Config, 
         let Tls { authority, certificate, key } = tls;
         tls.check(side, SystemTime::now())?;
         let (own, own_key) = match side {
-            Side::Orchestrator => ("listen_certificate", "listen_private_key"),
-            Side::Agent => ("connect_certificate", "connect_private_key"),
+            ConnectionSide::Orchestrator => ("listen_certificate", "listen_private_key"),
+            ConnectionSide::Agent => ("connect_certificate", "connect_private_key"),
         };
         settings.push((
             "transport/link/tls",

@@ -16,7 +16,7 @@ pub type AgentId = String;
 
 /// An agent.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Agent {
+pub struct AgentInfo {
     /// Random id, created at its start.
     pub id: AgentId,
     /// Name of its host, for display.
@@ -31,7 +31,7 @@ pub struct Agent {
     pub prefetch: u32,
 }
 
-impl Agent {
+impl AgentInfo {
     /// Maximum number of assignments of the agent.
     pub fn slots(&self) -> u32 {
         self.walkers.saturating_add(self.prefetch)
@@ -39,9 +39,9 @@ impl Agent {
 }
 
 #[derive(Serialize, Deserialize)]
-pub(super) enum Request<'a> {
+pub(super) enum AgentRequest<'a> {
     /// Joins the campaign.
-    Join(Agent),
+    Join(AgentInfo),
     /// A walker's message about a slot.
     #[serde(borrow)]
     Envelope(Envelope<'a>),
@@ -59,7 +59,7 @@ pub(super) enum Request<'a> {
 
 #[derive(Serialize, Deserialize)]
 #[expect(clippy::large_enum_variant, reason = "there is never more than one")]
-pub(super) enum Reply<'a> {
+pub(super) enum AgentReply<'a> {
     #[serde(borrow)]
     Joined(JoinReply<'a>),
     /// Answer to an envelope or a loss.

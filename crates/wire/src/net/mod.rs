@@ -43,7 +43,7 @@ pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
 pub use delta::DeltaError;
 pub use endpoint::{Endpoint, EndpointError};
 pub use handshake::HandshakeError;
-pub use message::{Agent, AgentId};
+pub use message::{AgentId, AgentInfo};
 pub use slot::{Slot, SlotReport};
 
 /// What agents need to know about a campaign.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-use super::message::{Agent, AgentId};
+use super::message::{AgentId, AgentInfo};
 
 /// Number of the first slot; smaller numbers are walkers of the orchestrator's host.
 const FIRST_SLOT: u32 = 1 << 16;
@@ -21,7 +21,7 @@ pub(super) struct AgentRegistry {
 /// An agent that has joined.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct RegisteredAgent {
-    pub agent: Agent,
+    pub agent: AgentInfo,
     pub first_slot: u32,
     /// Time at which its heartbeat disappeared.
     silent_since: Option<Instant>,
@@ -41,7 +41,7 @@ impl AgentRegistry {
 
     /// Registers an agent with new slots; `None` if there are not enough numbers left. An agent that is already
     /// registered must be removed first.
-    pub(super) fn join(&mut self, agent: Agent) -> Option<&RegisteredAgent> {
+    pub(super) fn join(&mut self, agent: AgentInfo) -> Option<&RegisteredAgent> {
         let first_slot = self.next_slot;
         self.next_slot = first_slot.checked_add(agent.slots())?;
         let id = agent.id.clone();
@@ -55,7 +55,7 @@ impl AgentRegistry {
     }
 
     /// Updates whether the agent's heartbeat is present. Returns the agent if this changed.
-    pub(super) fn set_alive(&mut self, id: &str, alive: bool, now: Instant) -> Option<&Agent> {
+    pub(super) fn set_alive(&mut self, id: &str, alive: bool, now: Instant) -> Option<&AgentInfo> {
         let registered = self.agents.get_mut(id)?;
         if alive == registered.silent_since.is_none() {
             return None;
@@ -85,8 +85,15 @@ impl AgentRegistry {
 mod tests {
     use super::*;
 
-    fn agent(id: &str, walkers: u32) -> Agent {
-        Agent { id: id.into(), host: "a".into(), pid: 1, program_version: "0".into(), walkers, prefetch: 1 }
+    fn agent(id: &str, walkers: u32) -> AgentInfo {
+        AgentInfo {
+            id: id.into(),
+            host: "a".into(),
+            pid: 1,
+            program_version: "0".into(),
+            walkers,
+            prefetch: 1,
+        }
     }
 
     #[test]

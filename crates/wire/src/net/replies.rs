@@ -3,7 +3,7 @@
 use tokio::task::JoinSet;
 use zenoh::query::Query;
 
-use super::message::{ORCHESTRATOR, Reply};
+use super::message::{AgentReply, ORCHESTRATOR};
 use crate::block::{BlockError, CandidateBlock};
 use crate::control::encode;
 use crate::protocol::message::{Answer, SenderId};
@@ -14,7 +14,7 @@ use crate::protocol::server_session::ServerTransport;
 pub(super) struct Replies(JoinSet<()>);
 
 impl Replies {
-    pub(super) fn reply(&mut self, query: &Query, reply: &Reply<'_>) {
+    pub(super) fn reply(&mut self, query: &Query, reply: &AgentReply<'_>) {
         self.spawn(query, encode(reply));
     }
 
@@ -38,7 +38,7 @@ impl ServerTransport for Replies {
     const HOLDS_POLLS: bool = true;
 
     fn encode(answer: Answer<'_>) -> Vec<u8> {
-        encode(&Reply::Answer(answer))
+        encode(&AgentReply::Answer(answer))
     }
 
     fn send(&mut self, _: SenderId, query: &Query, answer: &[u8]) {

@@ -13,14 +13,14 @@ use super::AgentBootstrap;
 use super::agent_event::AgentEvent;
 use super::delta::{self, MixtureDelta};
 use super::files::Files;
-use super::message::{Agent, JoinReply, Reply, Request};
+use super::message::{AgentInfo, AgentReply, AgentRequest, JoinReply};
 use super::registry::{AgentRegistry, RegisteredAgent};
 use super::replies::Replies;
 use crate::control::decode;
 use crate::protocol::frame;
 use crate::protocol::rejected::RejectedMessage;
 use crate::protocol::sequence::SenderMismatch;
-use crate::protocol::server_session::{Decision, ServerSession};
+use crate::protocol::server_session::{OfferDecision, ServerSession};
 use crate::transport::WorkItem;
 
 /// Each slot has one incarnation.
@@ -70,9 +70,9 @@ impl AgentSession {
         let reason = why.to_string();
         if let RejectedMessage::SenderMismatch(_) = why {
             // The agent will join again.
-            self.reply(query, &Reply::RejoinRequired(reason));
+            self.reply(query, &AgentReply::RejoinRequired(reason));
         } else {
-            self.reply(query, &Reply::Rejected(reason.clone()));
+            self.reply(query, &AgentReply::Rejected(reason.clone()));
             self.events.push(AgentEvent::MessageRejected(reason));
         }
     }
@@ -80,39 +80,39 @@ impl AgentSession {
     fn dispatch(&mut self, query: &Query, payload: &[u8]) -> Result<(), RejectedMessage> {
         let (control, block) = frame::split(payload)?;
         match decode(control)? {
-            Request::Join(agent) => self.join(query, agent)?,
-            Request::Envelope(envelope) => self.slots.receive(envelope, query, block)?,
-            Request::Lost { sender, sequence, crashed } => {
+            AgentRequest::Join(agent) => self.join(query, agent)?,
+            AgentRequest::Envelope(envelope) => self.slots.receive(envelope, query, block)?,
+            AgentRequest::Lost { sender, sequence, crashed } => {
                 self.slots.receive_loss(sender, sequence, crashed, query)?;
             }
-            Request::Mixture { session, have, wanted, skip } => {
+            AgentRequest::Mixture { session, have, wanted, skip } => {
                 self.check_session(session)?;
                 self.mixture(query, have, wanted, skip)?;
             }
-            Request::File { session, hash, offset } => {
+            AgentRequest::File { session, hash, offset } => {
                 self.check_session(session)?;
                 let part = self.files.part(&hash, offset)?;
                 let (length, part) = part.ok_or(RejectedMessage::File(hash))?;
-                self.reply(query, &Reply::File { length, part: &part });
+                self.reply(query, &AgentReply::File { length, part: &part });
             }
-            Request::Ping { session } => {
+            AgentRequest::Ping { session } => {
                 self.check_session(session)?;
                 let stopping = self.stopping.is_cancelled();
-                self.reply(query, &Reply::Pong { stopping });
+                self.reply(query, &AgentReply::Pong { stopping });
             }
-            Request::Leave { session, id } => {
+            AgentRequest::Leave { session, id } => {
                 self.check_session(session)?;
                 if let Some(member) = self.registry.leave(&id) {
                     self.agent_lost(&member);
                     self.events.push(AgentEvent::Left(member.agent));
                 }
-                self.reply(query, &Reply::Left);
+                self.reply(query, &AgentReply::Left);
             }
         }
         Ok(())
     }
 
-    fn reply(&mut self, query: &Query, reply: &Reply<'_>) {
+    fn reply(&mut self, query: &Query, reply: &AgentReply<'_>) {
         self.slots.transport.reply(query, reply);
     }
 
@@ -122,7 +122,7 @@ impl AgentSession {
     }
 
     /// An agent that repeats its request because the answer was lost gets new slots.
-    fn join(&mut self, query: &Query, agent: Agent) -> Result<(), RejectedMessage> {
+    fn join(&mut self, query: &Query, agent: AgentInfo) -> Result<(), RejectedMessage> {
         if let Some(member) = self.registry.leave(&agent.id) {
             self.agent_lost(&member);
         }
@@ -133,7 +133,7 @@ impl AgentSession {
         }
         let (first_slot, mixture_version) = (member.first_slot, self.newest().version());
         let joined = JoinReply { session: self.session, first_slot, mixture_version, setup: &self.setup };
-        self.slots.transport.reply(query, &Reply::Joined(joined));
+        self.slots.transport.reply(query, &AgentReply::Joined(joined));
         Ok(())
     }
 
@@ -154,7 +154,7 @@ impl AgentSession {
         let (version, shape) = (to.version(), delta::shape(&to));
         let from = from.map(|from| from.version());
         let part = MixtureDelta { version, from, shape, total, skip, keys, bytes: &bytes };
-        self.reply(query, &Reply::Mixture(part));
+        self.reply(query, &AgentReply::Mixture(part));
         Ok(())
     }
 
@@ -164,7 +164,7 @@ impl AgentSession {
     }
 
     /// Answers the pending offer of a slot.
-    pub(super) fn handle_decision(&mut self, decision: Decision<Query>) {
+    pub(super) fn handle_decision(&mut self, decision: OfferDecision<Query>) {
         if let Some(WorkItem { mixture, .. }) = &decision.work
             && mixture.version() > self.newest().version()
         {

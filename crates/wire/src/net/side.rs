@@ -2,7 +2,7 @@
 
 /// Side of a connection.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Side {
+pub(super) enum ConnectionSide {
     Orchestrator,
     Agent,
 }

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use tokio::time::Instant;
 
 use super::agent_client::{LinkError, Membership, decode_reply, delay_retry};
-use super::message::{Reply, Request};
+use super::message::{AgentReply, AgentRequest};
 use crate::block::CandidateBlock;
 use crate::control::{EncodedReport, checked_assignment, encode};
 use crate::ids::WalkId;
-use crate::messages::{Outcome, Progress, Report};
+use crate::messages::{AssignmentReport, Outcome, WalkProgress};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
 use crate::transport::WorkItem;
 
@@ -27,7 +27,7 @@ pub enum SlotReport {
     /// There was no assignment.
     Empty,
     /// The walker's report.
-    Report(Report),
+    Report(AssignmentReport),
     /// The walker has exited.
     Lost {
         /// Whether it crashed: the assignment may crash the next walker as well.
@@ -56,7 +56,7 @@ impl Slot {
     ) -> Result<Option<WorkItem>, LinkError> {
         self.sequence += 1;
         let (offer, candidate) = self.offer(report);
-        let poll = encode(&Request::Envelope(self.envelope(Payload::Poll { sequence: self.sequence })));
+        let poll = encode(&AgentRequest::Envelope(self.envelope(Payload::Poll { sequence: self.sequence })));
         let mut offered = false;
         loop {
             let sent_at = Instant::now();
@@ -71,7 +71,7 @@ impl Slot {
                 delay_retry(sent_at).await;
                 continue;
             };
-            let Reply::Answer(Answer { sequence, body }) = decode_reply(&answer)? else {
+            let AgentReply::Answer(Answer { sequence, body }) = decode_reply(&answer)? else {
                 return Err(LinkError::InvalidReply("it is not an answer to an offer".to_owned()));
             };
             if sequence != self.sequence {
@@ -98,10 +98,10 @@ impl Slot {
         &self,
         membership: Arc<Membership>,
         walk: WalkId,
-        progress: Progress,
+        progress: WalkProgress,
     ) -> impl Future<Output = ()> + Send + use<> {
         let envelope = self.envelope(Payload::Progress(walk, Cow::Owned(progress)));
-        let request = encode(&Request::Envelope(envelope));
+        let request = encode(&AgentRequest::Envelope(envelope));
         async move { drop(membership.client().send_once(&request, None).await) }
     }
 
@@ -114,7 +114,7 @@ impl Slot {
         match slot_report {
             SlotReport::Empty => {
                 let payload = Payload::Offer { sequence, report: None };
-                (encode(&Request::Envelope(self.envelope(payload))), None)
+                (encode(&AgentRequest::Envelope(self.envelope(payload))), None)
             }
             SlotReport::Report(report) => {
                 let encoded = EncodedReport::new(report, |block| block.view().id());
@@ -123,10 +123,10 @@ impl Slot {
                     Outcome::Candidate(block) => Some(CandidateBlock::as_bytes(block)),
                     _ => None,
                 };
-                (encode(&Request::Envelope(self.envelope(payload))), candidate)
+                (encode(&AgentRequest::Envelope(self.envelope(payload))), candidate)
             }
             SlotReport::Lost { crashed } => {
-                (encode(&Request::Lost { sender, sequence, crashed: *crashed }), None)
+                (encode(&AgentRequest::Lost { sender, sequence, crashed: *crashed }), None)
             }
         }
     }

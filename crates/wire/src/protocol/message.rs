@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::block::{Candidate, CandidateBlock};
 use crate::control::{ControlError, EncodedReport, checked_assignment, decode};
 use crate::ids::WalkId;
-use crate::messages::{Assignment, Outcome, Progress, Report};
+use crate::messages::{Assignment, AssignmentReport, Outcome, WalkProgress};
 
 /// Identifies the sender of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -44,14 +44,14 @@ pub(crate) enum Payload<'a> {
     /// Asks for the state of an offer.
     Poll { sequence: u64 },
     /// Current state of a walk.
-    Progress(WalkId, Cow<'a, Progress>),
+    Progress(WalkId, Cow<'a, WalkProgress>),
 }
 
 impl<'a> Payload<'a> {
     /// An offer with this report, and the candidate to send with it.
     pub(crate) fn offer(
         sequence: u64,
-        report: Option<&'a Report<Candidate>>,
+        report: Option<&'a AssignmentReport<Candidate>>,
     ) -> (Self, Option<&'a Candidate>) {
         let candidate = report.and_then(|report| match &report.outcome {
             Outcome::Candidate(candidate) => Some(candidate),
@@ -71,7 +71,7 @@ impl<'a> Payload<'a> {
 pub(crate) fn attach_candidate(
     report: Option<EncodedReport<'_>>,
     candidate: Option<CandidateBlock>,
-) -> Result<Option<Report>, ControlError> {
+) -> Result<Option<AssignmentReport>, ControlError> {
     match (report, candidate) {
         (Some(report), candidate) => report.attach_candidate(candidate).map(Some),
         (None, None) => Ok(None),

@@ -15,7 +15,7 @@ use super::rejected::RejectedMessage;
 use super::sequence::{OfferStatus, SequenceTracker};
 use crate::block::{BlockError, CandidateBlock};
 use crate::ids::WalkId;
-use crate::messages::{Progress, Report};
+use crate::messages::{AssignmentReport, WalkProgress};
 use crate::transport::{Incoming, WorkItem};
 
 /// Maximum number of progress messages queued for the reactor.
@@ -64,7 +64,7 @@ struct PendingOffer<R> {
 }
 
 /// The reactor's decision on an offer.
-pub(crate) struct Decision<R> {
+pub(crate) struct OfferDecision<R> {
     walker: u32,
     request: R,
     /// The next assignment; `None` for shutdown.
@@ -162,7 +162,7 @@ impl<T: ServerTransport> ServerSession<T> {
     }
 
     /// Forwards an offer to the reactor. The walker has reported, so the mixture of its assignment is released.
-    fn begin(&mut self, walker: u32, request: &T::Request, report: Option<Report>) {
+    fn begin(&mut self, walker: u32, request: &T::Request, report: Option<AssignmentReport>) {
         self.sequences.begin(walker);
         self.mixtures.remove(&walker);
         let (reply, decision) = oneshot::channel();
@@ -188,14 +188,14 @@ impl<T: ServerTransport> ServerSession<T> {
     }
 
     /// May drop the message.
-    fn progress(&mut self, walk: WalkId, progress: Progress) {
+    fn progress(&mut self, walk: WalkId, progress: WalkProgress) {
         if self.outbox.len() < MAX_QUEUED_PROGRESS {
             self.outbox.push_back(Incoming::Progress(walk, progress));
         }
     }
 
     /// The next decision of the reactor, for [`ServerSession::answer`].
-    pub(crate) fn poll_decision(&mut self, context: &mut Context<'_>) -> Poll<Decision<T::Request>> {
+    pub(crate) fn poll_decision(&mut self, context: &mut Context<'_>) -> Poll<OfferDecision<T::Request>> {
         let decided = self.pending.iter_mut().find_map(|(walker, pending)| {
             match Pin::new(&mut pending.decision).poll(context) {
                 Poll::Ready(decision) => Some((*walker, decision.ok().flatten())),
@@ -204,12 +204,12 @@ impl<T: ServerTransport> ServerSession<T> {
         });
         let Some((walker, work)) = decided else { return Poll::Pending };
         let Some(PendingOffer { request, .. }) = self.pending.remove(&walker) else { return Poll::Pending };
-        Poll::Ready(Decision { walker, request, work })
+        Poll::Ready(OfferDecision { walker, request, work })
     }
 
     /// Answers a pending offer and keeps the mixture of the new assignment.
-    pub(crate) fn answer(&mut self, decision: Decision<T::Request>) {
-        let Decision { walker, request, work } = decision;
+    pub(crate) fn answer(&mut self, decision: OfferDecision<T::Request>) {
+        let OfferDecision { walker, request, work } = decision;
         let Some((sender, sequence)) = self.sequences.pending(walker) else { return };
         let body = match &work {
             Some(WorkItem { assignment, mixture }) => AnswerBody::Assignment {

@@ -10,7 +10,7 @@ use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 use tokio_util::sync::CancellationToken;
 use wire::ipc::{ConnectInfo, IpcWalker};
-use wire::messages::{Assignment, Outcome, Report};
+use wire::messages::{Assignment, AssignmentReport, Outcome};
 use wire::transport::Transport;
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
@@ -67,7 +67,7 @@ fn walk(door: &ConnectInfo, stuck: bool) {
             sleep(Duration::MAX);
         }
         let outcome = Outcome::Candidate(candidate);
-        report = Some(Report { walk, assignment: number, outcome, checkpoint, progress });
+        report = Some(AssignmentReport { walk, assignment: number, outcome, checkpoint, progress });
     }
     assert!(walker.failure().is_none(), "{:?}", walker.failure());
 }
@@ -87,8 +87,8 @@ fn orchestrate(directory: &str) {
     });
 }
 
-pub fn progress(step: u64) -> wire::messages::Progress {
-    wire::messages::Progress { step, ..Default::default() }
+pub fn progress(step: u64) -> wire::messages::WalkProgress {
+    wire::messages::WalkProgress { step, ..Default::default() }
 }
 
 /// An assignment that ends with a candidate of this number of atoms and features.

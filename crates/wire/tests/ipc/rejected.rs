@@ -89,7 +89,7 @@ fn framed(control: &[u8], behind: &[u8]) -> Vec<u8> {
 /// The payload of an offer whose report names this candidate.
 fn offer(sequence: u8, candidate: &Candidate) -> Vec<u8> {
     let id = candidate.id;
-    let report = (id.walk.0, 1_u64, 0_u8, id, &[1_u8, 2][..], wire::messages::Progress::default());
+    let report = (id.walk.0, 1_u64, 0_u8, id, &[1_u8, 2][..], wire::messages::WalkProgress::default());
     [&[0, sequence, 1][..], &postcard::to_stdvec(&report).unwrap()].concat()
 }
 

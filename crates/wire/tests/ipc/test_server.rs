@@ -10,8 +10,8 @@ use calm::{Component, Mixture};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
-use wire::ipc::{ConnectInfo, IpcError, Server, ServerHandle, Sizes, space_needed};
-use wire::messages::{Outcome, Report};
+use wire::ipc::{ConnectInfo, IpcError, IpcServer, ServerHandle, Sizes, space_needed};
+use wire::messages::{AssignmentReport, Outcome};
 use wire::mixture::SharedMixture;
 use wire::shm_dir::{PreparedDir, ShmDir};
 use wire::transport::{Incoming, WorkItem};
@@ -39,7 +39,7 @@ pub struct TestServer {
 /// A walker that waits for an assignment.
 pub struct Offer {
     pub walker: u32,
-    pub report: Option<Report>,
+    pub report: Option<AssignmentReport>,
     pub reply: oneshot::Sender<Option<WorkItem>>,
 }
 
@@ -50,7 +50,7 @@ impl TestServer {
         let prepared = place.prepare(space_needed(&sizes)).unwrap();
         let mixtures = SharedMixture::create(&place.mixture(), &mixture(0), walkers).unwrap();
         let session = SESSION.fetch_add(1, Ordering::Relaxed);
-        let server = Server::open(&place, sizes, session).unwrap();
+        let server = IpcServer::open(&place, sizes, session).unwrap();
         let handle = server.handle();
         let (to_reactor, incoming) = mpsc::channel(4);
         let heard = Arc::new(Mutex::new(Vec::new()));
@@ -110,8 +110,8 @@ pub fn work(walker: u32, number: u64, size: (usize, usize)) -> WorkItem {
 }
 
 /// Checks that a report answers this assignment.
-pub fn check(report: &Report, walker: u32, number: u64, size: (usize, usize)) {
-    let Report { walk, assignment: found, ref checkpoint, ref outcome, .. } = *report;
+pub fn check(report: &AssignmentReport, walker: u32, number: u64, size: (usize, usize)) {
+    let AssignmentReport { walk, assignment: found, ref checkpoint, ref outcome, .. } = *report;
     assert_eq!((walk, found, checkpoint.as_slice()), (WalkId(walker), number, &number.to_le_bytes()[..]));
     let expected = CandidateBlock::encode(&candidate(&assignment(walker, number, size)));
     assert_eq!(*outcome, Outcome::Candidate(expected));

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use wire::WalkId;
-use wire::messages::Progress;
+use wire::messages::WalkProgress;
 use wire::net::{AgentEvent, LinkError, SlotReport};
 use wire::transport::Incoming;
 
@@ -24,7 +24,7 @@ async fn assignments_and_reports_survive_a_round_trip() {
             assignments += 1;
             assert_eq!(work.assignment.number, assignments);
             assert_eq!(work.mixture.version(), assignments, "the version of the assignment");
-            slot.progress(Arc::clone(&line), work.assignment.walk, Progress::default()).await;
+            slot.progress(Arc::clone(&line), work.assignment.walk, WalkProgress::default()).await;
             last_report = SlotReport::Report(report(&work.assignment));
         }
         assignments

@@ -11,10 +11,10 @@ use calm::{ChangedComponent, Component, Mixture};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
-use wire::messages::{Assignment, Outcome, Progress, Report};
+use wire::messages::{Assignment, AssignmentReport, Outcome, WalkProgress};
 use wire::net::{
-    Agent, AgentBootstrap, AgentClient, AgentEvent, AgentServer, Endpoint, Membership, NetError, StopTokens,
-    Tls,
+    AgentBootstrap, AgentClient, AgentEvent, AgentInfo, AgentServer, Endpoint, Membership, NetError,
+    StopTokens, Tls,
 };
 use wire::transport::{Incoming, WorkItem};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
@@ -36,7 +36,7 @@ pub struct TestServer {
 /// A slot that waits for an assignment.
 pub struct Offer {
     pub walker: u32,
-    pub report: Option<Report>,
+    pub report: Option<AssignmentReport>,
     pub reply: oneshot::Sender<Option<WorkItem>>,
 }
 
@@ -124,8 +124,8 @@ pub fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
-pub fn agent(id: &str, walkers: u32) -> Agent {
-    Agent {
+pub fn agent(id: &str, walkers: u32) -> AgentInfo {
+    AgentInfo {
         id: id.to_owned(),
         host: "here".into(),
         pid: std::process::id(),
@@ -136,7 +136,7 @@ pub fn agent(id: &str, walkers: u32) -> Agent {
 }
 
 /// An agent that has membership.
-pub async fn join(port: u16, agent: Agent) -> (Arc<AgentClient>, Arc<Membership>) {
+pub async fn join(port: u16, agent: AgentInfo) -> (Arc<AgentClient>, Arc<Membership>) {
     let client = Arc::new(AgentClient::open(&endpoint(port).into(), None, agent, |_| {}).await.unwrap());
     let membership = timeout(LIMIT, client.join()).await.expect("in time").unwrap();
     (client, Arc::new(membership))
@@ -181,7 +181,7 @@ pub fn work(walk: u32, number: u64, mixture: &Arc<Mixture>) -> WorkItem {
 }
 
 /// The report on an assignment.
-pub fn report(assignment: &Assignment) -> Report {
+pub fn report(assignment: &Assignment) -> AssignmentReport {
     let Assignment { campaign, walk, number, .. } = *assignment;
     let structure = structure();
     let n = structure.len();
@@ -206,12 +206,12 @@ pub fn report(assignment: &Assignment) -> Report {
         features: vec![number as f64; n * 20],
     };
     let outcome = Outcome::Candidate(CandidateBlock::encode(&candidate));
-    Report {
+    AssignmentReport {
         walk,
         assignment: number,
         outcome,
         checkpoint: number.to_le_bytes().to_vec(),
-        progress: Progress::default(),
+        progress: WalkProgress::default(),
     }
 }
 

@@ -14,11 +14,11 @@ fn adopted_process() -> (u32, String) {
 
 #[tokio::test]
 async fn an_adopted_process_is_watched_and_ended() {
-    let (pid, birth) = adopted_process();
+    let (pid, start_time) = adopted_process();
     let mut children = children(&["exit 0", "exit 0"], LIMITS);
-    children.adopt(1, pid, &birth).unwrap();
-    assert!(matches!(children.adopt(1, pid, &birth), Err(AdoptError::NotAdoptable { number: 1, .. })));
-    assert!(matches!(children.adopt(2, pid, &birth), Err(AdoptError::NotAdoptable { number: 2, .. })));
+    children.adopt(1, pid, &start_time).unwrap();
+    assert!(matches!(children.adopt(1, pid, &start_time), Err(AdoptError::NotAdoptable { number: 1, .. })));
+    assert!(matches!(children.adopt(2, pid, &start_time), Err(AdoptError::NotAdoptable { number: 2, .. })));
     // The other child starts and exits meanwhile.
     while !matches!(next(&mut children).await, ChildEvent::Ended { number: 0, .. }) {}
     assert_eq!(children.status()[1].incarnation, 0);
@@ -29,9 +29,9 @@ async fn an_adopted_process_is_watched_and_ended() {
 
 #[tokio::test]
 async fn an_adopted_process_that_dies_is_replaced() {
-    let (pid, birth) = adopted_process();
+    let (pid, start_time) = adopted_process();
     let mut children = children(&["exit 0"], LIMITS);
-    children.adopt(0, pid, &birth).unwrap();
+    children.adopt(0, pid, &start_time).unwrap();
     signal(pid, Signal::KILL);
     let events = rest(&mut children).await;
     let ended = ends(&events);
@@ -41,10 +41,10 @@ async fn an_adopted_process_that_dies_is_replaced() {
 
 #[test]
 fn processes_of_earlier_runs_are_asked_to_exit() {
-    let (pid, birth) = adopted_process();
+    let (pid, start_time) = adopted_process();
     assert!(matches!(request_exit(pid, "another/1"), Err(AdoptError::Gone { .. })));
     assert!(store::process_start_time(pid).is_some());
-    request_exit(pid, &birth).unwrap();
+    request_exit(pid, &start_time).unwrap();
     let begun = std::time::Instant::now();
     let lives =
         || std::fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| !stat.contains(") Z "));
@@ -58,8 +58,8 @@ fn processes_of_earlier_runs_are_asked_to_exit() {
 async fn reused_process_ids_are_not_adopted() {
     let own = std::process::id();
     let mut children = children(&["exit 0"], LIMITS);
-    for (pid, birth) in [(own, "another/1"), (own, ""), (0, ""), (u32::MAX, ""), (i32::MAX as u32, "")] {
-        assert!(matches!(children.adopt(0, pid, birth), Err(AdoptError::Gone { .. })), "{pid}");
+    for (pid, start_time) in [(own, "another/1"), (own, ""), (0, ""), (u32::MAX, ""), (i32::MAX as u32, "")] {
+        assert!(matches!(children.adopt(0, pid, start_time), Err(AdoptError::Gone { .. })), "{pid}");
     }
     // The failed adoption has no effect: the child is started normally.
     assert!(matches!(next(&mut children).await, ChildEvent::Started { incarnation: 1, .. }));

@@ -8,13 +8,13 @@ use crate::checksum::{
     CANDIDATE as CANDIDATES, COMPONENT as COMPONENTS, CheckedColumn, DECISION as DECISIONS,
     STRUCTURE as STRUCTURES, VALUE as VALUES, WALK as WALKS, WALK_CONDITIONS as CONDITIONS,
 };
-use crate::database::Value;
+use crate::database::SqlValue;
 use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
 use crate::numbers::encode_numbers;
 use crate::records::{AtomGrades, CandidateRecord, Commit, Decision, Fate, WalkRecord};
 
-type Row = Vec<Value>;
+type Row = Vec<SqlValue>;
 
 pub(super) const DECISION: [&str; 8] =
     ["sequence", "round", "kind", "walk", "candidate", "mixture_version", "detail", "checksum"];
@@ -63,7 +63,7 @@ pub(super) const WALK: [&str; 20] = [
     "seed_structure",
     "state",
     "reason",
-    "turn",
+    "assignments",
     "accepted",
     "step",
     "segment",
@@ -80,7 +80,7 @@ pub(super) const WALK: [&str; 20] = [
 ];
 
 /// Rows of each table. Decisions are numbered from 1 until the number of earlier decisions is known.
-pub(super) struct Rows {
+pub(super) struct CommitRows {
     pub decisions: Vec<Row>,
     pub structures: Vec<Row>,
     pub candidates: Vec<Row>,
@@ -96,7 +96,7 @@ pub(super) struct Rows {
     pub values: Vec<Row>,
 }
 
-impl Rows {
+impl CommitRows {
     pub fn from_commit(commit: &Commit) -> Result<Self> {
         let mut rows = Self {
             decisions: commit.decisions.iter().zip(1..).map(decision).collect::<Result<_>>()?,
@@ -114,7 +114,7 @@ impl Rows {
                 .collect(),
             walks: newest(&commit.walks, |walk| walk.walk).map(walk).collect::<Result<_>>()?,
             walk_conditions: newest(&commit.walks, |walk| walk.walk)
-                .filter(|walk| walk.turn == 0)
+                .filter(|walk| walk.assignments == 0)
                 .map(walk_conditions)
                 .collect(),
             values: newest(&commit.values, |(name, _)| name)
@@ -167,7 +167,7 @@ impl Rows {
             // The protocol is filled in with the decision's number.
             self.jobs.push(vec![
                 hash[..].into(),
-                Value::Integer(None),
+                SqlValue::Integer(None),
                 decision.into(),
                 record.priority.into(),
             ]);
@@ -178,8 +178,8 @@ impl Rows {
 
     /// Numbers the decisions from `first`. Without a protocol there are no jobs.
     pub fn number_from(&mut self, first: i64, protocol: Option<i64>) {
-        let shift = |value: &mut Value| {
-            if let Value::Integer(Some(number)) = value {
+        let shift = |value: &mut SqlValue| {
+            if let SqlValue::Integer(Some(number)) = value {
                 *number += first - 1;
             }
         };
@@ -201,7 +201,7 @@ impl Rows {
         }
         for (row, data) in self.candidates.iter_mut().zip(&self.candidate_data) {
             *row = CANDIDATES.with_checksum(std::mem::take(row));
-            if let [Value::Integer(Some(decision)), _, long @ ..] = data.as_slice() {
+            if let [SqlValue::Integer(Some(decision)), _, long @ ..] = data.as_slice() {
                 row.extend(long.iter().map(|column| long_checksum(*decision, column)));
             }
         }
@@ -209,8 +209,8 @@ impl Rows {
 }
 
 /// Features and grades, in the order of their columns.
-fn long_checksum(decision: i64, column: &Value) -> Value {
-    let Value::Bytes(bytes) = column else { return Value::Integer(None) };
+fn long_checksum(decision: i64, column: &SqlValue) -> SqlValue {
+    let SqlValue::Bytes(bytes) = column else { return SqlValue::Integer(None) };
     CheckedColumn::checksum(decision, bytes.as_deref()).into()
 }
 
@@ -318,7 +318,7 @@ fn walk(walk: &WalkRecord) -> Result<Row> {
         walk.seed_structure.into(),
         (&walk.state).into(),
         (&walk.reason).into(),
-        integer("turn", walk.turn)?.into(),
+        integer("number of assignments", walk.assignments)?.into(),
         walk.accepted.into(),
         integer("step", progress.step)?.into(),
         progress.segment.into(),

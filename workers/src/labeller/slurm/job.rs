@@ -15,7 +15,7 @@ pub(super) const LOG: &str = "slurm.log";
 
 /// Identifies a job.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(in super::super) struct Job {
+pub(in super::super) struct CalculationJob {
     /// The cluster: elsewhere the name has no meaning.
     pub cluster: String,
     pub directory: PathBuf,

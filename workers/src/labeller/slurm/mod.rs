@@ -37,7 +37,7 @@ use job::BEGUN;
 use squeue::{SqueueJob, Traces};
 use squeue_cache::SQUEUE_INTERVAL;
 
-pub(super) use job::Job;
+pub(super) use job::CalculationJob;
 pub(super) use script::{JobRequirements, write};
 pub(super) use squeue_cache::remove_cache;
 
@@ -78,17 +78,23 @@ impl Slurm {
     }
 
     /// The job of the calculation in this directory, which is below its campaign's.
-    pub async fn job(&self, directory: &Path) -> Result<Job, StoreError> {
+    pub async fn job(&self, directory: &Path) -> Result<CalculationJob, StoreError> {
         let last = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let campaign = directory.parent().map(last).filter(|name| name.starts_with("calmwalk-"));
         let name = campaign.into_iter().chain([last(directory)]).collect::<Vec<_>>().join("-");
         let cluster = self.cluster(directory).await?.to_owned();
-        Ok(Job { cluster, directory: directory.to_owned(), name, user: Some(own_user()), node: None })
+        Ok(CalculationJob {
+            cluster,
+            directory: directory.to_owned(),
+            name,
+            user: Some(own_user()),
+            node: None,
+        })
     }
 
     /// Submits a job that Slurm does not know. Waits while Slurm accepts no further job. If the reply is lost, looks for
     /// the job. If Slurm responds but refuses the job, the labeller fails, not the calculation.
-    pub async fn submit(&self, job: &Job) -> Result<(), StoreError> {
+    pub async fn submit(&self, job: &CalculationJob) -> Result<(), StoreError> {
         let mut refused = 0;
         loop {
             let on_full = |full: &SlurmError| {
@@ -115,7 +121,7 @@ impl Slurm {
         }
     }
 
-    pub async fn inspect(&self, job: &Job) -> Result<CalculationState, StoreError> {
+    pub async fn inspect(&self, job: &CalculationJob) -> Result<CalculationState, StoreError> {
         if job.directory.symlink_metadata().is_ok() && !private_directory::is_own(&job.directory) {
             // Another user has created a directory of that name after it was removed, or has submitted the job.
             return Ok(CalculationState::Elsewhere);
@@ -144,7 +150,11 @@ impl Slurm {
     }
 
     /// The state of a job that is finished or unknown to Slurm.
-    async fn finished_job(&self, job: &Job, jobs: &[SqueueJob]) -> Result<CalculationState, StoreError> {
+    async fn finished_job(
+        &self,
+        job: &CalculationJob,
+        jobs: &[SqueueJob],
+    ) -> Result<CalculationState, StoreError> {
         settle(&job.directory).await;
         if let Some(end) = CalculationEnd::read(&job.directory) {
             return Ok(CalculationState::Ended(end));
@@ -166,7 +176,7 @@ impl Slurm {
     }
 
     /// Waits for the end, and submits the job if Slurm does not know it; `None` if its directory was removed.
-    pub async fn wait(&self, job: &Job) -> Result<Option<CalculationEnd>, StoreError> {
+    pub async fn wait(&self, job: &CalculationJob) -> Result<Option<CalculationEnd>, StoreError> {
         let (mut pause, mut asked) = (MIN_POLL_INTERVAL, Instant::now());
         loop {
             if let Some(end) = CalculationEnd::read(&job.directory) {
@@ -190,7 +200,7 @@ impl Slurm {
 
     /// Cancels a job and waits briefly for its end. If Slurm does not respond, this fails: the job continues, and
     /// a later labeller finds it.
-    pub async fn cancel(&self, job: &Job) -> Result<(), StoreError> {
+    pub async fn cancel(&self, job: &CalculationJob) -> Result<(), StoreError> {
         let started = Instant::now();
         loop {
             let jobs = self.ask(job).await.map_err(|error| job_error(job, error))?;
@@ -211,7 +221,7 @@ impl Slurm {
     }
 
     /// Queries the job, and retries until Slurm responds.
-    async fn jobs(&self, job: &Job) -> Result<Vec<SqueueJob>, StoreError> {
+    async fn jobs(&self, job: &CalculationJob) -> Result<Vec<SqueueJob>, StoreError> {
         loop {
             match self.ask(job).await {
                 Ok(jobs) => return Ok(jobs),
@@ -221,7 +231,7 @@ impl Slurm {
         }
     }
 
-    async fn ask(&self, job: &Job) -> Result<Vec<SqueueJob>, SlurmError> {
+    async fn ask(&self, job: &CalculationJob) -> Result<Vec<SqueueJob>, SlurmError> {
         let name = format!("--name={}", job.name);
         let text = self.commands.queue(SqueueJob::FORMAT, &["--states=all", &name]).await?;
         let jobs: Vec<_> = text.lines().map(SqueueJob::parse).collect::<Result<_, _>>()?;
@@ -249,7 +259,7 @@ fn own_user() -> u32 {
     rustix::process::getuid().as_raw()
 }
 
-fn job_error(job: &Job, why: impl ToString) -> StoreError {
+fn job_error(job: &CalculationJob, why: impl ToString) -> StoreError {
     file_error(&job.directory, io::Error::other(why.to_string()))
 }
 
@@ -268,7 +278,7 @@ mod tests {
     #[tokio::test]
     async fn jobs_of_another_user_are_ignored() {
         let directory = tempfile::tempdir().unwrap();
-        let job = Job {
+        let job = CalculationJob {
             cluster: "any".to_owned(),
             directory: directory.path().to_owned(),
             name: "calmwalk-1".to_owned(),

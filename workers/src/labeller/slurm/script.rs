@@ -9,7 +9,7 @@ use std::path::Path;
 use dft::result_file;
 
 use super::super::calculation_runner::{self, Calculation, RunnerCommand, RunnerRequest};
-use super::job::{BEGUN, Job, LOG, REQUEST, SCRIPT};
+use super::job::{BEGUN, CalculationJob, LOG, REQUEST, SCRIPT};
 
 /// Slurm's time limit exceeds that of the runner, which ends the calculation in order, by this, s.
 const MARGIN: f64 = 60.0;
@@ -93,7 +93,7 @@ pub(super) fn clear_excluded_nodes(directory: &Path) -> io::Result<bool> {
 }
 
 /// Arguments of `sbatch`. They identify the job, whatever options the user sets.
-pub(super) fn arguments(job: &Job) -> Vec<OsString> {
+pub(super) fn arguments(job: &CalculationJob) -> Vec<OsString> {
     let option = |name: &str, value: &Path| {
         let mut option = OsString::from(name);
         option.push(value);

@@ -10,7 +10,7 @@ use std::time::Duration;
 use ::slurm::SlurmClient;
 use dft::result_file;
 
-use super::job::Job;
+use super::job::CalculationJob;
 
 /// Time between two queries to Slurm.
 pub(super) const SQUEUE_INTERVAL: Duration = Duration::from_secs(20);
@@ -18,7 +18,7 @@ pub(super) const SQUEUE_INTERVAL: Duration = Duration::from_secs(20);
 const CACHE_FILE: &str = "calmwalk-squeue";
 
 /// Whether Slurm recently reported the job as alive, or does not answer.
-pub(super) async fn is_alive(commands: &SlurmClient, job: &Job) -> bool {
+pub(super) async fn is_alive(commands: &SlurmClient, job: &CalculationJob) -> bool {
     let path = job.directory.with_file_name(CACHE_FILE);
     let names = match read_recent(&path) {
         Some(names) => names,

@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::control::ControlError;
 use crate::ids::{Origin, WalkId};
-use crate::messages::{Assignment, Outcome, Progress, Report};
+use crate::messages::{Assignment, AssignmentReport, Outcome, WalkProgress};
 use crate::protocol::frame::FrameError;
 use crate::protocol::message::AnswerBody;
 use any::{answer, assignment, given, offer, offered, report, request, sender};
@@ -156,7 +156,7 @@ proptest! {
     fn reports_with_candidates_of_other_walks_are_rejected(sender in sender(), candidate in candidate()) {
         let walk = WalkId(candidate.id.walk.0 ^ 1);
         let (outcome, checkpoint) = (Outcome::Candidate(candidate), Vec::new());
-        let report = Report { walk, assignment: 0, outcome, checkpoint, progress: Progress::default() };
+        let report = AssignmentReport { walk, assignment: 0, outcome, checkpoint, progress: WalkProgress::default() };
         prop_assert!(is_about_the_candidate(&super::request(&offered(sender, 1, Some(&report)))));
     }
 

@@ -45,7 +45,7 @@ impl Authority {
     }
 }
 
-fn refused(tls: &Tls, side: Side) -> String {
+fn refused(tls: &Tls, side: ConnectionSide) -> String {
     tls.check(side, today()).unwrap_err().to_string()
 }
 
@@ -53,7 +53,7 @@ fn refused(tls: &Tls, side: Side) -> String {
 fn valid_certificates_work_on_both_sides() {
     let directory = tempfile::tempdir().unwrap();
     let tls = Authority::new().host(directory.path(), |_| {});
-    for side in [Side::Orchestrator, Side::Agent] {
+    for side in [ConnectionSide::Orchestrator, ConnectionSide::Agent] {
         let checked = tls.check(side, today()).unwrap();
         assert_eq!(checked, CheckedTls { names: vec!["head".into(), "10.0.0.3".into()], warnings: vec![] });
     }
@@ -101,7 +101,7 @@ fn errors_name_the_file() {
             Some(content) => fs::write(here.join(file), content).unwrap(),
             None => fs::remove_file(here.join(file)).unwrap(),
         }
-        for side in [Side::Orchestrator, Side::Agent] {
+        for side in [ConnectionSide::Orchestrator, ConnectionSide::Agent] {
             let why = refused(&tls, side);
             let begins = format!("{}: ", here.join(file).display());
             assert!(why.starts_with(&begins) && why.contains(expected), "{file} {expected}: {why}");
@@ -115,18 +115,18 @@ fn certificates_of_other_authorities_or_purposes_are_rejected() {
     let here = directory.path();
     let tls = Authority::new().host(here, |_| {});
     fs::write(&tls.authority, Authority::new().pem).unwrap();
-    for side in [Side::Orchestrator, Side::Agent] {
+    for side in [ConnectionSide::Orchestrator, ConnectionSide::Agent] {
         let why = refused(&tls, side);
         assert!(why.contains("certificate.pem: the certificate is not signed by"), "{why}");
     }
     let tls = Authority::new().host(here, |certificate| {
         certificate.extended_key_usages = vec![Purpose::ClientAuth];
     });
-    assert!(refused(&tls, Side::Orchestrator).contains("serverAuth"));
-    assert!(tls.check(Side::Agent, today()).is_ok());
+    assert!(refused(&tls, ConnectionSide::Orchestrator).contains("serverAuth"));
+    assert!(tls.check(ConnectionSide::Agent, today()).is_ok());
     let tls = Authority::new().host(here, |certificate| certificate.subject_alt_names.clear());
-    assert!(refused(&tls, Side::Orchestrator).contains("has no host names"));
-    assert!(tls.check(Side::Agent, today()).is_ok(), "an agent needs no name");
+    assert!(refused(&tls, ConnectionSide::Orchestrator).contains("has no host names"));
+    assert!(tls.check(ConnectionSide::Agent, today()).is_ok(), "an agent needs no name");
 }
 
 #[test]
@@ -137,7 +137,7 @@ fn certificates_are_rejected_outside_their_validity_with_a_warning_before_expiry
         let tls = authority.host(directory.path(), |certificate| {
             certificate.not_after = date_time_ymd(year, month, day);
         });
-        tls.check(Side::Agent, today())
+        tls.check(ConnectionSide::Agent, today())
     };
     assert_eq!(until(2030, 6, 16).unwrap().warnings, [""; 0]);
     let warnings = until(2030, 6, 14).unwrap().warnings;
@@ -147,7 +147,7 @@ fn certificates_are_rejected_outside_their_validity_with_a_warning_before_expiry
     );
     let why = until(2030, 5, 31).unwrap_err().to_string();
     assert!(why.contains("certificate.pem: the certificate expired on 2030-05-31"), "{why}");
-    let early = authority.host(directory.path(), |_| {}).check(Side::Agent, today() - 200 * DAY);
+    let early = authority.host(directory.path(), |_| {}).check(ConnectionSide::Agent, today() - 200 * DAY);
     let why = early.unwrap_err().to_string();
     assert!(why.contains("certificate.pem: the certificate is valid only from 2030-01-01"), "{why}");
 }

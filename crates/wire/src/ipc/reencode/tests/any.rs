@@ -11,7 +11,7 @@ use super::encode_message;
 use crate::block::Candidate;
 use crate::conditions::WalkConditions;
 use crate::ids::{CampaignId, Origin, WalkId};
-use crate::messages::{Assignment, DeclineReason, Outcome, Progress, Report, Verdict, WalkEnd};
+use crate::messages::{Assignment, AssignmentReport, DeclineReason, Outcome, Verdict, WalkEnd, WalkProgress};
 use crate::protocol::message::{Answer, AnswerBody, Envelope, Payload, SenderId};
 
 fn verdict() -> impl Strategy<Value = Verdict> {
@@ -31,11 +31,11 @@ fn end() -> impl Strategy<Value = WalkEnd> {
     ]
 }
 
-fn progress() -> impl Strategy<Value = Progress> {
+fn progress() -> impl Strategy<Value = WalkProgress> {
     let numbers = [(); 4].map(|()| -1e3..1e9);
     (any::<u64>(), any::<u32>(), numbers, any::<u64>(), any::<u32>(), any::<Option<(u64, u64)>>()).prop_map(
         |(step, segment, [tau, temperature, relative_volume, gamma_max], refused, returns, last_return)| {
-            Progress {
+            WalkProgress {
                 step,
                 segment,
                 tau,
@@ -95,7 +95,7 @@ fn conditions() -> impl Strategy<Value = WalkConditions> {
     )
 }
 
-pub fn report() -> impl Strategy<Value = Report<Candidate>> {
+pub fn report() -> impl Strategy<Value = AssignmentReport<Candidate>> {
     let outcome = prop_oneof![
         candidate().prop_map(Outcome::Candidate),
         Just(Outcome::StepsDone),
@@ -108,7 +108,7 @@ pub fn report() -> impl Strategy<Value = Report<Candidate>> {
                 Outcome::Candidate(candidate) => candidate.id.walk,
                 _ => WalkId(walk),
             };
-            Report { walk, assignment, outcome, checkpoint, progress }
+            AssignmentReport { walk, assignment, outcome, checkpoint, progress }
         },
     )
 }
@@ -122,7 +122,7 @@ pub fn sender() -> impl Strategy<Value = SenderId> {
 }
 
 /// An offer as a walker sends it.
-pub fn offered(sender: SenderId, sequence: u64, report: Option<&Report<Candidate>>) -> Vec<u8> {
+pub fn offered(sender: SenderId, sequence: u64, report: Option<&AssignmentReport<Candidate>>) -> Vec<u8> {
     let (payload, candidate) = Payload::offer(sequence, report);
     encode_message(&Envelope { sender, payload }, candidate)
 }
