@@ -268,6 +268,40 @@ fn labelled_structures_have_a_section() {
     assert!(refused("out", "out/structures.extxyz").contains("is the file of labelled structures"));
 }
 
+/// Each mixture grades the same structures; the features follow from its artifact.
+#[test]
+fn mixtures_of_several_dimensions_are_compared() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("labelled.extxyz"), &aluminium(4));
+    let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
+    let build = ["calm", "build", "--model", &model, "labelled.extxyz", "--output", "linear.npz"];
+    succeed(here, build.iter().chain(&["--feature-variant", "linear", "--candidates", "1"]));
+    let own = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
+    let others = ["--compare-artifact", &own, "--compare-artifact", "linear.npz"];
+    let quick = ["--labelled", "labelled.extxyz", "--scan-steps", "2", "--no-relax"];
+    let printed = validate(here, "al_eam_1l", "out", &[&quick[..], &others[..]].concat());
+    assert!(printed.contains("under several mixtures") && printed.contains("linear.npz"), "{printed}");
+    let found = json(&here.join("out"));
+    let mixtures = found["mixtures"].as_array().unwrap();
+    let described: Vec<_> =
+        mixtures.iter().map(|mixture| json!([mixture["dimension"], mixture["components"]])).collect();
+    assert_eq!(Value::from(described), json!([[130, [1]], [130, [1]], [128, [1]]]));
+    assert_eq!((&mixtures[1]["artifact"], &mixtures[1]["scores"]), (&own.into(), &mixtures[0]["scores"]));
+    assert_eq!(mixtures[0]["scores"], found["labelled"]["scores"]);
+    assert_ne!(mixtures[2]["scores"][0]["spearman"], mixtures[0]["scores"][0]["spearman"]);
+    let table = std::fs::read_to_string(here.join("out/tables/mixtures.csv")).unwrap();
+    assert_eq!(table.lines().count(), 7, "{table}");
+
+    let silicon = config("data/si_sw_1l/gmm_artifacts.npz").display().to_string();
+    let start = ["calm", "validate", "--model", &model, "--output", "new"];
+    let refused = |more: &[&str]| refuse(here, start.iter().chain(more));
+    assert!(refused(&["--compare-artifact", &own]).contains("--labelled"));
+    let message = refused(&["--labelled", "labelled.extxyz", "--compare-artifact", &silicon]);
+    assert!(message.contains("si_sw_1l"), "{message}");
+    assert!(!here.join("new").join("validation.json").exists());
+}
+
 #[test]
 fn wrong_arguments_are_named() {
     let directory = tempfile::tempdir().unwrap();

@@ -150,6 +150,8 @@ fn check_table(live: &Live) {
     let shown =
         succeed(live.here(), ["queue", "campaign", "list", "--state", "queued", "--limit", "1000", "--json"]);
     let listed: Vec<Value> = serde_json::from_str(&shown).unwrap();
+    let page = get(address, "/api/candidates?order=queue&state=queued").json();
+    assert_eq!(page["imported"], 0);
     let names = |lines: &[Value], key: &str| lines.iter().map(|line| line[key].clone()).collect::<Vec<_>>();
     assert_eq!(names(&queue, "id"), names(&listed, "candidate"));
     let found = all_lines(address, "where=gamma+%3E+1.1+and+element+%3D+Al+and+origin+%3D+biased", 4);

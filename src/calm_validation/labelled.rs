@@ -6,6 +6,7 @@ mod collect;
 mod deviations;
 mod estimate;
 mod figures;
+mod mixtures;
 mod report;
 mod tables;
 #[cfg(test)]
@@ -14,5 +15,6 @@ mod tests;
 pub use self::collect::{LabelledErrors, LabelledStructure, ScoreColumn};
 pub use self::estimate::BOOTSTRAP;
 pub use self::figures::all as figures;
+pub use self::mixtures::{ComparedMixture, table as mixtures_table};
 pub use self::report::LabelledReport;
-pub use self::tables::{all as tables, write};
+pub use self::tables::{all as tables, write, write_table};

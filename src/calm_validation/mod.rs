@@ -29,7 +29,7 @@ use md::Fire;
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
-use self::labelled::LabelledReport;
+use self::labelled::{ComparedMixture, LabelledReport};
 use crate::exit_status::CommandError;
 
 pub use self::baseline_score::{BaselineScore, score_own_features};
@@ -85,6 +85,8 @@ pub struct Validation {
     pub collisions: Vec<Collision>,
     /// What labelled structures say, if there are any.
     pub labelled: Option<LabelledReport>,
+    /// The same labelled structures under several mixtures, that of the scores first; empty if there is no other.
+    pub mixtures: Vec<ComparedMixture>,
 }
 
 /// A score and what its bond scans tell.
@@ -111,7 +113,7 @@ pub struct Subject {
 pub fn run(
     subject: &Subject,
     settings: ValidationSettings,
-    labelled: Option<LabelledReport>,
+    (labelled, mixtures): (Option<LabelledReport>, Vec<ComparedMixture>),
     progress: &ValidationProgress,
 ) -> Result<Option<Validation>, CommandError> {
     progress.begin(
@@ -143,6 +145,7 @@ pub fn run(
         solutions,
         collisions,
         labelled,
+        mixtures,
     }))
 }
 

@@ -14,6 +14,9 @@ pub fn all(validation: &Validation) -> Vec<PageTable> {
         collisions(validation),
     ];
     tables.extend(validation.labelled.iter().flat_map(labelled::tables));
+    tables.extend(
+        validation.labelled.iter().map(|report| labelled::mixtures_table(&validation.mixtures, report)),
+    );
     tables.retain(|table| !table.rows.is_empty());
     tables
 }

@@ -32,7 +32,8 @@ use crate::wording;
 pub struct RelabelArgs {
     #[command(flatten)]
     location: CampaignArgs,
-    /// Candidates to relabel, also those labelled by the current protocol: ids, unique prefixes of ids, or decision numbers
+    /// Structures to relabel, also those labelled by the current protocol: ids, unique prefixes of ids, or decision numbers of
+    /// candidates, import-N of imported structures
     #[arg(value_name = "ID")]
     ids: Vec<String>,
     /// Relabel every structure whose label comes from another protocol than the current one

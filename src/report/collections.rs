@@ -40,7 +40,7 @@ pub struct OriginCollection {
     /// Sizes of structures.
     pub structures: SystematicSample<StructureSize>,
     /// Grades and errors of atoms.
-    pub atoms: SystematicSample<GradedAtom>,
+    pub atoms: SystematicSample<CollectedAtom>,
     /// Number of atoms of each element.
     pub elements: BTreeMap<Species, u64>,
     /// Numbers of structures by seed structure and status of their labels.
@@ -71,7 +71,7 @@ pub struct StructureSize {
 
 /// Grades and error of an atom.
 #[derive(Clone, Copy, Debug)]
-pub struct GradedAtom {
+pub struct CollectedAtom {
     /// γ under the original mixture.
     pub gamma: f64,
     /// γ_nbr under the original mixture.
@@ -182,7 +182,7 @@ impl OriginCollection {
         let stretches = shortest.filter(|_| is_labelled).map(|shortest| stretches(structure, shortest));
         for (k, gamma) in row.original.gamma.iter().enumerate() {
             let label = row.label_forces.as_ref().and_then(|label| label.get(k));
-            self.atoms.add(GradedAtom {
+            self.atoms.add(CollectedAtom {
                 gamma: *gamma,
                 gamma_nbr: row.original.gamma_nbr.get(k).copied().unwrap_or(f64::NAN),
                 error: label.zip(forces.get(k)).map(|(label, model)| norm(sub(*model, *label))),

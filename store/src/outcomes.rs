@@ -9,7 +9,7 @@ use crate::records::AtomGrades;
 /// The cost of a label made in this campaign.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelCost {
-    /// Index of the seed structure.
+    /// Index of the seed structure; [`u32::MAX`] for imported structures.
     pub seed_structure: u32,
     /// Formula.
     pub formula: String,
@@ -37,7 +37,7 @@ pub struct LabelledEnergies {
 /// Label jobs of one size that have no label yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PendingJobs {
-    /// Index of the seed structure.
+    /// Index of the seed structure; [`u32::MAX`] for imported structures.
     pub seed_structure: u32,
     /// Formula.
     pub formula: String,
@@ -84,7 +84,7 @@ pub struct ValueRange {
 /// Failed labels of one seed structure and formula: this part of the collected structures has no label.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Unlabelled {
-    /// Name of the seed structure.
+    /// Name of the seed structure; `imported` for imported structures.
     pub seed_structure: String,
     /// Formula.
     pub formula: String,

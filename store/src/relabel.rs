@@ -10,13 +10,13 @@ use crate::records::{JobState, Protocol};
 pub struct Relabellable {
     /// Its hash.
     pub content: ContentHash,
-    /// Sequence number of the decision on its candidate.
+    /// Sequence number of the decision on its candidate; above all decisions for an imported structure.
     pub decision: i64,
     /// Name of the protocol of its label.
     pub protocol: String,
     /// State of its job under the requested protocol, if it has one.
     pub job: Option<JobState>,
-    /// Index of the seed structure.
+    /// Index of the seed structure; [`u32::MAX`] for imported structures.
     pub seed_structure: u32,
     /// Formula.
     pub formula: String,

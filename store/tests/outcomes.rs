@@ -1,7 +1,8 @@
 //! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
 use store::{
-    FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs, Store, Unlabelled, ValueRange,
+    ExportFilter, FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs, RelabelRequest,
+    Store, Unlabelled, ValueRange,
 };
 use wire::{Candidate, CandidateBlock, ContentHash, Origin};
 
@@ -70,6 +71,48 @@ async fn costs_are_those_of_successful_attempts() {
         store.label_usage().await.unwrap(),
         LabelUsage { cores: 1, ..store.label_usage().await.unwrap() }
     );
+}
+
+/// A structure without a seed structure costs as much as others, fails as others do, and can be labelled again.
+#[tokio::test]
+async fn imported_structures_count_as_others_do() {
+    let home = Home::new();
+    let (store, _) = filled(&home).await;
+    let dft = protocol("dft").hash;
+    let files: Vec<_> = (0..2).map(|k| ("new.extxyz".to_owned(), k, structure(50.0 + k as f64))).collect();
+    store.queue_imports(&files, 1, 30_000).await.unwrap();
+    assert_eq!(store.imported_jobs(JobState::Queued).await.unwrap(), 2);
+    let done = lease(&store, 30_000).await;
+    assert_eq!(done.candidate, "import-1");
+    store.complete(&done, &label(-5.0), 36_000).await.unwrap();
+    let failing = lease(&store, 36_000).await;
+    assert_eq!(failing.candidate, "import-2");
+    store.fail(&failing, "crashed", "", 1, 37_000).await.unwrap();
+
+    let newest = store.label_costs(dft, 1).await.unwrap().remove(0);
+    assert_eq!((newest.seed_structure, newest.atoms, newest.core_seconds), (u32::MAX, 2, 6.0));
+    for ranges in [true, false] {
+        let unlabelled = store.unlabelled(dft, ranges).await.unwrap();
+        let rows: Vec<_> =
+            unlabelled.iter().map(|row| (row.seed_structure.as_str(), row.failed, row.labelled)).collect();
+        assert_eq!(rows, [("diamond", 2, 3), ("imported", 1, 1)], "ranges: {ranges}");
+        assert_eq!(unlabelled[1].gamma, ValueRange::default());
+    }
+
+    let found = store.relabellable(dft).await.unwrap();
+    let import = found.last().unwrap();
+    assert_eq!((found.len(), import.content), (4, ContentHash::from_structure(&structure(50.0))));
+    assert_eq!((import.seed_structure, import.formula.as_str(), import.atoms), (u32::MAX, "Si2", 2));
+    let request =
+        RelabelRequest { structures: &[import.content], again: true, reason: "doubtful", protocol: None };
+    assert_eq!(store.relabel(&request, 40_000).await.unwrap().again, 1);
+    store.prioritise_job("import-1", 9, 40_000).await.unwrap();
+    let again = lease(&store, 40_000).await;
+    assert_eq!(again.candidate, "import-1");
+    store.complete(&again, &label(-6.0), 41_000).await.unwrap();
+    let imported = ExportFilter { protocol: dft, biased: false, control: false, imported: true };
+    let rows = store.labelled(&imported, None, 10).await.unwrap();
+    assert_eq!(rows.iter().map(|row| row.label.energy).collect::<Vec<_>>(), [-6.0]);
 }
 
 #[tokio::test]

@@ -8,7 +8,7 @@ use crate::output::{self, range};
 use crate::page::{PageTable, TableCell, count, percent, real, text};
 
 /// The force error of the paper's table of contamination, eV/Å.
-const CONTAMINATION: f64 = 0.5;
+pub(super) const CONTAMINATION: f64 = 0.5;
 
 /// All tables that have rows.
 pub fn all(report: &LabelledReport) -> Vec<PageTable> {
@@ -35,19 +35,22 @@ pub fn write(report: &LabelledReport, out: &mut dyn Write) -> io::Result<()> {
         let (sampled, structures) = (report.sampled_atoms, report.sampled_structures);
         writeln!(out, "ranks, quantiles and intervals are from {sampled} atoms of {structures} structures")?;
     }
-    for table in all(report) {
-        let align = |(title, cell): (&&str, &TableCell)| {
-            format!("{}{}", if cell.is_number { ">" } else { "" }, ::figures::plain(title))
-        };
-        let titles: Vec<_> = table.titles.iter().zip(&table.rows[0]).map(align).collect();
-        let mut aligned = output::TextTable::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
-        for row in &table.rows {
-            aligned.push(row.iter().map(|cell| cell.shown.clone()).collect());
-        }
-        writeln!(out, "\n{}", ::figures::plain(&table.caption))?;
-        aligned.write(out)?;
+    all(report).iter().try_for_each(|table| write_table(table, out))
+}
+
+/// Prints a table, if it has rows, with its caption.
+pub fn write_table(table: &PageTable, out: &mut dyn Write) -> io::Result<()> {
+    let Some(first) = table.rows.first() else { return Ok(()) };
+    let align = |(title, cell): (&&str, &TableCell)| {
+        format!("{}{}", if cell.is_number { ">" } else { "" }, ::figures::plain(title))
+    };
+    let titles: Vec<_> = table.titles.iter().zip(first).map(align).collect();
+    let mut aligned = output::TextTable::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
+    for row in &table.rows {
+        aligned.push(row.iter().map(|cell| cell.shown.clone()).collect());
     }
-    Ok(())
+    writeln!(out, "\n{}", ::figures::plain(&table.caption))?;
+    aligned.write(out)
 }
 
 fn errors(report: &LabelledReport) -> PageTable {
@@ -138,7 +141,7 @@ fn name(score: &ScoreReport) -> TableCell {
 }
 
 /// Value and interval.
-fn cells(estimate: IntervalEstimate, factor: f64, digits: usize) -> [TableCell; 2] {
+pub(super) fn cells(estimate: IntervalEstimate, factor: f64, digits: usize) -> [TableCell; 2] {
     let interval = estimate.interval.map(|(low, high)| [low, high].map(|x| real(factor * x, digits)));
     let text = |of: fn(&TableCell) -> &String| {
         interval.as_ref().map_or(String::new(), |[low, high]| format!("{} to {}", of(low), of(high)))

@@ -1,19 +1,22 @@
 //! `calmwalk calm validate`
 
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::Species;
 use atoms::prototypes::Prototype;
+use calm::Mixture;
 use md::Fire;
 use potentials::grace::GraceModel;
+use tokio_util::sync::CancellationToken;
 
 use super::other_scores::OtherScores;
 use super::score::load;
 use super::scorer::Scorer;
 use super::validate_labels;
 use crate::atomic_file::refuse_to_replace;
+use crate::calm_validation::labelled::{ComparedMixture, LabelledReport};
 use crate::calm_validation::{
     self, AtomScore, EnergySpread, PAGE, Subject, Validation, ValidationProgress, ValidationSettings, both,
     labelled, verdict,
@@ -57,6 +60,10 @@ pub struct CalmValidateArgs {
     /// errors
     #[arg(long, value_name = "LABELLED.extxyz")]
     labelled: Option<PathBuf>,
+    /// Another mixture of the model, such as one with more components; may be repeated. A table compares what γ up to 1 keeps of the
+    /// labelled structures under each mixture
+    #[arg(long, value_name = "CALM.npz", requires = "labelled")]
+    compare_artifact: Vec<PathBuf>,
     /// Directory for the files, created if it does not exist; files of an earlier validation are replaced
     #[arg(long, short, value_name = "DIR")]
     output: PathBuf,
@@ -92,14 +99,15 @@ impl CalmValidateArgs {
         create_directory(&self.output)?;
         let stop = stop_token()?;
         let labelled = match &self.labelled {
-            None => None,
+            None => (None, Vec::new()),
             Some(input) => {
                 let mut scorer = Scorer::new(model.clone(), mixture.clone());
                 let found = validate_labels::report(input, &mut scorer, &mut compared, &stop)?;
-                if found.is_none() {
+                let Some(report) = found else { return Ok(stopped()) };
+                let Some(mixtures) = self.mixtures(input, &mixture, &report, &stop)? else {
                     return Ok(stopped());
-                }
-                found
+                };
+                (Some(report), mixtures)
             }
         };
         let progress = ValidationProgress::new(Bar::new(Some(1), BAR), stop);
@@ -117,6 +125,7 @@ impl CalmValidateArgs {
             if let Some(report) = &validation.labelled {
                 writeln!(out)?;
                 labelled::write(report, out)?;
+                labelled::write_table(&labelled::mixtures_table(&validation.mixtures, report), out)?;
             }
             let page = self.output.join(PAGE);
             let others = output::count(files.len() - 1, "file");
@@ -134,6 +143,29 @@ impl CalmValidateArgs {
             ensemble = &self.ensemble;
         }
         OtherScores::load(&self.model, features, &self.baseline, ensemble)
+    }
+
+    /// What the labelled structures say under each mixture. `None` if it was stopped.
+    fn mixtures(
+        &self,
+        input: &Path,
+        mixture: &Mixture,
+        report: &LabelledReport,
+        stop: &CancellationToken,
+    ) -> Result<Option<Vec<ComparedMixture>>, CommandError> {
+        let own = self.artifact.as_ref().unwrap_or(&self.model).display().to_string();
+        let mut mixtures = vec![ComparedMixture::new(own, mixture, report)];
+        for path in &self.compare_artifact {
+            let (features, artifact) = load(&self.model, Some(path))?;
+            let mixture = Arc::new(artifact.mixture);
+            let mut scorer = Scorer::new(features.model.clone(), mixture.clone());
+            let mut none = OtherScores::load(&self.model, &features, &[], &[])?;
+            let Some(report) = validate_labels::report(input, &mut scorer, &mut none, stop)? else {
+                return Ok(None);
+            };
+            mixtures.push(ComparedMixture::new(path.display().to_string(), &mixture, &report));
+        }
+        Ok(Some(mixtures))
     }
 
     /// The spread of the energies, if there are further models.

@@ -2,7 +2,8 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use store::{ExportFilter, JobState, PendingJobs, Relabellable, Store};
+use monitor::candidate_details::IMPORT_PREFIX;
+use store::{ExportFilter, JobState, PendingJobs, Relabellable, Store, StoreError};
 use wire::ContentHash;
 
 use super::CommandError;
@@ -40,22 +41,14 @@ impl Selection {
         selection
     }
 
-    /// The structures of these candidates, whatever the protocol of their labels.
-    pub async fn from_ids(
-        store: &Store,
-        all: Vec<Relabellable>,
-        ids: &[String],
-    ) -> Result<Self, CommandError> {
+    /// The structures of these candidates and imports, whatever the protocol of their labels.
+    pub async fn from_ids(store: &Store, all: Vec<Relabellable>, ids: &[String]) -> Result<Self, CommandError> {
         let mut wanted = HashSet::new();
         for id in ids {
-            let candidate = store.find_candidate(id).await?.candidate;
-            let content = match store.candidate(&candidate).await? {
-                Some(stored) => stored.block.view().id().content,
-                None => return Err(CommandError::Input(format!("there is no candidate {candidate}"))),
-            };
+            let (name, content) = structure_named(store, id).await?;
             if !all.iter().any(|structure| structure.content == content) {
                 return Err(CommandError::Input(format!(
-                    "{candidate} has no label to replace: see calmwalk explain (to queue a failed or dropped candidate again, \
+                    "{name} has no label to replace: see calmwalk explain (to queue a failed or dropped structure again, \
                      use calmwalk queue … retry)"
                 )));
             }
@@ -108,6 +101,24 @@ impl Selection {
     }
 }
 
+/// Name and hash of the structure of a candidate, or of `import-N`.
+async fn structure_named(store: &Store, id: &str) -> Result<(String, ContentHash), CommandError> {
+    if let Some(number) = id.strip_prefix(IMPORT_PREFIX) {
+        let found = match number.parse() {
+            Ok(number) => store.imported_structure(number).await?,
+            Err(_) => None,
+        };
+        let imported = store.imported_structures().await?;
+        let found = found.ok_or_else(|| StoreError::UnknownImport { id: id.to_owned(), imported })?;
+        return Ok((id.to_owned(), found.content));
+    }
+    let candidate = store.find_candidate(id).await?.candidate;
+    match store.candidate(&candidate).await? {
+        Some(stored) => Ok((candidate, stored.block.view().id().content)),
+        None => Err(CommandError::Input(format!("there is no candidate {candidate}"))),
+    }
+}
+
 /// The structures whose labels match the filter.
 pub async fn matching(
     store: &Store,
@@ -117,7 +128,7 @@ pub async fn matching(
     let mut matching = HashSet::new();
     let conditions = store.walk_conditions().await?;
     for protocol in store.protocols().await? {
-        let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: false };
+        let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
         let mut last = None;
         loop {
             let page = store.labelled(&filter, last, PAGE).await?;

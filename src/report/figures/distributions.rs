@@ -4,13 +4,13 @@ use ::figures::{Figure, Panel, Scale};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use wire::Origin;
 
-use super::super::collections::{Collections, GradedAtom};
+use super::super::collections::{Collections, CollectedAtom};
 use super::super::style::{WIDTH, axis, grouped, origins};
 use super::super::{Csv, FigureContent};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
 /// A quantity of an atom.
-type AtomQuantity = fn(&GradedAtom) -> Option<f64>;
+type AtomQuantity = fn(&CollectedAtom) -> Option<f64>;
 
 /// Number of bins of a panel.
 const BINS: usize = 40;

@@ -4,7 +4,7 @@ use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale, Side};
 use analysis::{QuantileBin, binned_quantiles, kernel_density, linear_edges, quantile};
 use wire::Origin;
 
-use super::super::collections::{Collections, GradedAtom};
+use super::super::collections::{Collections, CollectedAtom};
 use super::super::style::{WIDTH, axis, grouped, origin_style, origins};
 use super::super::{Csv, FigureContent, csv};
 use super::NO_LABELS;
@@ -21,7 +21,7 @@ struct Quantity {
     letter: char,
     title: &'static str,
     scale: Scale,
-    of: fn(&GradedAtom) -> Option<f64>,
+    of: fn(&CollectedAtom) -> Option<f64>,
 }
 
 const QUANTITIES: [Quantity; 2] = [
@@ -164,10 +164,10 @@ fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f
 }
 
 /// Pairs of quantity and error of the labelled atoms.
-fn pairs(collections: &Collections, origin: Origin, of: fn(&GradedAtom) -> Option<f64>) -> Vec<[f64; 2]> {
+fn pairs(collections: &Collections, origin: Origin, of: fn(&CollectedAtom) -> Option<f64>) -> Vec<[f64; 2]> {
     let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
     let pair =
-        |atom: &GradedAtom| Some([of(atom)?, atom.error?]).filter(|[x, y]| x.is_finite() && y.is_finite());
+        |atom: &CollectedAtom| Some([of(atom)?, atom.error?]).filter(|[x, y]| x.is_finite() && y.is_finite());
     collection.atoms.items().filter_map(pair).collect()
 }
 

@@ -4,14 +4,14 @@ use ::figures::{Colour, Figure, LegendKey, Panel, Scale, legend};
 use analysis::{binned_quantiles, logarithmic_edges, spearman};
 use wire::Origin;
 
-use super::super::collections::{Collections, GradedAtom};
+use super::super::collections::{Collections, CollectedAtom};
 use super::super::style::{WIDTH, axis, grouped};
 use super::super::{Csv, FigureContent, csv};
 use super::errors::{MIN_ATOMS, middle, ribbons};
 use super::{NO_LABELS, row};
 
 /// A quantity of an atom.
-type AtomQuantity = fn(&GradedAtom) -> f64;
+type AtomQuantity = fn(&CollectedAtom) -> f64;
 
 /// Number of bins of a panel.
 const BINS: usize = 18;
@@ -19,7 +19,7 @@ const BINS: usize = 18;
 pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
     let atoms = |origin: Origin| collections.both()[usize::from(origin == Origin::Control)].1.atoms.items();
     let labelled = atoms(Origin::Biased).chain(atoms(Origin::Control)).filter(|atom| atom.error.is_some());
-    let labelled: Vec<GradedAtom> = labelled.copied().collect();
+    let labelled: Vec<CollectedAtom> = labelled.copied().collect();
     if labelled.is_empty() {
         return Err(NO_LABELS.into());
     }

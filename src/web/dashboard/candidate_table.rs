@@ -57,7 +57,11 @@ pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery)
     let query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
     let CandidatePage { rows, next, scanned } = query.page(&dashboard.store).await?;
     let next = next.map(|place| format!("{:?}:{}", place.value, place.decision));
-    json(&json!({ "candidates": rows, "next": next, "looked_at": scanned }))
+    let imported = match query.state.filter(|_| query.order == Order::Queue) {
+        Some(state) => Some(dashboard.store.imported_jobs(state).await?),
+        None => None,
+    };
+    json(&json!({ "candidates": rows, "next": next, "scanned": scanned, "imported": imported }))
 }
 
 impl CandidateQuery {

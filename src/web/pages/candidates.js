@@ -51,18 +51,19 @@ export function show(content, rest, signal) {
 
 /** A filter with few matches takes several requests. */
 async function fetchPage(params, after, signal, onProgress, isStale) {
-  let [found, searched, next] = [[], 0, after];
+  let [found, searched, next, imported] = [[], 0, after, null];
   do {
     const query = new URLSearchParams(params);
     query.set("limit", LENGTH - found.length);
     if (next) query.set("after", next);
     const page = await fetchJson(`/api/candidates?${query}`, signal);
     found = found.concat(page.candidates);
-    searched += page.looked_at;
+    searched += page.scanned;
+    imported = page.imported;
     next = page.next;
     if (next && found.length < LENGTH) onProgress(searched);
   } while (next && found.length < LENGTH && !isStale());
-  return { candidates: found, next };
+  return { candidates: found, next, imported };
 }
 
 function filters(params, change) {
@@ -83,7 +84,7 @@ function filters(params, change) {
       "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
 }
 
-function lines({ candidates, next }, params, change, pages, after, load) {
+function lines({ candidates, next, imported }, params, change, pages, after, load) {
   const order = params.get("order") || "decision";
   const ascending = params.get("ascending") === "true";
   const head = ([title, isNumber, key]) => {
@@ -105,6 +106,7 @@ function lines({ candidates, next }, params, change, pages, after, load) {
   return [
     element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
     candidates.length === 0 && element("p", {}, "No candidate matches."),
+    imported > 0 && element("p", {}, `Not listed: ${whole(imported)} imported (see calmwalk queue list).`),
     element("p", { class: "turn", role: "status" },
       element("button", { type: "button", "data-keep": "before", disabled: pages.length === 0, onclick: back }, "← previous"),
       ` page ${number} `, element("button", { type: "button", "data-keep": "next", disabled: !next, onclick: on }, "next →")),

@@ -34,6 +34,13 @@ const COUNTED_WAITING: &str = "SELECT seed_structure, candidate.formula, candida
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     WHERE job.state IN ('queued', 'leased') AND job.protocol = $1 GROUP BY seed_structure, candidate.formula, candidate.atoms";
 
+/// Jobs of imported structures: their numbers in the queue are above all decisions.
+const IMPORTED: &str = "SELECT CAST(coalesce(sum(number), 0) AS BIGINT) FROM job_count
+    WHERE state = $1 AND seed_structure = 4294967295";
+
+/// The same, counted, for tables of an earlier version.
+const COUNTED_IMPORTED: &str = "SELECT count(*) FROM job WHERE state = $1 AND decision >= 1099511627776";
+
 pub(crate) const OLDEST_LEASE: &str = "SELECT job, holder, started FROM attempt WHERE outcome IS NULL
     ORDER BY started, job LIMIT 1";
 
@@ -83,6 +90,15 @@ impl Store {
             Ok((protocol, state, number))
         };
         rows.into_iter().map(row).collect()
+    }
+
+    /// Number of jobs of imported structures in that state.
+    pub async fn imported_jobs(&self, state: JobState) -> Result<u64> {
+        let mut transaction = self.database.begin_read().await?;
+        let sql = if have_counts(&mut transaction).await? { IMPORTED } else { COUNTED_IMPORTED };
+        let number = query(sql).bind(state.name()).fetch_one(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(number)
     }
 
     /// Unfinished jobs of this protocol, by size.

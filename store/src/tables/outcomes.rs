@@ -11,11 +11,13 @@ use crate::error::Result;
 use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
 use crate::words;
 
-/// The newest first: the cost of labels may change with the machine.
+/// The newest first: the cost of labels may change with the machine. Imported structures have no seed structure.
 pub(crate) const COSTS: &str =
-    "SELECT attempt.*, candidate.seed_structure, candidate.formula, candidate.atoms AS size
+    "SELECT attempt.*, coalesce(candidate.seed_structure, 4294967295) AS seed_structure, structure.formula,
+        structure.atoms AS size
     FROM label CROSS JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
-    CROSS JOIN job ON job.number = label.job CROSS JOIN candidate ON candidate.decision = job.decision
+    CROSS JOIN job ON job.number = label.job CROSS JOIN structure ON structure.number = job.structure
+    LEFT JOIN candidate ON candidate.decision = job.decision
     WHERE label.protocol = $1 ORDER BY label.number DESC LIMIT $2";
 
 pub(crate) const CORES_IN_USE: &str =
@@ -29,7 +31,8 @@ pub(crate) const FAILURE_CLASSES: &str = "SELECT class,
     FROM attempt CROSS JOIN job ON job.number = attempt.job
     WHERE class IS NOT NULL AND job.protocol = $1 GROUP BY class ORDER BY class";
 
-pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, formula,
+pub(crate) const UNLABELLED: &str = "SELECT CASE WHEN candidate.decision IS NULL THEN 'imported' ELSE coalesce(name, '') END AS seed_name,
+        structure.formula AS formula,
         CAST(sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) AS BIGINT) AS failed,
         CAST(sum(CASE WHEN state = 'labelled' THEN 1 ELSE 0 END) AS BIGINT) AS labelled,
         min(CASE WHEN state = 'failed' THEN original_gamma END) AS gamma_low,
@@ -40,32 +43,39 @@ pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, for
         max(CASE WHEN state = 'labelled' THEN original_gamma END) AS labelled_gamma_high,
         min(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_low,
         max(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_high
-    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    FROM job CROSS JOIN structure ON structure.number = job.structure
+    LEFT JOIN candidate ON candidate.decision = job.decision
     LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
     WHERE job.state IN ('failed', 'labelled') AND job.protocol = $1
     AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
                     AND standing = 'excluded')
-    GROUP BY candidate.seed_structure, name, formula
+    GROUP BY coalesce(candidate.seed_structure, 4294967295), candidate.decision IS NULL, name, structure.formula
     HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
-    ORDER BY candidate.seed_structure, formula";
+    ORDER BY coalesce(candidate.seed_structure, 4294967295), structure.formula";
 
 /// The same, without the ranges of labelled structures.
-const FAILED: &str = "SELECT coalesce(name, '') AS seed_name, candidate.formula AS formula, count(*) AS failed,
+const FAILED: &str = "SELECT CASE WHEN failure.seed_structure = 4294967295 THEN 'imported' ELSE coalesce(name, '') END AS seed_name,
+        failure.formula AS formula, count(*) AS failed,
         (SELECT CAST(coalesce(sum(job_count.number), 0) AS BIGINT) FROM job_count
          WHERE job_count.protocol = $1 AND job_count.state = 'labelled'
-         AND job_count.seed_structure = candidate.seed_structure AND job_count.formula = candidate.formula)
+         AND job_count.seed_structure = failure.seed_structure AND job_count.formula = failure.formula)
         - (SELECT count(*) FROM label CROSS JOIN job AS own ON own.structure = label.structure AND own.protocol = label.protocol
-           CROSS JOIN candidate AS found ON found.decision = own.decision
+           CROSS JOIN structure AS excluded ON excluded.number = own.structure
+           LEFT JOIN candidate AS found ON found.decision = own.decision
            WHERE label.protocol = $1 AND standing = 'excluded' AND own.state = 'labelled'
-           AND found.seed_structure = candidate.seed_structure AND found.formula = candidate.formula) AS labelled,
+           AND coalesce(found.seed_structure, 4294967295) = failure.seed_structure
+           AND excluded.formula = failure.formula) AS labelled,
         min(original_gamma) AS gamma_low, max(original_gamma) AS gamma_high,
         min(relative_volume) AS volume_low, max(relative_volume) AS volume_high,
         CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_low, CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_high,
         CAST(NULL AS DOUBLE PRECISION) AS labelled_volume_low, CAST(NULL AS DOUBLE PRECISION) AS labelled_volume_high
-    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
-    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE job.state = 'failed' AND job.protocol = $1
-    GROUP BY candidate.seed_structure, name, candidate.formula ORDER BY candidate.seed_structure, candidate.formula";
+    FROM (SELECT coalesce(candidate.seed_structure, 4294967295) AS seed_structure, structure.formula AS formula,
+              original_gamma, relative_volume
+          FROM job CROSS JOIN structure ON structure.number = job.structure
+          LEFT JOIN candidate ON candidate.decision = job.decision
+          WHERE job.state = 'failed' AND job.protocol = $1) AS failure
+    LEFT JOIN seed_structure ON seed_structure.seed = failure.seed_structure
+    GROUP BY failure.seed_structure, name, failure.formula ORDER BY failure.seed_structure, failure.formula";
 
 pub(crate) const FINISHED: &str = concat!(
     "SELECT candidate.decision AS decision, CASE state WHEN 'failed' THEN 'failed' ELSE 'labelled' END AS job_state,

@@ -24,12 +24,13 @@ use crate::relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 /// Jobs with their labels. A structure with labels under several protocols has several rows.
 pub(crate) const LABELLED: &str =
     "SELECT structure.hash AS hash, job.decision AS decision, protocol.name AS protocol, own.state AS state,
-        candidate.seed_structure AS seed_structure, candidate.formula AS formula, candidate.atoms AS atoms
+        coalesce(candidate.seed_structure, 4294967295) AS seed_structure, structure.formula AS formula,
+        structure.atoms AS atoms
     FROM job
     CROSS JOIN label ON label.structure = job.structure AND label.protocol = job.protocol AND standing IN ('label', 'excluded')
     CROSS JOIN structure ON structure.number = job.structure
-    CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
+    LEFT JOIN candidate ON candidate.decision = job.decision
     LEFT JOIN job AS own ON own.structure = job.structure AND own.protocol = $1
     WHERE job.state <> 'dropped' ORDER BY job.decision, job.number";
 

@@ -88,6 +88,13 @@ impl BaselineFile {
     /// # Errors
     /// As [`Self::load`].
     pub fn read<R: Read + Seek>(file: &Archive<R>) -> Result<Self, Error> {
+        if !file.contains("baseline_schema") {
+            return Err(file.invalid(
+                "baseline_schema",
+                "no such array",
+                "a file that `calmwalk calm baseline` wrote",
+            ));
+        }
         file.expect_count("baseline_schema", SCHEMA)?;
         let text = |key: &str| file.strings(key).map(|texts| texts.concat());
         let origin = FeatureOrigin {

@@ -1,6 +1,7 @@
 //! Pass 3: histograms of σ of the components of an element in one shard.
 
 use faer::linalg::matmul::matmul;
+use faer::prelude::ReborrowMut;
 use faer::{Accum, MatMut, Par};
 
 use super::components::BuiltComponent;
@@ -10,8 +11,13 @@ use super::sorter::{BLOCK_ATOMS, Block, Sorter};
 use crate::grade::DISTANCE_FLOOR;
 use crate::linear::{row_dots, view};
 
-/// Fills, for each component, the raw and the weighted histogram of σ = √(**δ**ᵀS**δ** + 10⁻⁸), where S**δ** of a block of
-/// atoms is one matrix product. The histograms depend on the order of the atoms, not on the batches in which they arrive.
+/// Columns of the triangle that one matrix product gives: enough to be fast, few enough to skip most of the zeros.
+const PANEL: usize = 66;
+
+/// Fills, for each component, the raw and the weighted histogram of σ = √(**δ**ᵀS**δ** + 10⁻⁸). S is symmetric, so
+/// **δ**ᵀS**δ** = **δ**ᵀT**δ** with its upper triangle T, T_ij = 2 S_ij for i < j and T_ii = S_ii. Tᵀ**δ** of a block of atoms is
+/// one matrix product for each panel of columns, over the rows down to the diagonal. The histograms depend on the order of the
+/// atoms, not on the batches in which they arrive.
 #[derive(Debug, Clone)]
 pub struct CalibrationPass {
     sorter: Sorter,
@@ -22,8 +28,9 @@ pub struct CalibrationPass {
 struct Sums {
     dimension: usize,
     grid: Grid,
-    inverses: Vec<Vec<f64>>,
-    /// S**δ** of the atoms of a block.
+    /// T of each component, `[D × D]`.
+    triangles: Vec<Vec<f64>>,
+    /// Tᵀ**δ** of the atoms of a block.
     products: Vec<f64>,
     /// **δ**ᵀS**δ** of each.
     squared: Vec<f64>,
@@ -45,7 +52,7 @@ impl CalibrationPass {
         let sums = Sums {
             dimension,
             grid: Grid::default(),
-            inverses: components.iter().map(|component| component.inverse.clone()).collect(),
+            triangles: components.iter().map(|component| triangle(&component.inverse, dimension)).collect(),
             products: vec![0.0; BLOCK_ATOMS * dimension],
             squared: Vec::with_capacity(BLOCK_ATOMS),
             histograms: ElementHistograms::empty(components.len()),
@@ -74,9 +81,16 @@ impl Sums {
     fn add(&mut self, slot: usize, block: &Block) {
         let (atoms, dimension) = (block.weights.len(), self.dimension);
         let products = &mut self.products[..atoms * dimension];
-        let out = MatMut::from_row_major_slice_mut(&mut *products, atoms, dimension);
-        let inverse = view(&self.inverses[slot], dimension, dimension);
-        matmul(out, Accum::Replace, view(&block.deltas, atoms, dimension), inverse, 1.0, Par::Seq);
+        let mut out = MatMut::from_row_major_slice_mut(&mut *products, atoms, dimension);
+        let deltas = view(&block.deltas, atoms, dimension);
+        let triangle = view(&self.triangles[slot], dimension, dimension);
+        for first in (0..dimension).step_by(PANEL) {
+            let columns = PANEL.min(dimension - first);
+            let panel = triangle.submatrix(0, first, first + columns, columns);
+            let deltas = deltas.subcols(0, first + columns);
+            let out = out.rb_mut().subcols_mut(first, columns);
+            matmul(out, Accum::Replace, deltas, panel, 1.0, Par::Seq);
+        }
         let histogram = &mut self.histograms.components[slot];
         row_dots(&block.deltas, products, dimension, &mut self.squared);
         for (squared, weight) in self.squared.iter().zip(&block.weights) {
@@ -86,4 +100,17 @@ impl Sums {
             histogram.weighted[bin] += weight;
         }
     }
+}
+
+/// The upper triangle T of a symmetric matrix S with **δ**ᵀT**δ** = **δ**ᵀS**δ**, `[D × D]`.
+fn triangle(matrix: &[f64], dimension: usize) -> Vec<f64> {
+    let mut triangle = vec![0.0; dimension * dimension];
+    for row in 0..dimension {
+        triangle[row * dimension + row] = matrix[row * dimension + row];
+        for column in row + 1..dimension {
+            triangle[row * dimension + column] =
+                matrix[row * dimension + column] + matrix[column * dimension + row];
+        }
+    }
+    triangle
 }
