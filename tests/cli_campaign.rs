@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use atoms::extxyz::{Frame, LabelKeys, Labels, Value};
+use atoms::extxyz::{ExtxyzValue, Frame, FrameLabels, LabelKeys};
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
 use potentials::{Eam, EamStyle};
 use serde_json::Value as Json;
@@ -51,7 +51,8 @@ fn write_campaign(here: &Path, changes: &[(&str, &str)]) {
         text = text.replace(from, to);
     }
     let seeds = read_extxyz(&config("data/aluminium_seeds.extxyz")).unwrap();
-    let wanted = |frame: &&Frame| ["fcc-100", "slab-111"].map(Value::from).contains(&frame.info["name"]);
+    let wanted =
+        |frame: &&Frame| ["fcc-100", "slab-111"].map(ExtxyzValue::from).contains(&frame.info["name"]);
     write_frames(&here.join("seeds.extxyz"), &seeds.iter().filter(wanted).cloned().collect::<Vec<_>>());
     fs::write(here.join("small.toml"), text).unwrap();
 }
@@ -287,7 +288,7 @@ fn labelled_structures_are_imported_once() {
     assert_eq!(succeed(here, ["import", "small", "new.extxyz"]), counts(3, 0, 0, "potential"));
     assert_eq!(succeed(here, ["import", "small", "new.extxyz", "own.extxyz"]), counts(0, 0, 7, "potential"));
     let mut other = seeds[..1].to_vec();
-    let labels = Labels { energy: Some(-364.0), ..other[0].labels().unwrap() };
+    let labels = FrameLabels { energy: Some(-364.0), ..other[0].labels().unwrap() };
     other[0].set_labels(&labels, LabelKeys::Mace);
     write_frames(&here.join("other.extxyz"), &other);
     assert_eq!(succeed(here, ["import", "small", "other.extxyz"]), counts(0, 1, 0, "potential"));

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use atoms::extxyz::Value;
+use atoms::extxyz::ExtxyzValue;
 use atoms::read_extxyz;
 use serde_json::{Value as Json, json};
 
@@ -165,7 +165,7 @@ fn write_with_clusters(here: &Path, groups: &str, clusters: usize) {
     for number in 0..clusters {
         let mut cluster = frames[0].clone();
         cluster.structure.periodic = [false; 3];
-        cluster.info.insert("name".to_owned(), Value::Text(format!("cluster-{number}")));
+        cluster.info.insert("name".to_owned(), ExtxyzValue::Text(format!("cluster-{number}")));
         frames.push(cluster);
     }
     write_frames(&seeds, &frames);

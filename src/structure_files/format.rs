@@ -14,10 +14,10 @@ use crate::exit_status::Failure;
 
 /// The structures of a file, in order.
 pub enum Structures {
-    Extxyz(Box<extxyz::Reader<Input>>),
+    Extxyz(Box<extxyz::ExtxyzReader<Input>>),
     /// One structure.
     Poscar(Option<Input>),
-    LammpsDump(Box<lammps_dump::Reader<Input>>),
+    LammpsDump(Box<lammps_dump::LammpsDumpReader<Input>>),
 }
 
 type Input = Box<dyn BufRead + Send>;
@@ -61,11 +61,12 @@ impl Structures {
         let input =
             unpacked(path, bytes).map_err(|source| FileError::Open { path: path.to_path_buf(), source })?;
         match format(path) {
-            Some(Format::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::Reader::new(input)))),
+            Some(Format::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::ExtxyzReader::new(input)))),
             Some(Format::Poscar) => Ok(Self::Poscar(Some(input))),
-            Some(Format::LammpsDump) => {
-                Ok(Self::LammpsDump(Box::new(lammps_dump::Reader::new(input, dump_elements.to_vec()))))
-            }
+            Some(Format::LammpsDump) => Ok(Self::LammpsDump(Box::new(lammps_dump::LammpsDumpReader::new(
+                input,
+                dump_elements.to_vec(),
+            )))),
             None => Err(FileError::Format(path.to_path_buf())),
         }
     }
