@@ -12,7 +12,7 @@ use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree as _;
 use proptest::test_runner::TestRunner;
-use serde_json::{Value as Json, json};
+use serde_json::{Value, json};
 
 fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
@@ -23,7 +23,7 @@ fn shared(name: &str) -> PathBuf {
 }
 
 /// What ASE reads from files, if an interpreter is configured.
-fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Json>> {
+fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Value>> {
     let Some(python) = std::env::var_os("CALMWALK_PYTHON") else {
         eprintln!("CALMWALK_PYTHON is not set: no comparison with ASE");
         return None;
@@ -40,7 +40,7 @@ fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Json>> {
     Some(serde_json::from_slice(&output.stdout).unwrap())
 }
 
-fn real(value: f64) -> Json {
+fn real(value: f64) -> Value {
     match value {
         _ if value.is_finite() => json!(value),
         _ if value.is_nan() => json!("nan"),
@@ -48,7 +48,7 @@ fn real(value: f64) -> Json {
     }
 }
 
-fn to_json(value: &ExtxyzValue) -> Json {
+fn to_json(value: &ExtxyzValue) -> Value {
     match value {
         ExtxyzValue::Bool(value) => json!(value),
         ExtxyzValue::Int(value) => json!(value),
@@ -59,32 +59,32 @@ fn to_json(value: &ExtxyzValue) -> Json {
 }
 
 /// Whether JSON has content without a value here, which stays text.
-fn is_foreign(json: &Json) -> bool {
+fn is_foreign(json: &Value) -> bool {
     match json {
-        Json::Null | Json::Object(_) => true,
-        Json::Array(items) => items.iter().any(is_foreign),
+        Value::Null | Value::Object(_) => true,
+        Value::Array(items) => items.iter().any(is_foreign),
         _ => false,
     }
 }
 
-fn info_to_json(value: &ExtxyzValue) -> Json {
+fn info_to_json(value: &ExtxyzValue) -> Value {
     let text = value.text().and_then(|text| text.strip_prefix("_JSON "));
     let foreign = text.and_then(|text| serde_json::from_str(text).ok()).filter(is_foreign);
     foreign.unwrap_or_else(|| to_json(value))
 }
 
-fn column_to_json(column: &Column) -> Json {
-    let items: Vec<Json> = match &column.entries {
+fn column_to_json(column: &Column) -> Value {
+    let items: Vec<Value> = match &column.entries {
         ColumnData::Real(values) => values.iter().map(|value| real(*value)).collect(),
         ColumnData::Int(values) => values.iter().map(|value| json!(value)).collect(),
         ColumnData::Bool(values) => values.iter().map(|value| json!(value)).collect(),
         ColumnData::Text(values) => values.iter().map(|value| json!(value)).collect(),
     };
-    if column.width == 1 { items.into() } else { items.chunks(column.width).map(Json::from).collect() }
+    if column.width == 1 { items.into() } else { items.chunks(column.width).map(Value::from).collect() }
 }
 
 /// Asserts the same bits and types, and nothing else.
-fn assert_same(frame: &Frame, ase: &Json) {
+fn assert_same(frame: &Frame, ase: &Value) {
     let structure = &frame.structure;
     let numbers: Vec<u8> = structure.species.iter().map(|species| species.atomic_number()).collect();
     assert_eq!(ase["numbers"], json!(numbers));
@@ -106,7 +106,7 @@ fn assert_same(frame: &Frame, ase: &Json) {
         }
     }
     assert_eq!(ase["free"], json!(free));
-    assert_eq!(ase["arrays"], Json::Object(given));
+    assert_eq!(ase["arrays"], Value::Object(given));
     let mut info = serde_json::Map::new();
     for (key, value) in &frame.info {
         let numbers = value.numbers();
@@ -118,11 +118,11 @@ fn assert_same(frame: &Frame, ase: &Json) {
             _ => drop(info.insert(key.clone(), info_to_json(value))),
         }
     }
-    assert_eq!(ase["info"], Json::Object(info));
-    assert_eq!(ase["results"], Json::Object(results));
+    assert_eq!(ase["info"], Value::Object(info));
+    assert_eq!(ase["results"], Value::Object(results));
 }
 
-fn assert_all_same(frames: &[Frame], ase: &[Json]) {
+fn assert_all_same(frames: &[Frame], ase: &[Value]) {
     assert_eq!(frames.len(), ase.len());
     for (frame, ase) in frames.iter().zip(ase) {
         assert_same(frame, ase);
@@ -149,7 +149,7 @@ fn read(text: &[u8]) -> Vec<Frame> {
 
 #[test]
 fn files_of_ase_are_read_as_ase_reads_them() {
-    let ase: Vec<Json> = serde_json::from_slice(&std::fs::read(data("ase_sample.json")).unwrap()).unwrap();
+    let ase: Vec<Value> = serde_json::from_slice(&std::fs::read(data("ase_sample.json")).unwrap()).unwrap();
     let frames = read_extxyz(&data("ase_sample.extxyz")).unwrap();
     assert_all_same(&frames, &ase);
     assert_eq!(frames[0].labels().unwrap().energy, Some(-27.123456789012345));

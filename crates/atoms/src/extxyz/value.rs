@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use serde_json::Value as Json;
+use serde_json::Value;
 
 use crate::cell::Matrix3;
 
@@ -149,14 +149,14 @@ pub(super) fn logical(word: &str) -> Option<bool> {
     }
 }
 
-fn from_json(json: &Json) -> Option<ExtxyzValue> {
+fn from_json(json: &Value) -> Option<ExtxyzValue> {
     match json {
-        Json::Null | Json::Object(_) => None,
-        Json::Bool(value) => Some(ExtxyzValue::Bool(*value)),
-        Json::Number(number) if number.is_f64() => number.as_f64().map(ExtxyzValue::Real),
-        Json::Number(number) => number.as_i64().map(ExtxyzValue::Int),
-        Json::String(text) => Some(ExtxyzValue::Text(text.clone())),
-        Json::Array(values) => values.iter().map(from_json).collect::<Option<_>>().map(ExtxyzValue::List),
+        Value::Null | Value::Object(_) => None,
+        Value::Bool(value) => Some(ExtxyzValue::Bool(*value)),
+        Value::Number(number) if number.is_f64() => number.as_f64().map(ExtxyzValue::Real),
+        Value::Number(number) => number.as_i64().map(ExtxyzValue::Int),
+        Value::String(text) => Some(ExtxyzValue::Text(text.clone())),
+        Value::Array(values) => values.iter().map(from_json).collect::<Option<_>>().map(ExtxyzValue::List),
     }
 }
 
@@ -178,7 +178,7 @@ fn stays_text(text: &str) -> bool {
         ExtxyzValue::Int(_) | ExtxyzValue::Real(_) | ExtxyzValue::List(_)
     );
     let words = text.contains(|c| c != ' ' && c != ',');
-    let json = text.strip_prefix("_JSON ").is_none_or(|json| serde_json::from_str::<Json>(json).is_ok());
+    let json = text.strip_prefix("_JSON ").is_none_or(|json| serde_json::from_str::<Value>(json).is_ok());
     printable && words && !number && json && ExtxyzValue::parse(text) == ExtxyzValue::Text(text.to_owned())
 }
 
