@@ -141,11 +141,11 @@ impl LoadedCampaign {
     }
 
     /// Size of the label of each seed structure, on which its cost depends. A program must be installed.
-    pub fn label_sizes(&self) -> Result<Vec<dft::Size>, CommandError> {
+    pub fn label_sizes(&self) -> Result<Vec<dft::CalculationSize>, CommandError> {
         let structures = self.seed_structures.iter().map(|seed| &seed.seed.structure);
         Ok(match &self.config.label.method {
             LabelMethod::Potential(_) => structures
-                .map(|structure| dft::Size { atoms: structure.len(), electrons: 0.0, k_points: 1 })
+                .map(|structure| dft::CalculationSize { atoms: structure.len(), electrons: 0.0, k_points: 1 })
                 .collect(),
             LabelMethod::Code(settings) => {
                 let code = settings.prepare(&self.config.label.pass_environment);

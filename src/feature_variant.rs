@@ -173,7 +173,7 @@ pub fn model_projection(model: &GraceModel) -> Option<Projection> {
 /// A projection of another basis.
 pub fn with_projection(model: GraceModel, projection: &Projection) -> Result<GraceModel, UnfitProjection> {
     let layers = model.description().architecture.layers();
-    model.with_projection(grace::Projection {
+    model.with_projection(grace::GraceProjection {
         matrix: projection.matrix.clone(),
         dimension: projection.columns,
         normalize: projection.normalised,

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use npz::Archive;
+use npz::NpzFile;
 
 use crate::exit_status::CommandError;
 
@@ -17,7 +17,7 @@ pub fn hash(path: &Path) -> std::io::Result<String> {
 /// # Errors
 /// A file that is no archive of numbers and texts.
 pub fn model_hash(path: &Path) -> Result<String, CommandError> {
-    let file = Archive::open(path).map_err(CommandError::input)?;
+    let file = NpzFile::open(path).map_err(CommandError::input)?;
     let mut hasher = blake3::Hasher::new();
     let keys = file.names().filter(|key| !key.starts_with("uq_") || *key == "uq_rp_matrix");
     for key in keys {

@@ -34,7 +34,7 @@ pub enum MethodConfig {
     /// With an external program.
     Code {
         /// The program and the protocol.
-        settings: Box<dft::Settings>,
+        settings: Box<dft::DftSettings>,
         /// How its calculations run.
         running: ExecutionSettings,
     },

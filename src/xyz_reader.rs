@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use atoms::extxyz::{Frame, Labels, Reader};
+use atoms::extxyz::{ExtxyzReader, Frame, FrameLabels};
 use atoms::{FileError, open_extxyz};
 use store::records::{Label, LabelDetails};
 
@@ -16,7 +16,7 @@ pub struct XyzReader {
     /// Length of the file, bytes. `None` for a pipe.
     pub length: Option<u64>,
     read: Arc<AtomicU64>,
-    reader: Reader<Box<dyn BufRead>>,
+    reader: ExtxyzReader<Box<dyn BufRead>>,
 }
 
 /// Counts the bytes read.
@@ -29,7 +29,7 @@ impl XyzReader {
         let length = file.metadata().ok().filter(|found| found.is_file()).map(|found| found.len());
         let read = Arc::new(AtomicU64::new(0));
         let input: Box<dyn BufRead> = Box::new(BufReader::new(Counting(file, Arc::clone(&read))));
-        Ok(Self { path: path.to_owned(), length, read, reader: Reader::new(input) })
+        Ok(Self { path: path.to_owned(), length, read, reader: ExtxyzReader::new(input) })
     }
 
     /// Bytes read so far.
@@ -65,10 +65,10 @@ pub fn label(frame: &Frame) -> Result<Label, String> {
         .labels()
         .map_err(|error| format!("{} is {}, expected {}", error.key, error.found, error.expected))?
     {
-        Labels { energy: Some(energy), forces: Some(forces), stress } => {
+        FrameLabels { energy: Some(energy), forces: Some(forces), stress } => {
             Ok(Label { energy, forces, stress, details: LabelDetails::default() })
         }
-        Labels { energy, .. } => {
+        FrameLabels { energy, .. } => {
             let missing = if energy.is_none() { "energy" } else { "forces" };
             Err(format!("the frame has no {missing}: expected {missing} or REF_{missing}"))
         }

@@ -7,7 +7,7 @@ use std::path::Path;
 use atoms::extxyz::Frame;
 use atoms::{Cell, Structure, read_extxyz};
 use calm::Artifact;
-use calm::baselines::{Baseline, BaselineFile, Kind};
+use calm::baselines::{Baseline, BaselineFile, BaselineKind};
 use npyz::NpyFile;
 
 use crate::common::{calmwalk, config, deviation, refuse, succeed, write_frames};
@@ -65,7 +65,8 @@ fn atoms_are_scored_by_every_kind() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     write_frames(&here.join("train.extxyz"), &training(4));
-    let kinds: Vec<Kind> = Kind::ALL.into_iter().filter(|kind| !kind.has_force_form()).collect();
+    let kinds: Vec<BaselineKind> =
+        BaselineKind::ALL.into_iter().filter(|kind| !kind.has_force_form()).collect();
     let mut arguments = vec!["b.npz", "--neighbours", "1", "--artifact"];
     let artifact = path(ARTIFACT);
     arguments.push(&artifact);

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Stdio;
 
 use calm::{Artifact, Component, Grades};
-use npz::Archive;
+use npz::NpzFile;
 use serde_json::Value;
 use store::{Fate, Store, StoredCandidate};
 use tempfile::TempDir;
@@ -114,7 +114,7 @@ fn every_version_grades_as_the_selector_did() {
     );
 
     let original = config("data/al_eam_1l/gmm_artifacts.npz");
-    let [original, first] = [&original, &here.join("0.npz")].map(|path| Archive::open(path).unwrap());
+    let [original, first] = [&original, &here.join("0.npz")].map(|path| NpzFile::open(path).unwrap());
     let text = ["element_map", "threshold_mode", "uq_feature_mode"];
     for name in original.names() {
         match text.contains(&name) {

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
-use atoms::extxyz::{Frame, Value};
+use atoms::extxyz::{ExtxyzValue, Frame};
 use atoms::{Cell, NeighbourList, Species, Structure, read_extxyz};
 use calm::{Artifact, Grades};
 use npyz::NpyFile;
@@ -147,12 +147,12 @@ fn what_a_frame_came_with_is_kept() {
     let scored = read_extxyz(&here.join("in.extxyz")).unwrap();
     let [first, second] = scored.as_slice() else { panic!("two frames") };
     assert_eq!(first.labels().unwrap(), labelled.labels().unwrap());
-    assert_eq!(first.info["note"], Value::from("mine"));
+    assert_eq!(first.info["note"], ExtxyzValue::from("mine"));
     assert_eq!(first.info["config_type"], labelled.info["config_type"]);
     assert_ne!(first.info["energy"], first.info["REF_energy"]);
     assert_ne!(first.arrays["forces"], first.arrays["REF_forces"]);
     assert!(!first.arrays.contains_key("gamma_gradient"));
-    assert_eq!(second.info["REF_energy"], Value::from(-1.5));
+    assert_eq!(second.info["REF_energy"], ExtxyzValue::from(-1.5));
     assert!(!second.info.contains_key("stress") && !second.arrays.contains_key("REF_forces"));
 }
 

@@ -5,10 +5,10 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use atoms::extxyz::{Frame, LabelKeys, Labels, Value};
+use atoms::extxyz::{ExtxyzValue, Frame, FrameLabels, LabelKeys};
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
 use potentials::{Eam, EamStyle};
-use serde_json::Value as Json;
+use serde_json::Value;
 
 use crate::common::processes::{assert_no_leftovers, wait_until};
 use crate::common::{Running, config, deviation, program, refuse, succeed, write_frames};
@@ -51,16 +51,17 @@ fn write_campaign(here: &Path, changes: &[(&str, &str)]) {
         text = text.replace(from, to);
     }
     let seeds = read_extxyz(&config("data/aluminium_seeds.extxyz")).unwrap();
-    let wanted = |frame: &&Frame| ["fcc-100", "slab-111"].map(Value::from).contains(&frame.info["name"]);
+    let wanted =
+        |frame: &&Frame| ["fcc-100", "slab-111"].map(ExtxyzValue::from).contains(&frame.info["name"]);
     write_frames(&here.join("seeds.extxyz"), &seeds.iter().filter(wanted).cloned().collect::<Vec<_>>());
     fs::write(here.join("small.toml"), text).unwrap();
 }
 
-fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
+fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Value {
     serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
 }
 
-fn jobs(here: &Path) -> Vec<Json> {
+fn jobs(here: &Path) -> Vec<Value> {
     json(here, ["queue", "small", "list"]).as_array().unwrap().clone()
 }
 
@@ -82,7 +83,7 @@ fn a_finished_campaign_is_shown() {
     assert_eq!((&status["finished"], &status["mode"]), (&true.into(), &"reproducible".into()));
     assert_eq!((&status["candidates"]["accepted"], &status["candidates"]["control"]), (&4.into(), &4.into()));
     let declined: u64 =
-        status["candidates"]["declined"].as_object().unwrap().values().flat_map(Json::as_u64).sum();
+        status["candidates"]["declined"].as_object().unwrap().values().flat_map(Value::as_u64).sum();
     assert_eq!(status["candidates"]["seen"], 4 + declined);
     assert_eq!((&status["mixture_version"], &status["processes"]), (&4.into(), &serde_json::json!([])));
     let jobs = jobs(here);
@@ -94,7 +95,7 @@ fn a_finished_campaign_is_shown() {
     let walks = status["walks"].as_array().unwrap();
     assert!(walks.len() == 4 && walks.iter().all(|walk| walk["state"] == "quota_reached"));
 
-    assert_eq!((&status["disk"]["at_the_end"], &status["led"]), (&Json::Null, &false.into()));
+    assert_eq!((&status["disk"]["at_the_end"], &status["led"]), (&Value::Null, &false.into()));
     let shown = succeed(here, ["status", "small"]);
     assert!(!shown.contains("when all is collected"), "{shown}");
     assert!(
@@ -113,7 +114,7 @@ fn a_finished_campaign_is_shown() {
     assert!(succeed(here, ["queue", "small", "show", id]).contains(" eV/atom"));
     let table =
         succeed(here, ["queue", "small", "list", "--state", "labelled", "--limit", "2", "--offset", "1"]);
-    let order = |a: &Json| (-a["priority"].as_i64().unwrap(), a["job"].as_i64().unwrap());
+    let order = |a: &Value| (-a["priority"].as_i64().unwrap(), a["job"].as_i64().unwrap());
     let mut sorted = jobs.clone();
     sorted.sort_by_key(order);
     assert!(table.lines().nth(1).unwrap().starts_with(sorted[1]["candidate"].as_str().unwrap()), "{table}");
@@ -287,7 +288,7 @@ fn labelled_structures_are_imported_once() {
     assert_eq!(succeed(here, ["import", "small", "new.extxyz"]), counts(3, 0, 0, "potential"));
     assert_eq!(succeed(here, ["import", "small", "new.extxyz", "own.extxyz"]), counts(0, 0, 7, "potential"));
     let mut other = seeds[..1].to_vec();
-    let labels = Labels { energy: Some(-364.0), ..other[0].labels().unwrap() };
+    let labels = FrameLabels { energy: Some(-364.0), ..other[0].labels().unwrap() };
     other[0].set_labels(&labels, LabelKeys::Mace);
     write_frames(&here.join("other.extxyz"), &other);
     assert_eq!(succeed(here, ["import", "small", "other.extxyz"]), counts(0, 1, 0, "potential"));

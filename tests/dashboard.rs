@@ -7,7 +7,7 @@ use std::io::BufReader;
 use std::path::Path;
 use std::process::Stdio;
 
-use atoms::extxyz::Reader;
+use atoms::extxyz::ExtxyzReader;
 use atoms::poscar::read_poscar;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -172,7 +172,7 @@ fn check_candidate(live: &Live, id: &str) {
     let shown = get(&live.address, &format!("/api/candidates/{id}/structure")).json();
     let file = get(&live.address, &format!("/api/candidates/{id}/structure.extxyz"));
     assert!(file.head.contains(&format!("attachment; filename=\"{id}.extxyz\"")), "{}", file.head);
-    let frame = Reader::new(file.body.as_bytes()).next().unwrap().unwrap();
+    let frame = ExtxyzReader::new(file.body.as_bytes()).next().unwrap().unwrap();
     assert_eq!(shown["positions"], json!(frame.structure.positions));
     assert_eq!(shown["cell"], json!(frame.structure.cell.0));
     let gamma = frame.arrays["gamma"].reals().unwrap();
@@ -309,7 +309,7 @@ fn the_table_and_exports_speak_one_language() {
     ] {
         succeed(here, ["export", "campaign", "--output", "set.extxyz", "--control", "--where", &condition]);
         let frames = fs::File::open(here.join("set.extxyz")).unwrap();
-        let frames = Reader::new(BufReader::new(frames)).map(|frame| frame.unwrap());
+        let frames = ExtxyzReader::new(BufReader::new(frames)).map(|frame| frame.unwrap());
         let exported: BTreeSet<_> =
             frames.map(|frame| frame.info["candidate_id"].text().unwrap().to_owned()).collect();
         let query: String = form_urlencoded::byte_serialize(condition.as_bytes()).collect();

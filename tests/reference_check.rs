@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
-use atoms::extxyz::{Frame, LabelKeys, Labels};
+use atoms::extxyz::{Frame, FrameLabels, LabelKeys};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -29,7 +29,7 @@ fn campaign(method: Option<&str>) -> TempDir {
 }
 
 /// Writes the seed structures with labels by the campaign's own method, changed by `change` (number of the frame).
-fn write_known(here: &Path, change: impl Fn(usize, &mut Labels)) {
+fn write_known(here: &Path, change: impl Fn(usize, &mut FrameLabels)) {
     succeed(here, ["label-file", "seeds.extxyz", "--config", "campaign.toml", "--output", "known.extxyz"]);
     let path = here.join("known.extxyz");
     let frames = atoms::read_extxyz(&path).unwrap();
@@ -42,7 +42,7 @@ fn write_known(here: &Path, change: impl Fn(usize, &mut Labels)) {
     write_frames(&path, &changed.collect::<Vec<_>>());
 }
 
-fn add_energy(labels: &mut Labels, per_atom: f64) {
+fn add_energy(labels: &mut FrameLabels, per_atom: f64) {
     let atoms = labels.forces.as_ref().unwrap().len() as f64;
     labels.energy = labels.energy.map(|energy| energy + per_atom * atoms);
 }
@@ -173,7 +173,7 @@ fn waiting_campaign() -> TempDir {
     let mut frames = atoms::read_extxyz(&here.join("seeds.extxyz")).unwrap();
     for frame in &mut frames {
         let forces = Some(vec![[1.0, 0.0, 0.0]; frame.structure.len()]);
-        frame.set_labels(&Labels { energy: Some(-3.0), forces, stress: None }, LabelKeys::Ase);
+        frame.set_labels(&FrameLabels { energy: Some(-3.0), forces, stress: None }, LabelKeys::Ase);
     }
     write_frames(&here.join("known.extxyz"), &frames);
     directory

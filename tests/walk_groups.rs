@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::Path;
 
-use atoms::extxyz::Value;
+use atoms::extxyz::ExtxyzValue;
 use atoms::read_extxyz;
-use serde_json::{Value as Json, json};
+use serde_json::{Value, json};
 
 use crate::common::campaign::{Outcome, Small, outcome};
 use crate::common::{calmwalk, refuse, stderr, succeed, write_frames};
@@ -32,7 +32,7 @@ fn write(here: &Path, groups: &str, walkers: usize, keys: &str) {
     fs::write(&config, text + groups).unwrap();
 }
 
-fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
+fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Value {
     serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
 }
 
@@ -56,7 +56,7 @@ fn walks_of_all_groups_share_a_mixture_and_give_the_same_bytes_for_any_number_of
     let conditions: Vec<_> = walks
         .iter()
         .map(|walk| {
-            let Json::Object(c) = &walk["conditions"] else { panic!("{walk}") };
+            let Value::Object(c) = &walk["conditions"] else { panic!("{walk}") };
             (walk["seed_structure"].clone(), c["group"].clone(), c["temperature"].clone(), c["tau"].clone())
         })
         .collect();
@@ -165,7 +165,7 @@ fn write_with_clusters(here: &Path, groups: &str, clusters: usize) {
     for number in 0..clusters {
         let mut cluster = frames[0].clone();
         cluster.structure.periodic = [false; 3];
-        cluster.info.insert("name".to_owned(), Value::Text(format!("cluster-{number}")));
+        cluster.info.insert("name".to_owned(), ExtxyzValue::Text(format!("cluster-{number}")));
         frames.push(cluster);
     }
     write_frames(&seeds, &frames);
@@ -179,10 +179,10 @@ fn warnings(here: &Path, command: &str) -> String {
     said
 }
 
-fn biased_walks(here: &Path) -> Vec<(String, Json)> {
+fn biased_walks(here: &Path) -> Vec<(String, Value)> {
     let status = json(here, ["status", "campaign"]);
     let walks = status["walks"].as_array().unwrap().iter().filter(|walk| walk["origin"] == "biased");
-    let walk = |walk: &Json| {
+    let walk = |walk: &Value| {
         (walk["seed_structure"].as_str().unwrap().to_owned(), walk["conditions"]["volume_ramp"].clone())
     };
     walks.map(walk).collect()

@@ -4,7 +4,7 @@
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    for frame in atoms::extxyz::Reader::new(bytes).take(100) {
+    for frame in atoms::extxyz::ExtxyzReader::new(bytes).take(100) {
         let Ok(frame) = frame else { break };
         let _ = frame.structure.validate();
         let mut written = Vec::new();

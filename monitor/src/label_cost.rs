@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use analysis::{CostModel, Measured, Predicted, Size};
+use analysis::{CostModel, CostPredictors, MeasuredCost, Predicted};
 use serde::Serialize;
 use store::{LabelCost, PendingJobs, Protocol, Store, StoreError};
 use wire::ContentHash;
@@ -45,7 +45,7 @@ pub struct QueueCost {
 pub struct CostEstimator {
     model: Option<CostModel>,
     /// Size of the newest label of each seed structure and formula.
-    sizes: HashMap<(u32, String), Size>,
+    sizes: HashMap<(u32, String), CostPredictors>,
     /// See [`QueueCost::overhead`].
     overhead: f64,
 }
@@ -76,14 +76,14 @@ impl CostEstimator {
     }
 
     /// Expected total cost of labels of these sizes, each with its number.
-    pub fn predict(&self, sizes: impl IntoIterator<Item = (Size, u64)>) -> Option<CoreHours> {
+    pub fn predict(&self, sizes: impl IntoIterator<Item = (CostPredictors, u64)>) -> Option<CoreHours> {
         let predicted = self.model.as_ref()?.predict_all(sizes)?;
         Some(CoreHours::from_core_seconds(predicted, self.overhead))
     }
 
     /// A job has the size of the newest label of its seed structure and formula. Otherwise only the number of atoms
     /// is known.
-    fn size_of(&self, waiting: &PendingJobs) -> Size {
+    fn size_of(&self, waiting: &PendingJobs) -> CostPredictors {
         let known = self.sizes.get(&(waiting.seed_structure, waiting.formula.clone()));
         let other = self.sizes.values().next();
         known.copied().unwrap_or_else(|| {
@@ -91,7 +91,7 @@ impl CostEstimator {
             // Methods without electrons have no k-point mesh either. For the others the size is unknown, which NaN
             // tells the model.
             let electrons = other.and_then(|other| other.electrons).map(|_| f64::NAN);
-            Size { atoms, electrons, k_points: 1.0 }
+            CostPredictors { atoms, electrons, k_points: 1.0 }
         })
     }
 }
@@ -158,16 +158,16 @@ impl CoreHours {
     }
 }
 
-fn size(cost: &LabelCost) -> Size {
-    Size {
+fn size(cost: &LabelCost) -> CostPredictors {
+    CostPredictors {
         atoms: cost.atoms.into(),
         electrons: cost.electrons.filter(|electrons| *electrons > 0.0),
         k_points: cost.k_points.unwrap_or(1).into(),
     }
 }
 
-fn measured(cost: &LabelCost) -> Measured {
-    Measured { size: size(cost), core_seconds: cost.core_seconds }
+fn measured(cost: &LabelCost) -> MeasuredCost {
+    MeasuredCost { size: size(cost), core_seconds: cost.core_seconds }
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use atoms::Structure;
-use calm::baselines::{Baseline, BaselineError, Kind};
+use calm::baselines::{Baseline, BaselineError, BaselineKind};
 
 use super::{AtomScore, DetectionRule};
 use crate::feature_variant::FeatureModel;
@@ -79,14 +79,14 @@ pub fn score_own_features(
 
 /// D-optimality detects above 1, as in the paper. Other scores have no limit. Those that have a zero are
 /// judged as the paper judges the spread of an ensemble; the likelihood has none.
-fn rule(kind: Kind) -> Option<DetectionRule> {
+fn rule(kind: BaselineKind) -> Option<DetectionRule> {
     match kind {
-        Kind::DOptimalityElement | Kind::DOptimalityCentred | Kind::DOptimalityComponent => {
+        BaselineKind::DOptimalityElement | BaselineKind::DOptimalityCentred | BaselineKind::DOptimalityComponent => {
             Some(DetectionRule::Threshold(1.0))
         }
-        Kind::Llpr | Kind::LlprSum | Kind::LlprForces | Kind::Euclidean | Kind::KNearest => {
+        BaselineKind::Llpr | BaselineKind::LlprSum | BaselineKind::LlprForces | BaselineKind::Euclidean | BaselineKind::KNearest => {
             Some(DetectionRule::TENFOLD)
         }
-        Kind::Likelihood => None,
+        BaselineKind::Likelihood => None,
     }
 }

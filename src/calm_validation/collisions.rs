@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use atoms::{Cell, Species, Structure};
-use potentials::grace::Projection;
+use potentials::grace::GraceProjection;
 use serde::Serialize;
 
 use super::{Subject, ValidationGrader, ValidationProgress, ValidationSettings};
@@ -126,7 +126,7 @@ impl Environment {
 }
 
 /// |B| · (projection of B / |B|): the linear features, from the normalised ones and the logarithm of the norm behind them.
-fn linear_features(map: &Projection, z: &[f64]) -> Vec<f64> {
+fn linear_features(map: &GraceProjection, z: &[f64]) -> Vec<f64> {
     let norm = (z[map.dimension] / f64::from(map.density_scale)).exp();
     z[..map.dimension].iter().map(|x| norm * x).collect()
 }

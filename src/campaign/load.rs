@@ -255,7 +255,7 @@ impl Loader<'_> {
     }
 
     /// Protocol settings of a program, which must be installed with all it needs for every seed structure.
-    fn code(&self, settings: &dft::Settings, seeds: &[SourcedStructure]) -> Result<Value, ConfigError> {
+    fn code(&self, settings: &dft::DftSettings, seeds: &[SourcedStructure]) -> Result<Value, ConfigError> {
         let key = format!("label.method.{}", settings.name());
         let at = || location(self.path, self.text, &key);
         let wrong = |message: String| ConfigError::File { at: at(), key: key.clone(), message };

@@ -140,7 +140,7 @@ impl Loader<'_> {
             let frames = read_structures(path).map_err(|error| wrong(error.to_string()))?;
             for (number, frame) in frames.into_iter().enumerate() {
                 let source = format!("{}:{}", path.display(), frame.line);
-                let named = frame.info.get("name").and_then(extxyz::Value::text).map(str::to_owned);
+                let named = frame.info.get("name").and_then(extxyz::ExtxyzValue::text).map(str::to_owned);
                 let name = named.unwrap_or_else(|| format!("{stem}-{number}"));
                 if let Some(first) = sources.insert(name.clone(), source.clone()) {
                     return Err(wrong(format!(

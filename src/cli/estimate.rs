@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use analysis::{CostModel, Measured, Size};
+use analysis::{CostModel, CostPredictors, MeasuredCost};
 use monitor::disk::DiskForecast;
 use monitor::label_cost::{CoreHours, CostEstimator};
 use serde_json::json;
@@ -52,7 +52,7 @@ fn core_seconds(text: &str) -> Result<f64, String> {
 /// The labels of one seed structure.
 struct SeedEstimate {
     name: String,
-    size: Size,
+    size: CostPredictors,
     /// Upper limit.
     labels: u64,
     /// Cost of one label.
@@ -124,9 +124,9 @@ impl EstimateArgs {
     }
 
     /// The cost model, and a description of its source.
-    fn costs(&self, first: Option<&Size>) -> Result<(Option<CostEstimator>, String), CommandError> {
+    fn costs(&self, first: Option<&CostPredictors>) -> Result<(Option<CostEstimator>, String), CommandError> {
         if let (Some(core_seconds), Some(size)) = (self.core_seconds, first) {
-            let measured = Measured { size: *size, core_seconds };
+            let measured = MeasuredCost { size: *size, core_seconds };
             let costs = CostEstimator::from_model(CostModel::fit(&[measured], None));
             return Ok((Some(costs), "--core-seconds".into()));
         }
@@ -141,9 +141,9 @@ impl EstimateArgs {
 }
 
 /// The quantities that the cost of a label depends on, from its method.
-fn cost_size(size: &dft::Size) -> Size {
+fn cost_size(size: &dft::CalculationSize) -> CostPredictors {
     let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
-    Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 }
+    CostPredictors { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 }
 }
 
 fn newest_labels(count: usize) -> String {
@@ -213,7 +213,7 @@ fn as_json(estimate: &CampaignEstimate) -> serde_json::Value {
         walks.map(|time| json!({ "biased": time.biased / 3600.0, "control": time.control / 3600.0 }))
     };
     let of_seed = |seed: &SeedEstimate| {
-        let Size { atoms, electrons, k_points } = seed.size;
+        let CostPredictors { atoms, electrons, k_points } = seed.size;
         json!({
             "seed_structure": seed.name, "labels": seed.labels, "atoms": atoms, "electrons": electrons,
             "k_points": k_points, "core_hours_each": seed.cost_per_label, "walk_hours": hours(seed.walks),

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use atoms::cell::{Matrix3, Vec3, norm};
-use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, write_frame};
+use atoms::extxyz::{Column, ColumnData, Frame, FrameLabels, LabelKeys, write_frame};
 use atoms::{Structure, read_structures};
 use serde::Serialize;
 use store::Protocol;
@@ -168,7 +168,7 @@ impl Labelled {
     fn frame(&self, structure: Structure) -> Frame {
         let mut frame = Frame::from(structure);
         let (energy, forces) = (Some(self.energy), Some(self.forces.clone()));
-        frame.set_labels(&Labels { energy, forces, stress: self.stress }, LabelKeys::Ase);
+        frame.set_labels(&FrameLabels { energy, forces, stress: self.stress }, LabelKeys::Ase);
         frame.info.insert("protocol".to_owned(), self.protocol.clone().into());
         frame.info.insert("protocol_hash".to_owned(), self.protocol_hash[..16].to_owned().into());
         if let Some(moments) = &self.magnetic_moments {

@@ -49,7 +49,7 @@ pub enum LabelMethod {
     Potential(PotentialConfig),
     /// A program.
     #[serde(untagged)]
-    Code(Box<dft::Settings>),
+    Code(Box<dft::DftSettings>),
 }
 
 impl LabelMethod {
@@ -88,8 +88,8 @@ impl<'de> Visitor<'de> for Methods {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<LabelMethod, A::Error> {
         let name: String = map.next_key()?.ok_or_else(|| A::Error::custom("found no label method"))?;
-        if name != "potential" && !dft::Settings::NAMES.contains(&name.as_str()) {
-            let names = dft::Settings::NAMES.join("`, `");
+        if name != "potential" && !dft::DftSettings::NAMES.contains(&name.as_str()) {
+            let names = dft::DftSettings::NAMES.join("`, `");
             let mut message = format!("unknown value `{name}`, expected one of `potential`, `{names}`");
             if THROUGH_ASE.contains(&name.to_ascii_lowercase().as_str()) {
                 message += &format!("; {name} makes labels through `ase`: see docs/dft-codes.md");
@@ -98,7 +98,7 @@ impl<'de> Visitor<'de> for Methods {
         }
         if name != "potential" {
             let settings = MapAccessDeserializer::new(Again { name: Some(name), map });
-            return dft::Settings::deserialize(settings)
+            return dft::DftSettings::deserialize(settings)
                 .map(|settings| LabelMethod::Code(Box::new(settings)));
         }
         let reference = map.next_value()?;

@@ -1,6 +1,6 @@
 //! Kept share, mean absolute error and classification against the threshold (the paper's figure of the benchmark, panel c).
 
-use figures::{Anchor, Axis, Colour, Figure, Panel, Rectangle, Scale, Stroke};
+use figures::{Anchor, Axis, AxisScale, Colour, Figure, Panel, Rectangle, Stroke};
 
 use super::{FilterReport, Metrics, ThresholdResult};
 
@@ -19,10 +19,10 @@ pub fn draw(report: &FilterReport, grade: &str) -> Figure {
     let place = |k: usize| Rectangle { x: left + k as f64 * (width + gap), y: 32.0, width, height: 140.0 };
     let threshold = |step: &ThresholdResult| step.threshold;
     let ends = (report.steps.first().map_or(0.0, threshold), report.steps.last().map_or(1.0, threshold));
-    let scale = if ends.0 > 0.0 { Scale::Logarithmic } else { Scale::Linear };
+    let scale = if ends.0 > 0.0 { AxisScale::Logarithmic } else { AxisScale::Linear };
     let x = Axis::new(&format!("threshold of {grade}"), scale, ends.0, ends.1);
 
-    let mut panel = Panel::new(place(0), x.clone(), Axis::new("kept share", Scale::Linear, 0.0, 1.0));
+    let mut panel = Panel::new(place(0), x.clone(), Axis::new("kept share", AxisScale::Linear, 0.0, 1.0));
     panel.line(report.steps.iter().map(|step| [step.threshold, step.share]), Colour::INK.line(1.3));
     finish(panel, 'a', &mut figure);
 
@@ -90,5 +90,5 @@ fn axis(title: &str, report: &FilterReport, quantities: &[Of]) -> Axis {
         }
     }
     let margin = 0.08 * (high - low).max(1e-3 * high.abs());
-    Axis::new(title, Scale::Linear, low - margin, high + margin)
+    Axis::new(title, AxisScale::Linear, low - margin, high + margin)
 }

@@ -14,10 +14,10 @@ use crate::exit_status::CommandError;
 
 /// The structures of a file, in order.
 pub enum Structures {
-    Extxyz(Box<extxyz::Reader<BoxedReader>>),
+    Extxyz(Box<extxyz::ExtxyzReader<BoxedReader>>),
     /// One structure.
     Poscar(Option<BoxedReader>),
-    LammpsDump(Box<lammps_dump::Reader<BoxedReader>>),
+    LammpsDump(Box<lammps_dump::LammpsDumpReader<BoxedReader>>),
 }
 
 type BoxedReader = Box<dyn BufRead + Send>;
@@ -61,10 +61,10 @@ impl Structures {
         let input =
             unpacked(path, bytes).map_err(|source| FileError::Open { path: path.to_path_buf(), source })?;
         match format(path) {
-            Some(StructureFormat::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::Reader::new(input)))),
+            Some(StructureFormat::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::ExtxyzReader::new(input)))),
             Some(StructureFormat::Poscar) => Ok(Self::Poscar(Some(input))),
             Some(StructureFormat::LammpsDump) => {
-                Ok(Self::LammpsDump(Box::new(lammps_dump::Reader::new(input, dump_elements.to_vec()))))
+                Ok(Self::LammpsDump(Box::new(lammps_dump::LammpsDumpReader::new(input, dump_elements.to_vec()))))
             }
             None => Err(FileError::Format(path.to_path_buf())),
         }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use atoms::{Structure, read_extxyz};
 use calm::Artifact;
-use md::{Dynamics, Langevin, Settings, State, Stream, Thermostat};
+use md::{Dynamics, DynamicsSettings, Langevin, State, Stream, Thermostat};
 use potentials::grace::{Grace, GraceModel, Precision, RadialPath};
 use potentials::{Zbl, ZblWindow, ZblWindows};
 use workers::bias::BiasedPotential;
@@ -70,7 +70,7 @@ fn check(precision: Precision) {
         BiasedPotential::new(Grace::new(model), mixture, Some(zbl), 2, &structure.species).unwrap();
     let stream = Stream::new(3, 0, 0);
     let state = State::thermal(structure, 50.0, &stream);
-    let settings = Settings {
+    let settings = DynamicsSettings {
         time_step: 1.0,
         thermostat: Thermostat::Langevin(Langevin { temperature: 50.0, friction: 0.01 }),
         ramp: None,

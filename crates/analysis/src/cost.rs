@@ -17,7 +17,7 @@ use fit::{Fit, Normal};
 
 /// What the cost of a label depends on.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Size {
+pub struct CostPredictors {
     /// Number of atoms.
     pub atoms: f64,
     /// Number of electrons treated; `None` if unknown.
@@ -28,15 +28,15 @@ pub struct Size {
 
 /// A finished label and its cost.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Measured {
+pub struct MeasuredCost {
     /// Size of the calculation.
-    pub size: Size,
+    pub size: CostPredictors,
     /// Its cost.
     pub core_seconds: f64,
 }
 
 /// A user's estimate before any label exists; trusted within a factor of three.
-pub type Guess = Measured;
+pub type Guess = MeasuredCost;
 
 /// Predicted cost of one label or of several together, core-seconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -74,8 +74,8 @@ const NORMAL_95: f64 = 1.644_853_626_951_472_2;
 impl CostModel {
     /// Fits the model to finished labels and a user's estimate; `None` without either. Labels whose size or
     /// cost is not positive are ignored.
-    pub fn fit(measured: &[Measured], guess: Option<Guess>) -> Option<Self> {
-        let is_usable = |label: &&Measured| label.size.is_usable() && is_positive(label.core_seconds);
+    pub fn fit(measured: &[MeasuredCost], guess: Option<Guess>) -> Option<Self> {
+        let is_usable = |label: &&MeasuredCost| label.size.is_usable() && is_positive(label.core_seconds);
         let labels: Vec<_> = measured.iter().filter(is_usable).collect();
         let guess = guess.filter(|guess| is_usable(&guess));
         let known = || labels.iter().copied().chain(&guess);
@@ -86,7 +86,7 @@ impl CostModel {
             let logarithms = label.size.logarithms(by_electrons);
             centre.iter_mut().zip(logarithms).for_each(|(centre, x)| *centre += x / number);
         }
-        let point = |label: &Measured| {
+        let point = |label: &MeasuredCost| {
             let [x, k] = label.size.logarithms(by_electrons);
             ([1.0, x - centre[0], k - centre[1]], label.core_seconds.ln())
         };
@@ -101,7 +101,7 @@ impl CostModel {
     }
 
     /// Predicts one label; `None` if the size is not positive.
-    pub fn predict(&self, size: &Size) -> Option<Predicted> {
+    pub fn predict(&self, size: &CostPredictors) -> Option<Predicted> {
         let row = self.row(size)?;
         let middle = self.fit.at(&row);
         let away = STUDENT_95 * (self.fit.scale.powi(2) + self.fit.variance(&row)).sqrt();
@@ -111,7 +111,7 @@ impl CostModel {
 
     /// Predicts the total of labels, given as (size, number). Labels without a usable size are assumed to cost
     /// the mean of the others; `None` if no size is usable.
-    pub fn predict_all(&self, sizes: impl IntoIterator<Item = (Size, u64)>) -> Option<Predicted> {
+    pub fn predict_all(&self, sizes: impl IntoIterator<Item = (CostPredictors, u64)>) -> Option<Predicted> {
         let (mut sum, mut noise, mut gradient) = (0.0, 0.0, [0.0; 3]);
         let (mut known, mut all) = (0.0, 0.0);
         for (size, number) in sizes {
@@ -135,14 +135,14 @@ impl CostModel {
         Some(Predicted { core_seconds, low: core_seconds / away, high: core_seconds * away })
     }
 
-    fn row(&self, size: &Size) -> Option<[f64; 3]> {
+    fn row(&self, size: &CostPredictors) -> Option<[f64; 3]> {
         let is_known = size.is_usable() && (!self.by_electrons || size.electrons.is_some());
         let [x, k] = size.logarithms(self.by_electrons);
         is_known.then_some([1.0, x - self.centre[0], k - self.centre[1]])
     }
 }
 
-impl Size {
+impl CostPredictors {
     fn is_usable(&self) -> bool {
         is_positive(self.atoms) && is_positive(self.k_points) && self.electrons.is_none_or(is_positive)
     }

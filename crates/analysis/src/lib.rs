@@ -28,7 +28,7 @@ pub use bins::Bins;
 pub use bootstrap::Bootstrap;
 pub use completion::{Completion, CompletionBin};
 pub use contour::contours;
-pub use cost::{CostModel, Guess, Measured, Predicted, Size};
+pub use cost::{CostModel, CostPredictors, Guess, MeasuredCost, Predicted};
 pub use density::{Density2d, kernel_density};
 pub use ensemble::{EnsembleError, force_deviation, standard_deviation};
 pub use errors::{ErrorBin, ForceErrors};

@@ -81,7 +81,7 @@ pub struct TooFewLabels {
 }
 
 /// Element fractions and energy difference per atom of a structure.
-struct Row {
+struct RegressionRow {
     /// Index of the element and its fraction.
     fractions: Vec<(usize, f64)>,
     difference: f64,
@@ -113,7 +113,7 @@ impl EnergyOffsets {
         if possible.len() < needed {
             return Err(TooFewLabels { structures: possible.len(), needed });
         }
-        let rows: Vec<_> = possible.iter().map(|label| Row::new(label, &elements)).collect();
+        let rows: Vec<_> = possible.iter().map(|label| RegressionRow::new(label, &elements)).collect();
         let mut used = within_cut(&residuals(&rows, &robust_start(&rows, elements.len())));
         let mut solved = Solved::solve(&rows, &weights(&used), elements.len());
         for _ in 0..MAX_SELECTIONS {
@@ -185,7 +185,7 @@ impl EnergyOffsets {
     }
 }
 
-impl Row {
+impl RegressionRow {
     fn new(label: &LabelledEnergy, elements: &[u8]) -> Self {
         let atoms = label.atoms();
         let fraction = |(element, number): &(u8, u32)| {
@@ -202,7 +202,7 @@ impl Row {
 }
 
 /// Offsets that are insensitive to outliers (Huber's estimator by reweighting).
-fn robust_start(rows: &[Row], elements: usize) -> Vec<f64> {
+fn robust_start(rows: &[RegressionRow], elements: usize) -> Vec<f64> {
     let mut differences: Vec<_> = rows.iter().map(|row| row.difference).collect();
     differences.sort_by(f64::total_cmp);
     let median = quantile(&differences, 0.5).unwrap_or(0.0);
@@ -220,7 +220,7 @@ fn robust_start(rows: &[Row], elements: usize) -> Vec<f64> {
     offsets
 }
 
-fn residuals(rows: &[Row], offsets: &[f64]) -> Vec<f64> {
+fn residuals(rows: &[RegressionRow], offsets: &[f64]) -> Vec<f64> {
     rows.iter().map(|row| row.residual(offsets)).collect()
 }
 
@@ -244,7 +244,7 @@ struct Solved {
 }
 
 impl Solved {
-    fn solve(rows: &[Row], weights: &[f64], elements: usize) -> Self {
+    fn solve(rows: &[RegressionRow], weights: &[f64], elements: usize) -> Self {
         let mut normal = Mat::<f64>::zeros(elements, elements);
         let mut right = vec![0.0; elements];
         for (row, weight) in rows.iter().zip(weights) {

@@ -24,10 +24,10 @@ use std::collections::BTreeMap;
 use crate::structure::Structure;
 
 pub use error::{ExtxyzError, ExtxyzErrorKind};
-pub use labels::{LabelError, LabelKeys, Labels};
-pub use read::Reader;
-pub use value::Value;
-pub use write::{WriteError, write_frame};
+pub use labels::{FrameLabels, LabelError, LabelKeys};
+pub use read::ExtxyzReader;
+pub use value::ExtxyzValue;
+pub use write::{ExtxyzWriteError, write_frame};
 
 /// A structure with the other data of its frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,7 +35,7 @@ pub struct Frame {
     /// Species, positions, cell (zero where the file has none) and periodicity.
     pub structure: Structure,
     /// The keys of the comment line except `Lattice`, `Properties` and `pbc`.
-    pub info: BTreeMap<String, Value>,
+    pub info: BTreeMap<String, ExtxyzValue>,
     /// The columns except species and positions, by their name in the file.
     pub arrays: BTreeMap<String, Column>,
     /// The line at which the frame starts, from 1; 0 if it did not come from a file.

@@ -16,20 +16,20 @@ use crate::species::Species;
 use crate::structure::Structure;
 
 pub use error::{DumpError, DumpErrorKind};
-use sections::{Atom, Columns, SimulationBox};
+use sections::{DumpAtom, DumpColumns, SimulationBox};
 
 /// Iterates over the snapshots of a stream. Ends after the first error.
 ///
 /// A frame has `timestep` in its `info`, and the array `id` if the dump has it. Its line is that of the first `ITEM:`.
-pub struct Reader<R> {
-    lines: Lines<R>,
+pub struct LammpsDumpReader<R> {
+    lines: DumpLines<R>,
     /// Elements of atom types 1, 2, ….
     types: Vec<Species>,
     ended: bool,
 }
 
 /// The lines of a stream.
-struct Lines<R> {
+struct DumpLines<R> {
     input: R,
     /// Number of the line in `text`, from 1.
     number: usize,
@@ -38,7 +38,7 @@ struct Lines<R> {
 
 /// What precedes the atoms of a snapshot.
 #[derive(Default)]
-struct Header {
+struct SnapshotHeader {
     /// Line of the first item.
     line: usize,
     timestep: Option<i64>,
@@ -46,15 +46,15 @@ struct Header {
     bounds: Option<SimulationBox>,
 }
 
-impl<R: BufRead> Reader<R> {
+impl<R: BufRead> LammpsDumpReader<R> {
     /// Reads from `input` as the iterator advances. `types` are the elements of the atom types, from type 1, for dumps without the
     /// column `element`.
     pub fn new(input: R, types: Vec<Species>) -> Self {
-        Self { lines: Lines { input, number: 0, text: String::new() }, types, ended: false }
+        Self { lines: DumpLines { input, number: 0, text: String::new() }, types, ended: false }
     }
 
     fn frame(&mut self) -> Result<Option<Frame>, DumpErrorKind> {
-        let mut header = Header::default();
+        let mut header = SnapshotHeader::default();
         while self.lines.advance()? {
             if self.lines.text.trim().is_empty() {
                 continue;
@@ -75,7 +75,7 @@ impl<R: BufRead> Reader<R> {
     }
 
     /// A section before the atoms.
-    fn section(&mut self, item: &str, header: &mut Header) -> Result<(), DumpErrorKind> {
+    fn section(&mut self, item: &str, header: &mut SnapshotHeader) -> Result<(), DumpErrorKind> {
         if let Some(words) = item.strip_prefix("BOX BOUNDS") {
             let mut rows = [const { Vec::new() }; 3];
             for row in &mut rows {
@@ -107,8 +107,8 @@ impl<R: BufRead> Reader<R> {
         Ok(())
     }
 
-    fn body(&mut self, columns: &str, header: Header) -> Result<Frame, DumpErrorKind> {
-        let columns = Columns::parse(columns, &self.types)?;
+    fn body(&mut self, columns: &str, header: SnapshotHeader) -> Result<Frame, DumpErrorKind> {
+        let columns = DumpColumns::parse(columns, &self.types)?;
         let count = header.atoms.ok_or(DumpErrorKind::NoSection("NUMBER OF ATOMS"))?;
         let bounds = header.bounds.as_ref().ok_or(DumpErrorKind::NoSection("BOX BOUNDS"))?;
         let mut atoms = Vec::new();
@@ -121,10 +121,10 @@ impl<R: BufRead> Reader<R> {
 }
 
 fn frame(
-    mut atoms: Vec<Atom>,
-    columns: &Columns,
+    mut atoms: Vec<DumpAtom>,
+    columns: &DumpColumns,
     bounds: &SimulationBox,
-    header: &Header,
+    header: &SnapshotHeader,
 ) -> Result<Frame, DumpErrorKind> {
     let ids = columns.has_id();
     if ids {
@@ -133,7 +133,7 @@ fn frame(
             return Err(DumpErrorKind::RepeatedId(twice[0].id));
         }
     }
-    let position = |atom: &Atom| -> Vec3 { bounds.position(atom.position, columns.scaled()) };
+    let position = |atom: &DumpAtom| -> Vec3 { bounds.position(atom.position, columns.scaled()) };
     let structure = Structure {
         species: atoms.iter().map(|atom| atom.species).collect(),
         positions: atoms.iter().map(position).collect(),
@@ -152,7 +152,7 @@ fn frame(
     Ok(frame)
 }
 
-impl<R: BufRead> Iterator for Reader<R> {
+impl<R: BufRead> Iterator for LammpsDumpReader<R> {
     type Item = Result<Frame, DumpError>;
 
     fn next(&mut self) -> Option<Self::Item> {
@@ -165,7 +165,7 @@ impl<R: BufRead> Iterator for Reader<R> {
     }
 }
 
-impl<R: BufRead> Lines<R> {
+impl<R: BufRead> DumpLines<R> {
     /// Reads the next line into `text`; false at the end of the stream.
     fn advance(&mut self) -> Result<bool, DumpErrorKind> {
         self.text.clear();

@@ -93,12 +93,12 @@ impl fmt::Display for PoscarSection {
 /// `move_mask` `[n × 3]` (true: free to move), as in ASE. Data after the positions (velocities,
 /// predictor–corrector data) are ignored.
 pub fn read_poscar(input: impl BufRead) -> Result<Frame, PoscarError> {
-    let mut lines = Lines { input, number: 0, text: String::new() };
+    let mut lines = PoscarLines { input, number: 0, text: String::new() };
     let frame = frame(&mut lines);
     frame.map_err(|fault| PoscarError { line: lines.number, kind: fault })
 }
 
-fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
+fn frame(lines: &mut PoscarLines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
     let comment = lines.take(PoscarSection::Comment)?.to_owned();
     let factors = lines.parse(PoscarSection::Scale, factors)?;
     let mut lattice = [[0.0; 3]; 3];
@@ -106,15 +106,15 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
         *vector = lines.parse(PoscarSection::LatticeVector, vector3)?;
     }
     let factors = match factors {
-        Scale::Factors(factors) => factors,
-        Scale::Volume(volume) => [(volume / Cell(lattice).volume()).cbrt(); 3],
+        PoscarScale::Factors(factors) => factors,
+        PoscarScale::Volume(volume) => [(volume / Cell(lattice).volume()).cbrt(); 3],
     };
     let stretch = |x: Vec3| -> Vec3 { std::array::from_fn(|k| x[k] * factors[k]) };
     let cell = Cell(lattice.map(stretch));
     let symbols = symbols(lines.take(PoscarSection::Symbols)?)?;
     let counts = lines.parse(PoscarSection::Counts, |text| counts(text, symbols.len()))?;
     let mut mode = lines.parse(PoscarSection::Mode, mode)?;
-    let selective = mode == Mode::Selective;
+    let selective = mode == CoordinateMode::Selective;
     if selective {
         mode = lines.parse(PoscarSection::Mode, mode_of_positions)?;
     }
@@ -130,7 +130,7 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
                 lines.parse(PoscarSection::Position, vector3)?
             };
             structure.species.push(species);
-            let cartesian = mode == Mode::Cartesian;
+            let cartesian = mode == CoordinateMode::Cartesian;
             structure.positions.push(if cartesian { stretch(position) } else { cell.cartesian(position) });
         }
     }
@@ -148,7 +148,7 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
 
 /// Why a structure cannot be written.
 #[derive(Debug, thiserror::Error)]
-pub enum WriteError {
+pub enum PoscarWriteError {
     /// The stream reports an error.
     #[error("cannot be written: {0}")]
     Io(#[from] std::io::Error),
@@ -167,7 +167,7 @@ pub fn write_poscar(
     out: &mut impl Write,
     structure: &Structure,
     comment: &str,
-) -> Result<Vec<usize>, WriteError> {
+) -> Result<Vec<usize>, PoscarWriteError> {
     Structure { periodic: [true; 3], ..structure.clone() }.validate()?;
     let mut elements: Vec<Species> = Vec::new();
     for species in &structure.species {
@@ -205,14 +205,14 @@ fn joined(words: impl Iterator<Item = String>) -> String {
     words.collect::<Vec<_>>().join(" ")
 }
 
-struct Lines<R> {
+struct PoscarLines<R> {
     input: R,
     /// Number of the line in `text`, from 1.
     number: usize,
     text: String,
 }
 
-impl<R: BufRead> Lines<R> {
+impl<R: BufRead> PoscarLines<R> {
     fn take(&mut self, expected: PoscarSection) -> Result<&str, PoscarErrorKind> {
         self.text.clear();
         self.number += 1;
@@ -236,20 +236,20 @@ impl<R: BufRead> Lines<R> {
     }
 }
 
-enum Scale {
+enum PoscarScale {
     Factors(Vec3),
     /// Å³
     Volume(f64),
 }
 
 /// One factor or three; the rest of the line is a comment.
-fn factors(text: &str) -> Option<Scale> {
+fn factors(text: &str) -> Option<PoscarScale> {
     let numbers: Vec<f64> = text.split_whitespace().map_while(|word| word.parse().ok()).take(3).collect();
     match *numbers {
         _ if !numbers.iter().all(|x| x.is_finite()) => None,
-        [factor] if factor > 0.0 => Some(Scale::Factors([factor; 3])),
-        [volume] if volume < 0.0 => Some(Scale::Volume(-volume)),
-        [x, y, z] if x > 0.0 && y > 0.0 && z > 0.0 => Some(Scale::Factors([x, y, z])),
+        [factor] if factor > 0.0 => Some(PoscarScale::Factors([factor; 3])),
+        [volume] if volume < 0.0 => Some(PoscarScale::Volume(-volume)),
+        [x, y, z] if x > 0.0 && y > 0.0 && z > 0.0 => Some(PoscarScale::Factors([x, y, z])),
         _ => None,
     }
 }
@@ -294,24 +294,24 @@ fn counts(text: &str, symbols: usize) -> Option<Vec<u64>> {
 }
 
 #[derive(Clone, Copy, PartialEq)]
-enum Mode {
+enum CoordinateMode {
     Selective,
     Direct,
     Cartesian,
 }
 
 /// Only the first letter is significant.
-fn mode(text: &str) -> Option<Mode> {
+fn mode(text: &str) -> Option<CoordinateMode> {
     match text.chars().next()? {
-        'S' | 's' => Some(Mode::Selective),
+        'S' | 's' => Some(CoordinateMode::Selective),
         _ => mode_of_positions(text),
     }
 }
 
-fn mode_of_positions(text: &str) -> Option<Mode> {
+fn mode_of_positions(text: &str) -> Option<CoordinateMode> {
     match text.chars().next()? {
-        'D' | 'd' => Some(Mode::Direct),
-        'C' | 'c' | 'K' | 'k' => Some(Mode::Cartesian),
+        'D' | 'd' => Some(CoordinateMode::Direct),
+        'C' | 'c' | 'K' | 'k' => Some(CoordinateMode::Cartesian),
         _ => None,
     }
 }

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 
-use crate::extxyz::{self, Frame, Reader};
+use crate::extxyz::{self, ExtxyzReader, Frame};
 use crate::{lammps_dump, poscar};
 
 /// Extensions of other programs' formats that `ase convert` reads.
@@ -110,7 +110,7 @@ pub fn open_extxyz(path: &Path) -> Result<File, FileError> {
 
 /// Reads all frames of an extended XYZ file, at least one.
 pub fn read_extxyz(path: &Path) -> Result<Vec<Frame>, FileError> {
-    let frames: Result<Vec<_>, _> = Reader::new(open(path)?).collect();
+    let frames: Result<Vec<_>, _> = ExtxyzReader::new(open(path)?).collect();
     match frames {
         Ok(frames) if frames.is_empty() => Err(FileError::Empty(path.to_owned())),
         Ok(frames) => Ok(frames),

@@ -5,14 +5,14 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use atoms::extxyz::{Column, ColumnData, Frame, Reader, Value, write_frame};
+use atoms::extxyz::{Column, ColumnData, ExtxyzReader, ExtxyzValue, Frame, write_frame};
 use atoms::poscar::write_poscar;
 use atoms::{Cell, Species, Structure, read_extxyz, read_structures};
 use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree as _;
 use proptest::test_runner::TestRunner;
-use serde_json::{Value as Json, json};
+use serde_json::{Value, json};
 
 fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
@@ -23,7 +23,7 @@ fn shared(name: &str) -> PathBuf {
 }
 
 /// What ASE reads from files, if an interpreter is configured.
-fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Json>> {
+fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Value>> {
     let Some(python) = std::env::var_os("CALMWALK_PYTHON") else {
         eprintln!("CALMWALK_PYTHON is not set: no comparison with ASE");
         return None;
@@ -40,7 +40,7 @@ fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Json>> {
     Some(serde_json::from_slice(&output.stdout).unwrap())
 }
 
-fn real(value: f64) -> Json {
+fn real(value: f64) -> Value {
     match value {
         _ if value.is_finite() => json!(value),
         _ if value.is_nan() => json!("nan"),
@@ -48,43 +48,43 @@ fn real(value: f64) -> Json {
     }
 }
 
-fn to_json(value: &Value) -> Json {
+fn to_json(value: &ExtxyzValue) -> Value {
     match value {
-        Value::Bool(value) => json!(value),
-        Value::Int(value) => json!(value),
-        Value::Real(value) => real(*value),
-        Value::Text(text) => json!(text),
-        Value::List(values) => values.iter().map(to_json).collect(),
+        ExtxyzValue::Bool(value) => json!(value),
+        ExtxyzValue::Int(value) => json!(value),
+        ExtxyzValue::Real(value) => real(*value),
+        ExtxyzValue::Text(text) => json!(text),
+        ExtxyzValue::List(values) => values.iter().map(to_json).collect(),
     }
 }
 
 /// Whether JSON has content without a value here, which stays text.
-fn is_foreign(json: &Json) -> bool {
+fn is_foreign(json: &Value) -> bool {
     match json {
-        Json::Null | Json::Object(_) => true,
-        Json::Array(items) => items.iter().any(is_foreign),
+        Value::Null | Value::Object(_) => true,
+        Value::Array(items) => items.iter().any(is_foreign),
         _ => false,
     }
 }
 
-fn info_to_json(value: &Value) -> Json {
+fn info_to_json(value: &ExtxyzValue) -> Value {
     let text = value.text().and_then(|text| text.strip_prefix("_JSON "));
     let foreign = text.and_then(|text| serde_json::from_str(text).ok()).filter(is_foreign);
     foreign.unwrap_or_else(|| to_json(value))
 }
 
-fn column_to_json(column: &Column) -> Json {
-    let items: Vec<Json> = match &column.entries {
+fn column_to_json(column: &Column) -> Value {
+    let items: Vec<Value> = match &column.entries {
         ColumnData::Real(values) => values.iter().map(|value| real(*value)).collect(),
         ColumnData::Int(values) => values.iter().map(|value| json!(value)).collect(),
         ColumnData::Bool(values) => values.iter().map(|value| json!(value)).collect(),
         ColumnData::Text(values) => values.iter().map(|value| json!(value)).collect(),
     };
-    if column.width == 1 { items.into() } else { items.chunks(column.width).map(Json::from).collect() }
+    if column.width == 1 { items.into() } else { items.chunks(column.width).map(Value::from).collect() }
 }
 
 /// Asserts the same bits and types, and nothing else.
-fn assert_same(frame: &Frame, ase: &Json) {
+fn assert_same(frame: &Frame, ase: &Value) {
     let structure = &frame.structure;
     let numbers: Vec<u8> = structure.species.iter().map(|species| species.atomic_number()).collect();
     assert_eq!(ase["numbers"], json!(numbers));
@@ -106,7 +106,7 @@ fn assert_same(frame: &Frame, ase: &Json) {
         }
     }
     assert_eq!(ase["free"], json!(free));
-    assert_eq!(ase["arrays"], Json::Object(given));
+    assert_eq!(ase["arrays"], Value::Object(given));
     let mut info = serde_json::Map::new();
     for (key, value) in &frame.info {
         let numbers = value.numbers();
@@ -118,11 +118,11 @@ fn assert_same(frame: &Frame, ase: &Json) {
             _ => drop(info.insert(key.clone(), info_to_json(value))),
         }
     }
-    assert_eq!(ase["info"], Json::Object(info));
-    assert_eq!(ase["results"], Json::Object(results));
+    assert_eq!(ase["info"], Value::Object(info));
+    assert_eq!(ase["results"], Value::Object(results));
 }
 
-fn assert_all_same(frames: &[Frame], ase: &[Json]) {
+fn assert_all_same(frames: &[Frame], ase: &[Value]) {
     assert_eq!(frames.len(), ase.len());
     for (frame, ase) in frames.iter().zip(ase) {
         assert_same(frame, ase);
@@ -144,12 +144,12 @@ fn unnumbered(mut frames: Vec<Frame>) -> Vec<Frame> {
 }
 
 fn read(text: &[u8]) -> Vec<Frame> {
-    unnumbered(Reader::new(text).collect::<Result<_, _>>().unwrap())
+    unnumbered(ExtxyzReader::new(text).collect::<Result<_, _>>().unwrap())
 }
 
 #[test]
 fn files_of_ase_are_read_as_ase_reads_them() {
-    let ase: Vec<Json> = serde_json::from_slice(&std::fs::read(data("ase_sample.json")).unwrap()).unwrap();
+    let ase: Vec<Value> = serde_json::from_slice(&std::fs::read(data("ase_sample.json")).unwrap()).unwrap();
     let frames = read_extxyz(&data("ase_sample.extxyz")).unwrap();
     assert_all_same(&frames, &ase);
     assert_eq!(frames[0].labels().unwrap().energy, Some(-27.123456789012345));
@@ -257,13 +257,13 @@ fn errors_tell_the_path() {
 #[test]
 fn a_file_cut_after_any_line_is_an_error_unless_a_frame_ends_there() {
     let text = std::fs::read_to_string(data("ase_sample.extxyz")).unwrap();
-    let starts: Vec<usize> = Reader::new(text.as_bytes())
+    let starts: Vec<usize> = ExtxyzReader::new(text.as_bytes())
         .map(|frame| frame.unwrap().line)
         .chain([text.lines().count() + 1])
         .collect();
     let mut cut = String::new();
     for (number, line) in text.lines().enumerate() {
-        let last = Reader::new(cut.as_bytes()).last();
+        let last = ExtxyzReader::new(cut.as_bytes()).last();
         let ends = starts.contains(&(number + 1));
         assert_eq!(last.is_none_or(|frame| frame.is_ok()), ends, "line {number}");
         cut += &format!("{line}\n");
@@ -306,24 +306,24 @@ const ODD: &[&str] = &[
     "٣",
 ];
 
-fn any_value() -> impl Strategy<Value = Value> {
+fn any_value() -> impl Strategy<Value = ExtxyzValue> {
     let real = || prop_oneof![any::<f64>().prop_filter("finite", |x| x.is_finite()), -10.0..10.0];
     let text =
         || prop_oneof![".{0,20}", "[ -~]{0,20}", proptest::sample::select(ODD).prop_map(str::to_owned)];
     let row = move |length| vec(real(), length);
     prop_oneof![
-        any::<bool>().prop_map(Value::from),
-        any::<i64>().prop_map(Value::from),
-        real().prop_map(Value::from),
-        text().prop_map(Value::from),
-        vec(any::<bool>(), 0..5).prop_map(Value::from),
-        vec(any::<i64>(), 0..5).prop_map(Value::from),
-        vec(any::<f64>().prop_filter("a number", |x| !x.is_nan()), 2..5).prop_map(Value::from),
-        vec(text(), 0..4).prop_map(Value::from),
-        (1..4_usize, 0..4_usize).prop_flat_map(move |(n, m)| vec(row(m), n)).prop_map(Value::from),
-        vec(vec(any::<bool>(), 2), 2).prop_map(Value::from),
-        vec(vec(vec(any::<i64>(), 1), 2), 3).prop_map(Value::from),
-        vec(vec(text(), 2), 2).prop_map(Value::from),
+        any::<bool>().prop_map(ExtxyzValue::from),
+        any::<i64>().prop_map(ExtxyzValue::from),
+        real().prop_map(ExtxyzValue::from),
+        text().prop_map(ExtxyzValue::from),
+        vec(any::<bool>(), 0..5).prop_map(ExtxyzValue::from),
+        vec(any::<i64>(), 0..5).prop_map(ExtxyzValue::from),
+        vec(any::<f64>().prop_filter("a number", |x| !x.is_nan()), 2..5).prop_map(ExtxyzValue::from),
+        vec(text(), 0..4).prop_map(ExtxyzValue::from),
+        (1..4_usize, 0..4_usize).prop_flat_map(move |(n, m)| vec(row(m), n)).prop_map(ExtxyzValue::from),
+        vec(vec(any::<bool>(), 2), 2).prop_map(ExtxyzValue::from),
+        vec(vec(vec(any::<i64>(), 1), 2), 3).prop_map(ExtxyzValue::from),
+        vec(vec(text(), 2), 2).prop_map(ExtxyzValue::from),
     ]
 }
 
@@ -380,13 +380,13 @@ proptest! {
 
     #[test]
     fn random_bytes_never_panic(bytes in vec(any::<u8>(), 0..300)) {
-        prop_assert!(Reader::new(bytes.as_slice()).count() <= bytes.len());
+        prop_assert!(ExtxyzReader::new(bytes.as_slice()).count() <= bytes.len());
     }
 
     #[test]
     fn random_comments_never_panic(comment in r#"([A-Za-z:=+"'\[\]{}\\,. 0-9_-]|Lattice=|Properties=|pbc=|stress=|\[\[){0,40}"#) {
         let text = format!("1\n{comment}\nAl 0 0 0\n");
-        if let Some(Ok(frame)) = Reader::new(text.as_bytes()).next() {
+        if let Some(Ok(frame)) = ExtxyzReader::new(text.as_bytes()).next() {
             let mut again = Vec::new();
             if write_frame(&mut again, &frame).is_ok() {
                 prop_assert_eq!(read(&again), unnumbered(vec![frame]));
@@ -401,6 +401,6 @@ proptest! {
         if let Some(place) = bytes.get_mut(at) {
             *place = byte;
         }
-        prop_assert!(Reader::new(bytes.as_slice()).count() <= 6);
+        prop_assert!(ExtxyzReader::new(bytes.as_slice()).count() <= 6);
     }
 }

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use calm::baselines::{Baseline, BaselineSettings, Builder, Kind};
+use calm::baselines::{Baseline, BaselineKind, BaselineSettings, Builder};
 use npyz::WriterBuilder;
 
 const DIMENSION: usize = 130;
@@ -49,7 +49,7 @@ fn save(path: &Path, features: &[f64]) {
     writer.extend(features.iter().copied()).and_then(|()| writer.finish()).expect("an array");
 }
 
-fn build(kind: Kind, settings: &BaselineSettings, features: &[f64]) -> (Baseline, usize) {
+fn build(kind: BaselineKind, settings: &BaselineSettings, features: &[f64]) -> (Baseline, usize) {
     let mut builder = Builder::new(kind, settings, DIMENSION, 1, None).expect("settings");
     let (elements, mut sweeps) = ([0; STRUCTURE], 0);
     while builder.needs_sweep() {
@@ -95,10 +95,12 @@ fn main() {
     let peer: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
 
     let elements = vec![0; ATOMS];
-    let ((active, sweeps), maxvol) = measured(|| build(Kind::DOptimalityElement, &settings, &training));
+    let ((active, sweeps), maxvol) =
+        measured(|| build(BaselineKind::DOptimalityElement, &settings, &training));
     let (_, score) = measured(|| active.score(&elements, &queries).expect("features"));
-    let (uncertainties, llpr) =
-        measured(|| build(Kind::Llpr, &settings, &training).0.score(&elements, &queries).expect("features"));
+    let (uncertainties, llpr) = measured(|| {
+        build(BaselineKind::Llpr, &settings, &training).0.score(&elements, &queries).expect("features")
+    });
     check(directory.path(), &uncertainties);
     let rows = |name: &str, own: f64| {
         let other = peer[name].as_f64().expect("a time");

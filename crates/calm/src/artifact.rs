@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use npz::{Archive, Error};
+use npz::{Error, NpzFile};
 
 use crate::component::{Component, ComponentError, Statistics};
 use crate::mixture::{Mixture, MixtureError};
@@ -148,7 +148,7 @@ impl Artifact {
     /// expected.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
         let path = path.as_ref();
-        let file = &Archive::open(path)?;
+        let file = &NpzFile::open(path)?;
         check_schema(file, "__schema_version__")?;
         if file.contains("uq_feature_mode") {
             let mode = file.strings("uq_feature_mode")?.concat();
@@ -184,7 +184,7 @@ impl Artifact {
     /// As [`Artifact::load`].
     pub fn load_export(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
         let path = path.as_ref();
-        let file = &Archive::open(path)?;
+        let file = &NpzFile::open(path)?;
         check_schema(file, "uq_schema_version")?;
         let symbols = file.strings("element_names")?;
         let element_count = count(file, "uq_n_elements")?;
@@ -239,7 +239,7 @@ impl Projection {
     /// # Errors
     /// As [`Artifact::load`].
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
-        let file = &Archive::open(path.as_ref())?;
+        let file = &NpzFile::open(path.as_ref())?;
         check_schema(file, "__schema_version__")?;
         let elements = file.numbers("elements")?.data;
         let first =
@@ -250,7 +250,7 @@ impl Projection {
     }
 
     /// Reads the keys that both file formats share.
-    fn read(file: &Archive, feature_dimension: usize, asinh: bool) -> Result<Self, ArtifactError> {
+    fn read(file: &NpzFile, feature_dimension: usize, asinh: bool) -> Result<Self, ArtifactError> {
         let matrix = file.numbers("uq_rp_matrix")?;
         let [rows, columns] = matrix.shape[..] else {
             let found = format!("shape {:?}", matrix.shape);
@@ -332,23 +332,23 @@ fn differs<T: PartialEq + ToString>(
     Err(ProjectionMismatch { what, artifact: artifact.to_string(), model: model.to_string() })
 }
 
-fn invalid(file: &Archive, key: &str, found: impl ToString, expected: impl ToString) -> ArtifactError {
+fn invalid(file: &NpzFile, key: &str, found: impl ToString, expected: impl ToString) -> ArtifactError {
     file.invalid(key, found, expected).into()
 }
 
 /// A count; some builds store it as a floating-point number.
-fn count(file: &Archive, key: &str) -> Result<usize, ArtifactError> {
+fn count(file: &NpzFile, key: &str) -> Result<usize, ArtifactError> {
     as_count(file, key, file.scalar(key)?)
 }
 
-fn as_count(file: &Archive, key: &str, found: f64) -> Result<usize, ArtifactError> {
+fn as_count(file: &NpzFile, key: &str, found: f64) -> Result<usize, ArtifactError> {
     if found.fract() == 0.0 && (0.0..=u32::MAX as f64).contains(&found) {
         return Ok(found as usize);
     }
     Err(invalid(file, key, found, "a whole number, 0 or more"))
 }
 
-fn check_schema(file: &Archive, key: &str) -> Result<(), ArtifactError> {
+fn check_schema(file: &NpzFile, key: &str) -> Result<(), ArtifactError> {
     let schema = count(file, key)?;
     if SCHEMAS.contains(&schema) {
         return Ok(());
@@ -357,7 +357,7 @@ fn check_schema(file: &Archive, key: &str) -> Result<(), ArtifactError> {
 }
 
 /// θ, `[elements][slots]`: the weighted thresholds if present.
-fn thresholds(file: &Archive, elements: usize) -> Result<Vec<Vec<f64>>, ArtifactError> {
+fn thresholds(file: &NpzFile, elements: usize) -> Result<Vec<Vec<f64>>, ArtifactError> {
     let weighted = file.contains("eff_interp_thresholds");
     let key = if weighted { "eff_interp_thresholds" } else { "interp_thresholds" };
     let found = file.numbers(key)?;
@@ -370,7 +370,7 @@ fn thresholds(file: &Archive, elements: usize) -> Result<Vec<Vec<f64>>, Artifact
 }
 
 /// Consecutive square matrices of this shape, each symmetric up to rounding.
-fn symmetric(file: &Archive, key: &str, shape: &[usize]) -> Result<Vec<f64>, ArtifactError> {
+fn symmetric(file: &NpzFile, key: &str, shape: &[usize]) -> Result<Vec<f64>, ArtifactError> {
     let numbers = file.numbers(key)?.with_shape(shape)?;
     let dimension = shape.last().copied().unwrap_or_default();
     for (index, matrix) in numbers.chunks_exact((dimension * dimension).max(1)).enumerate() {
@@ -395,7 +395,7 @@ struct ElementComponents {
 }
 
 impl ElementComponents {
-    fn read(file: &Archive, element: usize, thresholds: Option<&Vec<f64>>) -> Result<Self, ArtifactError> {
+    fn read(file: &NpzFile, element: usize, thresholds: Option<&Vec<f64>>) -> Result<Self, ArtifactError> {
         let key = format!("centroids_{element}");
         let centroids = file.numbers(&key)?;
         let [slots, dimension] = centroids.shape[..] else {
@@ -452,7 +452,7 @@ impl ElementComponents {
 }
 
 /// Whether the features of an artifact go through asinh.
-fn asinh(file: &Archive) -> Result<bool, ArtifactError> {
+fn asinh(file: &NpzFile) -> Result<bool, ArtifactError> {
     let transform = match file.contains("uq_feature_transform") {
         true => file.strings("uq_feature_transform")?.concat(),
         false => String::new(),
@@ -467,7 +467,7 @@ fn asinh(file: &Archive) -> Result<bool, ArtifactError> {
 /// Assembles the artifact.
 fn finish(
     path: &Path,
-    file: &Archive,
+    file: &NpzFile,
     symbols: Vec<String>,
     elements: Vec<Vec<Arc<Component>>>,
     asinh: bool,

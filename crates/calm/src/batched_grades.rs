@@ -11,7 +11,7 @@ use crate::mixture::Mixture;
 pub struct BatchedGrades {
     collected: Mutex<Collected>,
     /// Buffers that no thread uses.
-    idle: Mutex<Vec<Scratch>>,
+    idle: Mutex<Vec<GradeBuffers>>,
 }
 
 #[derive(Debug, Default)]
@@ -22,7 +22,7 @@ struct Collected {
 
 /// Buffers of one thread.
 #[derive(Debug, Default)]
-struct Scratch {
+struct GradeBuffers {
     elements: Vec<usize>,
     grades: Grades,
 }

@@ -16,10 +16,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::moments::{self, Moments};
+use crate::moments::{self, InitialMagneticMoments};
 use crate::{
-    DftBackend, Exit, Failure, FailureClass, Input, PassedEnvironment, Results, RetryAdjustment, SetupError,
-    Size, script_output, validation, version_query,
+    CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, Failure, FailureClass,
+    PassedEnvironment, RetryAdjustment, SetupError, script_output, validation, version_query,
 };
 
 /// The script that runs the calculator.
@@ -35,7 +35,7 @@ const INPUT_VERSION: u32 = 1;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 #[schemars(extend("required" = ["calculator"]))]
-pub struct Settings {
+pub struct AseSettings {
     /// A Python with ASE and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
     pub command: Vec<String>,
     /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
@@ -48,21 +48,21 @@ pub struct Settings {
     /// Initial magnetic moment of each element, μ_B. Default: 1 for the elements not listed; without this table
     /// no atom has a moment.
     #[serde(rename = "initial_magnetic_moments")]
-    pub moments: Moments,
+    pub moments: InitialMagneticMoments,
 }
 
-impl Default for Settings {
+impl Default for AseSettings {
     fn default() -> Self {
         Self {
             command: vec!["python3".into()],
             environment: BTreeMap::new(),
             calculator: PathBuf::new(),
-            moments: Moments::new(),
+            moments: InitialMagneticMoments::new(),
         }
     }
 }
 
-impl Settings {
+impl AseSettings {
     /// Reads the calculator's file and queries the versions.
     ///
     /// # Errors
@@ -105,7 +105,7 @@ impl Versions {
 /// A configured calculator.
 #[derive(Clone, Debug)]
 pub struct Ase {
-    settings: Settings,
+    settings: AseSettings,
     environment: BTreeMap<String, String>,
     calculator: Vec<u8>,
     versions: Versions,
@@ -114,7 +114,7 @@ pub struct Ase {
 impl DftBackend for Ase {
     fn identity(&self) -> Value {
         // Destructure, so that a new setting cannot be forgotten here.
-        let Settings { command: _, environment: _, calculator: _, moments } = &self.settings;
+        let AseSettings { command: _, environment: _, calculator: _, moments } = &self.settings;
         json!({
             "code": "ase", "ase": self.versions.ase, "recipe": INPUT_VERSION, "version": self.versions.version,
             "calculator": blake3::hash(&self.calculator).to_hex().to_string(), "moments": moments,
@@ -130,7 +130,7 @@ impl DftBackend for Ase {
         &self,
         structure: &Structure,
         adjustments: &BTreeSet<RetryAdjustment>,
-    ) -> Result<Input, Failure> {
+    ) -> Result<CalculationInput, Failure> {
         structure.validate().map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let table = &self.settings.moments;
         let task = json!({
@@ -146,15 +146,20 @@ impl DftBackend for Ase {
             (CALCULATOR_FILE, self.calculator.clone()),
             ("input.json", task.to_string().into_bytes()),
         ];
-        Ok(Input {
+        Ok(CalculationInput {
             files: files.map(|(name, content)| (name.to_owned(), content)).into(),
             command: self.settings.command.iter().cloned().chain([SCRIPT_FILE.to_owned()]).collect(),
             environment: self.environment.clone(),
-            ..Input::default()
+            ..CalculationInput::default()
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure> {
         let by = [("ase", self.versions.ase.as_str()), ("version", self.versions.version.as_str())];
         match script_output::read(structure, directory, &by)? {
             Some(calculated) => Ok(calculated),
@@ -162,8 +167,8 @@ impl DftBackend for Ase {
         }
     }
 
-    fn size(&self, structure: &Structure) -> Size {
-        Size { atoms: structure.len(), electrons: 0.0, k_points: 1 }
+    fn size(&self, structure: &Structure) -> CalculationSize {
+        CalculationSize { atoms: structure.len(), electrons: 0.0, k_points: 1 }
     }
 }
 

@@ -8,8 +8,8 @@ use atoms::{Species, Structure};
 
 use crate::{Failure, FailureClass, PinnedFile, RetryAdjustment};
 
-/// A configured program that makes labels. Each program's `Settings` locates the program and its
-/// pseudopotentials and creates it.
+/// A configured program that makes labels. Each program's settings locate the program and its
+/// pseudopotentials and create it.
 ///
 /// Steps of a label: write the files of [`Self::input`] to an empty directory, run the command there, and pass
 /// the directory to [`Self::read`].
@@ -28,8 +28,11 @@ pub trait DftBackend: Send + Sync {
     ///
     /// # Errors
     /// [`FailureClass::BadInput`](crate::FailureClass) if the program's input cannot express the structure.
-    fn input(&self, structure: &Structure, adjustments: &BTreeSet<RetryAdjustment>)
-    -> Result<Input, Failure>;
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<CalculationInput, Failure>;
 
     /// Reads the results of the calculation in `directory`, which ended with `exit`. Accepts them only if the
     /// program states convergence and calculated exactly the requested structure: atoms, order, species and
@@ -38,15 +41,20 @@ pub trait DftBackend: Send + Sync {
     ///
     /// # Errors
     /// Why there is no label. Output that cannot be read is a failure like any other.
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure>;
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure>;
 
     /// The quantities that determine the cost of a calculation.
-    fn size(&self, structure: &Structure) -> Size;
+    fn size(&self, structure: &Structure) -> CalculationSize;
 }
 
 /// Input of a calculation.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Input {
+pub struct CalculationInput {
     /// Content of each file by its name in the directory.
     pub files: BTreeMap<String, Vec<u8>>,
     /// The program with its arguments. Its output is kept in the files `stdout` and `stderr` beside the others.
@@ -88,7 +96,7 @@ impl Exit {
 
 /// The results of a calculation.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Results {
+pub struct CalculationResults {
     /// The energy consistent with the forces, eV: with smearing, the free energy.
     pub energy: f64,
     /// The energy extrapolated to zero smearing, eV, if the program reports it.
@@ -107,7 +115,7 @@ pub struct Results {
 
 /// The quantities that determine the cost of a calculation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Size {
+pub struct CalculationSize {
     /// Number of atoms.
     pub atoms: usize,
     /// Number of valence electrons; 0 if unknown.

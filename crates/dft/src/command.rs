@@ -22,8 +22,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::{
-    DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, SetupError, Size, executable,
-    validation,
+    CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, Failure, FailureClass,
+    RetryAdjustment, SetupError, executable, validation,
 };
 
 const STRUCTURE: &str = "structure.extxyz";
@@ -35,7 +35,7 @@ const RESERVED: [&str; 4] = [STRUCTURE, LABEL, "stdout", "stderr"];
 /// The settings of `[label.method.command]`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Settings {
+pub struct CommandSettings {
     /// The program and its arguments, one word each, without a shell. The program is an absolute path or a name
     /// to look up in PATH. Pass scripts among `files` to their interpreter: `["python3", "label.py"]`.
     pub command: Vec<String>,
@@ -57,7 +57,7 @@ pub struct Command {
     version: String,
 }
 
-impl Settings {
+impl CommandSettings {
     /// Finds the program and reads the files.
     ///
     /// # Errors
@@ -103,7 +103,7 @@ impl DftBackend for Command {
         &self,
         structure: &Structure,
         adjustments: &BTreeSet<RetryAdjustment>,
-    ) -> Result<Input, Failure> {
+    ) -> Result<CalculationInput, Failure> {
         let mut text = Vec::new();
         write_frame(&mut text, &Frame::from(structure.clone()))
             .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
@@ -111,10 +111,20 @@ impl DftBackend for Command {
         files.insert(STRUCTURE.to_owned(), text);
         let names: Vec<_> = adjustments.iter().map(|adjustment| adjustment.name()).collect();
         let environment = BTreeMap::from([("CALMWALK_REMEDIES".to_owned(), names.join(","))]);
-        Ok(Input { files, command: self.command.clone(), environment, ..Input::default() })
+        Ok(CalculationInput {
+            files,
+            command: self.command.clone(),
+            environment,
+            ..CalculationInput::default()
+        })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure> {
         match exit {
             Exit::Code(0) => read::label(structure, &directory.join(LABEL)),
             Exit::Code(3) => {
@@ -130,7 +140,7 @@ impl DftBackend for Command {
         }
     }
 
-    fn size(&self, structure: &Structure) -> Size {
-        Size { atoms: structure.len(), electrons: 0.0, k_points: 1 }
+    fn size(&self, structure: &Structure) -> CalculationSize {
+        CalculationSize { atoms: structure.len(), electrons: 0.0, k_points: 1 }
     }
 }

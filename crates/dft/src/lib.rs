@@ -29,11 +29,11 @@ mod validation;
 pub mod vasp;
 mod version_query;
 
-pub use backend::{DftBackend, Exit, Input, Results, SetupError, Size};
+pub use backend::{CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, SetupError};
 pub use environment::PassedEnvironment;
 pub use failure::{Failure, FailureClass};
-pub use moments::Moments;
+pub use moments::InitialMagneticMoments;
 pub use pinned_file::PinnedFile;
 pub use retry_adjustment::{RetryAdjustment, adjustments};
-pub use settings::Settings;
+pub use settings::DftSettings;
 pub use smearing::Smearing;

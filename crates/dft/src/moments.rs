@@ -7,7 +7,7 @@ use atoms::{Species, Structure};
 use crate::RetryAdjustment;
 
 /// Initial moment of each element, μ_B.
-pub type Moments = BTreeMap<Species, f64>;
+pub type InitialMagneticMoments = BTreeMap<Species, f64>;
 
 /// Default moment of an element, μ_B. A calculation that starts without moments never finds any, and strained
 /// structures of nonmagnetic elements may have some.
@@ -17,7 +17,7 @@ pub(crate) const DEFAULT_MOMENT: f64 = 1.0;
 /// solution.
 pub(crate) fn initial(
     structure: &Structure,
-    table: &Moments,
+    table: &InitialMagneticMoments,
     adjustments: &BTreeSet<RetryAdjustment>,
 ) -> Vec<f64> {
     let factor = if adjustments.contains(&RetryAdjustment::OtherMoments) { 0.5 } else { 1.0 };

@@ -3,7 +3,7 @@
 use atoms::cell::{self, scale};
 use atoms::{NeighbourList, Structure, shortest_distance};
 
-use crate::{Failure, FailureClass, Results, Size, k_mesh};
+use crate::{CalculationResults, CalculationSize, Failure, FailureClass, k_mesh};
 
 /// Minimum distance of atoms, Å. No campaign needs smaller ones, and some codes accept them silently.
 const MIN_DISTANCE: f64 = 0.4;
@@ -71,17 +71,21 @@ impl PaddedStructure {
     }
 
     /// Removes the stress if a direction was padded, because it is undefined for the original structure.
-    pub fn without_padding_stress(&self, calculated: Results) -> Results {
+    pub fn without_padding_stress(&self, calculated: CalculationResults) -> CalculationResults {
         let stress = calculated.stress.filter(|_| self.repeats == [true; 3]);
-        Results { stress, ..calculated }
+        CalculationResults { stress, ..calculated }
     }
 }
 
 /// The quantities that determine the cost, for this vacuum, k-point spacing and number of valence electrons.
-pub(crate) fn size(structure: &Structure, vacuum: f64, k_spacing: f64, electrons: f64) -> Size {
+pub(crate) fn size(structure: &Structure, vacuum: f64, k_spacing: f64, electrons: f64) -> CalculationSize {
     // Writing the input reports structures that cannot be calculated.
     let mesh = PaddedStructure::new(structure, vacuum).map_or([1; 3], |padded| padded.mesh(k_spacing));
-    Size { atoms: structure.len(), electrons, k_points: mesh.iter().map(|n| *n as usize).product() }
+    CalculationSize {
+        atoms: structure.len(),
+        electrons,
+        k_points: mesh.iter().map(|n| *n as usize).product(),
+    }
 }
 
 #[cfg(test)]
@@ -102,7 +106,10 @@ mod tests {
         assert_eq!(padded.structure.positions, slab.positions);
         assert_eq!(padded.mesh(0.5), [4, 3, 1]);
         let stress = Some([[1.0; 3]; 3]);
-        assert_eq!(padded.without_padding_stress(Results { stress, ..Default::default() }).stress, None);
+        assert_eq!(
+            padded.without_padding_stress(CalculationResults { stress, ..Default::default() }).stress,
+            None
+        );
 
         let molecule = PaddedStructure::new(&oxygen([false; 3], Cell([[0.0; 3]; 3])), 8.0).unwrap();
         assert_eq!(molecule.structure.cell, Cell::orthorhombic(9.0, 8.0, 10.0));

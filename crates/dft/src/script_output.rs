@@ -8,7 +8,7 @@ use atoms::{Cell, Species, Structure};
 use serde::Deserialize;
 
 use crate::structure_check::check_same_structure;
-use crate::{Failure, FailureClass, Results, validation};
+use crate::{CalculationResults, Failure, FailureClass, validation};
 
 /// The script returns numbers without loss.
 const TOLERANCE: f64 = 1e-9;
@@ -50,14 +50,18 @@ pub(crate) fn read(
     structure: &Structure,
     directory: &Path,
     by: &[(&str, &str)],
-) -> Result<Option<Results>, Failure> {
+) -> Result<Option<CalculationResults>, Failure> {
     match validation::read_output_file(directory, "result.json")? {
         Some(bytes) => parse(structure, &bytes, by),
         None => Ok(None),
     }
 }
 
-fn parse(structure: &Structure, bytes: &[u8], by: &[(&str, &str)]) -> Result<Option<Results>, Failure> {
+fn parse(
+    structure: &Structure,
+    bytes: &[u8],
+    by: &[(&str, &str)],
+) -> Result<Option<CalculationResults>, Failure> {
     let Ok(outcome) = serde_json::from_slice::<ScriptOutput>(bytes) else { return Ok(None) };
     for (name, expected) in by {
         let found = outcome.by.get(*name).map_or("of an unknown version", String::as_str);
@@ -82,7 +86,7 @@ fn parse(structure: &Structure, bytes: &[u8], by: &[(&str, &str)]) -> Result<Opt
     let found = Structure { species, positions, cell: Cell(cell), periodic: structure.periodic };
     check_same_structure(structure, &found, TOLERANCE)?;
     let matrix = |[xx, yy, zz, yz, xz, xy]: [f64; 6]| [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
-    let calculated = Results {
+    let calculated = CalculationResults {
         energy,
         energy_without_smearing,
         forces,

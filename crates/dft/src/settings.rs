@@ -10,22 +10,22 @@ use crate::{DftBackend, PassedEnvironment, SetupError, abinit, ase, command, cp2
 /// Which program makes labels, with its settings: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Settings {
+pub enum DftSettings {
     /// ABINIT.
-    Abinit(abinit::Settings),
+    Abinit(abinit::AbinitSettings),
     /// An ASE calculator.
-    Ase(ase::Settings),
+    Ase(ase::AseSettings),
     /// A user's program.
-    Command(command::Settings),
+    Command(command::CommandSettings),
     /// CP2K.
-    Cp2k(cp2k::Settings),
+    Cp2k(cp2k::Cp2kSettings),
     /// GPAW.
-    Gpaw(gpaw::Settings),
+    Gpaw(gpaw::GpawSettings),
     /// VASP.
-    Vasp(vasp::Settings),
+    Vasp(vasp::VaspSettings),
 }
 
-impl Settings {
+impl DftSettings {
     /// Names of the programs.
     pub const NAMES: [&str; 6] = ["abinit", "ase", "command", "cp2k", "gpaw", "vasp"];
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::result_file::{self, ResultFileError};
-use crate::{Exit, Failure, FailureClass, Results};
+use crate::{CalculationResults, Exit, Failure, FailureClass};
 
 /// The failure of a calculation without a complete result. `logs` are files in `directory` whose last lines go
 /// into the message.
@@ -88,10 +88,17 @@ pub(crate) fn check_version(program: &str, found: &str, expected: &str) -> Resul
 ///
 /// # Errors
 /// [`FailureClass::Implausible`]
-pub(crate) fn check_numbers(calculated: &Results, atoms: usize) -> Result<(), Failure> {
+pub(crate) fn check_numbers(calculated: &CalculationResults, atoms: usize) -> Result<(), Failure> {
     let implausible = |message: String| Err(FailureClass::Implausible.with_message(message));
-    let Results { energy, energy_without_smearing, forces, stress, magnetic_moments, magnetisation, .. } =
-        calculated;
+    let CalculationResults {
+        energy,
+        energy_without_smearing,
+        forces,
+        stress,
+        magnetic_moments,
+        magnetisation,
+        ..
+    } = calculated;
     if forces.len() != atoms {
         return implausible(format!("{} forces for {atoms} atoms", forces.len()));
     }
@@ -117,10 +124,10 @@ mod tests {
 
     #[test]
     fn numbers_that_are_none_are_implausible() {
-        let good = Results { forces: vec![[0.0; 3]; 2], ..Default::default() };
+        let good = CalculationResults { forces: vec![[0.0; 3]; 2], ..Default::default() };
         assert_eq!(check_numbers(&good, 2), Ok(()));
         assert!(check_numbers(&good, 3).is_err());
-        let nan = |change: fn(&mut Results)| {
+        let nan = |change: fn(&mut CalculationResults)| {
             let mut bad = good.clone();
             change(&mut bad);
             check_numbers(&bad, 2).unwrap_err().message

@@ -33,11 +33,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::checks::{at_least, positive};
-use crate::moments::{self, Moments};
+use crate::moments::{self, InitialMagneticMoments};
 use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, SetupError, Size, Smearing,
-    executable, version_query,
+    CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, Failure, FailureClass,
+    RetryAdjustment, SetupError, Smearing, executable, version_query,
 };
 use potcar::Potcar;
 
@@ -50,7 +50,7 @@ const INPUT_VERSION: u32 = 1;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 #[schemars(extend("required" = ["version", "pseudopotentials"]))]
-pub struct Settings {
+pub struct VaspSettings {
     /// VASP with its launcher: `["mpirun", "-np", "16", "vasp_std"]`.
     pub command: Vec<String>,
     /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
@@ -87,7 +87,7 @@ pub struct Settings {
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B (`MAGMOM`). Default: 1.
     #[serde(rename = "initial_magnetic_moments")]
-    pub moments: Moments,
+    pub moments: InitialMagneticMoments,
     /// Tolerance of the energy in the last electronic step, eV (`EDIFF`).
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
@@ -108,7 +108,7 @@ pub struct Settings {
     pub tags: BTreeMap<String, String>,
 }
 
-impl Default for Settings {
+impl Default for VaspSettings {
     fn default() -> Self {
         Self {
             command: vec!["vasp_std".into()],
@@ -123,7 +123,7 @@ impl Default for Settings {
             smearing: Smearing::Gaussian,
             smearing_width: 0.1,
             spin: true,
-            moments: Moments::new(),
+            moments: InitialMagneticMoments::new(),
             energy_tolerance: 1e-6,
             steps: 100,
             vacuum: 10.0,
@@ -134,7 +134,7 @@ impl Default for Settings {
     }
 }
 
-impl Settings {
+impl VaspSettings {
     /// Finds the program and reads the POTCAR files.
     ///
     /// # Errors
@@ -223,7 +223,7 @@ impl Settings {
 /// A configured VASP.
 #[derive(Clone, Debug)]
 pub struct Vasp {
-    settings: Settings,
+    settings: VaspSettings,
     potcars: BTreeMap<Species, Potcar>,
 }
 
@@ -245,7 +245,7 @@ impl DftBackend for Vasp {
         };
         let pseudopotentials: BTreeMap<&str, Value> = self.potcars.iter().map(potcar).collect();
         // Destructure, so that a new setting cannot be forgotten here.
-        let Settings {
+        let VaspSettings {
             command: _,
             environment: _,
             version,
@@ -282,7 +282,7 @@ impl DftBackend for Vasp {
         &self,
         structure: &Structure,
         adjustments: &BTreeSet<RetryAdjustment>,
-    ) -> Result<Input, Failure> {
+    ) -> Result<CalculationInput, Failure> {
         let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
         let (poscar, order) = poscar(&padded.structure)?;
         let mut potcar = Vec::new();
@@ -301,23 +301,28 @@ impl DftBackend for Vasp {
             ("INCAR", incar::incar(&self.settings, &moments, adjustments).into_bytes()),
             ("KPOINTS", incar::kpoints(padded.mesh(k_spacing), k_spacing).into_bytes()),
         ];
-        Ok(Input {
+        Ok(CalculationInput {
             files: files.map(|(name, content)| (name.to_owned(), content)).into(),
             command: self.settings.command.clone(),
             environment: version_query::environment(&self.settings.environment),
-            ..Input::default()
+            ..CalculationInput::default()
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure> {
         let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
         let (_, order) = poscar(&padded.structure)?;
         let calculated = result::read(&padded.structure, &order, &self.settings.version, directory, exit)?;
         Ok(padded.without_padding_stress(calculated))
     }
 
-    fn size(&self, structure: &Structure) -> Size {
-        let Settings { vacuum, k_spacing, .. } = self.settings;
+    fn size(&self, structure: &Structure) -> CalculationSize {
+        let VaspSettings { vacuum, k_spacing, .. } = self.settings;
         let potcars = structure.species.iter().filter_map(|species| self.potcars.get(species));
         padded_structure::size(structure, vacuum, k_spacing, potcars.map(|potcar| potcar.valence).sum())
     }

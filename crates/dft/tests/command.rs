@@ -6,8 +6,8 @@ use std::process::Command;
 
 use atoms::{Cell, Structure};
 use dft::{
-    DftBackend, Exit, Failure, FailureClass, PassedEnvironment, Results, RetryAdjustment, Settings,
-    SetupError,
+    CalculationResults, DftBackend, DftSettings, Exit, Failure, FailureClass, PassedEnvironment,
+    RetryAdjustment, SetupError,
 };
 
 /// Copies the columns of the structure and adds the label; exits with the given code.
@@ -33,11 +33,11 @@ fn oxide() -> Structure {
 }
 
 /// Settings for [`SCRIPT`] with this end of the comment line and this exit code.
-fn settings(directory: &Path, info: &str, code: u8) -> dft::command::Settings {
+fn settings(directory: &Path, info: &str, code: u8) -> dft::command::CommandSettings {
     for (name, content) in [("label.sh", SCRIPT), ("more", info), ("code", &code.to_string())] {
         std::fs::write(directory.join(name), content).unwrap();
     }
-    dft::command::Settings {
+    dft::command::CommandSettings {
         command: ["sh", "label.sh"].map(str::to_owned).to_vec(),
         files: ["label.sh", "more", "code"].map(|name| directory.join(name)).to_vec(),
         version: "1".to_owned(),
@@ -50,7 +50,7 @@ fn run(
     structure: &Structure,
     adjustments: &[RetryAdjustment],
     place: &Path,
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     let input = code.input(structure, &BTreeSet::from_iter(adjustments.iter().copied()))?;
     for (name, content) in &input.files {
         std::fs::write(place.join(name), content).unwrap();
@@ -61,7 +61,7 @@ fn run(
     code.read(structure, place, Exit::Code(status.code().unwrap()))
 }
 
-fn label(info: &str, code: u8) -> Result<Results, Failure> {
+fn label(info: &str, code: u8) -> Result<CalculationResults, Failure> {
     let (home, place) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     run(&settings(home.path(), info, code).prepare().unwrap(), &oxide(), &[], place.path())
 }
@@ -72,7 +72,7 @@ fn a_script_makes_a_label() {
     let code = settings(home.path(), INFO, 0).prepare().unwrap();
     let adjustments = [RetryAdjustment::OtherMoments, RetryAdjustment::MoreSteps];
     let calculated = run(&code, &oxide(), &adjustments, place.path()).unwrap();
-    let expected = Results {
+    let expected = CalculationResults {
         energy: -1.625,
         energy_without_smearing: Some(-1.5),
         forces: vec![[0.5, -0.25, 1e-3]; 3],
@@ -147,11 +147,11 @@ fn a_file_cut_anywhere_is_no_label() {
 #[test]
 fn files_are_among_the_paths() {
     let text = r#"{ "command": { "command": ["sh", "a"], "files": ["a", "b"], "version": "1" } }"#;
-    let mut settings: Settings = serde_json::from_str(text).unwrap();
+    let mut settings: DftSettings = serde_json::from_str(text).unwrap();
     assert_eq!(settings.paths(), [&mut PathBuf::from("a"), &mut PathBuf::from("b")]);
     assert_eq!(settings.name(), "command");
     assert!(settings.prepare(&PassedEnvironment::default()).is_err());
-    assert!(serde_json::from_str::<Settings>(&text.replace("files", "file")).is_err());
+    assert!(serde_json::from_str::<DftSettings>(&text.replace("files", "file")).is_err());
 }
 
 #[test]
@@ -180,12 +180,13 @@ fn calculations_read_the_files_that_were_hashed() {
 #[test]
 fn what_is_missing_is_found_before_anything_runs() {
     let home = tempfile::tempdir().unwrap();
-    let fault = |change: &dyn Fn(&mut dft::command::Settings)| {
+    let fault = |change: &dyn Fn(&mut dft::command::CommandSettings)| {
         let mut settings = settings(home.path(), INFO, 0);
         change(&mut settings);
         settings.prepare().unwrap_err()
     };
-    let program = |settings: &mut dft::command::Settings, name: &str| settings.command[0] = name.to_owned();
+    let program =
+        |settings: &mut dft::command::CommandSettings, name: &str| settings.command[0] = name.to_owned();
     for name in ["no-such-program", "/no/such/program", "./label.sh"] {
         let found = fault(&|settings| program(settings, name));
         assert!(matches!(&found, SetupError::Program { program, .. } if program == name), "{found}");

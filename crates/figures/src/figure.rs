@@ -15,12 +15,12 @@ pub struct Figure {
     /// Height, points.
     pub height: f64,
     /// From bottom to top.
-    pub items: Vec<Item>,
+    pub items: Vec<FigureItem>,
 }
 
 /// An item of a figure.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Item {
+pub enum FigureItem {
     /// Polylines and the area they enclose (even-odd rule).
     Shape {
         /// Several lines form one shape, with holes where they enclose each other.
@@ -50,7 +50,7 @@ pub enum Item {
         clip: Option<Rectangle>,
     },
     /// Text.
-    Text(Text),
+    Text(FigureText),
 }
 
 /// Shape of a marker.
@@ -64,7 +64,7 @@ pub enum Marker {
 
 /// A line of text with `_{subscript}` and `^{superscript}`.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Text {
+pub struct FigureText {
     /// Position on the baseline.
     pub position: Point,
     /// The text.
@@ -103,34 +103,46 @@ impl Figure {
     /// Draws a polyline.
     pub fn line(&mut self, points: Vec<Point>, stroke: Stroke) {
         let lines = vec![points];
-        self.items.push(Item::Shape { lines, closed: false, fill: None, stroke: Some(stroke), clip: None });
+        self.items.push(FigureItem::Shape {
+            lines,
+            closed: false,
+            fill: None,
+            stroke: Some(stroke),
+            clip: None,
+        });
     }
 
     /// Draws a filled rectangle.
     pub fn rectangle(&mut self, place: Rectangle, fill: Paint) {
         let lines = vec![place.corners()];
-        self.items.push(Item::Shape { lines, closed: true, fill: Some(fill), stroke: None, clip: None });
+        self.items.push(FigureItem::Shape {
+            lines,
+            closed: true,
+            fill: Some(fill),
+            stroke: None,
+            clip: None,
+        });
     }
 
     /// Draws text.
-    pub fn text(&mut self, position: Point, markup: &str, anchor: Anchor) -> &mut Text {
-        self.items.push(Item::Text(Text {
+    pub fn text(&mut self, position: Point, markup: &str, anchor: Anchor) -> &mut FigureText {
+        self.items.push(FigureItem::Text(FigureText {
             position,
             markup: markup.into(),
-            size: Text::SIZE,
+            size: FigureText::SIZE,
             anchor,
             bold: false,
             rotated: false,
             colour: Colour::INK,
         }));
         match self.items.last_mut() {
-            Some(Item::Text(text)) => text,
+            Some(FigureItem::Text(text)) => text,
             _ => unreachable!("it was just put there"),
         }
     }
 }
 
-impl Text {
+impl FigureText {
     /// Default font size, points.
     pub const SIZE: f64 = 8.0;
 }

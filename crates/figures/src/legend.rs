@@ -1,6 +1,6 @@
 //! Legends.
 
-use crate::{Anchor, Figure, Item, Marker, Paint, Rectangle, Stroke, Text, width};
+use crate::{Anchor, Figure, FigureItem, FigureText, Marker, Paint, Rectangle, Stroke, width};
 
 /// The sample of a legend entry.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,7 +19,7 @@ const GAP: f64 = 12.0;
 
 /// Draws entries in a row that ends at `right`, with the text on the baseline `base`.
 pub fn legend(figure: &mut Figure, [right, base]: [f64; 2], keys: &[(LegendKey, &str)]) {
-    let of = |words: &str| SAMPLE + 4.0 + Text::SIZE * width(words, false);
+    let of = |words: &str| SAMPLE + 4.0 + FigureText::SIZE * width(words, false);
     let whole =
         keys.iter().map(|(_, words)| of(words)).sum::<f64>() + GAP * keys.len().saturating_sub(1) as f64;
     let mut x = right - whole;
@@ -37,7 +37,14 @@ fn draw(figure: &mut Figure, key: LegendKey, place: Rectangle) {
         LegendKey::Line(stroke) => figure.line(vec![[place.x, middle], [place.right(), middle]], stroke),
         LegendKey::Dot(marker, fill) => {
             let centres = vec![[place.x + 0.5 * place.width, middle]];
-            figure.items.push(Item::Dots { centres, marker, radius: 2.2, fill, stroke: None, clip: None });
+            figure.items.push(FigureItem::Dots {
+                centres,
+                marker,
+                radius: 2.2,
+                fill,
+                stroke: None,
+                clip: None,
+            });
         }
     }
 }

@@ -15,14 +15,14 @@ mod ticks;
 
 pub use axis::Axis;
 pub use colours::{Colour, Paint, Stroke};
-pub use figure::{Figure, Item, Marker, Rectangle, Text};
+pub use figure::{Figure, FigureItem, FigureText, Marker, Rectangle};
 pub use font::{BOLD, FAMILY, REGULAR};
 pub use legend::{LegendKey, legend};
-pub use panel::{Panel, Side};
+pub use panel::{MarginalSide, Panel};
 pub use png::{PngError, to_png};
 pub use rich_text::{Anchor, escape, plain, to_html, width};
 pub use svg::to_svg;
-pub use ticks::Scale;
+pub use ticks::AxisScale;
 
 /// A point on a sheet or in data coordinates: x, y.
 pub type Point = [f64; 2];

@@ -1,7 +1,7 @@
 //! Plots data between two axes.
 
 use crate::axis::Axis;
-use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text};
+use crate::{Anchor, Colour, Figure, FigureItem, FigureText, Marker, Paint, Point, Rectangle, Stroke};
 
 /// Length of a major and of a minor tick, points.
 const TICK: f64 = 3.0;
@@ -18,7 +18,7 @@ pub struct Panel {
     pub x: Axis,
     /// Vertical axis.
     pub y: Axis,
-    data: Vec<Item>,
+    data: Vec<FigureItem>,
 }
 
 impl Panel {
@@ -72,7 +72,7 @@ impl Panel {
         let centres: Vec<_> = points.into_iter().map(|point| self.to_sheet(point)).collect();
         if !centres.is_empty() {
             let (fill, clip) = (fill.into(), Some(self.area));
-            self.data.push(Item::Dots { centres, marker, radius, fill, stroke, clip });
+            self.data.push(FigureItem::Dots { centres, marker, radius, fill, stroke, clip });
         }
     }
 
@@ -83,13 +83,13 @@ impl Panel {
     }
 
     /// Draws text at data coordinates with an offset in points.
-    pub fn text(&mut self, at: Point, [right, down]: Point, words: &str, anchor: Anchor) -> &mut Text {
+    pub fn text(&mut self, at: Point, [right, down]: Point, words: &str, anchor: Anchor) -> &mut FigureText {
         let [x, y] = self.to_sheet(at);
         let mut sheet = Figure::new("", "", 0.0, 0.0);
-        sheet.text([x + right, y + down], words, anchor).size = Text::SIZE - 1.0;
+        sheet.text([x + right, y + down], words, anchor).size = FigureText::SIZE - 1.0;
         self.data.append(&mut sheet.items);
         match self.data.last_mut() {
-            Some(Item::Text(text)) => text,
+            Some(FigureItem::Text(text)) => text,
             _ => unreachable!("it was just put there"),
         }
     }
@@ -114,22 +114,25 @@ impl Panel {
     pub fn draw(self, figure: &mut Figure) {
         let sides = vec![self.area.corners()];
         let stroke = Some(Colour::INK.line(AXIS));
-        self.draw_with(figure, Item::Shape { lines: sides, closed: true, fill: None, stroke, clip: None });
+        self.draw_with(
+            figure,
+            FigureItem::Shape { lines: sides, closed: true, fill: None, stroke, clip: None },
+        );
     }
 
     /// Draws the panel as a marginal plot, with one axis line only.
-    pub fn draw_as_margin(self, figure: &mut Figure, side: Side) {
+    pub fn draw_as_margin(self, figure: &mut Figure, side: MarginalSide) {
         let corners = self.area.corners();
         let line = match side {
-            Side::Below => vec![corners[3], corners[2]],
-            Side::Left => vec![corners[3], corners[0]],
+            MarginalSide::Below => vec![corners[3], corners[2]],
+            MarginalSide::Left => vec![corners[3], corners[0]],
         };
         let stroke = Some(Colour::INK.line(AXIS));
-        let item = Item::Shape { lines: vec![line], closed: false, fill: None, stroke, clip: None };
+        let item = FigureItem::Shape { lines: vec![line], closed: false, fill: None, stroke, clip: None };
         self.draw_with(figure, item);
     }
 
-    fn draw_with(mut self, figure: &mut Figure, sides: Item) {
+    fn draw_with(mut self, figure: &mut Figure, sides: FigureItem) {
         figure.items.append(&mut self.data);
         figure.items.push(sides);
         self.draw_horizontal(figure);
@@ -158,8 +161,8 @@ impl Panel {
             let length = if tick.label.is_empty() { SMALL_TICK } else { TICK };
             figure.line(vec![[left, y], [left - length, y]], Colour::INK.line(AXIS));
             if !tick.label.is_empty() {
-                figure.text([left - 5.0, y + 0.35 * Text::SIZE], &tick.label, Anchor::End);
-                widest = widest.max(Text::SIZE * crate::width(&tick.label, false));
+                figure.text([left - 5.0, y + 0.35 * FigureText::SIZE], &tick.label, Anchor::End);
+                widest = widest.max(FigureText::SIZE * crate::width(&tick.label, false));
             }
         }
         let middle = self.area.y + 0.5 * self.area.height;
@@ -176,14 +179,14 @@ impl Panel {
         let line = |line: L| -> Vec<Point> { line.into_iter().map(|point| self.to_sheet(point)).collect() };
         let lines: Vec<_> = lines.into_iter().map(line).filter(|line| line.len() > 1).collect();
         if !lines.is_empty() {
-            self.data.push(Item::Shape { lines, closed, fill, stroke, clip: Some(self.area) });
+            self.data.push(FigureItem::Shape { lines, closed, fill, stroke, clip: Some(self.area) });
         }
     }
 }
 
 /// The axis line of a marginal plot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Side {
+pub enum MarginalSide {
     /// The lower one, for a plot above its panel.
     Below,
     /// The left one, for a plot to the right of its panel.

@@ -4,7 +4,9 @@ use tiny_skia::{FillRule, LineJoin, Mask, PathBuilder, Pixmap, StrokeDash, Trans
 use ttf_parser::OutlineBuilder;
 
 use crate::rich_text::runs;
-use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text, font, width};
+use crate::{
+    Anchor, Colour, Figure, FigureItem, FigureText, Marker, Paint, Point, Rectangle, Stroke, font, width,
+};
 
 /// Points per inch.
 const POINTS_PER_INCH: f64 = 72.0;
@@ -56,21 +58,21 @@ struct Sheet {
 }
 
 impl Sheet {
-    fn item(&mut self, item: &Item) {
+    fn item(&mut self, item: &FigureItem) {
         match item {
-            Item::Shape { lines, closed, fill, stroke, clip } => {
+            FigureItem::Shape { lines, closed, fill, stroke, clip } => {
                 let mut builder = PathBuilder::new();
                 lines.iter().for_each(|line| add(&mut builder, line, *closed));
                 self.path(builder, *fill, *stroke, *clip);
             }
-            Item::Dots { centres, marker, radius, fill, stroke, clip } => {
+            FigureItem::Dots { centres, marker, radius, fill, stroke, clip } => {
                 for centre in centres {
                     let mut builder = PathBuilder::new();
                     add_mark(&mut builder, *marker, *centre, *radius);
                     self.path(builder, Some(*fill), *stroke, *clip);
                 }
             }
-            Item::Text(text) => self.text(text),
+            FigureItem::Text(text) => self.text(text),
         }
     }
 
@@ -114,8 +116,8 @@ impl Sheet {
         });
     }
 
-    fn text(&mut self, text: &Text) {
-        let Text { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
+    fn text(&mut self, text: &FigureText) {
+        let FigureText { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
         let length = size * width(markup, *bold);
         let mut pen = match anchor {
             Anchor::Start => 0.0,

@@ -15,7 +15,7 @@ pub enum Anchor {
 
 /// A part of a text with one style.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Run<'a> {
+pub struct TextRun<'a> {
     /// The characters.
     pub text: &'a str,
     /// Vertical style.
@@ -50,11 +50,11 @@ impl Script {
 }
 
 /// Splits a text into runs. Unclosed braces end with the text.
-pub fn runs(markup: &str) -> Vec<Run<'_>> {
+pub fn runs(markup: &str) -> Vec<TextRun<'_>> {
     let (mut runs, mut rest) = (Vec::new(), markup);
     let mut push = |text, script| {
         if !str::is_empty(text) {
-            runs.push(Run { text, script });
+            runs.push(TextRun { text, script });
         }
     };
     loop {
@@ -72,13 +72,13 @@ pub fn runs(markup: &str) -> Vec<Run<'_>> {
 
 /// Width of a text at font size 1.
 pub fn width(markup: &str, bold: bool) -> f64 {
-    let of = |run: Run<'_>| run.script.scale() * run.text.chars().map(|c| advance(c, bold)).sum::<f64>();
+    let of = |run: TextRun<'_>| run.script.scale() * run.text.chars().map(|c| advance(c, bold)).sum::<f64>();
     runs(markup).into_iter().map(of).sum()
 }
 
 /// The text without braces, for data files.
 pub fn plain(markup: &str) -> String {
-    let of = |run: &Run<'_>| match run.script {
+    let of = |run: &TextRun<'_>| match run.script {
         Script::Normal => run.text.to_owned(),
         Script::Sub => format!("_{}", run.text),
         Script::Super => format!("^{}", run.text),
@@ -88,7 +88,7 @@ pub fn plain(markup: &str) -> String {
 
 /// The text as HTML.
 pub fn to_html(markup: &str) -> String {
-    let of = |run: &Run<'_>| {
+    let of = |run: &TextRun<'_>| {
         let text = escape(run.text);
         match run.script {
             Script::Normal => text,

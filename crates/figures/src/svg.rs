@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use crate::font::FAMILY;
 use crate::rich_text::{escape, runs};
-use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text};
+use crate::{Anchor, Colour, Figure, FigureItem, FigureText, Marker, Paint, Point, Rectangle, Stroke};
 
 /// The SVG element, for a file or for HTML.
 pub fn to_svg(figure: &Figure) -> String {
@@ -30,25 +30,25 @@ struct Svg<'a> {
 }
 
 impl Svg<'_> {
-    fn item(&mut self, item: &Item) {
+    fn item(&mut self, item: &FigureItem) {
         match item {
-            Item::Shape { lines, closed, fill, stroke, clip } => {
+            FigureItem::Shape { lines, closed, fill, stroke, clip } => {
                 let data: String = lines.iter().map(|line| path(line, *closed)).collect();
                 let style = format!("{}{}{}", filled(*fill), stroked(*stroke), self.clipped(*clip));
                 self.push(&format!("<path d=\"{data}\"{style}/>"));
             }
-            Item::Dots { centres, marker, radius, fill, stroke, clip } => {
+            FigureItem::Dots { centres, marker, radius, fill, stroke, clip } => {
                 let style = format!("{}{}{}", filled(Some(*fill)), stroked(*stroke), self.clipped(*clip));
                 self.push(&format!("<g{style}>"));
                 let marks: String = centres.iter().map(|centre| mark(*marker, *centre, *radius)).collect();
                 self.push(&format!("{marks}</g>"));
             }
-            Item::Text(text) => self.text(text),
+            FigureItem::Text(text) => self.text(text),
         }
     }
 
-    fn text(&mut self, text: &Text) {
-        let Text { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
+    fn text(&mut self, text: &FigureText) {
+        let FigureText { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
         let anchor = match anchor {
             Anchor::Start => "start",
             Anchor::Middle => "middle",

@@ -2,7 +2,7 @@
 
 /// The mapping of values to positions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Scale {
+pub enum AxisScale {
     /// Linear.
     Linear,
     /// Logarithmic.
@@ -19,10 +19,10 @@ pub struct Tick {
 }
 
 /// Ticks of an axis from `low` to `high`, about `number` of them labelled.
-pub fn choose(scale: Scale, low: f64, high: f64, number: usize) -> Vec<Tick> {
+pub fn choose(scale: AxisScale, low: f64, high: f64, number: usize) -> Vec<Tick> {
     match scale {
-        Scale::Linear => linear(low, high, number),
-        Scale::Logarithmic => logarithmic(low, high, number),
+        AxisScale::Linear => linear(low, high, number),
+        AxisScale::Logarithmic => logarithmic(low, high, number),
     }
 }
 

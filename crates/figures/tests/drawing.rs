@@ -1,7 +1,8 @@
 //! A figure with every kind of item, as SVG and as PNG.
 
 use figures::{
-    Anchor, Axis, Colour, Figure, LegendKey, Marker, Panel, Rectangle, Scale, Side, legend, to_png, to_svg,
+    Anchor, Axis, AxisScale, Colour, Figure, LegendKey, MarginalSide, Marker, Panel, Rectangle, legend,
+    to_png, to_svg,
 };
 use quick_xml::Reader;
 use quick_xml::events::Event;
@@ -9,8 +10,8 @@ use quick_xml::events::Event;
 fn figure() -> Figure {
     let mut figure = Figure::new("test", "Errors <by> \"γ\"", 200.0, 150.0);
     let place = Rectangle { x: 50.0, y: 40.0, width: 120.0, height: 70.0 };
-    let x = Axis::new("γ_{nbr}", Scale::Logarithmic, 0.1, 10.0);
-    let y = Axis::new("error (eV Å^{−1})", Scale::Linear, 0.0, 2.0);
+    let x = Axis::new("γ_{nbr}", AxisScale::Logarithmic, 0.1, 10.0);
+    let y = Axis::new("error (eV Å^{−1})", AxisScale::Linear, 0.0, 2.0);
     let mut panel = Panel::new(place, x, y);
     panel.band(&[(0.1, 0.0, 1.0), (1.0, 0.5, 1.5), (10.0, 1.0, 9.0)], Colour::BLUE.faint(0.3));
     panel.line([[0.1, 0.5], [10.0, 1.5]], Colour::VERMILLION.line(1.0));
@@ -22,8 +23,8 @@ fn figure() -> Figure {
     panel.panel_letter('a');
     panel.draw(&mut figure);
     let margin = Rectangle { x: 50.0, y: 20.0, width: 120.0, height: 18.0 };
-    let bare = Axis::new("", Scale::Linear, 0.0, 1.0).without_ticks();
-    Panel::new(margin, bare.clone(), bare).draw_as_margin(&mut figure, Side::Below);
+    let bare = Axis::new("", AxisScale::Linear, 0.0, 1.0).without_ticks();
+    Panel::new(margin, bare.clone(), bare).draw_as_margin(&mut figure, MarginalSide::Below);
     legend(&mut figure, [170.0, 12.0], &[(LegendKey::Line(Colour::BLUE.dashed(1.0)), "control & more")]);
     figure
 }

@@ -13,7 +13,7 @@ use crate::volume_ramp::VolumeRamp;
 
 /// The settings of a run, apart from its initial state.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Settings {
+pub struct DynamicsSettings {
     /// Time step, fs; see [`default_time_step`].
     pub time_step: f64,
     /// The thermostat.
@@ -44,12 +44,12 @@ impl Dynamics {
     /// If state or settings are invalid or the potential cannot evaluate the structure.
     pub fn new(
         state: State,
-        settings: Settings,
+        settings: DynamicsSettings,
         potential: &mut dyn Potential,
     ) -> Result<Self, DynamicsError> {
         let mut evaluation = Evaluation::default();
         evaluation.reset(state.structure.len());
-        let Settings { time_step, thermostat, ramp, stream, skin } = settings;
+        let DynamicsSettings { time_step, thermostat, ramp, stream, skin } = settings;
         let start = Checkpoint { state, evaluation, thermostat, ramp, time_step, stream };
         let mut dynamics = Self::resume(start, potential.cutoff(), skin)?;
         dynamics.evaluate(potential)?;

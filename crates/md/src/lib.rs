@@ -20,7 +20,7 @@ mod volume_ramp;
 mod wrong_setting;
 
 pub use checkpoint::Checkpoint;
-pub use dynamics::{Dynamics, Settings, default_time_step};
+pub use dynamics::{Dynamics, DynamicsSettings, default_time_step};
 pub use error::DynamicsError;
 pub use fire::{Fire, Relaxed};
 pub use langevin::{Langevin, LangevinSettings};

@@ -1,7 +1,8 @@
 //! A run that stops and resumes equals one that never stopped, bit for bit.
 
 use md::{
-    Checkpoint, Dynamics, DynamicsError, Langevin, NoseHooverChain, Settings, State, Thermostat, VolumeRamp,
+    Checkpoint, Dynamics, DynamicsError, DynamicsSettings, Langevin, NoseHooverChain, State, Thermostat,
+    VolumeRamp,
 };
 
 use crate::common::{LennardJones, argon_crystal, settings};
@@ -17,11 +18,11 @@ fn thermostats() -> [Thermostat; 3] {
 fn start(thermostat: Thermostat, periodic: [bool; 3], skin: f64) -> (Dynamics, LennardJones) {
     let mut structure = argon_crystal(2);
     structure.periodic = periodic;
-    let settings = Settings { skin, ..settings(5.0, thermostat) };
+    let settings = DynamicsSettings { skin, ..settings(5.0, thermostat) };
     let state = State::thermal(structure, 90.0, &settings.stream);
     let ramp = Some(VolumeRamp::new(&state, 1.0, 1.2, 150));
     let mut potential = LennardJones::argon();
-    let dynamics = Dynamics::new(state, Settings { ramp, ..settings }, &mut potential).unwrap();
+    let dynamics = Dynamics::new(state, DynamicsSettings { ramp, ..settings }, &mut potential).unwrap();
     (dynamics, potential)
 }
 

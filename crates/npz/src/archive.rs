@@ -11,20 +11,20 @@ use npyz::{DType, Deserialize, TypeChar, TypeRead};
 
 use crate::array::Array;
 use crate::error::{ArrayName, Error};
-use crate::header::Header;
+use crate::header::NpyHeader;
 
 /// Larger arrays count as corrupt, bytes.
 const MAX_ARRAY_BYTES: u64 = 1 << 32;
 
 /// An open archive. Arrays are read on demand, and the archive records which ones were read.
-pub struct Archive<R: Read + Seek = BufReader<File>> {
+pub struct NpzFile<R: Read + Seek = BufReader<File>> {
     path: PathBuf,
     names: BTreeSet<String>,
     zip: RefCell<NpzArchive<R>>,
     requested: RefCell<BTreeSet<String>>,
 }
 
-impl Archive {
+impl NpzFile {
     /// Opens a file.
     ///
     /// # Errors
@@ -39,7 +39,7 @@ impl Archive {
     }
 }
 
-impl<'a> Archive<Cursor<&'a [u8]>> {
+impl<'a> NpzFile<Cursor<&'a [u8]>> {
     /// Reads an archive in memory; errors refer to it as `name`.
     ///
     /// # Errors
@@ -49,7 +49,7 @@ impl<'a> Archive<Cursor<&'a [u8]>> {
     }
 }
 
-impl<R: Read + Seek> Archive<R> {
+impl<R: Read + Seek> NpzFile<R> {
     fn read(path: &Path, source: R) -> Result<Self, Error> {
         let zip = NpzArchive::new(source)
             .map_err(|source| Error::NotAnArchive { path: path.to_owned(), source })?;
@@ -107,7 +107,7 @@ impl<R: Read + Seek> Archive<R> {
     /// Integers.
     ///
     /// # Errors
-    /// As [`Archive::numbers`].
+    /// As [`NpzFile::numbers`].
     pub fn integers(&self, key: &str) -> Result<Array<i64>, Error> {
         let entry = self.entry(key)?;
         match entry.kind() {
@@ -120,7 +120,7 @@ impl<R: Read + Seek> Archive<R> {
     /// Single-precision numbers.
     ///
     /// # Errors
-    /// As [`Archive::numbers`].
+    /// As [`NpzFile::numbers`].
     pub fn floats_f32(&self, key: &str) -> Result<Array<f32>, Error> {
         let entry = self.entry(key)?;
         match entry.kind() {
@@ -132,7 +132,7 @@ impl<R: Read + Seek> Archive<R> {
     /// Strings, stored as bytes (`S`) or characters (`U`), without NUL padding.
     ///
     /// # Errors
-    /// As [`Archive::numbers`].
+    /// As [`NpzFile::numbers`].
     pub fn strings(&self, key: &str) -> Result<Vec<String>, Error> {
         let entry = self.entry(key)?;
         let unpadded = |text: &str| text.trim_end_matches('\0').to_owned();
@@ -152,7 +152,7 @@ impl<R: Read + Seek> Archive<R> {
     ///
     /// Compares the header with the size in the archive before reading any data, and reads the data to their
     /// end, where the archive verifies the checksum.
-    fn entry(&self, key: &str) -> Result<Entry, Error> {
+    fn entry(&self, key: &str) -> Result<StoredArray, Error> {
         let name = self.array_name(key);
         if !self.contains(key) {
             return Err(name.missing());
@@ -166,8 +166,8 @@ impl<R: Read + Seek> Archive<R> {
         if stored > MAX_ARRAY_BYTES {
             return Err(name.damaged(format!("{stored} bytes"), "at most 4 GiB"));
         }
-        let header =
-            Header::read(&mut file).map_err(|found| name.damaged(found, "a plain array in .npy format"))?;
+        let header = NpyHeader::read(&mut file)
+            .map_err(|found| name.damaged(found, "a plain array in .npy format"))?;
         if header.kind.num_bytes().is_none() {
             return Err(name.wrong_type(header.kind, "numbers or text"));
         }
@@ -188,19 +188,19 @@ impl<R: Read + Seek> Archive<R> {
         if header.fortran_order && header.shape.len() > 1 {
             return Err(name.wrong_shape(format!("{:?} in Fortran order", header.shape), "C order"));
         }
-        Ok(Entry { name, header, items, data })
+        Ok(StoredArray { name, header, items, data })
     }
 }
 
 /// An array as stored.
-struct Entry {
+struct StoredArray {
     name: ArrayName,
-    header: Header,
+    header: NpyHeader,
     items: usize,
     data: Vec<u8>,
 }
 
-impl Entry {
+impl StoredArray {
     fn kind(&self) -> (TypeChar, u64) {
         (self.header.kind.type_char(), self.header.kind.size_field())
     }

@@ -2,13 +2,13 @@
 
 use std::io::{Read, Seek};
 
-use crate::{Archive, Error};
+use crate::{Error, NpzFile};
 
-impl<R: Read + Seek> Archive<R> {
+impl<R: Read + Seek> NpzFile<R> {
     /// Finite numbers of this shape.
     ///
     /// # Errors
-    /// As [`Archive::numbers`], and if the shape differs or a number is not finite.
+    /// As [`NpzFile::numbers`], and if the shape differs or a number is not finite.
     pub fn floats(&self, key: &str, shape: &[usize]) -> Result<Vec<f64>, Error> {
         self.numbers(key)?.finite()?.with_shape(shape)
     }
@@ -16,7 +16,7 @@ impl<R: Read + Seek> Archive<R> {
     /// Shape and finite numbers of a non-empty array with `N` dimensions.
     ///
     /// # Errors
-    /// As [`Archive::floats`].
+    /// As [`NpzFile::floats`].
     pub fn tensor<const N: usize>(&self, key: &str) -> Result<([usize; N], Vec<f64>), Error> {
         self.numbers(key)?.finite()?.tensor()
     }
@@ -24,7 +24,7 @@ impl<R: Read + Seek> Archive<R> {
     /// One finite number, of shape `()` or `(1,)`.
     ///
     /// # Errors
-    /// As [`Archive::floats`].
+    /// As [`NpzFile::floats`].
     pub fn scalar(&self, key: &str) -> Result<f64, Error> {
         self.numbers(key)?.finite()?.into_scalar()
     }
@@ -32,7 +32,7 @@ impl<R: Read + Seek> Archive<R> {
     /// One finite number, or `default` if the array is absent.
     ///
     /// # Errors
-    /// As [`Archive::floats`].
+    /// As [`NpzFile::floats`].
     pub fn scalar_or(&self, key: &str, default: f64) -> Result<f64, Error> {
         if self.contains(key) { self.scalar(key) } else { Ok(default) }
     }
@@ -40,7 +40,7 @@ impl<R: Read + Seek> Archive<R> {
     /// One integer from `min` to `max`.
     ///
     /// # Errors
-    /// As [`Archive::integers`], and if there is not exactly one integer within these bounds.
+    /// As [`NpzFile::integers`], and if there is not exactly one integer within these bounds.
     pub fn count(&self, key: &str, min: usize, max: usize) -> Result<usize, Error> {
         let value = self.integers(key)?.into_scalar()?;
         match usize::try_from(value) {
@@ -52,7 +52,7 @@ impl<R: Read + Seek> Archive<R> {
     /// One integer that must equal `expected`, which other arrays determine.
     ///
     /// # Errors
-    /// As [`Archive::count`].
+    /// As [`NpzFile::count`].
     pub fn expect_count(&self, key: &str, expected: usize) -> Result<(), Error> {
         let value = self.integers(key)?.into_scalar()?;
         if usize::try_from(value) == Ok(expected) {
@@ -64,7 +64,7 @@ impl<R: Read + Seek> Archive<R> {
     /// A flag, 0 or 1; `default` if absent.
     ///
     /// # Errors
-    /// As [`Archive::count`].
+    /// As [`NpzFile::count`].
     pub fn flag_or(&self, key: &str, default: bool) -> Result<bool, Error> {
         if self.contains(key) { Ok(self.count(key, 0, 1)? == 1) } else { Ok(default) }
     }
@@ -72,7 +72,7 @@ impl<R: Read + Seek> Archive<R> {
     /// Indices below `bound`, any number of them.
     ///
     /// # Errors
-    /// As [`Archive::integers`], and if an index is not below the bound.
+    /// As [`NpzFile::integers`], and if an index is not below the bound.
     pub fn indices(&self, key: &str, bound: usize) -> Result<Vec<usize>, Error> {
         let check = |i: &i64| usize::try_from(*i).ok().filter(|i| *i < bound).ok_or(*i);
         self.integers(key)?.data.iter().map(check).collect::<Result<_, _>>().map_err(|i| {
@@ -87,7 +87,7 @@ impl<R: Read + Seek> Archive<R> {
     /// `length` indices below `bound`.
     ///
     /// # Errors
-    /// As [`Archive::indices`], and if the number of indices differs.
+    /// As [`NpzFile::indices`], and if the number of indices differs.
     pub fn exactly_indices(&self, key: &str, length: usize, bound: usize) -> Result<Vec<usize>, Error> {
         let indices = self.indices(key, bound)?;
         if indices.len() == length {

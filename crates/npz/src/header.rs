@@ -13,7 +13,7 @@ const MAX_HEADER_BYTES: usize = 1 << 16;
 
 /// Type and shape of an array.
 #[derive(Debug)]
-pub(crate) struct Header {
+pub(crate) struct NpyHeader {
     pub kind: TypeStr,
     pub fortran_order: bool,
     pub shape: Vec<usize>,
@@ -21,7 +21,7 @@ pub(crate) struct Header {
     pub length: u64,
 }
 
-impl Header {
+impl NpyHeader {
     /// Reads up to the start of the data.
     pub fn read(mut source: impl Read) -> Result<Self, String> {
         let mut fixed = [0; 8];
@@ -66,7 +66,7 @@ fn bytes<const N: usize>(source: &mut impl Read) -> Result<[u8; N], String> {
 struct Dictionary<'a>(&'a str);
 
 impl<'a> Dictionary<'a> {
-    fn header(mut self, length: u64) -> Result<Header, String> {
+    fn header(mut self, length: u64) -> Result<NpyHeader, String> {
         let (mut kind, mut fortran_order, mut shape) = (None, None, None);
         self.expect("{")?;
         while !self.take("}") {
@@ -88,7 +88,7 @@ impl<'a> Dictionary<'a> {
         }
         match (kind, fortran_order, shape, self.0.trim_start()) {
             (Some(kind), Some(fortran_order), Some(shape), "") => {
-                Ok(Header { kind, fortran_order, shape, length })
+                Ok(NpyHeader { kind, fortran_order, shape, length })
             }
             (.., "") => Err("a header without one of descr, fortran_order and shape".to_owned()),
             (.., rest) => Err(format!("'{}' after the header", beginning(rest))),

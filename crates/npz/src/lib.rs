@@ -2,7 +2,7 @@
 //!
 //! ```no_run
 //! # fn read() -> Result<(), npz::Error> {
-//! let archive = npz::Archive::open("kokkos.npz".as_ref())?;
+//! let archive = npz::NpzFile::open("kokkos.npz".as_ref())?;
 //! let layers = archive.count("n_layers", 1, 64)?;
 //! let weights = archive.floats("weights", &[layers, 3])?;
 //! # Ok(())
@@ -16,7 +16,7 @@ mod error;
 mod header;
 mod writer;
 
-pub use archive::Archive;
+pub use archive::NpzFile;
 pub use array::Array;
 pub use error::Error;
 pub use writer::{Writer, names};

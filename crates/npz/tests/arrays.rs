@@ -2,14 +2,14 @@
 
 use std::path::Path;
 
-use npz::{Archive, Error};
+use npz::{Error, NpzFile};
 use proptest::prelude::*;
 
 use crate::common::{archive, array, file};
 
 /// Reads an archive with the single array `a`.
-fn read<T>(bytes: Vec<u8>, read: impl FnOnce(&Archive<std::io::Cursor<&[u8]>>) -> T) -> T {
-    read(&Archive::from_bytes("a.npz", &archive(&[("a", bytes)])).unwrap())
+fn read<T>(bytes: Vec<u8>, read: impl FnOnce(&NpzFile<std::io::Cursor<&[u8]>>) -> T) -> T {
+    read(&NpzFile::from_bytes("a.npz", &archive(&[("a", bytes)])).unwrap())
 }
 
 fn message<T: std::fmt::Debug>(result: Result<T, Error>) -> String {
@@ -63,7 +63,7 @@ fn texts_lose_their_padding() {
 #[test]
 fn an_archive_knows_its_names_and_what_was_asked() {
     let bytes = archive(&[("b", array(&[], &[1.0])), ("a", array(&[], &[2.0])), ("c", array(&[], &[2.0]))]);
-    let archive = Archive::from_bytes("a.npz", &bytes).unwrap();
+    let archive = NpzFile::from_bytes("a.npz", &bytes).unwrap();
     assert_eq!(archive.names().collect::<Vec<_>>(), ["a", "b", "c"]);
     assert!(archive.contains("a") && !archive.contains("d"));
     archive.scalar("a").unwrap();
@@ -73,7 +73,7 @@ fn an_archive_knows_its_names_and_what_was_asked() {
 
 #[test]
 fn files_that_are_no_archives_are_named() {
-    let open = |path: &Path| message(Archive::open(path).map(|_| ()));
+    let open = |path: &Path| message(NpzFile::open(path).map(|_| ()));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.npz");
     assert!(open(&path).contains("x.npz: No such file"));
@@ -81,7 +81,7 @@ fn files_that_are_no_archives_are_named() {
     std::fs::write(&path, "no archive").unwrap();
     assert!(open(&path).ends_with("expected a NumPy .npz archive"));
     std::fs::write(&path, archive(&[("a", array(&[], &[2.0]))])).unwrap();
-    assert_eq!(Archive::open(&path).unwrap().scalar("a").unwrap(), 2.0);
+    assert_eq!(NpzFile::open(&path).unwrap().scalar("a").unwrap(), 2.0);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Archives with valid checksums and hostile headers give errors, without panics or excessive allocation.
 
-use npz::{Archive, Error};
+use npz::{Error, NpzFile};
 use proptest::prelude::*;
 
 use crate::common::{archive, array, file};
@@ -8,7 +8,7 @@ use crate::common::{archive, array, file};
 /// The error for a file that can be read neither as numbers nor as strings.
 fn refused(bytes: Vec<u8>) -> Option<String> {
     let bytes = archive(&[("a", bytes)]);
-    let archive = Archive::from_bytes("hostile.npz", &bytes).unwrap();
+    let archive = NpzFile::from_bytes("hostile.npz", &bytes).unwrap();
     let errors = [
         archive.numbers("a").err(),
         archive.strings("a").err(),
@@ -116,7 +116,7 @@ fn archives_that_announce_more_than_they_hold_are_errors() {
         let list = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
         let announced = 10 + text.len() as u32 + items;
         bytes[list + 24..list + 28].copy_from_slice(&announced.to_le_bytes());
-        let archive = Archive::from_bytes("hostile.npz", &bytes).unwrap();
+        let archive = NpzFile::from_bytes("hostile.npz", &bytes).unwrap();
         let error = archive.numbers("a").unwrap_err().to_string();
         assert!(error.contains(&format!("found 80 bytes of data for shape [{items}] of |b1")), "{error}");
     }
@@ -157,7 +157,7 @@ proptest! {
     #[test]
     fn near_misses_are_errors_or_harmless(text in nearly_a_header(), length in 0..200_usize) {
         let bytes = archive(&[("a", file(text.as_bytes(), &vec![0; length]))]);
-        let archive = Archive::from_bytes("hostile.npz", &bytes).unwrap();
+        let archive = NpzFile::from_bytes("hostile.npz", &bytes).unwrap();
         if let Ok(array) = archive.numbers("a") {
             prop_assert!(array.data.len() <= length);
             prop_assert_eq!(array.shape.iter().product::<usize>(), array.data.len());
@@ -173,7 +173,7 @@ proptest! {
         let place = place % bytes.len();
         bytes[place] ^= change;
         let bytes = archive(&[("a", bytes)]);
-        if let Ok(array) = Archive::from_bytes("hostile.npz", &bytes).unwrap().numbers("a") {
+        if let Ok(array) = NpzFile::from_bytes("hostile.npz", &bytes).unwrap().numbers("a") {
             prop_assert_eq!(array.shape.iter().product::<usize>(), array.data.len());
         }
     }

@@ -2,7 +2,7 @@
 
 use std::io::Cursor;
 
-use npz::{Archive, Writer};
+use npz::{NpzFile, Writer};
 
 fn written() -> Vec<u8> {
     let mut out = Writer::new(Cursor::new(Vec::new()));
@@ -19,7 +19,7 @@ fn written() -> Vec<u8> {
 #[test]
 fn arrays_are_read_back() {
     let bytes = written();
-    let archive = Archive::from_bytes("a.npz", &bytes).unwrap();
+    let archive = NpzFile::from_bytes("a.npz", &bytes).unwrap();
     let matrix = archive.floats_f32("matrix").unwrap();
     assert_eq!((matrix.shape, matrix.data), (vec![2, 3], vec![0.0, 0.5, 1.0, 1.5, 2.0, 2.5]));
     assert_eq!(archive.numbers("empty").unwrap().shape, [0, 3]);
@@ -58,7 +58,7 @@ fn arrays_are_copied_from_another_archive() {
     out.copy(Cursor::new(written()), |key| key == "matrix" || key == "mode").unwrap();
     out.scalar("matrix", 3.0).unwrap();
     let bytes = out.finish().unwrap().into_inner();
-    let archive = Archive::from_bytes("copy.npz", &bytes).unwrap();
+    let archive = NpzFile::from_bytes("copy.npz", &bytes).unwrap();
     let names: Vec<&str> = archive.names().collect();
     assert_eq!(names, ["count", "empty", "flag", "matrix", "names", "none"]);
     assert_eq!(archive.numbers("matrix").unwrap().data, [3.0]);

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 
-use crate::eam_pairs::{AddForces, AddPairs, Bonds, Functions};
+use crate::eam_pairs::{AddForces, AddPairs, EamBonds, Functions};
 use crate::eam_spline::{self, Cubic};
 use crate::grace::Instructions;
 use crate::near_pairs::NearPairs;
@@ -37,7 +37,7 @@ pub struct Eam {
     sums: Vec<[f64; 2]>,
     /// F′(ρ_i), eV per unit of density.
     embedding_slopes: Vec<f64>,
-    bonds: Bonds,
+    bonds: EamBonds,
 }
 
 impl Eam {
@@ -65,7 +65,7 @@ impl Eam {
             kinds: Vec::new(),
             sums: Vec::new(),
             embedding_slopes: Vec::new(),
-            bonds: Bonds::default(),
+            bonds: EamBonds::default(),
         }
     }
 

@@ -3,7 +3,7 @@
 use atoms::{Evaluation, NeighbourList};
 
 use crate::eam_spline::{self, Cubic};
-use crate::grace::Pass;
+use crate::grace::SimdPass;
 use crate::near_pairs::{LANES, Lanes, NearPairs, sum};
 use crate::setfl::{EamStyle, Setfl};
 
@@ -71,15 +71,15 @@ const NONE: Lanes = [0.0; LANES];
 
 /// All pairs within the cutoff in blocks of eight, kept until the densities are known.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Bonds {
-    blocks: Vec<Block>,
+pub(crate) struct EamBonds {
+    blocks: Vec<PairBlock>,
     /// End of each atom's blocks.
     ends: Vec<usize>,
 }
 
 /// Eight pairs of an atom. Unused lanes are zero and point to the atom itself.
 #[derive(Clone, Copy, Debug)]
-struct Block {
+struct PairBlock {
     atoms: [u32; LANES],
     d: [Lanes; 3],
     /// φ′(r) / r, eV/Å².
@@ -90,7 +90,7 @@ struct Block {
     slope_there: Lanes,
 }
 
-impl Bonds {
+impl EamBonds {
     pub fn clear(&mut self) {
         self.blocks.clear();
         self.ends.clear();
@@ -104,10 +104,10 @@ pub(crate) struct AddPairs<'a> {
     pub kinds: &'a [usize],
     pub near: &'a mut NearPairs,
     pub sums: &'a mut [[f64; 2]],
-    pub bonds: &'a mut Bonds,
+    pub bonds: &'a mut EamBonds,
 }
 
-impl Pass for AddPairs<'_> {
+impl SimdPass for AddPairs<'_> {
     #[inline(always)]
     fn run(self, _: bool) {
         if self.functions.elements == 1 { self.add::<true>() } else { self.add::<false>() }
@@ -208,12 +208,12 @@ fn add_block<const ONE: bool>(
     Pieces { here, there, p, per_r }: &Pieces,
     atoms: [u32; LANES],
     d: [Lanes; 3],
-) -> (Block, Lanes, [Lanes; 2]) {
+) -> (PairBlock, Lanes, [Lanes; 2]) {
     let (mut energies, pair_slopes) = functions.evaluate(0, here, p);
     let (density_here, slopes_here) = functions.evaluate(1, here, p);
     let (density_there, slopes_there) =
         if ONE { (density_here, slopes_here) } else { functions.evaluate(1, there, p) };
-    let mut block = Block { atoms, d, pair_slope: NONE, slope_here: NONE, slope_there: NONE };
+    let mut block = PairBlock { atoms, d, pair_slope: NONE, slope_here: NONE, slope_there: NONE };
     for b in 0..LANES {
         let phi = energies[b] * per_r[b];
         energies[b] = 0.5 * phi;
@@ -227,7 +227,7 @@ fn add_block<const ONE: bool>(
 
 /// Adds forces and virial of all bonds, given F′(ρ) of each atom.
 pub(crate) struct AddForces<'a> {
-    pub bonds: &'a Bonds,
+    pub bonds: &'a EamBonds,
     pub embedding_slopes: &'a [f64],
     pub out: &'a mut Evaluation,
 }
@@ -235,7 +235,7 @@ pub(crate) struct AddForces<'a> {
 /// The independent components of a symmetric matrix.
 const UPPER: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)];
 
-impl Pass for AddForces<'_> {
+impl SimdPass for AddForces<'_> {
     #[inline(always)]
     fn run(self, _: bool) {
         let forces = &mut self.out.forces[..];
@@ -274,7 +274,7 @@ impl Pass for AddForces<'_> {
 
 /// E′(r) / r of eight pairs, eV/Å².
 #[inline(always)]
-fn slope(block: &Block, here: f64, embedding_slopes: &[f64]) -> Lanes {
+fn slope(block: &PairBlock, here: f64, embedding_slopes: &[f64]) -> Lanes {
     let mut slope = block.pair_slope;
     for b in 0..LANES {
         let there = embedding_slopes[block.atoms[b] as usize];

@@ -7,7 +7,7 @@ use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Struc
 
 use crate::pairs::{self, Elements};
 use crate::potential_file::PotentialFileError;
-use crate::stillinger_weber_file::{Entries, Parameters};
+use crate::stillinger_weber_file::{Parameters, StillingerWeberEntries};
 
 /// The Stillinger–Weber potential for one or several elements.
 ///
@@ -145,7 +145,7 @@ impl PairTerm {
 impl StillingerWeber {
     /// Reads a parameter file (`.sw`), which must have an entry for each ordered triplet of its elements.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, PotentialFileError> {
-        let Entries { species, parameters } = Entries::read(path.as_ref())?;
+        let StillingerWeberEntries { species, parameters } = StillingerWeberEntries::read(path.as_ref())?;
         let n = species.len();
         let pair_entry = |i: usize, j: usize| &parameters[(i * n + j) * n + j];
         let pair_terms: Vec<PairTerm> =

@@ -53,14 +53,14 @@ impl Parameters {
 
 /// The entries of a file.
 #[derive(Debug)]
-pub(crate) struct Entries {
+pub(crate) struct StillingerWeberEntries {
     /// All elements of the file, in order of appearance.
     pub(crate) species: Vec<Species>,
     /// `[(i * elements + j) * elements + k]`, i the centre.
     pub(crate) parameters: Vec<Parameters>,
 }
 
-struct Entry {
+struct TripletEntry {
     line: usize,
     triplet: [Species; 3],
     parameters: Parameters,
@@ -69,12 +69,12 @@ struct Entry {
 const ENTRY_WORDS: usize = 14;
 const ENTRY: &str = "element1 element2 element3 epsilon sigma a lambda gamma costheta0 A B p q tol";
 
-impl Entries {
+impl StillingerWeberEntries {
     /// Reads the file.
     pub(crate) fn read(path: &Path) -> Result<Self, PotentialFileError> {
         let file = PotentialFile::open(path)?;
         let mut lines = file.lines();
-        let mut entries: Vec<Entry> = Vec::new();
+        let mut entries: Vec<TripletEntry> = Vec::new();
         while let Some(entry) = read_entry(&mut lines)? {
             if let Some(first) = entries.iter().find(|other| other.triplet == entry.triplet) {
                 let found = format!("a second entry for {:?}", entry.triplet);
@@ -99,7 +99,7 @@ impl Entries {
 }
 
 /// The next fourteen words outside comments; `None` at the end of the file.
-fn read_entry(lines: &mut Lines<'_>) -> Result<Option<Entry>, PotentialFileError> {
+fn read_entry(lines: &mut Lines<'_>) -> Result<Option<TripletEntry>, PotentialFileError> {
     let mut words: Vec<&str> = Vec::new();
     let mut first_line = 0;
     while words.len() < ENTRY_WORDS {
@@ -127,7 +127,7 @@ fn read_entry(lines: &mut Lines<'_>) -> Result<Option<Entry>, PotentialFileError
     };
     let triplet = [element(0)?, element(1)?, element(2)?];
     let parameters = read_parameters(lines, &words)?;
-    Ok(Some(Entry { line: first_line, triplet, parameters }))
+    Ok(Some(TripletEntry { line: first_line, triplet, parameters }))
 }
 
 fn read_parameters(lines: &Lines<'_>, words: &[&str]) -> Result<Parameters, PotentialFileError> {
@@ -154,7 +154,7 @@ fn read_parameters(lines: &Lines<'_>, words: &[&str]) -> Result<Parameters, Pote
 /// Checks that entries which describe the same pair or angle agree.
 ///
 /// The product λ ε may differ by the rounding of its factors in the file.
-fn check_symmetry(lines: &Lines<'_>, entries: &[Entry]) -> Result<(), PotentialFileError> {
+fn check_symmetry(lines: &Lines<'_>, entries: &[TripletEntry]) -> Result<(), PotentialFileError> {
     for entry in entries {
         let [i, j, k] = entry.triplet;
         for other in entries {
@@ -185,7 +185,7 @@ fn same_angle(one: &Parameters, other: &Parameters) -> bool {
 fn in_order(
     lines: &Lines<'_>,
     species: &[Species],
-    entries: &[Entry],
+    entries: &[TripletEntry],
 ) -> Result<Vec<Parameters>, PotentialFileError> {
     let mut parameters = Vec::new();
     for i in species {

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Structure};
-use potentials::grace::{Grace, GraceModel, Projection, PullBack};
+use potentials::grace::{Grace, GraceModel, GraceProjection, PullBack};
 
 use crate::common;
 use crate::common::model_file::{BYTES, array, changed, changed_of, deep, floats, strings};
@@ -231,7 +231,7 @@ fn a_given_projection_replaces_that_of_the_file() {
         // Other features of the same model: half as many, linear.
         let half = projection.dimension / 2;
         let matrix = projection.matrix.chunks(projection.dimension).flat_map(|row| row[..half].to_vec());
-        let linear = Projection {
+        let linear = GraceProjection {
             matrix: matrix.collect(),
             dimension: half,
             normalize: false,
@@ -247,7 +247,7 @@ fn a_given_projection_replaces_that_of_the_file() {
             assert!(p.iter().zip(z).all(near));
         }
 
-        let other = Projection { layers: projection.layers + 1, ..projection.clone() };
+        let other = GraceProjection { layers: projection.layers + 1, ..projection.clone() };
         let message = own.clone().with_projection(other).unwrap_err().to_string();
         assert!(message.contains("layers, the model has"), "{message}");
         let mut short = projection.clone();

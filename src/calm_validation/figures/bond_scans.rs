@@ -1,6 +1,6 @@
 //! Energy and scores along bond scans (the paper's Figs. 3a, S1 and S10).
 
-use figures::{Axis, Colour, Figure, LegendKey, Panel, Rectangle, Scale};
+use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Panel, Rectangle};
 
 use super::super::detection::{COMPRESSION, DetectionRule, LONGEST, STRETCHING};
 use super::super::{BondScan, Validation};
@@ -53,7 +53,7 @@ fn keys(validation: &Validation) -> Vec<(LegendKey, String)> {
 
 fn distances(title: &str, scan: &BondScan) -> Axis {
     let first = scan.points.first().map_or(0.0, |point| point.distance);
-    Axis::new(title, Scale::Linear, first, LONGEST)
+    Axis::new(title, AxisScale::Linear, first, LONGEST)
 }
 
 fn draw_energies(figure: &mut Figure, scan: &BondScan, place: Rectangle, letter: char) {
@@ -61,7 +61,7 @@ fn draw_energies(figure: &mut Figure, scan: &BondScan, place: Rectangle, letter:
     let lowest = scan.energy.unwrap_or(0.0);
     let stretched = energies.iter().filter(|[d, _]| *d > scan.equilibrium).map(|[_, energy]| energy - lowest);
     let depth = stretched.fold(0.1, f64::max).min(MAX_ENERGY);
-    let y = Axis::new("ΔE (eV)", Scale::Linear, -0.15 * depth, 1.25 * depth).with_ticks(3);
+    let y = Axis::new("ΔE (eV)", AxisScale::Linear, -0.15 * depth, 1.25 * depth).with_ticks(3);
     let mut panel = Panel::new(place, distances("", scan).without_ticks(), y);
     panel.vertical_line(scan.equilibrium);
     panel.line(energies.iter().map(|[d, energy]| [*d, energy - lowest]), Colour::INK.line(1.0));

@@ -1,6 +1,6 @@
 //! γ and γ_nbr by the distance to a defect (the paper's Figs. 3b–d and S8).
 
-use figures::{Axis, Colour, Figure, LegendKey, Marker, Panel, Rectangle, Scale, Stroke};
+use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel, Rectangle, Stroke};
 
 use super::super::defects::{DefectKind, Shell};
 use super::super::{Defect, Validation};
@@ -69,7 +69,7 @@ fn draw_panel(figure: &mut Figure, kind: DefectKind, defects: &[&Defect], place:
         DefectKind::Surface => "depth below the surface (Å)",
         DefectKind::GrainBoundary => "distance to the boundary (Å)",
     };
-    let x = Axis::new(title, Scale::Linear, -0.02 * farthest, 1.02 * farthest);
+    let x = Axis::new(title, AxisScale::Linear, -0.02 * farthest, 1.02 * farthest);
     let mut panel = Panel::new(place, x, axis("γ", values));
     let (low, high) = (panel.x.low, panel.x.high);
     panel.line([[low, 1.0], [high, 1.0]], Colour::GREY.dashed(0.7));

@@ -1,6 +1,8 @@
 //! Places of panels, and how scores look.
 
-use figures::{Anchor, Axis, Colour, Figure, LegendKey, Rectangle, Scale, Stroke, Text, legend, width};
+use figures::{
+    Anchor, Axis, AxisScale, Colour, Figure, FigureText, LegendKey, Rectangle, Stroke, legend, width,
+};
 
 use crate::page::style::WIDTH;
 
@@ -51,7 +53,7 @@ pub fn axis(title: &str, values: impl IntoIterator<Item = f64>) -> Axis {
     let usable = values.into_iter().filter(|x| x.is_finite() && *x > 0.0);
     let (low, high) = usable.fold((1.0, 1.0), |(low, high): (f64, f64), x| (low.min(x), high.max(x)));
     let margin = (high / low).powf(0.05).max(1.1);
-    Axis::new(title, Scale::Logarithmic, low / margin, high * margin)
+    Axis::new(title, AxisScale::Logarithmic, low / margin, high * margin)
 }
 
 /// Letter of panel `k`: a to z, then none.
@@ -98,7 +100,7 @@ pub fn legend_height(keys: &[(LegendKey, String)]) -> f64 {
 
 /// Divides the keys into rows that fit.
 fn rows(keys: &[(LegendKey, String)]) -> Vec<&[(LegendKey, String)]> {
-    let length = |(_, words): &(LegendKey, String)| 30.0 + Text::SIZE * width(words, false);
+    let length = |(_, words): &(LegendKey, String)| 30.0 + FigureText::SIZE * width(words, false);
     let (mut rows, mut start, mut used) = (Vec::new(), 0, 0.0);
     for (k, key) in keys.iter().enumerate() {
         if k > start && used + length(key) > WIDTH - 16.0 {

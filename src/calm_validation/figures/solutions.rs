@@ -1,6 +1,6 @@
 //! γ of random solid solutions against composition (the paper's Figs. 4a and 4d).
 
-use figures::{Axis, Colour, Figure, LegendKey, Marker, Panel, Scale};
+use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel};
 
 use super::super::solutions::{Composition, FirstShell};
 use super::super::{Solution, Validation};
@@ -40,7 +40,7 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
 fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &PanelGrid, first: usize) {
     let [a, b] = &solution.elements;
     let compositions = || solution.compositions.iter().filter(|of| of.structures > 0);
-    let shares = |title: &str| Axis::new(title, Scale::Linear, 0.0, 100.0);
+    let shares = |title: &str| Axis::new(title, AxisScale::Linear, 0.0, 100.0);
     let curve = |of: fn(&Composition) -> f64| -> Vec<_> {
         compositions().map(|composition| [100.0 * composition.fraction, of(composition)]).collect()
     };
@@ -55,7 +55,7 @@ fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &PanelGrid, fir
     panel.panel_letter(letter(first));
     panel.draw(figure);
 
-    let y = Axis::new("atoms above 1 (%)", Scale::Linear, 0.0, 103.0);
+    let y = Axis::new("atoms above 1 (%)", AxisScale::Linear, 0.0, 103.0);
     let mut panel = Panel::new(grid.place(first + 1), shares(&share), y);
     panel.line(curve(|of| 100.0 * of.averages_above_1), Colour::VERMILLION.dashed(1.2));
     let above = curve(|of| 100.0 * of.above_1);

@@ -2,7 +2,7 @@
 
 use atoms::cell::sub;
 use atoms::{Repetition, Structure};
-use figures::{Anchor, Colour, Figure, Item, Marker, Paint, Rectangle};
+use figures::{Anchor, Colour, Figure, FigureItem, Marker, Paint, Rectangle};
 
 use super::super::defects::DefectKind;
 use super::super::{Defect, Validation};
@@ -102,7 +102,7 @@ fn draw_atoms(figure: &mut Figure, numbers: &mut Csv, defect: &Defect, place: Re
     for (atom, [x, y]) in atoms {
         let centre =
             [middle[0] + scale * (x - 0.5 * (left + right)), middle[1] - scale * (y - 0.5 * (low + high))];
-        figure.items.push(Item::Dots {
+        figure.items.push(FigureItem::Dots {
             centres: vec![centre],
             marker: Marker::Disc,
             radius: (1.15 * scale).min(6.0),

@@ -3,7 +3,7 @@
 use analysis::{Bins, Exceedance, ForceErrors, LabelledEnergy, SystematicSample};
 use atoms::Species;
 use atoms::cell::{norm, sub};
-use atoms::extxyz::Labels;
+use atoms::extxyz::FrameLabels;
 
 use super::deviations::Deviations;
 
@@ -36,9 +36,9 @@ pub struct LabelledStructure<'a> {
     /// Scores of the atoms, `[n]` for each column.
     pub scores: &'a [&'a [f64]],
     /// What the model predicts.
-    pub predicted: &'a Labels,
+    pub predicted: &'a FrameLabels,
     /// The labels; what is missing here or in the prediction is not compared.
-    pub labels: &'a Labels,
+    pub labels: &'a FrameLabels,
 }
 
 /// Collects labelled structures. Counts, means and contamination are of all of them; ranks, quantiles, bands, intervals

@@ -4,7 +4,7 @@ use ::figures::{to_png, to_svg};
 use analysis::{Bootstrap, quantile, roc_auc, spearman};
 use atoms::Species;
 use atoms::cell::{norm, sub};
-use atoms::extxyz::Labels;
+use atoms::extxyz::FrameLabels;
 
 use super::*;
 
@@ -22,8 +22,8 @@ fn uniform(place: usize) -> f64 {
 struct Sample {
     species: Vec<Species>,
     scores: [Vec<f64>; 2],
-    predicted: Labels,
-    labels: Labels,
+    predicted: FrameLabels,
+    labels: FrameLabels,
 }
 
 /// Energies of the labels are those of the model plus 1 eV for each aluminium and −2 eV for each nickel atom, to ± 8 meV.
@@ -38,12 +38,12 @@ fn sample(number: usize) -> Sample {
     let offset = (ATOMS - nickel) as f64 - 2.0 * nickel as f64 + 0.016 * (uniform(place(0, 9)) - 0.5);
     Sample {
         species: (0..ATOMS).map(element).collect(),
-        predicted: Labels {
+        predicted: FrameLabels {
             energy: Some(-3.5),
             forces: Some(vec![[0.1, 0.2, -0.3]; ATOMS]),
             stress: Some([[0.01; 3]; 3]),
         },
-        labels: Labels {
+        labels: FrameLabels {
             energy: Some(-3.5 + offset),
             forces: Some((0..ATOMS).map(|atom| sub([0.1, 0.2, -0.3], error(atom))).collect()),
             stress: number.is_multiple_of(2).then_some([[0.013; 3]; 3]),
@@ -181,7 +181,7 @@ fn atoms_without_a_finite_score_are_only_counted() {
 #[test]
 fn what_has_no_labels_says_nothing() {
     let mut samples: Vec<_> = (0..3).map(sample).collect();
-    samples.iter_mut().for_each(|sample| sample.labels = Labels::default());
+    samples.iter_mut().for_each(|sample| sample.labels = FrameLabels::default());
     let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
     assert_eq!((report.structures, report.atoms), (0, 0));
     assert!(tables(&report).is_empty() && figures(&report).is_empty());

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use calm::baselines::{Baseline, BaselineFile, BaselineSettings, Builder, Kind};
+use calm::baselines::{Baseline, BaselineFile, BaselineSettings, Builder, BaselineKind};
 use calm::{Artifact, Mixture};
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
@@ -43,7 +43,7 @@ pub struct CalmBaselineArgs {
     /// Kind of score, may be repeated: d-optimality-element, d-optimality-centred, d-optimality-component, llpr, llpr-sum,
     /// llpr-forces, euclidean, k-nearest, likelihood
     #[arg(long, required = true, value_name = "KIND", value_delimiter = ',')]
-    kind: Vec<Kind>,
+    kind: Vec<BaselineKind>,
     /// File for the scores; an existing file is replaced at the end
     #[arg(long, short, value_name = "BASELINES.npz")]
     output: PathBuf,

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use calm::Projection;
 use calm::build::{BuildSettings, BuiltElement, BuiltMixture, random_projection};
-use npz::Archive;
+use npz::NpzFile;
 use potentials::grace::GraceModel;
 
 use crate::artifact_checks::check_sound;
@@ -192,7 +192,7 @@ pub(super) fn projected(
     dimension: usize,
 ) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
     let seed = if model.projection().is_some() {
-        let file = Archive::open(path).map_err(CommandError::input)?;
+        let file = NpzFile::open(path).map_err(CommandError::input)?;
         let key = "uq_rp_seed";
         let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(CommandError::input)?;
         seed.and_then(|seed| seed.data.first().copied())

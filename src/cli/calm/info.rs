@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::Species;
 use calm::{Artifact, Mixture};
-use npz::Archive;
+use npz::NpzFile;
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
@@ -118,7 +118,7 @@ impl CalmInfoArgs {
 }
 
 fn inspect(path: &Path) -> Result<Content, CommandError> {
-    let archive = &Archive::open(path)
+    let archive = &NpzFile::open(path)
         .map_err(|error| CommandError::Input(format!("{error} (kokkos.npz or gmm_artifacts.npz)")))?;
     if archive.contains("__schema_version__") {
         let artifact = Artifact::load(path).map_err(CommandError::input)?;
@@ -207,7 +207,7 @@ impl Model {
 }
 
 impl MixtureInfo {
-    fn new(artifact: &Artifact, schema_key: &str, archive: &Archive) -> Self {
+    fn new(artifact: &Artifact, schema_key: &str, archive: &NpzFile) -> Self {
         let Artifact { symbols, mixture, projection } = artifact;
         Self {
             schema: archive.scalar(schema_key).unwrap_or_default() as u32,
@@ -282,11 +282,11 @@ impl MixtureInfo {
 }
 
 /// A single text, if the array exists and is readable.
-fn text(archive: &Archive, key: &str) -> Option<String> {
+fn text(archive: &NpzFile, key: &str) -> Option<String> {
     archive.strings(key).ok().filter(|texts| texts.len() == 1).map(|texts| texts.concat())
 }
 
-fn components(symbols: &[String], mixture: &Mixture, archive: &Archive) -> Vec<ComponentInfo> {
+fn components(symbols: &[String], mixture: &Mixture, archive: &NpzFile) -> Vec<ComponentInfo> {
     // By element and slot; not in exports.
     let stored = |name: &str| -> Vec<Vec<f64>> {
         let of = |element| archive.numbers(&format!("{name}_{element}"));

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::FileError;
-use atoms::extxyz::{Column, ColumnData, Frame, Value, write_frame};
+use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, write_frame};
 use calm::Artifact;
 use npyz::{NpyWriter, WriterBuilder};
 use potentials::grace::GraceModel;
@@ -201,7 +201,7 @@ fn move_labels_to_reference(frame: &mut Frame) {
         }
         if let Some(value) = info {
             // MACE reads REF_stress as nine numbers in a row.
-            let flat = value.numbers().filter(|numbers| numbers.len() > 1).map(Value::from);
+            let flat = value.numbers().filter(|numbers| numbers.len() > 1).map(ExtxyzValue::from);
             frame.info.insert(reference, flat.unwrap_or(value));
         }
     }

@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::Path;
 
-use atoms::extxyz::{Frame, Labels};
+use atoms::extxyz::{Frame, FrameLabels};
 use figures::{to_png, to_svg};
 
 use super::score_table::ScoreTable;
@@ -46,10 +46,10 @@ impl ScoreLabels {
         let labels = frame.labels().unwrap_or_else(|error| {
             self.unreadable.0 += 1;
             self.unreadable.1.get_or_insert_with(|| error.to_string());
-            Labels::default()
+            FrameLabels::default()
         });
         let evaluation = &scorer.evaluation;
-        let predicted = Labels {
+        let predicted = FrameLabels {
             energy: Some(evaluation.energy()),
             forces: Some(evaluation.forces.clone()),
             stress: evaluation.stress(&frame.structure),

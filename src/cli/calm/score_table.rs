@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use atoms::cell::{norm, sub};
-use atoms::extxyz::{Frame, Labels};
+use atoms::extxyz::{Frame, FrameLabels};
 
 use super::scorer::Scorer;
 use crate::atomic_file::{AtomicFile, cannot_write};
@@ -28,7 +28,7 @@ impl ScoreTable {
     }
 
     /// Adds a frame that was scored last. Numbers that follow from labels are empty without them.
-    pub fn add(&mut self, frame: &Frame, scorer: &Scorer, labels: &Labels) -> Result<(), CommandError> {
+    pub fn add(&mut self, frame: &Frame, scorer: &Scorer, labels: &FrameLabels) -> Result<(), CommandError> {
         let atoms = frame.structure.len() as f64;
         let largest = |values: &[f64]| values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let pairs = labels.forces.iter().flatten().zip(&scorer.evaluation.forces);

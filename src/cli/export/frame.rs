@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, Value};
+use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, FrameLabels, LabelKeys};
 use dft::RetryAdjustment;
 use store::{ExportRow, ExportSource};
 use wire::{WalkConditions, WalkId};
@@ -62,14 +62,14 @@ pub fn frame(
 ) -> Frame {
     let mut frame = Frame::from(row.structure);
     let label = row.label;
-    let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
+    let labels = FrameLabels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
     frame.set_labels(&labels, keys);
     let scalars = |values| Column { width: 1, entries: ColumnData::Real(values) };
     let details = label.details;
     if let Some(moments) = details.magnetic_moments {
         frame.arrays.insert("magmoms".to_owned(), scalars(moments));
     }
-    let mut info = |key: &str, value: Value| frame.info.insert(key.to_owned(), value);
+    let mut info = |key: &str, value: ExtxyzValue| frame.info.insert(key.to_owned(), value);
     for (key, number) in
         [("energy_without_smearing", details.energy_without_smearing), ("magmom", details.magnetisation)]
     {
@@ -123,8 +123,8 @@ pub fn frame(
     frame
 }
 
-fn integer(number: u64) -> Value {
-    Value::Int(i64::try_from(number).unwrap_or(i64::MAX))
+fn integer(number: u64) -> ExtxyzValue {
+    ExtxyzValue::Int(i64::try_from(number).unwrap_or(i64::MAX))
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use atoms::Potential;
-use md::{Dynamics, Settings, State, Stream, default_time_step};
+use md::{Dynamics, DynamicsSettings, State, Stream, default_time_step};
 
 use self::config::{DynamicsSection, MdConfig, OutputSection};
 use self::trajectory::{Trajectory, time};
@@ -85,9 +85,9 @@ fn initial_state(dynamics: &DynamicsSection, structure: atoms::Structure) -> Sta
     State::thermal(structure, dynamics.temperature.get(), &Stream::new(dynamics.rng_seed, 0, 0))
 }
 
-fn settings(dynamics: &DynamicsSection, state: &State) -> Settings {
+fn settings(dynamics: &DynamicsSection, state: &State) -> DynamicsSettings {
     let default = default_time_step(&state.structure.species);
-    Settings {
+    DynamicsSettings {
         time_step: dynamics.time_step.map_or(default, |time_step| time_step.get()),
         thermostat: dynamics.thermostat.start(dynamics.temperature.get()),
         ramp: None,

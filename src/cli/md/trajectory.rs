@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use atoms::extxyz::{Column, Frame, LabelKeys, Labels, write_frame};
+use atoms::extxyz::{Column, Frame, FrameLabels, LabelKeys, write_frame};
 use atoms::units::ACCELERATION;
 use md::Dynamics;
 
@@ -41,7 +41,7 @@ impl Trajectory {
 /// Energy (eV), forces (eV/Å), stress (eV/Å³, without its kinetic part), step, time (fs), temperature (K) and momenta.
 fn frame(dynamics: &Dynamics) -> Frame {
     let (state, evaluation) = (dynamics.state(), dynamics.evaluation());
-    let labels = Labels {
+    let labels = FrameLabels {
         energy: Some(evaluation.energy()),
         forces: Some(evaluation.forces.clone()),
         stress: evaluation.stress(&state.structure),

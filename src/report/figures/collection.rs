@@ -1,6 +1,6 @@
 //! Fates of candidates, and the rate at which new structures were found.
 
-use ::figures::{Anchor, Axis, Colour, Figure, Panel, Scale};
+use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, Panel};
 use store::Candidates;
 
 use super::super::report_data::ReportData;
@@ -43,7 +43,7 @@ fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangl
     ];
     let names: Vec<_> = fates.iter().map(|(name, _)| (*name).to_owned()).collect();
     let largest = fates.iter().map(|(_, count)| *count).max().unwrap_or(0).max(1) as f64;
-    let x = Axis::new("candidates", Scale::Linear, 0.0, 1.25 * largest).with_ticks(4);
+    let x = Axis::new("candidates", AxisScale::Linear, 0.0, 1.25 * largest).with_ticks(4);
     let mut panel = Panel::new(place, x, Axis::categorical("", &names));
     for (k, (name, count)) in fates.iter().enumerate() {
         let (low, high) = (k as f64 + 0.18, k as f64 + 0.82);
@@ -66,8 +66,9 @@ fn draw_progress(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Recta
         let cells = ["b".to_owned(), String::new(), csv::number(seen as f64), csv::number(accepted as f64)];
         numbers.push(&cells);
     }
-    let x = Axis::new("candidates decided", Scale::Linear, 0.0, 1.03 * seen.max(1) as f64).with_ticks(4);
-    let y = Axis::new("accepted structures", Scale::Linear, 0.0, 1.12 * accepted.max(1) as f64).with_ticks(4);
+    let x = Axis::new("candidates decided", AxisScale::Linear, 0.0, 1.03 * seen.max(1) as f64).with_ticks(4);
+    let y =
+        Axis::new("accepted structures", AxisScale::Linear, 0.0, 1.12 * accepted.max(1) as f64).with_ticks(4);
     let mut panel = Panel::new(place, x, y);
     panel.line([[0.0, 0.0], [seen as f64, seen as f64]], Colour::GREY.dashed(0.7));
     panel.line(line, Colour::VERMILLION.line(1.5));

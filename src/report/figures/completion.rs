@@ -1,6 +1,6 @@
 //! Share of structures that were labelled, by grade and by volume.
 
-use ::figures::{Axis, Colour, Figure, Marker, Panel, Rectangle, Scale};
+use ::figures::{Axis, AxisScale, Colour, Figure, Marker, Panel, Rectangle};
 use analysis::CompletionBin;
 
 use super::super::report_data::ReportData;
@@ -54,7 +54,7 @@ fn draw_bins(
         (None, None) => Some((k as f64 + 0.5, "unknown".to_owned())),
         _ => None,
     });
-    let y = Axis::new("labelled (%)", Scale::Linear, 0.0, 118.0);
+    let y = Axis::new("labelled (%)", AxisScale::Linear, 0.0, 118.0);
     let mut panel = Panel::new(place, Axis::binned(title, bins.len(), ends), y);
     for (k, bin) in bins.iter().enumerate() {
         let x = k as f64 + 0.5;

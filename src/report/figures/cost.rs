@@ -1,6 +1,6 @@
 //! Cost of labels.
 
-use ::figures::{Axis, Colour, Figure, Marker, Panel, Scale};
+use ::figures::{Axis, AxisScale, Colour, Figure, Marker, Panel};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use store::LabelCost;
 
@@ -29,10 +29,11 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
     }
     let places = row(2, [46.0, 62.0, 12.0], 22.0, 112.0);
     let seconds: Vec<_> = costs.iter().map(|cost| cost.core_seconds).collect();
-    let x = axis("core-seconds per label", Scale::Logarithmic, &seconds, None);
+    let x = axis("core-seconds per label", AxisScale::Logarithmic, &seconds, None);
     let histogram = Histogram::from_values(logarithmic_edges(x.low, x.high, BINS), seconds.iter().copied());
     let largest = histogram.counts().iter().max().copied().unwrap_or(0) as f64;
-    let mut panel = Panel::new(places[0], x, Axis::new("labels", Scale::Linear, 0.0, 1.1 * largest.max(1.0)));
+    let mut panel =
+        Panel::new(places[0], x, Axis::new("labels", AxisScale::Linear, 0.0, 1.1 * largest.max(1.0)));
     for (edges, count) in histogram.edges().windows(2).zip(histogram.counts()) {
         panel.bar([edges[0], 0.0], [edges[1], *count as f64], Colour::BLUE.faint(0.6));
     }
@@ -40,8 +41,8 @@ pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
     panel.draw(&mut figure);
     let (title, size) = size(costs);
     let sizes: Vec<_> = costs.iter().map(size).collect();
-    let x = axis(title, Scale::Logarithmic, &sizes, None);
-    let y = axis("core-seconds per label", Scale::Logarithmic, &seconds, None);
+    let x = axis(title, AxisScale::Logarithmic, &sizes, None);
+    let y = axis("core-seconds per label", AxisScale::Logarithmic, &seconds, None);
     let mut panel = Panel::new(places[1], x, y);
     let every = costs.len().div_ceil(MAX_DRAWN);
     let points = costs.iter().step_by(every).map(|cost| [size(cost), cost.core_seconds]);

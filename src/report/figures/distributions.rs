@@ -1,6 +1,6 @@
 //! Grades and force errors of biased walks against those of control walks.
 
-use ::figures::{Figure, Panel, Scale};
+use ::figures::{AxisScale, Figure, Panel};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use wire::Origin;
 
@@ -35,7 +35,7 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
             collection.atoms.items().filter_map(of).filter(|x| x.is_finite()).collect()
         };
         let all: Vec<f64> = shown.iter().flat_map(|origin| values(*origin)).collect();
-        let x = axis(title, Scale::Logarithmic, &all, (letter != 'c').then_some(1.0)).with_ticks(4);
+        let x = axis(title, AxisScale::Logarithmic, &all, (letter != 'c').then_some(1.0)).with_ticks(4);
         let edges = logarithmic_edges(x.low, x.high, BINS);
         let known = |origin: &Origin| !values(*origin).is_empty();
         let histogram = |origin: &Origin| (*origin, Histogram::from_values(edges.clone(), values(*origin)));

@@ -1,6 +1,6 @@
 //! Force error against γ_nbr and against the relative nearest-neighbour distance, with marginal densities (the paper's Fig. 8).
 
-use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale, Side};
+use ::figures::{Axis, AxisScale, Colour, Figure, MarginalSide, Panel, Rectangle};
 use analysis::{QuantileBin, binned_quantiles, kernel_density, linear_edges, quantile};
 use wire::Origin;
 
@@ -20,13 +20,18 @@ const GRID_POINTS: usize = 160;
 struct Quantity {
     letter: char,
     title: &'static str,
-    scale: Scale,
+    scale: AxisScale,
     of: fn(&CollectedAtom) -> Option<f64>,
 }
 
 const QUANTITIES: [Quantity; 2] = [
-    Quantity { letter: 'a', title: "γ_{nbr}", scale: Scale::Logarithmic, of: |atom| Some(atom.gamma_nbr) },
-    Quantity { letter: 'b', title: "d_{nn} / d_{nn}^{0}", scale: Scale::Linear, of: |atom| atom.stretch },
+    Quantity {
+        letter: 'a',
+        title: "γ_{nbr}",
+        scale: AxisScale::Logarithmic,
+        of: |atom| Some(atom.gamma_nbr),
+    },
+    Quantity { letter: 'b', title: "d_{nn} / d_{nn}^{0}", scale: AxisScale::Linear, of: |atom| atom.stretch },
 ];
 
 pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
@@ -60,7 +65,7 @@ fn draw_panel(
     let all =
         |k: usize| -> Vec<f64> { of.iter().flat_map(|(_, pairs)| pairs.iter().map(move |p| p[k])).collect() };
     let x = axis(against.title, against.scale, &all(0), Some(1.0));
-    let y = axis("force error (eV Å^{−1})", Scale::Logarithmic, &all(1), None);
+    let y = axis("force error (eV Å^{−1})", AxisScale::Logarithmic, &all(1), None);
     let mut panel = Panel::new(place, x.clone(), y.clone());
     panel.vertical_line(1.0);
     let edges = edges(&x);
@@ -83,16 +88,16 @@ fn draw_panel(
 /// Edges of the bins of a panel, equally wide on its axis.
 fn edges(x: &Axis) -> Vec<f64> {
     match x.scale {
-        Scale::Linear => linear_edges(x.low, x.high, BINS),
-        Scale::Logarithmic => analysis::logarithmic_edges(x.low, x.high, BINS),
+        AxisScale::Linear => linear_edges(x.low, x.high, BINS),
+        AxisScale::Logarithmic => analysis::logarithmic_edges(x.low, x.high, BINS),
     }
 }
 
 /// Midpoint of a bin on the axis of a panel.
 pub fn middle(panel: &Panel, band: &QuantileBin) -> f64 {
     match panel.x.scale {
-        Scale::Linear => 0.5 * (band.low + band.high),
-        Scale::Logarithmic => (band.low * band.high).sqrt(),
+        AxisScale::Linear => 0.5 * (band.low + band.high),
+        AxisScale::Logarithmic => (band.low * band.high).sqrt(),
     }
 }
 
@@ -135,23 +140,23 @@ fn draw_margins(figure: &mut Figure, of: &[(Origin, Vec<[f64; 2]>)], place: Rect
     };
     let (horizontal, vertical) = (along(x, 0), along(y, 1));
     let (places, densities) = (
-        || Axis::new("", Scale::Linear, 0.0, 1.0).without_ticks(),
+        || Axis::new("", AxisScale::Linear, 0.0, 1.0).without_ticks(),
         |lines: &[(Origin, Vec<(f64, f64)>)]| {
             let largest =
                 lines.iter().flat_map(|(_, line)| line).map(|(_, density)| *density).fold(0.0, f64::max);
-            Axis::new("", Scale::Linear, 0.0, 1.05 * largest).without_ticks()
+            Axis::new("", AxisScale::Linear, 0.0, 1.05 * largest).without_ticks()
         },
     );
     let mut panel = Panel::new(above, places(), densities(&horizontal));
     horizontal
         .iter()
         .for_each(|(origin, line)| draw_density(&mut panel, *origin, line, |x, density| [x, density]));
-    panel.draw_as_margin(figure, Side::Below);
+    panel.draw_as_margin(figure, MarginalSide::Below);
     let mut panel = Panel::new(right, densities(&vertical), places());
     vertical
         .iter()
         .for_each(|(origin, line)| draw_density(&mut panel, *origin, line, |y, density| [density, y]));
-    panel.draw_as_margin(figure, Side::Left);
+    panel.draw_as_margin(figure, MarginalSide::Left);
 }
 
 fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f64, f64) -> [f64; 2]) {

@@ -1,6 +1,6 @@
 //! Force error against either grade, for all labelled atoms, with nested percentile bands (as the paper's Fig. 2).
 
-use ::figures::{Colour, Figure, LegendKey, Panel, Scale, legend};
+use ::figures::{AxisScale, Colour, Figure, LegendKey, Panel, legend};
 use analysis::{binned_quantiles, logarithmic_edges, spearman};
 use wire::Origin;
 
@@ -34,8 +34,8 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
         let pairs = labelled.iter().filter_map(|atom| Some((of(atom), atom.error?)));
         let pairs: Vec<_> = pairs.filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
         let (grades, errors): (Vec<_>, Vec<_>) = pairs.iter().copied().unzip();
-        let x = axis(title, Scale::Logarithmic, &grades, Some(1.0));
-        let y = axis("force error (eV Å^{−1})", Scale::Logarithmic, &errors, None);
+        let x = axis(title, AxisScale::Logarithmic, &grades, Some(1.0));
+        let y = axis("force error (eV Å^{−1})", AxisScale::Logarithmic, &errors, None);
         let edges = logarithmic_edges(x.low, x.high, BINS);
         let found = binned_quantiles(&edges, pairs);
         let mut panel = Panel::new(place, x, y);

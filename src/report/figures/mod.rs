@@ -9,7 +9,7 @@ mod grades;
 mod projection;
 mod space;
 
-use ::figures::{Axis, Panel, Scale};
+use ::figures::{Axis, AxisScale, Panel};
 use analysis::Histogram;
 use wire::Origin;
 
@@ -52,7 +52,7 @@ fn draw_histograms(panel: &mut Panel, histograms: &[(Origin, Histogram)]) {
 /// The vertical axis of histograms.
 fn share_axis(title: &str, histograms: &[(Origin, Histogram)]) -> Axis {
     let largest = histograms.iter().flat_map(|(_, histogram)| histogram.fractions()).fold(0.0, f64::max);
-    Axis::new(title, Scale::Linear, 0.0, 108.0 * largest.max(1e-6))
+    Axis::new(title, AxisScale::Linear, 0.0, 108.0 * largest.max(1e-6))
 }
 
 /// Writes the bins of histograms to the figure's data: panel, origin, lower edge, upper edge, count.

@@ -1,6 +1,6 @@
 //! Features projected onto their first two principal components, with 95 % contours (the paper's Fig. 7a).
 
-use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale};
+use ::figures::{Axis, AxisScale, Colour, Figure, Panel, Rectangle};
 use analysis::{Density2d, contours};
 use wire::Origin;
 
@@ -74,7 +74,7 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
         });
         let margin = 0.05 * (high - low);
         let title = format!("PC {} ({:.1} %)", k + 1, 100.0 * plane.shares[k]);
-        Axis::new(&title, Scale::Linear, low - margin, high + margin)
+        Axis::new(&title, AxisScale::Linear, low - margin, high + margin)
     };
     let mut panel = Panel::new(place, axis(0), axis(1));
     for (origin, points) in both {

@@ -1,6 +1,6 @@
 //! Volumes and composition of the collected structures.
 
-use ::figures::{Axis, Figure, Panel, Rectangle, Scale};
+use ::figures::{Axis, AxisScale, Figure, Panel, Rectangle};
 use analysis::{Histogram, linear_edges};
 use wire::Origin;
 
@@ -67,7 +67,7 @@ fn draw_volumes(
         collection.structures.items().filter_map(of).filter(|x| x.is_finite()).collect()
     };
     let all: Vec<_> = shown.iter().flat_map(values).collect();
-    let x = axis(title, Scale::Linear, &all, None).with_ticks(4);
+    let x = axis(title, AxisScale::Linear, &all, None).with_ticks(4);
     let edges = linear_edges(x.low, x.high, BINS);
     let shown = shown.iter().filter(|origin| !values(origin).is_empty());
     let histogram = |origin: &Origin| (*origin, Histogram::from_values(edges.clone(), values(origin)));
@@ -112,7 +112,7 @@ fn draw_elements(
     elements.truncate(MAX_ELEMENTS);
     let names: Vec<_> = elements.iter().map(|element| element.symbol().to_owned()).collect();
     let shares = elements.iter().flat_map(|element| shown.iter().map(|origin| of(element, *origin).1));
-    let y = Axis::new("atoms (%)", Scale::Linear, 0.0, 1.08 * shares.fold(0.0, f64::max));
+    let y = Axis::new("atoms (%)", AxisScale::Linear, 0.0, 1.08 * shares.fold(0.0, f64::max));
     let mut panel = Panel::new(place, Axis::categorical("element", &names), y);
     let width = 0.7 / shown.len() as f64;
     for (k, element) in elements.iter().enumerate() {

@@ -1,7 +1,7 @@
 //! One candidate or imported structure: its details, its atoms, and files to download.
 
 use atoms::Structure;
-use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, write_frame};
+use atoms::extxyz::{Column, ColumnData, Frame, FrameLabels, LabelKeys, write_frame};
 use atoms::poscar::write_poscar;
 use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
@@ -82,7 +82,8 @@ async fn frame(store: &Store, found: StructureRecord) -> Result<Frame, StoreErro
     let labels = store.labels_of(found.content).await?;
     if let Some(labelled) = labels.into_iter().find(|label| label.record.status == LabelStatus::Label) {
         let label = labelled.record.label;
-        let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
+        let labels =
+            FrameLabels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
         frame.set_labels(&labels, LabelKeys::Ase);
         frame.info.insert("protocol".to_owned(), labelled.protocol.name.into());
     }

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use atoms::extxyz::{LabelKeys, Labels};
+use atoms::extxyz::{FrameLabels, LabelKeys};
 use serde_json::Value;
 
 use super::jobs::{Jobs, once_each};
@@ -19,7 +19,7 @@ fn checked() -> Jobs {
     let mut frames = atoms::read_extxyz(&jobs.place.path().join("seeds.extxyz")).unwrap();
     for frame in &mut frames {
         let forces = Some(vec![[0.25, 0.0, 0.0]; frame.structure.len()]);
-        frame.set_labels(&Labels { energy: Some(-1.5), forces, stress: None }, LabelKeys::Ase);
+        frame.set_labels(&FrameLabels { energy: Some(-1.5), forces, stress: None }, LabelKeys::Ase);
     }
     assert_eq!(frames.len(), KNOWN);
     write_frames(&jobs.place.path().join("known.extxyz"), &frames);

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use atoms::Structure;
-use dft::{DftBackend, Failure, FailureClass, Size};
+use dft::{CalculationSize, DftBackend, Failure, FailureClass};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::sync::OnceCell;
@@ -68,7 +68,7 @@ impl CodeMethod {
         Self { code: code.into(), execution, runner, root, current, slurm }
     }
 
-    pub(super) fn size(&self, structure: &Structure) -> Size {
+    pub(super) fn size(&self, structure: &Structure) -> CalculationSize {
         self.code.size(structure)
     }
 

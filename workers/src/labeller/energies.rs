@@ -1,7 +1,7 @@
 //! Reference for the energies of labels: the potential's energies plus offsets of the elements, fitted to labels.
 
 use analysis::EnergyOffsets;
-use dft::Results;
+use dft::CalculationResults;
 use monitor::energy_offsets::energy_offsets;
 use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
@@ -36,7 +36,7 @@ impl Offsets {
         store: &Store,
         protocol: &Protocol,
         lease: &Lease,
-        result: &Result<Results, dft::Failure>,
+        result: &Result<CalculationResults, dft::Failure>,
         stop: &CancellationToken,
     ) -> Result<Option<EnergyReference<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };

@@ -6,7 +6,7 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use analysis::{CostModel, Measured, Size};
+use analysis::{CostModel, CostPredictors, MeasuredCost};
 use atoms::cell::{dot, norm};
 use atoms::{ElementPair, Structure};
 use schemars::JsonSchema;
@@ -152,7 +152,7 @@ impl LabelGuard {
 pub(super) async fn rejection(
     store: &Store,
     lease: &Lease,
-    size: dft::Size,
+    size: dft::CalculationSize,
 ) -> Result<Option<String>, StoreError> {
     if lease.overruled {
         return Ok(None);
@@ -185,15 +185,15 @@ fn damaged(error: serde_json::Error) -> StoreError {
 async fn too_costly(
     store: &Store,
     lease: &Lease,
-    size: dft::Size,
+    size: dft::CalculationSize,
     guard: &LabelGuard,
 ) -> Result<Option<String>, StoreError> {
     let Some(largest) = guard.max_cost else { return Ok(None) };
     let costs = store.label_costs(lease.protocol, MAX_COST_LABELS).await?;
     let measured: Vec<_> = costs
         .iter()
-        .map(|cost| Measured {
-            size: Size {
+        .map(|cost| MeasuredCost {
+            size: CostPredictors {
                 atoms: cost.atoms.into(),
                 electrons: cost.electrons.filter(|electrons| *electrons > 0.0),
                 k_points: cost.k_points.unwrap_or(1).into(),
@@ -202,7 +202,7 @@ async fn too_costly(
         })
         .collect();
     let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
-    let size = Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 };
+    let size = CostPredictors { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 };
     // Before the first label the cost is unknown and nothing is rejected.
     let expected = CostModel::fit(&measured, None).and_then(|model| model.predict(&size));
     let too_much = expected.map(|expected| expected.core_seconds).filter(|seconds| *seconds > largest);

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
-use dft::Input;
+use dft::CalculationInput;
 
 /// Maximum number of lines.
 const MAX_LINES: usize = 40;
@@ -11,7 +11,7 @@ const MAX_LINES: usize = 40;
 const MAX_CHARACTERS: usize = 200;
 
 /// Lines only in `plain`, with `-`, and lines only in `changed`, with `+`, file by file.
-pub(super) fn input_diff(plain: &Input, changed: &Input) -> String {
+pub(super) fn input_diff(plain: &CalculationInput, changed: &CalculationInput) -> String {
     let mut lines = Vec::new();
     let [before, after] = [plain, changed].map(|input| input.command.join(" "));
     compare("command", &before, &after, &mut lines);

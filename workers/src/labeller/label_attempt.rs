@@ -1,6 +1,6 @@
 //! The results of methods.
 
-use dft::{Failure, Results};
+use dft::{CalculationResults, Failure};
 use store::records::Lease;
 
 use super::calculation_handle::CalculationHandle;
@@ -9,7 +9,7 @@ use super::validate::{LabelBounds, validate};
 
 /// The result of a method.
 pub(super) struct LabelAttempt {
-    pub result: Result<Results, Failure>,
+    pub result: Result<CalculationResults, Failure>,
     /// Its calculation behind it, if it was a process of its own.
     pub ended: Option<EndedCalculation>,
 }
@@ -41,7 +41,7 @@ pub(super) struct EndedCalculation {
 #[derive(Clone, Debug)]
 pub struct SingleLabel {
     /// Its numbers, validated like those of a campaign are.
-    pub result: Result<Results, Failure>,
+    pub result: Result<CalculationResults, Failure>,
     /// The end of what the program said; empty for a potential.
     pub log: String,
     /// Cores times duration, s.

@@ -1,7 +1,7 @@
 //! How far a label outside the queue is, as the store has it.
 
 use atoms::{Matrix3, Vec3};
-use dft::{Failure, FailureClass, Results};
+use dft::{CalculationResults, Failure, FailureClass};
 use serde::{Deserialize, Serialize};
 use store::records::{Label, LabelDetails};
 use store::{Store, StoreError};
@@ -80,10 +80,15 @@ impl LabelProgress {
     }
 
     /// Adds the result of an attempt, whose calculation is recorded as `calculation`.
-    pub fn add(&mut self, result: Result<Results, Failure>, calculation: Option<String>, attempts: u32) {
+    pub fn add(
+        &mut self,
+        result: Result<CalculationResults, Failure>,
+        calculation: Option<String>,
+        attempts: u32,
+    ) {
         self.calculation = None;
         let failure = match result {
-            Ok(Results { energy, forces, stress, .. }) => {
+            Ok(CalculationResults { energy, forces, stress, .. }) => {
                 self.outcome = Some(LabelOutcome::Made { energy, forces, stress });
                 return;
             }
@@ -143,7 +148,11 @@ mod tests {
     fn progress_survives_as_json() {
         let mut progress = LabelProgress::default();
         failed(&mut progress, FailureClass::Crashed);
-        let results = Results { energy: -0.1, forces: vec![[1e-300, 0.3, -2.0]], ..Results::default() };
+        let results = CalculationResults {
+            energy: -0.1,
+            forces: vec![[1e-300, 0.3, -2.0]],
+            ..CalculationResults::default()
+        };
         progress.add(Ok(results), None, 3);
         let text = serde_json::to_string(&progress).unwrap();
         assert_eq!(serde_json::from_str::<LabelProgress>(&text).unwrap(), progress);

@@ -4,7 +4,7 @@ use std::panic;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use atoms::{Potential, Structure};
-use dft::{DftBackend, Failure, Results, Size};
+use dft::{CalculationResults, CalculationSize, DftBackend, Failure};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
@@ -114,9 +114,9 @@ impl Method {
     }
 
     /// The properties that determine the cost of a label.
-    pub(super) fn size(&self, structure: &Structure) -> Size {
+    pub(super) fn size(&self, structure: &Structure) -> CalculationSize {
         match self {
-            Self::Reference(_) => Size { atoms: structure.len(), electrons: 0.0, k_points: 1 },
+            Self::Reference(_) => CalculationSize { atoms: structure.len(), electrons: 0.0, k_points: 1 },
             Self::Code(method) => method.size(structure),
         }
     }
@@ -146,7 +146,7 @@ impl Method {
 pub(super) async fn evaluate(
     method: Arc<Mutex<ReferenceMethod>>,
     structure: Structure,
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     // One that panicked has taken everybody with it who could see it.
     let label = move || method.lock().unwrap_or_else(PoisonError::into_inner).label(&structure);
     spawn_blocking(label).await.unwrap_or_else(|crash| panic::resume_unwind(crash.into_panic()))

@@ -39,7 +39,7 @@ mod validate;
 use std::pin::pin;
 use std::time::{Duration, Instant};
 
-use dft::{Failure, FailureClass, Results};
+use dft::{CalculationResults, Failure, FailureClass};
 use store::records::{Label, LabelDetails, Lease, Protocol};
 use store::{LeaseStatus, Store, StoreError, words};
 use tokio_util::sync::CancellationToken;
@@ -251,7 +251,7 @@ async fn label_jobs(
 
 /// A result that the store has.
 struct Delivered {
-    validated: Result<Results, Failure>,
+    validated: Result<CalculationResults, Failure>,
     outcome: DeliveryOutcome,
     ended: Option<EndedCalculation>,
 }
@@ -418,7 +418,7 @@ async fn end_of_grace(grace: Option<Duration>, stop: &CancellationToken) {
 async fn deliver(
     store: &Store,
     lease: &Lease,
-    validated: &Result<Results, Failure>,
+    validated: &Result<CalculationResults, Failure>,
     log: &str,
     attempts: u32,
     now: i64,
@@ -440,7 +440,7 @@ async fn deliver(
 }
 
 /// A result for the store keeps it.
-fn label(results: &Results) -> Label {
+fn label(results: &CalculationResults) -> Label {
     Label {
         energy: results.energy,
         forces: results.forces.clone(),

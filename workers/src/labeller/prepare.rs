@@ -6,7 +6,7 @@ use std::io;
 use std::path::Path;
 
 use atoms::Structure;
-use dft::{DftBackend, Exit, Failure, Input, PinnedFile, Results, RetryAdjustment};
+use dft::{CalculationInput, CalculationResults, DftBackend, Exit, Failure, PinnedFile, RetryAdjustment};
 use store::{CalculationRecord, StoreError};
 
 use super::ExecutionSettings;
@@ -22,7 +22,7 @@ const GIGABYTE: f64 = 1e9;
 
 /// The input of a calculation and its record in the store.
 pub(super) struct PreparedInput {
-    pub input: Input,
+    pub input: CalculationInput,
     pub record: CalculationRecord,
     /// Seconds.
     pub time_limit: f64,
@@ -67,7 +67,7 @@ fn names_of_effective(
     code: &dyn DftBackend,
     structure: &Structure,
     adjustments: &BTreeSet<RetryAdjustment>,
-    input: &Input,
+    input: &CalculationInput,
 ) -> Result<Option<String>, Failure> {
     let mut effective = adjustments.clone();
     if effective.remove(&RetryAdjustment::OtherMoments) && code.input(structure, &effective)? != *input {
@@ -81,7 +81,7 @@ fn names_of_effective(
 ///
 /// # Errors
 /// The input cannot be written, or a file to be copied no longer has the hash in the protocol.
-pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
+pub(super) fn write(directory: &Path, input: &CalculationInput) -> Result<(), StoreError> {
     let copy = |(name, original): (&String, &PinnedFile)| match original.content() {
         Ok(content) => Ok((name.clone(), content)),
         Err(error) => Err(file_error(original.path(), error)),
@@ -109,7 +109,7 @@ pub(super) fn read(
     structure: &Structure,
     work: &Path,
     exit: Exit,
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     code.read(structure, work, exit).map_err(|failure| match exit {
         Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode => exit.failure(),
         Exit::Code(_) | Exit::Signal(_) => failure,
@@ -119,7 +119,7 @@ pub(super) fn read(
 #[cfg(test)]
 mod tests {
     use atoms::{Cell, Species};
-    use dft::{SetupError, Size};
+    use dft::{CalculationSize, SetupError};
     use store::records::OTHER_MOMENTS;
 
     use super::*;
@@ -138,18 +138,22 @@ mod tests {
             Ok(())
         }
 
-        fn input(&self, _: &Structure, adjustments: &BTreeSet<RetryAdjustment>) -> Result<Input, Failure> {
+        fn input(
+            &self,
+            _: &Structure,
+            adjustments: &BTreeSet<RetryAdjustment>,
+        ) -> Result<CalculationInput, Failure> {
             let factor = if adjustments.contains(&RetryAdjustment::OtherMoments) { 0.5 } else { 1.0 };
             let moment = self.moment.map(|moment| ("input".to_owned(), (factor * moment).to_string().into()));
-            Ok(Input { files: moment.into_iter().collect(), ..Input::default() })
+            Ok(CalculationInput { files: moment.into_iter().collect(), ..CalculationInput::default() })
         }
 
-        fn read(&self, _: &Structure, _: &Path, _: Exit) -> Result<Results, Failure> {
-            Ok(Results::default())
+        fn read(&self, _: &Structure, _: &Path, _: Exit) -> Result<CalculationResults, Failure> {
+            Ok(CalculationResults::default())
         }
 
-        fn size(&self, _: &Structure) -> Size {
-            Size::default()
+        fn size(&self, _: &Structure) -> CalculationSize {
+            CalculationSize::default()
         }
     }
 

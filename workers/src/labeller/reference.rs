@@ -1,7 +1,7 @@
 //! Labels from a potential instead of DFT, as in the paper's own tests.
 
 use atoms::{Evaluation, NeighbourList, Potential, Structure};
-use dft::{Failure, FailureClass, Results};
+use dft::{CalculationResults, Failure, FailureClass};
 
 /// A reference potential.
 pub struct ReferenceMethod {
@@ -19,7 +19,7 @@ impl ReferenceMethod {
     ///
     /// # Errors
     /// [`FailureClass::BadInput`] for a structure that the potential cannot evaluate.
-    pub fn label(&mut self, structure: &Structure) -> Result<Results, Failure> {
+    pub fn label(&mut self, structure: &Structure) -> Result<CalculationResults, Failure> {
         let mut neighbours = NeighbourList::new(self.potential.cutoff(), 0.0);
         neighbours
             .update(structure)
@@ -27,11 +27,11 @@ impl ReferenceMethod {
         let evaluated = self.potential.evaluate(structure, &neighbours, &mut self.evaluation);
         evaluated.map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let evaluation = &self.evaluation;
-        Ok(Results {
+        Ok(CalculationResults {
             energy: evaluation.energy(),
             forces: evaluation.forces.clone(),
             stress: evaluation.stress(structure),
-            ..Results::default()
+            ..CalculationResults::default()
         })
     }
 }

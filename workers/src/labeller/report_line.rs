@@ -1,6 +1,6 @@
 //! One line for the user about each job.
 
-use dft::{Failure, Results};
+use dft::{CalculationResults, Failure};
 use store::records::Lease;
 use store::{CompleteOutcome, FailOutcome};
 
@@ -13,7 +13,7 @@ pub(super) enum DeliveryOutcome {
 /// Formats the line. For a label it begins with `labelled`.
 pub(super) fn format_report(
     lease: &Lease,
-    validated: &Result<Results, Failure>,
+    validated: &Result<CalculationResults, Failure>,
     outcome: &DeliveryOutcome,
     seconds: f64,
 ) -> String {

@@ -2,7 +2,7 @@
 
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
-use dft::{Failure, FailureClass, Results};
+use dft::{CalculationResults, Failure, FailureClass};
 use monitor::energy_offsets::labelled_energy;
 use serde::{Deserialize, Serialize};
 
@@ -81,11 +81,11 @@ impl LabelBounds {
 /// # Errors
 /// [`FailureClass::Implausible`], with what is wrong.
 pub(super) fn validate(
-    results: Results,
+    results: CalculationResults,
     structure: &Structure,
     bounds: &LabelBounds,
     expected: Option<EnergyReference<'_>>,
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     let problem = wrong_length(&results, structure.len())
         .or_else(|| non_finite(&results))
         .or_else(|| bounds.refuses(results.energy, &results.forces, results.stress.as_ref()))
@@ -97,14 +97,14 @@ pub(super) fn validate(
     }
 }
 
-fn wrong_length(results: &Results, atoms: usize) -> Option<String> {
+fn wrong_length(results: &CalculationResults, atoms: usize) -> Option<String> {
     let moments = results.magnetic_moments.as_ref().map_or(atoms, Vec::len);
     let lists = [("forces", results.forces.len()), ("magnetic moments", moments)];
     let (name, found) = lists.into_iter().find(|(_, found)| *found != atoms)?;
     Some(format!("{found} {name} for {atoms} atoms"))
 }
 
-fn non_finite(results: &Results) -> Option<String> {
+fn non_finite(results: &CalculationResults) -> Option<String> {
     let energies = [Some(results.energy), results.energy_without_smearing];
     let moments = results.magnetic_moments.iter().flatten().chain(&results.magnetisation);
     let find = |name, mut numbers: &mut dyn Iterator<Item = f64>| {
@@ -118,7 +118,7 @@ fn non_finite(results: &Results) -> Option<String> {
 }
 
 fn energy_mismatch(
-    results: &Results,
+    results: &CalculationResults,
     structure: &Structure,
     bounds: &LabelBounds,
     expected: EnergyReference<'_>,

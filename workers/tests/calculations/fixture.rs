@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use atoms::{Species, Structure};
 use dft::{
-    DftBackend, Exit, Failure, FailureClass, Input, PinnedFile, Results, RetryAdjustment, SetupError, Size,
-    result_file,
+    CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, Failure, FailureClass,
+    PinnedFile, RetryAdjustment, SetupError, result_file,
 };
 use serde_json::json;
 use store::{Attempt, JobDetails, LabelRecord, ProcessRecord, Store, StoreError, unix_milliseconds};
@@ -47,14 +47,18 @@ impl DftBackend for Script {
         Ok(())
     }
 
-    fn input(&self, _: &Structure, remedies: &BTreeSet<RetryAdjustment>) -> Result<Input, Failure> {
+    fn input(
+        &self,
+        _: &Structure,
+        remedies: &BTreeSet<RetryAdjustment>,
+    ) -> Result<CalculationInput, Failure> {
         let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
         let files = [("job.sh", self.text.clone()), ("remedies", format!("first\n{}\n", names.join(" ")))];
         let command = match self.text.split_once(' ') {
             Some(("no-such-program", _)) => vec!["no-such-program".to_owned()],
             _ => vec!["sh".to_owned(), "job.sh".to_owned()],
         };
-        Ok(Input {
+        Ok(CalculationInput {
             files: files.map(|(name, text)| (name.to_owned(), text.into_bytes())).into(),
             command,
             environment: BTreeMap::from([("SCRIPT".to_owned(), "fake".to_owned())]),
@@ -62,7 +66,12 @@ impl DftBackend for Script {
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure> {
         match exit {
             Exit::Code(0) => {}
             Exit::Code(3) => return Err(FailureClass::NotConverged.with_message("the script says so")),
@@ -80,17 +89,17 @@ impl DftBackend for Script {
             .trim()
             .parse()
             .map_err(|_| FailureClass::Crashed.with_message("no energy"))?;
-        Ok(Results {
+        Ok(CalculationResults {
             energy,
             forces: vec![[0.0; 3]; structure.len()],
             magnetic_moments: Some(vec![0.5; structure.len()]),
             electronic_steps: Some(7),
-            ..Results::default()
+            ..CalculationResults::default()
         })
     }
 
-    fn size(&self, structure: &Structure) -> Size {
-        Size { atoms: structure.len(), electrons: 8.0, k_points: 27 }
+    fn size(&self, structure: &Structure) -> CalculationSize {
+        CalculationSize { atoms: structure.len(), electrons: 8.0, k_points: 27 }
     }
 }
 

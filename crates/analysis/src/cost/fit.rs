@@ -5,7 +5,7 @@ use super::{EXPONENT_PRIORS, GUESS_SIGMA, PRIOR_NOISE_SCALE};
 type Matrix3 = [[f64; 3]; 3];
 
 /// (1, ln x, ln k) and the logarithm of the cost.
-pub(super) type Point = ([f64; 3], f64);
+pub(super) type CostPoint = ([f64; 3], f64);
 
 /// A normal prior.
 pub(super) struct Normal {
@@ -34,14 +34,15 @@ const ITERATIONS: usize = 60;
 impl Fit {
     /// Fits by expectation maximisation: with fixed weights the problem is linear; the residuals then give
     /// scale and weights. `None` without points and guess.
-    pub fn new(points: &[Point], guess: Option<Point>) -> Option<Self> {
+    pub fn new(points: &[CostPoint], guess: Option<CostPoint>) -> Option<Self> {
         if points.is_empty() && guess.is_none() {
             return None;
         }
         let (mut weights, mut scale) = (vec![1.0; points.len()], PRIOR_NOISE_SCALE);
         let (mut coefficients, mut covariance) = solve(points, &weights, scale, guess)?;
         for _ in 0..ITERATIONS {
-            let squares = |(point, weight): (&Point, &f64)| weight * residual(&coefficients, point).powi(2);
+            let squares =
+                |(point, weight): (&CostPoint, &f64)| weight * residual(&coefficients, point).powi(2);
             let left_over: f64 = points.iter().zip(&weights).map(squares).sum();
             // A single label always fits and carries no information on the scale.
             let freedom = points.len().saturating_sub(1) as f64;
@@ -76,7 +77,7 @@ impl Fit {
     }
 
     /// Mean of cost / median cost over the labels, with the weights of the fit.
-    fn mean_of_factors(&self, points: &[Point], weights: &[f64]) -> f64 {
+    fn mean_of_factors(&self, points: &[CostPoint], weights: &[f64]) -> f64 {
         let (mut sum, mut weight) =
             (DEGREES_OF_FREEDOM * (0.5 * self.scale.powi(2)).exp(), DEGREES_OF_FREEDOM);
         for (point, w) in points.iter().zip(weights) {
@@ -87,12 +88,17 @@ impl Fit {
     }
 }
 
-fn residual(coefficients: &[f64; 3], (row, cost): &Point) -> f64 {
+fn residual(coefficients: &[f64; 3], (row, cost): &CostPoint) -> f64 {
     cost - coefficients.iter().zip(row).map(|(c, x)| c * x).sum::<f64>()
 }
 
 /// Most probable coefficients and their covariance.
-fn solve(points: &[Point], weights: &[f64], scale: f64, guess: Option<Point>) -> Option<([f64; 3], Matrix3)> {
+fn solve(
+    points: &[CostPoint],
+    weights: &[f64],
+    scale: f64,
+    guess: Option<CostPoint>,
+) -> Option<([f64; 3], Matrix3)> {
     let (mut precision, mut right) = ([[0.0; 3]; 3], [0.0; 3]);
     for (k, prior) in EXPONENT_PRIORS.iter().enumerate() {
         precision[k + 1][k + 1] = prior.sd.powi(-2);

@@ -20,29 +20,29 @@ impl Random {
     }
 }
 
-fn size(atoms: f64, k_points: f64) -> Size {
-    Size { atoms, electrons: Some(4.0 * atoms), k_points }
+fn size(atoms: f64, k_points: f64) -> CostPredictors {
+    CostPredictors { atoms, electrons: Some(4.0 * atoms), k_points }
 }
 
 /// A campaign of cells with 8 to 128 atoms, whose k-point meshes shrink as the cells grow.
-fn campaign(labels: usize, exponent: f64, scatter: f64, seed: u64) -> Vec<Measured> {
+fn campaign(labels: usize, exponent: f64, scatter: f64, seed: u64) -> Vec<MeasuredCost> {
     let mut random = Random(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x1234_5678);
     let mut label = || {
         let atoms = (8.0 * 16_f64.powf(random.even())).round();
         let k_points = (256.0 / atoms).ceil();
         let noise = (scatter * random.normal()).exp();
         let core_seconds = 3.0 * (atoms / 8.0).powf(exponent) * k_points.powf(0.9) * noise;
-        Measured { size: size(atoms, k_points), core_seconds }
+        MeasuredCost { size: size(atoms, k_points), core_seconds }
     };
     (0..labels).map(|_| label()).collect()
 }
 
-fn total(labels: &[Measured]) -> f64 {
+fn total(labels: &[MeasuredCost]) -> f64 {
     labels.iter().map(|label| label.core_seconds).sum()
 }
 
 /// Prediction of the last third from the first two thirds / its actual cost.
-fn ratio(labels: &[Measured]) -> f64 {
+fn ratio(labels: &[MeasuredCost]) -> f64 {
     let (known, rest) = labels.split_at(labels.len() * 2 / 3);
     let model = CostModel::fit(known, None).unwrap();
     model.predict_all(rest.iter().map(|label| (label.size, 1))).unwrap().core_seconds / total(rest)
@@ -51,14 +51,14 @@ fn ratio(labels: &[Measured]) -> f64 {
 #[test]
 fn nothing_is_known_before_the_first_label() {
     assert!(CostModel::fit(&[], None).is_none());
-    let useless = Measured { size: size(0.0, 1.0), core_seconds: 1.0 };
-    let failed = Measured { size: size(8.0, 1.0), core_seconds: f64::NAN };
+    let useless = MeasuredCost { size: size(0.0, 1.0), core_seconds: 1.0 };
+    let failed = MeasuredCost { size: size(8.0, 1.0), core_seconds: f64::NAN };
     assert!(CostModel::fit(&[useless, failed], None).is_none());
 }
 
 #[test]
 fn one_label_is_enough_to_begin_with() {
-    let model = CostModel::fit(&[Measured { size: size(8.0, 27.0), core_seconds: 100.0 }], None).unwrap();
+    let model = CostModel::fit(&[MeasuredCost { size: size(8.0, 27.0), core_seconds: 100.0 }], None).unwrap();
     let same = model.predict(&size(8.0, 27.0)).unwrap();
     assert!((80.0..125.0).contains(&same.core_seconds) && same.low < 100.0 && same.high > 100.0);
     // Twice the atoms: 2² times the cost by the prior, with linear and cubic codes within the interval.
@@ -72,11 +72,11 @@ fn one_label_is_enough_to_begin_with() {
 
 #[test]
 fn a_guess_holds_until_labels_come() {
-    let guess = Measured { size: size(32.0, 1.0), core_seconds: 3600.0 };
+    let guess = MeasuredCost { size: size(32.0, 1.0), core_seconds: 3600.0 };
     let guessed = CostModel::fit(&[], Some(guess)).unwrap();
     let before = guessed.predict(&guess.size).unwrap();
     assert!(before.low < 1200.0 && before.high > 10_000.0 && guessed.labels() == 0);
-    let labels = [Measured { core_seconds: 60.0, ..guess }; 5];
+    let labels = [MeasuredCost { core_seconds: 60.0, ..guess }; 5];
     let after = CostModel::fit(&labels, Some(guess)).unwrap().predict(&guess.size).unwrap();
     assert!((50.0..80.0).contains(&after.core_seconds), "{after:?}");
 }
@@ -95,7 +95,7 @@ fn without_all_electrons_atoms_count() {
     let mut labels = campaign(50, 2.0, 0.0, 1);
     labels[7].size.electrons = None;
     let model = CostModel::fit(&labels, None).unwrap();
-    let unknown = Size { electrons: None, ..size(20.0, 4.0) };
+    let unknown = CostPredictors { electrons: None, ..size(20.0, 4.0) };
     assert_eq!(model.predict(&unknown), model.predict(&size(20.0, 4.0)));
     // Conversely, a model of electrons predicts nothing where electrons are unknown.
     let model = CostModel::fit(&campaign(50, 2.0, 0.0, 1), None).unwrap();
@@ -137,8 +137,12 @@ const ABINIT: [(u32, u32, u32, f64); 24] = [
 
 #[test]
 fn the_last_third_of_real_labels_is_within_a_factor_of_two() {
-    let label = |&(atoms, electrons, k_points, core_seconds): &(u32, u32, u32, f64)| Measured {
-        size: Size { atoms: atoms.into(), electrons: Some(electrons.into()), k_points: k_points.into() },
+    let label = |&(atoms, electrons, k_points, core_seconds): &(u32, u32, u32, f64)| MeasuredCost {
+        size: CostPredictors {
+            atoms: atoms.into(),
+            electrons: Some(electrons.into()),
+            k_points: k_points.into(),
+        },
         core_seconds,
     };
     let labels: Vec<_> = ABINIT.iter().map(label).collect();
@@ -190,7 +194,7 @@ proptest! {
         labels in prop::collection::vec((1e-3..1e6, 1e-3..1e6, 1e-6..1e9), 1..30), atoms in 1.0..1e5, k_points in 1.0..1e4
     ) {
         let measured = |&(atoms, k_points, core_seconds): &(f64, f64, f64)| {
-            Measured { size: size(atoms, k_points), core_seconds }
+            MeasuredCost { size: size(atoms, k_points), core_seconds }
         };
         let labels: Vec<_> = labels.iter().map(measured).collect();
         let model = CostModel::fit(&labels, None).unwrap();

@@ -1,7 +1,7 @@
 //! Parses the comment line: `key=value` pairs with quotes, brackets and escapes.
 
 use super::error::ExtxyzErrorKind;
-use super::value::Value;
+use super::value::ExtxyzValue;
 
 /// Keys whose value always stays text.
 pub(super) fn is_verbatim(key: &str) -> bool {
@@ -13,7 +13,7 @@ pub(super) fn is_verbatim(key: &str) -> bool {
 /// Inside `"…"`, `'…'`, `{…}` and `[…]` white space belongs to the word. A backslash escapes the next
 /// character. Spaces may surround `=`. A key without `=` is true. A line without any `=` is free text: its
 /// words are keys with the value true, and a single apostrophe is allowed.
-pub(super) fn parse(line: &str) -> Result<Vec<(String, Value)>, ExtxyzErrorKind> {
+pub(super) fn parse(line: &str) -> Result<Vec<(String, ExtxyzValue)>, ExtxyzErrorKind> {
     let mut cursor = Cursor { line, at: 0, lenient: !line.contains('=') };
     let mut pairs = Vec::new();
     loop {
@@ -29,7 +29,7 @@ pub(super) fn parse(line: &str) -> Result<Vec<(String, Value)>, ExtxyzErrorKind>
             cursor.skip_space();
             cursor.value(&key)?
         } else {
-            Value::Bool(true)
+            ExtxyzValue::Bool(true)
         };
         pairs.push((key, value));
     }
@@ -108,16 +108,16 @@ impl Cursor<'_> {
         }
     }
 
-    fn value(&mut self, key: &str) -> Result<Value, ExtxyzErrorKind> {
+    fn value(&mut self, key: &str) -> Result<ExtxyzValue, ExtxyzErrorKind> {
         if self.rest().starts_with("[[") {
             return self.matrix(key);
         }
         let word = self.word(false)?;
-        Ok(if is_verbatim(key) { Value::Text(word) } else { Value::parse(&word) })
+        Ok(if is_verbatim(key) { ExtxyzValue::Text(word) } else { ExtxyzValue::parse(&word) })
     }
 
     /// `[[…], […]]` without quotes, up to the bracket that closes the first one.
-    fn matrix(&mut self, key: &str) -> Result<Value, ExtxyzErrorKind> {
+    fn matrix(&mut self, key: &str) -> Result<ExtxyzValue, ExtxyzErrorKind> {
         let start = self.at;
         let mut depth = 0_usize;
         while let Some(c) = self.next() {
@@ -128,7 +128,7 @@ impl Cursor<'_> {
             }
             if depth == 0 {
                 let text = self.line.get(start..self.at).unwrap_or("");
-                return Value::parse_json(text)
+                return ExtxyzValue::parse_json(text)
                     .ok_or_else(|| ExtxyzErrorKind::key(key, text, "rows of numbers"));
             }
         }

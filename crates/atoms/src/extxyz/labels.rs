@@ -1,11 +1,11 @@
 //! Energy, forces and stress under the names that other programs use.
 
-use super::{Column, Frame, Value};
+use super::{Column, ExtxyzValue, Frame};
 use crate::cell::{Matrix3, Vec3};
 
 /// The labels of a frame: the results of a calculation, usually DFT.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Labels {
+pub struct FrameLabels {
     /// Total energy, eV.
     pub energy: Option<f64>,
     /// `[n]`, eV/Å.
@@ -50,7 +50,7 @@ impl Frame {
     /// takes precedence over `free_energy`, as in ASE; `stress` over `virial` (eV), with stress = −virial /
     /// volume; and `forces` over `force`, which QUIP writes. Of an asymmetric stress the upper triangle is
     /// used, as in ASE.
-    pub fn labels(&self) -> Result<Labels, LabelError> {
+    pub fn labels(&self) -> Result<FrameLabels, LabelError> {
         let reference = QUANTITIES.map(|quantity| format!("REF_{quantity}"));
         let given = |key: &String| self.info.contains_key(key) || self.arrays.contains_key(key);
         let prefix = if reference.iter().any(given) { "REF_" } else { "" };
@@ -66,11 +66,11 @@ impl Frame {
             None => self.forces(&format!("{prefix}force"))?,
             forces => forces,
         };
-        Ok(Labels { energy, forces, stress })
+        Ok(FrameLabels { energy, forces, stress })
     }
 
     /// Replaces all labels of the frame, under any names.
-    pub fn set_labels(&mut self, labels: &Labels, keys: LabelKeys) {
+    pub fn set_labels(&mut self, labels: &FrameLabels, keys: LabelKeys) {
         for quantity in QUANTITIES {
             for key in [quantity.to_owned(), format!("REF_{quantity}")] {
                 self.info.remove(&key);
@@ -102,7 +102,7 @@ impl Frame {
         &self,
         prefix: &str,
         quantity: &str,
-        read: fn(&Self, &Value) -> Result<T, &'static str>,
+        read: fn(&Self, &ExtxyzValue) -> Result<T, &'static str>,
     ) -> Result<Option<T>, LabelError> {
         let key = format!("{prefix}{quantity}");
         let read = |value| {
@@ -111,11 +111,11 @@ impl Frame {
         self.info.get(&key).map(read).transpose()
     }
 
-    fn energy(&self, value: &Value) -> Result<f64, &'static str> {
+    fn energy(&self, value: &ExtxyzValue) -> Result<f64, &'static str> {
         value.number().filter(|energy| energy.is_finite()).ok_or("a finite number")
     }
 
-    fn matrix(&self, value: &Value) -> Result<Matrix3, &'static str> {
+    fn matrix(&self, value: &ExtxyzValue) -> Result<Matrix3, &'static str> {
         let numbers = value.numbers().filter(|numbers| numbers.iter().all(|x| x.is_finite()));
         match numbers.as_deref() {
             Some(&[xx, xy, xz, _, yy, yz, _, _, zz]) | Some(&[xx, yy, zz, yz, xz, xy]) => {
@@ -125,7 +125,7 @@ impl Frame {
         }
     }
 
-    fn stress_from_virial(&self, value: &Value) -> Result<Matrix3, &'static str> {
+    fn stress_from_virial(&self, value: &ExtxyzValue) -> Result<Matrix3, &'static str> {
         let volume = self.structure.cell.volume();
         if volume == 0.0 {
             return Err("none without a cell that has a volume");

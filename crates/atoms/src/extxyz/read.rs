@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::io::{BufRead, ErrorKind};
 
 use super::error::{ExtxyzError, ExtxyzErrorKind, excerpt};
-use super::table::Table;
-use super::{Frame, Value, comment};
+use super::table::AtomTable;
+use super::{ExtxyzValue, Frame, comment};
 use crate::cell::{Cell, Matrix3};
 use crate::structure::Structure;
 
 /// Iterates over the frames of a stream. Ends after the first error.
-pub struct Reader<R> {
+pub struct ExtxyzReader<R> {
     input: R,
     /// Number of the line in `text`, from 1.
     line: usize,
@@ -18,7 +18,7 @@ pub struct Reader<R> {
     ended: bool,
 }
 
-impl<R: BufRead> Reader<R> {
+impl<R: BufRead> ExtxyzReader<R> {
     /// Reads from `input` as the iterator advances.
     pub fn new(input: R) -> Self {
         Self { input, line: 0, text: String::new(), ended: false }
@@ -55,8 +55,8 @@ impl<R: BufRead> Reader<R> {
         if !self.advance()? {
             return Err(ExtxyzErrorKind::Truncated { found: 0, expected: count, start }.at(self.line));
         }
-        let Header { info, cell, periodic, mut table } =
-            Header::new(&self.text).map_err(|fault| fault.at(self.line))?;
+        let ExtxyzHeader { info, cell, periodic, mut table } =
+            ExtxyzHeader::new(&self.text).map_err(|fault| fault.at(self.line))?;
         for atom in 0..count {
             if !self.advance()? {
                 return Err(ExtxyzErrorKind::Truncated { found: atom, expected: count, start }.at(self.line));
@@ -70,7 +70,7 @@ impl<R: BufRead> Reader<R> {
     }
 }
 
-impl<R: BufRead> Iterator for Reader<R> {
+impl<R: BufRead> Iterator for ExtxyzReader<R> {
     type Item = Result<Frame, ExtxyzError>;
 
     fn next(&mut self) -> Option<Self::Item> {
@@ -84,14 +84,14 @@ impl<R: BufRead> Iterator for Reader<R> {
 }
 
 /// The parsed comment line.
-struct Header {
-    info: BTreeMap<String, Value>,
+struct ExtxyzHeader {
+    info: BTreeMap<String, ExtxyzValue>,
     cell: Cell,
     periodic: [bool; 3],
-    table: Table,
+    table: AtomTable,
 }
 
-impl Header {
+impl ExtxyzHeader {
     fn new(line: &str) -> Result<Self, ExtxyzErrorKind> {
         let mut info = BTreeMap::new();
         for (key, mut value) in comment::parse(line)? {
@@ -106,9 +106,9 @@ impl Header {
         let lattice = info.remove("Lattice").map(|value| lattice(&value)).transpose()?;
         let periodic = info.remove("pbc").map(|value| periodic(&value)).transpose()?;
         let table = match info.remove("Properties") {
-            Some(Value::Text(properties)) => Table::new(&properties, true)?,
+            Some(ExtxyzValue::Text(properties)) => AtomTable::new(&properties, true)?,
             Some(other) => return Err(fault("Properties", &other, "name:type:columns triples")),
-            None => Table::new("species:S:1:pos:R:3", false)?,
+            None => AtomTable::new("species:S:1:pos:R:3", false)?,
         };
         Ok(Self {
             info,
@@ -119,11 +119,11 @@ impl Header {
     }
 }
 
-fn fault(key: &str, value: &Value, expected: &'static str) -> ExtxyzErrorKind {
+fn fault(key: &str, value: &ExtxyzValue, expected: &'static str) -> ExtxyzErrorKind {
     ExtxyzErrorKind::key(key, &value.to_string(), expected)
 }
 
-fn lattice(value: &Value) -> Result<Cell, ExtxyzErrorKind> {
+fn lattice(value: &ExtxyzValue) -> Result<Cell, ExtxyzErrorKind> {
     match value.numbers().as_deref() {
         Some(&[a, b, c, d, e, f, g, h, i]) => Ok(Cell([[a, b, c], [d, e, f], [g, h, i]])),
         _ => Err(fault("Lattice", value, "9 numbers")),
@@ -131,7 +131,7 @@ fn lattice(value: &Value) -> Result<Cell, ExtxyzErrorKind> {
 }
 
 /// A 3×3 matrix from its 9 components in Fortran order, or from 6 in Voigt order.
-fn matrix(value: &Value) -> Option<Matrix3> {
+fn matrix(value: &ExtxyzValue) -> Option<Matrix3> {
     match *value.numbers()? {
         [xx, yx, zx, xy, yy, zy, xz, yz, zz] => Some([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]]),
         [xx, yy, zz, yz, xz, xy] => Some([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
@@ -139,15 +139,15 @@ fn matrix(value: &Value) -> Option<Matrix3> {
     }
 }
 
-fn periodic(value: &Value) -> Result<[bool; 3], ExtxyzErrorKind> {
-    let flag = |value: &Value| match value {
-        Value::Bool(flag) => Some(*flag),
-        Value::Int(0) => Some(false),
-        Value::Int(1) => Some(true),
+fn periodic(value: &ExtxyzValue) -> Result<[bool; 3], ExtxyzErrorKind> {
+    let flag = |value: &ExtxyzValue| match value {
+        ExtxyzValue::Bool(flag) => Some(*flag),
+        ExtxyzValue::Int(0) => Some(false),
+        ExtxyzValue::Int(1) => Some(true),
         _ => None,
     };
     let flags: Option<Vec<bool>> = match value {
-        Value::List(values) => values.iter().map(flag).collect(),
+        ExtxyzValue::List(values) => values.iter().map(flag).collect(),
         _ => flag(value).map(|flag| vec![flag; 3]),
     };
     flags.and_then(|flags| flags.try_into().ok()).ok_or_else(|| fault("pbc", value, "three of T and F"))

@@ -9,7 +9,7 @@ use crate::cell::Vec3;
 use crate::species::{Species, UnknownSpecies};
 
 /// The atoms of a frame while it is read.
-pub(super) struct Table {
+pub(super) struct AtomTable {
     columns: Vec<TableColumn>,
     /// Fields per line.
     width: usize,
@@ -34,7 +34,7 @@ enum Content {
     Ignored,
 }
 
-impl Table {
+impl AtomTable {
     /// Columns as `Properties` describes them: `name:type:columns` triples.
     pub(super) fn new(properties: &str, exact: bool) -> Result<Self, ExtxyzErrorKind> {
         let fault = |expected| ExtxyzErrorKind::key("Properties", properties, expected);

@@ -2,7 +2,7 @@ use super::*;
 use crate::cell::Cell;
 
 fn frames(text: &str) -> Result<Vec<Frame>, ExtxyzError> {
-    Reader::new(text.as_bytes()).collect()
+    ExtxyzReader::new(text.as_bytes()).collect()
 }
 
 fn only(text: &str) -> Frame {
@@ -11,7 +11,7 @@ fn only(text: &str) -> Frame {
     frames.remove(0)
 }
 
-fn info(comment: &str) -> BTreeMap<String, Value> {
+fn info(comment: &str) -> BTreeMap<String, ExtxyzValue> {
     only(&format!("1\n{comment}\nAl 0 0 0\n")).info
 }
 
@@ -29,7 +29,7 @@ fn plain_xyz_has_no_cell_and_more_columns_do_not_matter() {
     assert_eq!(frame.structure.positions[1], [1.0, 2.0, 3.0]);
     assert_eq!(frame.structure.cell, Cell([[0.0; 3]; 3]));
     assert_eq!(frame.structure.periodic, [false; 3]);
-    assert_eq!(frame.info["Cubic"], Value::Bool(true));
+    assert_eq!(frame.info["Cubic"], ExtxyzValue::Bool(true));
 }
 
 #[test]
@@ -63,7 +63,7 @@ fn values_of_every_type() {
             .replace('\n', " ")
             .as_str(),
     );
-    let expected: [(&str, Value); 20] = [
+    let expected: [(&str, ExtxyzValue); 20] = [
         ("i", (-3).into()),
         ("r", 100.0.into()),
         ("t", "abc".into()),
@@ -77,7 +77,7 @@ fn values_of_every_type() {
         ("spaced", 4.into()),
         ("bools", vec![true, true, false].into()),
         ("json", vec![vec![1, 2], vec![3, 4]].into()),
-        ("bare", Value::List(vec![Value::List(vec![1.5.into(), 2.into()]), vec![3, 4].into()])),
+        ("bare", ExtxyzValue::List(vec![ExtxyzValue::List(vec![1.5.into(), 2.into()]), vec![3, 4].into()])),
         ("object", "_JSON {\"a\": 1}".into()),
         ("words", vec!["a", "b"].into()),
         ("empty", "".into()),
@@ -205,10 +205,10 @@ fn errors_tell_line_found_and_expected() {
             ExtxyzError { line: error.line - 4, ..error }.to_string(),
             message.replace("at line 1", "at line 5")
         );
-        let mut reader = Reader::new(text.as_bytes());
+        let mut reader = ExtxyzReader::new(text.as_bytes());
         assert!(reader.next().unwrap().is_err() && reader.next().is_none());
     }
-    let error = Reader::new(b"1\n\xff\nAl 0 0 0\n".as_slice()).next().unwrap().unwrap_err();
+    let error = ExtxyzReader::new(b"1\n\xff\nAl 0 0 0\n".as_slice()).next().unwrap().unwrap_err();
     assert_eq!(error.to_string(), "line 2: found bytes that are not text, expected UTF-8");
 }
 
@@ -230,12 +230,12 @@ fn labels_under_their_names() {
     let error = plain.labels().unwrap_err();
     assert!(error.to_string().ends_with("expected none without a cell that has a volume"), "{error}");
     let plain = only("1\nfree_energy=1.5\nAl 0 0 0\n").labels().unwrap();
-    assert_eq!(plain, Labels { energy: Some(1.5), ..Labels::default() });
+    assert_eq!(plain, FrameLabels { energy: Some(1.5), ..FrameLabels::default() });
 }
 
 #[test]
 fn labels_replace_those_of_any_name() {
-    let labels = Labels {
+    let labels = FrameLabels {
         energy: Some(-3.25),
         forces: Some(vec![[0.5, 0.0, -1e-9]]),
         stress: Some([[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]]),
@@ -275,7 +275,7 @@ fn what_cannot_be_read_again_is_not_written() {
         assert_eq!(message, format!("the column 'x' {fault}"));
     }
     for (key, value) in [
-        ("pbc", Value::from(true)),
+        ("pbc", ExtxyzValue::from(true)),
         ("", true.into()),
         ("a\nb", true.into()),
         ("uid", 5.into()),

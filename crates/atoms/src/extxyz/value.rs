@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use serde_json::Value as Json;
+use serde_json::Value;
 
 use crate::cell::Matrix3;
 
@@ -10,7 +10,7 @@ use crate::cell::Matrix3;
 ///
 /// JSON objects and nulls (`_JSON {…}`) are kept as text and written back unchanged.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Value {
+pub enum ExtxyzValue {
     /// `T` or `F`; a key without a value is true.
     Bool(bool),
     /// An integer.
@@ -20,10 +20,10 @@ pub enum Value {
     /// Anything else.
     Text(String),
     /// A vector; a matrix is a list of its rows.
-    List(Vec<Value>),
+    List(Vec<ExtxyzValue>),
 }
 
-impl Value {
+impl ExtxyzValue {
     /// The number, if it is one.
     pub fn number(&self) -> Option<f64> {
         match self {
@@ -70,7 +70,7 @@ impl Value {
         from_json(&serde_json::from_str(text).ok()?)
     }
 
-    /// The text, before quotes and escapes, that [`Value::parse`] and ASE read as this value.
+    /// The text, before quotes and escapes, that [`ExtxyzValue::parse`] and ASE read as this value.
     ///
     /// `None` for a list whose rows differ in length, or that contains numbers that are not finite below its
     /// first level: JSON or ASE cannot represent them.
@@ -105,7 +105,7 @@ impl Value {
 }
 
 /// As in the comment line, before quotes; lists as in JSON.
-impl fmt::Display for Value {
+impl fmt::Display for ExtxyzValue {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Bool(value) => f.write_str(if *value { "T" } else { "F" }),
@@ -120,20 +120,23 @@ impl fmt::Display for Value {
     }
 }
 
-fn json_item(value: &Value) -> String {
+fn json_item(value: &ExtxyzValue) -> String {
     match value {
-        Value::Bool(value) => value.to_string(),
-        Value::Text(text) => json_string(text),
+        ExtxyzValue::Bool(value) => value.to_string(),
+        ExtxyzValue::Text(text) => json_string(text),
         _ => value.to_string(),
     }
 }
 
 /// One value for a single word, a list for several; `None` if a word has another type.
-fn all<'a>(words: impl Iterator<Item = &'a str>, parse: impl Fn(&str) -> Option<Value>) -> Option<Value> {
+fn all<'a>(
+    words: impl Iterator<Item = &'a str>,
+    parse: impl Fn(&str) -> Option<ExtxyzValue>,
+) -> Option<ExtxyzValue> {
     let mut values = words.map(parse).collect::<Option<Vec<_>>>()?;
     match values.len() {
         0 | 1 => values.pop(),
-        _ => Some(Value::List(values)),
+        _ => Some(ExtxyzValue::List(values)),
     }
 }
 
@@ -146,23 +149,23 @@ pub(super) fn logical(word: &str) -> Option<bool> {
     }
 }
 
-fn from_json(json: &Json) -> Option<Value> {
+fn from_json(json: &Value) -> Option<ExtxyzValue> {
     match json {
-        Json::Null | Json::Object(_) => None,
-        Json::Bool(value) => Some(Value::Bool(*value)),
-        Json::Number(number) if number.is_f64() => number.as_f64().map(Value::Real),
-        Json::Number(number) => number.as_i64().map(Value::Int),
-        Json::String(text) => Some(Value::Text(text.clone())),
-        Json::Array(values) => values.iter().map(from_json).collect::<Option<_>>().map(Value::List),
+        Value::Null | Value::Object(_) => None,
+        Value::Bool(value) => Some(ExtxyzValue::Bool(*value)),
+        Value::Number(number) if number.is_f64() => number.as_f64().map(ExtxyzValue::Real),
+        Value::Number(number) => number.as_i64().map(ExtxyzValue::Int),
+        Value::String(text) => Some(ExtxyzValue::Text(text.clone())),
+        Value::Array(values) => values.iter().map(from_json).collect::<Option<_>>().map(ExtxyzValue::List),
     }
 }
 
 /// At least two numbers or booleans of one type, which need no JSON.
-fn is_plain_vector(values: &[Value]) -> bool {
+fn is_plain_vector(values: &[ExtxyzValue]) -> bool {
     values.len() > 1
-        && (values.iter().all(|value| matches!(value, Value::Bool(_)))
-            || values.iter().all(|value| matches!(value, Value::Int(_)))
-            || values.iter().all(|value| matches!(value, Value::Real(_))))
+        && (values.iter().all(|value| matches!(value, ExtxyzValue::Bool(_)))
+            || values.iter().all(|value| matches!(value, ExtxyzValue::Int(_)))
+            || values.iter().all(|value| matches!(value, ExtxyzValue::Real(_))))
 }
 
 /// Whether the bare text is read back as the same text, also by ASE.
@@ -170,11 +173,13 @@ fn is_plain_vector(values: &[Value]) -> bool {
 /// Python parses `1_000` as a number, and non-ASCII files depend on the locale.
 fn stays_text(text: &str) -> bool {
     let printable = text.bytes().all(|byte| (b' '..=b'~').contains(&byte));
-    let number =
-        matches!(Value::parse(&text.replace('_', "")), Value::Int(_) | Value::Real(_) | Value::List(_));
+    let number = matches!(
+        ExtxyzValue::parse(&text.replace('_', "")),
+        ExtxyzValue::Int(_) | ExtxyzValue::Real(_) | ExtxyzValue::List(_)
+    );
     let words = text.contains(|c| c != ' ' && c != ',');
-    let json = text.strip_prefix("_JSON ").is_none_or(|json| serde_json::from_str::<Json>(json).is_ok());
-    printable && words && !number && json && Value::parse(text) == Value::Text(text.to_owned())
+    let json = text.strip_prefix("_JSON ").is_none_or(|json| serde_json::from_str::<Value>(json).is_ok());
+    printable && words && !number && json && ExtxyzValue::parse(text) == ExtxyzValue::Text(text.to_owned())
 }
 
 /// A JSON string in ASCII.
@@ -191,43 +196,43 @@ fn json_string(text: &str) -> String {
     quoted
 }
 
-impl From<bool> for Value {
+impl From<bool> for ExtxyzValue {
     fn from(value: bool) -> Self {
         Self::Bool(value)
     }
 }
 
-impl From<i64> for Value {
+impl From<i64> for ExtxyzValue {
     fn from(value: i64) -> Self {
         Self::Int(value)
     }
 }
 
-impl From<f64> for Value {
+impl From<f64> for ExtxyzValue {
     fn from(value: f64) -> Self {
         Self::Real(value)
     }
 }
 
-impl From<&str> for Value {
+impl From<&str> for ExtxyzValue {
     fn from(text: &str) -> Self {
         Self::Text(text.to_owned())
     }
 }
 
-impl From<String> for Value {
+impl From<String> for ExtxyzValue {
     fn from(text: String) -> Self {
         Self::Text(text)
     }
 }
 
-impl<T: Into<Value>> From<Vec<T>> for Value {
+impl<T: Into<ExtxyzValue>> From<Vec<T>> for ExtxyzValue {
     fn from(values: Vec<T>) -> Self {
         Self::List(values.into_iter().map(Into::into).collect())
     }
 }
 
-impl From<Matrix3> for Value {
+impl From<Matrix3> for ExtxyzValue {
     fn from(matrix: Matrix3) -> Self {
         matrix.map(|row| Self::from(row.to_vec())).to_vec().into()
     }

@@ -3,12 +3,12 @@
 use std::io::Write;
 
 use super::comment::{is_verbatim, quote};
-use super::{Column, ColumnData, Frame, Value};
+use super::{Column, ColumnData, ExtxyzValue, Frame};
 use crate::structure::StructureError;
 
 /// Why a frame cannot be written so that this reader and ASE read it back.
 #[derive(Debug, thiserror::Error)]
-pub enum WriteError {
+pub enum ExtxyzWriteError {
     /// The stream reports an error.
     #[error("cannot be written: {0}")]
     Io(#[from] std::io::Error),
@@ -36,7 +36,7 @@ pub enum WriteError {
 /// Writes one frame, or nothing if it cannot be written.
 ///
 /// Keys and columns are in alphabetical order, so equal frames give equal bytes.
-pub fn write_frame(out: &mut impl Write, frame: &Frame) -> Result<(), WriteError> {
+pub fn write_frame(out: &mut impl Write, frame: &Frame) -> Result<(), ExtxyzWriteError> {
     frame.structure.validate()?;
     let mut text = Vec::new();
     writeln!(text, "{}", frame.structure.len())?;
@@ -54,7 +54,7 @@ pub fn write_frame(out: &mut impl Write, frame: &Frame) -> Result<(), WriteError
     Ok(out.write_all(&text)?)
 }
 
-fn comment(frame: &Frame) -> Result<String, WriteError> {
+fn comment(frame: &Frame) -> Result<String, ExtxyzWriteError> {
     let mut words = Vec::new();
     let lattice = frame.structure.cell.0.concat();
     if lattice.iter().any(|x| *x != 0.0) {
@@ -63,12 +63,12 @@ fn comment(frame: &Frame) -> Result<String, WriteError> {
     let mut properties = "species:S:1:pos:R:3".to_owned();
     for (name, column) in &frame.arrays {
         let kind = kind(name, column, frame.structure.len())
-            .map_err(|fault| WriteError::Column { name: name.clone(), fault })?;
+            .map_err(|fault| ExtxyzWriteError::Column { name: name.clone(), fault })?;
         properties.push_str(&format!(":{name}:{kind}:{}", column.width));
     }
     words.push(format!("Properties={}", quote(&properties)));
     for (key, value) in &frame.info {
-        let value = info(key, value).map_err(|fault| WriteError::Key { key: key.clone(), fault })?;
+        let value = info(key, value).map_err(|fault| ExtxyzWriteError::Key { key: key.clone(), fault })?;
         words.push(format!("{}={}", quote(key), quote(&value)));
     }
     let [a, b, c] = frame.structure.periodic.map(flag);
@@ -77,7 +77,7 @@ fn comment(frame: &Frame) -> Result<String, WriteError> {
 }
 
 /// The value as text; on failure, what is wrong.
-fn info(key: &str, value: &Value) -> Result<String, &'static str> {
+fn info(key: &str, value: &ExtxyzValue) -> Result<String, &'static str> {
     match key {
         "Lattice" | "Properties" | "pbc" => return Err("belongs to the structure"),
         "stress" | "virial" => return matrix(value).ok_or("needs a 3 × 3 matrix or 6 components"),
@@ -94,7 +94,7 @@ fn info(key: &str, value: &Value) -> Result<String, &'static str> {
 }
 
 /// Nine components in Fortran order.
-fn matrix(value: &Value) -> Option<String> {
+fn matrix(value: &ExtxyzValue) -> Option<String> {
     match *value.numbers()? {
         [xx, xy, xz, yx, yy, yz, zx, zy, zz] => Some(reals(&[xx, yx, zx, xy, yy, zy, xz, yz, zz])),
         [xx, yy, zz, yz, xz, xy] => Some(reals(&[xx, xy, xz, xy, yy, yz, xz, yz, zz])),

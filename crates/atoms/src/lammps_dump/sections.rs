@@ -91,7 +91,7 @@ fn finite(word: &str) -> Option<f64> {
 }
 
 /// An atom of a snapshot.
-pub(super) struct Atom {
+pub(super) struct DumpAtom {
     /// 0 without the column.
     pub id: i64,
     pub species: Species,
@@ -100,7 +100,7 @@ pub(super) struct Atom {
 }
 
 /// Where the columns are.
-pub(super) struct Columns {
+pub(super) struct DumpColumns {
     id: Option<usize>,
     species: SpeciesColumn,
     position: [usize; 3],
@@ -121,7 +121,7 @@ const COORDINATES: [([&str; 3], bool); 4] = [
     (["xs", "ys", "zs"], true),
 ];
 
-impl Columns {
+impl DumpColumns {
     /// From the names after `ATOMS`. A column `element` comes before `types`, which give elements to atom types.
     pub fn parse(names: &str, types: &[Species]) -> Result<Self, DumpErrorKind> {
         let words: Vec<&str> = names.split_whitespace().collect();
@@ -149,7 +149,7 @@ impl Columns {
     }
 
     /// The atom of a line.
-    pub fn atom(&self, text: &str, types: &[Species]) -> Result<Atom, DumpErrorKind> {
+    pub fn atom(&self, text: &str, types: &[Species]) -> Result<DumpAtom, DumpErrorKind> {
         let words: Vec<&str> = text.split_whitespace().collect();
         if words.len() != self.count {
             return Err(DumpErrorKind::line(text, "as many values as ITEM: ATOMS names columns"));
@@ -173,6 +173,6 @@ impl Columns {
             *x = finite(words[column])
                 .ok_or_else(|| DumpErrorKind::line(words[column], "a finite coordinate"))?;
         }
-        Ok(Atom { id, species, position })
+        Ok(DumpAtom { id, species, position })
     }
 }

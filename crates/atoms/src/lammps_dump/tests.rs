@@ -1,9 +1,10 @@
 use super::*;
 use crate::cell::{norm, sub};
-use crate::extxyz::Value;
+use crate::extxyz::ExtxyzValue;
 
 fn read_all(text: &str, types: &[&str]) -> Result<Vec<Frame>, DumpError> {
-    Reader::new(text.as_bytes(), types.iter().map(|symbol| symbol.parse().unwrap()).collect()).collect()
+    LammpsDumpReader::new(text.as_bytes(), types.iter().map(|symbol| symbol.parse().unwrap()).collect())
+        .collect()
 }
 
 const ORTHOGONAL: &str = "ITEM: UNITS\nmetal\nITEM: TIME\n0.5\nITEM: TIMESTEP\n500\nITEM: NUMBER OF ATOMS\n2\n\
@@ -20,7 +21,7 @@ fn scaled_coordinates_in_an_orthogonal_box() {
     assert_eq!(structure.formula(), "MoO");
     assert_eq!(structure.positions, [[0.0; 3], [1.0, 2.5, 3.0]], "in the order of their ids");
     assert_eq!(arrays["id"].reals().unwrap(), [2.0, 7.0]);
-    assert_eq!(info["timestep"], Value::Int(500));
+    assert_eq!(info["timestep"], ExtxyzValue::Int(500));
 }
 
 #[test]
@@ -66,7 +67,7 @@ fn all_coordinates_of_lammps_are_the_same_positions() {
     for text in files {
         let frame = read_all(text, &["Si", "O"]).unwrap().remove(1);
         let structure = frame.structure;
-        assert_eq!(frame.info["timestep"], Value::Int(20));
+        assert_eq!(frame.info["timestep"], ExtxyzValue::Int(20));
         for (vector, expected) in structure.cell.0.iter().zip(cell) {
             assert!(norm(sub(*vector, *expected)) < 1e-12);
         }
@@ -122,7 +123,8 @@ fn errors_tell_line_found_and_expected() {
         assert!(error.starts_with(message), "{error}");
     }
     assert!(read_all("", &[]).unwrap().is_empty());
-    let bytes = Reader::new(&b"ITEM: TIMESTEP\n\xff\xfe\n"[..], vec![]).next().unwrap().unwrap_err();
+    let bytes =
+        LammpsDumpReader::new(&b"ITEM: TIMESTEP\n\xff\xfe\n"[..], vec![]).next().unwrap().unwrap_err();
     assert!(bytes.to_string().starts_with("line 2: found bytes that are not text"), "{bytes}");
 }
 

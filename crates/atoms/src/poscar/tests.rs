@@ -108,7 +108,7 @@ fn atoms_of_an_element_are_written_together() {
     assert_eq!(frame.info["comment"].text(), Some("name"));
     structure.cell = Cell([[0.0; 3]; 3]);
     structure.periodic = [false; 3];
-    assert!(matches!(write_poscar(&mut text, &structure, ""), Err(WriteError::Structure(_))));
+    assert!(matches!(write_poscar(&mut text, &structure, ""), Err(PoscarWriteError::Structure(_))));
 }
 
 proptest! {

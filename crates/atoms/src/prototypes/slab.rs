@@ -93,7 +93,7 @@ pub fn slab(prototype: Prototype, species: Species, distance: f64, facet: Facet)
     let [u, v] = facet.in_plane(prototype).map(|vector| scale(vector, a));
     let crystal = prototype.structure(species, distance);
     let layers = facet.layers(prototype);
-    let column = Column::new(&crystal, u, v, layers + 4);
+    let column = LayerStack::new(&crystal, u, v, layers + 4);
     // A surface is where the fewest bonds are cut: at the widest gap between layers.
     let gap = |k: usize| column.layers[k + 1].height - column.layers[k].height;
     let widest =
@@ -118,18 +118,18 @@ pub fn slab(prototype: Prototype, species: Species, distance: f64, facet: Facet)
 }
 
 /// A crystal above one cell of a lattice plane, turned so that the plane is that of x and y.
-struct Column {
+struct LayerStack {
     u: Vec3,
     v: Vec3,
-    layers: Vec<Layer>,
+    layers: Vec<AtomicLayer>,
 }
 
-struct Layer {
+struct AtomicLayer {
     height: f64,
     sites: Vec<[f64; 2]>,
 }
 
-impl Column {
+impl LayerStack {
     /// The lowest `number` layers from a lattice point on, above the cell of the lattice vectors `u` and `v`.
     fn new(crystal: &Structure, u: Vec3, v: Vec3, number: usize) -> Self {
         let tolerance = FLATNESS * norm(crystal.cell.0[0]);
@@ -144,7 +144,7 @@ impl Column {
         let reach = height + norm(u) + norm(v);
         let images = crystal.cell.heights().map(|h| (reach / h).ceil() as i32 + 1);
         let range = |k: usize| -images[k]..=images[k];
-        let mut layers: Vec<Layer> = Vec::new();
+        let mut layers: Vec<AtomicLayer> = Vec::new();
         for (i, j, k) in range(0).flat_map(|i| range(1).flat_map(move |j| range(2).map(move |k| (i, j, k)))) {
             for position in &crystal.positions {
                 let r = add(*position, crystal.cell.translation([i, j, k]));
@@ -156,7 +156,7 @@ impl Column {
                 let [x, y, h] = turn(r);
                 match layers.iter_mut().find(|layer| (layer.height - h).abs() < tolerance) {
                     Some(layer) => layer.sites.push([x, y]),
-                    None => layers.push(Layer { height: h, sites: vec![[x, y]] }),
+                    None => layers.push(AtomicLayer { height: h, sites: vec![[x, y]] }),
                 }
             }
         }

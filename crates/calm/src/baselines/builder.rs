@@ -6,7 +6,7 @@ use super::distances::{Euclidean, KNearestBuilder};
 use super::error::{BaselineError, check};
 use super::likelihood::Likelihood;
 use super::llpr::LlprBuilder;
-use super::settings::{BaselineSettings, Kind};
+use super::settings::{BaselineKind, BaselineSettings};
 use crate::mixture::Mixture;
 
 /// A baseline under construction.
@@ -15,14 +15,14 @@ use crate::mixture::Mixture;
 /// [`Builder::finish`]. Structures must come in the same order each time.
 #[derive(Debug, Clone)]
 pub struct Builder {
-    kind: Kind,
+    kind: BaselineKind,
     dimension: usize,
-    state: State,
+    state: BuilderState,
     is_done: bool,
 }
 
 #[derive(Debug, Clone)]
-enum State {
+enum BuilderState {
     DOptimality(Box<DOptimalityBuilder>),
     Llpr(LlprBuilder),
     KNearest(KNearestBuilder),
@@ -32,13 +32,13 @@ enum State {
 
 impl Builder {
     /// A baseline of `elements` elements and features of dimension D. Kinds that divide atoms by component need the
-    /// mixture ([`Kind::needs_mixture`]).
+    /// mixture ([`BaselineKind::needs_mixture`]).
     ///
     /// # Errors
     /// Settings out of range; no mixture, or one of other elements or features; one without statistics
-    /// ([`Kind::Likelihood`]).
+    /// ([`BaselineKind::Likelihood`]).
     pub fn new(
-        kind: Kind,
+        kind: BaselineKind,
         settings: &BaselineSettings,
         dimension: usize,
         elements: usize,
@@ -56,22 +56,28 @@ impl Builder {
             expect("elements", mixture.element_count(), elements)?;
         }
         let state = match kind {
-            Kind::DOptimalityElement | Kind::DOptimalityCentred | Kind::DOptimalityComponent => {
+            BaselineKind::DOptimalityElement
+            | BaselineKind::DOptimalityCentred
+            | BaselineKind::DOptimalityComponent => {
                 let builder = DOptimalityBuilder::new(kind, settings, dimension, elements, mixture);
-                State::DOptimality(Box::new(builder))
+                BuilderState::DOptimality(Box::new(builder))
             }
-            Kind::Llpr | Kind::LlprSum | Kind::LlprForces => {
-                State::Llpr(LlprBuilder::new(kind, settings, dimension))
+            BaselineKind::Llpr | BaselineKind::LlprSum | BaselineKind::LlprForces => {
+                BuilderState::Llpr(LlprBuilder::new(kind, settings, dimension))
             }
-            Kind::KNearest => State::KNearest(KNearestBuilder::new(settings, dimension, elements)),
-            Kind::Euclidean => State::Ready(Baseline::Euclidean(Euclidean::new(needed()?))),
-            Kind::Likelihood => State::Ready(Baseline::Likelihood(Likelihood::new(needed()?)?)),
+            BaselineKind::KNearest => {
+                BuilderState::KNearest(KNearestBuilder::new(settings, dimension, elements))
+            }
+            BaselineKind::Euclidean => BuilderState::Ready(Baseline::Euclidean(Euclidean::new(needed()?))),
+            BaselineKind::Likelihood => {
+                BuilderState::Ready(Baseline::Likelihood(Likelihood::new(needed()?)?))
+            }
         };
         Ok(Self { kind, dimension, is_done: !kind.needs_data(), state })
     }
 
     /// What is built.
-    pub fn kind(&self) -> Kind {
+    pub fn kind(&self) -> BaselineKind {
         self.kind
     }
 
@@ -90,24 +96,24 @@ impl Builder {
         }
         check(self.dimension, elements, features)?;
         match &mut self.state {
-            State::DOptimality(builder) => builder.add(elements, features),
-            State::Llpr(builder) => {
+            BuilderState::DOptimality(builder) => builder.add(elements, features),
+            BuilderState::Llpr(builder) => {
                 builder.add(features);
                 Ok(())
             }
-            State::KNearest(builder) => builder.add(elements, features),
-            State::Ready(_) => Ok(()),
+            BuilderState::KNearest(builder) => builder.add(elements, features),
+            BuilderState::Ready(_) => Ok(()),
         }
     }
 
     /// Adds the rows of the same structure's force components, `[3 atoms × D]` as for
-    /// [`Baseline::score_forces`], where the kind has them ([`Kind::has_force_form`]).
+    /// [`Baseline::score_forces`], where the kind has them ([`BaselineKind::has_force_form`]).
     ///
     /// # Errors
     /// A wrong length, rows that are not finite.
     pub fn add_forces(&mut self, rows: &[f64]) -> Result<(), BaselineError> {
         match &mut self.state {
-            State::Llpr(builder) => builder.add_forces(rows),
+            BuilderState::Llpr(builder) => builder.add_forces(rows),
             _ => Ok(()),
         }
     }
@@ -115,7 +121,7 @@ impl Builder {
     /// Ends a sweep over the data. Returns whether another one is needed.
     pub fn end_sweep(&mut self) -> bool {
         self.is_done = match &mut self.state {
-            State::DOptimality(builder) => self.is_done || !builder.end_sweep(),
+            BuilderState::DOptimality(builder) => self.is_done || !builder.end_sweep(),
             _ => true,
         };
         !self.is_done
@@ -127,10 +133,10 @@ impl Builder {
     /// No data; linear algebra that failed.
     pub fn finish(self) -> Result<Baseline, BaselineError> {
         match self.state {
-            State::DOptimality(builder) => builder.finish().map(Baseline::DOptimality),
-            State::Llpr(builder) => builder.finish().map(Baseline::Llpr),
-            State::KNearest(builder) => builder.finish().map(Baseline::KNearest),
-            State::Ready(baseline) => Ok(baseline),
+            BuilderState::DOptimality(builder) => builder.finish().map(Baseline::DOptimality),
+            BuilderState::Llpr(builder) => builder.finish().map(Baseline::Llpr),
+            BuilderState::KNearest(builder) => builder.finish().map(Baseline::KNearest),
+            BuilderState::Ready(baseline) => Ok(baseline),
         }
     }
 }

@@ -1,9 +1,9 @@
 //! D-optimality: γ_Dopt = max_j |(**x** A⁺)_j| for an active set A of training atoms (paper, Methods, "Validation").
 
 use super::error::BaselineError;
-use super::groups::{Groups, for_each_group, subtract};
+use super::groups::{AtomGroups, for_each_group, subtract};
 use super::max_vol::{ActiveSet, Tolerances};
-use super::settings::{BaselineSettings, Kind};
+use super::settings::{BaselineKind, BaselineSettings};
 use crate::mixture::Mixture;
 
 /// Rows that are taken into account at once.
@@ -12,15 +12,15 @@ const BLOCK_ROWS: usize = 128;
 /// An active set for each element or component.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DOptimality {
-    pub(super) kind: Kind,
-    pub(super) groups: Groups,
+    pub(super) kind: BaselineKind,
+    pub(super) groups: AtomGroups,
     pub(super) sets: Vec<ActiveSet>,
     pub(super) converged: bool,
 }
 
 impl DOptimality {
     /// Which of the three constructions.
-    pub fn kind(&self) -> Kind {
+    pub fn kind(&self) -> BaselineKind {
         self.kind
     }
 
@@ -64,7 +64,7 @@ impl DOptimality {
         mut visit: impl FnMut(usize, &[usize], &[f64]),
     ) -> Result<(), BaselineError> {
         let groups = self.groups.assign(elements, features)?;
-        let centred = self.kind == Kind::DOptimalityCentred;
+        let centred = self.kind == BaselineKind::DOptimalityCentred;
         for_each_group(&groups, self.dimension(), features, |group, atoms, rows| {
             if let Some(centroid) = self.groups.centroid(group).filter(|_| centred) {
                 subtract(rows, centroid);
@@ -89,14 +89,15 @@ pub(super) struct DOptimalityBuilder {
 impl DOptimalityBuilder {
     /// `mixture` is needed for the constructions by component.
     pub fn new(
-        kind: Kind,
+        kind: BaselineKind,
         settings: &BaselineSettings,
         dimension: usize,
         elements: usize,
         mixture: Option<&Mixture>,
     ) -> Self {
         let groups = mixture.filter(|_| kind.needs_mixture());
-        let groups = groups.map_or_else(|| Groups::of_elements(dimension, elements), Groups::of_components);
+        let groups =
+            groups.map_or_else(|| AtomGroups::of_elements(dimension, elements), AtomGroups::of_components);
         let sets = vec![ActiveSet::new(dimension); groups.count()];
         Self {
             blocks: vec![Vec::new(); groups.count()],

@@ -3,7 +3,7 @@
 use std::collections::BinaryHeap;
 
 use super::error::{BaselineError, check_element};
-use super::groups::{Groups, for_each_group, subtract};
+use super::groups::{AtomGroups, for_each_group, subtract};
 use super::max_vol::multiply_transposed;
 use super::settings::BaselineSettings;
 use crate::build::random_key;
@@ -16,12 +16,12 @@ const BLOCK_ROWS: usize = 256;
 /// Distance to the nearest centroid of the element, min_k |**z** − **μ**_k|.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Euclidean {
-    pub(super) groups: Groups,
+    pub(super) groups: AtomGroups,
 }
 
 impl Euclidean {
     pub(super) fn new(mixture: &Mixture) -> Self {
-        Self { groups: Groups::of_components(mixture) }
+        Self { groups: AtomGroups::of_components(mixture) }
     }
 
     /// D
@@ -105,7 +105,7 @@ impl Sample {
                 self.nearer(dimension, neighbours, block, (number * BLOCK_ROWS, of_sample), &mut nearest);
             }
             for (row, heap) in block.chunks_exact(dimension).zip(nearest) {
-                let exact = heap.iter().map(|found: &Neighbour| {
+                let exact = heap.iter().map(|found: &NearestAtom| {
                     squared_distance(row, &self.rows[found.index * dimension..][..dimension])
                 });
                 let furthest = exact.fold(f64::NEG_INFINITY, f64::max);
@@ -122,7 +122,7 @@ impl Sample {
         neighbours: usize,
         block: &[f64],
         (first, of_sample): (usize, &[f64]),
-        nearest: &mut [BinaryHeap<Neighbour>],
+        nearest: &mut [BinaryHeap<NearestAtom>],
     ) {
         let products = multiply_transposed(block, of_sample, dimension);
         let count = of_sample.len() / dimension;
@@ -131,7 +131,7 @@ impl Sample {
             let length = dot(row, row);
             for (offset, (product, square)) in products.iter().zip(&self.squares[first..]).enumerate() {
                 let squared = (length - 2.0 * product + square).max(0.0);
-                let found = Neighbour { squared, index: first + offset };
+                let found = NearestAtom { squared, index: first + offset };
                 if heap.len() < neighbours {
                     heap.push(found);
                 } else if heap.peek().is_some_and(|furthest| found < *furthest) {
@@ -145,20 +145,20 @@ impl Sample {
 
 /// A training atom, ordered by distance, then by index.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Neighbour {
+struct NearestAtom {
     squared: f64,
     index: usize,
 }
 
-impl Eq for Neighbour {}
+impl Eq for NearestAtom {}
 
-impl PartialOrd for Neighbour {
+impl PartialOrd for NearestAtom {
     fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
         Some(self.cmp(other))
     }
 }
 
-impl Ord for Neighbour {
+impl Ord for NearestAtom {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
         self.squared.total_cmp(&other.squared).then(self.index.cmp(&other.index))
     }

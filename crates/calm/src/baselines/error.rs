@@ -47,7 +47,7 @@ pub enum BaselineError {
     #[error("{kind} needs a mixture of the same features")]
     NoMixture {
         /// The kind.
-        kind: super::Kind,
+        kind: super::BaselineKind,
     },
     /// A mixture that does not fit the features.
     #[error("the mixture has {found} {what}, expected {expected}")]

@@ -3,11 +3,11 @@
 use std::io::{self, Read, Seek, Write};
 use std::path::Path;
 
-use npz::{Archive, Error, Writer};
+use npz::{Error, NpzFile, Writer};
 
 use super::error::OriginMismatch;
 use super::settings::BaselineSettings;
-use super::{Baseline, Kind, stored};
+use super::{Baseline, BaselineKind, stored};
 
 /// Version of the layout.
 const SCHEMA: usize = 1;
@@ -80,14 +80,14 @@ impl BaselineFile {
     /// # Errors
     /// Missing or ill-shaped arrays, with file, key, what was found and what was expected.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, Error> {
-        Self::read(&Archive::open(path.as_ref())?)
+        Self::read(&NpzFile::open(path.as_ref())?)
     }
 
     /// Reads an open archive.
     ///
     /// # Errors
     /// As [`Self::load`].
-    pub fn read<R: Read + Seek>(file: &Archive<R>) -> Result<Self, Error> {
+    pub fn read<R: Read + Seek>(file: &NpzFile<R>) -> Result<Self, Error> {
         if !file.contains("baseline_schema") {
             return Err(file.invalid(
                 "baseline_schema",
@@ -109,8 +109,9 @@ impl BaselineFile {
         let settings = stored::read_settings(file)?;
         let mut baselines = Vec::new();
         for (number, name) in file.strings("kinds")?.into_iter().enumerate() {
-            let kind = Kind::named(&name);
-            let kind = kind.ok_or_else(|| file.invalid("kinds", format!("'{name}'"), Kind::names()))?;
+            let kind = BaselineKind::named(&name);
+            let kind =
+                kind.ok_or_else(|| file.invalid("kinds", format!("'{name}'"), BaselineKind::names()))?;
             baselines.push(stored::read(file, number, kind, &origin)?);
         }
         if baselines.is_empty() {

@@ -6,13 +6,13 @@ use crate::mixture::Mixture;
 
 /// The groups, those of the first element first.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Groups {
+pub(super) struct AtomGroups {
     dimension: usize,
     /// `[K × D]` for each element; without centroids, the element is one group.
     centroids: Vec<Vec<f64>>,
 }
 
-impl Groups {
+impl AtomGroups {
     /// One group for each element.
     pub fn of_elements(dimension: usize, elements: usize) -> Self {
         Self { dimension, centroids: vec![Vec::new(); elements] }

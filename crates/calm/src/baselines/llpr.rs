@@ -9,7 +9,7 @@ use faer::{Accum, MatMut, Par};
 
 use super::error::{BaselineError, check_rows};
 use super::max_vol::multiply_transposed;
-use super::settings::{BaselineSettings, Kind};
+use super::settings::{BaselineKind, BaselineSettings};
 use crate::linear::{LinearError, dot, eigen, trace, view};
 
 /// Rows that are added to G at once.
@@ -18,7 +18,7 @@ const BLOCK_ROWS: usize = 128;
 /// One Gram matrix for all elements.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Llpr {
-    pub(super) kind: Kind,
+    pub(super) kind: BaselineKind,
     pub(super) dimension: usize,
     /// G, `[D × D]`, symmetric.
     pub(super) gram: Vec<f64>,
@@ -30,7 +30,7 @@ pub struct Llpr {
 
 impl Llpr {
     pub(super) fn new(
-        kind: Kind,
+        kind: BaselineKind,
         dimension: usize,
         gram: Vec<f64>,
         regularisation: f64,
@@ -47,7 +47,7 @@ impl Llpr {
     }
 
     /// Which rows the Gram matrix has.
-    pub fn kind(&self) -> Kind {
+    pub fn kind(&self) -> BaselineKind {
         self.kind
     }
 
@@ -78,7 +78,7 @@ impl Llpr {
 /// Sums the Gram matrix.
 #[derive(Debug, Clone)]
 pub(super) struct LlprBuilder {
-    kind: Kind,
+    kind: BaselineKind,
     dimension: usize,
     regularisation: f64,
     /// √ of the weight of force components.
@@ -89,7 +89,7 @@ pub(super) struct LlprBuilder {
 }
 
 impl LlprBuilder {
-    pub fn new(kind: Kind, settings: &BaselineSettings, dimension: usize) -> Self {
+    pub fn new(kind: BaselineKind, settings: &BaselineSettings, dimension: usize) -> Self {
         Self {
             kind,
             dimension,
@@ -110,7 +110,7 @@ impl LlprBuilder {
         for z in features.chunks_exact(self.dimension) {
             row.iter_mut().zip(z).for_each(|(sum, z)| *sum += z);
         }
-        if self.kind != Kind::LlprSum {
+        if self.kind != BaselineKind::LlprSum {
             row.iter_mut().for_each(|sum| *sum /= atoms as f64);
         }
         self.push(&row, 1.0);

@@ -7,13 +7,13 @@
 //!
 //! | kind | score of an atom with features **z** |
 //! | --- | --- |
-//! | [`Kind::DOptimalityElement`] | max_j \|(**z** A⁺)_j\|, rows of A selected from the element's atoms |
-//! | [`Kind::DOptimalityCentred`] | the same for each component, of **z** − **μ** |
-//! | [`Kind::DOptimalityComponent`] | the same for each component, of **z** |
-//! | [`Kind::Llpr`], [`Kind::LlprSum`], [`Kind::LlprForces`] | √(**z**ᵀ(G + λI)⁻¹**z**) |
-//! | [`Kind::Euclidean`] | distance to the nearest centroid |
-//! | [`Kind::KNearest`] | distance to the k-th nearest of a sample of training atoms |
-//! | [`Kind::Likelihood`] | −log of the mixture's density |
+//! | [`BaselineKind::DOptimalityElement`] | max_j \|(**z** A⁺)_j\|, rows of A selected from the element's atoms |
+//! | [`BaselineKind::DOptimalityCentred`] | the same for each component, of **z** − **μ** |
+//! | [`BaselineKind::DOptimalityComponent`] | the same for each component, of **z** |
+//! | [`BaselineKind::Llpr`], [`BaselineKind::LlprSum`], [`BaselineKind::LlprForces`] | √(**z**ᵀ(G + λI)⁻¹**z**) |
+//! | [`BaselineKind::Euclidean`] | distance to the nearest centroid |
+//! | [`BaselineKind::KNearest`] | distance to the k-th nearest of a sample of training atoms |
+//! | [`BaselineKind::Likelihood`] | −log of the mixture's density |
 //!
 //! The plain Mahalanobis distance σ is [`crate::Grades::sigma`]. One Gaussian for each element (K = 1) is a mixture
 //! that is built with a single candidate, 1.
@@ -37,7 +37,7 @@ pub use error::{BaselineError, OriginMismatch};
 pub use file::{BaselineFile, FeatureOrigin};
 pub use likelihood::Likelihood;
 pub use llpr::Llpr;
-pub use settings::{BaselineSettings, Kind};
+pub use settings::{BaselineKind, BaselineSettings};
 
 /// A score that is ready for use.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,13 +56,13 @@ pub enum Baseline {
 
 impl Baseline {
     /// What it is.
-    pub fn kind(&self) -> Kind {
+    pub fn kind(&self) -> BaselineKind {
         match self {
             Self::DOptimality(found) => found.kind(),
             Self::Llpr(found) => found.kind(),
-            Self::Euclidean(_) => Kind::Euclidean,
-            Self::KNearest(_) => Kind::KNearest,
-            Self::Likelihood(_) => Kind::Likelihood,
+            Self::Euclidean(_) => BaselineKind::Euclidean,
+            Self::KNearest(_) => BaselineKind::KNearest,
+            Self::Likelihood(_) => BaselineKind::Likelihood,
         }
     }
 
@@ -94,7 +94,7 @@ impl Baseline {
     }
 
     /// The uncertainty of the force of each atom, √(u_x² + u_y² + u_z²), where the baseline has one
-    /// ([`Kind::has_force_form`]); otherwise `None`. `rows` has the gradient of the sum of the structure's features
+    /// ([`BaselineKind::has_force_form`]); otherwise `None`. `rows` has the gradient of the sum of the structure's features
     /// with respect to the coordinates of its atoms, `[3 atoms × D]`.
     ///
     /// # Errors

@@ -7,7 +7,7 @@ use super::error::BaselineError;
 
 /// A kind of baseline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Kind {
+pub enum BaselineKind {
     /// One uncentred active set for each element.
     DOptimalityElement,
     /// One active set for each component, of features from which its centroid is subtracted.
@@ -18,7 +18,7 @@ pub enum Kind {
     Llpr,
     /// The same from their sum.
     LlprSum,
-    /// As [`Kind::Llpr`], with the rows of force components.
+    /// As [`BaselineKind::Llpr`], with the rows of force components.
     LlprForces,
     /// Distance to the nearest centroid.
     Euclidean,
@@ -28,7 +28,7 @@ pub enum Kind {
     Likelihood,
 }
 
-impl Kind {
+impl BaselineKind {
     /// All kinds.
     pub const ALL: [Self; 9] = [
         Self::DOptimalityElement,
@@ -85,13 +85,13 @@ impl Kind {
     }
 }
 
-impl fmt::Display for Kind {
+impl fmt::Display for BaselineKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(self.name())
     }
 }
 
-impl FromStr for Kind {
+impl FromStr for BaselineKind {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {

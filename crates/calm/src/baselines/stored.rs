@@ -2,14 +2,14 @@
 
 use std::io::{self, Read, Seek, Write};
 
-use npz::{Archive, Error, Writer};
+use npz::{Error, NpzFile, Writer};
 
 use super::distances::{Euclidean, KNearest, Sample};
-use super::groups::Groups;
+use super::groups::AtomGroups;
 use super::likelihood::{Gaussian, Likelihood};
 use super::max_vol::ActiveSet;
 use super::settings::BaselineSettings;
-use super::{Baseline, DOptimality, FeatureOrigin, Kind, Llpr};
+use super::{Baseline, BaselineKind, DOptimality, FeatureOrigin, Llpr};
 
 pub(super) fn write_settings<W: Write + Seek>(
     file: &mut Writer<W>,
@@ -26,7 +26,7 @@ pub(super) fn write_settings<W: Write + Seek>(
     file.strings("seed", &[], &[&settings.seed.to_string()])
 }
 
-pub(super) fn read_settings<R: Read + Seek>(file: &Archive<R>) -> Result<BaselineSettings, Error> {
+pub(super) fn read_settings<R: Read + Seek>(file: &NpzFile<R>) -> Result<BaselineSettings, Error> {
     let seed = file.strings("seed")?.concat();
     let settings = BaselineSettings {
         tolerance: file.scalar("tolerance")?,
@@ -107,7 +107,7 @@ impl<W: Write + Seek> Arrays<'_, W> {
         self.file.array(&self.key(name), &[numbers.len() / self.dimension, self.dimension], numbers)
     }
 
-    fn groups(&mut self, groups: &Groups) -> io::Result<()> {
+    fn groups(&mut self, groups: &AtomGroups) -> io::Result<()> {
         let dimension = self.dimension;
         self.counts("centroid_counts", groups.centroids().iter().map(|found| found.len() / dimension))?;
         self.rows("centroids", groups.centroids().iter().flatten().copied())
@@ -115,26 +115,28 @@ impl<W: Write + Seek> Arrays<'_, W> {
 }
 
 pub(super) fn read<R: Read + Seek>(
-    file: &Archive<R>,
+    file: &NpzFile<R>,
     number: usize,
-    kind: Kind,
+    kind: BaselineKind,
     origin: &FeatureOrigin,
 ) -> Result<Baseline, Error> {
     let found = Stored { file, number, dimension: origin.dimension, elements: origin.symbols.len() };
     Ok(match kind {
-        Kind::DOptimalityElement | Kind::DOptimalityCentred | Kind::DOptimalityComponent => {
-            Baseline::DOptimality(found.d_optimality(kind)?)
+        BaselineKind::DOptimalityElement
+        | BaselineKind::DOptimalityCentred
+        | BaselineKind::DOptimalityComponent => Baseline::DOptimality(found.d_optimality(kind)?),
+        BaselineKind::Llpr | BaselineKind::LlprSum | BaselineKind::LlprForces => {
+            Baseline::Llpr(found.llpr(kind)?)
         }
-        Kind::Llpr | Kind::LlprSum | Kind::LlprForces => Baseline::Llpr(found.llpr(kind)?),
-        Kind::Euclidean => Baseline::Euclidean(Euclidean { groups: found.groups(true)? }),
-        Kind::KNearest => Baseline::KNearest(found.k_nearest()?),
-        Kind::Likelihood => Baseline::Likelihood(found.likelihood()?),
+        BaselineKind::Euclidean => Baseline::Euclidean(Euclidean { groups: found.groups(true)? }),
+        BaselineKind::KNearest => Baseline::KNearest(found.k_nearest()?),
+        BaselineKind::Likelihood => Baseline::Likelihood(found.likelihood()?),
     })
 }
 
 /// Reads the arrays of one baseline.
 struct Stored<'a, R: Read + Seek> {
-    file: &'a Archive<R>,
+    file: &'a NpzFile<R>,
     number: usize,
     dimension: usize,
     elements: usize,
@@ -174,16 +176,16 @@ impl<R: Read + Seek> Stored<'_, R> {
             .collect())
     }
 
-    fn groups(&self, of_components: bool) -> Result<Groups, Error> {
+    fn groups(&self, of_components: bool) -> Result<AtomGroups, Error> {
         let (counts, sum) = self.counts("centroid_counts", self.elements, MOST_COMPONENTS)?;
         if counts.iter().any(|count| (*count > 0) != of_components) {
             let expected = if of_components { "centroids of every element" } else { "no centroids" };
             return Err(self.file.invalid(&self.key("centroid_counts"), format!("{counts:?}"), expected));
         }
-        Ok(Groups::of_centroids(self.dimension, self.rows("centroids", &counts, sum)?))
+        Ok(AtomGroups::of_centroids(self.dimension, self.rows("centroids", &counts, sum)?))
     }
 
-    fn d_optimality(&self, kind: Kind) -> Result<DOptimality, Error> {
+    fn d_optimality(&self, kind: BaselineKind) -> Result<DOptimality, Error> {
         let groups = self.groups(kind.needs_mixture())?;
         let (ranks, sum) = self.counts("ranks", groups.count(), self.dimension)?;
         let rows = self.rows("rows", &ranks, sum)?.into_iter();
@@ -193,7 +195,7 @@ impl<R: Read + Seek> Stored<'_, R> {
         Ok(DOptimality { kind, groups, sets: sets.collect(), converged })
     }
 
-    fn llpr(&self, kind: Kind) -> Result<Llpr, Error> {
+    fn llpr(&self, kind: BaselineKind) -> Result<Llpr, Error> {
         let (gram, dimension) = (self.key("gram"), self.dimension);
         let numbers = self.file.floats(&gram, &[dimension, dimension])?;
         let regularisation = self.file.scalar(&self.key("regularisation"))?;

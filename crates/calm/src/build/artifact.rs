@@ -4,11 +4,11 @@ use std::io::{self, Seek, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-use npz::{Archive, Writer};
+use npz::{NpzFile, Writer};
 
 use super::components::BuiltComponent;
 use super::error::{BuildError, expect_length};
-use super::histogram::{BINS, ElementHistograms, Grid, Histogram};
+use super::histogram::{BINS, BinEdges, ElementHistograms, SigmaHistogram};
 use super::settings::BuildSettings;
 use super::thresholds::{ThresholdRule, Thresholds};
 use crate::artifact::{Artifact, ArtifactError, Projection};
@@ -167,7 +167,7 @@ impl BuiltMixture {
         let weighted = self.thresholds.iter().flat_map(|thresholds| &thresholds.weighted);
         file.array("eff_interp_thresholds", &shape, weighted.map(|&value| value as f32))?;
         file.strings("threshold_mode", &[], &["robust_mad"])?;
-        let grid = Grid::default();
+        let grid = BinEdges::default();
         file.array("hist_bin_edges", &[BINS + 1], grid.edges().iter().map(|&edge| edge as f32))?;
 
         file.strings("uq_feature_mode", &[], &["basis_rp"])?;
@@ -262,7 +262,7 @@ fn thresholds(element: Option<&BuiltElement>, slots: usize, dimension: usize) ->
         Some(element) => element.histograms.clone(),
         None => ElementHistograms::empty(0),
     };
-    histograms.components.resize_with(slots, Histogram::default);
+    histograms.components.resize_with(slots, SigmaHistogram::default);
     histograms.thresholds(ThresholdRule::Robust, dimension)
 }
 
@@ -287,9 +287,9 @@ fn stored(
 /// # Errors
 /// As [`Artifact::load`]; histograms on another grid.
 pub fn read_histograms(path: impl AsRef<Path>) -> Result<Vec<Option<ElementHistograms>>, ArtifactError> {
-    let file = &Archive::open(path.as_ref())?;
+    let file = &NpzFile::open(path.as_ref())?;
     let edges = file.numbers("hist_bin_edges")?.with_shape(&[BINS + 1])?;
-    let grid = Grid::default();
+    let grid = BinEdges::default();
     let mut pairs = edges.iter().zip(grid.edges());
     if let Some((found, expected)) = pairs.find(|(a, b)| (*a - *b).abs() > EDGE_ROUNDING * *b) {
         return Err(file.invalid("hist_bin_edges", found, expected).into());
@@ -302,7 +302,7 @@ pub fn read_histograms(path: impl AsRef<Path>) -> Result<Vec<Option<ElementHisto
     Ok(elements)
 }
 
-fn read_element(file: &Archive, index: usize) -> Result<ElementHistograms, ArtifactError> {
+fn read_element(file: &NpzFile, index: usize) -> Result<ElementHistograms, ArtifactError> {
     let (raw, weighted) = (format!("hist_{index}"), format!("eff_hist_{index}"));
     let counts = file.integers(&raw)?;
     let slots = counts.shape.first().copied().unwrap_or_default();
@@ -315,7 +315,7 @@ fn read_element(file: &Archive, index: usize) -> Result<ElementHistograms, Artif
         return Err(file.invalid(&weighted, found, "sums of weights").into());
     }
     let rows = counts.chunks_exact(BINS).zip(weights.chunks_exact(BINS));
-    let components = rows.map(|(raw, weighted)| Histogram {
+    let components = rows.map(|(raw, weighted)| SigmaHistogram {
         raw: raw.iter().map(|&count| count as u64).collect(),
         weighted: weighted.to_vec(),
     });

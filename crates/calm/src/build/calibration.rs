@@ -6,8 +6,8 @@ use faer::{Accum, MatMut, Par};
 
 use super::components::BuiltComponent;
 use super::error::{BuildError, expect_length};
-use super::histogram::{ElementHistograms, Grid};
-use super::sorter::{BLOCK_ATOMS, Block, Sorter};
+use super::histogram::{BinEdges, ElementHistograms};
+use super::sorter::{BLOCK_ATOMS, ComponentBlock, Sorter};
 use crate::grade::DISTANCE_FLOOR;
 use crate::linear::{row_dots, view};
 
@@ -27,7 +27,7 @@ pub struct CalibrationPass {
 #[derive(Debug, Clone)]
 struct Sums {
     dimension: usize,
-    grid: Grid,
+    grid: BinEdges,
     /// T of each component, `[D × D]`.
     triangles: Vec<Vec<f64>>,
     /// Tᵀ**δ** of the atoms of a block.
@@ -51,7 +51,7 @@ impl CalibrationPass {
         let centroids = components.iter().flat_map(|component| &component.centroid).copied().collect();
         let sums = Sums {
             dimension,
-            grid: Grid::default(),
+            grid: BinEdges::default(),
             triangles: components.iter().map(|component| triangle(&component.inverse, dimension)).collect(),
             products: vec![0.0; BLOCK_ATOMS * dimension],
             squared: Vec::with_capacity(BLOCK_ATOMS),
@@ -78,7 +78,7 @@ impl CalibrationPass {
 }
 
 impl Sums {
-    fn add(&mut self, slot: usize, block: &Block) {
+    fn add(&mut self, slot: usize, block: &ComponentBlock) {
         let (atoms, dimension) = (block.weights.len(), self.dimension);
         let products = &mut self.products[..atoms * dimension];
         let mut out = MatMut::from_row_major_slice_mut(&mut *products, atoms, dimension);

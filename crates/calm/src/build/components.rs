@@ -2,7 +2,7 @@
 
 use super::distances::check;
 use super::error::{BuildError, expect_same};
-use super::moments::{ElementSums, Moments, merge_small};
+use super::moments::{ClusterMoments, ElementSums, merge_small};
 use super::settings::check_dimension;
 use crate::linear::{
     Inverse, LinearError, REGULARISATION, TRUNCATION, pseudo_inverse_with_spectrum, regularised,
@@ -56,14 +56,18 @@ pub fn components(centroids: &[f64], sums: &ElementSums) -> Result<Vec<BuiltComp
         expect_same("the length of a scatter", sums.scatter.len() as u64, half as u64)?;
     }
     let pairs = centroids.chunks_exact(dimension).zip(&sums.components);
-    let mut merged: Vec<Moments> =
-        pairs.map(|(centroid, sums)| Moments { centroid: centroid.to_vec(), sums: sums.clone() }).collect();
+    let mut merged: Vec<ClusterMoments> = pairs
+        .map(|(centroid, sums)| ClusterMoments { centroid: centroid.to_vec(), sums: sums.clone() })
+        .collect();
     merge_small(&mut merged, dimension + 1);
     merged.sort_by(|a, b| b.sums.effective_count.total_cmp(&a.sums.effective_count));
     merged.into_iter().enumerate().map(|(slot, moments)| component(slot, moments)).collect()
 }
 
-fn component(slot: usize, Moments { centroid, sums }: Moments) -> Result<BuiltComponent, BuildError> {
+fn component(
+    slot: usize,
+    ClusterMoments { centroid, sums }: ClusterMoments,
+) -> Result<BuiltComponent, BuildError> {
     let dimension = centroid.len();
     let scatter = unpacked(&sums.scatter, dimension);
     let (count, effective_count) = (sums.count, sums.effective_count);
@@ -131,15 +135,15 @@ mod tests {
     }
 
     /// The clusters of a case without its sentinels, merged.
-    fn merged(case: &Value, effective: &[f64], minimum: usize) -> Vec<Moments> {
+    fn merged(case: &Value, effective: &[f64], minimum: usize) -> Vec<ClusterMoments> {
         let (centroids, counts) = (rows(&case["centroids"]), numbers(&case["counts"]));
         let scatters = matrices(&case["scatter"]);
         let slots = centroids.into_iter().zip(scatters).zip(counts.into_iter().zip(effective));
-        let mut clusters: Vec<Moments> = slots
+        let mut clusters: Vec<ClusterMoments> = slots
             .filter(|((centroid, _), _)| centroid[0] < 1e9)
             .map(|((centroid, scatter), (count, &effective_count))| {
                 let sums = ComponentSums { count, effective_count, scatter: packed(&scatter) };
-                Moments { centroid, sums }
+                ClusterMoments { centroid, sums }
             })
             .collect();
         merge_small(&mut clusters, minimum);

@@ -12,7 +12,7 @@ const ATOMS_PER_PRODUCT: usize = 128;
 
 /// Centroids with buffers for distances to them.
 #[derive(Debug, Clone)]
-pub(super) struct Distances {
+pub(super) struct CentroidDistances {
     dimension: usize,
     centroids: Vec<f64>,
     /// |**c**|² of each centroid.
@@ -24,14 +24,14 @@ pub(super) struct Distances {
 }
 
 /// A chunk of a batch with its products.
-pub(super) struct Chunk<'a> {
+pub(super) struct DistanceChunk<'a> {
     /// Index of its first atom in the batch.
     pub first: usize,
     features: &'a [f64],
-    of: &'a Distances,
+    of: &'a CentroidDistances,
 }
 
-impl Distances {
+impl CentroidDistances {
     /// Centroids, `[K × D]`.
     pub fn new(dimension: usize, centroids: Vec<f64>) -> Self {
         let mut distances = Self { dimension, centroids, squares: vec![], products: vec![], lengths: vec![] };
@@ -66,16 +66,16 @@ impl Distances {
     }
 
     /// Calls `visit` with each chunk of a batch of finite features, `[atoms × D]`, in order.
-    pub fn for_each_chunk(&mut self, features: &[f64], visit: impl FnMut(&Chunk<'_>)) {
+    pub fn for_each_chunk(&mut self, features: &[f64], visit: impl FnMut(&DistanceChunk<'_>)) {
         row_dots(features, features, self.dimension, &mut self.lengths);
         self.for_each_checked_chunk(features, visit);
     }
 
     /// Calls `visit` with each chunk of the batch that [`Self::check`] accepted last, in order.
-    pub fn for_each_checked_chunk(&mut self, features: &[f64], mut visit: impl FnMut(&Chunk<'_>)) {
+    pub fn for_each_checked_chunk(&mut self, features: &[f64], mut visit: impl FnMut(&DistanceChunk<'_>)) {
         for (index, chunk) in features.chunks(ATOMS_PER_PRODUCT * self.dimension).enumerate() {
             self.multiply(chunk);
-            visit(&Chunk { first: index * ATOMS_PER_PRODUCT, features: chunk, of: self });
+            visit(&DistanceChunk { first: index * ATOMS_PER_PRODUCT, features: chunk, of: self });
         }
     }
 
@@ -108,7 +108,7 @@ pub(super) fn check(features: &[f64], dimension: usize, lengths: &mut Vec<f64>) 
     }
 }
 
-impl Chunk<'_> {
+impl DistanceChunk<'_> {
     /// Features of its atoms, one after the other.
     pub fn rows(&self) -> impl Iterator<Item = &[f64]> {
         self.features.chunks_exact(self.of.dimension)
@@ -179,9 +179,9 @@ mod tests {
     fn products_give_the_distances() {
         for (dimension, count, atoms) in [(1, 1, 3), (3, 2, 1), (5, 31, 700), (130, 8, 300)] {
             let (centroids, features) = (numbers(1, dimension * count), numbers(2, dimension * atoms));
-            let mut distances = Distances::new(dimension, centroids.clone());
+            let mut distances = CentroidDistances::new(dimension, centroids.clone());
             let mut seen = 0;
-            let visit = |chunk: &Chunk<'_>| {
+            let visit = |chunk: &DistanceChunk<'_>| {
                 assert_eq!(chunk.first, seen);
                 for (atom, row) in chunk.rows().enumerate() {
                     let direct: Vec<f64> =
@@ -216,8 +216,8 @@ mod tests {
         }
         // Far from the origin, products lose digits.
         features.iter_mut().chain(&mut centroids).for_each(|value| *value += 1e4);
-        let mut distances = Distances::new(dimension, centroids.clone());
-        let visit = |chunk: &Chunk<'_>| {
+        let mut distances = CentroidDistances::new(dimension, centroids.clone());
+        let visit = |chunk: &DistanceChunk<'_>| {
             for (atom, row) in chunk.rows().enumerate() {
                 assert_eq!(chunk.assigned(atom), nearest(centroids.chunks_exact(dimension), row));
             }

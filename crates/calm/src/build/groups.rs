@@ -1,6 +1,6 @@
 //! k-means of the centroids of any number of shards in bounded memory.
 
-use super::kmeans::{Clusters, Points, weighted_kmeans};
+use super::kmeans::{Clusters, WeightedPoints, weighted_kmeans};
 use super::mini_batch::CandidateClusters;
 use super::random::Random;
 use super::settings::BuildSettings;
@@ -13,7 +13,7 @@ const ALL_SHARDS: u64 = u64::MAX;
 
 /// The clusters of shards for one K, of groups of shards, of groups of groups, …
 #[derive(Debug, Clone)]
-pub(super) struct Groups {
+pub(super) struct ShardGroups {
     dimension: usize,
     k: usize,
     /// Random seed, all shards, element and K.
@@ -30,7 +30,7 @@ struct Level {
     clusters: Clusters,
 }
 
-impl Groups {
+impl ShardGroups {
     pub fn new(settings: &BuildSettings, element: usize, k: usize) -> Self {
         let words = [settings.seed, ALL_SHARDS, element as u64, k as u64];
         Self { dimension: settings.dimension, k, words, levels: Vec::new() }
@@ -80,9 +80,9 @@ impl Clusters {
     }
 }
 
-fn points(dimension: usize, clusters: &Clusters) -> Points<'_> {
+fn points(dimension: usize, clusters: &Clusters) -> WeightedPoints<'_> {
     let Clusters { centroids, counts, weights, .. } = clusters;
-    Points { dimension, features: centroids, weights, counts }
+    WeightedPoints { dimension, features: centroids, weights, counts }
 }
 
 #[cfg(test)]
@@ -92,7 +92,7 @@ mod tests {
     #[test]
     fn memory_is_bounded_and_nothing_is_lost() {
         let settings = BuildSettings { dimension: 2, seed: 1, candidates: vec![3], shard_size: 1 };
-        let mut groups = Groups::new(&settings, 0, 3);
+        let mut groups = ShardGroups::new(&settings, 0, 3);
         let mut random = Random::new(&[5]);
         let shards = 2 * MEMBERS * MEMBERS + 3 * MEMBERS + 5;
         let mut weight = 0.0;

@@ -9,7 +9,7 @@ pub const BINS: usize = 1000;
 
 /// The distribution of σ over the training atoms of a component, with and without weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Histogram {
+pub struct SigmaHistogram {
     /// Atoms in each bin, `[1000]`.
     pub raw: Vec<u64>,
     /// Their weights, `[1000]`.
@@ -20,16 +20,16 @@ pub struct Histogram {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ElementHistograms {
     /// In the order of the components.
-    pub components: Vec<Histogram>,
+    pub components: Vec<SigmaHistogram>,
 }
 
-impl Default for Histogram {
+impl Default for SigmaHistogram {
     fn default() -> Self {
         Self { raw: vec![0; BINS], weighted: vec![0.0; BINS] }
     }
 }
 
-impl Histogram {
+impl SigmaHistogram {
     /// Number of atoms.
     pub fn count(&self) -> u64 {
         self.raw.iter().sum()
@@ -38,7 +38,7 @@ impl Histogram {
     /// Number of atoms with σ above `sigma`, where atoms spread evenly inside a bin; not whole.
     pub fn count_above(&self, sigma: f64) -> f64 {
         let counts: Vec<f64> = self.raw.iter().map(|&count| count as f64).collect();
-        let grid = Grid::default();
+        let grid = BinEdges::default();
         let distribution = Distribution::new(&grid, &counts);
         distribution.map_or(0.0, |found| (1.0 - found.share_below(sigma)) * found.total())
     }
@@ -47,12 +47,12 @@ impl Histogram {
 impl ElementHistograms {
     /// Histograms without atoms.
     pub fn empty(components: usize) -> Self {
-        Self { components: vec![Histogram::default(); components] }
+        Self { components: vec![SigmaHistogram::default(); components] }
     }
 
     /// All numbers in one row, for [`ExactSums`](super::ExactSums).
     pub fn to_row(&self) -> Vec<f64> {
-        let numbers = |histogram: &Histogram| {
+        let numbers = |histogram: &SigmaHistogram| {
             let mut numbers: Vec<f64> = histogram.raw.iter().map(|&count| count as f64).collect();
             numbers.extend(&histogram.weighted);
             numbers
@@ -66,7 +66,7 @@ impl ElementHistograms {
     /// A row of another length.
     pub fn from_row(row: &[f64]) -> Result<Self, BuildError> {
         expect_length("histograms of an element", row.len(), row.len().next_multiple_of(2 * BINS))?;
-        let components = row.chunks_exact(2 * BINS).map(|numbers| Histogram {
+        let components = row.chunks_exact(2 * BINS).map(|numbers| SigmaHistogram {
             raw: numbers[..BINS].iter().map(|&count| count as u64).collect(),
             weighted: numbers[BINS..].to_vec(),
         });
@@ -94,17 +94,17 @@ impl ElementHistograms {
 
 /// Edges of the bins, 10⁻² to 10³ in equal ratios, `[1001]`.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Grid {
+pub struct BinEdges {
     edges: Vec<f64>,
 }
 
-impl Default for Grid {
+impl Default for BinEdges {
     fn default() -> Self {
         Self { edges: (0..=BINS).map(|k| 10_f64.powf(-2.0 + 5.0 * k as f64 / BINS as f64)).collect() }
     }
 }
 
-impl Grid {
+impl BinEdges {
     /// The edges, ascending.
     pub fn edges(&self) -> &[f64] {
         &self.edges
@@ -119,7 +119,7 @@ impl Grid {
 /// The cumulative distribution of a histogram, linear inside its bins.
 #[derive(Debug, Clone)]
 pub(super) struct Distribution<'a> {
-    grid: &'a Grid,
+    grid: &'a BinEdges,
     counts: &'a [f64],
     /// Sum of the counts of the bins before each edge.
     cumulative: Vec<f64>,
@@ -127,7 +127,7 @@ pub(super) struct Distribution<'a> {
 
 impl<'a> Distribution<'a> {
     /// `None` without counts.
-    pub fn new(grid: &'a Grid, counts: &'a [f64]) -> Option<Self> {
+    pub fn new(grid: &'a BinEdges, counts: &'a [f64]) -> Option<Self> {
         let mut cumulative = vec![0.0];
         let mut sum = 0.0;
         cumulative.extend(counts.iter().map(|count| {
@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     fn grid_and_bins_are_those_of_the_reference() {
-        let (cases, grid) = (unit_cases(), Grid::default());
+        let (cases, grid) = (unit_cases(), BinEdges::default());
         let case = &cases["hist_grid"];
         assert_eq!(case["n_bins"], BINS);
         assert_near(&grid.edges()[..4], &numbers(&case["first"]), 1e-15);
@@ -185,18 +185,20 @@ mod tests {
 
     #[test]
     fn quantiles_invert_the_distribution() {
-        let grid = Grid::default();
+        let grid = BinEdges::default();
         let counts: Vec<f64> = (0..BINS).map(|k| if k % 7 == 3 { (k % 50) as f64 } else { 0.0 }).collect();
         let distribution = Distribution::new(&grid, &counts).unwrap();
         for share in [1e-6, 0.01, 0.3, 0.5, 0.77, 0.99, 1.0] {
             let found = distribution.share_below(distribution.quantile(share));
             assert!((found - share).abs() < 1e-12, "{share} {found}");
         }
-        let spread =
-            Histogram { raw: counts.iter().map(|&count| count as u64).collect(), ..Histogram::default() };
+        let spread = SigmaHistogram {
+            raw: counts.iter().map(|&count| count as u64).collect(),
+            ..SigmaHistogram::default()
+        };
         let (median, total) = (distribution.quantile(0.5), spread.count() as f64);
         assert!((spread.count_above(median) / total - 0.5).abs() < 1e-12);
-        assert_eq!((spread.count_above(2e3), Histogram::default().count_above(1.0)), (0.0, 0.0));
+        assert_eq!((spread.count_above(2e3), SigmaHistogram::default().count_above(1.0)), (0.0, 0.0));
         assert_eq!([distribution.share_below(0.0), distribution.share_below(2e3)], [0.0, 1.0]);
         assert!(Distribution::new(&grid, &[0.0; BINS]).is_none());
     }

@@ -1,6 +1,6 @@
 //! k-means++ and Lloyd's algorithm with weighted points.
 
-use super::distances::Distances;
+use super::distances::CentroidDistances;
 use super::random::Random;
 
 /// Runs of the global k-means from different initial centroids.
@@ -11,7 +11,7 @@ const MAX_ITERATIONS: usize = 1000;
 
 /// Weighted points.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Points<'a> {
+pub(super) struct WeightedPoints<'a> {
     pub dimension: usize,
     /// `[points × D]`, finite.
     pub features: &'a [f64],
@@ -34,7 +34,7 @@ pub(super) struct Clusters {
     pub inertia: f64,
 }
 
-impl<'a> Points<'a> {
+impl<'a> WeightedPoints<'a> {
     fn row(&self, point: usize) -> &'a [f64] {
         &self.features[point * self.dimension..][..self.dimension]
     }
@@ -44,7 +44,7 @@ impl<'a> Points<'a> {
 ///
 /// Each centroid is the best of 2 + ⌊ln K⌋ points, drawn with a probability proportional to the weighted squared
 /// distance from the centroids before. There are fewer centroids than `k` if there are fewer distinct points.
-pub(super) fn initial_centroids(points: &Points<'_>, k: usize, random: &mut Random) -> Vec<f64> {
+pub(super) fn initial_centroids(points: &WeightedPoints<'_>, k: usize, random: &mut Random) -> Vec<f64> {
     let trials = 2 + (k as f64).ln() as usize;
     let mut centroids = Vec::new();
     let Some(first) = random.index(&cumulative(points.weights.iter().copied())) else { return centroids };
@@ -68,9 +68,9 @@ pub(super) fn initial_centroids(points: &Points<'_>, k: usize, random: &mut Rand
 }
 
 /// Lowers each list of squared distances to those from its centroid. Returns the weighted sum of each list.
-fn lower(points: &Points<'_>, centroids: &[f64], lists: &mut [&mut Vec<f64>]) -> Vec<f64> {
+fn lower(points: &WeightedPoints<'_>, centroids: &[f64], lists: &mut [&mut Vec<f64>]) -> Vec<f64> {
     let mut sums = vec![0.0; lists.len()];
-    let mut distances = Distances::new(points.dimension, centroids.to_vec());
+    let mut distances = CentroidDistances::new(points.dimension, centroids.to_vec());
     distances.for_each_chunk(points.features, |chunk| {
         for atom in 0..chunk.rows().count() {
             let point = chunk.first + atom;
@@ -95,7 +95,7 @@ pub(super) fn cumulative(values: impl Iterator<Item = f64>) -> Vec<f64> {
 
 /// Weighted k-means: the partition of least inertia among ten runs of Lloyd's algorithm, each from initial centroids
 /// by k-means++. No cluster is left if no point has a weight.
-pub(super) fn weighted_kmeans(points: &Points<'_>, k: usize, random: &mut Random) -> Clusters {
+pub(super) fn weighted_kmeans(points: &WeightedPoints<'_>, k: usize, random: &mut Random) -> Clusters {
     let mut best: Option<Clusters> = None;
     for _ in 0..RUNS {
         let clusters = lloyd(points, initial_centroids(points, k, random), MAX_ITERATIONS);
@@ -107,9 +107,9 @@ pub(super) fn weighted_kmeans(points: &Points<'_>, k: usize, random: &mut Random
 }
 
 /// Lloyd's algorithm until no point changes its cluster, for at most `iterations`. Clusters without weight are dropped.
-pub(super) fn lloyd(points: &Points<'_>, initial: Vec<f64>, iterations: usize) -> Clusters {
+pub(super) fn lloyd(points: &WeightedPoints<'_>, initial: Vec<f64>, iterations: usize) -> Clusters {
     let dimension = points.dimension;
-    let mut distances = Distances::new(dimension, initial);
+    let mut distances = CentroidDistances::new(dimension, initial);
     let count = distances.count();
     let mut assigned = vec![usize::MAX; points.weights.len()];
     let (mut sums, mut inertia) = (vec![0.0; count * dimension], 0.0);

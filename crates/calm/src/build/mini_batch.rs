@@ -2,9 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::distances::Distances;
+use super::distances::CentroidDistances;
 use super::error::{BuildError, expect_weights};
-use super::kmeans::{Points, cumulative, initial_centroids, lloyd};
+use super::kmeans::{WeightedPoints, cumulative, initial_centroids, lloyd};
 use super::random::Random;
 use super::settings::BuildSettings;
 use crate::linear::squared_distance;
@@ -47,9 +47,9 @@ pub struct ShardClustering {
     atoms: u64,
     weight: f64,
     /// One for each candidate once the first mini-batch has been seen.
-    candidates: Vec<Candidate>,
+    candidates: Vec<CandidateState>,
     /// The centroids of all candidates.
-    distances: Distances,
+    distances: CentroidDistances,
 }
 
 /// The clusters that a shard found for an element. Serialisable, so that a build continues after its last finished
@@ -82,7 +82,7 @@ pub struct CandidateClusters {
 }
 
 #[derive(Debug, Clone)]
-struct Candidate {
+struct CandidateState {
     random: Random,
     /// Index of its first centroid among those of all candidates.
     first: usize,
@@ -111,7 +111,7 @@ impl ShardClustering {
             atoms: 0,
             weight: 0.0,
             candidates: Vec::new(),
-            distances: Distances::new(settings.dimension, Vec::new()),
+            distances: CentroidDistances::new(settings.dimension, Vec::new()),
             settings: settings.clone(),
         })
     }
@@ -169,7 +169,7 @@ impl ShardClustering {
             self.initialise(&batch, &weights);
         }
         let Self { candidates, distances, .. } = self;
-        candidates.iter_mut().for_each(Candidate::begin_batch);
+        candidates.iter_mut().for_each(CandidateState::begin_batch);
         let mut weighted = vec![0.0; self.settings.dimension];
         distances.for_each_chunk(&batch, |chunk| {
             for (atom, row) in chunk.rows().enumerate() {
@@ -196,14 +196,15 @@ impl ShardClustering {
 
     fn initialise(&mut self, batch: &[f64], weights: &[f64]) {
         let dimension = self.settings.dimension;
-        let points = Points { dimension, features: batch, weights, counts: &vec![1.0; weights.len()] };
+        let points =
+            WeightedPoints { dimension, features: batch, weights, counts: &vec![1.0; weights.len()] };
         let mut all = Vec::new();
         for &k in &self.settings.candidates {
             let words = [self.settings.seed, self.shard, self.element as u64, k as u64];
             let mut random = Random::new(&words);
             let initial = initial_centroids(&points, k, &mut random);
             let centroids = lloyd(&points, initial, REFINEMENTS).centroids;
-            self.candidates.push(Candidate {
+            self.candidates.push(CandidateState {
                 random,
                 first: all.len() / dimension,
                 counts: vec![0.0; centroids.len() / dimension],
@@ -215,11 +216,11 @@ impl ShardClustering {
             });
             all.extend(centroids);
         }
-        self.distances = Distances::new(dimension, all);
+        self.distances = CentroidDistances::new(dimension, all);
     }
 }
 
-impl Candidate {
+impl CandidateState {
     fn begin_batch(&mut self) {
         self.sums.fill(0.0);
         self.added.fill(0.0);

@@ -50,7 +50,7 @@ pub use components::{BuiltComponent, components};
 pub use elbow::elbow;
 pub use error::BuildError;
 pub use exact::ExactSums;
-pub use histogram::{BINS, ElementHistograms, Grid, Histogram};
+pub use histogram::{BINS, BinEdges, ElementHistograms, SigmaHistogram};
 pub use mini_batch::{CandidateClusters, ShardClustering, ShardClusters};
 pub use moments::{ComponentSums, ElementSums};
 pub use partition::{ElementPartition, Partitioner};

@@ -75,13 +75,13 @@ impl ElementSums {
 
 /// A cluster that can be merged.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Moments {
+pub(super) struct ClusterMoments {
     pub centroid: Vec<f64>,
     /// The scatter is empty if only centroids are of interest.
     pub sums: ComponentSums,
 }
 
-impl Moments {
+impl ClusterMoments {
     /// Takes over the atoms of another cluster, by the parallel-axis theorem:
     ///
     /// **μ** = (n_A **μ**_A + n_B **μ**_B) / n,  S = S_A + S_B + n_A n_B / n **dd**ᵀ,
@@ -107,13 +107,13 @@ impl Moments {
 
 /// Merges clusters with fewer than `min_atoms` atoms (paper, Methods): the smallest first, into the one with the
 /// nearest centroid, until none or only one cluster is left. The others keep their order.
-pub(super) fn merge_small(clusters: &mut Vec<Moments>, min_atoms: usize) {
+pub(super) fn merge_small(clusters: &mut Vec<ClusterMoments>, min_atoms: usize) {
     while clusters.len() > 1 {
         let count = |slot: &usize| clusters[*slot].sums.count;
         let smallest = (0..clusters.len()).min_by(|a, b| count(a).total_cmp(&count(b)));
         let Some(smallest) = smallest.filter(|slot| count(slot) < min_atoms as f64) else { return };
         let removed = clusters.remove(smallest);
-        let distance = |of: &Moments| squared_distance(&of.centroid, &removed.centroid);
+        let distance = |of: &ClusterMoments| squared_distance(&of.centroid, &removed.centroid);
         let nearest = clusters.iter_mut().min_by(|a, b| distance(a).total_cmp(&distance(b)));
         if let Some(nearest) = nearest {
             nearest.join(removed);

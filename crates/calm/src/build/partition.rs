@@ -4,9 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use super::elbow::elbow;
 use super::error::{BuildError, expect_length, expect_same};
-use super::groups::Groups;
+use super::groups::ShardGroups;
 use super::mini_batch::{CandidateClusters, ShardClusters};
-use super::moments::{ComponentSums, Moments, merge_small};
+use super::moments::{ClusterMoments, ComponentSums, merge_small};
 use super::settings::BuildSettings;
 
 /// The centroids of an element, about which pass 2 accumulates scatter.
@@ -46,7 +46,7 @@ pub struct Partitioner {
     /// Σ w |**x** − **c**|² of each candidate.
     inertia: Vec<f64>,
     /// Of each candidate.
-    groups: Vec<Groups>,
+    groups: Vec<ShardGroups>,
 }
 
 impl Partitioner {
@@ -56,7 +56,7 @@ impl Partitioner {
     /// Invalid settings.
     pub fn new(settings: &BuildSettings, element: usize) -> Result<Self, BuildError> {
         settings.check()?;
-        let groups = settings.candidates.iter().map(|&k| Groups::new(settings, element, k));
+        let groups = settings.candidates.iter().map(|&k| ShardGroups::new(settings, element, k));
         Ok(Self {
             element,
             next: 0,
@@ -101,7 +101,7 @@ impl Partitioner {
         let rows = found.centroids.chunks_exact(self.settings.dimension);
         let numbers = found.counts.into_iter().zip(found.weights);
         let clusters = rows.zip(numbers).map(|(centroid, (count, weight))| cluster(centroid, count, weight));
-        let mut merged: Vec<Moments> = clusters.collect();
+        let mut merged: Vec<ClusterMoments> = clusters.collect();
         merge_small(&mut merged, self.settings.min_atoms());
         let counts = merged.iter().map(|cluster| cluster.sums.count).collect();
         let centroids = merged.into_iter().flat_map(|cluster| cluster.centroid).collect();
@@ -125,9 +125,9 @@ impl Partitioner {
     }
 }
 
-fn cluster(centroid: &[f64], count: f64, effective_count: f64) -> Moments {
+fn cluster(centroid: &[f64], count: f64, effective_count: f64) -> ClusterMoments {
     let sums = ComponentSums { count, effective_count, scatter: Vec::new() };
-    Moments { centroid: centroid.to_vec(), sums }
+    ClusterMoments { centroid: centroid.to_vec(), sums }
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use std::io::{self, Read, Seek, Write};
 
 use npz::Writer;
 
-use super::histogram::{ElementHistograms, Histogram};
+use super::histogram::{ElementHistograms, SigmaHistogram};
 use super::thresholds::{ThresholdRule, Thresholds};
 
 /// The thresholds of an artifact, by the rule, for its histograms ([`read_histograms`](super::read_histograms)).
@@ -21,7 +21,7 @@ impl Recalibration {
         let slots = histograms.iter().flatten().map(|element| element.components.len()).max().unwrap_or(1);
         let of = |element: &Option<ElementHistograms>| {
             let mut element = element.clone().unwrap_or_else(|| ElementHistograms::empty(0));
-            element.components.resize_with(slots, Histogram::default);
+            element.components.resize_with(slots, SigmaHistogram::default);
             element.thresholds(rule, dimension)
         };
         Self { rule, elements: histograms.iter().map(of).collect(), slots }

@@ -5,7 +5,7 @@ use faer::{Accum, Mat, Par};
 
 use super::error::BuildError;
 use super::moments::{ComponentSums, ElementSums};
-use super::sorter::{Block, Sorter};
+use super::sorter::{ComponentBlock, Sorter};
 use crate::linear::view;
 
 /// Accumulates, for each component, the number of atoms, Σ w and Σ w **δδ**ᵀ with **δ** = **z** − **μ** about the fixed
@@ -67,7 +67,7 @@ impl ScatterPass {
 }
 
 impl Sums {
-    fn add(&mut self, slot: usize, block: &mut Block) {
+    fn add(&mut self, slot: usize, block: &mut ComponentBlock) {
         let (sums, scatter) = &mut self.components[slot];
         let rows = block.deltas.chunks_exact_mut(self.dimension).zip(&block.weights);
         for (row, &weight) in rows {

@@ -1,6 +1,6 @@
 //! Sorts the atoms of a stream into blocks by their nearest centroid, so that one matrix product serves many of them.
 
-use super::distances::{Distances, check};
+use super::distances::{CentroidDistances, check};
 use super::error::{BuildError, expect_weights};
 use super::settings::check_dimension;
 
@@ -10,13 +10,13 @@ pub(super) const BLOCK_ATOMS: usize = 128;
 /// The blocks of one element.
 #[derive(Debug, Clone)]
 pub(super) struct Sorter {
-    distances: Distances,
-    blocks: Vec<Block>,
+    distances: CentroidDistances,
+    blocks: Vec<ComponentBlock>,
 }
 
 /// Atoms that wait for the product of their component.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Block {
+pub(super) struct ComponentBlock {
     /// **δ** = **z** − **μ**, `[atoms × D]`.
     pub deltas: Vec<f64>,
     /// Weights of the atoms.
@@ -31,7 +31,10 @@ impl Sorter {
         if count == 0 {
             return Err(BuildError::NoCentroid);
         }
-        Ok(Self { distances: Distances::new(dimension, centroids), blocks: vec![Block::default(); count] })
+        Ok(Self {
+            distances: CentroidDistances::new(dimension, centroids),
+            blocks: vec![ComponentBlock::default(); count],
+        })
     }
 
     /// Adds atoms and calls `full` with the index of the component for each block that is full.
@@ -41,7 +44,7 @@ impl Sorter {
         &mut self,
         features: &[f64],
         weights: &[f64],
-        mut full: impl FnMut(usize, &mut Block),
+        mut full: impl FnMut(usize, &mut ComponentBlock),
     ) -> Result<(), BuildError> {
         let atoms = self.distances.check(features)?;
         expect_weights(weights, atoms)?;
@@ -61,13 +64,13 @@ impl Sorter {
     }
 
     /// Calls `rest` with each block that has atoms left.
-    pub fn finish(self, mut rest: impl FnMut(usize, &mut Block)) {
+    pub fn finish(self, mut rest: impl FnMut(usize, &mut ComponentBlock)) {
         let left = self.blocks.into_iter().enumerate().filter(|(_, block)| !block.weights.is_empty());
         left.for_each(|(slot, mut block)| rest(slot, &mut block));
     }
 }
 
-impl Block {
+impl ComponentBlock {
     fn push(&mut self, row: &[f64], centroid: &[f64], weight: f64) {
         if self.weights.capacity() == 0 {
             self.deltas.reserve_exact(BLOCK_ATOMS * row.len());

@@ -1,6 +1,6 @@
 //! Calibrated thresholds θ from histograms of σ.
 
-use super::histogram::{Distribution, ElementHistograms, Grid, Histogram};
+use super::histogram::{BinEdges, Distribution, ElementHistograms, SigmaHistogram};
 
 /// Makes the MAD of a normal distribution its standard deviation (paper, Methods).
 const MAD_SCALE: f64 = 1.4826;
@@ -64,13 +64,14 @@ impl ElementHistograms {
     /// Weights are rounded to single precision first, as artifacts store them, so that stored histograms give the same
     /// thresholds.
     pub fn thresholds(&self, rule: ThresholdRule, dimension: usize) -> Thresholds {
-        let grid = Grid::default();
-        let raw = |histogram: &Histogram| histogram.raw.iter().map(|&count| count as f64).collect::<Vec<_>>();
-        let weighted = |histogram: &Histogram| {
+        let grid = BinEdges::default();
+        let raw =
+            |histogram: &SigmaHistogram| histogram.raw.iter().map(|&count| count as f64).collect::<Vec<_>>();
+        let weighted = |histogram: &SigmaHistogram| {
             histogram.weighted.iter().map(|&weight| f64::from(weight as f32)).collect::<Vec<_>>()
         };
-        let counts: Vec<u64> = self.components.iter().map(Histogram::count).collect();
-        let from = |counts_of: &dyn Fn(&Histogram) -> Vec<f64>| {
+        let counts: Vec<u64> = self.components.iter().map(SigmaHistogram::count).collect();
+        let from = |counts_of: &dyn Fn(&SigmaHistogram) -> Vec<f64>| {
             let found: Vec<_> = self
                 .components
                 .iter()
@@ -83,7 +84,7 @@ impl ElementHistograms {
 }
 
 /// `None` without counts.
-fn calibrate(rule: ThresholdRule, grid: &Grid, counts: &[f64]) -> Option<Calibration> {
+fn calibrate(rule: ThresholdRule, grid: &BinEdges, counts: &[f64]) -> Option<Calibration> {
     let distribution = Distribution::new(grid, counts)?;
     let threshold = match rule {
         ThresholdRule::Robust => robust(grid, &distribution),
@@ -93,7 +94,7 @@ fn calibrate(rule: ThresholdRule, grid: &Grid, counts: &[f64]) -> Option<Calibra
 }
 
 /// m + 3 · 1.4826 · MAD.
-fn robust(grid: &Grid, distribution: &Distribution<'_>) -> f64 {
+fn robust(grid: &BinEdges, distribution: &Distribution<'_>) -> f64 {
     let median = distribution.quantile(0.5);
     let (mut low, mut high) = (0.0, grid.edges().last().copied().unwrap_or_default());
     for _ in 0..BISECTIONS {
@@ -123,10 +124,10 @@ mod tests {
     use crate::build::tests::{assert_near, rows, unit_cases};
 
     /// The histograms of the reference's cases.
-    fn histograms() -> Vec<Histogram> {
+    fn histograms() -> Vec<SigmaHistogram> {
         let cases = unit_cases();
         let filled = |case: &serde_json::Value| {
-            let mut histogram = Histogram::default();
+            let mut histogram = SigmaHistogram::default();
             for bin in rows(&case["hist_nonzero"]) {
                 histogram.raw[bin[0] as usize] = bin[1] as u64;
                 histogram.weighted[bin[0] as usize] = bin[1];
@@ -138,7 +139,7 @@ mod tests {
 
     #[test]
     fn thresholds_are_those_of_the_reference() {
-        let (cases, grid) = (unit_cases(), Grid::default());
+        let (cases, grid) = (unit_cases(), BinEdges::default());
         for (case, histogram) in cases["robust_threshold"].as_array().unwrap().iter().zip(histograms()) {
             let Some(found) = calibrate(ThresholdRule::Robust, &grid, &histogram.weighted) else {
                 assert!(case["threshold"].is_null());
@@ -168,7 +169,7 @@ mod tests {
                 assert_near(&[found.raw[other[1] as usize]], &[other[2]], 2e-14);
                 let own = calibrate(
                     ThresholdRule::Robust,
-                    &Grid::default(),
+                    &BinEdges::default(),
                     &all[slots[other[1] as usize]].weighted,
                 );
                 assert!(own.is_none_or(|own| own.threshold != other[2]));

@@ -4,7 +4,7 @@
 use std::io::{self, Read, Seek, Write};
 use std::path::Path;
 
-use npz::{Archive, Writer};
+use npz::{NpzFile, Writer};
 
 use super::artifact::{UNUSED, single, unused_inverse};
 use super::components::{Inverted, inverted};
@@ -94,7 +94,7 @@ impl UpdatedMixture {
     /// # Errors
     /// As [`Artifact::load`](crate::Artifact::load); covariances whose eigenvalues do not converge.
     pub fn new(artifact: &Path, original: &Mixture, mixture: &Mixture) -> Result<Self, UpdatedMixtureError> {
-        let file = &Archive::open(artifact)?;
+        let file = &NpzFile::open(artifact)?;
         let weighted = file.contains(WEIGHTED_THRESHOLDS);
         let key = if weighted { WEIGHTED_THRESHOLDS } else { RAW_THRESHOLDS };
         let ([count, slots], thresholds) = file.numbers(key)?.tensor()?;
@@ -126,7 +126,7 @@ impl UpdatedMixture {
 
     fn add(
         &mut self,
-        file: &Archive,
+        file: &NpzFile,
         element: usize,
         held: bool,
         original: &Mixture,
@@ -290,7 +290,7 @@ impl Element {
     }
 
     fn read(
-        file: &Archive,
+        file: &NpzFile,
         element: usize,
         slots: usize,
         dimension: usize,
@@ -321,7 +321,7 @@ impl Changed {
 
     /// What the artifact has of them; the last three are for information only, and early artifacts lack some.
     fn read(
-        file: &Archive,
+        file: &NpzFile,
         element: usize,
         slots: usize,
         dimension: usize,
@@ -356,7 +356,7 @@ impl Changed {
     }
 }
 
-fn numbers(file: &Archive, name: &str, element: usize) -> Result<Vec<f64>, UpdatedMixtureError> {
+fn numbers(file: &NpzFile, name: &str, element: usize) -> Result<Vec<f64>, UpdatedMixtureError> {
     Ok(file.numbers(&format!("{name}_{element}"))?.data)
 }
 

@@ -1,13 +1,13 @@
 //! Active sets against determinants and pseudo-inverses.
 
-use calm::baselines::{Baseline, BaselineSettings, Builder, DOptimality, Kind};
+use calm::baselines::{Baseline, BaselineKind, BaselineSettings, Builder, DOptimality};
 use proptest::prelude::*;
 
 use super::{Frame, built, frames, gram, joined, mixture, solve};
 use crate::common::Random;
 
-const CONSTRUCTIONS: [Kind; 3] =
-    [Kind::DOptimalityElement, Kind::DOptimalityCentred, Kind::DOptimalityComponent];
+const CONSTRUCTIONS: [BaselineKind; 3] =
+    [BaselineKind::DOptimalityElement, BaselineKind::DOptimalityCentred, BaselineKind::DOptimalityComponent];
 
 fn active(baseline: &Baseline) -> &DOptimality {
     let Baseline::DOptimality(found) = baseline else { panic!("active sets") };
@@ -25,7 +25,13 @@ fn single(rows: &[f64], dimension: usize) -> Vec<Frame> {
 }
 
 fn of_element(rows: &[f64], dimension: usize, settings: &BaselineSettings) -> Baseline {
-    built(Kind::DOptimalityElement, settings, &single(rows, dimension), dimension, &mixture(1, dimension, 1))
+    built(
+        BaselineKind::DOptimalityElement,
+        settings,
+        &single(rows, dimension),
+        dimension,
+        &mixture(1, dimension, 1),
+    )
 }
 
 proptest! {

@@ -6,7 +6,7 @@ mod stored;
 
 use std::sync::Arc;
 
-use calm::baselines::{Baseline, BaselineSettings, Builder, Kind};
+use calm::baselines::{Baseline, BaselineKind, BaselineSettings, Builder};
 use calm::{Component, Mixture, Statistics};
 
 use crate::common::Random;
@@ -47,7 +47,7 @@ fn mixture(seed: u64, dimension: usize, elements: usize) -> Mixture {
 
 /// All sweeps over these structures.
 fn built(
-    kind: Kind,
+    kind: BaselineKind,
     settings: &BaselineSettings,
     frames: &[Frame],
     dimension: usize,

@@ -1,6 +1,6 @@
 //! LLPR, distances and likelihood against their definitions.
 
-use calm::baselines::{BaselineError, BaselineSettings, Builder, Kind};
+use calm::baselines::{BaselineError, BaselineKind, BaselineSettings, Builder};
 use calm::{Component, Mixture};
 
 use super::{built, dot, frames, joined, mixture, solve};
@@ -27,11 +27,11 @@ fn llpr_is_that_of_its_gram_matrix() {
     };
     for regularisation in [1e-12, 1e-3] {
         let settings = BaselineSettings { regularisation, ..BaselineSettings::default() };
-        for kind in [Kind::Llpr, Kind::LlprSum] {
+        for kind in [BaselineKind::Llpr, BaselineKind::LlprSum] {
             let rows: Vec<Vec<f64>> = frames
                 .iter()
                 .map(|(elements, features)| {
-                    let atoms = if kind == Kind::Llpr { elements.len() as f64 } else { 1.0 };
+                    let atoms = if kind == BaselineKind::Llpr { elements.len() as f64 } else { 1.0 };
                     sum(features).iter().map(|x| x / atoms).collect()
                 })
                 .collect();
@@ -49,7 +49,7 @@ fn llpr_of_forces_has_the_rows_of_forces() {
     let (dimension, atoms) = (4, 3);
     let settings =
         BaselineSettings { regularisation: 1e-6, force_weight: 0.25, ..BaselineSettings::default() };
-    let mut builder = Builder::new(Kind::LlprForces, &settings, dimension, 1, None).unwrap();
+    let mut builder = Builder::new(BaselineKind::LlprForces, &settings, dimension, 1, None).unwrap();
     let mut rows = Vec::new();
     for seed in 0..60 {
         let (features, forces) =
@@ -83,7 +83,7 @@ fn distances_are_those_of_all_pairs() {
     let of_queries: Vec<usize> = (0..40).map(|k| k % 2).collect();
     let rows = || queries.chunks_exact(dimension).zip(&of_queries);
 
-    let euclidean = built(Kind::Euclidean, &BaselineSettings::default(), &[], dimension, &mixture);
+    let euclidean = built(BaselineKind::Euclidean, &BaselineSettings::default(), &[], dimension, &mixture);
     let nearest = |(z, element): (&[f64], &usize)| {
         let components = mixture.components(*element).unwrap().iter();
         components.map(|component| distance(z, component.centroid())).fold(f64::INFINITY, f64::min)
@@ -93,7 +93,7 @@ fn distances_are_those_of_all_pairs() {
 
     for neighbours in [1, 5, 10_000] {
         let settings = BaselineSettings { neighbours, ..BaselineSettings::default() };
-        let baseline = built(Kind::KNearest, &settings, &frames, dimension, &mixture);
+        let baseline = built(BaselineKind::KNearest, &settings, &frames, dimension, &mixture);
         let nth = |(z, element): (&[f64], &usize)| {
             let training = features.chunks_exact(dimension).zip(&of).filter(|(_, of)| *of == element);
             let mut all: Vec<f64> = training.map(|(row, _)| distance(z, row)).collect();
@@ -105,7 +105,8 @@ fn distances_are_those_of_all_pairs() {
     }
     // A training atom is its own nearest neighbour, exactly.
     let settings = BaselineSettings { neighbours: 1, ..BaselineSettings::default() };
-    let own = built(Kind::KNearest, &settings, &frames, dimension, &mixture).score(&of, &features).unwrap();
+    let own =
+        built(BaselineKind::KNearest, &settings, &frames, dimension, &mixture).score(&of, &features).unwrap();
     assert!(own.iter().all(|distance| *distance < 1e-15), "{own:?}");
 }
 
@@ -115,14 +116,20 @@ fn a_sample_is_bounded_and_does_not_depend_on_batches() {
     let (frames, mixture) = (frames(6, dimension, elements, 400), mixture(6, dimension, elements));
     let settings = BaselineSettings { sample: 50, neighbours: 50, ..BaselineSettings::default() };
     let build = |frames: &[_], seed| {
-        built(Kind::KNearest, &BaselineSettings { seed, ..settings.clone() }, frames, dimension, &mixture)
+        built(
+            BaselineKind::KNearest,
+            &BaselineSettings { seed, ..settings.clone() },
+            frames,
+            dimension,
+            &mixture,
+        )
     };
     let sampled = build(&frames, 42);
     assert_eq!(sampled, build(&[joined(&frames)], 42));
     assert_ne!(sampled, build(&frames, 43));
     // The furthest of 50 is nearer than the furthest of all.
     let all = BaselineSettings { neighbours: 10_000, ..BaselineSettings::default() };
-    let all = built(Kind::KNearest, &all, &frames, dimension, &mixture);
+    let all = built(BaselineKind::KNearest, &all, &frames, dimension, &mixture);
     let (near, far) = (sampled.score(&[0], &[0.0, 0.0]).unwrap(), all.score(&[0], &[0.0, 0.0]).unwrap());
     assert!(near[0] > 0.0 && near[0] <= far[0]);
 }
@@ -131,7 +138,7 @@ fn a_sample_is_bounded_and_does_not_depend_on_batches() {
 fn the_likelihood_is_that_of_normal_distributions() {
     let (dimension, elements) = (4, 2);
     let mixture = mixture(9, dimension, elements);
-    let baseline = built(Kind::Likelihood, &BaselineSettings::default(), &[], dimension, &mixture);
+    let baseline = built(BaselineKind::Likelihood, &BaselineSettings::default(), &[], dimension, &mixture);
     let queries: Vec<f64> = Random(3).take(30 * dimension).iter().map(|x| 1.0 + x).collect();
     let of: Vec<usize> = (0..30).map(|k| k % 2).collect();
     let likelihood = |(z, element): (&[f64], &usize)| {
@@ -162,29 +169,32 @@ fn wrong_input_is_refused() {
         Builder::new(kind, settings, dimension, elements, mixture).unwrap_err().to_string()
     };
     assert_eq!(
-        refused(Kind::Euclidean, &settings, 3, 1, None),
+        refused(BaselineKind::Euclidean, &settings, 3, 1, None),
         "euclidean needs a mixture of the same features"
     );
     assert_eq!(
-        refused(Kind::Euclidean, &settings, 4, 1, Some(&mixture)),
+        refused(BaselineKind::Euclidean, &settings, 4, 1, Some(&mixture)),
         "the mixture has 3 features, expected 4"
     );
     assert_eq!(
-        refused(Kind::Euclidean, &settings, 3, 2, Some(&mixture)),
+        refused(BaselineKind::Euclidean, &settings, 3, 2, Some(&mixture)),
         "the mixture has 1 elements, expected 2"
     );
     let wrong = BaselineSettings { tolerance: -1.0, ..settings.clone() };
-    assert_eq!(refused(Kind::Llpr, &wrong, 3, 1, None), "tolerance: found -1, expected a number above 0");
+    assert_eq!(
+        refused(BaselineKind::Llpr, &wrong, 3, 1, None),
+        "tolerance: found -1, expected a number above 0"
+    );
     let bare = Component::new(vec![0.0; 3], vec![0.0; 9], 1.0, None).unwrap();
     let bare = Mixture::new(0, vec![vec![bare.into()]]).unwrap();
-    assert!(refused(Kind::Likelihood, &settings, 3, 1, Some(&bare)).contains("no counts"));
+    assert!(refused(BaselineKind::Likelihood, &settings, 3, 1, Some(&bare)).contains("no counts"));
 
-    for kind in Kind::ALL.into_iter().filter(|kind| kind.needs_data()) {
+    for kind in BaselineKind::ALL.into_iter().filter(|kind| kind.needs_data()) {
         let mut builder = Builder::new(kind, &settings, 3, 1, Some(&mixture)).unwrap();
         let wrong = |found: Result<(), BaselineError>| found.unwrap_err().to_string();
         assert_eq!(wrong(builder.add(&[0], &[0.0; 2])), "features: found 2 numbers, expected 3");
         assert!(wrong(builder.add(&[0], &[0.0, f64::NAN, 0.0])).starts_with("features of atom 0"));
-        if !matches!(kind, Kind::Llpr | Kind::LlprSum | Kind::LlprForces) {
+        if !matches!(kind, BaselineKind::Llpr | BaselineKind::LlprSum | BaselineKind::LlprForces) {
             assert!(
                 wrong(builder.add(&[1], &[0.0; 3]))
                     .contains("has element index 1, the baseline has 1 elements")

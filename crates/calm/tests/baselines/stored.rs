@@ -2,8 +2,8 @@
 
 use std::io::Cursor;
 
-use calm::baselines::{BaselineFile, BaselineSettings, FeatureOrigin, Kind};
-use npz::{Archive, Writer};
+use calm::baselines::{BaselineFile, BaselineKind, BaselineSettings, FeatureOrigin};
+use npz::{NpzFile, Writer};
 use proptest::prelude::*;
 
 use super::{built, frames, joined, mixture};
@@ -19,7 +19,7 @@ fn stored() -> BaselineFile {
         symbols: vec!["Mo".into(), "W".into()],
         dimension,
     };
-    BaselineFile { origin, baselines: Kind::ALL.map(build).to_vec(), settings }
+    BaselineFile { origin, baselines: BaselineKind::ALL.map(build).to_vec(), settings }
 }
 
 fn bytes(file: &BaselineFile) -> Vec<u8> {
@@ -27,7 +27,7 @@ fn bytes(file: &BaselineFile) -> Vec<u8> {
 }
 
 fn read(bytes: &[u8]) -> Result<BaselineFile, String> {
-    let archive = Archive::from_bytes("b.npz", bytes).map_err(|error| error.to_string())?;
+    let archive = NpzFile::from_bytes("b.npz", bytes).map_err(|error| error.to_string())?;
     BaselineFile::read(&archive).map_err(|error| error.to_string())
 }
 
@@ -81,7 +81,7 @@ fn with(key: &str, write: Option<&Write>) -> Result<BaselineFile, String> {
 #[test]
 fn every_array_is_needed() {
     let all = bytes(&stored());
-    let names: Vec<String> = Archive::from_bytes("b", &all).unwrap().names().map(str::to_owned).collect();
+    let names: Vec<String> = NpzFile::from_bytes("b", &all).unwrap().names().map(str::to_owned).collect();
     assert!(names.len() > 40);
     for name in names {
         let message = with(&name, None).unwrap_err();

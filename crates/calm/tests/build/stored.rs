@@ -137,7 +137,7 @@ fn thresholds_are_set_anew_without_the_data() {
 
     let found = write(ThresholdRule::Percentile(90.0));
     assert_eq!(numbers(&other, "scatter_2"), numbers(&path, "scatter_2"));
-    assert_eq!(npz::Archive::open(&other).unwrap().strings("threshold_mode").unwrap(), ["percentile_90"]);
+    assert_eq!(npz::NpzFile::open(&other).unwrap().strings("threshold_mode").unwrap(), ["percentile_90"]);
     let raw = numbers(&other, "interp_thresholds");
     for (element, slot, component) in found.mixture.iter().filter(|(element, ..)| *element != 1) {
         let histogram = &histograms[element].as_ref().unwrap().components[slot];

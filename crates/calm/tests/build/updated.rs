@@ -68,11 +68,11 @@ fn an_updated_mixture_is_read_back() {
 
     // Without an update, every array is that of the artifact.
     write(&path, &original, &original, &later);
-    let archive = npz::Archive::open(&path).unwrap();
+    let archive = npz::NpzFile::open(&path).unwrap();
     for name in archive.names() {
         assert!(bytes(&later, name) == bytes(&path, name), "{name}");
     }
-    assert_eq!(npz::Archive::open(&later).unwrap().strings("campaign").unwrap(), ["c-1"]);
+    assert_eq!(npz::NpzFile::open(&later).unwrap().strings("campaign").unwrap(), ["c-1"]);
 
     let twice = updated(&updated(&original, 0, 1), 0, 1);
     let found = write(&path, &original, &twice, &later);

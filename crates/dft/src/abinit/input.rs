@@ -6,10 +6,10 @@ use std::fmt::Write;
 use atoms::{Species, Vec3};
 
 use super::pseudopotentials::Pseudopotential;
-use super::{Abinit, Settings};
+use super::{Abinit, AbinitSettings};
 use crate::padded_structure::PaddedStructure;
 use crate::pinned_file::DATA_DIRECTORY;
-use crate::{Failure, FailureClass, Input, RetryAdjustment, Smearing, moments};
+use crate::{CalculationInput, Failure, FailureClass, RetryAdjustment, Smearing, moments};
 
 /// Name of the input file; ABINIT derives the name of its output from it.
 const NAME: &str = "run.abi";
@@ -18,7 +18,7 @@ pub(super) fn write(
     abinit: &Abinit,
     padded: &PaddedStructure,
     adjustments: &BTreeSet<RetryAdjustment>,
-) -> Result<Input, Failure> {
+) -> Result<CalculationInput, Failure> {
     let bad = |error: crate::SetupError| FailureClass::BadInput.with_message(error.to_string());
     let species = BTreeSet::from_iter(padded.structure.species.iter().copied());
     let pseudopotentials = abinit.matching_pseudopotentials(&species).map_err(bad)?;
@@ -29,7 +29,7 @@ pub(super) fn write(
     let copies: Vec<_> = pseudopotentials.iter().map(|(species, one)| one.copy(*species)).collect();
     text += &format!("pp_dirpath \"{DATA_DIRECTORY}\"\npseudos \"{}\"\n", copies.join(", "));
     let originals = pseudopotentials.values().map(|one| one.pinned.clone());
-    Ok(Input {
+    Ok(CalculationInput {
         files: [(NAME.to_owned(), text.into_bytes())].into(),
         command: abinit.settings.command.iter().cloned().chain([NAME.to_owned()]).collect(),
         environment: abinit.environment.clone(),
@@ -39,7 +39,7 @@ pub(super) fn write(
 
 /// Keywords that do not depend on the structure: PBE, forces and stress, no symmetry but time reversal, no
 /// files beside the output.
-fn fixed(settings: &Settings) -> String {
+fn fixed(settings: &AbinitSettings) -> String {
     let occupation = match settings.smearing {
         Smearing::FermiDirac => 3,
         Smearing::MethfesselPaxton => 6,
@@ -54,7 +54,7 @@ fn fixed(settings: &Settings) -> String {
 
 fn electrons(
     text: &mut String,
-    settings: &Settings,
+    settings: &AbinitSettings,
     padded: &PaddedStructure,
     pseudopotentials: &BTreeMap<Species, &Pseudopotential>,
     adjustments: &BTreeSet<RetryAdjustment>,
@@ -82,7 +82,7 @@ fn electrons(
     *text += &format!("ngkpt {x} {y} {z}\nnshiftk 1\nshiftk 0 0 0\n");
 }
 
-fn steps(text: &mut String, settings: &Settings, paw: bool, adjustments: &BTreeSet<RetryAdjustment>) {
+fn steps(text: &mut String, settings: &AbinitSettings, paw: bool, adjustments: &BTreeSet<RetryAdjustment>) {
     let factor = if adjustments.contains(&RetryAdjustment::MoreSteps) { 3 } else { 1 };
     *text += &format!("nstep {}\n", settings.steps.saturating_mul(factor));
     if adjustments.contains(&RetryAdjustment::SlowerMixing) {

@@ -27,11 +27,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::checks::{at_least, positive};
-use crate::moments::Moments;
+use crate::moments::InitialMagneticMoments;
 use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
-    Smearing, validation, version_query,
+    CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, Failure, PassedEnvironment,
+    RetryAdjustment, SetupError, Smearing, validation, version_query,
 };
 use pseudopotentials::Pseudopotential;
 
@@ -44,7 +44,7 @@ const INPUT_VERSION: u32 = 1;
 /// The settings of `[label.method.abinit]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Settings {
+pub struct AbinitSettings {
     /// ABINIT with its launcher: `["mpirun", "-np", "4", "abinit"]`.
     pub command: Vec<String>,
     /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
@@ -71,7 +71,7 @@ pub struct Settings {
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
     #[serde(rename = "initial_magnetic_moments")]
-    pub moments: Moments,
+    pub moments: InitialMagneticMoments,
     /// Tolerance of the energy between electronic steps, met twice in a row, eV.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
@@ -84,7 +84,7 @@ pub struct Settings {
     pub vacuum: f64,
 }
 
-impl Default for Settings {
+impl Default for AbinitSettings {
     fn default() -> Self {
         Self {
             command: vec!["abinit".into()],
@@ -97,7 +97,7 @@ impl Default for Settings {
             smearing: Smearing::Gaussian,
             smearing_width: 0.1,
             spin: true,
-            moments: Moments::new(),
+            moments: InitialMagneticMoments::new(),
             energy_tolerance: 1e-6,
             steps: 200,
             vacuum: 10.0,
@@ -105,7 +105,7 @@ impl Default for Settings {
     }
 }
 
-impl Settings {
+impl AbinitSettings {
     /// Queries ABINIT's version and finds the pseudopotentials.
     ///
     /// # Errors
@@ -147,7 +147,7 @@ fn version(
 /// A configured ABINIT.
 #[derive(Clone, Debug)]
 pub struct Abinit {
-    settings: Settings,
+    settings: AbinitSettings,
     environment: BTreeMap<String, String>,
     version: String,
     pseudopotentials: BTreeMap<Species, Pseudopotential>,
@@ -159,7 +159,7 @@ impl Abinit {
         &self,
         species: &BTreeSet<Species>,
     ) -> Result<BTreeMap<Species, &Pseudopotential>, SetupError> {
-        let Settings { pseudopotentials: directory, pseudopotential_variants, .. } = &self.settings;
+        let AbinitSettings { pseudopotentials: directory, pseudopotential_variants, .. } = &self.settings;
         let mut chosen: BTreeMap<Species, &Pseudopotential> = BTreeMap::new();
         for species in species {
             let one = self.pseudopotentials.get(species);
@@ -183,7 +183,7 @@ impl DftBackend for Abinit {
         let hashes: BTreeMap<&str, &str> =
             self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.pinned.hash())).collect();
         // Destructure, so that a new setting cannot be forgotten here.
-        let Settings {
+        let AbinitSettings {
             command: _,
             environment: _,
             pseudopotentials: _,
@@ -215,11 +215,16 @@ impl DftBackend for Abinit {
         &self,
         structure: &Structure,
         adjustments: &BTreeSet<RetryAdjustment>,
-    ) -> Result<Input, Failure> {
+    ) -> Result<CalculationInput, Failure> {
         input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure> {
         let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
         match output::read(&padded.structure, directory, &self.version, self.settings.smearing)? {
             Some(calculated) => Ok(padded.without_padding_stress(calculated)),
@@ -227,8 +232,8 @@ impl DftBackend for Abinit {
         }
     }
 
-    fn size(&self, structure: &Structure) -> Size {
-        let Settings { vacuum, k_spacing, .. } = self.settings;
+    fn size(&self, structure: &Structure) -> CalculationSize {
+        let AbinitSettings { vacuum, k_spacing, .. } = self.settings;
         let valence = structure.species.iter().filter_map(|species| self.pseudopotentials.get(species));
         padded_structure::size(structure, vacuum, k_spacing, valence.map(|p| p.valence).sum())
     }

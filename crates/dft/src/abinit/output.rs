@@ -7,7 +7,7 @@ use atoms::{Cell, Species, Structure, units};
 
 use super::{HARTREE, Smearing};
 use crate::structure_check::check_same_structure;
-use crate::{Failure, FailureClass, Results, validation};
+use crate::{CalculationResults, Failure, FailureClass, validation};
 
 /// Lattice vectors have seven decimals, bohr.
 const CELL_PRECISION: f64 = 1e-6;
@@ -19,7 +19,7 @@ pub(super) fn read(
     directory: &Path,
     version: &str,
     smearing: Smearing,
-) -> Result<Option<Results>, Failure> {
+) -> Result<Option<CalculationResults>, Failure> {
     let text = |name| {
         let content = validation::read_output_file(directory, name)?.unwrap_or_default();
         Ok::<_, Failure>(String::from_utf8_lossy(&content).into_owned())
@@ -34,7 +34,7 @@ pub(super) fn parse(
     printed: &str,
     version: &str,
     smearing: Smearing,
-) -> Result<Option<Results>, Failure> {
+) -> Result<Option<CalculationResults>, Failure> {
     let calculated_by = stated_version(output);
     if let Some(found) = calculated_by {
         validation::check_version("ABINIT", found, version)?;
@@ -83,7 +83,7 @@ fn is_whole(output: &str) -> bool {
     output.contains("Calculation completed.") && last.starts_with("+Overall time at end")
 }
 
-fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Results> {
+fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<CalculationResults> {
     let results = document(output, "ResultsGS")?;
     let free = *energies.last()?;
     // The summary has fewer digits but must belong to the same calculation.
@@ -95,7 +95,7 @@ fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Results
     let entropy = value(document(output, "EnergyTerms")?, "'-kT*entropy'")?;
     let order = if smearing == Smearing::MethfesselPaxton { 1.0 } else { 0.0 };
     let force = HARTREE / units::BOHR;
-    Some(Results {
+    Some(CalculationResults {
         energy: free * HARTREE,
         energy_without_smearing: Some((free - entropy / (2.0 + order)) * HARTREE),
         forces: rows(results, "cartesian_forces").map(|row| vector(row, force)).collect::<Option<_>>()?,

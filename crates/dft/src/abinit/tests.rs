@@ -17,7 +17,7 @@ fn silicon() -> Structure {
     Structure { species: vec!["Si".parse().unwrap(); 2], positions, cell, periodic: [true; 3] }
 }
 
-fn abinit(settings: Settings) -> Abinit {
+fn abinit(settings: AbinitSettings) -> Abinit {
     let known = [("Si", 4.0, false), ("Fe", 16.0, true)].map(|(symbol, valence, paw)| {
         let path = format!("/{symbol}.{}", if paw { "xml" } else { "psp8" });
         let pinned = PinnedFile::fake(&path, &symbol.to_lowercase());
@@ -28,11 +28,11 @@ fn abinit(settings: Settings) -> Abinit {
 }
 
 /// The settings that give `INPUT`.
-fn settings() -> Settings {
-    Settings { cutoff: 200.0, k_spacing: 1.2, steps: 60, ..Settings::default() }
+fn settings() -> AbinitSettings {
+    AbinitSettings { cutoff: 200.0, k_spacing: 1.2, steps: 60, ..AbinitSettings::default() }
 }
 
-fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
+fn input(settings: AbinitSettings, adjustments: &[RetryAdjustment]) -> String {
     let adjustments = BTreeSet::from_iter(adjustments.iter().copied());
     let input = abinit(settings.clone()).input(&silicon(), &adjustments).unwrap();
     assert_eq!(input, abinit(settings).input(&silicon(), &adjustments).unwrap());
@@ -40,7 +40,7 @@ fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
     String::from_utf8(input.files["run.abi"].clone()).unwrap()
 }
 
-fn parse(structure: &Structure, output: &str) -> Result<Option<Results>, Failure> {
+fn parse(structure: &Structure, output: &str) -> Result<Option<CalculationResults>, Failure> {
     output::parse(structure, output, "", "9.6.2", Smearing::Gaussian)
 }
 
@@ -99,8 +99,11 @@ fn calculations_read_copies_of_what_was_hashed() {
     std::fs::write(&file, before).unwrap();
     let pseudopotential_variants = BTreeMap::from([("Si".parse().unwrap(), "mine.psp8".to_owned())]);
     let pseudopotentials = pseudopotentials::find(directory.path(), &pseudopotential_variants).unwrap();
-    let settings =
-        Settings { pseudopotentials: directory.path().to_owned(), pseudopotential_variants, ..settings() };
+    let settings = AbinitSettings {
+        pseudopotentials: directory.path().to_owned(),
+        pseudopotential_variants,
+        ..settings()
+    };
     let code = Abinit { pseudopotentials, ..abinit(settings) };
     let input = code.input(&silicon(), &BTreeSet::new()).unwrap();
     let text = String::from_utf8(input.files["run.abi"].clone()).unwrap();
@@ -115,11 +118,11 @@ fn calculations_read_copies_of_what_was_hashed() {
 
 #[test]
 fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
-    let identity = |settings: Settings| abinit(settings).identity();
+    let identity = |settings: AbinitSettings| abinit(settings).identity();
     let plain = identity(settings());
-    assert_eq!(identity(Settings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
-    assert_ne!(identity(Settings { cutoff: 400.0, ..settings() }), plain);
-    assert_ne!(identity(Settings { smearing_width: 0.2, ..settings() }), plain);
+    assert_eq!(identity(AbinitSettings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
+    assert_ne!(identity(AbinitSettings { cutoff: 400.0, ..settings() }), plain);
+    assert_ne!(identity(AbinitSettings { smearing_width: 0.2, ..settings() }), plain);
 }
 
 #[test]

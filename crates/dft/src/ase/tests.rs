@@ -14,9 +14,9 @@ fn copper() -> Structure {
     }
 }
 
-fn ase(moments: Moments) -> Ase {
+fn ase(moments: InitialMagneticMoments) -> Ase {
     let versions = Versions { ase: "3.22.1".into(), version: "mine".into() };
-    let settings = Settings { moments, ..Settings::default() };
+    let settings = AseSettings { moments, ..AseSettings::default() };
     Ase { environment: BTreeMap::new(), settings, calculator: b"def calculator(): ...".to_vec(), versions }
 }
 
@@ -37,7 +37,7 @@ fn the_task_is_the_structure_with_its_moments_and_adjustments() {
         "moments": null,
         "remedies": [],
     });
-    assert_eq!(task(&ase(Moments::new()), &[]), plain);
+    assert_eq!(task(&ase(InitialMagneticMoments::new()), &[]), plain);
     let changed = task(
         &ase([("Cu".parse().unwrap(), 3.0)].into()),
         &[RetryAdjustment::SlowerMixing, RetryAdjustment::OtherMoments],
@@ -47,8 +47,8 @@ fn the_task_is_the_structure_with_its_moments_and_adjustments() {
 }
 
 /// Reads this result for the structure [`copper`].
-fn read(mut converged: Value) -> Result<Results, Failure> {
-    let structure = task(&ase(Moments::new()), &[]);
+fn read(mut converged: Value) -> Result<CalculationResults, Failure> {
+    let structure = task(&ase(InitialMagneticMoments::new()), &[]);
     for key in ["species", "positions", "cell"] {
         converged[key] = structure[key].clone();
     }
@@ -56,7 +56,7 @@ fn read(mut converged: Value) -> Result<Results, Failure> {
     let by = json!({ "ase": "3.22.1", "version": "mine" });
     let text = json!({ "converged": converged, "by": by }).to_string();
     std::fs::write(directory.path().join("result.json"), text).unwrap();
-    ase(Moments::new()).read(&copper(), directory.path(), Exit::Code(0))
+    ase(InitialMagneticMoments::new()).read(&copper(), directory.path(), Exit::Code(0))
 }
 
 #[test]
@@ -66,7 +66,8 @@ fn a_calculator_need_not_give_more_than_energy_and_forces() {
         "energy": -1.5, "energy_without_smearing": null, "forces": forces, "stress": null, "moments": null,
         "magnetisation": null, "steps": null,
     });
-    let expected = Results { energy: -1.5, forces: forces.to_vec(), ..Results::default() };
+    let expected =
+        CalculationResults { energy: -1.5, forces: forces.to_vec(), ..CalculationResults::default() };
     assert_eq!(read(least.clone()), Ok(expected));
     for (key, value) in
         [("energy", json!(null)), ("forces", json!([[0.1, -0.2, 0.3]])), ("stress", json!([1.0]))]
@@ -80,8 +81,8 @@ fn a_calculator_need_not_give_more_than_energy_and_forces() {
 #[test]
 fn a_setting_that_does_not_exist_is_refused() {
     let text = r#"{ "calculator": "a.py", "calculators": "b.py" }"#;
-    assert!(serde_json::from_str::<Settings>(text).is_err());
-    let missing = Settings { calculator: "/no/such/file.py".into(), ..Settings::default() };
+    assert!(serde_json::from_str::<AseSettings>(text).is_err());
+    let missing = AseSettings { calculator: "/no/such/file.py".into(), ..AseSettings::default() };
     assert!(matches!(
         missing.prepare(&PassedEnvironment::default()),
         Err(SetupError::Setting { key: "calculator", .. })

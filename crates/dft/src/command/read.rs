@@ -3,16 +3,16 @@
 use std::path::Path;
 
 use atoms::Structure;
-use atoms::extxyz::{Frame, Reader};
+use atoms::extxyz::{ExtxyzReader, Frame};
 
 use crate::structure_check::check_same_structure;
-use crate::{Failure, FailureClass, Results, result_file};
+use crate::{CalculationResults, Failure, FailureClass, result_file};
 
 /// The precision of the digits that ASE writes.
 const TOLERANCE: f64 = 1e-6;
 
 /// The results in the file, if it is complete and describes this structure.
-pub(super) fn label(structure: &Structure, path: &Path) -> Result<Results, Failure> {
+pub(super) fn label(structure: &Structure, path: &Path) -> Result<CalculationResults, Failure> {
     let frame = whole_frame(path).map_err(|fault| {
         let name = path.file_name().unwrap_or_default().display();
         FailureClass::Crashed.with_message(format!("the command ended with 0, but {name} {fault}"))
@@ -28,7 +28,7 @@ fn whole_frame(path: &Path) -> Result<Frame, String> {
     if text.last() != Some(&b'\n') {
         return Err("does not end with a line break: it is incomplete".to_owned());
     }
-    let mut frames = Reader::new(text.as_slice());
+    let mut frames = ExtxyzReader::new(text.as_slice());
     let frame = frames.next().ok_or("is empty")?.map_err(|error| error.to_string())?;
     match frames.next() {
         None => Ok(frame),
@@ -36,7 +36,7 @@ fn whole_frame(path: &Path) -> Result<Frame, String> {
     }
 }
 
-fn numbers(mut frame: Frame) -> Result<Results, String> {
+fn numbers(mut frame: Frame) -> Result<CalculationResults, String> {
     // Keys with this prefix would take precedence over the plain ones.
     frame.info.retain(|key, _| !key.starts_with("REF_"));
     frame.arrays.retain(|key, _| !key.starts_with("REF_"));
@@ -58,7 +58,7 @@ fn numbers(mut frame: Frame) -> Result<Results, String> {
         }
     };
     let extended = frame.structure.periodic != [false; 3];
-    Ok(Results {
+    Ok(CalculationResults {
         energy: free.unwrap_or(energy),
         energy_without_smearing: free.map(|_| energy),
         forces,

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use atoms::Species;
 
-use super::Settings;
+use super::Cp2kSettings;
 use crate::SetupError;
 
 /// The file of the basis sets.
@@ -16,23 +16,23 @@ const FUNCTIONAL: &str = "GTH-PBE";
 
 /// Pseudopotential and basis set of an element.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Kind {
+pub(super) struct AtomicKind {
     /// Name of the pseudopotential.
     pub potential: String,
     /// Number of valence electrons.
     pub valence: f64,
     /// The entries of both.
-    pub entries: Entries,
+    pub entries: DataFileEntries,
 }
 
 /// Entries of the data files.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Entries {
+pub(super) struct DataFileEntries {
     pub potential: String,
     pub basis: String,
 }
 
-impl Entries {
+impl DataFileEntries {
     /// BLAKE3 of both.
     pub fn hash(&self) -> String {
         blake3::hash(format!("{}\n{}", self.potential, self.basis).as_bytes()).to_hex().to_string()
@@ -40,7 +40,7 @@ impl Entries {
 }
 
 /// All elements that have both.
-pub(super) fn find(settings: &Settings) -> Result<BTreeMap<Species, Kind>, SetupError> {
+pub(super) fn find(settings: &Cp2kSettings) -> Result<BTreeMap<Species, AtomicKind>, SetupError> {
     let (potentials, bases) = (text(settings, POTENTIALS)?, text(settings, BASES)?);
     let mut kinds = BTreeMap::new();
     for species in (1..=118).filter_map(|number| Species::from_atomic_number(number).ok()) {
@@ -58,7 +58,7 @@ pub(super) fn find(settings: &Settings) -> Result<BTreeMap<Species, Kind>, Setup
 }
 
 /// The error for an element that lacks one of them.
-pub(super) fn missing(species: Species, settings: &Settings) -> SetupError {
+pub(super) fn missing(species: Species, settings: &Cp2kSettings) -> SetupError {
     let directory = settings.pseudopotentials.display();
     let reason = format!(
         "no pseudopotential {} in {directory}/{POTENTIALS} with a basis set {} in {directory}/{BASES}: name another \
@@ -69,7 +69,7 @@ pub(super) fn missing(species: Species, settings: &Settings) -> SetupError {
     SetupError::Pseudopotential { species, reason }
 }
 
-fn text(settings: &Settings, name: &str) -> Result<String, SetupError> {
+fn text(settings: &Cp2kSettings, name: &str) -> Result<String, SetupError> {
     let path = settings.pseudopotentials.join(name);
     std::fs::read_to_string(&path).map_err(|error| SetupError::Setting {
         key: "pseudopotentials",
@@ -78,7 +78,7 @@ fn text(settings: &Settings, name: &str) -> Result<String, SetupError> {
     })
 }
 
-fn potential(species: Species, settings: &Settings) -> &str {
+fn potential(species: Species, settings: &Cp2kSettings) -> &str {
     settings.pseudopotential_variants.get(&species).map_or(FUNCTIONAL, String::as_str)
 }
 
@@ -86,8 +86,8 @@ fn kind(
     potentials: &str,
     bases: &str,
     species: Species,
-    settings: &Settings,
-) -> Result<Option<Kind>, String> {
+    settings: &Cp2kSettings,
+) -> Result<Option<AtomicKind>, String> {
     let name = potential(species, settings);
     if name != FUNCTIONAL && !name.starts_with("GTH-PBE-") {
         return Err(format!(
@@ -105,8 +105,8 @@ fn kind(
             || names.contains(&settings.basis.as_str()) && !names.iter().any(|name| name.contains("-q"))
     };
     let Some(basis) = entry(bases, species, fits) else { return Ok(None) };
-    let entries = Entries { potential: potential.to_owned(), basis: basis.to_owned() };
-    Ok(Some(Kind { potential: name.to_owned(), valence, entries }))
+    let entries = DataFileEntries { potential: potential.to_owned(), basis: basis.to_owned() };
+    Ok(Some(AtomicKind { potential: name.to_owned(), valence, entries }))
 }
 
 /// The lines of the first entry of this element whose names match. An entry starts with a symbol and ends
@@ -144,10 +144,10 @@ mod tests {
     const POTENTIAL: &str = "#\nSi GTH-BLYP-q4 GTH-BLYP\n    2    2\n 0.4\n#\nSi GTH-PBE-q4 GTH-PBE\n    2    2\n     0.44000000    1    -6.26928833\n#\nNi GTH-PBE-q18 GTH-PBE\n 4 6 8\n 0.3\n";
     const BASIS: &str = " Si DZVP-MOLOPT-SR-GTH DZVP-MOLOPT-SR-GTH-q4\n 1\n 2 0 2\n Ni DZVP-MOLOPT-SR-GTH DZVP-MOLOPT-SR-GTH-q10\n 1\n";
 
-    fn settings(directory: &Path) -> Settings {
+    fn settings(directory: &Path) -> Cp2kSettings {
         std::fs::write(directory.join(POTENTIALS), POTENTIAL).unwrap();
         std::fs::write(directory.join(BASES), BASIS).unwrap();
-        Settings { pseudopotentials: directory.to_owned(), ..Settings::default() }
+        Cp2kSettings { pseudopotentials: directory.to_owned(), ..Cp2kSettings::default() }
     }
 
     #[test]
@@ -162,10 +162,11 @@ mod tests {
         assert!(error.starts_with("pseudopotential of Ni: no pseudopotential GTH-PBE in "), "{error}");
 
         let pseudopotential_variants = BTreeMap::from([(silicon, "GTH-BLYP".to_owned())]);
-        let error = find(&Settings { pseudopotential_variants, ..settings.clone() }).unwrap_err().to_string();
+        let error =
+            find(&Cp2kSettings { pseudopotential_variants, ..settings.clone() }).unwrap_err().to_string();
         assert!(error.contains("GTH-BLYP in `pseudopotential_variants` is not of PBE"), "{error}");
         let pseudopotential_variants = BTreeMap::from([(nickel, "GTH-PBE-q18".to_owned())]);
-        assert!(find(&Settings { pseudopotential_variants, ..settings }).is_err());
+        assert!(find(&Cp2kSettings { pseudopotential_variants, ..settings }).is_err());
     }
 
     #[test]

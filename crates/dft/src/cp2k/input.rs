@@ -5,9 +5,9 @@ use std::fmt::Write;
 
 use atoms::Structure;
 
-use super::{Cp2k, OUTPUT, Settings, data};
+use super::{Cp2k, Cp2kSettings, OUTPUT, data};
 use crate::padded_structure::PaddedStructure;
-use crate::{Failure, FailureClass, Input, RetryAdjustment, moments};
+use crate::{CalculationInput, Failure, FailureClass, RetryAdjustment, moments};
 
 /// Name of the input file.
 const NAME: &str = "run.inp";
@@ -16,7 +16,7 @@ pub(super) fn write(
     cp2k: &Cp2k,
     padded: &PaddedStructure,
     adjustments: &BTreeSet<RetryAdjustment>,
-) -> Result<Input, Failure> {
+) -> Result<CalculationInput, Failure> {
     let species = BTreeSet::from_iter(padded.structure.species.iter().copied());
     // Only the entries that the identity contains.
     let (mut potentials, mut bases) = (String::new(), String::new());
@@ -37,13 +37,13 @@ pub(super) fn write(
         structure(cp2k, &padded.structure, adjustments),
     );
     let arguments = ["-i", NAME, "-o", OUTPUT].map(str::to_owned);
-    Ok(Input {
+    Ok(CalculationInput {
         files: [(NAME, text), (data::POTENTIALS, potentials), (data::BASES, bases)]
             .map(|(name, text)| (name.to_owned(), text.into_bytes()))
             .into(),
         command: cp2k.settings.command.iter().cloned().chain(arguments).collect(),
         environment: cp2k.environment.clone(),
-        ..Input::default()
+        ..CalculationInput::default()
     })
 }
 
@@ -73,7 +73,7 @@ impl Spins {
     }
 }
 
-fn method(settings: &Settings, spins: &Spins) -> String {
+fn method(settings: &Cp2kSettings, spins: &Spins) -> String {
     let spin = match settings.spin {
         true => format!("    UKS T\n    MULTIPLICITY {}\n", spins.multiplicity),
         false => String::new(),
@@ -102,7 +102,7 @@ fn k_points(mesh: [u32; 3]) -> String {
     )
 }
 
-fn steps(settings: &Settings, spins: &Spins, adjustments: &BTreeSet<RetryAdjustment>) -> String {
+fn steps(settings: &Cp2kSettings, spins: &Spins, adjustments: &BTreeSet<RetryAdjustment>) -> String {
     let has = |adjustment| adjustments.contains(&adjustment);
     let steps = settings.steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 });
     // Broyden's method stagnates below 0.2. Pulay's oscillates or stops at a bad condition number even in

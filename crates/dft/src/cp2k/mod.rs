@@ -25,13 +25,13 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::checks::{at_least, positive};
-use crate::moments::Moments;
+use crate::moments::InitialMagneticMoments;
 use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
-    validation, version_query,
+    CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, Failure, PassedEnvironment,
+    RetryAdjustment, SetupError, validation, version_query,
 };
-use data::Kind;
+use data::AtomicKind;
 
 /// eV, the value in CP2K (CODATA 2006).
 const HARTREE: f64 = 27.211_383_856_556_3;
@@ -51,7 +51,7 @@ const MIN_CUTOFF: f64 = 1000.0;
 /// The settings of `[label.method.cp2k]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Settings {
+pub struct Cp2kSettings {
     /// CP2K with its launcher: `["mpirun", "-np", "4", "cp2k"]`.
     pub command: Vec<String>,
     /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
@@ -79,7 +79,7 @@ pub struct Settings {
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
     #[serde(rename = "initial_magnetic_moments")]
-    pub moments: Moments,
+    pub moments: InitialMagneticMoments,
     /// CP2K's `EPS_SCF`: tolerance of the density between electronic steps.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub density_tolerance: f64,
@@ -92,7 +92,7 @@ pub struct Settings {
     pub vacuum: f64,
 }
 
-impl Default for Settings {
+impl Default for Cp2kSettings {
     fn default() -> Self {
         Self {
             command: vec!["cp2k".into()],
@@ -105,7 +105,7 @@ impl Default for Settings {
             k_spacing: 0.125,
             smearing_width: 0.1,
             spin: true,
-            moments: Moments::new(),
+            moments: InitialMagneticMoments::new(),
             density_tolerance: 1e-7,
             steps: 200,
             vacuum: 10.0,
@@ -113,7 +113,7 @@ impl Default for Settings {
     }
 }
 
-impl Settings {
+impl Cp2kSettings {
     /// Queries CP2K's version and finds pseudopotentials and basis sets.
     ///
     /// # Errors
@@ -150,14 +150,14 @@ fn version(
 /// A configured CP2K.
 #[derive(Clone, Debug)]
 pub struct Cp2k {
-    settings: Settings,
+    settings: Cp2kSettings,
     environment: BTreeMap<String, String>,
     version: String,
-    kinds: BTreeMap<Species, Kind>,
+    kinds: BTreeMap<Species, AtomicKind>,
 }
 
 impl Cp2k {
-    fn kind(&self, species: Species) -> Result<&Kind, SetupError> {
+    fn kind(&self, species: Species) -> Result<&AtomicKind, SetupError> {
         self.kinds.get(&species).ok_or_else(|| data::missing(species, &self.settings))
     }
 
@@ -172,7 +172,7 @@ impl DftBackend for Cp2k {
         let hashes: BTreeMap<&str, String> =
             self.kinds.iter().map(|(species, kind)| (species.symbol(), kind.entries.hash())).collect();
         // Destructure, so that a new setting cannot be forgotten here.
-        let Settings {
+        let Cp2kSettings {
             command: _,
             environment: _,
             pseudopotentials: _,
@@ -204,11 +204,16 @@ impl DftBackend for Cp2k {
         &self,
         structure: &Structure,
         adjustments: &BTreeSet<RetryAdjustment>,
-    ) -> Result<Input, Failure> {
+    ) -> Result<CalculationInput, Failure> {
         input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure> {
         let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
         match output::read(&padded.structure, directory, &self.version)? {
             Some(calculated) => Ok(padded.without_padding_stress(calculated)),
@@ -216,8 +221,8 @@ impl DftBackend for Cp2k {
         }
     }
 
-    fn size(&self, structure: &Structure) -> Size {
-        let Settings { vacuum, k_spacing, .. } = self.settings;
+    fn size(&self, structure: &Structure) -> CalculationSize {
+        let Cp2kSettings { vacuum, k_spacing, .. } = self.settings;
         padded_structure::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }

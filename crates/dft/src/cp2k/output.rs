@@ -7,7 +7,7 @@ use atoms::{Cell, Species, Structure, units};
 
 use super::{BOHR, HARTREE, OUTPUT};
 use crate::structure_check::check_same_structure;
-use crate::{Failure, FailureClass, Results, validation};
+use crate::{CalculationResults, Failure, FailureClass, validation};
 
 /// Lattice vectors have three decimals, Å, positions six.
 const CELL_PRECISION: f64 = 1e-3;
@@ -21,13 +21,17 @@ pub(super) fn read(
     structure: &Structure,
     directory: &Path,
     version: &str,
-) -> Result<Option<Results>, Failure> {
+) -> Result<Option<CalculationResults>, Failure> {
     let output = validation::read_output_file(directory, OUTPUT)?.unwrap_or_default();
     parse(structure, &String::from_utf8_lossy(&output), version)
 }
 
 /// As [`read`], from the text of the output.
-pub(super) fn parse(structure: &Structure, output: &str, version: &str) -> Result<Option<Results>, Failure> {
+pub(super) fn parse(
+    structure: &Structure,
+    output: &str,
+    version: &str,
+) -> Result<Option<CalculationResults>, Failure> {
     let calculated_by = stated_version(output);
     if let Some(found) = calculated_by {
         validation::check_version("CP2K", found, version)?;
@@ -78,7 +82,7 @@ fn is_whole(output: &str) -> bool {
     output.contains("PROGRAM ENDED AT") && last.contains("PROGRAM STOPPED IN")
 }
 
-fn numbers(output: &str, steps: u32) -> Option<Results> {
+fn numbers(output: &str, steps: u32) -> Option<CalculationResults> {
     let energy: f64 = word_after(output, "ENERGY| Total FORCE_EVAL ( QS ) energy [a.u.]:")?.parse().ok()?;
     // −TS. The zero-smearing limit is halfway between free and internal energy.
     let entropy: f64 = word_after(output, "Electronic entropic energy:")?.parse().ok()?;
@@ -86,7 +90,7 @@ fn numbers(output: &str, steps: u32) -> Option<Results> {
     let forces = forces.lines().skip_while(|line| !line.trim_start().starts_with('#')).skip(1);
     let forces = forces.take_while(|line| !line.trim_start().starts_with("SUM"));
     let moments = moments(output);
-    Some(Results {
+    Some(CalculationResults {
         energy: energy * HARTREE,
         energy_without_smearing: Some((energy - 0.5 * entropy) * HARTREE),
         forces: forces

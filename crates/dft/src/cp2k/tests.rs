@@ -2,7 +2,7 @@
 
 use proptest::prelude::*;
 
-use super::data::Entries;
+use super::data::DataFileEntries;
 use super::*;
 use crate::FailureClass;
 
@@ -18,27 +18,27 @@ fn silicon() -> Structure {
     Structure { species: vec!["Si".parse().unwrap(); 2], positions, cell, periodic: [true; 3] }
 }
 
-fn cp2k(settings: Settings) -> Cp2k {
-    let entries = Entries { potential: "Si GTH-PBE".into(), basis: "Si SZV".into() };
-    let kind = Kind { potential: "GTH-PBE".into(), valence: 4.0, entries };
+fn cp2k(settings: Cp2kSettings) -> Cp2k {
+    let entries = DataFileEntries { potential: "Si GTH-PBE".into(), basis: "Si SZV".into() };
+    let kind = AtomicKind { potential: "GTH-PBE".into(), valence: 4.0, entries };
     let environment = version_query::environment(&settings.environment);
     let kinds = BTreeMap::from([("Si".parse().unwrap(), kind)]);
     Cp2k { settings, environment, version: "2023.1".into(), kinds }
 }
 
 /// The settings that give `INPUT`.
-fn settings() -> Settings {
-    Settings {
+fn settings() -> Cp2kSettings {
+    Cp2kSettings {
         basis: "SZV-MOLOPT-SR-GTH".into(),
         cutoff: 1500.0,
         relative_cutoff: 300.0,
         density_tolerance: 1e-6,
         k_spacing: 10.0,
-        ..Settings::default()
+        ..Cp2kSettings::default()
     }
 }
 
-fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
+fn input(settings: Cp2kSettings, adjustments: &[RetryAdjustment]) -> String {
     let adjustments = BTreeSet::from_iter(adjustments.iter().copied());
     let input = cp2k(settings.clone()).input(&silicon(), &adjustments).unwrap();
     assert_eq!(input, cp2k(settings).input(&silicon(), &adjustments).unwrap());
@@ -46,7 +46,7 @@ fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
     String::from_utf8(input.files["run.inp"].clone()).unwrap()
 }
 
-fn parse(structure: &Structure, output: &str) -> Result<Option<Results>, Failure> {
+fn parse(structure: &Structure, output: &str) -> Result<Option<CalculationResults>, Failure> {
     output::parse(structure, output, "2023.1")
 }
 
@@ -72,7 +72,7 @@ fn adjustments_change_nothing_that_the_accuracy_depends_on() {
 #[test]
 fn meshes_hold_the_point_gamma() {
     let mesh = |spacing| {
-        let text = input(Settings { k_spacing: spacing, ..settings() }, &[]);
+        let text = input(Cp2kSettings { k_spacing: spacing, ..settings() }, &[]);
         text.lines().find(|line| line.contains("SCHEME")).map(|line| line.trim().to_owned())
     };
     assert_eq!(mesh(10.0), None);
@@ -90,7 +90,7 @@ fn calculations_read_the_entries_that_were_hashed() {
         std::fs::write(directory.path().join(data::BASES), bases).unwrap();
     };
     write("-6.27");
-    let settings = Settings { pseudopotentials: directory.path().to_owned(), ..settings() };
+    let settings = Cp2kSettings { pseudopotentials: directory.path().to_owned(), ..settings() };
     let prepared = || Cp2k { kinds: data::find(&settings).unwrap(), ..cp2k(settings.clone()) };
     let code = prepared();
     let entries = |code: &Cp2k| {
@@ -111,11 +111,11 @@ fn calculations_read_the_entries_that_were_hashed() {
 
 #[test]
 fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
-    let identity = |settings: Settings| cp2k(settings).identity();
+    let identity = |settings: Cp2kSettings| cp2k(settings).identity();
     let plain = identity(settings());
-    assert_eq!(identity(Settings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
-    assert_ne!(identity(Settings { relative_cutoff: 400.0, ..settings() }), plain);
-    let error = Settings { cutoff: 600.0, ..settings() }
+    assert_eq!(identity(Cp2kSettings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
+    assert_ne!(identity(Cp2kSettings { relative_cutoff: 400.0, ..settings() }), plain);
+    let error = Cp2kSettings { cutoff: 600.0, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap_err()
         .to_string();

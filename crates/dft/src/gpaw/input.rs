@@ -7,11 +7,11 @@ use atoms::cell::{Matrix3, Vec3};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::{Gpaw, SCRIPT, Settings, setups};
+use super::{Gpaw, GpawSettings, SCRIPT, setups};
 use crate::moments;
 use crate::padded_structure::PaddedStructure;
 use crate::pinned_file::DATA_DIRECTORY;
-use crate::{Failure, FailureClass, Input, RetryAdjustment, Smearing};
+use crate::{CalculationInput, Failure, FailureClass, RetryAdjustment, Smearing};
 
 /// Name of the script in the directory of a calculation.
 pub(super) const SCRIPT_FILE: &str = "job.py";
@@ -34,7 +34,7 @@ pub(super) fn write(
     gpaw: &Gpaw,
     padded: &PaddedStructure,
     adjustments: &BTreeSet<RetryAdjustment>,
-) -> Result<Input, Failure> {
+) -> Result<CalculationInput, Failure> {
     let (settings, structure) = (&gpaw.settings, &padded.structure);
     let mut data = BTreeMap::new();
     for species in BTreeSet::from_iter(structure.species.iter().copied()) {
@@ -58,7 +58,7 @@ pub(super) fn write(
     };
     let task = serde_json::to_vec_pretty(&task)
         .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
-    Ok(Input {
+    Ok(CalculationInput {
         files: [(SCRIPT_FILE.to_owned(), SCRIPT.into()), ("input.json".to_owned(), task)].into(),
         command: settings.command.iter().cloned().chain([SCRIPT_FILE.to_owned()]).collect(),
         environment: gpaw.environment.clone(),
@@ -67,7 +67,7 @@ pub(super) fn write(
 }
 
 fn parameters(
-    settings: &Settings,
+    settings: &GpawSettings,
     mesh: [u32; 3],
     electrons: f64,
     adjustments: &BTreeSet<RetryAdjustment>,

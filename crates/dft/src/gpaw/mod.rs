@@ -24,11 +24,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::checks::{at_least, positive};
-use crate::moments::Moments;
+use crate::moments::InitialMagneticMoments;
 use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
-    Smearing, script_output, validation, version_query,
+    CalculationInput, CalculationResults, CalculationSize, DftBackend, Exit, Failure, PassedEnvironment,
+    RetryAdjustment, SetupError, Smearing, script_output, validation, version_query,
 };
 use setups::Setup;
 
@@ -41,7 +41,7 @@ const INPUT_VERSION: u32 = 1;
 /// The settings of `[label.method.gpaw]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Settings {
+pub struct GpawSettings {
     /// A Python with GPAW and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
     pub command: Vec<String>,
     /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
@@ -66,7 +66,7 @@ pub struct Settings {
     pub spin: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
     #[serde(rename = "initial_magnetic_moments")]
-    pub moments: Moments,
+    pub moments: InitialMagneticMoments,
     /// Tolerance of the energy over the last three electronic steps, eV.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
@@ -82,7 +82,7 @@ pub struct Settings {
     pub vacuum: f64,
 }
 
-impl Default for Settings {
+impl Default for GpawSettings {
     fn default() -> Self {
         Self {
             command: vec!["/usr/bin/python3".into()],
@@ -94,7 +94,7 @@ impl Default for Settings {
             smearing: Smearing::Gaussian,
             smearing_width: 0.1,
             spin: true,
-            moments: Moments::new(),
+            moments: InitialMagneticMoments::new(),
             energy_tolerance: 1e-6,
             force_tolerance: 1e-3,
             steps: 200,
@@ -103,7 +103,7 @@ impl Default for Settings {
     }
 }
 
-impl Settings {
+impl GpawSettings {
     /// Queries GPAW's version and finds the setups.
     ///
     /// # Errors
@@ -157,7 +157,7 @@ impl Versions {
 /// A configured GPAW.
 #[derive(Clone, Debug)]
 pub struct Gpaw {
-    settings: Settings,
+    settings: GpawSettings,
     environment: BTreeMap<String, String>,
     versions: Versions,
     setups: BTreeMap<Species, Setup>,
@@ -186,7 +186,7 @@ impl DftBackend for Gpaw {
         let hashes: BTreeMap<&str, &str> =
             self.setups.iter().map(|(species, setup)| (species.symbol(), setup.pinned.hash())).collect();
         // Destructure, so that a new setting cannot be forgotten here.
-        let Settings {
+        let GpawSettings {
             command: _,
             environment: _,
             pseudopotentials: _,
@@ -229,11 +229,16 @@ impl DftBackend for Gpaw {
         &self,
         structure: &Structure,
         adjustments: &BTreeSet<RetryAdjustment>,
-    ) -> Result<Input, Failure> {
+    ) -> Result<CalculationInput, Failure> {
         input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+    fn read(
+        &self,
+        structure: &Structure,
+        directory: &Path,
+        exit: Exit,
+    ) -> Result<CalculationResults, Failure> {
         let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
         let by = [("gpaw", self.versions.gpaw.as_str()), ("ase", self.versions.ase.as_str())];
         match script_output::read(&padded.structure, directory, &by)? {
@@ -242,8 +247,8 @@ impl DftBackend for Gpaw {
         }
     }
 
-    fn size(&self, structure: &Structure) -> Size {
-        let Settings { vacuum, k_spacing, .. } = self.settings;
+    fn size(&self, structure: &Structure) -> CalculationSize {
+        let GpawSettings { vacuum, k_spacing, .. } = self.settings;
         padded_structure::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }

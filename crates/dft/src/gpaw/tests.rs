@@ -19,7 +19,7 @@ fn silicon() -> Structure {
     }
 }
 
-fn gpaw(settings: Settings) -> Gpaw {
+fn gpaw(settings: GpawSettings) -> Gpaw {
     let versions =
         Versions { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
     let setup = Setup { pinned: PinnedFile::fake("/setups/Si.PBE", "abc"), valence: 4.0 };
@@ -39,8 +39,8 @@ fn left(result: &[u8]) -> tempfile::TempDir {
     directory
 }
 
-fn read(structure: &Structure, result: &[u8]) -> Result<Results, Failure> {
-    gpaw(Settings::default()).read(structure, left(result).path(), Exit::Code(0))
+fn read(structure: &Structure, result: &[u8]) -> Result<CalculationResults, Failure> {
+    gpaw(GpawSettings::default()).read(structure, left(result).path(), Exit::Code(0))
 }
 
 fn by(gpaw: &str) -> Value {
@@ -49,7 +49,7 @@ fn by(gpaw: &str) -> Value {
 
 #[test]
 fn the_protocol_of_the_paper_is_written() {
-    let code = gpaw(Settings::default());
+    let code = gpaw(GpawSettings::default());
     let input = code.input(&silicon(), &BTreeSet::new()).unwrap();
     assert_eq!(input, code.input(&silicon(), &BTreeSet::new()).unwrap());
     assert_eq!(input.command, ["/usr/bin/python3", "job.py"]);
@@ -65,7 +65,7 @@ fn the_protocol_of_the_paper_is_written() {
 
 #[test]
 fn adjustments_change_nothing_that_the_accuracy_depends_on() {
-    let code = gpaw(Settings::default());
+    let code = gpaw(GpawSettings::default());
     let (plain, mut changed) = (task(&code, &[]), task(&code, &RetryAdjustment::ALL));
     assert_ne!(plain, changed);
     assert_eq!(changed["moments"], json!([0.5, 0.5]));
@@ -86,7 +86,7 @@ fn calculations_read_copies_of_what_was_hashed() {
     std::fs::write(&file, before).unwrap();
     let pseudopotential_variants = BTreeMap::from([("Si".parse().unwrap(), "mine".to_owned())]);
     let setups = setups::find(&[directory.path().to_owned()], &pseudopotential_variants).unwrap();
-    let code = Gpaw { setups, ..gpaw(Settings { pseudopotential_variants, ..Settings::default() }) };
+    let code = Gpaw { setups, ..gpaw(GpawSettings { pseudopotential_variants, ..GpawSettings::default() }) };
     assert_eq!(task(&code, &[])["setups"], json!("../data"));
     let data = code.input(&silicon(), &BTreeSet::new()).unwrap().data;
     // Under the name that GPAW looks for.
@@ -100,13 +100,13 @@ fn calculations_read_copies_of_what_was_hashed() {
 
 #[test]
 fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
-    let identity = |settings: Settings| gpaw(settings).identity();
-    let plain = identity(Settings::default());
+    let identity = |settings: GpawSettings| gpaw(settings).identity();
+    let plain = identity(GpawSettings::default());
     assert_eq!(plain["pseudopotentials"], json!({ "Si": "abc" }));
-    let slower = Settings { steps: 7, command: vec!["mpirun".into()], ..Settings::default() };
+    let slower = GpawSettings { steps: 7, command: vec!["mpirun".into()], ..GpawSettings::default() };
     assert_eq!(identity(slower), plain);
-    assert_ne!(identity(Settings { cutoff: 400.0, ..Settings::default() }), plain);
-    assert_ne!(identity(Settings { spin: false, ..Settings::default() }), plain);
+    assert_ne!(identity(GpawSettings { cutoff: 400.0, ..GpawSettings::default() }), plain);
+    assert_ne!(identity(GpawSettings { spin: false, ..GpawSettings::default() }), plain);
 }
 
 #[test]
@@ -132,7 +132,7 @@ fn a_result_that_is_cut_off_is_never_a_label() {
         assert_eq!(failure.class, FailureClass::Crashed, "cut at {end}: {failure}");
     }
     let nothing = tempfile::tempdir().unwrap();
-    let code = gpaw(Settings::default());
+    let code = gpaw(GpawSettings::default());
     let failure = code.read(&silicon(), nothing.path(), Exit::TimeLimit).unwrap_err();
     assert_eq!(failure.class, FailureClass::TimeLimit);
 }
@@ -176,12 +176,12 @@ fn a_result_of_another_version_is_of_another_program() {
 
 #[test]
 fn elements_without_a_setup_are_refused_by_name() {
-    let code = gpaw(Settings::default());
+    let code = gpaw(GpawSettings::default());
     assert_eq!(code.supports(&BTreeSet::from(["Si".parse().unwrap()])), Ok(()));
     let error = code.supports(&BTreeSet::from(["U".parse().unwrap()])).unwrap_err().to_string();
     assert!(error.starts_with("pseudopotential of U: no setup U.PBE (or .gz) in /setups"), "{error}");
     let magnetic =
-        Settings { moments: BTreeMap::from([("Si".parse().unwrap(), 5.0)]), ..Settings::default() };
+        GpawSettings { moments: BTreeMap::from([("Si".parse().unwrap(), 5.0)]), ..GpawSettings::default() };
     let error = gpaw(magnetic).supports(&BTreeSet::from(["Si".parse().unwrap()])).unwrap_err().to_string();
     assert_eq!(error, "initial_magnetic_moments: found Si = 5, expected at most its 4 valence electrons");
 }

@@ -9,9 +9,9 @@ use atoms::Species;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::Settings;
+use super::VaspSettings;
 use crate::SetupError;
-use crate::moments::{DEFAULT_MOMENT, Moments};
+use crate::moments::{DEFAULT_MOMENT, InitialMagneticMoments};
 
 const MP_RELAX_SET: &str = include_str!("mp_relax_set.toml");
 
@@ -35,7 +35,7 @@ struct Entries {
     #[serde(default = "default_moment")]
     default_magnetic_moment: f64,
     #[serde(default)]
-    initial_magnetic_moments: Moments,
+    initial_magnetic_moments: InitialMagneticMoments,
     pseudopotential_variants: BTreeMap<Species, String>,
 }
 
@@ -49,9 +49,9 @@ impl ElementTable {
     ///
     /// # Errors
     /// A file that cannot be read, or an element without a variant.
-    pub(super) fn fill(&self, settings: &Settings) -> Result<Settings, SetupError> {
+    pub(super) fn fill(&self, settings: &VaspSettings) -> Result<VaspSettings, SetupError> {
         let entries = self.read()?;
-        let mut filled = Settings { element_table: None, elements: Vec::new(), ..settings.clone() };
+        let mut filled = VaspSettings { element_table: None, elements: Vec::new(), ..settings.clone() };
         let given = settings.pseudopotential_variants.keys().copied();
         let elements: BTreeSet<Species> = match settings.elements.is_empty() {
             true => given.chain(entries.pseudopotential_variants.keys().copied()).collect(),
@@ -120,11 +120,11 @@ mod tests {
         symbols.iter().map(|symbol| symbol.parse().unwrap()).collect()
     }
 
-    fn with_table(elements: &[&str]) -> Settings {
-        Settings {
+    fn with_table(elements: &[&str]) -> VaspSettings {
+        VaspSettings {
             element_table: Some(ElementTable::MpRelaxSet),
             elements: species(elements),
-            ..Settings::default()
+            ..VaspSettings::default()
         }
     }
 
@@ -147,13 +147,13 @@ mod tests {
         settings.pseudopotential_variants = [("Fe".parse().unwrap(), "Fe".to_owned())].into();
         settings.moments = [("O".parse().unwrap(), 1.0), ("Al".parse().unwrap(), 3.0)].into();
         let filled = ElementTable::MpRelaxSet.fill(&settings).unwrap();
-        let written_out = Settings {
+        let written_out = VaspSettings {
             pseudopotential_variants: species(&["Fe", "O"])
                 .into_iter()
                 .zip(["Fe".into(), "O".into()])
                 .collect(),
             moments: [("Fe".parse().unwrap(), 5.0)].into(),
-            ..Settings::default()
+            ..VaspSettings::default()
         };
         assert_eq!(filled, written_out);
         // Without a list, every element of the table may occur.

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
-use super::Settings;
+use super::VaspSettings;
 use crate::{RetryAdjustment, SetupError, Smearing};
 
 /// Tags that are written here or would override those; users cannot set them.
@@ -48,7 +48,7 @@ const RESERVED_TAGS: [&str; 37] = [
 ];
 
 /// Checks the further tags in the settings.
-pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
+pub(super) fn check(settings: &VaspSettings) -> Result<(), SetupError> {
     for (tag, value) in &settings.tags {
         let found = format!("{tag} = {value:?}");
         let wrong =
@@ -69,7 +69,11 @@ pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
 }
 
 /// `INCAR` for these initial moments, in the order of POSCAR.
-pub(super) fn incar(settings: &Settings, moments: &[f64], adjustments: &BTreeSet<RetryAdjustment>) -> String {
+pub(super) fn incar(
+    settings: &VaspSettings,
+    moments: &[f64],
+    adjustments: &BTreeSet<RetryAdjustment>,
+) -> String {
     let has = |adjustment| adjustments.contains(&adjustment);
     let mut lines = vec![
         ("PREC", "Accurate".to_owned()),
@@ -136,7 +140,7 @@ mod tests {
     use super::*;
 
     fn lines(moments: &[f64], adjustments: &[RetryAdjustment]) -> BTreeSet<String> {
-        let settings = Settings { kpar: 4, ..Settings::default() };
+        let settings = VaspSettings { kpar: 4, ..VaspSettings::default() };
         incar(&settings, moments, &adjustments.iter().copied().collect()).lines().map(str::to_owned).collect()
     }
 
@@ -182,7 +186,7 @@ mod tests {
     fn further_tags_cannot_undo_the_protocol() {
         let fault = |tag: &str, value: &str| {
             let tags = [(tag.to_owned(), value.to_owned())].into();
-            check(&Settings { tags, ..Settings::default() })
+            check(&VaspSettings { tags, ..VaspSettings::default() })
         };
         assert_eq!(fault("LASPH", ".TRUE."), Ok(()));
         for (tag, value) in [

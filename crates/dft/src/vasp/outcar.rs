@@ -42,7 +42,7 @@ pub(super) struct Outcar {
 
 /// The table to which the next lines belong.
 #[derive(Clone, Copy, PartialEq)]
-enum Table {
+enum OutcarTable {
     None,
     Cell,
     Atoms { begun: bool },
@@ -53,7 +53,7 @@ impl Outcar {
     /// Reads what is there and ignores what cannot be read.
     pub fn read(mut input: impl BufRead) -> Self {
         let mut outcar = Self::default();
-        let (mut table, mut bytes) = (Table::None, Vec::new());
+        let (mut table, mut bytes) = (OutcarTable::None, Vec::new());
         loop {
             bytes.clear();
             match input.read_until(b'\n', &mut bytes) {
@@ -63,14 +63,14 @@ impl Outcar {
             }
             let line = String::from_utf8_lossy(&bytes);
             table = match table {
-                Table::None => outcar.line(&line),
+                OutcarTable::None => outcar.line(&line),
                 table => outcar.row(&line, table),
             };
         }
     }
 
     /// Reads a line outside tables; returns the table that starts after it.
-    fn line(&mut self, line: &str) -> Table {
+    fn line(&mut self, line: &str) -> OutcarTable {
         let after = |mark: &str| line.split_once(mark).map(|(_, rest)| rest.trim_start());
         if self.version.is_none()
             && let Some(rest) = after("vasp.")
@@ -102,17 +102,17 @@ impl Outcar {
             self.magnetisation = number(rest.1);
         } else if line.contains("direct lattice vectors") {
             self.cell.clear();
-            return Table::Cell;
+            return OutcarTable::Cell;
         } else if line.contains("POSITION") && line.contains("TOTAL-FORCE") {
             self.atoms.clear();
-            return Table::Atoms { begun: false };
+            return OutcarTable::Atoms { begun: false };
         } else if line.trim() == "magnetization (x)" {
             self.moments.clear();
-            return Table::Moments { begun: false };
+            return OutcarTable::Moments { begun: false };
         } else if line.contains("General timing and accounting informations") {
             self.complete = true;
         }
-        Table::None
+        OutcarTable::None
     }
 
     /// `   1(  13)  -----`: the start of an electronic step.
@@ -127,34 +127,34 @@ impl Outcar {
     }
 
     /// Reads a line in a table; returns the table of the next line.
-    fn row(&mut self, line: &str, table: Table) -> Table {
+    fn row(&mut self, line: &str, table: OutcarTable) -> OutcarTable {
         let ruled = line.trim_start().starts_with("-----");
         match table {
-            Table::Cell => match numbers(line, 9).as_deref() {
+            OutcarTable::Cell => match numbers(line, 9).as_deref() {
                 Some(&[x, y, z, ..]) => {
                     self.cell.push([x, y, z]);
-                    if self.cell.len() < 3 { table } else { Table::None }
+                    if self.cell.len() < 3 { table } else { OutcarTable::None }
                 }
-                _ => Table::None,
+                _ => OutcarTable::None,
             },
-            Table::Atoms { begun: false } if ruled => Table::Atoms { begun: true },
-            Table::Moments { begun: false } if ruled => Table::Moments { begun: true },
-            Table::Atoms { begun: false } | Table::Moments { begun: false } => table,
-            Table::Atoms { .. } => match numbers(line, 6).and_then(|row| row.try_into().ok()) {
+            OutcarTable::Atoms { begun: false } if ruled => OutcarTable::Atoms { begun: true },
+            OutcarTable::Moments { begun: false } if ruled => OutcarTable::Moments { begun: true },
+            OutcarTable::Atoms { begun: false } | OutcarTable::Moments { begun: false } => table,
+            OutcarTable::Atoms { .. } => match numbers(line, 6).and_then(|row| row.try_into().ok()) {
                 Some(row) => {
                     self.atoms.push(row);
                     table
                 }
-                None => Table::None,
+                None => OutcarTable::None,
             },
-            Table::Moments { .. } => match numbers(line, 3).as_deref() {
+            OutcarTable::Moments { .. } => match numbers(line, 3).as_deref() {
                 Some(&[_, .., total]) => {
                     self.moments.push(total);
                     table
                 }
-                _ => Table::None,
+                _ => OutcarTable::None,
             },
-            Table::None => Table::None,
+            OutcarTable::None => OutcarTable::None,
         }
     }
 

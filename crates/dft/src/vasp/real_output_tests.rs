@@ -7,7 +7,7 @@ use atoms::{Cell, Matrix3, Species, Structure, Vec3};
 use tempfile::TempDir;
 
 use super::result;
-use crate::{Exit, Failure, FailureClass, Results};
+use crate::{CalculationResults, Exit, Failure, FailureClass};
 
 /// The folder of the files; prints a note and returns `None` if it is unavailable.
 fn peer(name: &str) -> Option<PathBuf> {
@@ -44,20 +44,25 @@ fn initial(xml: &str) -> Structure {
 }
 
 /// Reads files as a calculation of `structure`, in its own order of atoms.
-fn judge(structure: &Structure, version: &str, directory: &TempDir, exit: Exit) -> Result<Results, Failure> {
+fn judge(
+    structure: &Structure,
+    version: &str,
+    directory: &TempDir,
+    exit: Exit,
+) -> Result<CalculationResults, Failure> {
     let order: Vec<usize> = (0..structure.len()).collect();
     result::read(structure, &order, version, directory.path(), exit)
 }
 
 /// Reads one file as the calculation of its own initial structure.
-fn judge_text(xml: &str, version: &str) -> Result<Results, Failure> {
+fn judge_text(xml: &str, version: &str) -> Result<CalculationResults, Failure> {
     let directory = TempDir::new().unwrap();
     std::fs::write(directory.path().join("vasprun.xml"), xml).unwrap();
     judge(&initial(xml), version, &directory, Exit::Code(0))
 }
 
 /// The numbers to compare.
-fn numbers(calculated: &Results) -> Vec<f64> {
+fn numbers(calculated: &CalculationResults) -> Vec<f64> {
     let energies = [calculated.energy, calculated.energy_without_smearing.unwrap()];
     [energies.as_slice(), &calculated.stress.unwrap().concat(), &calculated.forces.concat()].concat()
 }

@@ -8,7 +8,7 @@ use super::outcar::Outcar;
 use super::output::Output;
 use super::vasprun;
 use crate::structure_check::check_same_structure;
-use crate::{Exit, Failure, FailureClass, Results, result_file, validation};
+use crate::{CalculationResults, Exit, Failure, FailureClass, result_file, validation};
 
 /// Reads the calculation of `structure` by this version of VASP. `order` gives the order of the atoms in the
 /// files.
@@ -18,7 +18,7 @@ pub(super) fn read(
     version: &str,
     directory: &Path,
     exit: Exit,
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     let outcar = match result_file::open_delimited(&directory.join("OUTCAR"), b'\n') {
         Ok(file) => Outcar::read(file),
         Err(error) if error.is_missing() => Outcar::default(),
@@ -41,7 +41,7 @@ pub(super) fn read(
     if denied {
         return Err(FailureClass::NotConverged.with_message("OUTCAR does not report that EDIFF was reached"));
     }
-    let calculated = Results {
+    let calculated = CalculationResults {
         energy: output.energy,
         energy_without_smearing: Some(output.energy_without_smearing),
         forces: restore_order(&output.forces, order),

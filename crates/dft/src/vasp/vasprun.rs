@@ -25,7 +25,7 @@ const SKIPPED: [&str; 5] = ["eigenvalues", "dos", "projected", "kpoints", "symme
 /// A message that names what is missing or damaged.
 pub(super) fn read(input: impl BufRead) -> Result<Output, String> {
     let mut reader = Reader::from_reader(input);
-    let mut file = File::default();
+    let mut file = VasprunParser::default();
     let (mut buffer, mut skipped) = (Vec::new(), Vec::new());
     while !file.complete {
         buffer.clear();
@@ -46,7 +46,7 @@ pub(super) fn read(input: impl BufRead) -> Result<Output, String> {
 
 /// The state of the parser.
 #[derive(Default)]
-struct File {
+struct VasprunParser {
     /// The attribute `name`, or else the tag, of each open element.
     path: Vec<String>,
     /// Text of the innermost element.
@@ -58,12 +58,12 @@ struct File {
     /// Entries in the open table row.
     row: usize,
     ionic_steps: u32,
-    last: Calculation,
+    last: IonicStep,
 }
 
 /// The content of `<calculation>`.
 #[derive(Default)]
-struct Calculation {
+struct IonicStep {
     steps: u32,
     /// Free energy of the last electronic step and its extrapolation to zero smearing, eV.
     step_energies: [Option<f64>; 2],
@@ -76,7 +76,7 @@ struct Calculation {
     stress: Vec<Vec3>,
 }
 
-impl File {
+impl VasprunParser {
     fn open(&mut self, tag: &BytesStart) -> Result<(), String> {
         self.text.clear();
         let name = tag.try_get_attribute("name").map_err(|error| error.to_string())?;
@@ -88,7 +88,7 @@ impl File {
         match tag.name().as_ref() {
             "calculation" => {
                 self.ionic_steps += 1;
-                self.last = Calculation::default();
+                self.last = IonicStep::default();
             }
             "scstep" => self.last.steps += 1,
             "rc" => self.row = 0,
@@ -146,7 +146,7 @@ impl File {
     }
 }
 
-impl Calculation {
+impl IonicStep {
     /// Stores the text of an element if it is needed; `None` if it is invalid.
     fn take(&mut self, path: &[&str], text: &str) -> Option<()> {
         match path {

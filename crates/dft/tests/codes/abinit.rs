@@ -2,20 +2,20 @@
 
 use std::collections::BTreeMap;
 
-use dft::abinit::Settings;
+use dft::abinit::AbinitSettings;
 use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment, Smearing};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
 
-fn settings() -> Settings {
-    Settings { cutoff: 300.0, k_spacing: 0.8, spin: false, ..Settings::default() }
+fn settings() -> AbinitSettings {
+    AbinitSettings { cutoff: 300.0, k_spacing: 0.8, spin: false, ..AbinitSettings::default() }
 }
 
 #[test]
 fn the_forces_and_the_stress_of_silicon_are_derivatives_of_its_energy() {
     // The number of plane waves changes with the cell, which adds some 2e-5 eV/Å³ at this cutoff.
-    let code = Settings { cutoff: 600.0, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let code = AbinitSettings { cutoff: 600.0, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let structure = structures::silicon();
     let calculated = label(&code, &structure);
     checks::forces(&code, &structure, &calculated, 1e-3);
@@ -24,7 +24,7 @@ fn the_forces_and_the_stress_of_silicon_are_derivatives_of_its_energy() {
 
 #[test]
 fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
-    let code = Settings { smearing: Smearing::MethfesselPaxton, smearing_width: 0.2, ..settings() }
+    let code = AbinitSettings { smearing: Smearing::MethfesselPaxton, smearing_width: 0.2, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::aluminium();
@@ -36,14 +36,14 @@ fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
 fn iron_is_a_magnet() {
     let pseudopotentials = "/usr/share/abinit/psp/Pseudodojo_paw_pbe_standard".into();
     let moments = BTreeMap::from([("Fe".parse().unwrap(), 3.0)]);
-    let iron = Settings { pseudopotentials, moments, spin: true, cutoff: 500.0, ..settings() };
+    let iron = AbinitSettings { pseudopotentials, moments, spin: true, cutoff: 500.0, ..settings() };
     let calculated = label(&iron.prepare(&PassedEnvironment::default()).unwrap(), &structures::iron());
     checks::magnet(&calculated, 2.0, 0.2);
 }
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Settings { steps: 5, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let few = AbinitSettings { steps: 5, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::silicon());
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();

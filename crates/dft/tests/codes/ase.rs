@@ -7,18 +7,21 @@ use std::process::Command;
 
 use atoms::cell::{Vec3, add};
 use atoms::{Cell, Structure};
-use dft::ase::{Ase, Settings};
-use dft::{DftBackend, Exit, Failure, FailureClass, PassedEnvironment, Results, RetryAdjustment, SetupError};
+use dft::ase::{Ase, AseSettings};
+use dft::{
+    CalculationResults, DftBackend, Exit, Failure, FailureClass, PassedEnvironment, RetryAdjustment,
+    SetupError,
+};
 use tempfile::TempDir;
 
 fn python() -> String {
     std::env::var("CALMWALK_PYTHON").unwrap_or_else(|_| "/usr/bin/python3".to_owned())
 }
 
-fn settings(place: &TempDir, calculator: &str) -> Settings {
+fn settings(place: &TempDir, calculator: &str) -> AseSettings {
     let path = place.path().join("my_calculator.py");
     std::fs::write(&path, calculator).unwrap();
-    Settings { command: vec![python()], calculator: path, ..Settings::default() }
+    AseSettings { command: vec![python()], calculator: path, ..AseSettings::default() }
 }
 
 fn prepared(calculator: &str) -> Ase {
@@ -30,7 +33,7 @@ fn run(
     code: &dyn DftBackend,
     structure: &Structure,
     adjustments: &[RetryAdjustment],
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     let place = TempDir::new().unwrap();
     let input = code.input(structure, &adjustments.iter().copied().collect::<BTreeSet<_>>())?;
     for (name, content) in &input.files {
@@ -105,14 +108,14 @@ fn a_command_that_uses_ase_gives_the_same_but_for_the_digits_of_its_file() {
     let place = TempDir::new().unwrap();
     let path = place.path().join("label.py");
     std::fs::write(&path, LABEL).unwrap();
-    let settings = dft::command::Settings {
+    let settings = dft::command::CommandSettings {
         command: vec![python(), "label.py".to_owned()],
         files: vec![path],
         version: "EMT".to_owned(),
     };
     let found = run(&settings.prepare().unwrap(), &alloy(), &[]).unwrap();
     let expected = run(&prepared(EMT), &alloy(), &[]).unwrap();
-    let numbers = |label: &Results| {
+    let numbers = |label: &CalculationResults| {
         let energies = [label.energy, label.energy_without_smearing.unwrap()];
         [energies.as_slice(), &label.forces.concat(), &label.stress.unwrap().concat()].concat()
     };
@@ -239,7 +242,7 @@ fn what_is_missing_is_found_before_anything_is_calculated() {
     assert!(fault.contains("no_such_module"), "{fault}");
     let command = vec!["no-such-python".to_owned()];
     let fault =
-        Settings { command, ..settings(&place, EMT) }.prepare(&PassedEnvironment::default()).unwrap_err();
+        AseSettings { command, ..settings(&place, EMT) }.prepare(&PassedEnvironment::default()).unwrap_err();
     assert!(matches!(fault, SetupError::Program { .. }), "{fault}");
 }
 

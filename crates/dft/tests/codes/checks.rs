@@ -2,7 +2,7 @@
 
 use atoms::Structure;
 use atoms::cell::{Matrix3, add, dot, scale};
-use dft::{DftBackend, Results};
+use dft::{CalculationResults, DftBackend};
 
 use crate::run::label;
 use crate::structures::strained;
@@ -14,7 +14,7 @@ const DISPLACEMENT: f64 = 0.01;
 const STRAIN: f64 = 0.005;
 
 /// Compares forces, eV/Å, with the derivative of the energy along a direction in which every atom takes part.
-pub fn forces(code: &dyn DftBackend, structure: &Structure, calculated: &Results, tolerance: f64) {
+pub fn forces(code: &dyn DftBackend, structure: &Structure, calculated: &CalculationResults, tolerance: f64) {
     let direction = |atom: usize| {
         let x = atom as f64;
         [(1.0 + 1.7 * x).sin(), (2.0 + 2.3 * x).cos(), (0.5 + 3.1 * x).sin()]
@@ -36,7 +36,7 @@ pub fn forces(code: &dyn DftBackend, structure: &Structure, calculated: &Results
 }
 
 /// Compares the stress, eV/Å³, with the derivative of the energy along a strain of all components.
-pub fn stress(code: &dyn DftBackend, structure: &Structure, calculated: &Results, tolerance: f64) {
+pub fn stress(code: &dyn DftBackend, structure: &Structure, calculated: &CalculationResults, tolerance: f64) {
     const DIRECTION: Matrix3 = [[0.7, 0.3, -0.2], [0.3, 0.5, 0.4], [-0.2, 0.4, -0.3]];
     let energy = |step: f64| label(code, &strained(structure, &DIRECTION.map(|row| scale(row, step)))).energy;
     let expected = (energy(STRAIN) - energy(-STRAIN)) / (2.0 * STRAIN * structure.cell.volume());
@@ -48,7 +48,7 @@ pub fn stress(code: &dyn DftBackend, structure: &Structure, calculated: &Results
 }
 
 /// Compares the moment, μ_B.
-pub fn magnet(calculated: &Results, expected: f64, tolerance: f64) {
+pub fn magnet(calculated: &CalculationResults, expected: f64, tolerance: f64) {
     let moment = calculated.magnetisation.expect("calculated with spin");
     println!("moment: {moment:.4} μ_B, {:?}", calculated.magnetic_moments);
     assert!((moment - expected).abs() < tolerance, "{moment} instead of {expected} μ_B");

@@ -36,7 +36,7 @@ fn abinit_reads_copies() {
     for data in [psp8, xml] {
         let pseudopotentials = data.path().to_owned();
         let settings =
-            abinit::Settings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
+            abinit::AbinitSettings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
         needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
     }
 }
@@ -45,14 +45,15 @@ fn abinit_reads_copies() {
 fn gpaw_reads_copies() {
     let data = copies("/usr/share/gpaw-setups", &["Si.PBE.gz"]);
     let pseudopotentials = Some(data.path().to_owned());
-    let settings = gpaw::Settings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
+    let settings =
+        gpaw::GpawSettings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
     needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
 }
 
 #[test]
 fn cp2k_reads_copies() {
     let data = copies("/usr/share/cp2k", &["BASIS_MOLOPT", "GTH_POTENTIALS"]);
-    let settings = cp2k::Settings {
+    let settings = cp2k::Cp2kSettings {
         pseudopotentials: data.path().to_owned(),
         basis: "SZV-MOLOPT-SR-GTH".into(),
         cutoff: 2000.0,

@@ -1,20 +1,20 @@
 //! CP2K, with coarse grids and the smallest basis, which keep it consistent.
 
-use dft::cp2k::Settings;
+use dft::cp2k::Cp2kSettings;
 use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
 
-fn settings() -> Settings {
-    Settings {
+fn settings() -> Cp2kSettings {
+    Cp2kSettings {
         basis: "SZV-MOLOPT-SR-GTH".into(),
         cutoff: 3000.0,
         relative_cutoff: 500.0,
         density_tolerance: 1e-6,
         vacuum: 4.0,
         k_spacing: 10.0,
-        ..Settings::default()
+        ..Cp2kSettings::default()
     }
 }
 
@@ -31,7 +31,7 @@ fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
 #[test]
 fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
     // At Γ only: this checks sign, unit and order.
-    let code = Settings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }
+    let code = Cp2kSettings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::silicon();
@@ -41,7 +41,7 @@ fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Settings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let few = Cp2kSettings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::oxygen());
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();

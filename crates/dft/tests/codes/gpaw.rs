@@ -1,19 +1,19 @@
 //! GPAW. Real-space grids for densities cause an egg-box error of some 1e-4 eV/Å.
 
-use dft::gpaw::Settings;
+use dft::gpaw::GpawSettings;
 use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
 
-fn settings() -> Settings {
-    Settings { cutoff: 250.0, k_spacing: 1.2, spin: false, ..Settings::default() }
+fn settings() -> GpawSettings {
+    GpawSettings { cutoff: 250.0, k_spacing: 1.2, spin: false, ..GpawSettings::default() }
 }
 
 #[test]
 fn the_stress_of_silicon_is_a_derivative_of_the_energy() {
     // The number of plane waves changes with the cell, which adds some 1e-4 eV/Å³ at this cutoff and mesh.
-    let code = Settings { cutoff: 400.0, k_spacing: 0.8, ..settings() }
+    let code = GpawSettings { cutoff: 400.0, k_spacing: 0.8, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::silicon();
@@ -24,7 +24,7 @@ fn the_stress_of_silicon_is_a_derivative_of_the_energy() {
 
 #[test]
 fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
-    let code = Settings { k_spacing: 0.9, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let code = GpawSettings { k_spacing: 0.9, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let structure = structures::aluminium();
     let calculated = label(&code, &structure);
     let extrapolated = calculated.energy_without_smearing.unwrap();
@@ -34,7 +34,7 @@ fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
 
 #[test]
 fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
-    let code = Settings { spin: true, cutoff: 400.0, vacuum: 5.0, ..settings() }
+    let code = GpawSettings { spin: true, cutoff: 400.0, vacuum: 5.0, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::oxygen();
@@ -46,7 +46,7 @@ fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Settings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let few = GpawSettings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::silicon());
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();

@@ -7,14 +7,17 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use atoms::Structure;
-use dft::{DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, adjustments};
+use dft::{
+    CalculationInput, CalculationResults, DftBackend, Exit, Failure, FailureClass, RetryAdjustment,
+    adjustments,
+};
 
 /// One calculation from its input to its result.
 pub fn attempt(
     code: &dyn DftBackend,
     structure: &Structure,
     adjustments: &BTreeSet<RetryAdjustment>,
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     let place = tempfile::tempdir().unwrap();
     let input = prepared(code, structure, adjustments, place.path())?;
     calculate(code, structure, input, place.path())
@@ -26,7 +29,7 @@ pub fn prepared(
     structure: &Structure,
     adjustments: &BTreeSet<RetryAdjustment>,
     place: &Path,
-) -> Result<Input, Failure> {
+) -> Result<CalculationInput, Failure> {
     let input = code.input(structure, adjustments)?;
     let [work, data] = ["work", "data"].map(|folder| place.join(folder));
     [&work, &data].into_iter().for_each(|folder| std::fs::create_dir(folder).unwrap());
@@ -43,9 +46,9 @@ pub fn prepared(
 pub fn calculate(
     code: &dyn DftBackend,
     structure: &Structure,
-    input: Input,
+    input: CalculationInput,
     place: &Path,
-) -> Result<Results, Failure> {
+) -> Result<CalculationResults, Failure> {
     let directory = place.join("work");
     let output = |name| Stdio::from(File::create(directory.join(name)).unwrap());
     let status = Command::new(&input.command[0])
@@ -66,13 +69,13 @@ pub fn calculate(
 }
 
 /// A calculation that must succeed.
-pub fn label(code: &dyn DftBackend, structure: &Structure) -> Results {
+pub fn label(code: &dyn DftBackend, structure: &Structure) -> CalculationResults {
     attempt(code, structure, &BTreeSet::new())
         .unwrap_or_else(|failure| panic!("{}: {failure}", structure.formula()))
 }
 
 /// Retries with the adjustments until the calculation succeeds; returns the number of failures.
-pub fn climb(code: &dyn DftBackend, structure: &Structure) -> (Results, Vec<FailureClass>) {
+pub fn climb(code: &dyn DftBackend, structure: &Structure) -> (CalculationResults, Vec<FailureClass>) {
     let mut failures = Vec::new();
     loop {
         let changes = adjustments(&failures).unwrap_or_else(|| panic!("given up after {failures:?}"));

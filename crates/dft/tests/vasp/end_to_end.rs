@@ -6,12 +6,12 @@ use std::path::Path;
 use std::process::Command;
 
 use atoms::{Cell, Structure, read_poscar};
-use dft::{DftBackend, Exit, FailureClass, Input, RetryAdjustment};
+use dft::{CalculationInput, DftBackend, Exit, FailureClass, RetryAdjustment};
 use tempfile::TempDir;
 
 use super::{alumina, assert_close, data, expected, settings, text};
 
-fn input(structure: &Structure, adjustments: &[RetryAdjustment]) -> Input {
+fn input(structure: &Structure, adjustments: &[RetryAdjustment]) -> CalculationInput {
     let directory = TempDir::new().unwrap();
     let mut settings = settings(directory.path(), "5.4.4", &["Al", "O"]);
     settings.moments = [("O".parse().unwrap(), 0.25)].into();
@@ -19,7 +19,7 @@ fn input(structure: &Structure, adjustments: &[RetryAdjustment]) -> Input {
     code.input(structure, &BTreeSet::from_iter(adjustments.iter().copied())).unwrap()
 }
 
-fn file(input: &Input, name: &str) -> String {
+fn file(input: &CalculationInput, name: &str) -> String {
     String::from_utf8(input.files[name].clone()).unwrap()
 }
 

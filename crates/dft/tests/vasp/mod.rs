@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use atoms::{Cell, Structure};
-use dft::vasp::{Settings, Vasp};
-use dft::{DftBackend, Exit, Failure, Results};
+use dft::vasp::{Vasp, VaspSettings};
+use dft::{CalculationResults, DftBackend, Exit, Failure};
 use tempfile::TempDir;
 
 fn data(name: &str) -> PathBuf {
@@ -34,9 +34,9 @@ fn alumina() -> Structure {
 }
 
 /// The results in `tests/data/vasp`.
-fn expected() -> Results {
+fn expected() -> CalculationResults {
     let kilobar = [[-120.5, 3.25, -7.125], [3.25, 80.0, 12.5], [-7.125, 12.5, -12345.678]];
-    Results {
+    CalculationResults {
         energy: -24.30612345,
         energy_without_smearing: Some(-24.20612345),
         forces: vec![[0.12345678, -0.2, 0.03], [0.37654322, -0.05, -1.78], [-0.5, 0.25, 1.75]],
@@ -48,8 +48,8 @@ fn expected() -> Results {
 }
 
 #[track_caller]
-fn assert_close(found: &Results, expected: &Results, tolerance: f64) {
-    let numbers = |calculated: &Results| {
+fn assert_close(found: &CalculationResults, expected: &CalculationResults, tolerance: f64) {
+    let numbers = |calculated: &CalculationResults| {
         let mut numbers = calculated.forces.concat();
         numbers.extend(calculated.stress.iter().flatten().flatten());
         numbers.extend(calculated.magnetic_moments.iter().flatten());
@@ -74,13 +74,13 @@ fn potcar(title: &str, element: &str, valence: f64) -> String {
 }
 
 /// Settings for these elements, with POTCAR files in `directory`.
-fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
+fn settings(directory: &Path, version: &str, elements: &[&str]) -> VaspSettings {
     for element in elements {
         let potcar = potcar(&format!("PAW_PBE {element} 01Jan2000"), element, 3.0);
         std::fs::create_dir_all(directory.join(element)).unwrap();
         std::fs::write(directory.join(element).join("POTCAR"), potcar).unwrap();
     }
-    Settings {
+    VaspSettings {
         command: vec!["sh".to_owned()],
         version: version.to_owned(),
         pseudopotentials: directory.to_owned(),
@@ -88,12 +88,12 @@ fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
             .iter()
             .map(|element| (element.parse().unwrap(), (*element).to_owned()))
             .collect(),
-        ..Settings::default()
+        ..VaspSettings::default()
     }
 }
 
 /// Reads these files as the calculation of [`alumina`].
-fn read(files: &[(&str, &[u8])], exit: Exit) -> Result<Results, Failure> {
+fn read(files: &[(&str, &[u8])], exit: Exit) -> Result<CalculationResults, Failure> {
     let directory = TempDir::new().unwrap();
     for (name, content) in files {
         std::fs::write(directory.path().join(name), content).unwrap();

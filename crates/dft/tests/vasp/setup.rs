@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use dft::vasp::{ElementTable, Settings};
+use dft::vasp::{ElementTable, VaspSettings};
 use dft::{DftBackend, SetupError};
 use tempfile::TempDir;
 
@@ -11,8 +11,8 @@ use super::{alumina, potcar, settings};
 
 #[test]
 fn the_paper_s_protocol_is_the_default() {
-    let settings: dft::Settings = serde_json::from_str(r#"{ "vasp": { "version": "5.4.4" } }"#).unwrap();
-    let dft::Settings::Vasp(settings) = settings else { panic!("{}", settings.name()) };
+    let settings: dft::DftSettings = serde_json::from_str(r#"{ "vasp": { "version": "5.4.4" } }"#).unwrap();
+    let dft::DftSettings::Vasp(settings) = settings else { panic!("{}", settings.name()) };
     assert_eq!((settings.cutoff, settings.k_spacing, settings.smearing_width), (500.0, 0.125, 0.1));
     assert_eq!(
         (settings.smearing, settings.energy_tolerance, settings.spin),
@@ -25,8 +25,8 @@ fn the_paper_s_protocol_is_the_default() {
 fn the_identity_holds_what_changes_a_label() {
     let home = TempDir::new().unwrap();
     let first = settings(home.path(), "5.4.4", &["Al", "O"]);
-    let identity = |settings: &Settings| settings.prepare().unwrap().identity();
-    let same = |change: &dyn Fn(&mut Settings)| {
+    let identity = |settings: &VaspSettings| settings.prepare().unwrap().identity();
+    let same = |change: &dyn Fn(&mut VaspSettings)| {
         let mut settings = first.clone();
         change(&mut settings);
         identity(&settings) == identity(&first)
@@ -47,14 +47,14 @@ fn the_identity_is_the_same_with_a_table_as_with_its_entries_written_out() {
     let home = TempDir::new().unwrap();
     let mut written_out = settings(home.path(), "5.4.4", &["Al", "O"]);
     written_out.moments = ["Al", "O"].map(|symbol| (symbol.parse().unwrap(), 0.6)).into();
-    let mut with_table = Settings {
+    let mut with_table = VaspSettings {
         element_table: Some(ElementTable::MpRelaxSet),
         elements: ["Al", "O"].map(|symbol| symbol.parse().unwrap()).into(),
         pseudopotential_variants: [].into(),
         moments: [].into(),
         ..written_out.clone()
     };
-    let identity = |settings: &Settings| settings.prepare().unwrap().identity();
+    let identity = |settings: &VaspSettings| settings.prepare().unwrap().identity();
     assert_eq!(identity(&with_table), identity(&written_out));
     with_table.moments = [("O".parse().unwrap(), 2.0)].into();
     assert_ne!(identity(&with_table), identity(&written_out));
@@ -100,7 +100,7 @@ fn size_counts_valence_electrons_and_k_points() {
 #[test]
 fn what_is_missing_is_named() {
     let home = TempDir::new().unwrap();
-    let fault = |change: &dyn Fn(&mut Settings)| {
+    let fault = |change: &dyn Fn(&mut VaspSettings)| {
         let mut settings = settings(home.path(), "5.4.4", &["Al", "O"]);
         change(&mut settings);
         settings.prepare().unwrap_err()

@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use atoms::Potential;
 use case::Case;
-use md::{Dynamics, Settings, Stream, Thermostat};
+use md::{Dynamics, DynamicsSettings, Stream, Thermostat};
 use peer::Lammps;
 
 /// Number of measurements per program and crystal.
@@ -88,7 +88,7 @@ struct Ours {
 impl Ours {
     fn new(case: &Case) -> Self {
         let mut potential = case.potential();
-        let settings = Settings {
+        let settings = DynamicsSettings {
             time_step: case.time_step,
             thermostat: Thermostat::None,
             ramp: None,

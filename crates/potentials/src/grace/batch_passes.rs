@@ -7,7 +7,7 @@ use atoms::Vec3;
 use super::batches::Placed;
 use super::bonds::BondWork;
 use super::chunked_slices::ChunkedSlice;
-use super::instructions::{Instructions, Pass};
+use super::instructions::{Instructions, SimdPass};
 use super::layer_passes::{
     BackwardWork, Cotangents, LayerInput, Traced, TracedBonds, backward_bonds, backward_tape, forward,
 };
@@ -25,7 +25,7 @@ pub(super) struct Forward<'a, 'b, V: Vector> {
     pub work: (&'a mut Vec<V>, &'a mut BondWork<V>),
 }
 
-impl<V: Vector> Pass for Forward<'_, '_, V> {
+impl<V: Vector> SimdPass for Forward<'_, '_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
         forward(&self.here, &self.placed, self.trace, self.work);
@@ -42,7 +42,7 @@ pub(super) struct Energies<'a, V, B> {
     pub work: &'a mut ReadoutWork<V>,
 }
 
-impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> Pass for Energies<'_, V, B> {
+impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> SimdPass for Energies<'_, V, B> {
     #[inline(always)]
     fn run(self, _: bool) {
         let Self { readout, placed, basis, energies, cotangents, work } = self;
@@ -68,7 +68,7 @@ pub(super) struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
     pub work: (&'a mut BackwardWork<V>, &'a mut BondWork<V>),
 }
 
-impl<V: Vector, const N: usize> Pass for Backward<'_, '_, '_, V, N> {
+impl<V: Vector, const N: usize> SimdPass for Backward<'_, '_, '_, V, N> {
     #[inline(always)]
     fn run(self, _: bool) {
         let Self { here, placed, tape, bonds, from, to, returns, work } = self;
@@ -87,7 +87,7 @@ pub(super) struct Project<'a, 'b, V, B> {
     pub instructions: Instructions,
 }
 
-impl<'c, V: Vector, B: Fn(usize) -> &'c [V]> Pass for Project<'_, '_, V, B> {
+impl<'c, V: Vector, B: Fn(usize) -> &'c [V]> SimdPass for Project<'_, '_, V, B> {
     #[inline(always)]
     fn run(self, _: bool) {
         self.map.forward(self.places, self.bases, self.work, self.instructions);
@@ -102,7 +102,7 @@ pub(super) struct BeginProjectBack<'a, 'b, V> {
     pub work: &'a mut Projected<'b, V>,
 }
 
-impl<V: Vector> Pass for BeginProjectBack<'_, '_, V> {
+impl<V: Vector> SimdPass for BeginProjectBack<'_, '_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
         self.map.begin_backward(self.places, self.cotangent, self.work);
@@ -119,7 +119,7 @@ pub(super) struct ProjectBack<'a, 'b, V> {
     pub instructions: Instructions,
 }
 
-impl<V: Vector> Pass for ProjectBack<'_, '_, V> {
+impl<V: Vector> SimdPass for ProjectBack<'_, '_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
         let Self { map, layer, places, bases, work, instructions } = self;

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::instructions::Instructions;
-use super::tape::Batch;
+use super::tape::AtomBatch;
 
 /// Maximum number of atoms in a batch.
 const MAX_BATCH_ATOMS: usize = 16;
@@ -79,7 +79,7 @@ impl Batches {
     #[inline(always)]
     pub fn placed(&self, batch: usize, instructions: Instructions) -> Placed {
         let (places, element) = &self.batches[batch];
-        let batch = Batch { element: *element, atoms: places.len(), instructions };
+        let batch = AtomBatch { element: *element, atoms: places.len(), instructions };
         Placed { batch, first: places.start }
     }
 }
@@ -87,7 +87,7 @@ impl Batches {
 /// A batch with its places.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Placed {
-    pub batch: Batch,
+    pub batch: AtomBatch,
     /// Its first place.
     pub first: usize,
 }

@@ -3,7 +3,7 @@
 //! An export calls the invariants of the first layer `rho` and those of the second `I2`, with the norms
 //! `I_nl_LN` and `I_0_LN`, and also holds the same arrays under the names that the author of the model chose.
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::error::{GraceError, unsupported};
 
@@ -18,7 +18,7 @@ const NORMS: [&str; 2] = ["I_nl_LN", "I_0_LN"];
 
 impl BlockAliases {
     /// Reads the list of reductions and matches the two names.
-    pub fn read(archive: &Archive) -> Result<Self, GraceError> {
+    pub fn read(archive: &NpzFile) -> Result<Self, GraceError> {
         let names = archive.strings("reduce_names")?;
         let sources = |name: &str| archive.strings(&format!("{name}_instruction_names"));
         let mut found: [Option<String>; 2] = [None, None];
@@ -50,7 +50,7 @@ impl BlockAliases {
 }
 
 /// Ignores arrays that duplicate one that was read; rejects the file if they differ.
-pub(super) fn ignore_aliases(archive: &Archive, names: &BlockAliases) -> Result<(), GraceError> {
+pub(super) fn ignore_aliases(archive: &NpzFile, names: &BlockAliases) -> Result<(), GraceError> {
     let left_over: Vec<String> = archive.unread().into_iter().map(str::to_owned).collect();
     for key in left_over {
         let of_norm = ["_scale", "_lin_scale", "_type", "_n_out"]
@@ -71,7 +71,7 @@ pub(super) fn ignore_aliases(archive: &Archive, names: &BlockAliases) -> Result<
 }
 
 /// Whether both arrays are equal.
-fn same(archive: &Archive, one: &str, other: &str) -> bool {
+fn same(archive: &NpzFile, one: &str, other: &str) -> bool {
     let numbers = |key: &str| archive.numbers(key).map(|array| (array.shape, array.data));
     match (numbers(one), numbers(other)) {
         (Ok(one), Ok(other)) => one == other,

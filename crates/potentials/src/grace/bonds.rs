@@ -6,10 +6,10 @@
 use atoms::{Matrix3, NeighbourList, Structure, Vec3};
 
 use super::batches::Batches;
-use super::chunked_slices::{ChunkedSlice, Layout, PerChunk};
+use super::chunked_slices::{ChunkedSlice, PerChunk, PlaceLayout};
 use super::layer::Layer;
 use super::radial_network::RadialWork;
-use super::tape::Slot;
+use super::tape::TapeSlot;
 use super::threads::Threads;
 use super::vector::{MAX_LANES, Number, Vector};
 
@@ -18,7 +18,7 @@ const SQUARE_FLOOR: f64 = 1e-10;
 
 /// A bond within the cutoff of its pair.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Bond {
+pub(super) struct GraceBond {
     /// Place of the neighbour.
     pub neighbour: u32,
     /// Its element index.
@@ -31,19 +31,19 @@ pub(super) struct Bond {
 
 /// The bonds of all atoms, atoms in evaluation order, the bonds of each in the order of the neighbour list.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Bonds {
+pub(super) struct GraceBonds {
     pub offsets: Vec<usize>,
-    pub bonds: Vec<Bond>,
+    pub bonds: Vec<GraceBond>,
     /// First block of each atom; a block has as many bonds as a vector has lanes.
     pub block_offsets: Vec<usize>,
     incoming_offsets: Vec<usize>,
     /// The bonds that end at each atom, ascending.
     incoming: Vec<u32>,
     /// The bonds of each chunk, before concatenation.
-    found: Vec<Vec<Bond>>,
+    found: Vec<Vec<GraceBond>>,
 }
 
-impl Bonds {
+impl GraceBonds {
     /// Collects the bonds within the cutoff of their pair. Call it within [`Threads::run`].
     pub fn update<V: Vector>(
         &mut self,
@@ -58,7 +58,7 @@ impl Bonds {
         offsets.clear();
         offsets.resize(n + 1, 0);
         found.resize_with(batches.chunks.len().max(found.len()), Vec::new);
-        let counts = ChunkedSlice::new(Layout::Even(1), 0, &mut offsets[1..]);
+        let counts = ChunkedSlice::new(PlaceLayout::Even(1), 0, &mut offsets[1..]);
         let work = (counts, PerChunk::within(&batches.chunks, found));
         threads.for_each_chunk(&batches.chunks, work, &|chunk, (mut counts, mut found), _| {
             let Some(found) = found.only() else { return };
@@ -76,8 +76,8 @@ impl Bonds {
             block_offsets.push(block_offsets[place] + offsets[place + 1].div_ceil(V::LANES));
             offsets[place + 1] += offsets[place];
         }
-        bonds.resize(offsets[n], Bond { neighbour: 0, element: 0, d: [0.0; 3], r: 0.0 });
-        let all = ChunkedSlice::new(Layout::Ragged(offsets, 1), 0, &mut bonds[..]);
+        bonds.resize(offsets[n], GraceBond { neighbour: 0, element: 0, d: [0.0; 3], r: 0.0 });
+        let all = ChunkedSlice::new(PlaceLayout::Ragged(offsets, 1), 0, &mut bonds[..]);
         threads.for_each_chunk(&batches.chunks, all, &|chunk, mut all, _| {
             all.slice(&chunk.places).copy_from_slice(&found[chunk.number]);
         });
@@ -105,7 +105,7 @@ impl Bonds {
 
     /// The bonds of the atom at a place.
     #[inline(always)]
-    pub fn at(&self, place: usize) -> &[Bond] {
+    pub fn at(&self, place: usize) -> &[GraceBond] {
         &self.bonds[self.offsets[place]..self.offsets[place + 1]]
     }
 
@@ -144,13 +144,13 @@ fn bonds_of<V: Vector>(
     neighbours: &NeighbourList,
     elements: &[usize],
     batches: &Batches,
-) -> impl Iterator<Item = Bond> {
+) -> impl Iterator<Item = GraceBond> {
     neighbours.neighbours_of(atom).iter().filter_map(move |neighbour| {
         let j = neighbour.atom as usize;
         let d = neighbour.displacement(structure, atom);
         let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
         let is_within = r < layer.radial.cutoff(layer.radial.pair(elements[atom], elements[j]));
-        is_within.then(|| Bond { neighbour: batches.places[j], element: elements[j] as u32, d, r })
+        is_within.then(|| GraceBond { neighbour: batches.places[j], element: elements[j] as u32, d, r })
     })
 }
 
@@ -190,7 +190,7 @@ impl<V: Vector> BondWork<V> {
 
     /// R_nl(r) ζ_n and derivatives of a block; unused lanes are zero.
     #[inline(always)]
-    fn radial(&mut self, layer: &Layer<V>, centre: usize, bonds: &[Bond]) {
+    fn radial(&mut self, layer: &Layer<V>, centre: usize, bonds: &[GraceBond]) {
         let (lanes, distances) = (layer.radial.output_lanes(), distances(layer, centre, bonds));
         let (values, derivatives) = (&mut self.values[..], &mut self.derivatives[..]);
         layer.radial.evaluate(&distances[..bonds.len()], &mut self.radial, values, derivatives);
@@ -210,7 +210,7 @@ impl<V: Vector> BondWork<V> {
 pub(super) fn distances<V: Vector>(
     layer: &Layer<V>,
     centre: usize,
-    bonds: &[Bond],
+    bonds: &[GraceBond],
 ) -> [(usize, f64); MAX_LANES] {
     let mut distances = [(0, 0.0); MAX_LANES];
     for (distance, bond) in distances.iter_mut().zip(bonds) {
@@ -243,7 +243,7 @@ fn transpose<V: Vector>(rows: &[V], columns: &mut [V]) {
 
 /// v and r of a block; v is zero in unused lanes. Both are rounded after the division.
 #[inline(always)]
-pub(super) fn directions<V: Vector>(bonds: &[Bond]) -> ([V; 3], V) {
+pub(super) fn directions<V: Vector>(bonds: &[GraceBond]) -> ([V; 3], V) {
     let (mut ds, mut rs) = ([[0.0; MAX_LANES]; 3], [1.0; MAX_LANES]);
     for (b, bond) in bonds.iter().enumerate() {
         rs[b] = bond.r;
@@ -263,7 +263,7 @@ pub(super) fn directions<V: Vector>(bonds: &[Bond]) -> ([V; 3], V) {
 
 /// The bonds of one atom with the data that the forward pass leaves for the reverse pass.
 pub(super) struct OwnBonds<'a, V> {
-    pub bonds: &'a [Bond],
+    pub bonds: &'a [GraceBond],
     /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]; in later layers R_nl, \[block\]\[bond\]\[l\]\[channel\].
     pub values: &'a mut [V],
     /// dR_nl/dr in the same layout.
@@ -276,7 +276,7 @@ impl<'a, V: Vector> OwnBonds<'a, V> {
     pub fn blocks(
         self,
         layer: &Layer<V>,
-    ) -> impl Iterator<Item = (&'a [Bond], &'a mut [V], &'a mut [V])> + use<'a, V> {
+    ) -> impl Iterator<Item = (&'a [GraceBond], &'a mut [V], &'a mut [V])> + use<'a, V> {
         let lanes = V::LANES * layer.radial.output_lanes();
         let values = self.values.chunks_exact_mut(lanes).zip(self.derivatives.chunks_exact_mut(lanes));
         self.bonds
@@ -292,7 +292,7 @@ pub(super) fn accumulate<V: Vector>(
     layer: &Layer<V>,
     centre: usize,
     own: OwnBonds<V>,
-    (density, slot): (&mut [V], Slot),
+    (density, slot): (&mut [V], TapeSlot),
     work: &mut BondWork<V>,
 ) {
     for (bonds, values, derivatives) in own.blocks(layer) {
@@ -313,7 +313,7 @@ pub(super) fn accumulate<V: Vector>(
 pub(super) fn reverse<V: Vector, const N: usize>(
     layer: &Layer<V>,
     own: OwnBonds<V>,
-    (cotangent, slots): (&[V], [Slot; N]),
+    (cotangent, slots): (&[V], [TapeSlot; N]),
     work: &mut BondWork<V>,
     mut gradients: [&mut [Vec3]; N],
 ) {
@@ -338,7 +338,7 @@ pub(super) fn put<V: Vector>(of_block: &[V; 3], gradients: &mut [Vec3]) {
 
 /// A_lm,n += Σ_b Y_lm(v_b) R_nl(r_b) ζ_n over a block.
 #[inline(always)]
-fn add_bonds<V: Vector>(layer: &Layer<V>, density: &mut [V], slot: Slot, work: &BondWork<V>) {
+fn add_bonds<V: Vector>(layer: &Layer<V>, density: &mut [V], slot: TapeSlot, work: &BondWork<V>) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
     for l in 0..=layer.harmonics.lmax() {
         for lm in l * l..(l + 1) * (l + 1) {
@@ -358,7 +358,7 @@ fn add_bonds<V: Vector>(layer: &Layer<V>, density: &mut [V], slot: Slot, work: &
 #[inline(always)]
 fn slopes<V: Vector, const N: usize>(
     layer: &Layer<V>,
-    (cotangent, slots): (&[V], [Slot; N]),
+    (cotangent, slots): (&[V], [TapeSlot; N]),
     (values, derivatives): (&[V], &[V]),
     work: &BondWork<V>,
 ) -> [(V, [V; 3]); N] {
@@ -380,13 +380,13 @@ fn slopes<V: Vector, const N: usize>(
 #[inline(always)]
 fn add_slopes<V: Vector, const N: usize, const M: usize>(
     layer: &Layer<V>,
-    (cotangent, slots): (&[V], [Slot; N]),
+    (cotangent, slots): (&[V], [TapeSlot; N]),
     (values, derivatives): (&[V], &[V]),
     work: &BondWork<V>,
     lm: usize,
     slopes: &mut [(V, [V; 3]); N],
 ) {
-    let row = |slot: Slot, m: usize| {
+    let row = |slot: TapeSlot, m: usize| {
         let row = &cotangent[slot.row(&layer.density, lm + m)..][..layer.density.width];
         &V::flat(row)[..layer.density.channels]
     };

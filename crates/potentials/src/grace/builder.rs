@@ -1,7 +1,7 @@
 //! Assembles a model from its layers.
 
 use atoms::Species;
-use npz::Archive;
+use npz::NpzFile;
 
 use super::basis::BasisLayout;
 use super::description::{Architecture, GraceDescription};
@@ -9,13 +9,13 @@ use super::error::{GraceError, mismatch};
 use super::layer::LayerDraft;
 use super::network::Network;
 use super::networks::readout;
-use super::projection::{FeatureMap, Projection, has_projection};
+use super::projection::{FeatureMap, GraceProjection, has_projection};
 use super::shared_reader::reject_unread_arrays;
 use super::vector::Vector;
 
 /// What a reader has extracted from a file.
 pub(super) struct ModelBuilder<'a, V: Vector> {
-    pub archive: &'a Archive,
+    pub archive: &'a NpzFile,
     pub architecture: Architecture,
     pub elements: Vec<Species>,
     pub layers: Vec<LayerDraft<'a, V>>,
@@ -88,7 +88,7 @@ impl<V: Vector> ModelBuilder<'_, V> {
 
 /// The feature map, if the file has one.
 fn feature_map<V: Vector>(
-    archive: &Archive,
+    archive: &NpzFile,
     basis: &BasisLayout,
 ) -> Result<Option<FeatureMap<V>>, GraceError> {
     if !has_projection(archive) {
@@ -116,7 +116,7 @@ fn feature_map<V: Vector>(
     let layers = basis.blocks.len();
     let density_scale = archive.scalar_or("uq_rp_density_scale", 1.0)? as f32;
     let projection =
-        Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, layers };
+        GraceProjection { matrix, dimension, normalize, density_channels, density_scale, asinh, layers };
     archive.expect_count("uq_feature_dim", projection.feature_dimension())?;
     Ok(Some(FeatureMap::new(projection, basis)))
 }

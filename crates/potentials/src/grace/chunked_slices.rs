@@ -12,14 +12,14 @@ pub(super) trait SplitByChunk: Sized + Send {
 
 /// How many elements a place has.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Layout<'a> {
+pub(super) enum PlaceLayout<'a> {
     /// The same number for each place.
     Even(usize),
     /// The elements of a place start at its offset times a factor.
     Ragged(&'a [usize], usize),
 }
 
-impl Layout<'_> {
+impl PlaceLayout<'_> {
     #[inline(always)]
     fn begin(&self, place: usize) -> usize {
         match self {
@@ -32,7 +32,7 @@ impl Layout<'_> {
 /// A mutable slice over some places.
 #[derive(Debug)]
 pub(super) struct ChunkedSlice<'a, T> {
-    layout: Layout<'a>,
+    layout: PlaceLayout<'a>,
     /// Index of its first element in the whole array.
     begin: usize,
     numbers: &'a mut [T],
@@ -41,13 +41,13 @@ pub(super) struct ChunkedSlice<'a, T> {
 impl<'a, T> ChunkedSlice<'a, T> {
     /// From an array that starts with the elements of the place `first`.
     #[inline(always)]
-    pub fn new(layout: Layout<'a>, first: usize, numbers: &'a mut [T]) -> Self {
+    pub fn new(layout: PlaceLayout<'a>, first: usize, numbers: &'a mut [T]) -> Self {
         Self { layout, begin: layout.begin(first), numbers }
     }
 
     /// A slice without elements.
     pub fn empty() -> Self {
-        Self::new(Layout::Even(0), 0, &mut [])
+        Self::new(PlaceLayout::Even(0), 0, &mut [])
     }
 
     /// The elements of these places.

@@ -4,7 +4,7 @@ use super::evaluate::Evaluator;
 use super::layer::Layer;
 use super::product::Coupled;
 use super::radial_table::SUPPORT;
-use super::tape::Operation;
+use super::tape::TapeOperation;
 use super::vector::Vector;
 use super::weights::Weights;
 
@@ -45,20 +45,20 @@ fn of_bond<V: Vector>(layer: &Layer<V>, cotangents: u64) -> u64 {
     radial + forward + cotangents * backward * functions * channels
 }
 
-fn of_operation<V: Vector>(operation: &Operation<V>, cotangents: u64) -> u64 {
+fn of_operation<V: Vector>(operation: &TapeOperation<V>, cotangents: u64) -> u64 {
     let terms = |coupled: &[Coupled<V>]| coupled.iter().map(|c| c.terms.len() as u64).sum::<u64>();
     match operation {
-        Operation::Linear(linear) => {
+        TapeOperation::Linear(linear) => {
             let parts = linear.parts.iter().map(|part| part.tape[0].len() as u64 * size(&part.weights));
             (1 + cotangents) * parts.sum::<u64>()
         }
-        Operation::Product(product) => {
+        TapeOperation::Product(product) => {
             product.channels as u64 * (terms(&product.outputs) + cotangents * terms(&product.inputs))
         }
-        Operation::Combination(combination) => {
+        TapeOperation::Combination(combination) => {
             let terms = combination.outputs.iter().map(|(_, terms)| terms.len() as u64).sum::<u64>();
             combination.channels as u64 * terms * (1 + cotangents)
         }
-        Operation::EquivariantNorm(_) => 0,
+        TapeOperation::EquivariantNorm(_) => 0,
     }
 }

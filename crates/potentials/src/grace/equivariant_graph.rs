@@ -4,7 +4,7 @@ use super::equivariant_norm::EquivariantNorm;
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
 use super::linear::{Linear, LinearPart};
-use super::tape::{Operation, Tensor};
+use super::tape::{TapeOperation, Tensor};
 use super::vector::{Vector, to_lanes};
 use super::weights::Weights;
 
@@ -52,7 +52,7 @@ impl<V: Vector> Graph<'_, V> {
             parts.push(LinearPart::new(Weights::new(1, tensor.channels, rank, element), rows));
         }
         parts.retain(|part| !part.tape[0].is_empty());
-        self.operations.push(Operation::Linear(Linear { parts }));
+        self.operations.push(TapeOperation::Linear(Linear { parts }));
         Ok(out)
     }
 
@@ -86,7 +86,7 @@ impl<V: Vector> Graph<'_, V> {
         }
         self.weights += weights.len();
         let to = self.push(name, from.components, channels)?;
-        self.operations.push(Operation::EquivariantNorm(EquivariantNorm {
+        self.operations.push(TapeOperation::EquivariantNorm(EquivariantNorm {
             from,
             to,
             centred: invariant.iter().map(|x| x * centring).collect(),

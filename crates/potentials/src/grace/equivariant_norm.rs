@@ -1,6 +1,6 @@
 //! Normalisation of an equivariant tensor before it is sent to neighbours.
 
-use super::tape::{Slot, Tensor};
+use super::tape::{TapeSlot, Tensor};
 use super::vector::{Number, Vector};
 
 /// y_w,n = a_w,n x′_w,n / √(mean_n Σ_w d_w x′² + ε), where x′ is x, minus its mean over channels in the
@@ -24,7 +24,7 @@ pub(super) struct EquivariantNorm<V> {
 impl<V: Vector> EquivariantNorm<V> {
     /// Rows of x with the mean over channels to subtract.
     #[inline(always)]
-    fn rows<'a>(&'a self, x: &'a [V], slot: Slot) -> impl Iterator<Item = (usize, &'a [V], f64)> {
+    fn rows<'a>(&'a self, x: &'a [V], slot: TapeSlot) -> impl Iterator<Item = (usize, &'a [V], f64)> {
         self.centred.iter().enumerate().map(move |(w, centred)| {
             let row = &x[slot.row(&self.from, w)..][..self.from.width];
             (w, row, centred * self.mean(row))
@@ -48,7 +48,7 @@ impl<V: Vector> EquivariantNorm<V> {
 
     /// (mean_n Σ_w d_w x′² + ε)^(−1/2)
     #[inline(always)]
-    fn inverse(&self, tape: &[V], slot: Slot) -> f64 {
+    fn inverse(&self, tape: &[V], slot: TapeSlot) -> f64 {
         let mut square = 0.0;
         for (w, row, mean) in self.rows(tape, slot) {
             let mut sum = V::ZERO;
@@ -64,7 +64,7 @@ impl<V: Vector> EquivariantNorm<V> {
     #[inline(always)]
     pub fn forward(&self, atoms: usize, tape: &mut [V]) {
         let (before, out) = tape.split_at_mut(self.to.start * atoms);
-        for slot in (0..atoms).map(|slot| Slot { slot, slots: atoms }) {
+        for slot in (0..atoms).map(|slot| TapeSlot { slot, slots: atoms }) {
             let inverse = self.inverse(before, slot);
             for (w, row, mean) in self.rows(before, slot) {
                 let first = slot.row(&self.to, w) - self.to.start * atoms;
@@ -81,13 +81,13 @@ impl<V: Vector> EquivariantNorm<V> {
     #[inline(always)]
     pub fn backward<const N: usize>(&self, atoms: usize, tape: &[V], cotangent: &mut [V]) {
         for k in 0..N * atoms {
-            let of_tape = Slot { slot: k % atoms, slots: atoms };
-            self.backward_one(tape, of_tape, cotangent, Slot { slot: k, slots: N * atoms });
+            let of_tape = TapeSlot { slot: k % atoms, slots: atoms };
+            self.backward_one(tape, of_tape, cotangent, TapeSlot { slot: k, slots: N * atoms });
         }
     }
 
     #[inline(always)]
-    fn backward_one(&self, tape: &[V], of_tape: Slot, cotangent: &mut [V], slot: Slot) {
+    fn backward_one(&self, tape: &[V], of_tape: TapeSlot, cotangent: &mut [V], slot: TapeSlot) {
         let inverse = self.inverse(tape, of_tape);
         let mut along = V::ZERO;
         for (w, row, mean) in self.rows(tape, of_tape) {
@@ -116,14 +116,14 @@ impl<V: Vector> EquivariantNorm<V> {
         }
     }
 
-    /// As [`super::tape::Operation::keep`]; the components are needed together.
+    /// As [`super::tape::TapeOperation::keep`]; the components are needed together.
     pub fn keep(&self, needed: &mut [bool]) {
         if self.to.rows().any(|row| needed[row]) {
             self.from.rows().for_each(|row| needed[row] = true);
         }
     }
 
-    /// As [`super::tape::Operation::rename`]; both tensors have the same lanes on both tapes.
+    /// As [`super::tape::TapeOperation::rename`]; both tensors have the same lanes on both tapes.
     pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32) {
         for tensor in [&mut self.from, &mut self.to] {
             tensor.start = on_tape(tensor.start as u32) as usize;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use npz::{Archive, Error};
+use npz::{Error, NpzFile};
 
 /// A GRACE model file that cannot be read or is not supported.
 #[derive(Debug, thiserror::Error)]
@@ -97,7 +97,7 @@ impl From<Error> for GraceError {
 
 /// The error for an array that contradicts the rest of the model.
 pub(super) fn mismatch(
-    archive: &Archive,
+    archive: &NpzFile,
     key: &str,
     found: impl ToString,
     expected: impl ToString,
@@ -106,6 +106,6 @@ pub(super) fn mismatch(
 }
 
 /// The error for an unsupported kind of model.
-pub(super) fn unsupported(archive: &Archive, reason: impl Into<String>) -> GraceError {
+pub(super) fn unsupported(archive: &NpzFile, reason: impl Into<String>) -> GraceError {
     GraceError::Unsupported { path: archive.path().to_owned(), reason: reason.into() }
 }

@@ -34,7 +34,7 @@ impl PullBack {
 
 /// Receives some atoms and their features z, `[atoms, D]`, and writes ∂H/∂z of each unless the output is empty.
 /// Several threads call it concurrently.
-pub type Grade<'a> = dyn Fn(&[u32], &[f64], &mut [f64]) + Sync + 'a;
+pub type GradeFunction<'a> = dyn Fn(&[u32], &[f64], &mut [f64]) + Sync + 'a;
 
 /// A network with its scratch arrays.
 #[derive(Debug)]
@@ -125,7 +125,7 @@ impl<V: Vector> Evaluator<V> {
         &mut self,
         structure: &Structure,
         neighbours: &NeighbourList,
-        grade: &Grade,
+        grade: &GradeFunction,
         energy: &mut Evaluation,
         pull_back: Option<&mut PullBack>,
     ) -> Result<(), PotentialError> {
@@ -231,7 +231,7 @@ impl<V: Vector> Evaluator<V> {
         &mut self,
         structure: &Structure,
         neighbours: &NeighbourList,
-        grade: Option<&Grade>,
+        grade: Option<&GradeFunction>,
     ) -> Result<(), PotentialError> {
         self.take(structure, neighbours)?;
         self.begin_derivatives();

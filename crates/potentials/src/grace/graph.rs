@@ -2,14 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::error::{GraceError, mismatch, unsupported};
 use super::linear::{Linear, LinearPart};
 use super::product::{Combination, Combined, Coupled, Product, Term};
 use super::register_allocation::allocate;
 use super::schedule::depth_first;
-use super::tape::{Operation, Tensor};
+use super::tape::{TapeOperation, Tensor};
 use super::tape_program::TapeProgram;
 use super::vector::{Number, Vector, lanes_for};
 use super::weights::Weights;
@@ -19,13 +19,13 @@ const MAX_TAPE_LANES: usize = 1 << 20;
 
 /// A graph under construction.
 pub(super) struct Graph<'a, V: Vector> {
-    pub(super) archive: &'a Archive,
+    pub(super) archive: &'a NpzFile,
     /// All tensors, in their order on the tape.
     tensors: Vec<Tensor>,
     /// Tensors that reductions may refer to by name.
     named: Vec<(String, Tensor)>,
     end: usize,
-    pub(super) operations: Vec<Operation<V>>,
+    pub(super) operations: Vec<TapeOperation<V>>,
     /// First lane and number of lanes of each row of the basis B.
     pub(super) basis: Vec<(usize, usize)>,
     /// Components and channels of each source of the basis.
@@ -38,7 +38,7 @@ pub(super) struct Graph<'a, V: Vector> {
 impl<'a, V: Vector> Graph<'a, V> {
     /// A graph with only the sum over neighbours; errors call it `name`.
     pub fn new(
-        archive: &'a Archive,
+        archive: &'a NpzFile,
         name: &str,
         components: usize,
         channels: usize,
@@ -130,7 +130,7 @@ impl<'a, V: Vector> Graph<'a, V> {
             LinearPart::new(weights, rows.into_iter().unzip())
         };
         let parts = merged(rows.into_iter().map(part).collect());
-        self.operations.push(Operation::Linear(Linear { parts }));
+        self.operations.push(TapeOperation::Linear(Linear { parts }));
         Ok(out)
     }
 
@@ -192,7 +192,7 @@ impl<'a, V: Vector> Graph<'a, V> {
             outputs[*sum].terms.push(Term { left, right, coefficient });
         }
         let product = Product { width: out.width, channels: out.channels, outputs, inputs: Vec::new() };
-        self.operations.push(Operation::Product(product));
+        self.operations.push(TapeOperation::Product(product));
         Ok(out)
     }
 
@@ -210,7 +210,7 @@ impl<'a, V: Vector> Graph<'a, V> {
             outputs[*to].1.push((tensor.row(*from) as u32, V::Number::round(*factor)));
         }
         let combination = Combination::new(out.width, out.channels, outputs);
-        self.operations.push(Operation::Combination(combination));
+        self.operations.push(TapeOperation::Combination(combination));
         Ok(out)
     }
 

@@ -2,9 +2,9 @@
 
 use super::batch_passes::Energies;
 use super::batches::Placed;
-use super::chunked_slices::{ChunkedSlice, Layout, SharedSlice};
+use super::chunked_slices::{ChunkedSlice, PlaceLayout, SharedSlice};
 use super::evaluate::{Evaluator, PullBack};
-use super::instructions::Pass;
+use super::instructions::SimdPass;
 use super::readout::{Readout, ReadoutWork};
 use super::scratch::lock_scratch;
 use super::vector::Vector;
@@ -22,7 +22,7 @@ struct HiddenLayer<'a, V> {
     work: &'a mut ReadoutWork<V>,
 }
 
-impl<V: Vector> Pass for HiddenLayer<'_, V> {
+impl<V: Vector> SimdPass for HiddenLayer<'_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
         let Self { readout, placed, values, cotangent, of_densities, work } = self;
@@ -70,8 +70,9 @@ impl<V: Vector> Evaluator<V> {
         let (readout, width) = (&network.readout, network.readout.hidden_dimension());
         let per_atom = readout.blocks.len() * readout.density_lanes();
         values.resize(batches.order.len() * width, 0.0);
-        let even = |of_one, numbers| ChunkedSlice::new(Layout::Even(of_one), 0, numbers);
-        let of_densities = ChunkedSlice::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]);
+        let even = |of_one, numbers| ChunkedSlice::new(PlaceLayout::Even(of_one), 0, numbers);
+        let of_densities =
+            ChunkedSlice::new(PlaceLayout::Even(per_atom), 0, &mut self.density_cotangents[..]);
         let work = (even(1, &mut self.energies[..]), (even(width, &mut values[..]), of_densities));
         let cotangents = SharedSlice::new(width, 0, cotangent);
         self.threads.for_each_chunk(&batches.chunks, work, &|chunk, (mut energies, work), thread| {

@@ -19,7 +19,7 @@ enum InstructionSet {
 }
 
 /// A pass. Functions that it calls must be `inline(always)`; others are compiled for the baseline.
-pub(crate) trait Pass {
+pub(crate) trait SimdPass {
     /// `wide` states that there are 32 registers of eight numbers.
     fn run(self, wide: bool);
 }
@@ -51,7 +51,7 @@ impl Instructions {
 
     /// Runs a pass, compiled for these instructions.
     #[allow(unsafe_code)] // The processor has them: `best` has asked.
-    pub(crate) fn run(self, pass: impl Pass) {
+    pub(crate) fn run(self, pass: impl SimdPass) {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
             InstructionSet::Avx512 => unsafe { x86::with_avx512(pass) },
@@ -64,15 +64,15 @@ impl Instructions {
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use super::Pass;
+    use super::SimdPass;
 
     #[target_feature(enable = "avx512f,avx512vl,avx2,fma")]
-    pub fn with_avx512(pass: impl Pass) {
+    pub fn with_avx512(pass: impl SimdPass) {
         pass.run(true);
     }
 
     #[target_feature(enable = "avx2,fma")]
-    pub fn with_avx2(pass: impl Pass) {
+    pub fn with_avx2(pass: impl SimdPass) {
         pass.run(false);
     }
 }

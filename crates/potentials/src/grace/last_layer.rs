@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use super::batch_passes::{Backward, BeginProjectBack, Energies, Forward, Project, ProjectBack};
 use super::batches::{Batches, Chunk, Placed};
-use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
-use super::evaluate::{Evaluator, Grade};
+use super::chunked_slices::{ChunkedSlice, PlaceLayout, SplitByChunk};
+use super::evaluate::{Evaluator, GradeFunction};
 use super::instructions::Instructions;
 use super::layer_passes::{Cotangents, Gradients, LayerInput, LayerState};
 use super::network::Network;
@@ -18,12 +18,12 @@ use super::vector::Vector;
 const MAX_EARLIER_LAYERS: usize = 2;
 
 /// Data shared by all threads.
-struct Pass<'a, V: Vector> {
+struct LastLayerPass<'a, V: Vector> {
     network: &'a Network<V>,
     instructions: Instructions,
     batches: &'a Batches,
     here: LayerInput<'a, V>,
-    grade: Option<&'a Grade<'a>>,
+    grade: Option<&'a GradeFunction<'a>>,
 }
 
 /// Output arrays, split by chunk.
@@ -65,7 +65,7 @@ impl<V: Send> SplitByChunk for Results<'_, V> {
 impl<V: Vector> Evaluator<V> {
     /// The forward and reverse pass of all atoms through the last layer with `N` cotangents: of the energy, and
     /// of what `grade` computes from the features.
-    pub(super) fn pass_last_layer<const N: usize>(&mut self, grade: Option<&Grade>) {
+    pub(super) fn pass_last_layer<const N: usize>(&mut self, grade: Option<&GradeFunction>) {
         let Self { network, instructions, batches, scratch, projection, .. } = self;
         let last = self.layers.len() - 1;
         let (before, here) = self.layers.split_at_mut(last);
@@ -74,8 +74,12 @@ impl<V: Vector> Evaluator<V> {
         let of_densities = network.readout.blocks.len() * network.readout.density_lanes();
         let map = network.feature_map.as_ref().filter(|_| grade.is_some());
         let mut results = Results {
-            energies: ChunkedSlice::new(Layout::Even(1), 0, &mut self.energies[..]),
-            densities: ChunkedSlice::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
+            energies: ChunkedSlice::new(PlaceLayout::Even(1), 0, &mut self.energies[..]),
+            densities: ChunkedSlice::new(
+                PlaceLayout::Even(of_densities),
+                0,
+                &mut self.density_cotangents[..],
+            ),
             gradients: gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns),
             projected: map.map(|map| projection.parts(map)),
             bases: [(); MAX_EARLIER_LAYERS].map(|()| ChunkedSlice::empty()),
@@ -83,7 +87,7 @@ impl<V: Vector> Evaluator<V> {
         for (bases, (work, layer)) in results.bases.iter_mut().zip(before.iter_mut().zip(&network.layers)) {
             *bases = work.trace.bases_mut(layer);
         }
-        let pass = Pass { network, instructions: *instructions, batches, here, grade };
+        let pass = LastLayerPass { network, instructions: *instructions, batches, here, grade };
         self.threads.for_each_chunk(&batches.chunks, results, &|chunk, mut results, thread| {
             let scratch = &mut lock_scratch(scratch, thread);
             if let Some(returns) = results.gradients.returns.only() {
@@ -98,7 +102,7 @@ impl<V: Vector> Evaluator<V> {
     }
 }
 
-impl<V: Vector> Pass<'_, V> {
+impl<V: Vector> LastLayerPass<'_, V> {
     /// With one cotangent, the reverse pass runs while the tape of the batch is in the cache; with two it waits
     /// for the features.
     fn run<const N: usize>(&self, chunk: &Chunk, results: &mut Results<V>, scratch: &mut Scratch<V>) {

@@ -3,7 +3,7 @@
 use super::graph::Graph;
 use super::harmonics::Harmonics;
 use super::radial::RadialFunctions;
-use super::readout::Block;
+use super::readout::ReadoutBlock;
 use super::tape::Tensor;
 use super::tape_program::TapeProgram;
 use super::vector::Vector;
@@ -15,7 +15,7 @@ use super::vector::Vector;
 pub(super) struct Layer<V: Vector> {
     pub radial: RadialFunctions<V>,
     pub harmonics: Harmonics,
-    pub message: Message<V>,
+    pub message: LayerMessage<V>,
     /// T, \[q\]\[lm\]\[channel\], at the start of the tape.
     pub density: Tensor,
     pub steps: TapeProgram<V>,
@@ -24,7 +24,7 @@ pub(super) struct Layer<V: Vector> {
 /// The message of an atom to its neighbours: m_q,n = x_q,n + c_q,n with the tensor x of the preceding layer,
 /// zero beyond its components, and constants c of the atom's element.
 #[derive(Clone, Debug)]
-pub(super) struct Message<V> {
+pub(super) struct LayerMessage<V> {
     /// x on the tape of the preceding layer; `None` in the first layer.
     pub from: Option<Tensor>,
     /// Number of components q.
@@ -33,7 +33,7 @@ pub(super) struct Message<V> {
     pub constants: Vec<Vec<V>>,
 }
 
-impl<V: Vector> Message<V> {
+impl<V: Vector> LayerMessage<V> {
     /// Number of components that depend on the atom's environment.
     pub fn passed(&self) -> usize {
         self.from.map_or(0, |tensor| tensor.components)
@@ -50,8 +50,8 @@ pub(super) struct LayerDraft<'a, V: Vector> {
     pub graph: Graph<'a, V>,
     pub radial: RadialFunctions<V>,
     pub lmax: usize,
-    pub message: Message<V>,
-    pub block: Block<V>,
+    pub message: LayerMessage<V>,
+    pub block: ReadoutBlock<V>,
 }
 
 impl<V: Vector> LayerDraft<'_, V> {

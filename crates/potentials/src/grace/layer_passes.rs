@@ -5,20 +5,20 @@ use std::ops::Range;
 use atoms::Vec3;
 
 use super::batches::{Batches, Chunk, Placed};
-use super::bonds::{BondWork, Bonds, OwnBonds, accumulate, reverse};
-use super::chunked_slices::{ChunkedSlice, Layout, PerChunk, SharedSlice, SplitByChunk};
-use super::layer::{Layer, Message};
-use super::matrix::Rows;
+use super::bonds::{BondWork, GraceBonds, OwnBonds, accumulate, reverse};
+use super::chunked_slices::{ChunkedSlice, PerChunk, PlaceLayout, SharedSlice, SplitByChunk};
+use super::layer::{Layer, LayerMessage};
+use super::matrix::StridedRows;
 use super::messages::{ReturnedCotangents, accumulate_messages, reverse_messages};
 use super::network::Network;
-use super::readout::Block;
-use super::tape::{Slot, Tensor};
+use super::readout::ReadoutBlock;
+use super::tape::{TapeSlot, Tensor};
 use super::vector::Vector;
 
 /// Arrays of one layer for all atoms, in evaluation order.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LayerState<V> {
-    pub bonds: Bonds,
+    pub bonds: GraceBonds,
     pub trace: Trace<V>,
     /// m, `[n, lanes of a message]`; empty in the first layer.
     pub messages: Vec<V>,
@@ -97,7 +97,7 @@ pub(super) struct TracedBonds<'a, V> {
 impl<V> TracedBonds<'_, V> {
     /// The bonds of the atom at a place.
     #[inline(always)]
-    fn at<'a>(&'a mut self, place: usize, bonds: &'a Bonds) -> OwnBonds<'a, V> {
+    fn at<'a>(&'a mut self, place: usize, bonds: &'a GraceBonds) -> OwnBonds<'a, V> {
         let places = place..place + 1;
         let (values, derivatives) = (self.values.slice(&places), self.derivatives.slice(&places));
         OwnBonds { bonds: bonds.at(place), values, derivatives }
@@ -112,7 +112,7 @@ impl<V: Vector> Trace<V> {
     }
 
     /// Allocates the bond data and, on request, the tapes of these places.
-    pub fn reserve(&mut self, layer: &Layer<V>, bonds: &Bonds, places: &Range<usize>, keep_tapes: bool) {
+    pub fn reserve(&mut self, layer: &Layer<V>, bonds: &GraceBonds, places: &Range<usize>, keep_tapes: bool) {
         let blocks = bonds.block_offsets[places.end] - bonds.block_offsets[places.start];
         let of_block = V::LANES * layer.radial.output_lanes();
         grow(&mut self.tapes, if keep_tapes { places.len() * layer.steps.kept_lanes } else { 0 });
@@ -122,7 +122,7 @@ impl<V: Vector> Trace<V> {
     }
 
     /// The slices of all data.
-    pub fn slices<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> Traced<'a, V> {
+    pub fn slices<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a GraceBonds) -> Traced<'a, V> {
         self.parts(layer, bonds).0
     }
 
@@ -130,18 +130,22 @@ impl<V: Vector> Trace<V> {
     pub fn backward_slices<'a>(
         &'a mut self,
         layer: &Layer<V>,
-        bonds: &'a Bonds,
+        bonds: &'a GraceBonds,
     ) -> (ChunkedSlice<'a, V>, TracedBonds<'a, V>, SharedSlice<'a, V>) {
         let (Traced { tapes, bonds, .. }, cotangents) = self.parts(layer, bonds);
         (tapes, bonds, cotangents)
     }
 
-    fn parts<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> (Traced<'a, V>, SharedSlice<'a, V>) {
+    fn parts<'a>(
+        &'a mut self,
+        layer: &Layer<V>,
+        bonds: &'a GraceBonds,
+    ) -> (Traced<'a, V>, SharedSlice<'a, V>) {
         let (steps, of_block) = (&layer.steps, V::LANES * layer.radial.output_lanes());
-        let of_bonds = Layout::Ragged(&bonds.block_offsets, of_block);
+        let of_bonds = PlaceLayout::Ragged(&bonds.block_offsets, of_block);
         let traced = Traced {
-            tapes: ChunkedSlice::new(Layout::Even(steps.kept_lanes), self.first, &mut self.tapes),
-            bases: ChunkedSlice::new(Layout::Even(steps.basis_lanes), self.first_basis, &mut self.bases),
+            tapes: ChunkedSlice::new(PlaceLayout::Even(steps.kept_lanes), self.first, &mut self.tapes),
+            bases: ChunkedSlice::new(PlaceLayout::Even(steps.basis_lanes), self.first_basis, &mut self.bases),
             bonds: TracedBonds {
                 values: ChunkedSlice::new(of_bonds, self.first, &mut self.values),
                 derivatives: ChunkedSlice::new(of_bonds, self.first, &mut self.derivatives),
@@ -157,13 +161,17 @@ impl<V: Vector> Trace<V> {
 
     /// B, to be overwritten by its cotangents.
     pub fn bases_mut(&mut self, layer: &Layer<V>) -> ChunkedSlice<'_, V> {
-        ChunkedSlice::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.bases)
+        ChunkedSlice::new(PlaceLayout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.bases)
     }
 
     /// A copy of B, to be overwritten by its cotangents.
     pub fn copy_of_bases(&mut self, layer: &Layer<V>) -> ChunkedSlice<'_, V> {
         self.basis_cotangents.clone_from(&self.bases);
-        ChunkedSlice::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.basis_cotangents)
+        ChunkedSlice::new(
+            PlaceLayout::Even(layer.steps.basis_lanes),
+            self.first_basis,
+            &mut self.basis_cotangents,
+        )
     }
 
     /// Replaces B with its cotangents.
@@ -205,8 +213,8 @@ pub(super) fn grow<V: Vector>(lanes: &mut Vec<V>, length: usize) {
 pub(super) struct LayerInput<'a, V: Vector> {
     pub layer: &'a Layer<V>,
     /// The layer's part of the readout.
-    pub block: &'a Block<V>,
-    pub bonds: &'a Bonds,
+    pub block: &'a ReadoutBlock<V>,
+    pub bonds: &'a GraceBonds,
     /// The messages of all atoms.
     pub received: &'a [V],
     /// As [`LayerState::rows`].
@@ -218,7 +226,7 @@ impl<'a, V: Vector> LayerInput<'a, V> {
     pub fn new(
         network: &'a Network<V>,
         k: usize,
-        (bonds, received, rows): (&'a Bonds, &'a [V], &'a [u32]),
+        (bonds, received, rows): (&'a GraceBonds, &'a [V], &'a [u32]),
     ) -> Self {
         Self { layer: &network.layers[k], block: &network.readout.blocks[k], bonds, received, rows }
     }
@@ -236,7 +244,7 @@ pub(super) fn forward<V: Vector>(
     grow(tape, batch.atoms * steps.tape_lanes);
     tape[..batch.atoms * steps.fixed_lanes].fill(V::ZERO);
     for (slot, place) in places.clone().enumerate() {
-        let density = (&mut tape[..], Slot { slot, slots: batch.atoms });
+        let density = (&mut tape[..], TapeSlot { slot, slots: batch.atoms });
         let own = trace.bonds.at(place, bonds);
         match layer.message.from {
             None => accumulate(layer, batch.element, own, density, work),
@@ -256,7 +264,7 @@ pub(super) fn send<V: Vector>(
     messages: &mut [V],
 ) {
     for (slot, message) in messages.chunks_exact_mut(of_message).enumerate() {
-        let slot = Slot { slot, slots: placed.batch.atoms };
+        let slot = TapeSlot { slot, slots: placed.batch.atoms };
         for (q, row) in message.chunks_exact_mut(tensor.width).take(tensor.components).enumerate() {
             for (m, x) in row.iter_mut().zip(&tape[slot.row(tensor, q)..]) {
                 m.add(x);
@@ -272,7 +280,7 @@ pub(super) struct Cotangents<'a, V> {
     /// Cotangents of the basis from the features, one row per atom.
     pub basis: &'a [V],
     /// The message of the next layer and its cotangents, one row per atom.
-    pub returned: Option<(&'a Message<V>, [&'a [V]; 2])>,
+    pub returned: Option<(&'a LayerMessage<V>, [&'a [V]; 2])>,
 }
 
 /// Outputs of a reverse pass.
@@ -313,7 +321,7 @@ pub(super) fn backward_tape<V: Vector, const N: usize>(
     grow(&mut work.tape, slots * steps.cotangent_lanes);
     let cotangent = &mut work.tape[..];
     cotangent[..slots * steps.fixed_lanes].fill(V::ZERO);
-    if let Some((Message { from: Some(tensor), .. }, returned)) = &from.returned {
+    if let Some((LayerMessage { from: Some(tensor), .. }, returned)) = &from.returned {
         for (k, rows) in returned.iter().enumerate().take(N) {
             add_returned(tensor, rows, cotangent, (k * atoms, slots));
         }
@@ -326,7 +334,7 @@ pub(super) fn backward_tape<V: Vector, const N: usize>(
 /// ∂E/∂B of a batch.
 #[inline(always)]
 fn energy_basis_cotangent<V: Vector>(
-    block: &Block<V>,
+    block: &ReadoutBlock<V>,
     placed: &Placed,
     (densities, stride): (&[V], usize),
     lanes: usize,
@@ -335,7 +343,7 @@ fn energy_basis_cotangent<V: Vector>(
     let atoms = placed.batch.atoms;
     out.clear();
     out.resize(atoms * lanes, V::ZERO);
-    let (from, to) = (Rows::of_atoms(atoms, stride), Rows::of_atoms(atoms, lanes));
+    let (from, to) = (StridedRows::of_atoms(atoms, stride), StridedRows::of_atoms(atoms, lanes));
     let weights = block.weights.transposed(placed.batch.element);
     weights.multiply_add((densities, &mut out[..]), from, to, placed.batch.instructions);
 }
@@ -345,7 +353,7 @@ fn energy_basis_cotangent<V: Vector>(
 #[inline(always)]
 fn add_returned<V: Vector>(tensor: &Tensor, rows: &[V], tape: &mut [V], (first, slots): (usize, usize)) {
     for (atom, row) in rows.chunks_exact(tensor.components * tensor.width).enumerate() {
-        let slot = Slot { slot: first + atom, slots };
+        let slot = TapeSlot { slot: first + atom, slots };
         for (q, row) in row.chunks_exact(tensor.width).enumerate() {
             for (x, c) in tape[slot.row(tensor, q)..].iter_mut().zip(row) {
                 x.add(c);
@@ -365,7 +373,7 @@ pub(super) fn backward_bonds<V: Vector, const N: usize>(
 ) {
     let atoms = placed.batch.atoms;
     for (slot, place) in placed.places().enumerate() {
-        let slots = std::array::from_fn(|k| Slot { slot: k * atoms + slot, slots: N * atoms });
+        let slots = std::array::from_fn(|k| TapeSlot { slot: k * atoms + slot, slots: N * atoms });
         let cotangent = (&tape.tape[..], slots);
         let own = traced.at(place, bonds);
         let mut both = to.each_mut().map(|part| Some(part.slice(&(place..place + 1))));

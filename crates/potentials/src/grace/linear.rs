@@ -1,7 +1,7 @@
 //! Linear mixing of channels.
 
-use super::matrix::Rows;
-use super::tape::Batch;
+use super::matrix::StridedRows;
+use super::tape::AtomBatch;
 use super::vector::Vector;
 use super::weights::Weights;
 
@@ -31,9 +31,9 @@ impl<V: Vector> LinearPart<V> {
 
     /// Input and output rows at these lanes.
     #[inline(always)]
-    fn rows<'a>(&self, [from, to]: &'a [Vec<u32>; 2], slots: usize) -> (Rows<'a>, Rows<'a>) {
+    fn rows<'a>(&self, [from, to]: &'a [Vec<u32>; 2], slots: usize) -> (StridedRows<'a>, StridedRows<'a>) {
         let weights = self.weights.forward(0);
-        let rows = |starts, stride| Rows { starts, slots, stride, shift: 0 };
+        let rows = |starts, stride| StridedRows { starts, slots, stride, shift: 0 };
         (rows(from, weights.input_lanes()), rows(to, weights.output_lanes()))
     }
 }
@@ -41,7 +41,7 @@ impl<V: Vector> LinearPart<V> {
 impl<V: Vector> Linear<V> {
     /// Adds the results to their rows.
     #[inline(always)]
-    pub fn forward(&self, batch: &Batch, tape: &mut [V]) {
+    pub fn forward(&self, batch: &AtomBatch, tape: &mut [V]) {
         for part in &self.parts {
             let (from, to) = part.rows(&part.tape, batch.atoms);
             let weights = part.weights.forward(batch.element);
@@ -51,7 +51,7 @@ impl<V: Vector> Linear<V> {
 
     /// Adds to `N` cotangents of the inputs.
     #[inline(always)]
-    pub fn backward<const N: usize>(&self, batch: &Batch, cotangent: &mut [V]) {
+    pub fn backward<const N: usize>(&self, batch: &AtomBatch, cotangent: &mut [V]) {
         for part in &self.parts {
             let (from, to) = part.rows(&part.cotangents, N * batch.atoms);
             let weights = part.weights.transposed(batch.element);
@@ -59,7 +59,7 @@ impl<V: Vector> Linear<V> {
         }
     }
 
-    /// As [`super::tape::Operation::keep`].
+    /// As [`super::tape::TapeOperation::keep`].
     pub fn keep(&mut self, needed: &mut [bool]) {
         for part in &mut self.parts {
             let [from, to] = &part.tape;
@@ -72,7 +72,7 @@ impl<V: Vector> Linear<V> {
         self.parts.retain(|part| !part.tape[0].is_empty());
     }
 
-    /// As [`super::tape::Operation::rename`].
+    /// As [`super::tape::TapeOperation::rename`].
     pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32, of_cotangent: impl Fn(u32) -> u32) {
         for part in &mut self.parts {
             part.cotangents =

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::builder::ModelParts;
 use super::description::Architecture;
@@ -39,7 +39,7 @@ impl GraceModel {
     /// # Errors
     /// As [`GraceModel::load`].
     pub fn load_in(path: &Path, precision: Precision, radial: RadialPath) -> Result<Self, GraceError> {
-        let archive = Archive::open(path)?;
+        let archive = NpzFile::open(path)?;
         match precision {
             Precision::Double => Self::read(&archive, radial, AnyNetwork::Double),
             Precision::Mixed => Self::read(&archive, radial, AnyNetwork::Mixed),
@@ -51,11 +51,11 @@ impl GraceModel {
     /// # Errors
     /// If it cannot be read.
     pub fn has_projection(path: &Path) -> Result<bool, GraceError> {
-        Ok(has_projection(&Archive::open(path)?))
+        Ok(has_projection(&NpzFile::open(path)?))
     }
 
     fn read<V: Vector>(
-        archive: &Archive,
+        archive: &NpzFile,
         path: RadialPath,
         any: fn(Arc<Network<V>>) -> AnyNetwork,
     ) -> Result<Self, GraceError> {
@@ -74,7 +74,7 @@ impl GraceModel {
 }
 
 /// Detects the depth by the lists of single-particle basis functions that only deeper models have.
-fn detect(archive: &Archive) -> Architecture {
+fn detect(archive: &NpzFile) -> Architecture {
     if archive.contains("spbf_names") {
         Architecture::ThreeLayer
     } else if archive.contains("spb_names") {

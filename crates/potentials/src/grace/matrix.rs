@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::instructions::{Instructions, Pass};
+use super::instructions::{Instructions, SimdPass};
 use super::vector::{Number, Vector, lanes_for};
 
 /// A matrix `[inputs × outputs]` whose outputs are stored in panels of [`Vector::LANES`] columns.
@@ -55,7 +55,13 @@ impl<V: Vector> Matrix<V> {
     }
 
     /// Adds x M to the rows `to` for the rows x in `from`.
-    pub fn multiply_add(&self, lanes: impl Lanes<V>, from: Rows, to: Rows, instructions: Instructions) {
+    pub fn multiply_add(
+        &self,
+        lanes: impl MatrixOperands<V>,
+        from: StridedRows,
+        to: StridedRows,
+        instructions: Instructions,
+    ) {
         assert_eq!(from.len(), to.len());
         instructions.run(Multiply { matrix: self, lanes, from, to, factors: None });
     }
@@ -63,9 +69,9 @@ impl<V: Vector> Matrix<V> {
     /// The same after multiplying each row of `to` by its factor.
     pub fn scale_multiply_add(
         &self,
-        lanes: impl Lanes<V>,
-        from: Rows,
-        (to, factors): (Rows, Factors),
+        lanes: impl MatrixOperands<V>,
+        from: StridedRows,
+        (to, factors): (StridedRows, Factors),
         instructions: Instructions,
     ) {
         assert_eq!(from.len(), to.len());
@@ -77,9 +83,9 @@ impl<V: Vector> Matrix<V> {
     fn multiply_panels<const ROWS: usize, const PANELS: usize>(
         &self,
         inputs: Range<usize>,
-        lanes: &mut impl Lanes<V>,
-        from: Rows,
-        (to, factors): (Rows, Option<Factors>),
+        lanes: &mut impl MatrixOperands<V>,
+        from: StridedRows,
+        (to, factors): (StridedRows, Option<Factors>),
     ) {
         let n = self.output_lanes();
         let panel = |p: usize| &self.panels[p * self.inputs..][inputs.clone()];
@@ -99,12 +105,12 @@ impl<V: Vector> Matrix<V> {
 struct Multiply<'a, V, L> {
     matrix: &'a Matrix<V>,
     lanes: L,
-    from: Rows<'a>,
-    to: Rows<'a>,
+    from: StridedRows<'a>,
+    to: StridedRows<'a>,
     factors: Option<Factors<'a>>,
 }
 
-impl<V: Vector, L: Lanes<V>> Pass for Multiply<'_, V, L> {
+impl<V: Vector, L: MatrixOperands<V>> SimdPass for Multiply<'_, V, L> {
     /// Uses larger blocks if there are registers for them, which changes no bits.
     #[inline(always)]
     fn run(self, wide: bool) {
@@ -130,12 +136,12 @@ pub(super) struct Factors<'a> {
 }
 
 /// The arrays to read rows from and to add rows to, which may be the same.
-pub(super) trait Lanes<V> {
+pub(super) trait MatrixOperands<V> {
     fn read(&self) -> &[V];
     fn write(&mut self) -> &mut [V];
 }
 
-impl<V> Lanes<V> for (&[V], &mut [V]) {
+impl<V> MatrixOperands<V> for (&[V], &mut [V]) {
     #[inline(always)]
     fn read(&self) -> &[V] {
         self.0
@@ -147,7 +153,7 @@ impl<V> Lanes<V> for (&[V], &mut [V]) {
     }
 }
 
-impl<V> Lanes<V> for &mut [V] {
+impl<V> MatrixOperands<V> for &mut [V] {
     #[inline(always)]
     fn read(&self) -> &[V] {
         self
@@ -164,7 +170,7 @@ const INNER_BLOCK: usize = 256;
 
 /// Rows of an array: component r of slot s starts at lane `starts[r]` · `slots` + s · `stride` + `shift`.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Rows<'a> {
+pub(super) struct StridedRows<'a> {
     /// Where each component starts for a single slot.
     pub starts: &'a [u32],
     /// Number of atoms (times cotangents).
@@ -175,7 +181,7 @@ pub(super) struct Rows<'a> {
     pub shift: usize,
 }
 
-impl Rows<'static> {
+impl StridedRows<'static> {
     /// One row for each of `slots` atoms.
     #[inline(always)]
     pub fn of_atoms(slots: usize, stride: usize) -> Self {
@@ -183,7 +189,7 @@ impl Rows<'static> {
     }
 }
 
-impl Rows<'_> {
+impl StridedRows<'_> {
     #[inline(always)]
     fn len(&self) -> usize {
         self.starts.len() * self.slots
@@ -215,9 +221,9 @@ impl Rows<'_> {
 fn multiply_rows<V: Vector, const ROWS: usize, const PANELS: usize>(
     panels: [&[V]; PANELS],
     first_input: usize,
-    lanes: &mut impl Lanes<V>,
-    from: Rows,
-    to: (Rows, Option<Factors>),
+    lanes: &mut impl MatrixOperands<V>,
+    from: StridedRows,
+    to: (StridedRows, Option<Factors>),
 ) {
     let (n, mut row) = (from.len(), 0);
     while row + ROWS <= n {
@@ -242,9 +248,9 @@ fn multiply_rows<V: Vector, const ROWS: usize, const PANELS: usize>(
 fn multiply_block<V: Vector, const ROWS: usize, const PANELS: usize>(
     panels: [&[V]; PANELS],
     first_input: usize,
-    lanes: &mut impl Lanes<V>,
-    from: Rows,
-    (to, factors): (Rows, Option<Factors>),
+    lanes: &mut impl MatrixOperands<V>,
+    from: StridedRows,
+    (to, factors): (StridedRows, Option<Factors>),
     row: usize,
 ) {
     let (x, inputs) = (V::flat(lanes.read()), panels[0].len());
@@ -282,8 +288,8 @@ mod tests {
     use super::*;
 
     /// Two components of `slots` atoms each.
-    fn rows(starts: &[u32], slots: usize, stride: usize) -> Rows<'_> {
-        Rows { starts, slots, stride, shift: 0 }
+    fn rows(starts: &[u32], slots: usize, stride: usize) -> StridedRows<'_> {
+        StridedRows { starts, slots, stride, shift: 0 }
     }
 
     #[test]

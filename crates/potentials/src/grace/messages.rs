@@ -7,9 +7,9 @@ use std::ops::Range;
 use atoms::Vec3;
 
 use super::batches::Chunk;
-use super::bonds::{Bond, BondWork, Bonds, OwnBonds, bond_gradient, directions, distances, put};
+use super::bonds::{BondWork, GraceBond, GraceBonds, OwnBonds, bond_gradient, directions, distances, put};
 use super::layer::Layer;
-use super::tape::Slot;
+use super::tape::TapeSlot;
 use super::vector::Vector;
 
 /// The cotangents that a chunk of atoms returns to the senders of its messages: up to two, for the components
@@ -26,7 +26,7 @@ pub(super) struct ReturnedCotangents<V> {
 impl<V: Vector> ReturnedCotangents<V> {
     /// Finds the senders of a chunk and writes the row of each bond's neighbour. `row_of` is scratch memory
     /// with a number per atom.
-    pub fn find(&mut self, bonds: &Bonds, chunk: &Chunk, row_of: &mut [u32], rows: &mut [u32]) {
+    pub fn find(&mut self, bonds: &GraceBonds, chunk: &Chunk, row_of: &mut [u32], rows: &mut [u32]) {
         const NONE: u32 = u32::MAX;
         row_of.fill(NONE);
         let range = bonds.offsets[chunk.places.start]..bonds.offsets[chunk.places.end];
@@ -72,8 +72,8 @@ impl<V: Vector> ReturnedCotangents<V> {
 }
 
 /// A block of bonds in the reverse pass.
-struct Block<'a, V> {
-    bonds: &'a [Bond],
+struct BondBlock<'a, V> {
+    bonds: &'a [GraceBond],
     /// R_nl and dR_nl/dr, \[bond\]\[l\]\[channel\]
     values: &'a [V],
     derivatives: &'a [V],
@@ -89,7 +89,7 @@ pub(super) fn accumulate_messages<V: Vector>(
     centre: usize,
     own: OwnBonds<V>,
     messages: &[V],
-    (density, slot): (&mut [V], Slot),
+    (density, slot): (&mut [V], TapeSlot),
     work: &mut BondWork<V>,
 ) {
     for (bonds, values, derivatives) in own.blocks(layer) {
@@ -108,7 +108,7 @@ pub(super) fn reverse_messages<V: Vector, const N: usize>(
     layer: &Layer<V>,
     own: OwnBonds<V>,
     messages: &[V],
-    (cotangent, slots): (&[V], [Slot; N]),
+    (cotangent, slots): (&[V], [TapeSlot; N]),
     work: &mut BondWork<V>,
     gradients: [&mut [Vec3]; N],
     (rows, returns): (&[u32], &mut ReturnedCotangents<V>),
@@ -118,7 +118,7 @@ pub(super) fn reverse_messages<V: Vector, const N: usize>(
         let (v, r) = directions(bonds);
         layer.harmonics.evaluate::<V, true>(&v, &mut work.harmonics, &mut work.gradients);
         let block =
-            Block { bonds, values, derivatives, harmonics: &work.harmonics, gradients: &work.gradients };
+            BondBlock { bonds, values, derivatives, harmonics: &work.harmonics, gradients: &work.gradients };
         for (n, slot) in slots.into_iter().enumerate() {
             let cotangent = (cotangent, slot);
             let (along, across) = slopes(layer, &block, cotangent, messages);
@@ -133,9 +133,9 @@ pub(super) fn reverse_messages<V: Vector, const N: usize>(
 #[inline(always)]
 fn add_messages<V: Vector>(
     layer: &Layer<V>,
-    (bonds, values): (&[Bond], &[V]),
+    (bonds, values): (&[GraceBond], &[V]),
     messages: &[V],
-    (density, slot): (&mut [V], Slot),
+    (density, slot): (&mut [V], TapeSlot),
     work: &mut BondWork<V>,
 ) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
@@ -164,8 +164,8 @@ fn add_messages<V: Vector>(
 #[inline(always)]
 fn slopes<V: Vector>(
     layer: &Layer<V>,
-    block: &Block<V>,
-    (cotangent, slot): (&[V], Slot),
+    block: &BondBlock<V>,
+    (cotangent, slot): (&[V], TapeSlot),
     messages: &[V],
 ) -> (V, [V; 3]) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
@@ -199,8 +199,8 @@ fn slopes<V: Vector>(
 #[inline(always)]
 fn return_messages<V: Vector>(
     layer: &Layer<V>,
-    block: &Block<V>,
-    (cotangent, slot): (&[V], Slot),
+    block: &BondBlock<V>,
+    (cotangent, slot): (&[V], TapeSlot),
     rows: &[u32],
     message_cotangents: &mut [V],
 ) {

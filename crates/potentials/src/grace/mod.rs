@@ -76,12 +76,12 @@ mod weights;
 
 pub use description::{Architecture, GraceDescription};
 pub use error::{GraceError, UnfitProjection};
-pub use evaluate::{Grade, PullBack};
+pub use evaluate::{GradeFunction, PullBack};
 pub use instructions::Instructions;
-pub(crate) use instructions::Pass;
+pub(crate) use instructions::SimdPass;
 pub use model::GraceModel;
 pub use potential::Grace;
 pub use precision::Precision;
-pub use projection::{FeatureForm, Projection};
+pub use projection::{FeatureForm, GraceProjection};
 pub use radial::RadialPath;
 pub use threads::Threads;

@@ -6,7 +6,7 @@ use super::description::GraceDescription;
 use super::error::UnfitProjection;
 use super::network::AnyNetwork;
 use super::precision::Precision;
-use super::projection::{FeatureForm, Projection};
+use super::projection::{FeatureForm, GraceProjection};
 
 /// A GRACE model read from a `kokkos.npz` export.
 #[derive(Clone, Debug)]
@@ -45,14 +45,14 @@ impl GraceModel {
 
     /// D, the dimension of z; 0 for a model without feature arrays.
     pub fn feature_dimension(&self) -> usize {
-        self.projection().map_or(0, Projection::feature_dimension)
+        self.projection().map_or(0, GraceProjection::feature_dimension)
     }
 
     /// The model with this projection of its features, in place of its own if it has one.
     ///
     /// # Errors
     /// A matrix that has not D_basis rows; another number of layers.
-    pub fn with_projection(mut self, projection: Projection) -> Result<Self, UnfitProjection> {
+    pub fn with_projection(mut self, projection: GraceProjection) -> Result<Self, UnfitProjection> {
         let fits = |what, found, expected| {
             if found == expected { Ok(()) } else { Err(UnfitProjection { what, found, expected }) }
         };
@@ -65,7 +65,7 @@ impl GraceModel {
     }
 
     /// The feature map, if the model has one.
-    pub fn projection(&self) -> Option<&Projection> {
+    pub fn projection(&self) -> Option<&GraceProjection> {
         self.network.projection()
     }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::basis::BasisLayout;
 use super::layer::Layer;
 use super::precision::Precision;
-use super::projection::{FeatureForm, FeatureMap, Projection};
+use super::projection::{FeatureForm, FeatureMap, GraceProjection};
 use super::readout::Readout;
 use super::vector::{Double, Single, Vector};
 
@@ -27,11 +27,11 @@ impl<V: Vector> Network<V> {
         lanes.unwrap_or(0) * size_of::<V>()
     }
 
-    pub fn projection(&self) -> Option<&Projection> {
+    pub fn projection(&self) -> Option<&GraceProjection> {
         self.feature_map.as_ref().map(|map| &map.projection)
     }
 
-    fn set_projection(&mut self, projection: Projection) {
+    fn set_projection(&mut self, projection: GraceProjection) {
         self.feature_map = Some(FeatureMap::new(projection, &self.basis));
     }
 
@@ -58,7 +58,7 @@ impl AnyNetwork {
         }
     }
 
-    pub fn projection(&self) -> Option<&Projection> {
+    pub fn projection(&self) -> Option<&GraceProjection> {
         match self {
             Self::Double(network) => network.projection(),
             Self::Mixed(network) => network.projection(),
@@ -66,7 +66,7 @@ impl AnyNetwork {
     }
 
     /// `projection` must fit the basis.
-    pub fn set_projection(&mut self, projection: Projection) {
+    pub fn set_projection(&mut self, projection: GraceProjection) {
         match self {
             Self::Double(network) => Arc::make_mut(network).set_projection(projection),
             Self::Mixed(network) => Arc::make_mut(network).set_projection(projection),

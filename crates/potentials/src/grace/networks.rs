@@ -1,19 +1,19 @@
 //! Reads the perceptrons of a model: those of the radial functions and of the energy.
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::error::{GraceError, mismatch};
 use super::matrix::Matrix;
 use super::radial::column_by_order;
 use super::radial_network::RadialNetwork;
-use super::readout::{Activation, Block, Readout};
+use super::readout::{Activation, Readout, ReadoutBlock};
 use super::shared_reader::Embedding;
 use super::vector::{Double, Vector, to_lanes};
 use super::weights::with_transpose;
 
 /// The network `prefix` for channels × (lmax + 1) radial functions, with channels padded to whole vectors `V`.
 pub(super) fn radial_network<V: Vector>(
-    archive: &Archive,
+    archive: &NpzFile,
     prefix: &str,
     lmax: usize,
     channels: usize,
@@ -54,7 +54,7 @@ pub(super) fn radial_network<V: Vector>(
 /// The network of layer `name` in a three-layer model. Its inputs are the polynomials and the embeddings of
 /// centre and neighbour; all layers but the last have a bias.
 pub(super) fn enveloped_network<V: Vector>(
-    archive: &Archive,
+    archive: &NpzFile,
     name: &str,
     lmax: usize,
     channels: usize,
@@ -93,7 +93,7 @@ pub(super) fn enveloped_network<V: Vector>(
 /// The layer whose columns are radial functions, padded to whole vectors `V`; row-major `[channel, l]` in the
 /// file.
 fn last_radial_layer<V: Vector>(
-    archive: &Archive,
+    archive: &NpzFile,
     key: &str,
     [inputs, outputs]: [usize; 2],
     lmax: usize,
@@ -111,7 +111,7 @@ fn last_radial_layer<V: Vector>(
 }
 
 /// Number of outputs of a dense layer, and its weights times their norm, row-major `[inputs, outputs]`.
-fn dense(archive: &Archive, prefix: &str, k: usize, inputs: usize) -> Result<(usize, Vec<f64>), GraceError> {
+fn dense(archive: &NpzFile, prefix: &str, k: usize, inputs: usize) -> Result<(usize, Vec<f64>), GraceError> {
     let key = format!("{prefix}_W{k}");
     let ([rows, outputs], mut weights) = archive.tensor::<2>(&key)?;
     if rows != inputs {
@@ -124,8 +124,8 @@ fn dense(archive: &Archive, prefix: &str, k: usize, inputs: usize) -> Result<(us
 
 /// The readout of the densities of all layers' `blocks`, which must agree in number.
 pub(super) fn readout<V: Vector>(
-    archive: &Archive,
-    blocks: Vec<Block<V>>,
+    archive: &NpzFile,
+    blocks: Vec<ReadoutBlock<V>>,
     n_densities: usize,
     n_elements: usize,
     weights: &mut usize,

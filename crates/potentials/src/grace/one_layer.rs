@@ -4,20 +4,20 @@
 //!
 //! The energy uses the invariants up to the model's maximum order.
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::builder::{ModelBuilder, ModelParts};
 use super::description::Architecture;
 use super::error::GraceError;
 use super::graph::Graph;
-use super::layer::{LayerDraft, Message};
+use super::layer::{LayerDraft, LayerMessage};
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
-use super::readout::Block;
+use super::readout::ReadoutBlock;
 use super::shared_reader::{Embedding, Powers, cutoffs, elements, reject_unsupported_radial_variants};
 use super::vector::Vector;
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
     reject_unsupported_radial_variants(archive, "mlp_rad", "A")?;
     let lmax = archive.count("lmax", 0, 12)?;
@@ -35,9 +35,9 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Mod
     let mut graph = Graph::new(archive, "A", (lmax + 1) * (lmax + 1), channels)?;
     let a = graph.density();
     Powers { letter: "A", third_with_mixed: true, taken_by: &["rho"] }.make(&mut graph, a)?;
-    let block = Block { weights: graph.invariants("rho", elements.len())?, norm: None };
+    let block = ReadoutBlock { weights: graph.invariants("rho", elements.len())?, norm: None };
     let radial = RadialFunctions::new(network, elements.len(), cutoffs, path);
-    let message = Message { from: None, components: 1, constants };
+    let message = LayerMessage { from: None, components: 1, constants };
     let n_densities = archive.count("rho_n_out", 1, 4096)?;
     ModelBuilder {
         archive,

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 
-use super::evaluate::{Evaluator, Grade, PullBack};
+use super::evaluate::{Evaluator, GradeFunction, PullBack};
 use super::instructions::Instructions;
 use super::model::GraceModel;
 use super::network::AnyNetwork;
@@ -82,7 +82,7 @@ impl Grace {
         &mut self,
         structure: &Structure,
         neighbours: &NeighbourList,
-        grade: &Grade,
+        grade: &GradeFunction,
         energy: &mut Evaluation,
         pull_back: Option<&mut PullBack>,
     ) -> Result<(), PotentialError> {

@@ -76,7 +76,7 @@ impl<V: Vector> Product<V> {
         }
     }
 
-    /// As [`super::tape::Operation::keep`].
+    /// As [`super::tape::TapeOperation::keep`].
     pub fn keep(&mut self, needed: &mut [bool]) {
         self.outputs.retain(|output| needed[output.row]);
         for term in self.outputs.iter().flat_map(|output| &output.terms) {
@@ -86,7 +86,7 @@ impl<V: Vector> Product<V> {
         self.inputs = self.derivatives();
     }
 
-    /// As [`super::tape::Operation::rename`].
+    /// As [`super::tape::TapeOperation::rename`].
     pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32, of_cotangent: impl Fn(u32) -> u32) {
         for output in &mut self.outputs {
             output.row = on_tape(output.row as u32) as usize;
@@ -218,7 +218,7 @@ impl<V: Vector> Combination<V> {
         }
     }
 
-    /// As [`super::tape::Operation::keep`].
+    /// As [`super::tape::TapeOperation::keep`].
     pub fn keep(&mut self, needed: &mut [bool]) {
         self.outputs.retain(|(row, _)| needed[*row as usize]);
         for (from, _) in self.outputs.iter().flat_map(|(_, terms)| terms) {
@@ -226,7 +226,7 @@ impl<V: Vector> Combination<V> {
         }
     }
 
-    /// As [`super::tape::Operation::rename`].
+    /// As [`super::tape::TapeOperation::rename`].
     pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32, of_cotangent: impl Fn(u32) -> u32) {
         self.cotangents = renamed::<V>(&self.outputs, of_cotangent);
         self.outputs = renamed::<V>(&self.outputs, on_tape);

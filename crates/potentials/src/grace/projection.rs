@@ -2,13 +2,13 @@
 
 use std::ops::Range;
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::basis::BasisLayout;
 use super::batches::Chunk;
-use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
+use super::chunked_slices::{ChunkedSlice, PlaceLayout, SplitByChunk};
 use super::instructions::Instructions;
-use super::matrix::{Factors, Matrix, Rows};
+use super::matrix::{Factors, Matrix, StridedRows};
 use super::vector::{Number, Vector};
 use super::weights::with_transpose;
 
@@ -21,7 +21,7 @@ const SQUARE_FLOOR: f64 = 1e-30;
 /// The feature map of a model: z = (T(B̂ R), s log(‖B‖ + ε_0), s log(‖B_1‖ + ε_0), …) with
 /// B̂ = B / (‖B‖ + ε_0), ‖B‖ = √(Σ B² + 10⁻³⁰) and ε_0 = 10⁻¹².
 #[derive(Clone, Debug, PartialEq)]
-pub struct Projection {
+pub struct GraceProjection {
     /// R as stored, row-major `[D_basis, d]`.
     pub matrix: Vec<f32>,
     /// d, the number of projected features.
@@ -95,7 +95,7 @@ impl<V: Vector> ProjectionWork<V> {
 
     /// The slices of all atoms, which can be split.
     pub fn parts(&mut self, map: &FeatureMap<V>) -> Projected<'_, V> {
-        let (even, projection) = (Layout::Even, &map.projection);
+        let (even, projection) = (PlaceLayout::Even, &map.projection);
         Projected {
             projected: ChunkedSlice::new(even(map.lanes()), 0, &mut self.projected[..]),
             norms: ChunkedSlice::new(even(projection.n_norms()), 0, &mut self.norms[..]),
@@ -115,7 +115,7 @@ impl<V: Send> SplitByChunk for Projected<'_, V> {
     }
 }
 
-impl Projection {
+impl GraceProjection {
     /// D, the dimension of z.
     pub fn feature_dimension(&self) -> usize {
         self.dimension + if self.density_channels { self.n_norms() } else { 0 }
@@ -136,7 +136,7 @@ impl Projection {
 /// A projection with its matrix in the layout of the passes over atoms.
 #[derive(Clone, Debug)]
 pub(super) struct FeatureMap<V> {
-    pub projection: Projection,
+    pub projection: GraceProjection,
     /// For the basis of each layer.
     maps: Vec<ProjectionMaps<V>>,
     /// The layers in the order of their norms in z.
@@ -145,8 +145,8 @@ pub(super) struct FeatureMap<V> {
 
 impl<V: Vector> FeatureMap<V> {
     /// `projection` must fit the basis.
-    pub fn new(projection: Projection, basis: &BasisLayout) -> Self {
-        let Projection { matrix, dimension, .. } = &projection;
+    pub fn new(projection: GraceProjection, basis: &BasisLayout) -> Self {
+        let GraceProjection { matrix, dimension, .. } = &projection;
         let maps = basis.rows.iter().map(|rows| ProjectionMaps::new(matrix, *dimension, rows)).collect();
         Self { maps, blocks: basis.blocks.clone(), projection }
     }
@@ -184,7 +184,7 @@ impl<V: Vector> FeatureMap<V> {
                 norms[0] += square;
                 norms[layer + 1] += square;
             }
-            let (from, to) = (Rows::of_atoms(n, of_atom), Rows::of_atoms(n, lanes));
+            let (from, to) = (StridedRows::of_atoms(n, of_atom), StridedRows::of_atoms(n, lanes));
             maps.forward.multiply_add((bases, &mut *all_projected), from, to, instructions);
         }
         all_norms.iter_mut().for_each(|square| *square = square.sqrt());
@@ -239,8 +239,8 @@ impl<V: Vector> FeatureMap<V> {
         instructions: Instructions,
     ) {
         let (maps, stride) = (&self.maps[layer], self.projection.n_norms());
-        let from = Rows::of_atoms(places.len(), self.lanes());
-        let to = Rows::of_atoms(places.len(), maps.forward.input_lanes());
+        let from = StridedRows::of_atoms(places.len(), self.lanes());
+        let to = StridedRows::of_atoms(places.len(), maps.forward.input_lanes());
         let factors = Factors { numbers: &work.norms.slice(places)[layer + 1..], stride };
         let lanes = (&*work.projected.slice(places), bases);
         maps.transposed.scale_multiply_add(lanes, from, (to, factors), instructions);
@@ -253,7 +253,7 @@ impl<V: Vector> FeatureMap<V> {
 }
 
 /// Whether an export has a projection of the features.
-pub(super) fn has_projection(archive: &Archive) -> bool {
+pub(super) fn has_projection(archive: &NpzFile) -> bool {
     archive.contains("uq_schema_version")
 }
 

@@ -1,7 +1,7 @@
 //! The network on a Chebyshev basis that gives the radial functions, with two derivatives, in double precision.
 
 use super::instructions::Instructions;
-use super::matrix::{Matrix, Rows};
+use super::matrix::{Matrix, StridedRows};
 use super::vector::{Double, Vector, lanes_for};
 
 /// x ↦ silu(W_k … silu(W_1 g + b_1) + b_k), where g_k(r) = T_k(x) f_p(u), u = r/r_c, x = 2u − 1, k = 1 …, and
@@ -43,7 +43,7 @@ impl RadialNetwork {
             for (input, output) in work.input.iter().zip(&mut work.output) {
                 output.clear();
                 output.resize(layer.output_lanes(), Double::ZERO);
-                let row = Rows::of_atoms(1, 0);
+                let row = StridedRows::of_atoms(1, 0);
                 layer.multiply_add((&input[..], &mut output[..]), row, row, instructions);
             }
             let bias = if k == 0 { self.pair_biases.get(pair) } else { self.biases.get(k) };

@@ -1,6 +1,6 @@
 //! Tables of radial functions: splines of degree seven.
 
-use super::instructions::{Instructions, Pass};
+use super::instructions::{Instructions, SimdPass};
 use super::radial_network::{RadialNetwork, RadialWork};
 use super::vector::{Double, Number, Vector, to_lanes};
 
@@ -172,7 +172,7 @@ struct One<'a, V> {
     derivatives: &'a mut [V],
 }
 
-impl<V: Vector> Pass for One<'_, V> {
+impl<V: Vector> SimdPass for One<'_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
         let (interval, t) = self.table.locate(self.r);

@@ -1,8 +1,8 @@
 //! From the invariant basis to atomic energies.
 
 use super::invariant_norm::InvariantNorm;
-use super::matrix::{Matrix, Rows};
-use super::tape::Batch;
+use super::matrix::{Matrix, StridedRows};
+use super::tape::AtomBatch;
 use super::vector::{Number, Vector};
 use super::weights::Weights;
 
@@ -37,7 +37,7 @@ impl Activation {
 #[derive(Clone, Debug)]
 pub(super) struct Readout<V> {
     /// Densities of each layer.
-    pub blocks: Vec<Block<V>>,
+    pub blocks: Vec<ReadoutBlock<V>>,
     /// Layers of the perceptron with their transposes. The first also has an input for y_0 with zero weights,
     /// so that it can read y unchanged.
     pub layers: Vec<(Matrix<V>, Matrix<V>)>,
@@ -51,14 +51,14 @@ pub(super) struct Readout<V> {
 
 /// The densities of one layer.
 #[derive(Clone, Debug)]
-pub(super) struct Block<V> {
+pub(super) struct ReadoutBlock<V> {
     /// W
     pub weights: Weights<V>,
     /// Absent in one-layer models.
     pub norm: Option<InvariantNorm>,
 }
 
-impl<V: Vector> Block<V> {
+impl<V: Vector> ReadoutBlock<V> {
     /// Lanes of the densities.
     #[inline(always)]
     pub fn lanes(&self) -> usize {
@@ -82,7 +82,7 @@ pub(super) struct ReadoutWork<V> {
 impl<V: Vector> Readout<V> {
     /// Lanes of y.
     pub fn density_lanes(&self) -> usize {
-        self.blocks.first().map_or(0, Block::lanes)
+        self.blocks.first().map_or(0, ReadoutBlock::lanes)
     }
 
     /// Starts a batch of this many atoms.
@@ -99,14 +99,14 @@ impl<V: Vector> Readout<V> {
     pub fn add_densities(
         &self,
         layer: usize,
-        batch: &Batch,
+        batch: &AtomBatch,
         basis: (&[V], usize),
         work: &mut ReadoutWork<V>,
     ) {
         let (block, lanes, atoms) = (&self.blocks[layer], self.density_lanes(), batch.atoms);
         let densities = &mut work.densities[layer];
         zeros(densities, atoms * lanes);
-        let (from, to) = (Rows::of_atoms(atoms, basis.1), Rows::of_atoms(atoms, lanes));
+        let (from, to) = (StridedRows::of_atoms(atoms, basis.1), StridedRows::of_atoms(atoms, lanes));
         let weights = block.weights.forward(batch.element);
         weights.multiply_add((basis.0, &mut densities[..]), from, to, batch.instructions);
         let rows = densities.chunks_exact(lanes).zip(work.values[0].chunks_exact_mut(lanes));
@@ -120,13 +120,13 @@ impl<V: Vector> Readout<V> {
 
     /// The energies of the atoms, eV, after all layers have added their densities; leaves ∂E/∂y in `work`.
     #[inline(always)]
-    pub fn evaluate(&self, batch: &Batch, energies: &mut [f64], work: &mut ReadoutWork<V>) {
+    pub fn evaluate(&self, batch: &AtomBatch, energies: &mut [f64], work: &mut ReadoutWork<V>) {
         let atoms = batch.atoms;
         for (k, (layer, _)) in self.layers.iter().enumerate() {
             let (before, after) = work.values.split_at_mut(k + 1);
             zeros(&mut after[0], atoms * layer.output_lanes());
-            let from = Rows::of_atoms(atoms, layer.input_lanes());
-            let to = Rows::of_atoms(atoms, layer.output_lanes());
+            let from = StridedRows::of_atoms(atoms, layer.input_lanes());
+            let to = StridedRows::of_atoms(atoms, layer.output_lanes());
             layer.multiply_add((&before[k][..], &mut after[0][..]), from, to, batch.instructions);
             if k + 1 < self.layers.len() {
                 zeros(&mut work.slopes[k], atoms * layer.output_lanes());
@@ -149,7 +149,7 @@ impl<V: Vector> Readout<V> {
 
     /// Writes ∂E/∂y to `work.cotangent`.
     #[inline(always)]
-    fn backward(&self, batch: &Batch, work: &mut ReadoutWork<V>) {
+    fn backward(&self, batch: &AtomBatch, work: &mut ReadoutWork<V>) {
         let (atoms, lanes) = (batch.atoms, self.density_lanes());
         zeros(&mut work.cotangent, atoms);
         work.cotangent.iter_mut().for_each(|cotangent| cotangent[0] = V::Number::round(self.scale));
@@ -164,7 +164,7 @@ impl<V: Vector> Readout<V> {
 
     /// Goes back through the first `layers` layers of the perceptron: replaces the cotangent of what they give with that of y.
     #[inline(always)]
-    fn reverse(&self, layers: usize, batch: &Batch, work: &mut ReadoutWork<V>) {
+    fn reverse(&self, layers: usize, batch: &AtomBatch, work: &mut ReadoutWork<V>) {
         let atoms = batch.atoms;
         for (k, (_, transposed)) in self.layers[..layers].iter().enumerate().rev() {
             if k + 1 < self.layers.len() {
@@ -172,8 +172,8 @@ impl<V: Vector> Readout<V> {
                 cotangent.zip(V::flat(&work.slopes[k])).for_each(|(c, slope)| *c *= *slope);
             }
             zeros(&mut work.swap, atoms * transposed.output_lanes());
-            let from = Rows::of_atoms(atoms, transposed.input_lanes());
-            let to = Rows::of_atoms(atoms, transposed.output_lanes());
+            let from = StridedRows::of_atoms(atoms, transposed.input_lanes());
+            let to = StridedRows::of_atoms(atoms, transposed.output_lanes());
             transposed.multiply_add((&work.cotangent[..], &mut work.swap[..]), from, to, batch.instructions);
             std::mem::swap(&mut work.swap, &mut work.cotangent);
         }
@@ -192,7 +192,7 @@ impl<V: Vector> Readout<V> {
 
     /// These numbers after [`Readout::evaluate`], `[atoms, D_h]`.
     #[inline(always)]
-    pub fn hidden(&self, batch: &Batch, out: &mut [f64], work: &ReadoutWork<V>) {
+    pub fn hidden(&self, batch: &AtomBatch, out: &mut [f64], work: &ReadoutWork<V>) {
         let (hidden, first) = (self.hidden_layers(), usize::from(self.hidden_layers() > 0));
         for (atom, out) in out.chunks_exact_mut(self.hidden_dimension()).enumerate() {
             out[0] = row(&work.values[0], batch.atoms, atom)[0].into();
@@ -203,7 +203,7 @@ impl<V: Vector> Readout<V> {
 
     /// Replaces ∂E/∂y in `work` with the cotangent of y from that of these numbers, `[atoms, D_h]`.
     #[inline(always)]
-    pub fn hidden_backward(&self, batch: &Batch, cotangent: &[f64], work: &mut ReadoutWork<V>) {
+    pub fn hidden_backward(&self, batch: &AtomBatch, cotangent: &[f64], work: &mut ReadoutWork<V>) {
         let (hidden, first) = (self.hidden_layers(), usize::from(self.hidden_layers() > 0));
         let lanes = work.values[hidden].len();
         zeros(&mut work.cotangent, lanes);

@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
 use super::linear::{Linear, LinearPart};
-use super::tape::{Operation, Tensor};
+use super::tape::{TapeOperation, Tensor};
 use super::vector::Vector;
 use super::weights::Weights;
 
 /// The part of a reduction that reads one tensor.
-struct Source {
+struct ReductionSource {
     name: String,
     tensor: Tensor,
     /// The components to read,
@@ -29,12 +29,12 @@ struct Source {
 struct Reduction {
     n_types: usize,
     n_out: usize,
-    sources: Vec<Source>,
+    sources: Vec<ReductionSource>,
 }
 
 impl Reduction {
     /// W_kn of this tile for the central atom's element `t`.
-    fn weight(&self, source: &Source, tile: usize, [t, n, k]: [usize; 3]) -> f64 {
+    fn weight(&self, source: &ReductionSource, tile: usize, [t, n, k]: [usize; 3]) -> f64 {
         source.weights[((t * self.n_out + k) * source.tensor.channels + n) * source.n_tiles + tile]
     }
 }
@@ -50,7 +50,7 @@ impl<V: Vector> Graph<'_, V> {
         }
         let reduction = self.reduction(prefix, n_elements, 1)?;
         // Source, tile and channel of each index of the padded basis; `None` for padding.
-        let mut places: Vec<Option<(&Source, usize, usize)>> = Vec::new();
+        let mut places: Vec<Option<(&ReductionSource, usize, usize)>> = Vec::new();
         for source in &reduction.sources {
             for (component, tile) in source.collect.iter().zip(&source.tiles) {
                 self.basis.push((source.tensor.row(*component), source.tensor.width));
@@ -96,7 +96,7 @@ impl<V: Vector> Graph<'_, V> {
                 parts.push(LinearPart::new(weights, rows));
             }
         }
-        self.operations.push(Operation::Linear(Linear { parts }));
+        self.operations.push(TapeOperation::Linear(Linear { parts }));
         Ok(out)
     }
 
@@ -137,7 +137,7 @@ impl<V: Vector> Graph<'_, V> {
         [n_types, n_out, by_element]: [usize; 3],
         components: usize,
         norm: f64,
-    ) -> Result<Source, GraceError> {
+    ) -> Result<ReductionSource, GraceError> {
         let archive = self.archive;
         let key = |suffix: &str| format!("{prefix}_{suffix}_{name}");
         let weights_key = format!("{prefix}_reduce_{name}_W");
@@ -160,6 +160,14 @@ impl<V: Vector> Graph<'_, V> {
         self.weights += weights.len();
         let norm = norm * archive.scalar(&format!("{prefix}_reduce_{name}_norm"))?;
         weights.iter_mut().for_each(|w| *w *= norm);
-        Ok(Source { name: name.to_owned(), tensor, collect, tiles, sums, n_tiles: shape[3], weights })
+        Ok(ReductionSource {
+            name: name.to_owned(),
+            tensor,
+            collect,
+            tiles,
+            sums,
+            n_tiles: shape[3],
+            weights,
+        })
     }
 }

@@ -5,8 +5,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::tape::{Operation, Tensor};
-use super::tape_program::{Gather, Gathered, Ranges, Step, TapeProgram};
+use super::tape::{TapeOperation, Tensor};
+use super::tape_program::{Gather, Gathered, Ranges, TapeProgram, TapeStep};
 use super::vector::Vector;
 
 /// The allocated lanes of the graph's rows.
@@ -44,7 +44,7 @@ impl Registers {
 /// tensors `whole` stay contiguous, among them `message`, which receives its lanes. `basis` lists the first
 /// lanes and widths of the basis rows.
 pub(super) fn allocate<V: Vector>(
-    operations: Vec<Operation<V>>,
+    operations: Vec<TapeOperation<V>>,
     widths: &[usize],
     whole: Vec<Tensor>,
     basis: &[(usize, usize)],
@@ -53,7 +53,7 @@ pub(super) fn allocate<V: Vector>(
     let given = given(&operations, basis);
     let fixed = fixed(&operations, whole, &given, widths);
     let (fixed_lanes, mut tape, mut cotangents) = (fixed.end, fixed.clone(), fixed);
-    for row in operations.iter().flat_map(Operation::factors) {
+    for row in operations.iter().flat_map(TapeOperation::factors) {
         tape.take(row, widths[row]);
     }
     let kept_lanes = tape.end;
@@ -61,14 +61,14 @@ pub(super) fn allocate<V: Vector>(
     let fresh = along_cotangents(&operations, &mut cotangents, fixed_lanes, widths);
 
     let gather = |made_here: &dyn Fn(usize) -> bool| gather(basis, made_here, &tape, &cotangents);
-    let step = |(mut operation, fresh): (Operation<V>, Vec<usize>)| {
+    let step = |(mut operation, fresh): (TapeOperation<V>, Vec<usize>)| {
         let made = operation.writes();
-        let is_sum = matches!(operation, Operation::Linear(_));
+        let is_sum = matches!(operation, TapeOperation::Linear(_));
         let sums = if is_sum { ranges(made.clone(), &tape, widths) } else { Ranges::default() };
         let lane = |places: &Registers, row: u32| places.of[&(row as usize)] as u32;
         operation.rename(|row| lane(&tape, row), |row| lane(&cotangents, row));
         let (fresh, basis) = (ranges(fresh, &cotangents, widths), gather(&|row| made.contains(&row)));
-        Step { operation, sums, fresh, basis }
+        TapeStep { operation, sums, fresh, basis }
     };
     if let Some(message) = message {
         message.start = tape.of[&message.start];
@@ -87,13 +87,13 @@ pub(super) fn allocate<V: Vector>(
 /// Allocates the contiguous rows at the start of both tapes, in graph order: those of the tensors `whole`, of
 /// normalised tensors, and those that no operation produces.
 fn fixed<V: Vector>(
-    operations: &[Operation<V>],
+    operations: &[TapeOperation<V>],
     mut whole: Vec<Tensor>,
     given: &BTreeSet<usize>,
     widths: &[usize],
 ) -> Registers {
     for operation in operations {
-        if let Operation::EquivariantNorm(norm) = operation {
+        if let TapeOperation::EquivariantNorm(norm) = operation {
             whole.extend([norm.from, norm.to]);
         }
     }
@@ -106,14 +106,19 @@ fn fixed<V: Vector>(
 }
 
 /// Rows that are read or belong to the basis, but that no operation produces.
-fn given<V: Vector>(operations: &[Operation<V>], basis: &[(usize, usize)]) -> BTreeSet<usize> {
-    let made: BTreeSet<usize> = operations.iter().flat_map(Operation::writes).collect();
-    let taken = operations.iter().flat_map(Operation::reads).chain(basis.iter().map(|(row, _)| *row));
+fn given<V: Vector>(operations: &[TapeOperation<V>], basis: &[(usize, usize)]) -> BTreeSet<usize> {
+    let made: BTreeSet<usize> = operations.iter().flat_map(TapeOperation::writes).collect();
+    let taken = operations.iter().flat_map(TapeOperation::reads).chain(basis.iter().map(|(row, _)| *row));
     taken.filter(|row| !made.contains(row)).collect()
 }
 
 /// Forward, a row that does not start before `kept` keeps its lanes until its last read.
-fn along_tape<V: Vector>(operations: &[Operation<V>], places: &mut Registers, kept: usize, widths: &[usize]) {
+fn along_tape<V: Vector>(
+    operations: &[TapeOperation<V>],
+    places: &mut Registers,
+    kept: usize,
+    widths: &[usize],
+) {
     let uses = operations.iter().enumerate();
     let last: BTreeMap<usize, usize> =
         uses.flat_map(|(k, operation)| operation.reads().into_iter().map(move |row| (row, k))).collect();
@@ -131,7 +136,7 @@ fn along_tape<V: Vector>(operations: &[Operation<V>], places: &mut Registers, ke
 /// In reverse, a cotangent has lanes from the first contribution to it until its row's own operation. Returns
 /// the rows that each operation allocates.
 fn along_cotangents<V: Vector>(
-    operations: &[Operation<V>],
+    operations: &[TapeOperation<V>],
     places: &mut Registers,
     fixed: usize,
     widths: &[usize],
@@ -173,21 +178,21 @@ fn gather(
 mod tests {
     use super::super::instructions::Instructions;
     use super::super::product::{Combination, Coupled, Product, Term};
-    use super::super::tape::Batch;
+    use super::super::tape::AtomBatch;
     use super::super::vector::{Double, Vector};
     use super::*;
 
     /// to = factor · from
-    fn multiple(to: u32, from: u32, factor: f64) -> Operation<Double> {
-        Operation::Combination(Combination::new(1, 8, vec![(to, vec![(from, factor)])]))
+    fn multiple(to: u32, from: u32, factor: f64) -> TapeOperation<Double> {
+        TapeOperation::Combination(Combination::new(1, 8, vec![(to, vec![(from, factor)])]))
     }
 
-    fn square(to: usize, from: u32) -> Operation<Double> {
+    fn square(to: usize, from: u32) -> TapeOperation<Double> {
         let terms = vec![Term { left: from, right: from, coefficient: 1.0 }];
         let outputs = vec![Coupled { row: to, terms }];
         let mut product = Product { width: 1, channels: 8, outputs, inputs: Vec::new() };
         product.keep(&mut [true; 5]);
-        Operation::Product(product)
+        TapeOperation::Product(product)
     }
 
     /// x → 2x → 6x → 36x² → −36x²
@@ -208,7 +213,7 @@ mod tests {
     #[test]
     fn nothing_that_stood_there_before_is_seen() {
         let steps = chain();
-        let batch = Batch { element: 0, atoms: 2, instructions: Instructions::best() };
+        let batch = AtomBatch { element: 0, atoms: 2, instructions: Instructions::best() };
         let mut tape = vec![Double::splat(f64::NAN); 2 * steps.tape_lanes];
         let mut cotangent = vec![Double::splat(f64::NAN); 4 * steps.cotangent_lanes];
         tape[..2].copy_from_slice(&[Double::splat(0.5), Double::splat(-1.0)]);

@@ -7,12 +7,12 @@ use std::collections::BTreeMap;
 
 use super::linear::Linear;
 use super::product::Term;
-use super::tape::Operation;
+use super::tape::TapeOperation;
 use super::vector::Vector;
 
 /// The operations in pieces, depth first from those whose results no other piece reads.
-pub(super) fn depth_first<V: Vector>(operations: Vec<Operation<V>>) -> Vec<Operation<V>> {
-    let pieces: Vec<Operation<V>> = operations.into_iter().flat_map(divided).collect();
+pub(super) fn depth_first<V: Vector>(operations: Vec<TapeOperation<V>>) -> Vec<TapeOperation<V>> {
+    let pieces: Vec<TapeOperation<V>> = operations.into_iter().flat_map(divided).collect();
     let needs = needs(&pieces);
     let mut taken = vec![false; pieces.len()];
     needs.iter().flatten().for_each(|k| taken[*k] = true);
@@ -20,16 +20,16 @@ pub(super) fn depth_first<V: Vector>(operations: Vec<Operation<V>>) -> Vec<Opera
     for last in (0..pieces.len()).filter(|k| !taken[*k]) {
         visit(last, &needs, &mut visited, &mut order);
     }
-    let mut pieces: Vec<Option<Operation<V>>> = pieces.into_iter().map(Some).collect();
+    let mut pieces: Vec<Option<TapeOperation<V>>> = pieces.into_iter().map(Some).collect();
     order.into_iter().filter_map(|k| pieces[k].take()).collect()
 }
 
 /// For each piece, the pieces whose rows it reads.
-fn needs<V: Vector>(pieces: &[Operation<V>]) -> Vec<Vec<usize>> {
+fn needs<V: Vector>(pieces: &[TapeOperation<V>]) -> Vec<Vec<usize>> {
     let writes =
         pieces.iter().enumerate().flat_map(|(k, piece)| piece.writes().into_iter().map(move |row| (row, k)));
     let makers: BTreeMap<usize, usize> = writes.collect();
-    let needs = |piece: &Operation<V>| {
+    let needs = |piece: &TapeOperation<V>| {
         let mut needs: Vec<usize> = piece.reads().iter().filter_map(|row| makers.get(row).copied()).collect();
         needs.dedup();
         needs
@@ -47,16 +47,16 @@ fn visit(k: usize, needs: &[Vec<usize>], visited: &mut [bool], order: &mut Vec<u
 
 /// The parts of a linear map that add to different rows, and groups of a product's results that share no
 /// factor.
-fn divided<V: Vector>(operation: Operation<V>) -> Vec<Operation<V>> {
+fn divided<V: Vector>(operation: TapeOperation<V>) -> Vec<TapeOperation<V>> {
     match operation {
-        Operation::Linear(Linear { parts }) => {
+        TapeOperation::Linear(Linear { parts }) => {
             let groups = connected(parts, |part| part.tape[1].clone());
-            groups.into_iter().map(|parts| Operation::Linear(Linear { parts })).collect()
+            groups.into_iter().map(|parts| TapeOperation::Linear(Linear { parts })).collect()
         }
-        Operation::Product(product) => {
+        TapeOperation::Product(product) => {
             let rows = |terms: &[Term<V>]| terms.iter().flat_map(|t| [t.left, t.right]).collect();
             let groups = connected(product.outputs.clone(), |output| rows(&output.terms));
-            groups.into_iter().map(|outputs| Operation::Product(product.with_outputs(outputs))).collect()
+            groups.into_iter().map(|outputs| TapeOperation::Product(product.with_outputs(outputs))).collect()
         }
         whole => vec![whole],
     }

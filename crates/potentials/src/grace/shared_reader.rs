@@ -1,14 +1,14 @@
 //! Reads what models of all depths share: elements, switches, cutoffs, embeddings, and the order of products.
 
 use atoms::Species;
-use npz::Archive;
+use npz::NpzFile;
 
 use super::error::{GraceError, mismatch, unsupported};
 use super::graph::Graph;
 use super::tape::Tensor;
 use super::vector::{Double, Vector, to_lanes};
 
-pub(super) fn elements(archive: &Archive) -> Result<Vec<Species>, GraceError> {
+pub(super) fn elements(archive: &NpzFile) -> Result<Vec<Species>, GraceError> {
     let names = archive.strings("element_names")?;
     archive.count("n_elements", 1, 118)?;
     archive.expect_count("n_elements", names.len())?;
@@ -24,7 +24,7 @@ pub(super) fn elements(archive: &Archive) -> Result<Vec<Species>, GraceError> {
 
 /// Rejects a file in which one of these switches is present with an unsupported value.
 pub(super) fn reject_unsupported_variants(
-    archive: &Archive,
+    archive: &NpzFile,
     switches: &[(&str, usize, &str)],
 ) -> Result<(), GraceError> {
     for (key, supported, meaning) in switches {
@@ -37,7 +37,7 @@ pub(super) fn reject_unsupported_variants(
 
 /// Checks the switches of one radial network, one sum over neighbours and the whole file.
 pub(super) fn reject_unsupported_radial_variants(
-    archive: &Archive,
+    archive: &NpzFile,
     network: &str,
     density: &str,
 ) -> Result<(), GraceError> {
@@ -59,7 +59,7 @@ pub(super) fn reject_unsupported_radial_variants(
 }
 
 /// Rejects a file with unread arrays other than those of the mixture.
-pub(super) fn reject_unread_arrays(archive: &Archive, depth: &str) -> Result<(), GraceError> {
+pub(super) fn reject_unread_arrays(archive: &NpzFile, depth: &str) -> Result<(), GraceError> {
     let mut left_over = archive.unread();
     left_over.retain(|name| !name.starts_with("uq_"));
     if left_over.is_empty() {
@@ -75,7 +75,7 @@ pub(super) fn reject_unread_arrays(archive: &Archive, depth: &str) -> Result<(),
 }
 
 /// r_c for centre and neighbour element, `[n_elements²]`, Å.
-pub(super) fn cutoffs(archive: &Archive, n_elements: usize) -> Result<Vec<f64>, GraceError> {
+pub(super) fn cutoffs(archive: &NpzFile, n_elements: usize) -> Result<Vec<f64>, GraceError> {
     let rcut = archive.scalar("rcut")?;
     let (key, cutoffs) = if archive.count("has_bond_specific_cutoff", 0, 1)? == 1 {
         ("bond_cutoff_map", archive.floats("bond_cutoff_map", &[n_elements, n_elements])?)
@@ -95,7 +95,7 @@ pub(super) struct Embedding {
 }
 
 impl Embedding {
-    pub fn read(archive: &Archive, n_elements: usize, weights: &mut usize) -> Result<Self, GraceError> {
+    pub fn read(archive: &NpzFile, n_elements: usize, weights: &mut usize) -> Result<Self, GraceError> {
         let ([rows, size], values) = archive.tensor::<2>("chem_embedding")?;
         if rows != n_elements {
             let expected = format!("{n_elements} elements");
@@ -133,7 +133,7 @@ impl Embedding {
     /// `scale`.
     pub fn transformed<V: Vector>(
         &self,
-        archive: &Archive,
+        archive: &NpzFile,
         prefix: &str,
         channels: usize,
         scale: f64,
@@ -186,7 +186,7 @@ impl Powers<'_> {
     }
 
     /// 1 for x … 4 for xxxx.
-    fn highest_order(&self, archive: &Archive) -> Result<usize, GraceError> {
+    fn highest_order(&self, archive: &NpzFile) -> Result<usize, GraceError> {
         let (known, mut highest) = (self.names(), 0);
         for reduction in self.taken_by {
             let key = format!("{reduction}_instruction_names");

@@ -6,8 +6,8 @@ use atoms::Vec3;
 
 use super::batch_passes::{Backward, BeginProjectBack, Energies, Forward, Project, ProjectBack};
 use super::batches::Chunk;
-use super::bonds::Bonds;
-use super::chunked_slices::{ChunkedSlice, Layout, PerChunk, SharedSlice};
+use super::bonds::GraceBonds;
+use super::chunked_slices::{ChunkedSlice, PerChunk, PlaceLayout, SharedSlice};
 use super::evaluate::{Evaluator, add};
 use super::layer::Layer;
 use super::layer_passes::{Cotangents, Gradients, LayerInput, LayerState, send};
@@ -44,7 +44,7 @@ impl<V: Vector> Evaluator<V> {
         let here = LayerInput::new(network, k, (bonds, messages, rows));
         let sent = match after.first_mut() {
             Some(next) => {
-                let layout = Layout::Even(network.layers[k + 1].message.lanes());
+                let layout = PlaceLayout::Even(network.layers[k + 1].message.lanes());
                 ChunkedSlice::new(layout, 0, &mut next.messages[..])
             }
             None => ChunkedSlice::empty(),
@@ -74,8 +74,8 @@ impl<V: Vector> Evaluator<V> {
         let Self { network, instructions, batches, layers, scratch, .. } = self;
         let per_atom = network.readout.blocks.len() * network.readout.density_lanes();
         let work = (
-            ChunkedSlice::new(Layout::Even(1), 0, &mut self.energies[..]),
-            ChunkedSlice::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
+            ChunkedSlice::new(PlaceLayout::Even(1), 0, &mut self.energies[..]),
+            ChunkedSlice::new(PlaceLayout::Even(per_atom), 0, &mut self.density_cotangents[..]),
         );
         self.threads.for_each_chunk(
             &batches.chunks,
@@ -134,7 +134,7 @@ impl<V: Vector> Evaluator<V> {
         let (layer, n) = (&network.layers[k], batches.order.len());
         let LayerState { bonds, gradients, returns, message_cotangents, .. } = &mut layers[k];
         let [of_energy, of_features] = &mut self.forces;
-        let even = Layout::Even(1);
+        let even = PlaceLayout::Even(1);
         let forces = [
             ChunkedSlice::new(even, 0, &mut of_energy[..]),
             ChunkedSlice::new(even, 0, &mut of_features[..]),
@@ -156,7 +156,7 @@ impl<V: Vector> Evaluator<V> {
         for (k, sums) in message_cotangents.iter_mut().enumerate().take(N) {
             sums.clear();
             sums.resize(n * lanes, V::ZERO);
-            let sums = ChunkedSlice::new(Layout::Even(lanes), 0, sums);
+            let sums = ChunkedSlice::new(PlaceLayout::Even(lanes), 0, sums);
             let returns = &returns[..batches.chunks.len()];
             self.threads.for_each_chunk(&batches.chunks, sums, &|chunk, mut sums, _| {
                 let sums = sums.slice(&chunk.places);
@@ -203,12 +203,12 @@ fn part<'a, V>(numbers: &'a [V], places: &Range<usize>, of_one: usize) -> &'a [V
 /// The output arrays for `N` cotangents of a layer.
 pub(super) fn gradients_of<'a, V: Vector, const N: usize>(
     layer: &Layer<V>,
-    bonds: &'a Bonds,
+    bonds: &'a GraceBonds,
     chunks: &[Chunk],
     [of_energy, of_features]: &'a mut [Vec<Vec3>; 2],
     returns: &'a mut [ReturnedCotangents<V>],
 ) -> Gradients<'a, V> {
-    let ragged = Layout::Ragged(&bonds.offsets, 1);
+    let ragged = PlaceLayout::Ragged(&bonds.offsets, 1);
     let of_features =
         if N == 1 { ChunkedSlice::empty() } else { ChunkedSlice::new(ragged, 0, &mut of_features[..]) };
     let returns = if layer.message.from.is_some() { returns } else { &mut [] };

@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use atoms::{Cell, NeighbourList, Structure, Vec3};
-use npz::Archive;
+use npz::NpzFile;
 
 use super::error::{GraceError, unsupported};
 use super::model::GraceModel;
@@ -27,7 +27,7 @@ const SITES: [Vec3; 6] = [
 ];
 
 /// Rejects a model if atomic energies change when a cluster is rotated or reflected.
-pub(super) fn require_invariance(archive: &Archive, model: GraceModel) -> Result<GraceModel, GraceError> {
+pub(super) fn require_invariance(archive: &NpzFile, model: GraceModel) -> Result<GraceModel, GraceError> {
     let model = Arc::new(model);
     let mut grace = Grace::new(Arc::clone(&model));
     let here = energies(&mut grace, |x| x);

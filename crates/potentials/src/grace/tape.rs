@@ -45,7 +45,7 @@ impl Tensor {
 
 /// Atoms that are processed together.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Batch {
+pub(super) struct AtomBatch {
     /// Their common element.
     pub element: usize,
     /// Their number.
@@ -55,13 +55,13 @@ pub(super) struct Batch {
 
 /// The slot of an atom, or of one of its cotangents, on a tape.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Slot {
+pub(super) struct TapeSlot {
     pub slot: usize,
     /// Number of slots.
     pub slots: usize,
 }
 
-impl Slot {
+impl TapeSlot {
     /// First lane of a component.
     #[inline(always)]
     pub fn row(self, tensor: &Tensor, component: usize) -> usize {
@@ -71,7 +71,7 @@ impl Slot {
 
 /// An operation on the tape.
 #[derive(Clone, Debug)]
-pub(super) enum Operation<V: Vector> {
+pub(super) enum TapeOperation<V: Vector> {
     /// Mixes channels with weights.
     Linear(Linear<V>),
     /// Couples components, channel by channel.
@@ -82,9 +82,9 @@ pub(super) enum Operation<V: Vector> {
     EquivariantNorm(EquivariantNorm<V>),
 }
 
-impl<V: Vector> Operation<V> {
+impl<V: Vector> TapeOperation<V> {
     #[inline(always)]
-    pub fn forward(&self, batch: &Batch, tape: &mut [V]) {
+    pub fn forward(&self, batch: &AtomBatch, tape: &mut [V]) {
         match self {
             Self::Linear(linear) => linear.forward(batch, tape),
             Self::Product(product) => product.forward(batch.atoms, tape),
@@ -95,7 +95,7 @@ impl<V: Vector> Operation<V> {
 
     /// Adds to `N` cotangents of the inputs.
     #[inline(always)]
-    pub fn backward<const N: usize>(&self, batch: &Batch, tape: &[V], cotangent: &mut [V]) {
+    pub fn backward<const N: usize>(&self, batch: &AtomBatch, tape: &[V], cotangent: &mut [V]) {
         match self {
             Self::Linear(linear) => linear.backward::<N>(batch, cotangent),
             Self::Product(product) => product.backward::<N>(batch.atoms, tape, cotangent),

@@ -1,6 +1,6 @@
 //! Executes the operations of a layer on a batch, forward and in reverse.
 
-use super::tape::{Batch, Operation};
+use super::tape::{AtomBatch, TapeOperation};
 use super::vector::Vector;
 
 /// The operations of a layer in order, with the lanes of all rows on both tapes.
@@ -10,7 +10,7 @@ use super::vector::Vector;
 /// are reused.
 #[derive(Clone, Debug)]
 pub(super) struct TapeProgram<V: Vector> {
-    pub steps: Vec<Step<V>>,
+    pub steps: Vec<TapeStep<V>>,
     /// Basis rows that no operation produces.
     pub given: Gather,
     /// Lanes of the rows with the same position on both tapes, for one slot.
@@ -25,8 +25,8 @@ pub(super) struct TapeProgram<V: Vector> {
 
 /// An operation with what precedes and follows it.
 #[derive(Clone, Debug)]
-pub(super) struct Step<V: Vector> {
-    pub operation: Operation<V>,
+pub(super) struct TapeStep<V: Vector> {
+    pub operation: TapeOperation<V>,
     /// Results that are sums and must be zeroed, on the tape.
     pub sums: Ranges,
     /// Cotangents that receive their first contribution in this step of the reverse pass.
@@ -37,13 +37,13 @@ pub(super) struct Step<V: Vector> {
 
 impl<V: Vector> TapeProgram<V> {
     /// All operations.
-    pub fn operations(&self) -> impl Iterator<Item = &Operation<V>> {
+    pub fn operations(&self) -> impl Iterator<Item = &TapeOperation<V>> {
         self.steps.iter().map(|step| &step.operation)
     }
 
     /// From the sum over neighbours to the basis, one row per atom.
     #[inline(always)]
-    pub fn forward(&self, batch: &Batch, tape: &mut [V], basis: &mut [V]) {
+    pub fn forward(&self, batch: &AtomBatch, tape: &mut [V], basis: &mut [V]) {
         let lanes = self.basis_lanes;
         self.given.forward(batch.atoms, tape, basis, lanes);
         for step in &self.steps {
@@ -55,7 +55,13 @@ impl<V: Vector> TapeProgram<V> {
 
     /// From `N` cotangents of the basis, one row per atom, to those of the sum over neighbours.
     #[inline(always)]
-    pub fn backward<const N: usize>(&self, batch: &Batch, tape: &[V], cotangent: &mut [V], bases: [&[V]; N]) {
+    pub fn backward<const N: usize>(
+        &self,
+        batch: &AtomBatch,
+        tape: &[V],
+        cotangent: &mut [V],
+        bases: [&[V]; N],
+    ) {
         for step in self.steps.iter().rev() {
             step.fresh.clear(N * batch.atoms, cotangent);
             step.basis.backward(batch.atoms, bases, cotangent, self.basis_lanes);

@@ -8,22 +8,22 @@
 //!
 //! The file does not state the factors, so its lists of names must match this graph.
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::builder::{ModelBuilder, ModelParts};
 use super::description::Architecture;
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
-use super::layer::{LayerDraft, Message};
+use super::layer::{LayerDraft, LayerMessage};
 use super::networks::enveloped_network;
 use super::radial::{RadialFunctions, RadialPath};
-use super::readout::Block;
+use super::readout::ReadoutBlock;
 use super::shared_reader::{Embedding, elements, reject_unsupported_variants};
 use super::tape::Tensor;
 use super::two_layers::{expect_list, invariant_norm};
 use super::vector::{Number, Vector};
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
     reject_unsupported_variants(
         archive,
@@ -40,7 +40,8 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Mod
     archive.expect_count("energy_mlp_n_origins", 3)?;
     let mut weights = 0;
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
-    let mut reader = Reader { archive, path, n_elements: elements.len(), n_densities, embedding, weights };
+    let mut reader =
+        ThreeLayerReader { archive, path, n_elements: elements.len(), n_densities, embedding, weights };
     let (mut layers, mut message) = (Vec::new(), None);
     for number in 1..=3 {
         let (layer, sent) = reader.layer(number, message)?;
@@ -61,8 +62,8 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Mod
     .finish()
 }
 
-struct Reader<'a> {
-    archive: &'a Archive,
+struct ThreeLayerReader<'a> {
+    archive: &'a NpzFile,
     path: RadialPath,
     n_elements: usize,
     n_densities: usize,
@@ -70,7 +71,7 @@ struct Reader<'a> {
     weights: usize,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> ThreeLayerReader<'a> {
     /// A layer, from the message of the preceding layer, with its own message.
     fn layer<V: Vector>(
         &mut self,
@@ -99,7 +100,8 @@ impl<'a> Reader<'a> {
         powers(&mut graph, &name, base, self.n_elements)?;
         let norm = Some(invariant_norm(archive, &format!("rho{number}_norm"), self.n_densities)?);
         archive.expect_count(&format!("rho{number}_n_out"), self.n_densities)?;
-        let block = Block { weights: graph.invariants(&format!("rho{number}"), self.n_elements)?, norm };
+        let block =
+            ReadoutBlock { weights: graph.invariants(&format!("rho{number}"), self.n_elements)?, norm };
         let sent = match number {
             3 => None,
             _ => {
@@ -134,12 +136,16 @@ impl<'a> Reader<'a> {
         Ok(RadialFunctions::new(network, self.n_elements, cutoffs, self.path))
     }
 
-    fn scalar_message<V: Vector>(&mut self, name: &str, channels: usize) -> Result<Message<V>, GraceError> {
+    fn scalar_message<V: Vector>(
+        &mut self,
+        name: &str,
+        channels: usize,
+    ) -> Result<LayerMessage<V>, GraceError> {
         let scale = self.archive.scalar(&format!("{name}_inv_avg_n_neigh"))?;
         let prefix = format!("{name}_lin_transform");
         let constants =
             self.embedding.transformed(self.archive, &prefix, channels, scale, &mut self.weights)?;
-        Ok(Message { from: None, components: 1, constants })
+        Ok(LayerMessage { from: None, components: 1, constants })
     }
 
     /// The indicator of the preceding layer, plus the contribution of the neighbour's element to its invariant
@@ -149,7 +155,7 @@ impl<'a> Reader<'a> {
         name: &str,
         channels: usize,
         indicator: Tensor,
-    ) -> Result<Message<V>, GraceError> {
+    ) -> Result<LayerMessage<V>, GraceError> {
         let archive = self.archive;
         if indicator.channels != channels {
             let found = format!("{channels}, where the message has {} channels", indicator.channels);
@@ -163,7 +169,11 @@ impl<'a> Reader<'a> {
         let constants = |row: &Vec<V>| -> Vec<V> {
             mask.iter().flat_map(|m| row.iter().map(|x| x.scaled(V::Number::round(*m)))).collect()
         };
-        Ok(Message { from: Some(indicator), components, constants: rows.iter().map(constants).collect() })
+        Ok(LayerMessage {
+            from: Some(indicator),
+            components,
+            constants: rows.iter().map(constants).collect(),
+        })
     }
 
     /// A_f = Σ W_(y,q),f T_y,q, with 1/(mean number of neighbours).
@@ -209,7 +219,7 @@ fn powers<V: Vector>(
 }
 
 /// Checks that the file lists exactly the operations of this graph.
-fn expect_lists(archive: &Archive) -> Result<(), GraceError> {
+fn expect_lists(archive: &NpzFile) -> Result<(), GraceError> {
     let of_layers = |names: &[&str]| -> Vec<String> {
         (1..=3)
             .flat_map(|layer| names.iter().map(move |name| name.replace('L', &layer.to_string())))

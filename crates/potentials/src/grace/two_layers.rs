@@ -5,7 +5,7 @@
 //! and T_y,q = Σ_j R1 Y_y I_q(j), couples YI_f = Σ C T_y,q, reduces B = (YI, B0), and continues with B as the
 //! first layer does with A. The invariants of both layers are normalised and summed.
 
-use npz::Archive;
+use npz::NpzFile;
 
 use super::block_aliases::{BlockAliases, ignore_aliases};
 use super::builder::{ModelBuilder, ModelParts};
@@ -13,10 +13,10 @@ use super::description::Architecture;
 use super::error::{GraceError, mismatch, unsupported};
 use super::graph::Graph;
 use super::invariant_norm::InvariantNorm;
-use super::layer::{LayerDraft, Message};
+use super::layer::{LayerDraft, LayerMessage};
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
-use super::readout::Block;
+use super::readout::ReadoutBlock;
 use super::shared_reader::{Embedding, Powers, cutoffs, elements, reject_unsupported_radial_variants};
 use super::tape::Tensor;
 use super::vector::Vector;
@@ -24,12 +24,12 @@ use super::vector::Vector;
 const FIRST: Powers = Powers { letter: "A", third_with_mixed: false, taken_by: &["I1", "rho"] };
 const SECOND: Powers = Powers { letter: "B", third_with_mixed: false, taken_by: &["I2"] };
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
     let names = BlockAliases::read(archive)?;
     let mut weights = 0;
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
-    let mut reader = Reader {
+    let mut reader = TwoLayerReader {
         archive,
         path,
         lmax: archive.count("lmax", 0, 12)?,
@@ -56,8 +56,8 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Mod
     .finish()
 }
 
-struct Reader<'a> {
-    archive: &'a Archive,
+struct TwoLayerReader<'a> {
+    archive: &'a NpzFile,
     path: RadialPath,
     lmax: usize,
     n_elements: usize,
@@ -66,7 +66,7 @@ struct Reader<'a> {
     weights: usize,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> TwoLayerReader<'a> {
     /// The layer, its message and the order of its products.
     fn first_layer<V: Vector>(
         &mut self,
@@ -80,11 +80,11 @@ impl<'a> Reader<'a> {
         let order = FIRST.make(&mut graph, a)?;
         graph.reduce("I1", self.n_elements)?;
         let indicator = graph.reduce("I", self.n_elements)?;
-        let block = Block {
+        let block = ReadoutBlock {
             weights: graph.invariants("rho", self.n_elements)?,
             norm: Some(invariant_norm(archive, "I_nl_LN", n_densities)?),
         };
-        let message = Message { from: None, components: 1, constants };
+        let message = LayerMessage { from: None, components: 1, constants };
         Ok((LayerDraft { graph, radial, lmax, message, block }, indicator, order))
     }
 
@@ -105,7 +105,7 @@ impl<'a> Reader<'a> {
             constants.extend(scalar);
         }
         let components = indicator.components + 1;
-        let message = Message { from: Some(indicator), components, constants };
+        let message = LayerMessage { from: Some(indicator), components, constants };
 
         let functions = (lmax + 1) * (lmax + 1);
         let mut graph = Graph::new(archive, "the messages", components * functions, channels)?;
@@ -115,7 +115,7 @@ impl<'a> Reader<'a> {
         self.coupled_messages(&mut graph, indicator.components)?;
         let b = graph.reduce("B", self.n_elements)?;
         let order = SECOND.make(&mut graph, b)?;
-        let block = Block {
+        let block = ReadoutBlock {
             weights: graph.invariants("I2", self.n_elements)?,
             norm: Some(invariant_norm(archive, "I_0_LN", n_densities)?),
         };
@@ -170,7 +170,7 @@ impl<'a> Reader<'a> {
 
 /// The norm `name` of this many densities.
 pub(super) fn invariant_norm(
-    archive: &Archive,
+    archive: &NpzFile,
     name: &str,
     n_densities: usize,
 ) -> Result<InvariantNorm, GraceError> {
@@ -187,7 +187,7 @@ pub(super) fn invariant_norm(
 }
 
 /// Checks that the file lists exactly the operations of the graph.
-fn expect_lists(archive: &Archive, orders: [usize; 2]) -> Result<(), GraceError> {
+fn expect_lists(archive: &NpzFile, orders: [usize; 2]) -> Result<(), GraceError> {
     let [(mut maps, mut products), (more_maps, more_products)] =
         [FIRST.lists(orders[0]), SECOND.lists(orders[1])];
     maps.extend(more_maps);
@@ -208,7 +208,7 @@ fn expect_lists(archive: &Archive, orders: [usize; 2]) -> Result<(), GraceError>
 }
 
 /// Checks that the list `key` has the expected names, in any order.
-pub(super) fn expect_list(archive: &Archive, key: &str, mut expected: Vec<String>) -> Result<(), GraceError> {
+pub(super) fn expect_list(archive: &NpzFile, key: &str, mut expected: Vec<String>) -> Result<(), GraceError> {
     let mut found = archive.strings(key)?;
     found.sort();
     expected.sort();

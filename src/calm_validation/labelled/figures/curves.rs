@@ -1,6 +1,6 @@
 //! Contamination and ROC-AUC against the threshold of the force error (the paper's contamination curves and sweep).
 
-use ::figures::{Anchor, Axis, Colour, Figure, Panel, Rectangle, Scale, Stroke};
+use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, Panel, Rectangle, Stroke};
 
 use super::super::report::{IntervalEstimate, LabelledReport};
 use super::{runs, stroke};
@@ -19,8 +19,8 @@ const ERROR: &str = "threshold of the force error (eV Å^{−1})";
 
 pub fn contamination(report: &LabelledReport) -> FigureEntry {
     let (low, high) = (report.thresholds[0], report.thresholds[report.thresholds.len() - 1]);
-    let x = Axis::new(ERROR, Scale::Logarithmic, low, high);
-    let y = Axis::new("probability of a larger error", Scale::Linear, 0.0, 1.0);
+    let x = Axis::new(ERROR, AxisScale::Logarithmic, low, high);
+    let y = Axis::new("probability of a larger error", AxisScale::Linear, 0.0, 1.0);
     let mut chart = Chart::new("contamination", "Contamination of the confident set", x, y);
     chart.panel.vertical_line(0.5);
     let all = report.unfiltered.iter().map(|value| IntervalEstimate { value: *value, interval: None });
@@ -47,8 +47,8 @@ pub fn areas(report: &LabelledReport) -> FigureEntry {
     let first = report.thresholds.iter().position(|x| *x >= SWEEP.0).unwrap_or(0);
     let lows = report.scores.iter().flat_map(|score| &score.auc[first..first + thresholds.len()]);
     let lowest = lows.filter_map(|estimate| estimate.value).fold(0.5, f64::min);
-    let x = Axis::new(ERROR, Scale::Logarithmic, SWEEP.0, SWEEP.1);
-    let y = Axis::new("ROC-AUC", Scale::Linear, (lowest - 0.05).max(0.0), 1.0);
+    let x = Axis::new(ERROR, AxisScale::Logarithmic, SWEEP.0, SWEEP.1);
+    let y = Axis::new("ROC-AUC", AxisScale::Linear, (lowest - 0.05).max(0.0), 1.0);
     let mut chart = Chart::new("auc-sweep", "Detection of large force errors", x, y);
     chart.panel.line([[SWEEP.0, 0.5], [SWEEP.1, 0.5]], Colour::GREY.dashed(0.7));
     for (k, score) in report.scores.iter().enumerate() {

@@ -1,6 +1,6 @@
 //! Force error against the score of an atom (the paper's Fig. 2): bands, medians, and marginal distributions.
 
-use ::figures::{Anchor, Axis, Colour, Figure, Panel, Rectangle, Scale, Side};
+use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, MarginalSide, Panel, Rectangle};
 
 use super::super::report::{Band, ErrorHistograms, LabelledReport, ScoreReport};
 use crate::csv::{Csv, number};
@@ -93,13 +93,13 @@ fn draw_scores(
 ) {
     let above = Rectangle { y: place.y - 31.0, height: 28.0, ..place };
     let most = score.bands.iter().map(|band| band.atoms).max().unwrap_or(0) as f64;
-    let count = Axis::new("", Scale::Linear, 0.0, 1.05 * most).without_ticks();
+    let count = Axis::new("", AxisScale::Linear, 0.0, 1.05 * most).without_ticks();
     let mut panel = Panel::new(above, x.clone().with_title("").without_ticks(), count);
     for band in score.bands.iter().filter(|band| band.atoms > 0) {
         let colour = if is_within(band) { Colour::BLUE } else { Colour::VERMILLION };
         panel.bar([band.low, 0.0], [band.high, band.atoms as f64], colour.faint(0.3));
     }
-    panel.draw_as_margin(figure, Side::Below);
+    panel.draw_as_margin(figure, MarginalSide::Below);
 }
 
 /// Distributions of the error of either population, to the right.
@@ -112,7 +112,7 @@ fn draw_errors(figure: &mut Figure, histograms: &ErrorHistograms, place: Rectang
     let populations =
         [(shares(&histograms.within), Colour::BLUE), (shares(&histograms.beyond), Colour::VERMILLION)];
     let most = populations.iter().flat_map(|(shares, _)| shares).copied().fold(0.0, f64::max);
-    let share = Axis::new("", Scale::Linear, 0.0, 1.05 * most).without_ticks();
+    let share = Axis::new("", AxisScale::Linear, 0.0, 1.05 * most).without_ticks();
     let mut panel = Panel::new(right, share, y.clone().with_title("").without_ticks());
     for (shares, colour) in populations {
         let edges = &histograms.edges;
@@ -124,7 +124,7 @@ fn draw_errors(figure: &mut Figure, histograms: &ErrorHistograms, place: Rectang
         panel.polygons([outline.clone()], Some(colour.faint(0.18)), None);
         panel.line(outline, colour.line(0.9));
     }
-    panel.draw_as_margin(figure, Side::Left);
+    panel.draw_as_margin(figure, MarginalSide::Left);
 }
 
 /// The bins that are drawn, and the limit.
@@ -133,7 +133,7 @@ fn score_axis(score: &ScoreReport) -> Axis {
     let limit = score.limit.unwrap_or(1.0);
     let low = shown().map(|band| band.low).fold(0.8 * limit, f64::min);
     let high = shown().map(|band| band.high).fold(1.25 * limit, f64::max);
-    Axis::new(&score.name, Scale::Logarithmic, low, high)
+    Axis::new(&score.name, AxisScale::Logarithmic, low, high)
 }
 
 /// From the smallest 5 % to the largest 95 % quantile.
@@ -142,7 +142,7 @@ fn error_axis(score: &ScoreReport) -> Axis {
     let quantiles: Vec<_> = shown.filter_map(|band| band.quantiles).collect();
     let low = quantiles.iter().map(|q| q[0]).filter(|x| *x > 0.0).fold(f64::INFINITY, f64::min);
     let high = quantiles.iter().map(|q| q[6]).fold(0.0, f64::max);
-    Axis::new("force error (eV Å^{−1})", Scale::Logarithmic, low / 1.2, 1.2 * high)
+    Axis::new("force error (eV Å^{−1})", AxisScale::Logarithmic, low / 1.2, 1.2 * high)
 }
 
 /// Midpoint of a bin on the axis.

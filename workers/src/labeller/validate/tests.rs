@@ -12,13 +12,13 @@ fn silicon(atoms: usize) -> Structure {
     }
 }
 
-fn good() -> Results {
-    Results {
+fn good() -> CalculationResults {
+    CalculationResults {
         energy: -215.0,
         forces: vec![[0.5, 0.0, 0.0]; 2],
         stress: Some([[0.1; 3]; 3]),
         magnetic_moments: Some(vec![1.0; 2]),
-        ..Results::default()
+        ..CalculationResults::default()
     }
 }
 
@@ -30,7 +30,7 @@ fn offsets(good: usize, bad: &[f64]) -> EnergyOffsets {
 }
 
 /// What is said of a result with this change; nothing of one that is valid.
-fn said(change: impl FnOnce(&mut Results), offsets: Option<&EnergyOffsets>) -> String {
+fn said(change: impl FnOnce(&mut CalculationResults), offsets: Option<&EnergyOffsets>) -> String {
     let mut made = good();
     change(&mut made);
     let expected = offsets.map(|offsets| EnergyReference { model: -9.0, offsets });
@@ -85,7 +85,7 @@ fn results_out_of_bounds_are_rejected() {
 
 #[test]
 fn an_energy_is_compared_once_enough_labels_support_it() {
-    let far = |made: &mut Results| made.energy = -215.0 + 2.0 * 5e4;
+    let far = |made: &mut CalculationResults| made.energy = -215.0 + 2.0 * 5e4;
     assert_eq!(said(far, None), "");
     assert_eq!(said(far, Some(&offsets(4, &[]))), "", "four labels");
     let fitted = offsets(5, &[]);
