@@ -319,3 +319,28 @@ fn pages_import_the_functions_that_they_call() {
         }
     }
 }
+
+/// One word, one meaning: a type that other files can use has its name to itself. Names end at blanks, brackets and colons.
+#[test]
+fn types_that_other_files_use_have_names_of_their_own() {
+    let packages =
+        HOUSE.map(|(_, folder, _)| if folder.is_empty() { "src".into() } else { format!("{folder}/src") });
+    let mut found: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for (path, text) in sources(&packages.each_ref().map(String::as_str)) {
+        for line in text.lines().map(str::trim_start) {
+            let Some(item) =
+                ["pub ", "pub(crate) ", "pub(super) "].iter().find_map(|start| line.strip_prefix(start))
+            else {
+                continue;
+            };
+            let kinds = ["struct ", "enum ", "trait ", "union ", "type ", "unsafe trait "];
+            if let Some(rest) = kinds.iter().find_map(|kind| item.strip_prefix(kind)) {
+                let name = rest.split(|letter: char| !letter.is_alphanumeric()).next().unwrap();
+                found.entry(name.to_owned()).or_default().push(path.display().to_string());
+            }
+        }
+    }
+    assert!(found.len() > 500, "{}", found.len());
+    let shared: Vec<_> = found.iter().filter(|(_, files)| files.len() > 1).collect();
+    assert!(shared.is_empty(), "{shared:#?}");
+}
