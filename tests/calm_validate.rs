@@ -287,7 +287,10 @@ fn mixtures_of_several_dimensions_are_compared() {
     let described: Vec<_> =
         mixtures.iter().map(|mixture| json!([mixture["dimension"], mixture["components"]])).collect();
     assert_eq!(Value::from(described), json!([[130, [1]], [130, [1]], [128, [1]]]));
-    assert_eq!((&mixtures[1]["artifact"], &mixtures[1]["scores"]), (&own.into(), &mixtures[0]["scores"]));
+    assert_eq!(
+        (&mixtures[1]["artifact"], &mixtures[1]["scores"]),
+        (&own.as_str().into(), &mixtures[0]["scores"])
+    );
     assert_eq!(mixtures[0]["scores"], found["labelled"]["scores"]);
     assert_ne!(mixtures[2]["scores"][0]["spearman"], mixtures[0]["scores"][0]["spearman"]);
     let table = std::fs::read_to_string(here.join("out/tables/mixtures.csv")).unwrap();

@@ -81,12 +81,14 @@ pub fn score_own_features(
 /// judged as the paper judges the spread of an ensemble; the likelihood has none.
 fn rule(kind: BaselineKind) -> Option<DetectionRule> {
     match kind {
-        BaselineKind::DOptimalityElement | BaselineKind::DOptimalityCentred | BaselineKind::DOptimalityComponent => {
-            Some(DetectionRule::Threshold(1.0))
-        }
-        BaselineKind::Llpr | BaselineKind::LlprSum | BaselineKind::LlprForces | BaselineKind::Euclidean | BaselineKind::KNearest => {
-            Some(DetectionRule::TENFOLD)
-        }
+        BaselineKind::DOptimalityElement
+        | BaselineKind::DOptimalityCentred
+        | BaselineKind::DOptimalityComponent => Some(DetectionRule::Threshold(1.0)),
+        BaselineKind::Llpr
+        | BaselineKind::LlprSum
+        | BaselineKind::LlprForces
+        | BaselineKind::Euclidean
+        | BaselineKind::KNearest => Some(DetectionRule::TENFOLD),
         BaselineKind::Likelihood => None,
     }
 }

@@ -145,7 +145,7 @@ fn write_check(out: &mut dyn Write, page: &StatusLayout, check: &ReferenceCheck)
     reference_check::table(check).lines().try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
 }
 
-fn describe_disk(disk: &DiskUse, page: &StatusLayout, status: &Status) -> String {
+fn describe_disk(disk: &DiskUse, page: &StatusLayout, status: &CampaignStatus) -> String {
     let now = megabytes(disk.bytes);
     let Some((forecast, end)) = disk.forecast.zip(disk.at_the_end(status)) else {
         return format!("{now} now");
@@ -171,7 +171,7 @@ pub fn expected_end(end: &ExpectedEnd) -> Option<String> {
     Some(format!("expected within {hours} h ({})", parts.join(", ")))
 }
 
-fn describe_walks(status: &Status, ends: &WalkEnds) -> String {
+fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
     let state = if status.led { "running" } else { "unfinished" };
     let ended = match ends.ended() {

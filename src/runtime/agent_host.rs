@@ -178,7 +178,8 @@ async fn run_in(
         SharedMixture::space_needed(mixture, walkers).map_err(CommandError::failed)? + space_needed(&sizes);
     let _prepared = shm_dir.prepare(needed).map_err(CommandError::failed)?;
     let shared = SharedMixture::create(&shm_dir.mixture(), mixture, walkers).map_err(CommandError::failed)?;
-    let server = IpcServer::open(shm_dir, sizes, u64::from(std::process::id())).map_err(CommandError::failed)?;
+    let server =
+        IpcServer::open(shm_dir, sizes, u64::from(std::process::id())).map_err(CommandError::failed)?;
     let line = server.handle();
     let limits = Limits {
         heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),

@@ -63,9 +63,9 @@ impl Structures {
         match format(path) {
             Some(StructureFormat::Extxyz) => Ok(Self::Extxyz(Box::new(extxyz::ExtxyzReader::new(input)))),
             Some(StructureFormat::Poscar) => Ok(Self::Poscar(Some(input))),
-            Some(StructureFormat::LammpsDump) => {
-                Ok(Self::LammpsDump(Box::new(lammps_dump::LammpsDumpReader::new(input, dump_elements.to_vec()))))
-            }
+            Some(StructureFormat::LammpsDump) => Ok(Self::LammpsDump(Box::new(
+                lammps_dump::LammpsDumpReader::new(input, dump_elements.to_vec()),
+            ))),
             None => Err(FileError::Format(path.to_path_buf())),
         }
     }

@@ -148,7 +148,7 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         assert_eq!(store.load_walks().await.unwrap(), walks);
-        assert_eq!(store.processes(None).await.unwrap(), [process.clone()]);
+        assert_eq!(store.processes(None).await.unwrap(), std::slice::from_ref(&process));
         assert_eq!(store.status().await.unwrap().walks.len(), 2);
         assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
         store.close().await;

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use calm::baselines::{Baseline, BaselineFile, BaselineSettings, Builder, BaselineKind};
+use calm::baselines::{Baseline, BaselineFile, BaselineKind, BaselineSettings, Builder};
 use calm::{Artifact, Mixture};
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;

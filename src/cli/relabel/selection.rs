@@ -42,7 +42,11 @@ impl Selection {
     }
 
     /// The structures of these candidates and imports, whatever the protocol of their labels.
-    pub async fn from_ids(store: &Store, all: Vec<Relabellable>, ids: &[String]) -> Result<Self, CommandError> {
+    pub async fn from_ids(
+        store: &Store,
+        all: Vec<Relabellable>,
+        ids: &[String],
+    ) -> Result<Self, CommandError> {
         let mut wanted = HashSet::new();
         for id in ids {
             let (name, content) = structure_named(store, id).await?;

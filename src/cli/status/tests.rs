@@ -93,7 +93,7 @@ pub fn large() -> Snapshot {
     }
 }
 
-fn status() -> Status {
+fn status() -> CampaignStatus {
     let walk = |number: u32| WalkStatus {
         walk: number,
         seed_structure: format!("a-long-name-of-a-seed-structure-{number}"),
@@ -123,7 +123,7 @@ fn status() -> Status {
     };
     let declined =
         Declined { covered: 900_000, duplicate: 10_000, too_close: 1_000, budget: 100, backlog: 10_000 };
-    Status {
+    CampaignStatus {
         walkers_busy: Some(0.625),
         candidates: Candidates {
             seen: 1_000_000,

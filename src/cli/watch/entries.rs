@@ -57,7 +57,11 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&StructureFi
 }
 
 /// The entries of label jobs that match the filter.
-pub fn job_entries(jobs: &[QueueEntry], walks: &[WalkStatus], filter: Option<&StructureFilter>) -> Vec<PaneEntry> {
+pub fn job_entries(
+    jobs: &[QueueEntry],
+    walks: &[WalkStatus],
+    filter: Option<&StructureFilter>,
+) -> Vec<PaneEntry> {
     let matches = |job: &&QueueEntry| {
         let species = filter::species(&job.formula);
         filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species, walks)))

@@ -4,7 +4,7 @@ use ::figures::{AxisScale, Figure, Panel};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use wire::Origin;
 
-use super::super::collections::{Collections, CollectedAtom};
+use super::super::collections::{CollectedAtom, Collections};
 use super::super::style::{WIDTH, axis, grouped, origins};
 use super::super::{Csv, FigureContent};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};

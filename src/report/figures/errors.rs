@@ -4,7 +4,7 @@ use ::figures::{Axis, AxisScale, Colour, Figure, MarginalSide, Panel, Rectangle}
 use analysis::{QuantileBin, binned_quantiles, kernel_density, linear_edges, quantile};
 use wire::Origin;
 
-use super::super::collections::{Collections, CollectedAtom};
+use super::super::collections::{CollectedAtom, Collections};
 use super::super::style::{WIDTH, axis, grouped, origin_style, origins};
 use super::super::{Csv, FigureContent, csv};
 use super::NO_LABELS;

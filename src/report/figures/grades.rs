@@ -4,7 +4,7 @@ use ::figures::{AxisScale, Colour, Figure, LegendKey, Panel, legend};
 use analysis::{binned_quantiles, logarithmic_edges, spearman};
 use wire::Origin;
 
-use super::super::collections::{Collections, CollectedAtom};
+use super::super::collections::{CollectedAtom, Collections};
 use super::super::style::{WIDTH, axis, grouped};
 use super::super::{Csv, FigureContent, csv};
 use super::errors::{MIN_ATOMS, middle, ribbons};
