@@ -29,7 +29,7 @@ fn visible(directory: &Path) -> Vec<String> {
 #[test]
 fn a_copy_of_a_running_campaign_can_be_run_on() {
     // Seconds of work, so that it is under way while it is copied.
-    let small = Small { steps: 3000, max_per_walk: 1000, ..Small::default() };
+    let small = Small { steps: 1500, max_per_walk: 1000, ..Small::default() };
     let place = LabelCampaign::new(&small, &[]);
     let elsewhere = tempfile::tempdir().unwrap();
     let copy = elsewhere.path().join("copy").display().to_string();

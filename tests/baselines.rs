@@ -214,7 +214,7 @@ fn what_does_not_belong_together_is_refused() {
     );
     let message = score(&model, &["b.npz", "--baseline", "b.npz"]);
     assert!(message.contains("another file of baselines has a score 'llpr', too"), "{message}");
-    assert!(score(&model, &[&artifact]).contains("no array 'baseline_schema'"));
+    assert!(score(&model, &[&artifact]).contains("expected a file that `calmwalk calm baseline` wrote"));
     assert!(score(&model, &["train.extxyz"]).contains("expected a NumPy .npz archive"));
     assert_eq!(calmwalk(here, ["calm", "baseline"]).status.code(), Some(2));
 }

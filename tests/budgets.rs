@@ -106,7 +106,7 @@ fn as_many_structures_are_collected_as_there_may_be_labels_for() {
 #[test]
 fn a_limit_of_time_stops_walks_where_they_stand() {
     // Seconds of work, so that the clock is looked at before it is done.
-    let small = Small { steps: 3000, max_per_walk: 1000, ..Small::default() };
+    let small = Small { steps: 1500, max_per_walk: 1000, ..Small::default() };
     let expected = uninterrupted_outcome(&small);
     let directory = write(&small, "[budget]\nwall_time = \"4ms\"\n");
     let here = directory.path();

@@ -320,7 +320,7 @@ fn pages_import_the_functions_that_they_call() {
     }
 }
 
-/// One word, one meaning: a type that other files can use has its name to itself. Names end at blanks, brackets and colons.
+/// One word, one meaning: a type that other files can use has its name to itself.
 #[test]
 fn types_that_other_files_use_have_names_of_their_own() {
     let packages =
@@ -336,6 +336,10 @@ fn types_that_other_files_use_have_names_of_their_own() {
             let kinds = ["struct ", "enum ", "trait ", "union ", "type ", "unsafe trait "];
             if let Some(rest) = kinds.iter().find_map(|kind| item.strip_prefix(kind)) {
                 let name = rest.split(|letter: char| !letter.is_alphanumeric()).next().unwrap();
+                // A macro makes types of names that it is given.
+                if name.is_empty() {
+                    continue;
+                }
                 found.entry(name.to_owned()).or_default().push(path.display().to_string());
             }
         }

@@ -80,8 +80,11 @@ async fn imported_structures_count_as_others_do() {
     let (store, _) = filled(&home).await;
     let dft = protocol("dft").hash;
     let files: Vec<_> = (0..2).map(|k| ("new.extxyz".to_owned(), k, structure(50.0 + k as f64))).collect();
-    store.queue_imports(&files, 1, 30_000).await.unwrap();
+    store.queue_imports(&files, 0, 30_000).await.unwrap();
     assert_eq!(store.imported_jobs(JobState::Queued).await.unwrap(), 2);
+    for name in ["import-1", "import-2"] {
+        store.prioritise_job(name, 5, 30_000).await.unwrap();
+    }
     let done = lease(&store, 30_000).await;
     assert_eq!(done.candidate, "import-1");
     store.complete(&done, &label(-5.0), 36_000).await.unwrap();

@@ -20,9 +20,9 @@ use std::process::{Child, Command, Output};
 
 use atoms::extxyz::{Frame, write_frame};
 
-/// Number of kills in one test: 20, or `CALMWALK_KILLS`.
+/// Number of kills in one test: 12, or `CALMWALK_KILLS`.
 pub fn kills() -> u64 {
-    std::env::var("CALMWALK_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(20)
+    std::env::var("CALMWALK_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(12)
 }
 
 /// A deterministic pseudorandom number (SplitMix64).
