@@ -73,7 +73,7 @@ async fn costs_are_those_of_successful_attempts() {
     );
 }
 
-/// A structure without a seed structure costs as much as others, fails as others do, and can be labelled again.
+/// A structure without a seed structure counts in the cost and the failures like others, and can be relabelled.
 #[tokio::test]
 async fn imported_structures_count_as_others_do() {
     let home = Home::new();
