@@ -48,7 +48,7 @@ fn main() {
     println!("assignments of {steps_per_assignment} steps");
     println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
     let [live, rounds] = [CampaignMode::Live, CampaignMode::Reproducible].map(|mode| {
-        // As many walkers as walks, so that every assignment starts at once.
+        // One walker per walk, so that every assignment starts at once.
         let walks = seeds(&[600.0]);
         let settings =
             SelectorSettings { mode, walks_per_round: walks.len(), steps_per_assignment, ..settings() };
@@ -87,9 +87,9 @@ struct Campaign {
     accepted: u32,
     /// Time on the simulated clock of parallel walkers.
     time: Duration,
-    /// Processor time of all walkers, divided by the time that they were there.
+    /// Processor time of all walkers, divided by their total lifetime.
     busy: f64,
-    /// Share of the biased walks that had begun when the first control frame was decided.
+    /// Share of the biased walks that had started when the first control frame was decided.
     begun_before_control: f64,
 }
 

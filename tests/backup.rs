@@ -1,5 +1,5 @@
-//! `calmwalk store`: copies of a campaign that is run, whole or not there. The same tests on PostgreSQL are in
-//! `postgres_whole.rs`.
+//! `calmwalk store`: backups of a running campaign are complete or do not exist. `CALMWALK_POSTGRES` runs the same tests on a
+//! server.
 
 use std::fs;
 use std::path::Path;
@@ -18,23 +18,23 @@ fn ended(running: &mut common::Running) -> Option<i32> {
     running.0.wait().expect("a child").code()
 }
 
-/// What is in a directory but hidden names.
+/// The entries of a directory except hidden ones.
 fn visible(directory: &Path) -> Vec<String> {
     let names =
         fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
     names.filter(|name| !name.starts_with('.')).collect()
 }
 
-/// A copy that is made in mid-campaign comes to the same end as the campaign itself.
+/// A copy made during a campaign continues to the same outcome as the campaign.
 #[test]
 fn a_copy_of_a_running_campaign_can_be_run_on() {
-    // Seconds of work, so that it is under way while it is copied.
+    // Some seconds of work, so that it runs while it is copied.
     let small = Small { steps: 1500, max_per_walk: 1000, ..Small::default() };
     let place = LabelCampaign::new(&small, &[]);
     let elsewhere = tempfile::tempdir().unwrap();
     let copy = elsewhere.path().join("copy").display().to_string();
     let mut run = place.run();
-    wait_until("it advances", || {
+    wait_until("the campaign advances", || {
         place.status()["mixture_version"].as_u64().is_some_and(|version| version > 0)
     });
     let said = succeed(place.path(), ["store", "backup", place.argument(), &copy]);
@@ -62,7 +62,7 @@ fn a_killed_backup_leaves_nothing_that_looks_like_one() {
     let small = Small { steps: 60, ..Small::default() };
     let place = LabelCampaign::new(&small, &[]);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
-    // Enough for a copy to take its time.
+    // Enough data for a copy to take some time.
     on_store(place.location(), async |store| {
         for slot in 100..140 {
             let bytes = (0..1_000_000u64).map(|n| random(n + slot) as u8).collect();
@@ -99,13 +99,13 @@ fn a_killed_backup_leaves_nothing_that_looks_like_one() {
     }
     assert!(unfinished > 0, "none of {} was killed at work, {whole} were whole", kills());
     succeed(place.path(), ["store", "backup", place.argument(), &copy]);
-    assert_eq!(fs::read_dir(elsewhere.path()).unwrap().count(), 1, "what was left is removed");
+    assert_eq!(fs::read_dir(elsewhere.path()).unwrap().count(), 1, "the unfinished backups are removed");
     succeed(place.path(), ["export", &copy, "--control", "--output", "copy.extxyz"]);
     assert_eq!(fs::read(place.path().join("copy.extxyz")).unwrap(), exported);
 }
 
 #[test]
-fn check_and_compact_tell_what_they_find() {
+fn check_and_compact_report_what_they_find() {
     let small = Small { steps: 60, ..Small::default() };
     let place = LabelCampaign::new(&small, &[]);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
@@ -116,7 +116,7 @@ fn check_and_compact_tell_what_they_find() {
     let output = calmwalk(place.path(), ["store", "compact", place.argument(), "--drop-declined-features"]);
     assert!(stderr(&output).contains("calmwalk replay --set stops at the first of them"));
     succeed(place.path(), ["store", "check", place.argument()]);
-    wait_until("nobody is left", || processes_in(place.path()).is_empty());
+    wait_until("all processes have exited", || processes_in(place.path()).is_empty());
     on_store(place.location(), async |store| {
         let bytes = b"no component".to_vec();
         let component = store::ComponentRecord { element: 0, slot: 7, bytes };
@@ -136,13 +136,13 @@ fn check_and_compact_tell_what_they_find() {
     assert!(bytes.unwrap() > 100_000 && forecast["structures"].as_u64().unwrap() > 0, "{status}");
 }
 
-/// Where a file of SQLite is damaged, its own check says so.
+/// `store check` reports damage that SQLite's own check finds.
 #[test]
 fn a_damaged_file_is_found() {
     let small = Small { steps: 60, ..Small::default() };
     let place = LabelCampaign::new(&small, &[]);
     if place.argument() != "." {
-        // A server looks after its files itself.
+        // A server checks its own files.
         return;
     }
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());

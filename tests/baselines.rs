@@ -89,7 +89,7 @@ fn atoms_are_scored_by_every_kind() {
         if name.starts_with("d_opt") {
             assert!(largest(&inside) <= 1.01 + 1e-4, "{name}: {}", largest(&inside));
         }
-        // The average over the same neighbours as γ's, of which each crystal site has equal ones.
+        // The neighbourhood average is bounded by the largest score.
         let average = column(&frames, &format!("{name}_nbr"));
         assert!(
             average.iter().all(|x| x.is_finite()) && largest(&average) <= largest(&column(&frames, &name))
@@ -100,7 +100,7 @@ fn atoms_are_scored_by_every_kind() {
     check_by_features(here, &frames);
 }
 
-/// Distance and σ-free scores from the features that `calm score` wrote.
+/// Checks scores against the features that `calm score` wrote.
 fn check_by_features(here: &Path, frames: &[Frame]) {
     let file = NpyFile::new(BufReader::new(File::open(here.join("z.npy")).unwrap())).unwrap();
     let features: Vec<f64> = file.into_vec().unwrap();
@@ -131,7 +131,7 @@ fn forces_have_uncertainties_and_ensembles_disagree() {
     baseline(here, &[&["f.npz"], &common[..]].concat());
     let model = path(MODEL);
     let frames = score(here, "in.extxyz", &["--baseline", "f.npz", "--ensemble", &model]);
-    // Forces vanish by symmetry, whatever the weights; far from the training data they are uncertain.
+    // Forces of the first frame vanish by symmetry for any weights; those of the second are uncertain.
     let (still, moved) =
         (column(&frames[..1], "hidden_llpr_forces"), column(&frames[1..], "hidden_llpr_forces"));
     assert!(largest(&still) < 1e-6 * largest(&moved) && largest(&moved) > 0.0, "{still:?} {moved:?}");
@@ -153,12 +153,12 @@ fn mixtures_and_baselines_have_other_features() {
     let info: serde_json::Value = serde_json::from_str(&info).unwrap();
     assert_eq!((&info["schema"], &info["feature_dimension"]), (&3.into(), &128.into()), "{info}");
 
-    // The features follow from the artifact.
+    // The artifact determines the features.
     baseline(here, &["l.npz", "--artifact", "linear.npz", "--kind", "d-optimality-centred,likelihood"]);
     let scored = score(here, "in.extxyz", &["--artifact", "linear.npz", "--baseline", "l.npz"]);
     assert!(largest(&column(&scored, "d_optimality_centred")) <= 1.01 + 1e-4);
     assert!(column(&scored, "likelihood").iter().all(|x| x.is_finite()));
-    // Beside γ of the normalised features, those of the linear ones carry their name.
+    // Scores of the linear features are named after them, because γ uses the normalised features.
     baseline(
         here,
         &["h.npz", "--feature-variant", "hidden", "--kind", "llpr", "--kind", "d-optimality-element"],

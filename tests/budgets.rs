@@ -1,4 +1,4 @@
-//! Budgets end a campaign in order, and a larger one lets it go on; what a long label queue does.
+//! Budgets end a campaign in order, and a larger budget continues it; effects of a long label queue.
 
 use std::fs;
 use std::path::Path;
@@ -56,7 +56,7 @@ fn decisions(directory: &Path) -> Vec<String> {
     text.lines().map(str::to_owned).collect()
 }
 
-/// Labels that took a millisecond or more: others cost nothing.
+/// Number of labels that took a millisecond or more; shorter ones cost nothing.
 fn costly_labels(directory: &Path) -> usize {
     tokio::runtime::Runtime::new().unwrap().block_on(async {
         let store = store::Store::open_read_only(&directory.join("here")).await.unwrap();
@@ -71,7 +71,7 @@ fn costly_labels(directory: &Path) -> usize {
 
 #[test]
 fn as_many_structures_are_collected_as_there_may_be_labels_for() {
-    // With its control frame a structure takes two.
+    // A structure takes two labels: its own and its control frame's.
     let small = Small { walks_per_round: 1, ..Small::default() };
     let directory = write(&small, "[budget]\nlabels = 5\n");
     let here = directory.path();
@@ -87,7 +87,7 @@ fn as_many_structures_are_collected_as_there_may_be_labels_for() {
     assert!(walks(&ended).contains(&by_budget), "{ended}");
     let shown = succeed(here, ["status", "here"]);
     assert!(shown.contains("state       finished: budget.labels is used up"), "{shown}");
-    // The same for another number of walkers.
+    // The decisions do not depend on the number of walkers.
     let other = write(&Small { walkers: 1, ..small.clone() }, "[budget]\nlabels = 5\n");
     succeed(other.path(), RUN);
     assert_eq!(decisions(here), decisions(other.path()));
@@ -105,7 +105,7 @@ fn as_many_structures_are_collected_as_there_may_be_labels_for() {
 
 #[test]
 fn a_limit_of_time_stops_walks_where_they_stand() {
-    // Seconds of work, so that the clock is looked at before it is done.
+    // Some seconds of work, so that the campaign checks the clock before it ends.
     let small = Small { steps: 1500, max_per_walk: 1000, ..Small::default() };
     let expected = uninterrupted_outcome(&small);
     let directory = write(&small, "[budget]\nwall_time = \"4ms\"\n");
@@ -117,7 +117,7 @@ fn a_limit_of_time_stops_walks_where_they_stand() {
         (&stopped["finished"], &stopped["budget"]["used_up"]),
         (&true.into(), &"budget.wall_time".into())
     );
-    // The clock is looked at now and then: some walks may have come to their end before.
+    // The campaign checks the clock at intervals: some walks may have completed before.
     let walks = walks(&stopped);
     assert!(walks.iter().all(|(state, _)| !["waiting", "running"].contains(&state.as_str())), "{walks:?}");
     assert!(walks.contains(&("budget".into(), "budget.wall_time".into())), "{walks:?}");
@@ -128,7 +128,7 @@ fn a_limit_of_time_stops_walks_where_they_stand() {
         so_far.len() < all.len() && so_far == all[..so_far.len()],
         "the first decisions of the undisturbed campaign"
     );
-    // Nothing is begun as long as nothing is left.
+    // No walk starts while the budget is used up.
     succeed(here, RUN);
     assert_eq!(decisions(here), so_far);
     change(here, "\"4ms\"", "\"10h\"");
@@ -162,8 +162,8 @@ fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
     change(here, "[run]", "queue_limit = 4\non_queue_full = \"raise\"\n[run]");
     let run = program(here).args(RUN).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let mut run = Running(run);
-    // While nobody makes labels the queue only grows.
-    wait_until("a labeller is at work", || !processes_running(here, "labeller").is_empty());
+    // The queue only grows while the labellers are paused.
+    wait_until("a labeller is running", || !processes_running(here, "labeller").is_empty());
     let labellers = processes_running(here, "labeller");
     labellers.iter().for_each(|pid| hold(*pid, here.join("here").to_str().unwrap()));
     let raised = || decisions(here).into_iter().filter(|line| line.contains("\"raised_by\"")).count();

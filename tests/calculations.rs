@@ -1,4 +1,4 @@
-//! Labels by another program in a real campaign, while everybody who works on them is killed.
+//! Labels by an external program in a real campaign, while every process that works on them is killed.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,18 +10,18 @@ use crate::common::campaign::{Small, outcome_at};
 use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, check_single_labels, on_store};
 use crate::common::processes::{calculation_processes, processes_in, processes_running, signal, wait_until};
 
-/// Takes half a second, and starts what never ends by itself.
+/// Takes half a second, and starts background processes that do not end.
 const SCRIPT: &str = r#"
 sleep 1000 &
 setsid sleep 1000 &
 sleep 0.5
 "#;
 
-/// Programs may be killed so often: each time counts as a failure of a job, which has two rungs.
+/// Maximum number of kills of programs: each kill counts as a failure of its job, whose retries are limited.
 const PROGRAMS: usize = 2;
 const KILLS: usize = 24;
 
-/// Who is killed.
+/// The kind of process to kill.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Victim {
     Label,
@@ -32,7 +32,7 @@ enum Victim {
 }
 use Victim::{Child, Keeper, Label, Labeller, Program};
 
-/// The same numbers in each run.
+/// A deterministic random number generator.
 struct Random(u64);
 
 impl Random {
@@ -63,7 +63,7 @@ fn directories(scratch: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Those who can be killed now.
+/// Processes of this kind that are running now.
 fn victims(place: &LabelCampaign, scratch: &Path, who: Victim) -> Vec<u32> {
     let started = |what: &str| {
         let all = calculation_processes(scratch).into_iter();
@@ -79,7 +79,7 @@ fn victims(place: &LabelCampaign, scratch: &Path, who: Victim) -> Vec<u32> {
 }
 
 #[test]
-fn each_label_comes_once_whoever_is_killed() {
+fn each_label_is_made_once_despite_kills() {
     let scratch = tempfile::tempdir().unwrap();
     let (scratch, mut random) = (scratch.path().canonicalize().unwrap(), Random(11));
     let place = place(&scratch);
@@ -104,13 +104,13 @@ fn each_label_comes_once_whoever_is_killed() {
     }
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert!(killed.len() == 5, "{killed:?} {}", place.said());
-    // The last labellers leave by themselves.
+    // The last labellers exit on their own.
     label.0.wait().unwrap();
     outcome_at(place.argument(), place.path());
     assert!(on_store(place.location(), check_single_labels) > 2);
-    wait_until("nobody is left", || processes_in(place.path()).is_empty());
+    wait_until("all processes have exited", || processes_in(place.path()).is_empty());
 
-    // What a killed one has only just made is cleared away by those who come later.
+    // A later labeller removes the directories of a killed one after a minute.
     for directory in directories(&scratch) {
         let touched = Command::new("touch").args(["-d", "2 minutes ago"]).arg(directory).status();
         assert!(touched.unwrap().success());
@@ -120,8 +120,8 @@ fn each_label_comes_once_whoever_is_killed() {
     assert_eq!(fs::read_dir(&scratch).unwrap().count(), 0);
 }
 
-/// Answers and calculates as GPAW does, with the energy that stands in its setup of aluminium. When the first calculation is
-/// over, the file of which the setup is a copy becomes another.
+/// A stand-in for GPAW that returns the energy in its setup file of aluminium. After the first calculation, it replaces the
+/// original of the setup file.
 const GPAW: &str = r#"
 if [ ! -e input.json ]; then
     echo "{\"gpaw\": \"1\", \"ase\": \"1\", \"setup_paths\": [\"$GPAW_SETUP_PATH\"]}"
@@ -178,7 +178,7 @@ fn a_setup_that_is_replaced_between_two_labels_makes_none() {
         said.contains(&format!("cannot use {} (its content has changed: BLAKE3 ", setup.display())),
         "{said}"
     );
-    // Who begins now is refused.
+    // A labeller that starts now is refused.
     assert!(said.contains("labels made here would not belong to the campaign's protocol 'gpaw'"), "{said}");
     assert!(said.contains("settings.pseudopotentials.Al"), "{said}");
     assert_eq!((place.jobs("labelled"), place.jobs("failed")), (1, 0), "{said}");
@@ -187,7 +187,7 @@ fn a_setup_that_is_replaced_between_two_labels_makes_none() {
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
     outcome_at(place.argument(), place.path());
-    // All by the setup of the protocol, and it is not kept with any of them.
+    // All labels are made with the protocol's setup file, and no archive contains it.
     assert!(on_store(place.location(), check_single_labels) > 2);
     for job in on_store(place.location(), async |store| store.queue_list(None, u32::MAX, 0).await.unwrap()) {
         let details = place.job(&job.candidate);

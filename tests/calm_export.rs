@@ -16,7 +16,7 @@ use crate::common::{Running, config, deviation, program, refuse, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
 
-/// A campaign that has run to its end, with `change` made to its configuration before.
+/// A finished campaign, in whose configuration `from` was replaced.
 fn finished(small: &Small, from: &str, to: &str) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     let path = small.write(directory.path());
@@ -56,7 +56,7 @@ fn single(values: &[f64]) -> Vec<f64> {
     values.iter().map(|&value| f64::from(value as f32)).collect()
 }
 
-/// The newest version is that of the store, rounded.
+/// Compares the exported newest version with the store, rounded to single precision.
 fn check_newest(here: &Path, artifact: &Path) {
     let found = Artifact::load(artifact).unwrap();
     let stored = look(here, async |store| store.load_components().await.unwrap());
@@ -72,7 +72,7 @@ fn check_newest(here: &Path, artifact: &Path) {
     }
 }
 
-/// Grades of a candidate that were recorded under a mixture, and those of its file. All atoms are of one element.
+/// Deviation between the selector's grades of a candidate and grades by the exported file. All atoms are of one element.
 fn deviation_of_grades(candidate: &StoredCandidate, artifact: &Path) -> f64 {
     let mixture = Artifact::load(artifact).unwrap().mixture;
     let mut grades = Grades::default();
@@ -125,7 +125,7 @@ fn every_version_grades_as_the_selector_did() {
         }
     }
 
-    // The model with the mixture grades as the artifact does, to the last bit.
+    // The model with the embedded mixture gives bitwise the same grades as the artifact.
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
     let score = |model: &str, options: &[&str], output: &str| {
         let words = ["calm", "score", "--model", model, "seeds.extxyz", "--output", output];
@@ -202,7 +202,7 @@ fn what_cannot_be_exported_is_refused() {
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
     let message = refused(&["--output", "x.npz", "--embed", &model]);
     assert!(message.contains("is the model of the campaign"), "{message}");
-    // Some candidate was declined before the last version, and its features are gone.
+    // A candidate was declined at an earlier version, and its features were not stored.
     let message = refused(&["--version", &(newest - 1).to_string(), "--output", "x.npz"]);
     assert!(message.contains("were not stored (limit: collect.declined_features_mb)"), "{message}");
 

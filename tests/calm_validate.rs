@@ -1,4 +1,4 @@
-//! Tests of a grade without and with labels, through the program.
+//! Validation of a grade, with and without labels, through the program.
 
 use std::path::Path;
 
@@ -27,14 +27,14 @@ fn baselines(here: &Path, arguments: &[&str]) {
     succeed(here, start.iter().chain(arguments));
 }
 
-/// Labelled structures that the aluminium model was trained on.
+/// Labelled structures from the training data of the aluminium model.
 fn aluminium(number: usize) -> Vec<Frame> {
     let mut frames = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
     frames.truncate(number);
     frames
 }
 
-/// Grades a file by the aluminium model into scored.extxyz. Returns what is printed.
+/// Grades a file with the aluminium model into scored.extxyz. Returns the standard output.
 fn score(here: &Path, input: &str, arguments: &[&str]) -> String {
     let model = config("data/al_eam_1l/kokkos.npz");
     let start = ["calm", "score", "--model", model.to_str().unwrap(), input, "--output", "scored.extxyz"];
@@ -136,7 +136,7 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     ];
     validate(here, "ni_al_h_eam_1l", "out", &[&only[..], &ensemble[..]].concat());
     let found = json(&here.join("out"));
-    // A model agrees with itself everywhere.
+    // An ensemble of equal models has no spread anywhere.
     let spread = &found["scores"][1];
     assert_eq!(
         (&spread["name"], &spread["detection"]["at_equilibrium"]),
@@ -150,7 +150,7 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     );
     let compositions = solution["compositions"].as_array().unwrap();
     assert_eq!(compositions.len(), 11);
-    // Aluminium atoms are larger.
+    // Aluminium atoms are larger than nickel atoms.
     let distance = |k: usize| compositions[k]["distance"].as_f64().unwrap();
     assert!(distance(0) < distance(5) && distance(5) < distance(10), "{solution}");
     let atoms: u64 =
@@ -182,7 +182,7 @@ fn baselines_are_scanned_beside_the_grade() {
     ]);
     assert_eq!(Value::from(described), expected);
 
-    // The same crystals, graded by calm score.
+    // `calm score` gives the same grades for the same crystals.
     let scan = &found["bond_scans"][0];
     let points = scan["points"].as_array().unwrap();
     let graded: Vec<_> = points.iter().filter(|point| !point["energy"].is_null()).collect();
@@ -203,7 +203,7 @@ fn baselines_are_scanned_beside_the_grade() {
         assert!(deviation(&scanned, &expected) < 1e-6, "{column}: {scanned:?} {expected:?}");
     }
 
-    // Its own rule decides on each score.
+    // Each score has its own detection rule.
     let equilibrium = scan["equilibrium"].as_f64().unwrap();
     let largest = |k: usize| {
         let compressed =
@@ -232,7 +232,7 @@ fn labelled_structures_have_a_section() {
         score(here, "labelled.extxyz", &["--baseline", "b.npz", "--json", "l.json", "--figures", "drawn"]);
     let more = ["--labelled", "labelled.extxyz", "--baseline", "b.npz", "--scan-steps", "2", "--no-relax"];
     let text = validate(here, "al_eam_1l", "out", &more);
-    // Everything is as calm score has it.
+    // The section equals the output of `calm score`.
     let (_, tables) = printed.split_once("\n\n").unwrap();
     assert!(tables.contains("Spearman’s ρ") && text.contains(tables), "{text}\n{tables}");
     let found = json(&here.join("out"));
@@ -257,7 +257,7 @@ fn labelled_structures_have_a_section() {
         page.contains(&format!("In 3 labelled structures, Spearman’s ρ of γ and force error is {rho:.3}."))
     );
 
-    // What has no labels is refused, and so is an output that would replace them.
+    // Refuses structures without labels, and an output that would replace the input.
     let model = config("data/al_eam_1l/kokkos.npz");
     let refused = |output: &str, labelled: &str| {
         let start = ["calm", "validate", "--model", model.to_str().unwrap(), "--output", output];

@@ -1,4 +1,4 @@
-//! Hosts with wrong certificates: whoever can tell says at once which file is wrong, and nobody waits for ever.
+//! Hosts with wrong certificates: the process that can detect the wrong file names it at once, and no process hangs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,8 @@ impl Authority {
         Self { pem, issuer: Issuer::new(parameters, key) }
     }
 
-    /// A directory with the certificate of a host, which lasts for so long from now on, or is over since then.
+    /// Creates a directory with a host's certificate, which is valid for `days` from now, or expired that long ago if
+    /// negative.
     fn host(&self, directory: PathBuf, name: &str, days: i64) -> PathBuf {
         let key = KeyPair::generate().unwrap();
         let mut own = CertificateParams::new([name.to_owned()]).unwrap();
@@ -53,9 +54,9 @@ fn tls(directory: &Path) -> Vec<String> {
     vec![format!("--tls={}", directory.display())]
 }
 
-/// A campaign whose orchestrator and agent have these certificates, and speak to each other at `localhost`.
+/// A campaign whose orchestrator and agent use these certificates, and connect via `localhost`.
 fn hosts(orchestrator: &Path, agent: &Path) -> Hosts {
-    // It does not end by itself.
+    // The campaign does not end without a signal.
     let small = Small { mode: "live", steps: 1_000_000, max_per_walk: 1_000_000, ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "");
     let port = hosts.endpoints[0].rsplit(':').next().unwrap().to_owned();
@@ -96,7 +97,7 @@ fn files_that_are_wrong_end_a_run_and_an_agent_at_once() {
         }
     }
     assert!(!here.join("campaign/campaign.sqlite").exists(), "nothing was begun");
-    // Agents would be told a name that the certificate has not.
+    // The announced name is not in the certificate.
     let node = authority.host(here.join("node"), "node7", 300);
     let [tls] = tls(&node).try_into().unwrap();
     let arguments =
@@ -106,7 +107,7 @@ fn files_that_are_wrong_end_a_run_and_an_agent_at_once() {
 }
 
 #[test]
-fn a_certificate_that_expires_soon_is_spoken_of_when_a_run_begins() {
+fn a_run_warns_of_a_certificate_that_expires_soon() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     Small::default().write(here);
@@ -117,7 +118,7 @@ fn a_certificate_that_expires_soon_is_spoken_of_when_a_run_begins() {
     let _run =
         Running(command.stdout(Stdio::null()).stderr(fs::File::create(&said).unwrap()).spawn().unwrap());
     let said = || fs::read_to_string(&said).unwrap();
-    wait_until("it listens", || said().contains("agents may join"));
+    wait_until("the orchestrator listens", || said().contains("agents may join"));
     assert!(said().contains("certificate.pem expires on") && said().contains("in 5 days"), "{}", said());
 }
 
@@ -137,7 +138,7 @@ fn an_agent_that_cannot_accept_the_orchestrators_certificate_ends_and_says_why()
         let log = hosts.home.path().join("log");
         hosts.options[0].push(format!("--log={}", log.display()));
         let mut run = hosts.start_orchestrator();
-        wait_until("it listens", || hosts.orchestrator_stderr().contains("agents may join"));
+        wait_until("the orchestrator listens", || hosts.orchestrator_stderr().contains("agents may join"));
         let mut waiting = hosts.agent(0);
         assert_eq!(waiting.0.wait().unwrap().code(), Some(2), "{}", hosts.said(0));
         assert!(hosts.said(0).contains(expected), "{}", hosts.said(0));
@@ -156,11 +157,11 @@ fn an_agent_whose_certificate_the_orchestrator_refuses_ends_and_says_why() {
     let (authority, other) = (Authority::new(), Authority::new());
     let orchestrator = authority.host(here.join("head"), "localhost", 300);
     let agent = other.host(here.join("agent"), "node1", 300);
-    // It trusts both, but is known to one.
+    // The agent trusts both authorities, but only its own authority signed its certificate.
     fs::write(agent.join("authority.pem"), format!("{}{}", other.pem, authority.pem)).unwrap();
     let hosts = hosts(&orchestrator, &agent);
     let mut run = hosts.start_orchestrator();
-    wait_until("it listens", || hosts.orchestrator_stderr().contains("agents may join"));
+    wait_until("the orchestrator listens", || hosts.orchestrator_stderr().contains("agents may join"));
     let mut waiting = hosts.agent(0);
     assert_eq!(waiting.0.wait().unwrap().code(), Some(2), "{}", hosts.said(0));
     let said = hosts.said(0);

@@ -1,4 +1,4 @@
-//! `calmwalk calm score` against the values of gracemaker, and `calmwalk calm info`.
+//! `calmwalk calm score` compared with gracemaker's values, and `calmwalk calm info`.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -101,7 +101,7 @@ fn score_golden(model: &str, artifact: bool) {
     check_features(&here.join("z.npy"), &scored, &gmm);
 }
 
-/// The features of all atoms, graded by the mixture, give the grades that were written.
+/// Grading the written features with the mixture gives the written grades.
 fn check_features(path: &Path, scored: &[Frame], artifact: &Path) {
     let file = NpyFile::new(BufReader::new(File::open(path).unwrap())).unwrap();
     let artifact = Artifact::load(artifact).unwrap();
@@ -135,7 +135,7 @@ fn what_a_frame_came_with_is_kept() {
     let here = directory.path();
     let mut labelled = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap().remove(0);
     labelled.info.insert("note".into(), "mine".into());
-    // A cluster has no stress, and reference labels that stand beside a model's are left alone.
+    // A cluster has no stress, and reference labels beside the model's values are kept.
     let mut cluster = labelled.clone();
     cluster.structure.periodic = [false; 3];
     cluster.info.remove("stress");
@@ -167,7 +167,7 @@ fn info_tells_model_and_artifact_apart() {
     assert_eq!((&model["kind"], &model["architecture"]), (&"model".into(), &"GRACE-1L".into()));
     assert_eq!((&model["cutoff"], &model["lmax"], &model["channels"]), (&6.5.into(), &3.into(), &8.into()));
     assert_eq!((&model["basis_dimension"], &model["feature_dimension"]), (&328.into(), &130.into()));
-    // Of derivatives, see `RadialPath::Table`.
+    // The error of derivatives, see `RadialPath::Table`.
     assert!(model["radial_tables"][0]["error"].as_f64().unwrap() < 1e-9);
     assert_eq!(
         (&model["mixture"]["schema"], &model["mixture"]["can_be_updated"]),

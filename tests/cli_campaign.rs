@@ -1,4 +1,4 @@
-//! What can be done with a campaign from outside: status, queue, export, import.
+//! Commands on a campaign: status, queue, export, import.
 
 use std::fs;
 use std::path::Path;
@@ -13,7 +13,7 @@ use serde_json::Value;
 use crate::common::processes::{assert_no_leftovers, wait_until};
 use crate::common::{Running, config, deviation, program, refuse, succeed, write_frames};
 
-/// Two seed structures, a few hundred steps, two structures from each and as many of their controls.
+/// Two seed structures, a few hundred steps, and two structures per walk with their control frames.
 const CONFIGURATION: &str = r#"
 [potential]
 model = "CONFIGS/data/al_eam_1l/kokkos.npz"
@@ -43,7 +43,7 @@ walks_per_round = 2
 steps_per_assignment = 50
 "#;
 
-/// Writes `small.toml` with its seed structures; the campaign goes to `small`.
+/// Writes `small.toml` and its seed structures; the campaign's directory is `small`.
 fn write_campaign(here: &Path, changes: &[(&str, &str)]) {
     let mut text = CONFIGURATION.replace("CONFIGS", config("").to_str().unwrap().trim_end_matches('/'));
     for (from, to) in changes {
@@ -166,7 +166,7 @@ fn an_export_holds_labels_and_grades_in_decision_order() {
     let all = read_extxyz(&here.join("all.extxyz")).unwrap();
     assert_eq!(all.iter().filter(|frame| text(frame, "origin") == "control").count(), 4);
 
-    // Never in the place of the campaign itself, and not where no file can be.
+    // The output must not replace files of the campaign, and its directory must exist.
     for (output, reason) in
         [("small/campaign.sqlite", "a file of the campaign itself"), ("missing/all.extxyz", "cannot write")]
     {
@@ -175,7 +175,7 @@ fn an_export_holds_labels_and_grades_in_decision_order() {
     }
     succeed(here, ["status", "small"]);
 
-    // Another run of the same campaign, with another number of walkers, exports the same bytes.
+    // The same campaign with another number of walkers exports the same bytes.
     let again = tempfile::tempdir().unwrap();
     write_campaign(again.path(), &[("walkers = 2", "walkers = 1")]);
     succeed(again.path(), ["run", "small.toml"]);
@@ -183,7 +183,7 @@ fn an_export_holds_labels_and_grades_in_decision_order() {
     assert!(fs::read(here.join("ase.extxyz")).unwrap() == fs::read(again.path().join("ase.extxyz")).unwrap());
 }
 
-/// The labels are what the reference potential says of the structures.
+/// The labels equal evaluations by the reference potential.
 fn check_labels(frames: &[Frame]) {
     let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
     let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
@@ -199,7 +199,7 @@ fn check_labels(frames: &[Frame]) {
     }
 }
 
-/// The grades are those of the original mixture: grading the export with it gives them again.
+/// Grading the export with the original mixture gives the exported grades.
 fn check_grades(here: &Path, frames: &[Frame]) {
     let kokkos = config("data/al_eam_1l/kokkos.npz");
     let artifact = config("data/al_eam_1l/gmm_artifacts.npz");
@@ -247,7 +247,7 @@ fn failed_labels_are_shown_retried_and_dropped() {
     assert!(refuse(here, ["queue", "small", "drop", id(2)]).contains("its label job is dropped"));
     assert!(refuse(here, ["queue", "small", "prioritise", id(3), "1"]).contains("its label job is failed"));
 
-    // The same campaign goes on with a limit that lets labels pass.
+    // The campaign continues with a limit that accepts the labels.
     let before = fs::read_to_string(here.join("small.toml")).unwrap();
     fs::write(here.join("small.toml"), before.replace("max_force = 1e-3", "max_force = 1000")).unwrap();
     succeed(here, ["run", "small.toml"]);
@@ -270,7 +270,7 @@ fn labelled_structures_are_imported_once() {
     succeed(here, ["export", "small", "--output", "own.extxyz"]);
     let seeds = read_extxyz(&config("data/al_eam_1l/seed_frames.extxyz")).unwrap();
     write_frames(&here.join("new.extxyz"), &seeds[..3]);
-    // A frame without forces spoils all files.
+    // One frame without forces makes the import of all files fail.
     let mut bad = seeds[3..5].to_vec();
     bad[1].arrays.remove("forces");
     write_frames(&here.join("bad.extxyz"), &bad);
@@ -310,14 +310,14 @@ fn labelled_structures_are_imported_once() {
         "{message}"
     );
     assert!(!here.join("both.extxyz").exists());
-    // Without the imports there are labels of one protocol only.
+    // Without the imports, all labels have one protocol.
     succeed(here, ["export", "small", "--output", "again.extxyz"]);
     assert_eq!(fs::read(here.join("own.extxyz")).unwrap(), fs::read(here.join("again.extxyz")).unwrap());
     let other = ["export", "small", "--output", "both.extxyz", "--imported", "--protocol", "other code"];
     assert!(succeed(here, other).starts_with("3 structures"));
     let message = refuse(here, ["export", "small", "--output", "x.extxyz", "--protocol", "none"]);
     assert!(message.contains("no protocol 'none'; it has 'potential', 'other code'"), "{message}");
-    // The campaign still labels by its own protocol.
+    // The campaign still labels with its own protocol.
     succeed(here, ["run", "small.toml"]);
     assert!(jobs(here).iter().all(|job| job["protocol"] == "potential"));
 }
@@ -356,7 +356,7 @@ fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
         "1\nProperties=species:S:1:pos:R:3:forces:R:3 energy=1\nAl 0 0 0 0 0 0\n",
     )
     .unwrap();
-    // What is known decides what is a duplicate: not while decisions are made.
+    // Imports determine which candidates are duplicates, so a running campaign refuses them.
     let message = refuse(here, ["import", "small", "l.extxyz"]);
     assert!(message.contains("only one process may run a campaign"), "{message}");
     drop(run);

@@ -1,4 +1,4 @@
-//! `calmwalk md`: dynamics of a potential, from a configuration to a trajectory.
+//! `calmwalk md`: molecular dynamics with a potential, from a configuration to a trajectory.
 
 use std::fs;
 use std::path::Path;
@@ -58,7 +58,7 @@ fn energy_is_conserved_and_frames_say_what_the_potential_says() {
         assert!(deviation(&[labels.energy.unwrap()], &[expected.energy()]) < 1e-12);
         assert!((number(frame, "time_fs") - 2.0 * number(frame, "step")).abs() < 1e-9);
         if number(frame, "step") > 0.0 {
-            // At the start, a perfect crystal, forces and shear stress are nothing but rounding.
+            // In the initial perfect crystal, forces and shear stress vanish up to rounding.
             assert!(deviation(&labels.forces.unwrap().concat(), &expected.forces.concat()) < 1e-10);
             assert!(
                 deviation(
@@ -73,8 +73,8 @@ fn energy_is_conserved_and_frames_say_what_the_potential_says() {
         totals.push(labels.energy.unwrap() + kinetic_energy(frame));
     }
     assert!((number(&frames[0], "temperature") - 300.0).abs() < 1e-9);
-    // Half of the kinetic energy has become potential energy meanwhile; Verlet's error is of order (ω dt)²/24 ≈ 10⁻³
-    // of what is exchanged.
+    // Half of the kinetic energy has become potential energy; Verlet's relative error of the exchanged energy is of order (ω
+    // dt)²/24 ≈ 10⁻³.
     let exchanged = kinetic_energy(&frames[0]);
     let spread = totals.iter().fold(0.0, |worst: f64, total| worst.max((total - totals[0]).abs()));
     assert!(spread < 5e-3 * exchanged, "{spread} of {exchanged} eV");
@@ -118,7 +118,7 @@ fn the_configuration_in_configs_runs() {
     assert!(printed.starts_with("2000 steps of 32 atoms"), "{printed}");
     let frames = read_extxyz(&here.join("t.extxyz")).unwrap();
     assert_eq!(frames.len(), 21);
-    // The mean of 20 frames that know little of each other: √(2/93/20) of 300 K is 10 K.
+    // The mean of 20 nearly independent frames: √(2/93/20) of 300 K is 10 K.
     let mean = frames[1..].iter().map(|frame| number(frame, "temperature")).sum::<f64>() / 20.0;
     assert!((mean - 300.0).abs() < 50.0, "{mean} K");
 }

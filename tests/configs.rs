@@ -1,4 +1,4 @@
-//! Every file of `configs/` runs as it stands, and what comes of it can be read.
+//! Every file of `configs/` runs unchanged, and its results can be read.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -12,11 +12,11 @@ use serde_json::Value;
 
 use crate::common::{config, deviation, refuse, stderr, succeed};
 
-/// Runs a demo of so many biased walks to its end and checks its books; returns its labelled frames, control walks included.
-/// No two atoms may be closer than `least` Å.
+/// Runs a demo with this number of biased walks to its end, and checks its results. Returns its labelled frames, including
+/// control frames. No two atoms may be closer than `least` Å.
 fn campaign(directory: &Path, name: &str, walks: usize, least: f64) -> Vec<Frame> {
     let file = config(name).display().to_string();
-    // Beside its configuration it would be in the project.
+    // By default the campaign would be written beside its configuration, in the repository.
     let here = directory.join(Path::new(name).file_stem().unwrap()).display().to_string();
     let summary = succeed(directory, ["run", &file, "--directory", &here]);
     assert!(summary.contains(&format!("walks            {walks} biased")), "{summary}");
@@ -68,7 +68,7 @@ fn check_frames(frames: &[Frame], accepted: usize, least: f64) {
     assert_eq!(biased, accepted);
 }
 
-/// The labels are those of the potential that the configuration names.
+/// The labels equal evaluations by the configured potential.
 fn check_labels(frames: &[Frame], potential: &mut dyn Potential) {
     let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
     let mut expected = Evaluation::default();
@@ -84,7 +84,7 @@ fn check_labels(frames: &[Frame], potential: &mut dyn Potential) {
     }
 }
 
-/// ASE reads the same structures and labels.
+/// Checks that ASE reads the same structures and labels.
 fn read_by_ase(path: &Path, frames: &[Frame]) {
     let Some(python) = std::env::var_os("CALMWALK_PYTHON") else {
         eprintln!("CALMWALK_PYTHON is not set: no comparison with ASE");
@@ -109,7 +109,7 @@ fn read_by_ase(path: &Path, frames: &[Frame]) {
         assert_eq!(numbers("cell"), frame.structure.cell.0.as_flattened());
         assert_eq!(found["energy"].as_f64(), labels.energy);
         assert_eq!(numbers("forces"), labels.forces.unwrap().as_flattened());
-        // ASE goes by Voigt components, which are those of the symmetric stress.
+        // ASE converts to Voigt components, which symmetrises the stress.
         assert!(deviation(&numbers("stress"), labels.stress.unwrap().as_flattened()) < 1e-12);
         assert_eq!(numbers("gamma"), frame.arrays["gamma"].reals().unwrap());
     }
@@ -133,15 +133,15 @@ fn silicon_runs_as_it_stands() {
 #[test]
 fn nickel_aluminium_hydrogen_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    // Three temperatures of 8 seed structures, and two more of the 7 with hydrogen, two atoms of which may come as close
-    // as the configuration says.
+    // Three temperatures for 8 seed structures, and two more for the 7 with hydrogen. The configuration limits the distance
+    // of two hydrogen atoms.
     let frames = campaign(directory.path(), "nickel-aluminium-hydrogen.toml", 38, 0.6);
     let mut potential = Eam::load_as(config("data/NiAlH_jea.eam.alloy"), EamStyle::Alloy).unwrap();
     check_labels(&frames, &mut potential);
     check_conditions(&frames);
 }
 
-/// All temperatures, both directions of the ramp and the bonds of hydrogen are in what came out.
+/// Checks that the frames cover all temperatures, both directions of the volume ramp, and bonds of hydrogen.
 fn check_conditions(frames: &[Frame]) {
     let numbers =
         |key: &str| frames.iter().map(|frame| frame.info[key].number().unwrap()).collect::<Vec<_>>();
@@ -182,7 +182,7 @@ fn the_foundation_campaign_runs_once_its_files_are_there() {
     assert!(text.contains("\ncovariance_update = \"additive\"") && text.contains("\n[[walks]]"));
 }
 
-/// Runs one of the files for foundation models with a small model and short walks, so many of them. Returns its text.
+/// Runs a configuration for foundation models with a small model and short walks. Returns its text.
 fn foundation_campaign(name: &str, walks: usize) -> String {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
@@ -213,7 +213,7 @@ fn foundation_campaign(name: &str, walks: usize) -> String {
 
 #[test]
 fn every_file_of_configs_is_run_by_a_test() {
-    // silicon-dft.toml with ABINIT: cargo test --test external dft::
+    // `cargo test --test external dft::` runs silicon-dft.toml.
     let run = [
         "aluminium.toml",
         "foundation-campaign.toml",

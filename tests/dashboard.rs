@@ -1,5 +1,5 @@
-//! The dashboard of a campaign that runs, and of one that is only looked at: pages, news, the table, candidates, and actions,
-//! which only who knows the token may do, and no page of another site.
+//! The dashboard of a running campaign and of a read-only copy: pages, events, the table, candidates, and actions, which need
+//! the token and are refused to pages of other sites.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -17,7 +17,7 @@ use crate::common::http::{first_event, get, get_computed, request, said};
 use crate::common::processes::wait_until;
 use crate::common::{Running, config, program, refuse, succeed};
 
-/// A campaign that waits for labels from elsewhere.
+/// A running campaign that waits for external labels.
 struct Live {
     directory: TempDir,
     _run: Running,
@@ -26,10 +26,10 @@ struct Live {
 }
 
 impl Live {
-    /// One that has collected all it may.
+    /// A campaign that has collected all its structures.
     fn begin() -> Self {
         let live = Self::labelling("concurrency = 0");
-        wait_until("all is collected", || {
+        wait_until("all structures are collected", || {
             let status = live.status();
             let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
             let walks = status["walks"].as_array().unwrap();
@@ -38,7 +38,7 @@ impl Live {
         live
     }
 
-    /// With these lines of its section `[label]`.
+    /// Adds lines to the section `[label]`.
     fn labelling(label: &str) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let here = directory.path();
@@ -73,13 +73,13 @@ impl Live {
     }
 }
 
-/// A walk is paused or resumed: the answer's status, and what it says.
+/// Pauses or resumes a walk. Returns status and body of the response.
 fn change_walk(live: &Live, path: &str, headers: &[(&str, &str)]) -> (u16, Value) {
     let answer = request(&live.address, "POST", &format!("/api/walks/{path}"), headers, "{}");
     (answer.status, answer.json())
 }
 
-/// Every line of the table, a few at a time.
+/// Every line of the table, read in pages of `limit`.
 fn all_lines(address: &str, query: &str, limit: usize) -> Vec<Value> {
     let (mut lines, mut after) = (Vec::new(), String::new());
     loop {
@@ -211,7 +211,7 @@ fn check_actions(live: &Live, id: &str) {
     assert_eq!(get(&live.address, &path).status, 405);
     let asked = request(&live.address, "OPTIONS", &path, &[("Origin", "http://example.org")], "");
     assert!(!asked.head.contains("access-control"), "{}", asked.head);
-    assert_eq!(live.job(id), before, "nothing of that changed anything");
+    assert_eq!(live.job(id), before, "no refused request changes anything");
 
     let headers = [token, ("Origin", origin.as_str()), ("Sec-Fetch-Site", "same-origin")];
     assert_eq!(live.act(id, "prioritise", &headers, &json!({})).0, 400);
@@ -249,7 +249,7 @@ fn a_live_campaign_is_looked_at_and_changed() {
     check_copy(&live, id);
 }
 
-/// The components are those of the artifact, and some have moved.
+/// Compares the components with the artifact; some have moved.
 fn check_mixture(live: &Live) {
     let mixture = get_computed(&live.address, "/api/mixture");
     assert_eq!(mixture["version"], live.status()["mixture_version"]);
@@ -278,7 +278,7 @@ fn check_mixture(live: &Live) {
     assert!(found.iter().any(|component| component["moved"] == true));
 }
 
-/// A condition finds in the table what it finds for `calmwalk export`.
+/// A condition selects the same candidates in the table as in `calmwalk export`.
 #[test]
 fn the_table_and_exports_speak_one_language() {
     let directory = tempfile::tempdir().unwrap();
@@ -321,8 +321,8 @@ fn the_table_and_exports_speak_one_language() {
 }
 
 #[test]
-fn walks_are_paused_and_resumed_by_who_knows_the_token() {
-    // Walkers wait for ever when that many structures wait for labels, and walks stay under way.
+fn walks_are_paused_and_resumed_with_the_token() {
+    // The queue limit blocks the walkers, so the walks never end.
     let live = Live::labelling("concurrency = 0\nqueue_limit = 4");
     wait_until("walkers wait", || live.status()["labels"]["queued"].as_u64() > Some(4));
     let paused = || {
@@ -345,7 +345,7 @@ fn walks_are_paused_and_resumed_by_who_knows_the_token() {
         assert_eq!(found, status, "{headers:?} {why}");
     }
     assert_eq!(get(&live.address, &format!("/api/walks/{pause}")).status, 405);
-    assert_eq!(paused(), [0; 0], "nothing of that changed anything");
+    assert_eq!(paused(), [0; 0], "no refused request changes anything");
 
     assert_eq!(change_walk(&live, &pause, &[token]), (200, json!({ "changed": [going[0]], "paused": true })));
     assert_eq!(paused(), [going[0]]);
@@ -359,7 +359,7 @@ fn walks_are_paused_and_resumed_by_who_knows_the_token() {
     }
 }
 
-/// What is only looked at can only be looked at.
+/// The dashboard of a copy is read-only.
 fn check_copy(live: &Live, id: &str) {
     let here = live.here();
     succeed(here, ["store", "backup", "campaign", "copy"]);

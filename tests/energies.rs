@@ -1,4 +1,5 @@
-//! Energies of labels: which are believed, and how far the potential is from them when the difference of zeros is taken out.
+//! Energies of labels: which are accepted, and the energy errors of the potential without the offset between the zeros of
+//! energy.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,7 +13,7 @@ use crate::common;
 use crate::common::campaign::Small;
 use crate::common::succeed;
 
-/// A calculation whose energy is what the awk expression ENERGY gives; N is the number of atoms, X the first coordinate of the second.
+/// A calculation whose energy is the awk expression ENERGY; N is the number of atoms, X the x coordinate of the second atom.
 const SCRIPT: &str = r#"
 N=$(head -n 1 structure.extxyz)
 X=$(awk 'NR == 4 { print $2 }' structure.extxyz)
@@ -25,7 +26,7 @@ awk -v E="$E" '
 mv unfinished label.extxyz
 "#;
 
-/// Two frames, of which the second has the larger energy.
+/// Two frames; the energy of the second is larger in magnitude.
 const IMPORTED: &str = r#"1
 Lattice="9 0 0 0 9 0 0 0 9" Properties=species:S:1:pos:R:3:forces:R:3 pbc="T T T" energy=-40
 Al 0 0 0 0 0 0
@@ -34,7 +35,7 @@ Lattice="8 0 0 0 8 0 0 0 8" Properties=species:S:1:pos:R:3:forces:R:3 pbc="T T T
 Al 0 0 0 0 0 0
 "#;
 
-/// A campaign `here` whose labels have this energy, by an awk expression; `keys` are of `[label]`.
+/// A finished campaign `here` whose label energies are given by an awk expression; `keys` are added to `[label]`.
 fn labelled_with(energy: &str, keys: &str) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     let path = Small::default().write(directory.path());
@@ -52,7 +53,7 @@ fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
     serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
 }
 
-/// State of every job, number of atoms, and what its last attempt left as its log.
+/// State, number of atoms and log of the first attempt of every job.
 fn jobs(here: &Path) -> Vec<(String, u64, String)> {
     let jobs = json(here, ["queue", "here", "list", "--limit", "1000"]);
     let one = |job: &Json| {
@@ -83,7 +84,7 @@ fn an_absurd_energy_is_a_failed_attempt() {
     }
 }
 
-/// The bounds are keys of the configuration, also where nothing runs.
+/// The configured bounds also apply to `import` and `label-file`.
 #[test]
 fn bounds_are_those_of_the_configuration() {
     let directory = labelled_with("-56.5 * N", "max_energy_per_atom = 50.0");
@@ -92,7 +93,7 @@ fn bounds_are_those_of_the_configuration() {
         assert!(state == "failed" && log.contains(message), "{log}");
     }
     let here = directory.path();
-    // Without labels there are no energy errors, and it is said why.
+    // Without labels there are no energy errors, and the output gives the reason.
     let errors = json(here, ["force-errors", "here"]);
     assert_eq!(
         (&errors["energy"]["mean"], &errors["energy"]["offsets"]["structures"]),
@@ -103,7 +104,7 @@ fn bounds_are_those_of_the_configuration() {
         told.contains("no energy errors: ") && told.contains("at least 2 labelled structures; there are 0"),
         "{told}"
     );
-    // Nor is an import believed.
+    // An import is checked as well.
     fs::write(here.join("known.extxyz"), IMPORTED).unwrap();
     let message = common::refuse(here, ["import", "here", "known.extxyz"]);
     assert!(
@@ -120,7 +121,7 @@ fn bounds_are_those_of_the_configuration() {
     assert!(said.contains("beyond label.max_energy_per_atom = 50 eV/atom"), "{said}");
 }
 
-/// Energies of every labelled candidate in eV an atom, by its name: of the potential and of the label; with the structure's hash.
+/// Energies of the potential and of the label, eV/atom, and the structure's hash, by candidate.
 fn energies(here: &Path) -> BTreeMap<String, (f64, f64, String)> {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let rows = runtime.block_on(async {
@@ -138,7 +139,7 @@ fn energies(here: &Path) -> BTreeMap<String, (f64, f64, String)> {
     rows.into_iter().map(one).collect()
 }
 
-/// E_label − E_model of an atom: the mean over structures, each of which counts once although walks and controls may share it.
+/// Mean of E_label − E_model per atom over structures; a structure shared by walks and controls counts once.
 fn offset(energies: &BTreeMap<String, (f64, f64, String)>) -> f64 {
     let differences: BTreeMap<_, _> =
         energies.values().map(|(model, label, content)| (content, label - model)).collect();
@@ -159,7 +160,7 @@ fn energy_errors_are_without_the_difference_of_zeros() {
     assert!(energies.len() > 4 && offset < -50.0, "{offset}");
     let errors: BTreeMap<_, _> =
         energies.iter().map(|(id, (model, label, _))| (id, model - label + offset)).collect();
-    // A structure that a walk shares with its control counts once.
+    // A structure that a walk shares with its control walk counts once.
     let of_structures: BTreeMap<_, _> =
         energies.values().map(|(model, label, content)| (content, model - label + offset)).collect();
 
@@ -183,7 +184,7 @@ fn energy_errors_are_without_the_difference_of_zeros() {
         let line = format!("E_model − E_label: {:.1} meV/atom", 1000.0 * error);
         assert!(told.contains(&line) && told.contains(&note), "{line}\n{told}");
     }
-    // Nowhere is the difference of zeros called an error.
+    // No output includes the offset between the zeros of energy in an error.
     let summary = succeed(here, ["run", "campaign.toml", "--directory", "here"]);
     let told = succeed(here, ["force-errors", "here"]);
     succeed(here, ["report", "here", "--output", "report"]);

@@ -1,4 +1,4 @@
-//! What labels teach: `calmwalk force-errors`, `calmwalk report`, and what `status` and the summary say of labels that failed.
+//! Errors derived from labels: `calmwalk force-errors`, `calmwalk report`, and failed labels in `status` and the summary.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -47,7 +47,7 @@ fn pairs(rows: &[&ExportRow]) -> Vec<(f64, f64)> {
     pairs
 }
 
-/// By counting: ρ of the ranks, where a rank is the number of smaller values and half of that of equal ones.
+/// Spearman's ρ by counting: a rank is the number of smaller values plus half the number of equal ones.
 fn spearman(pairs: &[(f64, f64)]) -> f64 {
     let rank = |value: f64, of: &dyn Fn(&(f64, f64)) -> f64| {
         let smaller = pairs.iter().filter(|pair| of(pair) < value).count() as f64;
@@ -66,7 +66,7 @@ fn atoms_in(bin: &Json, pairs: &[(f64, f64)]) -> usize {
     pairs.iter().filter(|(gamma, _)| *gamma > above && *gamma <= up_to).count()
 }
 
-/// At the first biased step the bias is silent: the control has the very same structure there.
+/// The bias is zero at the first biased step, so the control walk has the same structure there.
 #[test]
 fn structures_of_both_walks_are_counted_and_not_compared() {
     let directory = tempfile::tempdir().unwrap();
@@ -104,7 +104,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     let rows = labelled(&here.join("whole"));
     let mut forces: Vec<_> = rows.iter().map(max_force).collect();
     forces.sort_by(f64::total_cmp);
-    // The same campaign, in which a third of the labels is not believed.
+    // The same campaign, but a third of the labels exceeds the maximum force.
     let limit = forces[forces.len() * 2 / 3];
     let text = fs::read_to_string(&config).unwrap();
     let text = text.replace("[label]", &format!("[label]\nmax_force = {limit}\nmax_attempts = 1"));
@@ -142,7 +142,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
         "{text}"
     );
 
-    // A walk and its control begin with the same structure, which has one job.
+    // A walk and its control walk start from the same structure, which has one job.
     let lost: BTreeSet<_> = lost.iter().map(|row| content(row)).collect();
     let kept: BTreeSet<_> = kept.iter().map(|row| content(row)).collect();
     let status = json(here, ["status", "strict"]);
@@ -158,7 +158,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     }
     assert!(!succeed(here, ["status", "whole"]).contains("unlabelled"));
     common::report::check(here, "strict", &status, &errors);
-    // Another protocol than there is.
+    // An unknown protocol.
     let wrong = common::refuse(here, ["force-errors", "whole", "--protocol", "nothing"]);
     assert!(wrong.contains("no protocol 'nothing'; it has 'potential'"), "{wrong}");
 }
@@ -172,13 +172,13 @@ fn labels_that_wait_have_a_price_as_soon_as_one_was_made() {
     fs::write(&config, text.replace("[label]", "[label]\nconcurrency = 0")).unwrap();
     let _run = common::Running(common::program(here).args(["run", "campaign.toml"]).spawn().unwrap());
     let queued = || json(here, ["status", "campaign"])["labels"]["queued"].as_u64().unwrap_or(0);
-    common::processes::wait_until("all is collected", || {
+    common::processes::wait_until("all structures are collected", || {
         here.join("campaign/campaign.sqlite").exists() && queued() >= 4
     });
     let before = json(here, ["status", "campaign"]);
     assert_eq!(before["cost"]["queue"]["remaining"], Json::Null, "{before}");
     assert!(succeed(here, ["status", "campaign"]).contains("unknown before the first one"));
-    // Labels from elsewhere.
+    // Make the labels with `calmwalk label`.
     let mut labeller = common::Running(
         common::program(here).args(["label", "--store", "campaign", "--until-empty"]).spawn().unwrap(),
     );

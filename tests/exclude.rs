@@ -1,4 +1,4 @@
-//! `calmwalk exclude`: a bad label counts nowhere, and everything says that it was excluded.
+//! `calmwalk exclude`: a bad label is left out of exports and statistics, and all views show that it is excluded.
 
 use std::path::Path;
 
@@ -19,7 +19,7 @@ fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
     serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
 }
 
-/// Candidates in an export, and what was said of it.
+/// Candidates in an export, and its standard output.
 fn exported(here: &Path) -> (Vec<String>, String) {
     let said = succeed(here, ["export", "here", "--output", "out.extxyz"]);
     let frames = atoms::read_extxyz(&here.join("out.extxyz")).unwrap();
@@ -27,14 +27,14 @@ fn exported(here: &Path) -> (Vec<String>, String) {
 }
 
 #[test]
-fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
+fn a_bad_label_is_left_out_until_it_is_included_again() {
     let directory = campaign();
     let here = directory.path();
     let (before, _) = exported(here);
     assert!(before.len() > 2);
     let bad = before[1].as_str();
     let (errors, report) = (json(here, ["force-errors", "here"]), "the SCF loop had two solutions");
-    // The campaign's part of the name may be left out.
+    // The id may omit the campaign.
     let short = bad.split_once('-').unwrap().1;
     let said = succeed(here, ["exclude", "here", short, "--reason", report]);
     assert!(
@@ -58,7 +58,7 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     };
     assert!(completed(&now) < completed(&errors));
 
-    // It is said wherever the label, or the campaign, is shown.
+    // Every view of the label or the campaign shows it.
     let status = json(here, ["status", "here"]);
     assert_eq!(status["labels"]["excluded"], 1);
     assert!(succeed(here, ["status", "here"]).contains("1 labels excluded"));
@@ -76,7 +76,7 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     let excluded = json(here, ["exclude", "here", "--list"]);
     assert_eq!((&excluded[0]["id"], &excluded[0]["reason"]), (&bad.into(), &report.into()));
     assert!(succeed(here, ["run", "campaign.toml", "--directory", "here"]).contains("1 excluded by hand"));
-    // Dropping is for what has no label, and says what is for the others.
+    // `queue drop` refuses structures with labels, and names the right command.
     let message = refuse(here, ["queue", "here", "drop", bad]);
     assert!(message.contains("use calmwalk exclude to take its label out of the data set"), "{message}");
 

@@ -1,4 +1,4 @@
-//! `calmwalk explain`: the history of a candidate is what the store holds, whatever became of it.
+//! `calmwalk explain`: the history of every candidate agrees with the store.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +12,7 @@ use crate::common;
 use crate::common::campaign::Small;
 use crate::common::{refuse, succeed};
 
-/// Walks from alike structures that advance together: what one finds is no news from the others.
+/// Concurrent walks from similar structures: a structure found by one of them is often covered for the others.
 fn campaign(changes: &[(&str, &str)]) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     let small = Small {
@@ -35,7 +35,7 @@ fn explain(here: &Path, id: &str) -> Value {
     serde_json::from_str(&succeed(here, ["explain", "here", id, "--json"])).unwrap()
 }
 
-/// Everything that the campaign decided, and the candidates of its decisions.
+/// All decisions of the campaign with their candidates.
 fn contents(here: &Path) -> Vec<(LoggedDecision, Option<StoredCandidate>)> {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     runtime.block_on(async {
@@ -53,12 +53,12 @@ fn contents(here: &Path) -> Vec<(LoggedDecision, Option<StoredCandidate>)> {
     })
 }
 
-/// Names of the candidates in a list of them.
+/// Candidate names in a list.
 fn names(list: &Value) -> Vec<&str> {
     list.as_array().unwrap().iter().map(|named| named["candidate"].as_str().unwrap()).collect()
 }
 
-/// The grades are those of the store, and the atoms that triggered are those above the threshold.
+/// Compares the grades with the store; the triggering atoms are those above the threshold.
 fn check_grades(details: &Value, stored: &StoredCandidate) {
     let (view, grades) = (stored.block.view(), &details["grades"]);
     let atoms = grades["atoms"].as_array().unwrap();
@@ -78,7 +78,7 @@ fn check_grades(details: &Value, stored: &StoredCandidate) {
     assert_eq!(grades["original"]["gamma_max"], largest);
 }
 
-/// The label's errors are those of the potential's forces.
+/// Checks the label, and the errors of the potential's forces.
 fn check_label(details: &Value, stored: &StoredCandidate) {
     let labels = details["labels"].as_array().unwrap();
     assert_eq!((labels.len(), &labels[0]["standing"]), (1, &"label".into()));
@@ -150,7 +150,7 @@ fn check_accepted(
     check_label(details, stored);
     let trigger = &details["grades"]["trigger"];
     assert!(trigger["above_walker"].as_u64() >= trigger["needed"].as_u64(), "{trigger}");
-    // Whoever was declined as covered later without having seen this version, from the whole log.
+    // Candidates declined as covered after this decision, whose walker had not seen this mixture version, from the whole log.
     let later = contents.iter().filter(|(later, candidate)| {
         let seen = candidate.as_ref().map(|candidate| candidate.block.view().mixture_version());
         later.sequence > decision.sequence
@@ -187,7 +187,7 @@ fn check_declined(
 }
 
 #[test]
-fn a_story_is_told_in_words_also_of_a_copy_and_of_what_failed() {
+fn explain_describes_copies_and_failed_labels_in_words() {
     let directory = campaign(&[("[label]\n", "[label]\nmax_force = 1e-6\nmax_attempts = 1\n")]);
     let here = directory.path();
     let contents = contents(here);
@@ -202,7 +202,7 @@ fn a_story_is_told_in_words_also_of_a_copy_and_of_what_failed() {
     fs::create_dir(here.join("copy")).unwrap();
     fs::copy(here.join("here/campaign.sqlite"), here.join("copy/campaign.sqlite")).unwrap();
     let before = fs::read(here.join("copy/campaign.sqlite")).unwrap();
-    // The campaign's part of the name may be left out, and the content as well.
+    // The id may omit the campaign and the content hash.
     let short = accepted.split('-').nth(1).unwrap();
     for place in ["here", "copy"] {
         let told = succeed(here, ["explain", place, short]);
@@ -220,7 +220,11 @@ fn a_story_is_told_in_words_also_of_a_copy_and_of_what_failed() {
             assert!(told.contains(part), "no '{part}' in\n{told}");
         }
     }
-    assert_eq!(fs::read(here.join("copy/campaign.sqlite")).unwrap(), before, "looked at, and not changed");
+    assert_eq!(
+        fs::read(here.join("copy/campaign.sqlite")).unwrap(),
+        before,
+        "explain does not change the copy"
+    );
     let declined = succeed(here, ["explain", "here", &of_kind("declined")]);
     assert!(declined.contains("declined: ") && declined.contains("no label job"), "{declined}");
     let control = succeed(here, ["explain", "here", &of_kind("control")]);

@@ -1,4 +1,4 @@
-//! `calmwalk export`: choosing structures, dividing them by seed structure, and the names of training codes.
+//! `calmwalk export`: selections, splits by seed structure, and the names of training codes.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -122,8 +122,8 @@ fn whole_seed_structures_go_to_one_part() {
     assert!(split(&[])[0].2 == bytes, "the same bytes each time");
     let others: Vec<_> =
         (1..9).map(|seed| split(&["--split-seed", &seed.to_string()])[0].1.clone()).collect();
-    assert!(others.iter().any(|other| *other != train_seeds), "another number deals otherwise");
-    // What is left out changes nothing for the others.
+    assert!(others.iter().any(|other| *other != train_seeds), "another seed gives another split");
+    // A selection does not change the part of the other seed structures.
     let [(_, high_seeds, _), _] = split(&["--where", "gamma > 1.5"]);
     assert!(high_seeds.is_subset(&train_seeds));
     let many = "a=0.2,b=0.2,c=0.2,d=0.2,e=0.1,f=0.1";
@@ -133,7 +133,7 @@ fn whole_seed_structures_go_to_one_part() {
     assert!(message.contains("the shares add up to 1.1"), "{message}");
 }
 
-/// ASE finds the labels under the names of each training code, and where each frame came from.
+/// ASE reads the labels under the names of each training code, and the origin of each frame.
 #[test]
 fn training_codes_find_their_names() {
     let directory = campaign();
@@ -190,7 +190,7 @@ fn training_codes_find_their_names() {
     }
 }
 
-/// Changes the database of the campaign behind the program's back.
+/// Changes the database without the program.
 fn change(here: &Path, statements: &[&str]) {
     let file = SqliteConnectOptions::new().filename(here.join("here/campaign.sqlite")).foreign_keys(false);
     tokio::runtime::Runtime::new().unwrap().block_on(async {
@@ -202,7 +202,7 @@ fn change(here: &Path, statements: &[&str]) {
     });
 }
 
-/// What it says on the standard error; nothing is written.
+/// Standard error of a failed export, which must not write a file.
 fn fails(here: &Path) -> String {
     let output = calmwalk(here, ["export", "here", "--output", "out.extxyz"]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
@@ -211,7 +211,7 @@ fn fails(here: &Path) -> String {
     stderr(&output)
 }
 
-/// The sign and a bit of the exponent of a force are flipped, a label is missing in its index, or a candidate in its table.
+/// A force has a flipped sign and exponent bit, the index lacks a label, or the table lacks a candidate.
 #[test]
 fn a_damaged_database_is_refused_with_what_is_damaged() {
     let directory = campaign();
@@ -255,7 +255,7 @@ fn a_damaged_database_is_refused_with_what_is_damaged() {
     export(here, &[]);
 }
 
-/// Nobody else may read the campaign, its log or a backup of it, and a lock that is deleted still holds.
+/// Only the owner can read the campaign, its log and its backups.
 #[test]
 fn files_of_a_campaign_are_private() {
     let directory = tempfile::tempdir().unwrap();
@@ -264,7 +264,7 @@ fn files_of_a_campaign_are_private() {
     let path = path.to_str().unwrap();
     succeed(here, ["run", path, "--directory", "here", "--log", "run.log"]);
     succeed(here, ["store", "backup", "here", "copy"]);
-    // While it is open there are files beside it.
+    // An open database has additional files.
     let open = SqliteConnectOptions::new().filename(here.join("here/campaign.sqlite"));
     tokio::runtime::Runtime::new().unwrap().block_on(async {
         let mut connection = open.connect().await.unwrap();

@@ -1,4 +1,4 @@
-//! A campaign whose walks diverge is no success: why they ended is said, counted and told, and the exit code is 1.
+//! A campaign whose walks all diverge fails: it reports, counts and notifies the causes, and exits with code 1.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -12,13 +12,13 @@ use crate::common::{calmwalk, stderr, succeed};
 
 const SEEDS: &[&str] = &["fcc-100", "vacancy", "fcc-097", "fcc-103"];
 
-/// Walks that are soon hotter than they may be: every one, or none.
+/// Writes a campaign in which all walks soon exceed the maximum temperature, or none.
 fn write(here: &Path, all_fail: bool) {
     let small = Small { steps: 40, seeds: SEEDS, walks_per_round: 4, ..Small::default() };
     let path = small.write(here);
     let mut text = small.text();
     if all_fail {
-        // What a displaced atom lets go is more than such walks may have.
+        // The energy of a displaced atom heats the cell above this limit.
         text = text.replace("temperature = 700.0", "temperature = 1.0");
         text = text.replace("[guard]", "[guard]\nmax_temperature = 2.0");
         let mut frames = atoms::read_extxyz(&here.join("seeds.extxyz")).unwrap();
@@ -49,7 +49,7 @@ fn a_campaign_whose_walks_all_diverge_has_failed() {
         "{summary}"
     );
     assert!(summary.contains("what to change: a smaller walk.time_step"), "{summary}");
-    // Of three walks or four: they may end together.
+    // The warning counts three or four walks, which may end together.
     assert!(said.contains("WARNING: ") && said.contains(" finished walks ended early ("), "{said}");
     assert!(said.contains("the campaign has failed: 4 of 4 finished walks"), "{said}");
 
@@ -62,7 +62,7 @@ fn a_campaign_whose_walks_all_diverge_has_failed() {
     assert_eq!((ends.len(), &ends[0]["end"], &ends[0]["cause"]), (1, &"diverged".into(), &"too_hot".into()));
     assert_eq!(ends[0]["walks"], 4);
 
-    // The same command once more comes to the same end, and tells nothing twice.
+    // Running the same command again fails again, and sends no second notification.
     assert_eq!(calmwalk(here, ["run", "campaign.toml"]).status.code(), Some(1));
     let events = fs::read_to_string(here.join("events")).unwrap();
     let told: Vec<_> = events.lines().filter(|line| line.starts_with("failing_walks ")).collect();

@@ -1,7 +1,7 @@
-//! A user of the host who has no token opens as many connections to the dashboard as the system lets him. The campaign does not
-//! mind, and its user is answered.
+//! A user without the token opens as many connections to the dashboard as the system permits. The campaign continues, and its
+//! owner is still served.
 //!
-//! `CALMWALK_FLOOD=5000 cargo test --test integration floods::` for the long version: so many connections, 300 by default.
+//! `CALMWALK_FLOOD=5000 cargo test --test integration floods::` opens 5000 connections instead of 300.
 
 use std::collections::VecDeque;
 use std::fs;
@@ -22,18 +22,18 @@ use crate::common::processes::{
     assert_no_leftovers, pause_walkers, processes_running, resume_processes, signal, wait_until,
 };
 
-/// Descriptors that the campaign's process may have.
+/// Limit of file descriptors of the campaign's process.
 const LIMIT: usize = 256;
-/// Connections that the flood holds at any time; new ones take the place of old ones.
+/// Number of connections that the flood keeps open; new ones replace old ones.
 const HELD: usize = 280;
 
-/// Connections in the flood.
+/// Total number of connections of the flood.
 fn connections() -> usize {
     std::env::var("CALMWALK_FLOOD").ok().and_then(|text| text.parse().ok()).unwrap_or(300)
 }
 
-/// What the connections say, in turns: nothing, a part of a request, a part of one with a body, a whole one whose answer nobody
-/// reads.
+/// Requests of the connections, in turn: none, a partial request, one with a partial body, and a complete one whose response
+/// is not read.
 const SAID: [&str; 4] = [
     "",
     "GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ",
@@ -41,7 +41,7 @@ const SAID: [&str; 4] = [
     "GET /api/events HTTP/1.1\r\nHost: localhost\r\n\r\n",
 ];
 
-/// Connections that come one after the other, for as long as this lives.
+/// Opens connections one after the other until it is dropped.
 struct Flood {
     flowing: Arc<AtomicBool>,
     opened: Arc<AtomicUsize>,
@@ -59,7 +59,7 @@ impl Flood {
                 if number > connections() {
                     thread::sleep(Duration::from_millis(5));
                 }
-                // Where the campaign has ended nobody listens any more.
+                // Connecting fails once the campaign has ended.
                 let Ok(mut stream) = TcpStream::connect(&address) else { continue };
                 let _ = stream.write_all(SAID[number % SAID.len()].as_bytes());
                 held.push_back(stream);
@@ -86,7 +86,7 @@ impl Drop for Flood {
 
 #[test]
 fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
-    // No walker may fail twice.
+    // A walker may be restarted only once.
     let small = Small::default();
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
@@ -105,7 +105,7 @@ fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
     let held = pause_walkers(here, 2);
 
     let flood = Flood::begin(address);
-    wait_until("the flood is there", || flood.opened() >= connections());
+    wait_until("the flood has opened its connections", || flood.opened() >= connections());
     signal(held[0], "KILL");
     wait_until("the walker is replaced", || {
         processes_running(here, "walker").iter().any(|pid| !held.contains(pid))
@@ -125,12 +125,12 @@ fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
 }
 
 #[test]
-fn who_says_nothing_is_not_listened_to_for_ever() {
+fn silent_connections_are_closed() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let path = Small::default().write(here);
     let text = fs::read_to_string(&path).unwrap();
-    // It waits for labels from elsewhere.
+    // The campaign waits for external labels.
     fs::write(&path, text.replace("[label]", "[label]\nconcurrency = 0")).unwrap();
     let mut command = common::program(here);
     command.args(["run", "campaign.toml", "--dashboard", "127.0.0.1:0"]);
@@ -144,7 +144,7 @@ fn who_says_nothing_is_not_listened_to_for_ever() {
         stream
     };
     let mut streams: Vec<_> = SAID[..3].iter().map(|text| connect(text)).collect();
-    // One that was answered and says no more.
+    // A connection that stays idle after its response.
     streams.push(connect("GET /api/samples HTTP/1.1\r\nHost: localhost\r\n\r\n"));
     let answers = streams.into_iter().map(|mut stream| {
         let mut answer = Vec::new();
@@ -156,12 +156,12 @@ fn who_says_nothing_is_not_listened_to_for_ever() {
     assert!(answers[2].starts_with("HTTP/1.1 408 "), "{answers:?}");
     assert!(answers[3].starts_with("HTTP/1.1 200 "), "{answers:?}");
 
-    // What is too long is refused.
+    // Requests that are too long are refused.
     let head = format!("GET /{} HTTP/1.1\r\nHost: localhost\r\n\r\n", "a".repeat(100_000));
     let headers = format!("GET / HTTP/1.1\r\nHost: localhost\r\n{}\r\n", "X: y\r\n".repeat(1000));
     for (text, status) in [(head, ["414", "431"]), (headers, ["431", "400"])] {
         let mut stream = TcpStream::connect(address).unwrap();
-        // It may be closed before all of it is sent.
+        // The server may close it before the whole request is sent.
         let _ = stream.write_all(text.as_bytes());
         let mut answer = [0; 12];
         if stream.read_exact(&mut answer).is_ok() {

@@ -1,4 +1,4 @@
-//! What a campaign does when its mixture forgets the training data.
+//! The actions of a campaign whose mixture forgets the training data.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::common::campaign::Small;
 use crate::common::label_campaign::on_store;
 use crate::common::{calmwalk, stderr, succeed};
 
-/// A campaign whose updates replace the covariance by that of the collected structure.
+/// Writes a campaign whose updates replace the covariance by that of the collected structure.
 fn write(here: &Path, action: &str, limit: f64) {
     let config = Small::default().write(here);
     let keys =
@@ -35,7 +35,7 @@ fn a_campaign_pauses_until_the_limit_is_raised() {
     let before = status(here);
     assert_eq!((&before["finished"], &before["training_frames"]["alarm"]), (&false.into(), &true.into()));
 
-    // The same again, before anything is done.
+    // Running it again unchanged fails again.
     let again = calmwalk(here, ["run", "campaign.toml"]);
     assert_eq!(again.status.code(), Some(1), "{}", stderr(&again));
     assert_eq!(status(here)["candidates"], before["candidates"]);
@@ -61,7 +61,7 @@ fn updates_become_additive_and_a_replay_agrees() {
     let growth = check_elements(here, training);
     assert!(text.contains(&format!("component 0 of Al is forgotten most: σ² × {growth:.2}")), "{text}");
     assert_eq!(training["elements"][0]["share_above_one"], training["share_above_one"]);
-    // The log has what earlier versions wrote.
+    // The log has the fields of earlier versions.
     let decisions = on_store(Location::from(&*here.join("campaign")), async |store| {
         store.decisions(1..=i64::MAX).await.unwrap()
     });
@@ -70,7 +70,7 @@ fn updates_become_additive_and_a_replay_agrees() {
     assert!(logged.map(without).reduce(|all, one| all && one).unwrap());
 }
 
-/// The forgetting of aluminium, which has one component, in JSON and in the report. Returns the growth of its mean σ².
+/// Checks the forgetting of aluminium, which has one component, in JSON and in the report. Returns the growth of its mean σ².
 fn check_elements(here: &Path, training: &Json) -> f64 {
     let [element] = training["elements"].as_array().unwrap().as_slice() else { panic!("{training}") };
     let growth = element["mean_square_growth"].as_f64().unwrap();

@@ -1,4 +1,4 @@
-//! Going on with a campaign under another configuration: what may change is applied and logged, the rest is refused.
+//! Continuing a campaign with another configuration: permitted changes are applied and logged, others are refused.
 
 use std::fs;
 use std::path::Path;
@@ -17,7 +17,7 @@ fn small() -> Small {
     Small { steps: 60, ..Small::default() }
 }
 
-/// A campaign that has run to its end.
+/// A finished campaign.
 fn finished() -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     small().write(directory.path());
@@ -25,7 +25,7 @@ fn finished() -> TempDir {
     directory
 }
 
-/// The configuration with its first `from` replaced.
+/// Replaces the first `from` in the configuration.
 fn replace(directory: &Path, from: &str, to: &str) {
     let path = directory.join("campaign.toml");
     let text = fs::read_to_string(&path).unwrap();
@@ -33,7 +33,7 @@ fn replace(directory: &Path, from: &str, to: &str) {
     fs::write(path, text.replacen(from, to, 1)).unwrap();
 }
 
-/// Goes on; what was printed of changes.
+/// Continues the campaign. Returns the lines about changes of the configuration.
 fn resume_processes(directory: &Path) -> String {
     let output = calmwalk(directory, RUN);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
@@ -41,7 +41,7 @@ fn resume_processes(directory: &Path) -> String {
     shown.lines().filter(|line| line.starts_with("configuration: ")).collect::<Vec<_>>().join("\n")
 }
 
-/// The database, read by `read`.
+/// Reads the database with `read`.
 fn look<T>(directory: &Path, read: impl AsyncFnOnce(&Store) -> T) -> T {
     tokio::runtime::Runtime::new().unwrap().block_on(async {
         let store = Store::open_read_only(&directory.join("here")).await.unwrap();
@@ -171,7 +171,7 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
 }
 
 #[test]
-fn a_larger_budget_lets_walks_go_on() {
+fn a_larger_budget_lets_walks_continue() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     Small::default().write(here);
@@ -187,7 +187,7 @@ fn a_larger_budget_lets_walks_go_on() {
     replace(here, "max_per_walk = 1", "max_per_walk = 2");
     assert_eq!(resume_processes(here), "configuration: collect.max_per_walk is now 2 (was 1)");
     assert_eq!(accepted(), collected(2));
-    // One for all of them: whoever comes first takes what is left.
+    // One more structure in total: the first walk that finds one collects it.
     replace(here, "max_per_walk = 2", "max_per_walk = 4\nmax_structures = 5");
     resume_processes(here);
     assert_eq!(accepted().iter().map(|walk| walk.2).sum::<u32>(), 5);
@@ -198,7 +198,7 @@ fn added_seed_structures_are_walked() {
     let directory = finished();
     let here = directory.path();
     let before = walks(here);
-    // A frame behind the others of the file …
+    // Append a frame to the file …
     Small { seeds: &["fcc-100", "vacancy", "fcc-097"], ..small() }.write(here);
     let shown = resume_processes(here);
     assert!(
@@ -211,7 +211,7 @@ fn added_seed_structures_are_walked() {
         walked[before.len()..].iter().any(|walk| walk.0 == "biased" && walk.1 == "fcc-097"),
         "{walked:?}"
     );
-    // … and another file.
+    // … and then another file.
     let frames = atoms::read_extxyz(&config("data/aluminium_seeds.extxyz")).unwrap();
     let frame = frames.into_iter().find(|frame| frame.info["name"].text() == Some("fcc-103")).unwrap();
     common::write_frames(&here.join("more.extxyz"), &[frame]);
@@ -265,7 +265,7 @@ fn precision_is_part_of_what_a_campaign_is() {
         "{message}"
     );
 
-    // One that begins in mixed precision gives the same with walkers as processes and in one process.
+    // A campaign in mixed precision gives the same decisions with separate processes and in a single process.
     let [processes, together] = [&[][..], &["--in-process"]].map(|options| {
         let directory = tempfile::tempdir().unwrap();
         small().write(directory.path());

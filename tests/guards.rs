@@ -1,4 +1,4 @@
-//! What is refused before anything is spent on it, and the bill before a campaign begins.
+//! Guards refuse structures before any cost arises; the cost estimate before a campaign starts.
 
 use std::fs;
 use std::path::Path;
@@ -27,7 +27,7 @@ fn names(jobs: &Json, state: &str) -> Vec<String> {
 }
 
 #[test]
-fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
+fn structures_that_a_guard_refuses_are_labelled_on_request() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     write(here, r#"guard = { min_bond_lengths = { "Al-Al" = 3.5 } }"#);
@@ -43,7 +43,7 @@ fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
     assert_eq!(status["failures"][0]["class"], "rejected_by_label_guard");
     assert_eq!(status["failures"][0]["failed"], refused.len());
 
-    // Overruled, one is labelled by the same labellers; the others stay refused.
+    // After `queue retry`, the same labellers label one structure; the others stay refused.
     succeed(here, ["queue", "campaign", "retry", &refused[0]]);
     succeed(here, ["run", "campaign.toml"]);
     let jobs = json(here, ["queue", "campaign", "list"]);
@@ -55,7 +55,7 @@ fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
 fn near_duplicates_of_labelled_structures_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    // Everything from one seed structure is as near as that.
+    // Structures from the same seed structure are closer than this tolerance.
     write(here, "guard = { duplicate_tolerance = 1.0 }");
     succeed(here, ["run", "campaign.toml"]);
     let jobs = json(here, ["queue", "campaign", "list"]);
@@ -66,7 +66,7 @@ fn near_duplicates_of_labelled_structures_are_refused() {
     assert!(labelled.iter().any(|name| log.contains(name.as_str())), "{log}");
 }
 
-/// The distances of control frames are not limited by any bias.
+/// The guard of biased walks does not limit the distances in control frames.
 #[test]
 fn control_frames_with_atoms_too_close_are_left_out() {
     const LIMIT: f64 = 2.55;
@@ -96,7 +96,7 @@ fn control_frames_with_atoms_too_close_are_left_out() {
     assert!(control > 0 && left_out > 0 && control + left_out <= accepted, "{status}");
     let told = succeed(here, ["status", "one"]);
     assert!(told.contains(&format!("{left_out} left out (the decision log has the reasons)")), "{told}");
-    // No label was spent on them.
+    // These frames were not labelled.
     succeed(here, ["export", "one", "--control", "--output", "all.extxyz"]);
     let frames = atoms::read_extxyz(&here.join("all.extxyz")).unwrap();
     let shortest = |frame: &Frame| {
@@ -137,7 +137,7 @@ fn a_campaign_has_a_bill_before_it_begins() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     Small::default().write(here);
-    // Two seed structures, four structures each, and a control frame of each of those.
+    // Two seed structures with four structures each, and a control frame for each of those.
     let plan = json(here, ["estimate", "campaign.toml"]);
     assert_eq!((&plan["labels"], &plan["core_hours"]), (&16.into(), &Json::Null));
     assert!(succeed(here, ["estimate", "campaign.toml"]).contains("cost unknown"));
@@ -150,12 +150,12 @@ fn a_campaign_has_a_bill_before_it_begins() {
     let priced = json(here, ["estimate", "campaign.toml", "--core-seconds", "3600"]);
     let hours = |plan: &Json| plan["core_hours"]["expected"].as_f64().unwrap();
     let first = priced["seed_structures"][0]["core_hours_each"]["expected"].as_f64().unwrap();
-    // An hour, and what labels take on average above the middle.
+    // One hour, times the ratio of mean and median of the predicted cost.
     assert!((0.9..1.2).contains(&first), "{priced}");
-    // The second cell has 47 atoms and not 32: (47/32)² times as much, before anything is known of the exponent.
+    // The second cell has 47 atoms instead of 32: (47/32)² times the cost by the prior exponent.
     let expected = 8.0 * first * (1.0 + (47.0_f64 / 32.0).powi(2));
     assert!((hours(&priced) / expected - 1.0).abs() < 1e-9, "{priced}");
-    // A key that limits structures limits the bill.
+    // A limit on structures also limits the cost.
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
     fs::write(
         here.join("less.toml"),

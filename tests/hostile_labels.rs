@@ -1,5 +1,5 @@
-//! Programs that make labels and leave whatever they like: the labeller survives it, and other users of the host have no part
-//! in it.
+//! Labelling programs that leave arbitrary files and processes behind: the labeller survives, and other users of the host
+//! cannot interfere.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -16,7 +16,7 @@ use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, on_store, 
 use crate::common::processes::{calculation_processes, pause_walkers, resume_processes, wait_until};
 use crate::common::{program, stderr};
 
-/// What a script leaves, as a script, and what is said of the label then.
+/// Name, shell command, and expected message of each kind of output.
 const LEFT: [(&str, &str, &str); 13] = [
     ("pipe", "mkfifo label.extxyz", "label.extxyz is a named pipe, expected a regular file"),
     ("link", "ln -s /dev/zero label.extxyz", "label.extxyz is a symbolic link, expected a regular file"),
@@ -40,13 +40,13 @@ const LEFT: [(&str, &str, &str); 13] = [
     ("names", "echo > \"$(printf 'caf\\351\\nnew \\001')\"; exit 1", "ended with exit code 1"),
     (
         "deep",
-        // A path of 5000 directories cannot be named any more.
+        // A path of 5000 directories exceeds the system's maximum path length.
         "thousand=$(printf 'd/%.0s' $(seq 1000)); for times in 1 2 3 4 5; do mkdir -p $thousand; cd -P $thousand; done; exit 1",
         "ended with exit code 1",
     ),
 ];
 
-/// Each structure gets one thing of [`LEFT`], and a label when it is tried again.
+/// A script that produces one kind of [`LEFT`] for each structure, and a label on the second attempt.
 fn script(home: &Path) -> String {
     let home = home.display();
     let mut script = format!(
@@ -60,7 +60,7 @@ fn script(home: &Path) -> String {
     script + "esac\n" + WRITE_FIXED_LABEL
 }
 
-/// Two atoms, `number` hundredths of an Å further apart.
+/// Two atoms, 2.5 Å and `number` hundredths of an Å apart.
 fn pair(number: usize) -> Structure {
     Structure {
         species: vec!["Al".parse().unwrap(); 2],
@@ -78,7 +78,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     for name in ["scratch", "seen", "kinds"] {
         fs::create_dir(home.join(name)).unwrap();
     }
-    // As /tmp is.
+    // The mode of /tmp.
     fs::set_permissions(&scratch, Permissions::from_mode(0o1777)).unwrap();
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
     let keys = format!(
@@ -90,7 +90,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     fs::write(place.path().join("label.sh"), script(&home)).unwrap();
     let mut run = place.run();
     let walkers = pause_walkers(place.path(), 1);
-    // What another user could have made before.
+    // A directory that another user could have created beforehand.
     let campaign = on_store(place.location(), async |store| store.campaign().await.unwrap().id);
     let trap = scratch.join(format!("calmwalk-{campaign}"));
     fs::create_dir(&trap).unwrap();
@@ -99,7 +99,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
         (0..LEFT.len()).map(|k| queue(place.location(), k as u64, pair(k), Vec::new())).collect();
     LEFT.iter().for_each(|(kind, ..)| fs::create_dir(home.join("kinds").join(kind)).unwrap());
     let mut label = place.label(&["--wait-timeout", "2m"]);
-    wait_until("all have come and gone", || fs::read_dir(home.join("kinds")).unwrap().count() == 0);
+    wait_until("every kind has been left once", || fs::read_dir(home.join("kinds")).unwrap().count() == 0);
     resume_processes(&walkers);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
@@ -118,7 +118,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
         });
         assert!(told, "{kind}: {logs:#?}");
     }
-    // Nobody has had to be started again, nothing is left, and nothing was done where others can write.
+    // No labeller was restarted, nothing remains, and nothing was written where others can write.
     assert!(!place.said().contains("backing off"), "{}", place.said());
     assert_eq!(calculation_processes(&scratch), []);
     let left: Vec<_> = fs::read_dir(&scratch).unwrap().map(|entry| entry.unwrap().path()).collect();
@@ -131,7 +131,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     assert!(!places.contains(&format!("{}/", trap.display())), "{places}");
 }
 
-/// A place to label one structure without a campaign.
+/// A directory to label one structure without a campaign.
 struct Once {
     home: tempfile::TempDir,
 }
@@ -239,7 +239,7 @@ fn walkers_have_no_password() {
     resume_processes(&walkers);
 }
 
-/// A daemon has a session of its own, no parent, and here not even an environment.
+/// A daemon with its own session, no parent and an empty environment.
 const DAEMON: &str = "env -i setsid sh -c 'sh -c \"echo \\$\\$ > $HERE/daemon; trap : TERM; while true; do sleep 1000; done\" &' \
                       < /dev/null > /dev/null 2>&1 &\nwhile [ ! -s $HERE/daemon ]; do sleep 0.01; done\n";
 
@@ -249,7 +249,7 @@ fn daemons_end_with_the_calculation() {
     label(once.command().output().unwrap());
     let daemon = once.read("daemon");
     assert!(!Path::new("/proc").join(daemon.trim()).exists(), "{daemon} is left");
-    // At its time limit as well.
+    // The same when the calculation reaches its time limit.
     let once = Once::new(&format!("{DAEMON}sleep 1000\n"), "time_limit = \"1s\"");
     let output = once.command().output().unwrap();
     assert!(stderr(&output).contains("time limit"), "{}", stderr(&output));
@@ -258,9 +258,9 @@ fn daemons_end_with_the_calculation() {
     once.assert_no_leftovers();
 }
 
-/// What loses its parent becomes a child of the calculation's runner, which has to take note of its end.
+/// An orphaned process becomes a child of the calculation runner, which must reap it.
 #[test]
-fn no_dead_process_is_left_while_a_calculation_goes_on() {
+fn no_zombie_is_left_while_a_calculation_runs() {
     let once = Once::new(
         "for times in 1 2 3 4 5; do (sleep 0 &); done\n\
          zombies() { cat /proc/[0-9]*/stat 2> /dev/null | awk -v parent=$PPID '$3 == \"Z\" && $4 == parent' | wc -l; }\n\

@@ -1,4 +1,4 @@
-//! A campaign on several hosts, as far as one host can show it: agents are processes of their own and speak TCP.
+//! A campaign on several hosts, simulated on one host: agents are separate processes and connect over TCP.
 //!
 //! `CALMWALK_KILLS=200 cargo test --test integration hosts::kills` for the long version.
 
@@ -11,24 +11,24 @@ use crate::common::hosts::{Hosts, uninterrupted_outcome};
 use crate::common::processes::{pause_walkers, processes_running, resume_processes, signal, wait_until};
 use crate::common::{Running, kills, random};
 
-/// A silent agent is soon taken for dead.
+/// The server soon declares a silent agent dead.
 fn hosts(small: &Small, others: usize) -> Hosts {
     Hosts::new(small, others, "agent_heartbeat_timeout = \"500ms\"")
 }
 
 #[test]
-fn a_campaign_on_three_hosts_comes_to_the_same() {
+fn a_campaign_on_three_hosts_has_the_same_outcome() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
     let hosts = Hosts::new(&small, 2, "");
-    // An agent may be there before its orchestrator.
+    // An agent may start before its orchestrator.
     let mut first = hosts.agent(0);
     wait_until("the agent waits", || hosts.said(0).contains("waiting for the orchestrator"));
     let mut orchestrator = hosts.start_orchestrator();
-    // One that comes late to a campaign that is over would wait for the next run of it.
+    // The campaign must not end before the second agent joins: the agent would wait for the next run.
     let held = pause_walkers(hosts.home.path(), 1);
     let mut second = hosts.agent(1);
     for host in 0..2 {
-        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walker,"));
+        wait_until("the agent has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
     resume_processes(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
@@ -48,7 +48,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     let held = pause_walkers(hosts.home.path(), 1);
     let mut agents = [hosts.agent(0), hosts.agent(1)];
     let at_work = |host: usize| !processes_running(hosts.others[host].path(), "walker").is_empty();
-    wait_until("walkers are at work", || at_work(0) && at_work(1));
+    wait_until("walkers are running", || at_work(0) && at_work(1));
     signal(agents[0].0.id(), "TERM");
     assert_eq!(agents[0].0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     signal(orchestrator.0.id(), "TERM");
@@ -60,7 +60,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     let held = pause_walkers(hosts.home.path(), 1);
     let joined = hosts.said(0).matches("joined: 1 walker,").count();
     let mut agent = hosts.agent(0);
-    wait_until("it has joined", || hosts.said(0).matches("joined: 1 walker,").count() > joined);
+    wait_until("the agent has joined", || hosts.said(0).matches("joined: 1 walker,").count() > joined);
     resume_processes(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
@@ -68,7 +68,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     hosts.assert_cleaned_up();
 }
 
-/// 200 ms each way, so an agent with an assignment ahead works through it as ever.
+/// With 200 ms of latency in each direction, an agent with a prefetched assignment works as usual.
 #[test]
 fn a_slow_line_changes_nothing() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
@@ -78,7 +78,7 @@ fn a_slow_line_changes_nothing() {
     hosts.options[1] = vec!["--prefetch=1".into()];
     let mut agent = hosts.agent(0);
     let mut orchestrator = hosts.start_orchestrator();
-    // On an idle machine the orchestrator's own walker would be through before the agent has joined.
+    // On an idle machine, the orchestrator's own walker would finish before the agent has joined.
     let held = pause_walkers(hosts.home.path(), 1);
     wait_until("the agent has joined", || hosts.said(0).contains("joined: 1 walker,"));
     resume_processes(&held);
@@ -88,7 +88,7 @@ fn a_slow_line_changes_nothing() {
     assert!(hosts.said(0).contains("joined: 1 walker,"), "{}", hosts.said(0));
     assert!(
         proxy.bytes_forwarded() > 1_000_000,
-        "candidates came over the line: {} bytes",
+        "candidates were sent over the connection: {} bytes",
         proxy.bytes_forwarded()
     );
     assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
@@ -118,13 +118,13 @@ fn what_a_killed_agent_leaves_is_removed_by_the_next() {
     hosts.assert_cleaned_up();
 }
 
-/// Kills a process, which is seen to be dead then.
+/// Kills a process and waits for its exit.
 fn kill(running: &mut Running) {
     running.0.kill().unwrap();
     running.0.wait().unwrap();
 }
 
-/// Kills the orchestrator, an agent, or a walker of an agent; whoever is no more is started again.
+/// Kills the orchestrator, an agent, or a walker of an agent, and restarts what was killed.
 #[test]
 fn kills_on_every_host_change_nothing() {
     let small = Small::default();
@@ -136,7 +136,7 @@ fn kills_on_every_host_change_nothing() {
         let mut orchestrator = hosts.start_orchestrator();
         let mut agents = [hosts.agent(0), hosts.agent(1)];
         let ended = loop {
-            // Another instant in each campaign: one that is over before it must not be tried again for ever.
+            // Use other times in each campaign: otherwise a campaign that ends before its first kill would repeat endlessly.
             std::thread::sleep(Duration::from_millis(random(done + 10_000 * campaigns) % 1500));
             match orchestrator.0.try_wait().unwrap() {
                 Some(ended) if ended.code().is_some() => break ended,
@@ -167,7 +167,7 @@ fn kills_on_every_host_change_nothing() {
             done += 1;
         };
         assert_eq!(ended.code(), Some(0), "after {done} kills");
-        // One that came late to a campaign that was over waits for the next run of it.
+        // An agent that joins after the end waits for the next run of the campaign.
         for (host, agent) in agents.iter_mut().enumerate() {
             signal(agent.0.id(), "TERM");
             let ended = agent.0.wait().unwrap();

@@ -1,11 +1,11 @@
-//! The edges of the house: which package may know which, as docs and design say, read from the manifests.
+//! Dependency rules of the workspace, checked against its manifests and sources.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
-/// Every package, where it lives, and the packages that it may depend on.
+/// Every package, its folder, and the packages that it may depend on.
 const HOUSE: [(&str, &str, &[&str]); 15] = [
     ("atoms", "crates/atoms", &[]),
     ("npz", "crates/npz", &[]),
@@ -85,8 +85,7 @@ fn name(manifest: &Table) -> String {
     manifest["package"]["name"].as_str().unwrap().to_owned()
 }
 
-/// The packages of the workspace that this one is built with, however they are written down. What only its tests
-/// need does not count.
+/// The workspace packages in a package's dependencies and build dependencies, in any notation; dev-dependencies do not count.
 fn edges(manifest: &Table, packages: &BTreeSet<String>) -> BTreeSet<String> {
     let mut tables = vec![manifest];
     tables.extend(table(manifest, "target").into_iter().flat_map(Table::values).filter_map(Value::as_table));
@@ -99,7 +98,7 @@ fn edges(manifest: &Table, packages: &BTreeSet<String>) -> BTreeSet<String> {
         .collect()
 }
 
-/// The name of the package behind a dependency, which may be used under another name.
+/// The package name of a dependency, which may be renamed.
 fn package_name(key: &str, value: &Value) -> String {
     let renamed = |value: &Value| value.get("package").and_then(Value::as_str).map(str::to_owned);
     let shared = || renamed(manifest(root()).get("workspace")?.get("dependencies")?.get(key)?);
@@ -107,7 +106,7 @@ fn package_name(key: &str, value: &Value) -> String {
 }
 
 #[test]
-fn every_package_is_in_the_house() {
+fn every_package_is_listed() {
     let found: BTreeMap<_, _> =
         members().into_iter().map(|folder| (name(&manifest(&folder)), folder)).collect();
     let planned: BTreeMap<_, _> =
@@ -119,7 +118,7 @@ fn every_package_is_in_the_house() {
 }
 
 #[test]
-fn packages_know_only_what_they_may() {
+fn packages_depend_only_on_allowed_ones() {
     let packages = HOUSE.iter().map(|(name, ..)| (*name).to_owned()).collect();
     for (name, folder, allowed) in HOUSE {
         let edges = edges(&manifest(&root().join(folder)), &packages);
@@ -128,9 +127,9 @@ fn packages_know_only_what_they_may() {
     }
 }
 
-/// What the table means, and what must not come in by a roundabout way either.
+/// Some packages must not depend on others even indirectly.
 #[test]
-fn nobody_reaches_what_is_not_theirs() {
+fn packages_do_not_depend_indirectly_on_forbidden_ones() {
     let packages: BTreeSet<_> = HOUSE.iter().map(|(name, ..)| (*name).to_owned()).collect();
     let edges_of: BTreeMap<_, _> = HOUSE
         .iter()
@@ -155,7 +154,7 @@ fn nobody_reaches_what_is_not_theirs() {
     }
 }
 
-/// Only labeller and refitter speak to the database.
+/// In `workers`, only labeller and refitter use the store.
 #[test]
 fn walkers_do_not_open_the_store() {
     let mut open = vec![root().join("workers/src")];
@@ -176,8 +175,7 @@ fn walkers_do_not_open_the_store() {
     assert!(read > 1);
 }
 
-/// The Rust files at these paths, which are files or folders, with their text. Unit tests, at the end of a file or
-/// in a `tests.rs`, do not count.
+/// The Rust sources at these paths, files or folders, without unit tests at the end of a file or in `tests.rs`.
 fn sources(paths: &[&str]) -> BTreeMap<PathBuf, String> {
     let mut open: Vec<_> = paths.iter().map(|path| root().join(path)).collect();
     let mut found = BTreeMap::new();
@@ -197,7 +195,7 @@ fn sources(paths: &[&str]) -> BTreeMap<PathBuf, String> {
     found
 }
 
-/// Functions of the store that begin a transaction which writes, or call one that does.
+/// Functions of the store that begin a write transaction, directly or indirectly.
 fn writing_functions() -> BTreeSet<String> {
     let mut bodies = BTreeMap::new();
     for text in sources(&["store/src/tables"]).values() {
@@ -223,8 +221,7 @@ fn writing_functions() -> BTreeSet<String> {
     }
 }
 
-/// The read side and the views take everything from the store and put nothing into it. The dashboard's `actions` are
-/// no view.
+/// The read side and the views read from the store and never write to it. The dashboard's `actions` are not a view.
 #[test]
 fn views_never_write() {
     let views = [
@@ -251,7 +248,7 @@ fn views_never_write() {
     }
 }
 
-/// What the read side computes, views put into words, tables and pages.
+/// The read side only computes; views produce text, tables and pages.
 #[test]
 fn the_read_side_renders_nothing() {
     for (path, text) in sources(&["monitor/src"]) {
@@ -261,7 +258,7 @@ fn the_read_side_renders_nothing() {
     }
 }
 
-/// Commands stand above everything else of the program.
+/// No other module of the program depends on the commands.
 #[test]
 fn commands_are_used_by_the_program_alone() {
     for (path, text) in sources(&["src"]) {
@@ -283,7 +280,7 @@ fn every_package_obeys_the_lints() {
     }
 }
 
-/// A browser finds a name that is not imported only when it comes to the line.
+/// A browser detects a missing import only when it executes the call.
 #[test]
 fn pages_import_the_functions_that_they_call() {
     let folder = root().join("src/web/pages");
@@ -320,9 +317,9 @@ fn pages_import_the_functions_that_they_call() {
     }
 }
 
-/// One word, one meaning: a type that other files can use has its name to itself.
+/// Type names that other files can use are unique in the workspace.
 #[test]
-fn types_that_other_files_use_have_names_of_their_own() {
+fn types_that_other_files_use_have_unique_names() {
     let packages =
         HOUSE.map(|(_, folder, _)| if folder.is_empty() { "src".into() } else { format!("{folder}/src") });
     let mut found: BTreeMap<String, Vec<String>> = BTreeMap::new();

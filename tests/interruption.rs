@@ -1,7 +1,7 @@
-//! A campaign outlives whatever happens to its process, and ends as if nothing had happened.
+//! A campaign survives the loss of its processes, and ends as if it had not been interrupted.
 //!
-//! `CALMWALK_KILLS=200 cargo test --test integration interruption::kills` for a long version, 1000 for a longer one; with
-//! `interruption::kills_of_a_campaign` only campaigns whose labels are made by a program.
+//! `CALMWALK_KILLS=200 cargo test --test integration interruption::kills` runs a long version, 1000 a longer one;
+//! `interruption::kills_of_a_campaign` runs only campaigns whose labels are made by a program.
 
 use std::path::Path;
 use std::process::Stdio;
@@ -22,14 +22,14 @@ fn start(directory: &Path, options: &[&str]) -> Running {
     Running(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("the program starts"))
 }
 
-/// How a campaign is written.
+/// A function that writes a campaign.
 type Write = fn(&Small, &Path);
 
 fn plain(small: &Small, directory: &Path) {
     small.write(directory);
 }
 
-/// Its labels are made by a program, in directories below `scratch`.
+/// Writes a campaign whose labels are made by a program, in directories below `scratch`.
 fn with_program(small: &Small, directory: &Path) {
     let scratch = directory.canonicalize().unwrap().join("scratch").display().to_string();
     std::fs::create_dir_all(&scratch).unwrap();
@@ -39,7 +39,7 @@ fn with_program(small: &Small, directory: &Path) {
     std::fs::write(small.write(directory), small.text().replace("[label]\nmethod", &keys)).unwrap();
 }
 
-/// Runs to the end without any disturbance, all in one process.
+/// Runs a campaign without interruption in a single process. Returns its outcome and duration.
 fn uninterrupted_outcome(small: &Small, write: Write) -> (Outcome, Duration) {
     let directory = tempfile::tempdir().unwrap();
     write(small, directory.path());
@@ -48,11 +48,12 @@ fn uninterrupted_outcome(small: &Small, write: Write) -> (Outcome, Duration) {
     (outcome(directory.path()), begun.elapsed())
 }
 
-/// Programs that make labels may be killed so often in a campaign: each time counts as a failure of a job, which has two rungs.
+/// Maximum number of kills of labelling programs per campaign: each kill counts as a failure of its job, whose retries are
+/// limited.
 const PROGRAMS: u64 = 2;
 
-/// Kills one process of the campaign, or all of them at once; the orchestrator if there is no such process now. Returns whether it
-/// was a program that makes a label.
+/// Kills one process of the campaign, or all at once; the orchestrator if there is no process of the chosen kind. Returns
+/// whether it was a labelling program.
 fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) -> bool {
     const ALL: u64 = 3;
     let kind = choice % 6;
@@ -82,7 +83,7 @@ fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) ->
     is_program
 }
 
-/// A few kills in each campaign, at any instant from the very start on, with one walker or two.
+/// Runs campaigns with some kills in each, at any time from the start on, with one or two walkers.
 fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
     let (expected, takes) = uninterrupted_outcome(&Small { walkers: 1, ..small.clone() }, write);
     assert!(expected.decisions.matches("\"kind\":\"accepted\"").count() >= 4, "{}", expected.decisions);
@@ -96,7 +97,8 @@ fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
             write(&Small { walkers: 1 + (random(done) % 2) as usize, ..small.clone() }, directory.path());
             let mut running = start(directory.path(), options);
             let ended = loop {
-                // Another in each campaign: one that is over before it must not be tried again for ever.
+                // Use other times in each campaign: otherwise a campaign that ends before its first kill would repeat
+                // endlessly.
                 let instant =
                     takes.mul_f64((random(1000 + done + 10_000 * campaigns) % 1000) as f64 / 1500.0);
                 std::thread::sleep(instant);
@@ -107,7 +109,7 @@ fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
                 let was_program = kill(directory.path(), &running, random(5000 + done), programs < PROGRAMS);
                 programs += u64::from(was_program);
                 done += 1;
-                // Of a process that was killed there may be a moment's delay until it is seen to be so.
+                // The exit of a killed process is not visible immediately.
                 std::thread::sleep(Duration::from_millis(5));
             };
             assert!(matches!(ended.code(), Some(0) | None), "{ended} after {done} kills");
@@ -142,7 +144,7 @@ fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
         small.write(directory.path());
         let mut running = start(directory.path(), &[]);
         wait_until("structures are found", || Counters::of(".", directory.path()).sent > 0);
-        // It must not be over before it is told.
+        // The campaign must not end before the signal.
         let held = pause_walkers(directory.path(), 2);
         signal(running.0.id(), name);
         resume_processes(&held);
@@ -170,7 +172,7 @@ fn live_mode_loses_and_doubles_nothing() {
     assert_no_leftovers(directory.path());
 }
 
-/// All walks are over, but a label is still being made elsewhere: whoever stops then must not be told that all is done.
+/// All walks have ended, but another labeller still makes a label: a stop now must not report a finished campaign.
 #[test]
 fn a_stop_while_labels_are_still_made_is_no_end() {
     let directory = tempfile::tempdir().unwrap();
@@ -184,7 +186,7 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
         let now = store::unix_milliseconds();
         let failed = store.queue_list(Some(store::JobState::Failed), 1, 0).await.unwrap();
         store.retry_job(&failed[0].candidate, now).await.unwrap();
-        // Whether a labeller in another container lives cannot be seen from here.
+        // This process cannot see whether a labeller in another container is alive.
         let here =
             store::ProcessRecord::new(store::ProcessRecord::LABELLER, Some(0), std::process::id(), now);
         let (place, ticks) = here.start_time.rsplit_once('/').unwrap();
@@ -192,7 +194,7 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
         let elsewhere = store::ProcessRecord { id: "elsewhere".into(), start_time, ..here };
         store.upsert_process(&elsewhere).await.unwrap();
         let protocol = store.protocols().await.unwrap()[0].hash;
-        store.lease(protocol, "elsewhere", now, 600).await.unwrap().expect("the job that was put back");
+        store.lease(protocol, "elsewhere", now, 600).await.unwrap().expect("the requeued job");
         store.close().await;
     });
     let mut running = start(here, &[]);
@@ -201,7 +203,7 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
         assert!(begun.elapsed() < Duration::from_secs(60), "the run has not begun");
         std::thread::sleep(Duration::from_millis(20));
     }
-    // Long enough to find every walk ended and nothing to lease.
+    // Long enough for the run to find all walks ended and no job to lease.
     std::thread::sleep(Duration::from_millis(1500));
     assert!(running.0.try_wait().unwrap().is_none(), "it waits for the label");
     signal(running.0.id(), "INT");

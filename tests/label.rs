@@ -1,4 +1,4 @@
-//! `calmwalk label`: labellers that no `run` starts. With `CALMWALK_POSTGRES` the same tests use a server.
+//! `calmwalk label`: labellers that `run` does not start. With `CALMWALK_POSTGRES` the same tests use a server.
 
 use std::fs;
 use std::process::Command;
@@ -13,14 +13,14 @@ use crate::common::processes::{
 };
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
-/// `run` starts no labellers of its own.
+/// `run` starts no labellers.
 const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nconcurrency = 0");
 
 fn ended(running: &mut Running) -> Option<i32> {
     running.0.wait().expect("a child").code()
 }
 
-/// The same campaign, all in one process.
+/// The outcome of the campaign in a single process.
 fn expected(small: &Small) -> Outcome {
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
@@ -28,7 +28,7 @@ fn expected(small: &Small) -> Outcome {
     outcome(directory.path())
 }
 
-/// A campaign that is over, and in whose queue is one structure that takes its time. Returns its name as well.
+/// A finished campaign with one queued structure whose label takes a while. Returns the structure's name as well.
 fn with_large_structure(changes: &[(&str, &str)]) -> (LabelCampaign, String) {
     let place = LabelCampaign::new(&Small { steps: 60, ..Small::default() }, changes);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
@@ -40,11 +40,13 @@ fn with_large_structure(changes: &[(&str, &str)]) -> (LabelCampaign, String) {
 fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     let small = Small::default();
     let place = LabelCampaign::new(&small, &[NO_SLOTS]);
-    // It may be there before the campaign.
+    // A labeller may start before the campaign exists.
     let mut label = place.label(&["--concurrency", "2", "--method", "potential", "--wait-timeout", "2m"]);
-    wait_until("it waits", || place.said().contains("waiting for the campaign: there is no campaign in"));
+    wait_until("the labeller waits", || {
+        place.said().contains("waiting for the campaign: there is no campaign in")
+    });
     let mut run = place.run();
-    // The campaign cannot end before both slots have been seen.
+    // The campaign must not end before both slots have been seen.
     let held = pause_walkers(place.path(), small.walkers);
     wait_until("both slots show in status", || {
         let status = place.status();
@@ -70,7 +72,7 @@ fn everything_in_one_process_waits_for_labels_of_others() {
     let small = Small { steps: 60, ..Small::default() };
     let place = LabelCampaign::new(&small, &[NO_SLOTS]);
     let mut run = place.start(&["run", "campaign.toml", "--directory", ".", "--in-process"]);
-    wait_until("walks are over", || {
+    wait_until("all walks have ended", || {
         let status = place.status();
         let walks = status["walks"].as_array().cloned().unwrap_or_default();
         let under_way = |walk: &&serde_json::Value| walk["state"] == "running" || walk["state"] == "waiting";
@@ -83,14 +85,14 @@ fn everything_in_one_process_waits_for_labels_of_others() {
 }
 
 #[test]
-fn what_it_is_killed_over_is_labelled_by_the_next() {
+fn the_job_of_a_killed_labeller_is_labelled_by_the_next() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--until-empty"]);
-    // Its slot is held so that the label is not made before it is killed.
+    // Pause its slot, so that the label is not made before the kill.
     place.pause_labeller();
     label.0.kill().unwrap();
     label.0.wait().unwrap();
-    wait_until("its slot ends with it", || processes_in(place.path()).is_empty());
+    wait_until("its slot has exited", || processes_in(place.path()).is_empty());
     assert_ne!(place.job(&name).job.state, JobState::Labelled);
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
     let job = place.job(&name);
@@ -100,12 +102,12 @@ fn what_it_is_killed_over_is_labelled_by_the_next() {
 }
 
 #[test]
-fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
+fn a_slot_that_is_killed_is_replaced_and_the_others_continue() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--concurrency", "2", "--until-empty"]);
     place.wait_for_lease();
     let slots = processes_running(place.path(), "labeller");
-    // The label is not made before its slot is found.
+    // Pause all slots, so that the label is not made before its slot is found.
     slots.iter().for_each(|slot| place.hold(*slot));
     let holder = place.job(&name).job.holder.unwrap();
     let pid: u32 = holder.rsplit('-').nth(1).unwrap().parse().unwrap();
@@ -133,7 +135,7 @@ fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
     signal(label.0.id(), "INT");
     assert_eq!(ended(&mut label), Some(130), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Labelled);
-    wait_until("nobody is left", || processes_in(place.path()).is_empty());
+    wait_until("all processes have exited", || processes_in(place.path()).is_empty());
     assert_eq!(place.status()["processes"], serde_json::json!([]));
 }
 
@@ -187,13 +189,13 @@ fn wrong_files_methods_and_stores_are_refused() {
     assert_eq!(ended(&mut labelling), Some(0), "{}", place.said());
 }
 
-/// The program on another host, as far as one can show it: with process numbers of its own, and another boot.
-/// `None` where this is not permitted.
+/// The program on a simulated other host, which has its own process ids and, on a server, its own boot id. `None` where this
+/// is not permitted.
 fn elsewhere(place: &LabelCampaign) -> Option<Command> {
     let boot = place.path().join("boot_id");
     fs::write(&boot, "11111111-2222-3333-4444-555555555555\n").unwrap();
     let flags = ["--user", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"];
-    // A boot of its own only where hosts share the database: SQLite takes what ran before a boot for gone.
+    // Another boot id only where hosts share the database: with SQLite, processes of another boot count as dead.
     let other_boot = match place.argument() {
         "." => "true".to_owned(),
         _ => format!("mount --bind {} /proc/sys/kernel/random/boot_id", boot.display()),
@@ -210,7 +212,7 @@ fn elsewhere(place: &LabelCampaign) -> Option<Command> {
     Some(command)
 }
 
-/// A labeller elsewhere is stopped in mid-label for longer than its lease, and goes on when another has made the label.
+/// A labeller on another host is paused for longer than its lease, and resumes after another labeller has made the label.
 #[test]
 fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     let (place, name) = with_large_structure(&[("[label]", "[label]\nlease_timeout = \"2s\"")]);
@@ -227,7 +229,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
         place.said()
     );
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
-    assert!(begun.elapsed() > Duration::from_secs(1), "not before the lease was over");
+    assert!(begun.elapsed() > Duration::from_secs(1), "the lease had not expired");
     let exported = place.export();
     signal(slot, "CONT");
     assert_eq!(ended(&mut late), Some(0), "{}", place.said());
@@ -243,7 +245,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     assert_eq!(place.export(), exported);
 }
 
-/// What this host cannot see it does not take for gone: neither `run` nor another labeller takes the job away.
+/// A process that this host cannot see does not count as dead: neither `run` nor another labeller takes its job.
 #[test]
 fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
     let (place, name) = with_large_structure(&[("[label]", "[label]\nlease_timeout = \"1m\"")]);
@@ -252,11 +254,11 @@ fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
     let mut label = place.spawn(command, &arguments);
     let slot = place.pause_labeller();
     let mut run = place.run();
-    wait_until("it runs", || {
+    wait_until("the run has started", || {
         let output = calmwalk(place.path(), ["status", place.argument()]);
         String::from_utf8_lossy(&output.stdout).contains("\nstate       running")
     });
-    // Longer than it takes until what is gone is found.
+    // Longer than the interval of the check for dead processes.
     std::thread::sleep(Duration::from_secs(6));
     assert_eq!(place.job(&name).job.attempts, 1, "{}", place.said());
     assert!(run.0.try_wait().unwrap().is_none(), "{}", place.said());

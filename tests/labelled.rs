@@ -1,4 +1,4 @@
-//! What `calm score` says of labelled structures, and `calm filter`.
+//! Statistics of labelled structures by `calm score`, and `calm filter`.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use serde_json::Value as Json;
 
 use crate::common::{calmwalk, config, random, refuse, stderr, succeed, write_frames};
 
-/// Scores frames of aluminium, which have labels of an EAM potential. Returns what is printed.
+/// Scores frames of aluminium with labels of an EAM potential. Returns the standard output.
 fn score(here: &Path, frames: &[Frame], more: &[&str]) -> String {
     write_frames(&here.join("in.extxyz"), frames);
     let model = config("data/al_eam_1l/kokkos.npz");
@@ -39,7 +39,7 @@ fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     values.sum::<f64>() / number
 }
 
-/// Twice the rank of each value, counted.
+/// Twice the rank of each value, by counting.
 fn ranks(values: &[f64]) -> Vec<f64> {
     let rank =
         |x: &f64| values.iter().map(|y| f64::from(u8::from(y < x)) + f64::from(u8::from(y <= x))).sum();
@@ -100,18 +100,18 @@ fn labelled_structures_say_how_far_a_grade_can_be_trusted() {
         assert_near(&of["confident"]["retention"]["value"], kept);
         assert_eq!(of["bins"].as_array().unwrap().len(), 7);
     }
-    // One row for each structure is what the filter reads.
+    // The filter reads one row per structure.
     let filter = ["calm", "filter", "t.csv", "--error", "force_error_mean", "--thresholds", "1e9", "--json"];
     let filtered: Json = serde_json::from_str(&succeed(here, filter)).unwrap();
     assert_near(&filtered["steps"][0]["mean_absolute_error"], mean(errors.into_iter()));
-    // The same input gives the same numbers, and what was scored can be scored again: it has reference labels now.
+    // The output is reproducible, and scored files, which have reference labels, can be scored again.
     write_frames(&here.join("again.extxyz"), &scored);
     assert_eq!(score(here, &scored, &["--json", "again.json"]), printed);
     assert_eq!(json(&here.join("again.json")), report);
 }
 
 #[test]
-fn without_labels_nothing_is_said() {
+fn without_labels_nothing_is_reported() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let mut frames = aluminium(1);
@@ -119,7 +119,7 @@ fn without_labels_nothing_is_said() {
     let printed = score(here, &[Frame::from(cell.clone())], &["--json", "labels.json"]);
     assert_eq!(printed, "wrote 1 structure with grades to out.extxyz\n");
     assert_eq!(json(&here.join("labels.json"))["structures"], 0);
-    // A label that cannot be read is no reason to grade nothing.
+    // Structures with unreadable labels are still graded.
     frames[0].info.insert("energy".into(), "unknown".into());
     write_frames(&here.join("bad.extxyz"), &frames);
     let model = config("data/al_eam_1l/kokkos.npz");
@@ -182,7 +182,7 @@ fn a_grade_that_tells_errors_keeps_better_structures_than_chance() {
         assert!(value < mean - 3.0 * deviation, "{step}");
         assert!(step["f1"].as_f64() > step["random_mean"]["f1"].as_f64(), "{step}");
     }
-    // Everything is kept at 2.
+    // A threshold of 2 keeps every structure.
     assert_eq!((&steps[2]["kept"], &steps[2][error]), (&400.into(), &found["unfiltered"][error]));
     let rows = fs::read_to_string(here.join("sweep.csv")).unwrap();
     assert_eq!(rows.lines().count(), 5);
@@ -192,7 +192,7 @@ fn a_grade_that_tells_errors_keeps_better_structures_than_chance() {
     );
     let figure = fs::read_to_string(here.join("sweep.svg")).unwrap();
     assert!(figure.contains("precision") && figure.contains("gamma_max") && !figure.contains("NaN"));
-    // Without classes there are errors only.
+    // Without classes there are only errors.
     let printed = succeed(
         here,
         ["calm", "filter", "t.csv", "--error", "predicted", "--draws", "0", "--figure", "f.png"],

@@ -1,4 +1,4 @@
-//! What a campaign leaves in its log.
+//! The log of a campaign.
 
 use std::collections::BTreeSet;
 use std::fs;

@@ -1,4 +1,4 @@
-//! `calmwalk lower-states`: labels found after the moments were changed say so, and the lower of two magnetic states is proposed or
+//! `calmwalk lower-states`: labels made with changed moments are marked, and the lower of two magnetic states is proposed or
 //! becomes the label.
 
 use std::fs;
@@ -10,7 +10,8 @@ use crate::common::campaign::Small;
 use crate::common::label_campaign::LabelCampaign;
 use crate::common::{refuse, succeed};
 
-/// Converges after the moments were changed, to −2.5 eV, and otherwise only beside a file `converges`, to the energy in it.
+/// Converges to −2.5 eV after the moments were changed; without a change only if the file `converges` exists, to the energy
+/// in it.
 const SCRIPT: &str = r#"
 case "$CALMWALK_REMEDIES" in
     *other_moments*) energy=-2.5 ;;
@@ -24,7 +25,7 @@ awk -v energy="$energy" '
 mv unfinished label.extxyz
 "#;
 
-/// A campaign that is over, whose labels all needed other moments.
+/// A finished campaign whose labels all needed changed moments.
 fn campaign() -> LabelCampaign {
     let small = Small { walkers: 1, steps: 120, seeds: &["fcc-100"], max_per_walk: 2, ..Small::default() };
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
@@ -145,18 +146,18 @@ fn the_lower_state_becomes_the_label_where_the_configuration_says_so() {
     let (here, argument) = (place.path(), place.argument());
     let before = place.export();
     let name = exported(&place, "atoms > 0").remove(0).0;
-    // The rule may change while the campaign lasts.
+    // A started campaign may change this rule.
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
     let text =
         text.replace("[label]", "[label]\non_lower_state = \"supersede\"\nmin_state_difference = 0.002");
     fs::write(here.join("campaign.toml"), text).unwrap();
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
 
-    // The requested label is higher: the one before stays.
+    // The requested label has a higher energy: the earlier label stays.
     label_again(&place, &name, "-0.5");
     assert!(place.said().contains("has a label already; this result is kept as a check"), "{}", place.said());
     assert_eq!((place.export(), place.jobs("lower_states"), place.jobs("queued")), (before, 0, 0));
-    // It is lower.
+    // The requested label has a lower energy.
     label_again(&place, &name, "-9.5");
     let found = exported(&place, "retry_adjustment != other_moments");
     assert!(

@@ -1,7 +1,7 @@
-//! Tests of the whole program that need nothing else.
+//! Tests of the whole program that need no other programs.
 //!
-//! `cargo test --test integration dashboard::` runs those of one module. With `CALMWALK_POSTGRES=$(.ci/postgres start)` the
-//! campaigns of `backup`, `label` and `relabel` are on that server.
+//! `cargo test --test integration dashboard::` runs the tests of one module. With `CALMWALK_POSTGRES=$(.ci/postgres start)`
+//! the campaigns of `backup`, `label` and `relabel` are stored on that server.
 
 mod common;
 

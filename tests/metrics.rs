@@ -1,4 +1,4 @@
-//! `/metrics` of a campaign that runs, and of an agent: format, numbers, and that docs/metrics.md lists what is there.
+//! `/metrics` of a running campaign and of an agent: format, values, and documentation in docs/metrics.md.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,10 +12,10 @@ use crate::common::http::{Answer, get, request, said};
 use crate::common::processes::{signal, wait_for_process, wait_until};
 use crate::common::{Running, program, refuse, succeed};
 
-/// A metric: its type, and its samples by labels as they are written.
+/// Type and samples of each metric; samples by their labels as text.
 type Metrics = BTreeMap<String, (String, BTreeMap<String, f64>)>;
 
-/// Reads the text format, strictly: HELP, TYPE, then the samples of that name.
+/// Parses the text format strictly: HELP, TYPE, then the samples of that name.
 fn parse(text: &str) -> Metrics {
     let mut metrics = Metrics::new();
     let (mut helped, mut current) = (String::new(), String::new());
@@ -57,7 +57,7 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
     let here = directory.path();
     let path = Small::default().write(here);
     let text = fs::read_to_string(&path).unwrap();
-    // All is collected, and then it waits for labels from elsewhere.
+    // The campaign collects its structures and then waits for external labels.
     fs::write(&path, text.replace("[label]", "[label]\nconcurrency = 0")).unwrap();
     let arguments = ["run", "campaign.toml", "--metrics", "127.0.0.1:0"];
     let run = program(here).args(arguments).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
@@ -66,7 +66,7 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
     let address = address.trim_end_matches("/metrics");
     let status =
         || -> Value { serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap() };
-    wait_until("all is collected", || {
+    wait_until("all structures are collected", || {
         let status = status();
         let walks = status["walks"].as_array().unwrap();
         let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
@@ -105,13 +105,13 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
 
 #[test]
 fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
-    // It does not end by itself.
+    // The campaign does not end without a signal.
     let small = Small { mode: "live", steps: 1_000_000, max_per_walk: 1_000_000, ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "");
     hosts.options[1] = vec!["--metrics=127.0.0.1:0".into()];
     let mut agent = hosts.agent(0);
     let mut address = String::new();
-    wait_until("it says where", || {
+    wait_until("the agent prints its address", || {
         let said = hosts.said(0);
         let found =
             said.lines().find_map(|line| line.strip_prefix("metrics at http://")?.strip_suffix("/metrics"));
@@ -130,11 +130,11 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     };
     assert_eq!(value("calmwalk_agent_link_up", ""), Some(0.0));
     assert_eq!(value("calmwalk_agent_assignments_received_total", ""), Some(0.0));
-    assert_eq!(value("calmwalk_agent_link_silence_seconds", ""), None, "nobody was ever heard");
+    assert_eq!(value("calmwalk_agent_link_silence_seconds", ""), None, "no orchestrator has answered yet");
 
     let mut orchestrator = hosts.start_orchestrator();
     let is_above = |name: &str, labels: &str| value(name, labels) > Some(0.0);
-    wait_until("it delivers candidates", || {
+    wait_until("the agent delivers candidates", || {
         is_above("calmwalk_agent_assignments_total", "outcome=\"candidate\"")
     });
     wait_until("a question was answered", || is_above("calmwalk_agent_link_round_trip_seconds", ""));
@@ -151,21 +151,21 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
         came > 0.0 && came <= taken && taken <= came + 1.0,
         "one walker has one assignment in hand: {metrics:?}"
     );
-    // An assignment has 40 steps at most.
+    // An assignment has at most 40 steps.
     let steps = number("calmwalk_agent_steps_total");
     assert!(steps > 0.0 && steps <= 40.0 * taken, "{metrics:?}");
 
     let walker = wait_for_process(hosts.others[0].path(), "walker");
     signal(walker, "KILL");
-    wait_until("it is replaced", || {
+    wait_until("the walker is replaced", || {
         value("calmwalk_agent_walker_restarts_total", "") == Some(1.0)
             && value("calmwalk_agent_walkers", "state=\"running\"") == Some(1.0)
     });
     signal(orchestrator.0.id(), "STOP");
-    wait_until("nobody answers", || value("calmwalk_agent_link_up", "") == Some(0.0));
+    wait_until("the link is down", || value("calmwalk_agent_link_up", "") == Some(0.0));
     assert!(value("calmwalk_agent_link_silence_seconds", "") > Some(1.0));
     signal(orchestrator.0.id(), "CONT");
-    wait_until("it answers again", || value("calmwalk_agent_link_up", "") == Some(1.0));
+    wait_until("the link is up again", || value("calmwalk_agent_link_up", "") == Some(1.0));
     signal(agent.0.id(), "TERM");
     assert_eq!(agent.0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     signal(orchestrator.0.id(), "TERM");

@@ -1,4 +1,5 @@
-//! `calmwalk calm build`: the same bytes however the work is divided and interrupted, and a mixture that grades its own data.
+//! `calmwalk calm build`: the bytes do not depend on the division of the work or on interruptions, and the mixture grades its
+//! own data.
 
 mod data;
 mod elements;
@@ -41,7 +42,7 @@ fn build(here: &Path, output: &str, data: &[&str], more: &[&str]) -> (Vec<u8>, S
     (fs::read(here.join(output)).unwrap(), printed)
 }
 
-/// A model as it comes from training, without arrays of features and mixture.
+/// Writes a model as exported after training, without arrays of features and mixture.
 fn write_plain_model(here: &Path, model: &str) {
     let mut out = npz::Writer::new(fs::File::create(here.join("plain.npz")).unwrap());
     out.copy(fs::File::open(config(model)).unwrap(), |key| key.starts_with("uq_")).unwrap();
@@ -65,7 +66,7 @@ fn the_number_of_threads_changes_no_byte_and_the_mixture_grades_its_data() {
         build(here, "one.npz", &["data.extxyz"], &["--threads", "1", "--embed", "model.npz"]);
     let (two, _) = build(here, "two.npz", &["data.extxyz"], &["--threads", "2"]);
     assert!(one == two, "the artifacts differ");
-    // Another seed is another mixture.
+    // Another random seed gives another mixture.
     let (other, _) = build(here, "other.npz", &["data.extxyz"], &["--rng-seed", "7"]);
     assert!(one != other);
 
@@ -79,7 +80,7 @@ fn the_number_of_threads_changes_no_byte_and_the_mixture_grades_its_data() {
     assert!(shown < 10.0 && (shown / 100.0 - above).abs() < 5e-4, "{shown} % {above}");
     assert!(printed.ends_with("wrote one.npz\n"), "{printed}");
 
-    // The model with the mixture is the model, and grades as the artifact does.
+    // The model with the embedded mixture differs only in its mixture, and gives the same grades as the artifact.
     assert_eq!(grades(here, "model.npz", &[]), gamma);
     assert!(grades(here, &model, &[]) != gamma);
     let (old, new) = (arrays(&config(MODEL)), arrays(&here.join("model.npz")));
@@ -145,7 +146,7 @@ fn an_interrupted_build_continues_and_another_is_refused() {
     let continued = fs::read(here.join("out.npz")).unwrap();
     let (anew, _) = build(here, "anew.npz", &files, &weights);
     assert!(continued == anew);
-    // Weights count in the statistics.
+    // The statistics include the weights.
     let artifact = Artifact::load(here.join("anew.npz")).unwrap();
     let statistics =
         artifact.mixture.components(0).unwrap().iter().map(|component| component.statistics().unwrap());
@@ -207,7 +208,7 @@ fn a_bad_structure_is_named_and_what_was_finished_is_kept() {
         assert!(message.contains(&format!("data.extxyz:{place}: ")) && message.contains(reason), "{message}");
         logs.push(fs::read(here.join("out.npz.build/pass-1")).unwrap());
     }
-    // Shards with the same structures are not computed, and saved, again.
+    // Finished shards are neither computed nor saved again.
     assert!(!logs[0].is_empty() && logs.iter().all(|log| *log == logs[0]));
     fs::write(here.join("data.extxyz"), &good).unwrap();
     let (mended, _) = build(here, "out.npz", &["data.extxyz"], &[]);
@@ -218,7 +219,7 @@ fn a_bad_structure_is_named_and_what_was_finished_is_kept() {
 fn changed_data_and_damaged_states_are_noticed() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    // Enough to be killed before the end.
+    // Enough data to kill the build before its end.
     let mut frames = [frames(), frames(), frames()].concat();
     write_frames(&here.join("data.extxyz"), &frames);
     let arguments = arguments("out.npz", &["data.extxyz"], &["--threads", "1"]);
@@ -288,7 +289,7 @@ fn thresholds_are_set_anew_from_the_histograms() {
         let grades = grades(here, model, &["--artifact", artifact]);
         grades.iter().filter(|gamma| **gamma > 1.0).count() as f64 / grades.len() as f64
     };
-    // Half of the atoms of each component are above the median, but for the width of a bin.
+    // Half of the atoms of each component are above the median, up to the width of a bin.
     let options = ["--percentile", "50", "--model", "model.npz", "--embed", "half_model.npz"];
     let first = ["calm", "recalibrate", "built.npz", "--output", "half.npz"];
     let printed = succeed(here, first.iter().chain(&options));
@@ -297,7 +298,7 @@ fn thresholds_are_set_anew_from_the_histograms() {
     assert!((half - 0.5).abs() < 0.02, "{half}");
     let own = grades(here, "half_model.npz", &[]);
     assert_eq!(own, grades(here, "model.npz", &["--artifact", "half.npz"]));
-    // Without the option, the artifact is the built one again.
+    // Without the option, the result equals the built artifact.
     succeed(here, ["calm", "recalibrate", "half.npz", "--output", "again.npz"]);
     assert_eq!(
         Artifact::load(here.join("again.npz")).unwrap(),
@@ -342,7 +343,7 @@ fn two_artifacts_are_compared_on_the_same_structures() {
         grades.sort_by(f64::total_cmp);
         let above = grades.iter().filter(|gamma| **gamma > 1.0).count() as f64 / ATOMS as f64;
         assert_eq!(found[0]["above_1"][index].as_f64(), Some(above));
-        // All atoms are in the sample; files have fewer digits.
+        // The sample has all atoms; the output of `calm score` has fewer digits.
         let median = 0.5 * (grades[ATOMS / 2 - 1] + grades[ATOMS / 2]);
         assert!((found[0]["median"][index].as_f64().unwrap() - median).abs() < 1e-6);
     }

@@ -1,7 +1,7 @@
-//! Files of every kind that a campaign reads, damaged at random: each is read, or refused by an error that names it.
+//! Randomly damaged files of every kind that a campaign reads: each is read, or refused with an error that names it.
 //!
-//! `CALMWALK_MUTATIONS=5000 cargo test --test integration mutations::` for the long version: so many of each kind. A number in the message of
-//! a failure is the one that makes the same file again.
+//! `CALMWALK_MUTATIONS=5000 cargo test --test integration mutations::` tries 5000 mutations of each kind. The number in a
+//! failure message reproduces the file.
 
 use std::fs;
 use std::io::{Cursor, Read, Write};
@@ -20,7 +20,7 @@ use crate::common;
 use crate::common::config;
 use crate::common::mutate::{mutated, mutations};
 
-/// Gives damaged files of this name to a reader, which returns what it has to say of one that it refuses.
+/// Passes damaged files of this name to a reader, which returns its error if it refuses one.
 fn read_all(
     name: &str,
     number: u64,
@@ -43,7 +43,7 @@ fn read_all(
     assert!(refused > 0, "{name}: nothing was refused");
 }
 
-/// The same of a file that there is.
+/// The same with mutations of an existing file.
 fn of_file(name: &str, number: u64, file: &Path, read: impl Fn(&Path) -> Result<(), String>) {
     let bytes = fs::read(file).unwrap();
     assert_eq!(read(file), Ok(()), "{name}");
@@ -93,7 +93,7 @@ fn members(file: &Path) -> Vec<(String, Vec<u8>)> {
     (0..number).map(read).collect()
 }
 
-/// An archive with one member damaged, and sound checksums.
+/// An archive with one damaged member and valid checksums.
 fn with_damaged_member(members: &[(String, Vec<u8>)], number: u64) -> Vec<u8> {
     let chosen = (common::random(number) % members.len() as u64) as usize;
     let mut out = NpzWriter::new(Cursor::new(Vec::new()));
@@ -105,12 +105,12 @@ fn with_damaged_member(members: &[(String, Vec<u8>)], number: u64) -> Vec<u8> {
     out.zip_writer().finish().unwrap().into_inner()
 }
 
-/// Reads a model; one that can be read evaluates a structure, or says why not.
+/// Reads a model. If that succeeds, evaluates a structure, which may return an error.
 fn read_model(path: &Path) -> Result<(), String> {
     let model = Arc::new(GraceModel::load(path).map_err(text)?);
     Artifact::load_export(path).map_err(text)?;
     let (structure, mut neighbours) = (structure(), NeighbourList::new(model.cutoff(), 0.0));
-    // A cutoff may be anything now: one that a structure has no room for is refused here.
+    // The cutoff may be arbitrary: the neighbour list refuses one that does not suit the structure.
     if neighbours.update(&structure).is_ok() {
         let _ = Grace::new(model).forward(&structure, &neighbours);
     }
@@ -134,7 +134,7 @@ fn artifacts() {
     read_all("gmm_artifacts.npz", 40, |number| with_damaged_member(&members, number), read);
 }
 
-/// Blocks have no names; their errors say what they are.
+/// Blocks have no file name, so their errors are not checked for it.
 #[test]
 fn candidates() {
     let structure = structure();
@@ -170,7 +170,7 @@ fn candidates() {
     }
 }
 
-/// With the checksum and the length that the block should have, so that what lies behind them is reached.
+/// Sets the correct length and checksum, so that the code behind these checks is reached.
 fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
     let length = bytes.len() as u64;
     if let Some(place) = bytes.get_mut(16..24) {

@@ -1,4 +1,4 @@
-//! Whether the owner of a campaign is told what happens to it, once, and whether that can disturb it.
+//! Notifications: each event is sent once, and a failing command does not disturb the campaign.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -14,7 +14,7 @@ use crate::common::{Running, program, succeed};
 
 const RUN: [&str; 2] = ["run", "campaign.toml"];
 
-/// Writes `campaign.toml`, and a script with this last line that adds a line to `events` and leaves what it was told.
+/// Writes `campaign.toml`, and a notification script that appends a line to `events`, saves its input and ends with `last`.
 fn write(here: &Path, small: &Small, notify: &str, change: (&str, &str), last: &str) {
     let script = format!(
         "#!/bin/sh\ncd '{}'\ncat > \"$CALMWALK_EVENT.json\"\necho \"$CALMWALK_EVENT $1 $CALMWALK_MESSAGE\" >> events\n{last}\n",
@@ -33,7 +33,7 @@ fn events(here: &Path) -> Vec<String> {
     text.lines().map(|line| line.split_once(' ').unwrap().0.to_owned()).collect()
 }
 
-/// Lines of the operations log of these kinds.
+/// Entries of these kinds in the operations log.
 fn operations(here: &Path, kinds: &[&str]) -> Vec<(String, Value)> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     let lines = runtime.block_on(async {
@@ -47,7 +47,7 @@ fn operations(here: &Path, kinds: &[&str]) -> Vec<(String, Value)> {
 }
 
 #[test]
-fn the_end_is_told_once_with_the_state_of_the_campaign() {
+fn the_end_is_notified_once_with_the_state_of_the_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     write(here, &Small::default(), "", ("[label]", "[budget]\nlabels = 4\n[label]"), "exit 0");
@@ -64,7 +64,7 @@ fn the_end_is_told_once_with_the_state_of_the_campaign() {
     assert!(line.contains("end argument the campaign is finished: "), "{line}");
     let log = operations(here, &["notified", "not_notified"]);
     assert!(log.len() == 2 && log.iter().all(|(kind, _)| kind == "notified"), "{log:?}");
-    // The same command once more says nothing new.
+    // Running the same command again sends no notification.
     succeed(here, RUN);
     assert_eq!(events(here).len(), 2);
 }
@@ -87,7 +87,7 @@ fn a_command_that_fails_or_hangs_is_a_line_in_the_log() {
 }
 
 #[test]
-fn a_stall_is_told_once_also_over_restarts() {
+fn a_stall_is_notified_once_across_restarts() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let small = Small { steps: 1_000_000, ..Small::default() };
@@ -97,22 +97,22 @@ fn a_stall_is_told_once_also_over_restarts() {
         let run = program(here).args(RUN).stderr(Stdio::null()).stdout(Stdio::null()).spawn();
         let run = Running(run.unwrap());
         if again {
-            // Several times as long as it takes to be told.
+            // Several times the delay of the notification.
             std::thread::sleep(std::time::Duration::from_secs(6));
         } else {
-            wait_until("the stall is told", || !operations_if_any(here).is_empty());
+            wait_until("the stall is notified", || !operations_if_any(here).is_empty());
         }
         drop(run);
-        wait_until("the walkers are gone", || common::processes::processes_in(here).is_empty());
+        wait_until("all processes have exited", || common::processes::processes_in(here).is_empty());
     }
     assert_eq!(events(here), ["stall"]);
 }
 
-/// How often the selector has found so far that the mixture forgets its training data.
+/// Number of decisions so far that raised the forgetting alarm.
 fn alarms(here: &Path) -> usize {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     runtime.block_on(async {
-        // There may be no database yet.
+        // The database may not exist yet.
         let Ok(store) = store::Store::open_read_only(here.join("campaign")).await else { return 0 };
         let decisions = store.decisions(1..=i64::MAX).await.unwrap_or_default();
         store.close().await;
@@ -121,7 +121,7 @@ fn alarms(here: &Path) -> usize {
 }
 
 #[test]
-fn a_mixture_that_forgets_is_spoken_of_once_a_run_and_told_once() {
+fn forgetting_is_reported_once_per_run_and_notified_once() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let small = Small { steps: 900, ..Small::default() };
@@ -135,7 +135,7 @@ fn a_mixture_that_forgets_is_spoken_of_once_a_run_and_told_once() {
     let spoken_of = || fs::read_to_string(&said).unwrap().matches("forgets its training data").count();
     let mut run = start();
     wait_until("there are several alarms", || alarms(here) >= 3);
-    wait_until("it is told", || !events(here).is_empty());
+    wait_until("the command has been called", || !events(here).is_empty());
     signal(run.0.id(), "TERM");
     run.0.wait().unwrap();
     let text = fs::read_to_string(&said).unwrap();

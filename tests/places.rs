@@ -1,4 +1,4 @@
-//! Where campaigns are kept, and that no campaign is taken for another.
+//! Locations of campaigns; no campaign is mistaken for another.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::common::campaign::Small;
 use crate::common::{calmwalk, refuse, stderr, succeed};
 
-/// A campaign that is over at once.
+/// Writes a campaign that ends quickly.
 fn write(directory: &Path) {
     fs::create_dir_all(directory).unwrap();
     Small { steps: 30, max_per_walk: 1, seeds: &["fcc-100"], ..Small::default() }.write(directory);
@@ -18,7 +18,7 @@ fn status(here: &Path, of: &str) -> Value {
     serde_json::from_str(&succeed(here, ["status", of, "--json"])).unwrap()
 }
 
-/// Runs it to its end; what it said.
+/// Runs a campaign to its end. Returns its standard error.
 fn run(here: &Path, arguments: &[&str]) -> String {
     let output = calmwalk(here, ["run", "--in-process"].iter().chain(arguments));
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
@@ -32,7 +32,7 @@ fn campaigns_of_init_do_not_meet() {
     for name in ["first", "second"] {
         let printed = succeed(here, ["init", name]);
         assert!(printed.contains(&format!("calmwalk status {name}\n")), "{printed}");
-        // Their content is the same, as that of `init` is: only where they are tells them apart.
+        // Both configurations are equal; only their paths differ.
         write(&here.join(name));
         let said = run(here, &[&format!("{name}/campaign.toml")]);
         assert!(said.contains(&format!("starting campaign '{name}' in {name}/campaign with /")), "{said}");
@@ -44,7 +44,7 @@ fn campaigns_of_init_do_not_meet() {
     let entries = fs::read_dir(here).unwrap().count();
     assert_eq!(entries, 2, "nothing was left in the working directory");
 
-    // Every command takes the directory that `init` made.
+    // Every command accepts the directory that `init` created.
     for command in
         [&["status"][..], &["force-errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]]
     {
@@ -67,7 +67,7 @@ fn a_directory_with_several_campaigns_is_not_enough() {
     write(here);
     fs::copy(here.join("campaign.toml"), here.join("other.toml")).unwrap();
     run(here, &["campaign.toml"]);
-    // One that no configuration names gives way to one that is named.
+    // A campaign with a configuration is preferred to one without.
     succeed(here, ["store", "backup", "campaign", "copy"]);
     assert_eq!(status(here, ".")["name"], here.file_name().unwrap().to_str().unwrap());
     run(here, &["other.toml"]);
@@ -92,7 +92,7 @@ fn a_campaign_refuses_the_configuration_of_another() {
     for words in ["second/campaign.toml: ", &expected, "with --directory", "by --adopt"] {
         assert!(message.contains(words), "{words}: {message}");
     }
-    // Nor does it lead to changing the file.
+    // The error about a changed value also names the campaign, so that users do not edit the wrong file.
     let text = fs::read_to_string(here.join("second/campaign.toml")).unwrap();
     fs::write(here.join("second/campaign.toml"), text.replace("tau = 0.3", "tau = 0.4")).unwrap();
     let message = refuse(here, both("second/campaign.toml"));
@@ -117,7 +117,7 @@ fn a_campaign_moves_with_its_configuration() {
     let here = directory.path();
     write(&here.join("first"));
     run(here, &["first/campaign.toml"]);
-    // Moved together, copied together, and the configuration renamed.
+    // Move both, then rename the configuration.
     fs::rename(here.join("first"), here.join("moved")).unwrap();
     let said = run(here, &["moved/campaign.toml"]);
     assert!(said.contains("campaign 'moved' in moved/campaign is finished"), "{said}");
@@ -134,7 +134,7 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     write(&here.join("first"));
-    // As a version of calmwalk left it that knew of no configuration files.
+    // A campaign of an earlier version, which did not record configuration files.
     run(here, &["first/campaign.toml", "--directory", "campaign"]);
     forget_the_configuration(&here.join("campaign"));
     let message = refuse(here, ["run", "first/campaign.toml"]);
@@ -147,14 +147,14 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     }
     assert!(!here.join("first/campaign").exists());
     run(here, &["first/campaign.toml", "--directory", "campaign"]);
-    // It has become that of this file, and is in nobody else's way.
+    // It now belongs to this configuration, and does not block others.
     write(&here.join("second"));
     run(here, &["second/campaign.toml"]);
     assert!(
         refuse(here, ["run", "first/campaign.toml"])
             .contains("campaign already contains a campaign of this configuration")
     );
-    // Nor one that is beside its configuration.
+    // The same for a campaign beside its configuration.
     run(here, &["second/campaign.toml", "--directory", "second"]);
     fs::remove_dir_all(here.join("second/campaign")).unwrap();
     assert!(refuse(here, ["run", "second/campaign.toml"]).contains("--directory ./second to continue"));

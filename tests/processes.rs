@@ -1,4 +1,4 @@
-//! Walkers and labellers are processes of their own: whatever happens to one of them, the campaign comes to the same end.
+//! Walkers and labellers are separate processes: whatever happens to one of them, the campaign has the same outcome.
 
 use std::fs;
 use std::path::Path;
@@ -27,12 +27,12 @@ fn wait(running: &mut Running) -> Option<i32> {
     running.0.wait().expect("a child").code()
 }
 
-/// What it has said so far.
+/// Standard error of the run so far.
 fn said(directory: &Path) -> String {
     fs::read_to_string(directory.join("stderr")).expect("its standard error")
 }
 
-/// The same campaign, all in one process.
+/// The outcome of the campaign in a single process.
 fn expected(small: &Small) -> Outcome {
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
@@ -40,7 +40,7 @@ fn expected(small: &Small) -> Outcome {
     outcome(directory.path())
 }
 
-/// Long enough for processes to fail and be replaced meanwhile.
+/// Long enough for processes to fail and be replaced.
 fn long() -> Small {
     Small { steps: 900, ..Small::default() }
 }
@@ -51,14 +51,14 @@ fn with_keys(path: &Path, keys: &str) {
     fs::write(path, text).unwrap();
 }
 
-/// Waits for the end of the campaign, which is in order, leaves nothing behind, and is that of an undisturbed run.
+/// Waits for the end of the campaign, and checks its exit code, outcome and that nothing remains.
 fn ends_as_undisturbed(mut running: Running, directory: &Path, small: &Small) {
     assert_eq!(wait(&mut running), Some(0), "{}", said(directory));
     assert_eq!(outcome(directory), expected(small));
     assert_no_leftovers(directory);
 }
 
-/// Runs a long campaign to its end. What `disturb` does to it when its walkers are at work must change nothing.
+/// Runs a long campaign to its end. `disturb` runs once the walkers are working, and must not change the outcome.
 fn disturbed(keys: &str, disturb: impl FnOnce(&Path)) -> tempfile::TempDir {
     let small = long();
     let directory = tempfile::tempdir().unwrap();
@@ -71,7 +71,7 @@ fn disturbed(keys: &str, disturb: impl FnOnce(&Path)) -> tempfile::TempDir {
     directory
 }
 
-/// A campaign with a model of its own, which can be spoiled.
+/// Writes a campaign with a copy of the model, which a test can damage.
 fn with_own_model(small: &Small, directory: &Path) {
     let path = small.write(directory);
     let model = config("data/al_eam_1l/kokkos.npz");
@@ -83,7 +83,7 @@ fn with_own_model(small: &Small, directory: &Path) {
 /// The processes in `status`.
 fn shown(directory: &Path) -> Vec<Value> {
     let output = calmwalk(directory, ["status", ".", "--json"]);
-    // There may be no database yet.
+    // The database may not exist yet.
     let Ok(status) = serde_json::from_slice::<Value>(&output.stdout) else { return Vec::new() };
     status["processes"].as_array().cloned().unwrap_or_default()
 }
@@ -99,12 +99,12 @@ fn operations(directory: &Path, kind: &str) -> Vec<Value> {
     found.map(|operation| operation.detail).collect()
 }
 
-/// What the operations log says of ended processes.
+/// Entries of the operations log about ended processes.
 fn endings(directory: &Path) -> Vec<String> {
     operations(directory, "process_ended").iter().map(Value::to_string).collect()
 }
 
-/// Checks that a run that has failed is not taken for one that was killed, and that its last end is recorded with the reason.
+/// Checks that a failed run is recorded as failed with its reason, not as killed.
 fn recorded_as_failed(directory: &Path, reason: &str) {
     let left = shown(directory);
     assert!(left.iter().all(|process| process["kind"] == "labeller"), "{left:?}");
@@ -113,14 +113,14 @@ fn recorded_as_failed(directory: &Path, reason: &str) {
     assert!(last["how"] == "failed" && last["error"].as_str().unwrap().contains(reason), "{last}");
 }
 
-/// Waits until both walkers are at work.
+/// Waits until both walkers are working.
 fn wait_for_work(directory: &Path) {
     wait_until("walkers advance", || {
         let output = calmwalk(directory, ["status", ".", "--json"]);
         let status = serde_json::from_slice::<Value>(&output.stdout).unwrap_or_default();
         status["mixture_version"].as_u64().is_some_and(|version| version > 0)
     });
-    wait_until("both are there", || processes_running(directory, "walker").len() == 2);
+    wait_until("both walkers are running", || processes_running(directory, "walker").len() == 2);
 }
 
 #[test]
@@ -138,19 +138,19 @@ fn a_hung_walker_is_killed_and_replaced() {
 }
 
 #[test]
-fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
+fn a_terminated_walker_leaves_its_walk_to_another() {
     let directory = disturbed("", |here| signal(wait_for_process(here, "walker"), "TERM"));
     let endings = endings(directory.path());
     assert!(endings.iter().any(|ending| ending.contains("exit code 130")), "{endings:?}");
 }
 
 #[test]
-fn a_labeller_that_is_told_to_end_is_replaced() {
+fn a_terminated_labeller_is_replaced() {
     disturbed("", |here| {
         let held = pause_walkers(here, 2);
         let labeller = wait_for_process(here, "labeller");
         signal(labeller, "TERM");
-        wait_until("another is there", || {
+        wait_until("another labeller is running", || {
             processes_running(here, "labeller").first().is_some_and(|other| *other != labeller)
         });
         resume_processes(&held);
@@ -158,7 +158,7 @@ fn a_labeller_that_is_told_to_end_is_replaced() {
 }
 
 #[test]
-fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
+fn a_walker_that_cannot_start_is_given_up_and_the_others_continue() {
     let small = long();
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
@@ -166,7 +166,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     with_keys(&here.join("campaign.toml"), "max_restarts = 1");
     let running = start(here);
     wait_for_work(here);
-    // The other does not end the campaign before this one was given up.
+    // The other walker must not end the campaign before this one is given up.
     let held = pause_walkers(here, 2);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
@@ -212,7 +212,7 @@ fn a_run_may_have_more_descriptors_than_its_walkers() {
 }
 
 #[test]
-fn without_any_walker_the_campaign_fails_and_can_go_on() {
+fn without_any_walker_the_campaign_fails_and_can_continue() {
     let small = long();
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
@@ -243,16 +243,16 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     wait_for_work(here);
     let labellers = processes_running(here, "labeller");
     assert_eq!(labellers.len(), 1);
-    // So that it does not just look whether anybody needs it.
+    // Pause it, so that it does not look for an orchestrator and exit.
     hold(labellers[0], here.to_str().unwrap());
     running.0.kill().unwrap();
     running.0.wait().unwrap();
-    wait_until("walkers are gone", || processes_running(here, "walker").is_empty());
+    wait_until("the walkers have exited", || processes_running(here, "walker").is_empty());
     let is_killed = |process: &Value| process["kind"] == "orchestrator" && process["state"] == "dead";
     assert!(shown(here).iter().any(is_killed), "{:?}", shown(here));
     let running = start(here);
     wait_until("there are walkers again", || processes_running(here, "walker").len() == 2);
-    // While a labeller is held, the campaign does not end either.
+    // The campaign cannot end while a labeller is paused.
     let second = refuse(here, RUN);
     assert!(second.contains(&format!("process {}", running.0.id())), "{second}");
     signal(labellers[0], "CONT");
@@ -269,7 +269,7 @@ fn a_labeller_finishes_the_queue_without_an_orchestrator_and_leaves() {
     wait_for_work(here);
     running.0.kill().unwrap();
     running.0.wait().unwrap();
-    wait_until("every process is gone", || processes_in(here).is_empty());
+    wait_until("all processes have exited", || processes_in(here).is_empty());
     let status: Value = serde_json::from_str(&succeed(here, ["status", ".", "--json"])).unwrap();
     let labels = &status["labels"];
     assert_eq!((&labels["queued"], &labels["leased"]), (&0.into(), &0.into()), "{labels}");
@@ -310,7 +310,7 @@ fn clean_removes_what_killed_processes_left_and_nothing_else() {
     assert!(message.contains(&format!("process {}", running.0.id())), "{message}");
     processes_in(here).iter().for_each(|process| signal(process.pid, "KILL"));
     running.0.wait().unwrap();
-    wait_until("every process is gone", || processes_in(here).is_empty());
+    wait_until("all processes have exited", || processes_in(here).is_empty());
     let place = wire::shm_dir::ShmDir::for_campaign(here).unwrap();
     assert!(place.directory().exists());
     let said = succeed(here, ["clean", "."]);
@@ -318,7 +318,7 @@ fn clean_removes_what_killed_processes_left_and_nothing_else() {
     assert_no_leftovers(here);
 }
 
-/// The program with a shared memory of its own, of `megabytes` with `filled` of them taken.
+/// The program with its own shared memory of `megabytes`, of which `filled` are used.
 fn with_shared_memory(directory: &Path, megabytes: u32, filled: u32) -> Option<Command> {
     let mut unshare = Command::new("unshare");
     unshare.args(["--user", "--map-root-user", "--mount"]).current_dir(directory);
@@ -338,7 +338,7 @@ fn with_shared_memory(directory: &Path, megabytes: u32, filled: u32) -> Option<C
 }
 
 #[test]
-fn sixteen_megabytes_of_shared_memory_are_enough_or_the_need_is_said() {
+fn sixteen_megabytes_of_shared_memory_are_enough_or_the_need_is_reported() {
     let small = Small::default();
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
@@ -368,7 +368,7 @@ fn shared_memory_is_the_users_alone() {
     assert_eq!(fs::metadata(shm_dir.directory()).unwrap().mode() & 0o777, 0o700);
     let mut segments = 0;
     for file in fs::read_dir("/dev/shm").unwrap().flatten() {
-        // Those that nobody needs any more are removed at any time.
+        // Unused segments may be removed at any time.
         let (name, Ok(data)) = (file.file_name(), file.metadata()) else { continue };
         if name.to_string_lossy().starts_with(shm_dir.prefix()) {
             segments += 1;

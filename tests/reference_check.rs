@@ -1,4 +1,4 @@
-//! The check of the reference before the first walk: it passes, refuses, is accepted, and continues after a kill.
+//! The reference check before the first walk: it passes, fails, is accepted, and continues after a kill.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -15,7 +15,7 @@ use crate::common::{Running, calmwalk, program, refuse, stderr, succeed, write_f
 
 const CHECK: &str = "reference_check = { structures = \"known.extxyz\" }";
 
-/// A campaign in `campaign.toml` with a check, whose label method has this text instead of that of the small campaign.
+/// Writes a campaign with a reference check and, if given, another label method.
 fn campaign(method: Option<&str>) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     let path = Small::default().write(directory.path());
@@ -28,7 +28,7 @@ fn campaign(method: Option<&str>) -> TempDir {
     directory
 }
 
-/// Writes the seed structures with labels by the campaign's own method, changed by `change` (number of the frame).
+/// Writes the seed structures with labels by the campaign's own method, modified by `change` (number of the frame, labels).
 fn write_known(here: &Path, change: impl Fn(usize, &mut FrameLabels)) {
     succeed(here, ["label-file", "seeds.extxyz", "--config", "campaign.toml", "--output", "known.extxyz"]);
     let path = here.join("known.extxyz");
@@ -55,13 +55,13 @@ fn status(here: &Path) -> Value {
     serde_json::from_str(&succeed(here, ["status", ".", "--json"])).unwrap()
 }
 
-/// The details of the operations of this kind.
+/// Details of the operations of this kind.
 fn operations(here: &Path, kind: &str) -> Vec<Value> {
     let operations = on_store(here.into(), async |store| store.operations(0, 1000).await.unwrap());
     operations.into_iter().filter(|one| one.kind == kind).map(|one| one.detail).collect()
 }
 
-/// The details of the checks in the operations log.
+/// Details of the checks in the operations log.
 fn logged(here: &Path) -> Vec<Value> {
     operations(here, "reference_check")
 }
@@ -85,7 +85,7 @@ fn labels_that_agree_start_the_campaign() {
         ),
         "{said}"
     );
-    // Neither candidates nor labels of the campaign: all accepted structures have exactly one label.
+    // The check adds neither candidates nor labels: all accepted structures have exactly one label.
     outcome(here);
     let check = &status(here)["reference_check"];
     assert_eq!(
@@ -95,7 +95,7 @@ fn labels_that_agree_start_the_campaign() {
     assert_eq!(check["overall"]["energy"]["frames"], 2);
     assert!(succeed(here, ["status", "."]).contains("; reference check passed\n"));
     assert_eq!(logged(here).len(), 1);
-    // It is not repeated, but for what it depends on.
+    // The check is repeated only if its inputs change.
     assert!(!stderr(&run(here, &[])).contains("reference"));
     write_known(here, |_, labels| add_energy(labels, -200.0));
     let said = stderr(&run(here, &[]));
@@ -127,7 +127,7 @@ fn labels_that_differ_stop_the_campaign_until_they_are_accepted() {
     assert_eq!(state["reference_check"]["state"], "failed");
     assert!(state["walks"].as_array().unwrap().iter().all(|walk| walk["step"] == 0), "{state}");
     assert!(succeed(here, ["status", "."]).contains("; reference check failed\n"));
-    // These runs were refused, not killed.
+    // The check refused these runs, so they are not recorded as killed.
     assert_eq!(state["processes"], json!([]));
     let ended = operations(here, "ended");
     assert_eq!(ended.len(), 2);
@@ -146,12 +146,12 @@ fn labels_that_differ_stop_the_campaign_until_they_are_accepted() {
     assert_eq!(status(here)["reference_check"]["state"], "accepted");
     let states: Vec<_> = logged(here).into_iter().map(|detail| detail["state"].clone()).collect();
     assert_eq!(states, ["failed", "failed", "accepted"]);
-    // The acceptance holds.
+    // The acceptance remains valid.
     assert_eq!(run(here, &[]).status.code(), Some(0));
     outcome(here);
 }
 
-/// Before a label: writes a line to `started`, and waits for the file `go` of the campaign.
+/// Before each label: appends a line to `started`, and waits for the file `go`.
 const WAITING_SCRIPT: &str = r#"
 echo >> HERE/started
 while [ ! -e HERE/go ]; do sleep 0.02; done
@@ -184,9 +184,9 @@ fn started(here: &Path) -> usize {
     fs::read_to_string(here.join("started")).unwrap_or_default().len()
 }
 
-/// The check that was killed had begun to label a structure that the file has no longer.
+/// The killed check had started to label a structure that was then removed from the file.
 #[test]
-fn a_calculation_that_nobody_wants_any_more_is_ended() {
+fn a_calculation_that_is_no_longer_needed_is_ended() {
     let directory = waiting_campaign();
     let here = directory.path();
     let mut running =
@@ -228,7 +228,7 @@ fn a_killed_check_continues_with_the_calculation_that_is_running() {
         signal(running.0.id(), stop);
         let ended = running.0.wait().unwrap();
         assert_eq!(ended.code(), if stop == "TERM" { Some(130) } else { None });
-        // Only the one that was killed is missing.
+        // Only a killed run is recorded as dead.
         let left = if stop == "TERM" { json!([]) } else { json!(["dead"]) };
         let processes = status(here)["processes"].clone();
         let states = processes.as_array().unwrap().iter().map(|process| process["state"].clone());
@@ -315,15 +315,15 @@ fn validate_warns_of_files_that_show_little() {
 const LAUNCH: [&str; 8] =
     ["launch", "campaign.toml", "--on", "slurm", "--agents=0", "--directory", ".", "--dry-run"];
 
-/// What `calmwalk launch` prints, with this further option.
+/// Output of `calmwalk launch` with these further options.
 fn launched(here: &Path, further: &[&str]) -> std::process::Output {
     let mut command = program(here);
-    // Slurm's commands may be installed without a Slurm that answers.
+    // Hide Slurm's commands, which may be installed without a working Slurm.
     command.args(LAUNCH).args(further).env("PATH", "");
     command.output().unwrap()
 }
 
-/// A requeued job repeats its command, whatever the configuration says by then.
+/// A requeued job repeats its command, even if the configuration has changed.
 #[test]
 fn a_launched_campaign_accepts_only_the_check_that_the_user_has_seen() {
     let directory = campaign(None);
@@ -356,7 +356,7 @@ fn a_launched_campaign_accepts_only_the_check_that_the_user_has_seen() {
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(0), "{said}");
     assert!(said.contains("WARNING: reference check: accepted, 2 structures"), "{said}");
-    // The job is requeued when there is no check any more.
+    // The job is requeued after the check was removed.
     with_check("");
     assert_eq!(run(here, &[accept]).status.code(), Some(0));
 }

@@ -1,5 +1,5 @@
-//! `calmwalk relabel`: doubtful labels are made again, and a campaign labels by another protocol. The same tests on PostgreSQL are
-//! in `postgres_whole.rs`.
+//! `calmwalk relabel`: repeats doubtful labels, and changes the protocol of a campaign. `CALMWALK_POSTGRES` runs the same
+//! tests on a server.
 
 use std::fs;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::signal;
 use crate::common::{calmwalk, config, random, refuse, stderr, succeed};
 
-/// A campaign that is over, and how many labels it has.
+/// A finished campaign, and its number of labels.
 fn labelled() -> (LabelCampaign, u64) {
     let place = LabelCampaign::new(&Small { steps: 120, ..Small::default() }, &[]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
@@ -21,7 +21,7 @@ fn labelled() -> (LabelCampaign, u64) {
     (place, labels)
 }
 
-/// Writes `fine.toml`: the same campaign with another label potential, by a protocol of this name.
+/// Writes `fine.toml`: the same campaign with another label potential, under a protocol of this name.
 fn another_protocol(place: &LabelCampaign, name: &str) {
     let potential = config("data/Al_mm.eam.fs");
     let text = fs::read_to_string(place.path().join("campaign.toml")).unwrap();
@@ -41,7 +41,7 @@ fn run(place: &LabelCampaign, configuration: &str) {
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
 }
 
-/// Names of the protocols in an export, one a structure, and names of their candidates.
+/// Protocol and candidate of each structure in an export.
 fn exported(place: &LabelCampaign) -> Vec<(String, String)> {
     let text = String::from_utf8(place.export()).unwrap();
     let value = |line: &str, key: &str| {
@@ -94,7 +94,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     assert_eq!((&twice["again"], &twice["waiting_already"]), (&0.into(), &labels.into()));
     assert_eq!((place.jobs("again"), place.jobs("queued")), (labels, labels));
     let before = exported(&place);
-    // A structure that was found twice has one label.
+    // Two candidates with the same structure share one label.
     assert!(before.len() as u64 >= labels && before.iter().all(|(protocol, _)| protocol == "potential"));
     check(&place);
     assert!(refuse(here, ["run", "campaign.toml", "--directory", "."]).contains("labels of two protocols"));
@@ -125,7 +125,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
 }
 
 #[test]
-fn a_protocol_needs_a_name_of_its_own_and_a_campaign_that_nobody_runs() {
+fn a_protocol_needs_its_own_name_and_a_campaign_that_is_not_running() {
     let (place, _) = labelled();
     another_protocol(&place, "potential");
     let with = ["relabel", place.argument(), "--config", "fine.toml", "--all"];
@@ -184,7 +184,7 @@ fn killed_at_any_instant_all_or_nothing_is_asked_for() {
     }
     relabel(&place, &["--all", "--include-current"]);
     assert_eq!(place.jobs("again"), labels);
-    // Labellers that are killed leave nothing undone either.
+    // Kills of labellers do not lose jobs either.
     for kill in 0..4 {
         let mut running = place.label(&["--until-empty"]);
         std::thread::sleep(Duration::from_millis(random(100 + kill) % 400));
@@ -198,7 +198,7 @@ fn killed_at_any_instant_all_or_nothing_is_asked_for() {
 }
 
 #[test]
-fn labellers_go_on_with_the_new_protocol() {
+fn labellers_continue_with_the_new_protocol() {
     let (place, labels) = labelled();
     another_protocol(&place, "fine");
     let name = place.queue_large();

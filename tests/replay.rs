@@ -1,4 +1,5 @@
-//! `calmwalk replay`: the same decisions by the same rules, others by others, and plain words where it cannot go on.
+//! `calmwalk replay`: the same rules give the same decisions, other rules give others, and errors state where a replay cannot
+//! continue.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,7 +15,7 @@ use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
 
-/// A campaign that has run to its end, its configuration changed before.
+/// A finished campaign with these changes to its configuration.
 fn finished(small: &Small, changes: &[(&str, &str)]) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     let path = small.write(directory.path());
@@ -23,7 +24,7 @@ fn finished(small: &Small, changes: &[(&str, &str)]) -> TempDir {
     directory
 }
 
-/// Walks from alike structures that advance together: what one finds is no news from the others.
+/// Concurrent walks from similar structures: a structure found by one of them is often covered for the others.
 fn many() -> Small {
     Small { walks_per_round: 4, seeds: &["fcc-100", "fcc-097", "fcc-103", "vacancy"], ..Small::default() }
 }
@@ -43,7 +44,7 @@ fn replayed(directory: &Path, settings: &[&str]) -> Value {
     serde_json::from_str(&text).unwrap()
 }
 
-/// Everything comes out as it was, and is what `status` counts.
+/// Checks that the replay reproduces everything, and agrees with `status`.
 fn check_exact(directory: &Path) -> Value {
     let report = replayed(directory, &[]);
     assert_eq!((&report["difference"], &report["same_mixture"]), (&Value::Null, &true.into()), "{report}");
@@ -72,7 +73,7 @@ fn execute(directory: &Path, statements: &[&str]) {
     });
 }
 
-/// Labelled structures of the campaign, as a file that another campaign can import.
+/// Exports the labelled structures, so that another campaign can import them.
 fn export(directory: &Path) -> PathBuf {
     let path = directory.join("labelled.extxyz");
     succeed(directory, ["export", "here", "--output", path.to_str().unwrap()]);
@@ -80,7 +81,7 @@ fn export(directory: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise() {
+fn a_reproducible_campaign_is_reproduced_and_other_rules_decide_otherwise() {
     let directory = finished(&many(), &[]);
     let here = directory.path();
     let database = fs::read(here.join("here/campaign.sqlite")).unwrap();
@@ -100,7 +101,7 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
     assert_eq!(accepted(&strict, "before") - lost.len() as u64 + won.len() as u64, accepted(&strict, "now"));
     assert!(lost.iter().any(|change| change["reason"] == "covered"), "{lost:?}");
     assert!(lost.iter().all(|change| change["step"].as_u64() > Some(20)), "{lost:?}");
-    // A value can be set as a whole or inside.
+    // A value can be set as a whole table or by its inner key.
     let inside = replayed(here, &["collect.criterion.threshold=1.2"]);
     assert_eq!(
         (&inside["now"], &inside["set"]["collect.criterion.threshold"]),
@@ -119,12 +120,12 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
 }
 
 #[test]
-fn a_live_campaign_that_went_on_by_other_limits_comes_out_as_it_was() {
+fn a_live_campaign_that_continued_with_other_limits_is_reproduced() {
     let live = Small { mode: "live", ..Small::default() };
     let directory = finished(&live, &[("max_per_walk = 4", "max_per_walk = 1")]);
     let here = directory.path();
     check_exact(here);
-    // Structures that the walks will meet again when they go on would be duplicates; these are of another campaign.
+    // Import structures of another campaign: own structures that the walks find again would be duplicates.
     let other = finished(&Small { steps: 120, ..Small::default() }, &[]);
     let labelled = export(other.path());
     succeed(here, ["import", "here", labelled.to_str().unwrap()]);
@@ -146,14 +147,14 @@ fn kinds(directory: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_mixture_that_begins_anew_comes_out_as_it_was() {
+fn a_mixture_that_is_reset_is_reproduced() {
     let small = Small { walks_per_round: 1, ..Small::default() };
     let directory =
         finished(&small, &[("[seed_structures]", "update = \"per_seed_structure\"\n[seed_structures]")]);
     let report = check_exact(directory.path());
     let carried = replayed(directory.path(), &["calm.update=cumulative"]);
     let versions = |report: &Value| report["now"]["mixture_version"].as_u64().unwrap();
-    assert!(versions(&carried) < versions(&report), "no version for a new begin: {carried}");
+    assert!(versions(&carried) < versions(&report), "no version for a reset: {carried}");
 }
 
 #[test]
@@ -229,7 +230,7 @@ fn what_was_changed_behind_its_back_is_found() {
     );
     execute(here, &[&alpha]);
     fails(&["damaged database: decision ", "its content has the checksum "]);
-    // With a checksum that belongs to it, only the replay can tell.
+    // With a matching checksum, only the replay can detect the change.
     let message = stderr(&calmwalk(here, ["replay", "here"]));
     let checksum = message.split("its content has the checksum ").nth(1).unwrap().split(',').next().unwrap();
     let checksum = u32::from_str_radix(checksum, 16).unwrap();

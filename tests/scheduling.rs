@@ -1,4 +1,4 @@
-//! Which walks walkers are given, and what leaves walkers idle.
+//! The order in which walks are assigned, and idle walkers.
 
 use std::fs;
 use std::process::Stdio;
@@ -11,7 +11,7 @@ use crate::common::label_campaign::on_store;
 use crate::common::processes::wait_until;
 use crate::common::{Running, program, succeed};
 
-/// In live mode, with the one walker that a walk is left to.
+/// In live mode with a single walker.
 #[test]
 fn control_walks_do_not_wait_for_the_last_biased_walk() {
     let directory = tempfile::tempdir().unwrap();
@@ -29,7 +29,7 @@ fn control_walks_do_not_wait_for_the_last_biased_walk() {
         .map(|decision| decision.sequence)
         .collect();
     let control = decisions.iter().find(|decision| decision.kind == "control").unwrap().sequence;
-    // The one walker begins the last biased walk when the one before it has ended.
+    // The single walker starts the last biased walk after the one before it has ended.
     let [.., before_last, _] = ends[..] else { panic!("{ends:?}") };
     assert!(ends.len() == 6 && control < before_last, "{control}, {ends:?}");
 }
@@ -39,7 +39,7 @@ fn walkers_that_rounds_leave_idle_are_named_and_measured() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let small = Small { walkers: 4, walks_per_round: 1, steps: 1_000_000, ..Small::default() };
-    // Nothing is collected.
+    // The threshold is too high to collect a structure.
     fs::write(small.write(here), small.text().replace("threshold = 1.0", "threshold = 1e6")).unwrap();
     let idle = "at most 2 of the 4 walkers have something to do at a time: a round has 1 biased walks (run.walks_per_round)";
     let shown = succeed(here, ["validate", "campaign.toml"]);

@@ -1,4 +1,4 @@
-//! The JSON schema of the configuration: that the published copy is current, and that it takes what the program takes.
+//! The JSON schema of the configuration: the published copy is current, and it accepts what the program accepts.
 
 use std::fs;
 use std::path::Path;
@@ -20,7 +20,7 @@ fn as_list(value: &Value) -> impl Iterator<Item = &Value> {
     value.as_array().into_iter().flatten()
 }
 
-/// Where a value and a schema do not agree. Knows the keywords that the schema has, and no others.
+/// Places where a value violates a schema. Supports only the keywords of this schema.
 fn faults(schema: &Value, value: &Value, at: &str) -> Vec<String> {
     let mut faults = Vec::new();
     let mut expect = |holds: bool, what: &Value| {
@@ -103,7 +103,7 @@ fn every_campaign_of_the_project_is_valid() {
     let mut campaigns = 0;
     for entry in fs::read_dir(config("")).unwrap() {
         let path = entry.unwrap().path();
-        // The configuration of `calmwalk md` is none of a campaign.
+        // The configuration of `calmwalk md` is not a campaign.
         if path.extension().is_some_and(|extension| extension == "toml")
             && !path.ends_with("md-aluminium.toml")
         {

@@ -1,4 +1,4 @@
-//! `calmwalk select`, and what a campaign makes of it (`import --queue`).
+//! `calmwalk select`, and labelling of its output by a campaign (`import --queue`).
 
 use std::fs;
 use std::path::Path;
@@ -75,7 +75,7 @@ fn selected_structures_keep_their_frames_whatever_threads_and_memory() {
     let bytes = fs::read(here.join("out.extxyz")).unwrap();
     let again = select(here, &["pool.extxyz", "--threads", "2", "--memory", "0"]);
     assert_eq!((again, fs::read(here.join("out.extxyz")).unwrap()), (found, bytes));
-    // Nothing but the output is left.
+    // No temporary files remain.
     assert_eq!(fs::read_dir(here).unwrap().count(), 2);
     let first = select(here, &["pool.extxyz", "-n", "1"]);
     assert!(first["gamma_left"].as_f64() > Some(1.0));
@@ -104,7 +104,7 @@ fn several_strategies_pick_from_what_is_left() {
     numbers.dedup();
     assert_eq!(numbers.len(), 11);
     assert_eq!(found["floor"], 131);
-    // Commas, repetition and aliases are the same, and so is a single thread.
+    // Commas, repeated options, aliases and a single thread give the same picks.
     let same = [
         "--threads",
         "1",
@@ -118,7 +118,7 @@ fn several_strategies_pick_from_what_is_left() {
     assert_eq!(select(here, &[&["pool.extxyz"], &same[..]].concat()), found);
     let other = select(here, &[&["pool.extxyz", "--rng-seed", "1", "--strategy"], &parts[..]].concat());
     assert_ne!(other["picks"], found["picks"]);
-    // With a window, what is above is not seen.
+    // Atoms above the window are ignored.
     let within = select(here, &["pool.extxyz", "--gamma-max", "1.5", "--gamma-min", "1.1", "-n", "1"]);
     assert!(within["picks"][0]["gamma_max"].as_f64() < Some(1.51));
 }
@@ -149,7 +149,7 @@ fn wrong_selections_are_refused() {
     let message = refused(here, &["pool.extxyz", "--output", "pool.extxyz"]);
     assert!(message.contains("is a file of the pool"), "{message}");
     assert!(!here.join("out.extxyz").exists());
-    // The mixture of an export has no statistics: what updates nothing works.
+    // The mixture of an export has no statistics, so only strategies without updates work.
     let model = file("kokkos.npz");
     let own = ["select", "--model", &model, "pool.extxyz", "--output", "out.extxyz"];
     assert!(refuse(here, own).contains("the mixture has no statistics, which greedy updates"));
@@ -167,7 +167,7 @@ fn what_was_selected_is_labelled_by_a_campaign() {
     Small { steps: 120, ..Small::default() }.write(here);
     succeed(here, ["run", "campaign.toml"]);
     succeed(here, ["export", "campaign", "--output", "own.extxyz"]);
-    // Of a campaign, the store has the features.
+    // The store has the features of a campaign's candidates.
     let own = select(here, &["--campaign", "campaign", "--strategy", "fps", "-n", "1"]);
     assert!(own["pool"]["features_from_stores"].as_u64() > Some(0), "{own}");
     assert_eq!(own["pool"]["features_computed"], 0);

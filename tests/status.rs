@@ -1,4 +1,4 @@
-//! `calmwalk status` while a campaign runs, after it was killed, and of a copy.
+//! `calmwalk status` of a running campaign, of a killed one, and of a copy.
 
 use std::fs;
 use std::process::Stdio;
@@ -10,7 +10,7 @@ use crate::common::campaign::Small;
 use crate::common::processes::wait_until;
 use crate::common::{Running, program, refuse, succeed};
 
-/// Two walks that find nothing and are not done for a long time.
+/// Two walks that collect nothing and run for a long time.
 fn endless() -> String {
     let text = Small { steps: 1_000_000, ..Small::default() }.text();
     text.replace("threshold = 1.0", "threshold = 1e6")
@@ -33,7 +33,7 @@ fn walks_are_seen_to_advance_and_a_copy_says_the_same() {
         let walks = seen["walks"].as_array().unwrap();
         walks.len() == 2 && walks.iter().all(|walk| walk["steps_per_second"].as_f64() > Some(0.0))
     });
-    wait_until("the end is in sight", || {
+    wait_until("the expected end is known", || {
         seen = status("campaign");
         seen["expected_end"]["time"].is_i64()
     });

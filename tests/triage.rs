@@ -1,4 +1,4 @@
-//! What `validate` finds out about seed structures before a campaign starts.
+//! Checks of seed structures by `validate` before a campaign starts.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -26,14 +26,14 @@ fn cubic(name: &str, n: u8, a: f64, displacement: f64) -> String {
     text
 }
 
-/// A campaign with these structures behind those of [`Small`], a known crystal among them.
+/// Writes a campaign with these structures after those of [`Small`].
 fn write(here: &Path, more: &str) {
     Small::default().write(here);
     let known = fs::read_to_string(here.join("seeds.extxyz")).unwrap();
     fs::write(here.join("seeds.extxyz"), known + more).unwrap();
 }
 
-/// The rows of a CSV whose cells in use have no commas and quotes, by their first cell.
+/// The rows of a CSV by their first cell; its cells have no commas or quotes.
 fn rows(path: &Path) -> BTreeMap<String, BTreeMap<String, String>> {
     let text = fs::read_to_string(path).unwrap();
     let mut lines = text.lines().map(|line| line.split(',').map(str::to_owned).collect::<Vec<_>>());
@@ -56,7 +56,7 @@ fn seed_structures_are_graded_and_measured() {
     let text = |name: &str, column: &str| rows[name][column].as_str();
     let number = |name: &str, column: &str| rows[name][column].parse::<f64>().unwrap();
 
-    // The grades are those of `calm score`, and what it counts.
+    // The grades equal those of `calm score`.
     let [model, artifact] =
         ["kokkos.npz", "gmm_artifacts.npz"].map(|name| config(&format!("data/al_eam_1l/{name}")));
     let (model, artifact) = (model.display().to_string(), artifact.display().to_string());
@@ -99,7 +99,7 @@ fn seed_structures_are_graded_and_measured() {
         (number("cubic", "distance") - 2.8).abs() < 1e-9 && (number("cubic", "limit") - 2.1).abs() < 1e-9
     );
 
-    // Both are of one size, and their steps scale with atoms and neighbours.
+    // Times per step scale with atoms and neighbours.
     let work = |name: &str| number(name, "atoms") * (1.0 + number(name, "neighbours_per_atom"));
     for hours in ["walk_hours", "control_hours"] {
         let time = |name: &str| number(name, hours);
@@ -128,7 +128,7 @@ fn the_worst_seed_structures_come_first() {
     let (shown, all) = (table(&[]), table(&["--all"]));
     assert_eq!(all.len(), 32);
     assert_eq!(shown.last().unwrap(), "… and 12 more seed structures (use --all, or --csv FILE)");
-    // Times are measured again, the order is the same.
+    // The times differ, because they are measured again; the order does not.
     let names = |rows: &[String]| {
         rows.iter().map(|row| row.split(' ').next().unwrap().to_owned()).collect::<Vec<_>>()
     };
@@ -138,7 +138,7 @@ fn the_worst_seed_structures_come_first() {
     assert!(is_candidate.is_sorted_by(|a, b| a >= b) && is_candidate[0] && !is_candidate[31], "{all:?}");
 }
 
-/// Nickel, aluminium and hydrogen under a mixture that was built without hydrogen.
+/// Nickel, aluminium and hydrogen, with a mixture that has no data for hydrogen.
 #[test]
 fn elements_that_the_mixture_has_no_data_of_are_shown() {
     let directory = tempfile::tempdir().unwrap();
@@ -147,7 +147,7 @@ fn elements_that_the_mixture_has_no_data_of_are_shown() {
     let without_hydrogen = with_changed_arrays(&artifact, |name, numbers| match name {
         "counts_1" | "effective_count_1" | "scatter_1" => numbers.fill(0.0),
         "inv_cov_1" => {
-            // The inverse of the regularisation, of each component.
+            // The inverse of the regularisation alone, for each component.
             let dimension = (numbers.len() / 3).isqrt();
             let diagonal = |k: usize| (k % (dimension * dimension)).is_multiple_of(dimension + 1);
             numbers.iter_mut().enumerate().for_each(|(k, x)| *x = if diagonal(k) { 1e6 } else { 0.0 });

@@ -1,4 +1,4 @@
-//! Groups of walks under several conditions, which share one mixture.
+//! Groups of walks under several conditions, which share a mixture.
 
 use std::fs;
 use std::path::Path;
@@ -24,7 +24,7 @@ tau_values = [0.2, 0.4]
 repeats = 2
 "#;
 
-/// A small campaign with these groups, and with these keys in `[collect]`.
+/// Writes a small campaign with these groups, and with these keys in `[collect]`.
 fn write(here: &Path, groups: &str, walkers: usize, keys: &str) {
     let small = Small { walkers, steps: 120, max_per_walk: 2, ..Small::default() };
     let config = small.write(here);
@@ -156,7 +156,7 @@ fn wrong_groups_are_refused() {
     assert!(said.contains("is in no group: no walk starts from it"), "{said}");
 }
 
-/// A small campaign with these groups, whose seed structures are a crystal and `clusters` without a cell.
+/// Writes a small campaign with these groups; its seed structures are a crystal and `clusters` clusters without a cell.
 fn write_with_clusters(here: &Path, groups: &str, clusters: usize) {
     write(here, groups, 1, "");
     let seeds = here.join("seeds.extxyz");
@@ -208,7 +208,7 @@ fn a_structure_without_a_volume_is_skipped_where_all_its_walks_would_change_it()
     let csv = fs::read_to_string(here.join("seeds.csv")).unwrap();
     assert!(csv.lines().nth(1).unwrap().starts_with("cluster-0,") && csv.contains(",skipped,"), "{csv}");
 
-    // All must be able to walk, if that is wanted, and at least one.
+    // With `on_invalid = "error"` every seed structure needs a walk; otherwise at least one does.
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
     let strict = text.replace("[seed_structures]", "[seed_structures]\non_invalid = \"error\"");
     fs::write(here.join("strict.toml"), strict).unwrap();

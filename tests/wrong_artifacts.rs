@@ -1,4 +1,4 @@
-//! Artifacts that load and mean nothing: refused where a campaign would otherwise collect nothing, or everything.
+//! Inconsistent artifacts that can be loaded: refused, because a campaign would collect nothing or everything.
 
 use crate::common;
 use crate::common::config_tester::{ConfigTester, changed, line};
@@ -74,13 +74,13 @@ fn artifacts_that_are_nonsense_are_refused() {
     tester.refused_with(&path(ARTIFACT), "bad.npz", &["array 'inv_cov_0'", "expected symmetric matrices"]);
 }
 
-/// What no single component shows: numbers that belong together, but to other data.
+/// Consistent components that belong to other data, which only the training frames reveal.
 #[test]
-fn the_grades_of_the_training_frames_tell() {
+fn the_grades_of_the_training_frames_reveal_it() {
     let tester = ConfigTester::new();
     let frames = path("data/al_eam_1l/seed_frames.extxyz");
     let at = format!("c.toml:{}: calm.training_frames: {frames}: ", line(&frames));
-    // Another centroid, with the true covariance.
+    // A wrong centroid with the correct covariance.
     tester.write("bad.npz", scaled("centroids_0", 0.5));
     tester.refused_with(&path(ARTIFACT), "bad.npz", &[&at, "the median of γ is ", "expected 0.001 to 1"]);
 }
@@ -99,9 +99,9 @@ fn many_training_atoms_outside_are_warned_of() {
 }
 
 #[test]
-fn without_training_frames_the_seed_structures_tell() {
+fn without_training_frames_the_seed_structures_reveal_it() {
     let tester = ConfigTester::new();
-    // γ × 10⁻³: the export has no scatter that would show it.
+    // γ × 10⁻³. The export has no scatter to compare with.
     let model = with_arrays(&config("data/al_eam_1l/kokkos.npz"), |name, numbers| {
         if name == "uq_inv_cov" {
             numbers.iter_mut().for_each(|value| *value *= 1e-6);

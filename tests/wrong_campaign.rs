@@ -1,4 +1,4 @@
-//! Directories and databases that a campaign cannot be run in: told, and left as they are.
+//! Directories and databases in which a campaign cannot run: each is reported and left unchanged.
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
@@ -14,7 +14,7 @@ use crate::common::{Running, calmwalk, program, refuse, stderr, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
 
-/// A campaign small enough to be run again and again.
+/// A campaign that is small enough to run repeatedly.
 fn small() -> Small {
     Small { steps: 60, ..Small::default() }
 }
@@ -67,7 +67,7 @@ fn other_files_in_the_place_of_the_database_are_refused_unchanged() {
 }
 
 #[test]
-fn a_damaged_database_is_told_and_left_alone() {
+fn a_damaged_database_is_reported_and_left_unchanged() {
     let directory = written(&small());
     succeed(directory.path(), RUN);
     let database = directory.path().join("here/campaign.sqlite");
@@ -90,7 +90,7 @@ fn a_damaged_database_is_told_and_left_alone() {
 }
 
 #[test]
-fn a_directory_that_is_none_is_told() {
+fn a_path_that_is_not_a_directory_is_reported() {
     let directory = written(&small());
     let text = fs::read(directory.path().join("campaign.toml")).unwrap();
     for (place, reason) in [("campaign.toml", "it is a file"), ("campaign.toml/here", "Not a directory")] {
@@ -118,7 +118,7 @@ fn names_need_not_be_text_but_for_sqlite() {
     assert!(succeed(above.path(), run(OsStr::new("here"))).contains("; next:"));
 }
 
-/// The program as a user without any rights, if we may become one; `None` if that cannot be tried here.
+/// The program as an unprivileged user; `None` if this process cannot change its user.
 fn unprivileged(directory: &Path) -> Option<Command> {
     let rights = ["--reuid=65534", "--regid=65534", "--clear-groups"];
     let program = env!("CARGO_BIN_EXE_calmwalk");
@@ -133,7 +133,7 @@ fn unprivileged(directory: &Path) -> Option<Command> {
 }
 
 #[test]
-fn a_directory_without_write_permission_is_told() {
+fn a_directory_without_write_permission_is_reported() {
     let directory = written(&small());
     fs::set_permissions(directory.path(), fs::Permissions::from_mode(0o755)).unwrap();
     let Some(mut command) = unprivileged(directory.path()) else { return };
@@ -141,7 +141,7 @@ fn a_directory_without_write_permission_is_told() {
     assert!(message.contains("cannot use the directory here (Permission denied"), "{message}");
     assert!(!directory.path().join("here").exists());
 
-    // Nor can another's campaign be gone on with.
+    // The user cannot continue another user's campaign either.
     succeed(directory.path(), RUN);
     let database = directory.path().join("here/campaign.sqlite");
     let before = fs::read(&database).unwrap();
@@ -151,7 +151,7 @@ fn a_directory_without_write_permission_is_told() {
     assert_eq!(fs::read(&database).unwrap(), before);
 }
 
-/// A small file system of its own, gone in the end.
+/// A small file system, unmounted on drop.
 struct Disk<'a>(&'a Path);
 
 impl<'a> Disk<'a> {
@@ -179,7 +179,7 @@ fn a_full_disk_loses_nothing() {
     let uninterrupted_outcome = written(&small);
     succeed(uninterrupted_outcome.path(), RUN);
     let expected = outcome(&uninterrupted_outcome.path().join("here"));
-    // Full when the database is begun, when it is published, when it is opened, in mid-campaign.
+    // The disk is full when the database is created, published or opened, or during the campaign.
     for size in ["size=4k", "size=64k", "size=200k", "size=300k", "size=600k", "size=800k"] {
         let directory = written(&small);
         let here = directory.path().join("here");
@@ -202,7 +202,7 @@ fn a_log_that_cannot_be_kept_stops_no_campaign() {
     let full = fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
     let output = program(directory.path()).args(RUN).stderr(full).output().unwrap();
     assert_eq!(output.status.code(), Some(0));
-    // The summary is what was asked for: that it cannot be given is a failure, and the next run gives it.
+    // The summary is the requested output, so failing to print it is an error; the next run prints it.
     let full = fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
     let output = program(directory.path()).args(RUN).stdout(full).output().unwrap();
     let message = assert_plain(&output, 1);
@@ -227,7 +227,7 @@ fn a_second_run_of_a_campaign_names_the_first() {
         assert!(first.0.try_wait().unwrap().is_none(), "the first run ended too early to be met");
         std::thread::yield_now();
     }
-    // Stopped, it cannot end before the second comes.
+    // Pause the first run, so that it cannot end before the second starts.
     signal("-STOP", first.0.id());
     let second = calmwalk(directory.path(), RUN);
     signal("-CONT", first.0.id());

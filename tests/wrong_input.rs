@@ -1,5 +1,5 @@
-//! Wrong configurations and wrong files: exit code 2, a message that says where, what was found and what was expected,
-//! and nothing written.
+//! Wrong configurations and files: exit code 2, a message with the place, the value found and the one expected, and no
+//! output.
 
 use std::fs;
 use std::io::{Cursor, Read, Write};
@@ -140,7 +140,7 @@ fn every_wrong_key_is_named_with_its_line() {
 }
 
 #[test]
-fn whole_sections_and_files_that_are_none_are_told() {
+fn whole_sections_and_files_that_are_none_are_reported() {
     let tester = ConfigTester::new();
     tester.refused_with("[potential]\nmodel", "model", &["c.toml:", "`model`"]);
     tester.refused_with("tau = 0.15 ", "# ", &["missing key `tau`", "[walk]"]);
@@ -190,7 +190,7 @@ fn broken_models_and_artifacts_are_named() {
     let tester = ConfigTester::new();
     for (file, key) in [(MODEL, "potential.model"), (ARTIFACT, "calm.artifact")] {
         let at = format!("c.toml:{}: {key}: ", line(&path(file)));
-        // The mixture of a model is not read where there is an artifact.
+        // An artifact replaces the mixture of the model, which is then not read.
         let whole = match file {
             MODEL => without(MODEL, |name| name.starts_with("uq_")),
             _ => fs::read(config(file)).unwrap(),
@@ -217,7 +217,7 @@ fn broken_models_and_artifacts_are_named() {
 fn a_model_without_feature_arrays_cannot_be_graded_with() {
     let tester = ConfigTester::new();
     tester.write("bare.npz", without(MODEL, |name| name.starts_with("uq_")));
-    // With an artifact, it has the features of that.
+    // The artifact would provide the features.
     let text = changed(&path(MODEL), "bare.npz").replacen("artifact = ", "# artifact = ", 1);
     let message = tester.refused(text.replacen("[calm]", "[calm]\nupdate = \"never\"", 1));
     assert!(message.contains("potential.model: bare.npz: no feature projection (uq_* arrays)"), "{message}");
@@ -247,7 +247,7 @@ fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
         "{left_out}"
     );
 
-    // Without updates the export is enough.
+    // Without updates the mixture of the export suffices.
     let never =
         changed("artifact = ", "update = \"never\" # ").replace("biased_steps = 2000 ", "biased_steps = 60 ");
     tester.write("c.toml", never.replace("# equilibration_steps = 500", "equilibration_steps = 10"));

@@ -1,4 +1,4 @@
-//! Wrong seed structures: refused with file and line before any walk begins.
+//! Wrong seed structures: refused with file and line before any walk starts.
 
 use std::fmt::Write;
 use std::fs;
@@ -26,7 +26,7 @@ fn good() -> String {
     text
 }
 
-/// A desk whose demo takes its seed structures from `name`.
+/// A tester whose demo reads its seed structures from another file.
 struct Seeds {
     tester: ConfigTester,
     files: String,
@@ -106,7 +106,7 @@ fn structures_that_no_walk_can_start_from_are_refused() {
     }
 }
 
-/// The campaign runs with the others, unless the configuration wants all of them.
+/// The campaign runs with the other structures, unless the configuration requires all.
 #[test]
 fn a_structure_that_no_walk_can_start_from_is_skipped_and_listed() {
     let seeds = Seeds::new();
@@ -168,7 +168,7 @@ fn structures_from_which_nothing_can_be_collected_are_refused() {
     let words =
         ":1: the structure has no periodic direction, and so no volume for walk.volume_ramp to change";
     seeds.refused("cluster.extxyz", &cluster, &[words]);
-    // Without a ramp it needs no cell.
+    // Without a volume ramp it needs no cell.
     seeds.tester.write("c.toml", changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# "));
     succeed(seeds.tester.path(), ["validate", "c.toml"]);
 }
@@ -208,7 +208,7 @@ fn small_cells_become_supercells() {
         ))
         .contains("supercells")
     );
-    // A cluster is left as it is, and too large a supercell is refused.
+    // Clusters are not repeated, and supercells that are too large are refused.
     let cluster = good().replace(CELL, "pbc=\"F F F\"");
     seeds.tester.write("cluster.extxyz", &cluster);
     let cluster = changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# ");
@@ -219,7 +219,7 @@ fn small_cells_become_supercells() {
     assert!(message.contains(expected), "{message}");
 }
 
-/// A campaign cannot change the structures that it has, and so not their repetition.
+/// A campaign cannot change its seed structures, and thus not their repetition.
 #[test]
 fn a_campaign_keeps_its_supercells() {
     let directory = tempfile::tempdir().unwrap();
@@ -251,7 +251,7 @@ fn a_campaign_keeps_its_supercells() {
     );
 }
 
-/// What `validate` warns of, in a valid campaign with these seed structures.
+/// Warnings of `validate` for a valid campaign with these seed structures.
 fn warnings(seeds: &Seeds, name: &str, content: impl AsRef<[u8]>) -> Vec<String> {
     seeds.tester.write(name, content);
     seeds.tester.write("c.toml", changed(&seeds.files, name));
@@ -264,7 +264,7 @@ fn warnings(seeds: &Seeds, name: &str, content: impl AsRef<[u8]>) -> Vec<String>
 fn the_same_structure_twice_is_warned_of() {
     let seeds = Seeds::new();
     let other = good().replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 2.81");
-    // Other digits, the same structure.
+    // The same structure within the tolerance.
     let again = good().replace("Al 2.8 2.8 2.8", "Al 2.80000001 2.8 2.8");
     let found = warnings(&seeds, "three.extxyz", format!("{}{other}{again}", good()));
     let [warning] = found.as_slice() else { panic!("{found:?}") };
@@ -295,7 +295,7 @@ fn lengths_in_bohr_are_warned_of() {
         (0.5292, "nearest neighbours are 1.48 Å apart, 0.59 times the sum of their radii"),
     ] {
         let found = warnings(&seeds, "bohr.extxyz", scaled(factor));
-        // A repulsion that reaches into these bonds is another warning.
+        // Ignore the warning about a repulsion that reaches into these bonds.
         let near: Vec<_> = found.iter().filter(|warning| warning.contains("nearest neighbours")).collect();
         let [warning] = near.as_slice() else { panic!("{found:?}") };
         assert!(
@@ -314,7 +314,7 @@ fn the_good_structure_is_good() {
     assert!(valid.contains("seed structures  1, with 27 to 27 atoms"), "{valid}");
 }
 
-/// The window of aluminium, 2.42 times the fractions, reaches into the bonds of 2.8 Å.
+/// The ZBL window of aluminium, 2.42 Å times the fractions, reaches into the bonds of 2.8 Å.
 #[test]
 fn a_repulsion_that_reaches_into_bonds_is_shown_and_warned_of() {
     let seeds = Seeds::new();

@@ -1,4 +1,4 @@
-//! Values that cannot be meant, names that are nearly right, and everything that is wrong with a file at once.
+//! Implausible values, misspelt names, and all errors of a file at once.
 
 use std::fs;
 
@@ -6,7 +6,7 @@ use crate::common;
 use crate::common::config_tester::{ConfigTester, changed, line};
 use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
-/// The warnings of `validate` about the demo with other values, which are also those of `run`; it must be valid.
+/// The warnings of `validate`, which equal those of `run`, for a valid variant of the demo.
 fn warnings(tester: &ConfigTester, text: &str) -> Vec<String> {
     tester.write("c.toml", text);
     let output = calmwalk(tester.path(), ["validate", "c.toml"]);
@@ -53,7 +53,7 @@ fn unusual_values_are_warned_of_at_their_own_lines() {
 }
 
 #[test]
-fn run_gives_the_same_warnings_and_goes_on() {
+fn run_gives_the_same_warnings_and_continues() {
     let tester = ConfigTester::new();
     let text = changed("biased_steps = 2000 ", "biased_steps = 5 ")
         .replace("# equilibration_steps = 500", "equilibration_steps = 1");
@@ -65,7 +65,7 @@ fn run_gives_the_same_warnings_and_goes_on() {
 }
 
 #[test]
-fn values_that_nobody_can_mean_are_refused() {
+fn implausible_values_are_refused() {
     let tester = ConfigTester::new();
     for (from, to, expected) in [
         (
@@ -89,7 +89,7 @@ fn values_that_nobody_can_mean_are_refused() {
     ] {
         tester.refused_with(from, to, &[&format!("c.toml:{}: ", line(from)), expected]);
     }
-    // Of a table of its own, too.
+    // The same in a separate table.
     let abinit = "[label.method.abinit]\npseudopotentials = \"/\"\ncutoff = 10\nk_spacing = 6\n";
     let text = changed("method = { potential", "# method = { potential")
         .replace("\n[budget]", &format!("\n{abinit}\n[budget]"));
@@ -111,7 +111,7 @@ fn values_that_nobody_can_mean_are_refused() {
 }
 
 #[test]
-fn everything_that_is_wrong_is_told_at_once() {
+fn all_errors_are_reported_together() {
     let tester = ConfigTester::new();
     let mut text = changed("tau = 0.15 ", "# ").replace("temperature = 600.0", "temprature = 600.0");
     for (from, to) in [
@@ -156,7 +156,7 @@ fn everything_that_is_wrong_is_told_at_once() {
 }
 
 #[test]
-fn missing_keys_are_told_together() {
+fn missing_keys_are_reported_together() {
     let tester = ConfigTester::new();
     let message = tester.refused("[walk]\n[potential]\n");
     for key in ["temperature", "biased_steps", "tau", "model", "calm", "seed_structures", "collect", "label"]
@@ -208,7 +208,7 @@ fn names_that_are_nearly_right_get_a_hint() {
 }
 
 #[test]
-fn other_things_in_the_place_of_files_are_told() {
+fn other_things_in_the_place_of_files_are_reported() {
     let tester = ConfigTester::new();
     let seeds = config("data/aluminium_seeds.extxyz").display().to_string();
     for (name, expected) in [
@@ -229,7 +229,7 @@ fn other_things_in_the_place_of_files_are_told() {
     };
     assert!(score("seeds.cif").contains("expected extended XYZ; convert it with `ase convert seeds.cif"));
     assert!(score("folder").contains("it is a directory"));
-    // The directory that `init` makes, in the place of its configuration.
+    // The directory that `init` creates, given instead of its configuration.
     succeed(tester.path(), ["init", "mine"]);
     let message = refuse(tester.path(), ["validate", "mine"]);
     assert!(

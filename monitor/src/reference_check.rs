@@ -345,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn each_difference_above_its_bound_is_told_with_its_frame() {
+    fn each_difference_above_its_bound_is_reported_with_its_frame() {
         let known = four();
         let faults = |change: &dyn Fn(&mut Label)| {
             let mut labels = labels(&known);

@@ -93,7 +93,7 @@ fn each_candidate_has_three_grades() {
     );
 }
 
-/// The walk goes on, and the log says why nothing came of it.
+/// The walk continues, and the log gives the reason.
 #[test]
 fn a_candidate_that_cannot_be_graded_is_left_out() {
     let mut selector = begin(&live(), 1);
@@ -110,7 +110,7 @@ fn a_candidate_that_cannot_be_graded_is_left_out() {
     assert_eq!(kinds(&decided(&mut selector, report)), ["accepted"]);
 }
 
-/// The second walk ends when the first has collected all that its seed structure may give, and goes on when that is more.
+/// The second walk ends once the first has reached the limit of their seed structure, and continues with a larger limit.
 #[test]
 fn walks_of_one_seed_structure_share_a_limit() {
     let limited = SelectorSettings {
@@ -466,7 +466,7 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
     assert!(selector.forgetting_level() > 1.0);
 }
 
-/// The covariances alone tell it too.
+/// The covariances alone suffice to detect forgetting.
 #[test]
 fn forgetting_raises_an_alarm_without_training_frames() {
     let limit = ForgettingAlarm { mean_square_growth: positive(1.5), ..ForgettingAlarm::default() };

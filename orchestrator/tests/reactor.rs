@@ -316,7 +316,7 @@ async fn assignments_of_dead_walkers_are_completed_by_others() {
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
-/// A walker that asks again without a report no longer has its walk in hand.
+/// A walker that asks again without a report no longer holds its walk.
 #[tokio::test(flavor = "multi_thread")]
 async fn walks_without_a_report_are_assigned_again() {
     let folder = tempfile::tempdir().unwrap();

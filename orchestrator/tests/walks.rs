@@ -303,7 +303,7 @@ fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
     assert_eq!(store.known.len(), 3, "control frames are not what later candidates are compared with");
 }
 
-/// It is not labelled; the walk goes on to its later frames, which are matched by step all the same.
+/// The frame is not labelled. The walk continues to its later frames, which are still matched by step.
 #[test]
 fn a_control_frame_with_atoms_too_close_is_left_out() {
     let mut store = MemoryStore::default();

@@ -56,7 +56,7 @@ fn filters_are_evaluated() {
     }
 }
 
-/// Whether the word stands in the text, not as a part of another word.
+/// Whether the text contains the word, not as a part of another word.
 fn has_word(text: &str, word: &str) -> bool {
     text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').any(|found| found == word)
 }

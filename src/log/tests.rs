@@ -67,7 +67,7 @@ fn lines_of_several_writers_do_not_interleave() {
             let path = Arc::clone(&path);
             let long = "x".repeat(500 * writer as usize);
             thread::spawn(move || {
-                // Each has opened the file for itself, as processes do.
+                // Each log opens the file separately, as separate processes do.
                 tracing::subscriber::with_default(log(&path, LogFormat::Json, LogLevel::Info), || {
                     (0..200_u64).for_each(|line| info!(writer, line, "{long}"));
                 });

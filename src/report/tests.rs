@@ -121,7 +121,7 @@ fn file<'a>(files: &'a [PageFile], path: &str) -> &'a str {
 #[tokio::test]
 async fn every_setting_is_on_the_page() {
     let directory = tempfile::tempdir().unwrap();
-    // More keys than the page shows of a table that grows with the campaign, and one that comes last in the alphabet.
+    // More keys than the page shows of a growing table, and one that is last in the alphabet.
     let keys: serde_json::Map<_, _> = (0..80).map(|k| (format!("key{k:02}"), json!(k))).collect();
     let configuration = json!({ "guard": keys, "walk": { "temperature": 417.0, "volume_ramp": null } });
     let store = begin(directory.path(), &configuration.to_string()).await;
@@ -138,7 +138,7 @@ async fn every_setting_is_on_the_page() {
 }
 
 #[tokio::test]
-async fn what_is_missing_is_said() {
+async fn missing_data_are_reported() {
     let directory = tempfile::tempdir().unwrap();
     let store = begin(directory.path(), "{}").await;
     let files = build(&store).await.unwrap();

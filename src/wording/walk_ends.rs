@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn ends_are_said_with_their_causes() {
+    fn ends_are_described_with_their_causes() {
         let walk = |number: u32, state: &str, reason: &str| WalkStatus {
             walk: number,
             state: state.into(),

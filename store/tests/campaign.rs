@@ -1,4 +1,4 @@
-//! Creating and opening campaigns; what is committed is read back.
+//! Creating and opening campaigns; committed data are read back.
 
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
@@ -320,7 +320,7 @@ async fn the_newest_decisions_are_summarized() {
     );
 }
 
-/// They are written before the first assignment and never again.
+/// Walk conditions are written once, before the first assignment.
 #[tokio::test]
 async fn conditions_of_walks_are_read_back() {
     let home = Home::new();

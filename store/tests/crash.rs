@@ -1,5 +1,5 @@
-//! Kills a process that commits and labels without end at random times: whatever it reported as committed is there,
-//! and everything else is there as a whole or not at all.
+//! Kills a process that commits and labels in a loop, at random times: everything that it reported as committed is stored,
+//! and everything else is stored completely or not at all.
 
 use std::env;
 use std::io::{BufRead, BufReader, Write};

@@ -94,7 +94,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_included_again() {
     let all = store.excluded().await.unwrap();
     assert_eq!((all.len(), all[0].id.as_str(), all[0].exclusion.time), (1, second, 100));
     whole(&store).await;
-    // Its job is done: it is not labelled again automatically.
+    // Its job is finished, so it is not labelled again automatically.
     assert!(store.lease(dft.hash, "host/a", 300, 10).await.unwrap().is_none());
 
     assert_eq!(store.include(&ids, 400).await.unwrap(), [change(second, true, None)]);
@@ -162,7 +162,7 @@ async fn only_a_requested_label_replaces_an_excluded_one() {
     let order = RelabelRequest { structures: &[content(1)], again: true, reason: "better", protocol: None };
     assert_eq!(store.relabel(&order, 20_005).await.unwrap().again, 1);
     whole(&store).await;
-    // Until the new label arrives, the other one stays excluded, also if it never arrives.
+    // The earlier label stays excluded until the new one arrives, even if it never does.
     let failing = lease(&store, 20_006).await;
     store.fail(&failing, "crashed", "", 1, 20_007).await.unwrap();
     assert_eq!(store.queue_show(&names[0]).await.unwrap().job.state, JobState::Labelled);
@@ -176,7 +176,7 @@ async fn only_a_requested_label_replaces_an_excluded_one() {
         ((LabelStatus::Superseded, -1.0, bad), |energy| (LabelStatus::Check, energy, None));
     let expected = [superseded, check(-9.0), check(-8.0), (LabelStatus::Label, -1.5, None)];
     assert_eq!(history(&store, content(1)).await, expected);
-    // There is nothing to include.
+    // The new label is not excluded.
     assert_eq!(store.include(&names, 20_011).await.unwrap(), [change(&names[0], false, None)]);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;

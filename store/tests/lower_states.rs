@@ -12,7 +12,7 @@ use crate::common::*;
 const SUPERSEDE: LowerStateRule =
     LowerStateRule { min_difference: 0.001, on_lower_state: OnLowerState::Supersede };
 
-/// A campaign with so many candidates that wait for labels, and their names.
+/// A campaign with this number of candidates that wait for labels, and their names.
 async fn campaign_with(home: &Home, candidates: u64) -> (Store, Vec<String>) {
     let store = home.create().await.with_caller_clock();
     let names = accept(&store, candidates).await;
@@ -85,7 +85,7 @@ async fn a_label_says_with_what_its_calculation_ran_also_after_a_takeover() {
         ..CalculationRecord::default()
     };
     store.record_calculation(&first, "pid 7", &made).await.unwrap();
-    // The labeller is killed; the next one would not have changed anything itself.
+    // The labeller is killed. The next one takes over its calculation without adjustments of its own.
     assert_eq!(store.release_all("host", 1).await.unwrap(), 1);
     let second = lease(&store, 2).await;
     assert_eq!(second.earlier_calculations, ["pid 7"]);
@@ -271,7 +271,7 @@ async fn a_requested_label_of_a_higher_state_is_kept_as_a_check() {
     for (energy, now) in [(-1.0, 0), (-2.0, 10)] {
         label_with(&store, None, energy, now).await;
     }
-    // The user says that the second is bad.
+    // The user excludes the second.
     store.exclude(&names[1..], "bad", 15).await.unwrap();
     relabel(&store, &names, 20).await;
     assert_eq!(label_with(&store, Some("other_moments"), -0.5, 30).await, CompleteOutcome::KeptAsCheck);

@@ -73,7 +73,7 @@ async fn costs_are_those_of_successful_attempts() {
     );
 }
 
-/// A structure without a seed structure costs as much as others, fails as others do, and can be labelled again.
+/// A structure without a seed structure counts in the cost and the failures like others, and can be relabelled.
 #[tokio::test]
 async fn imported_structures_count_as_others_do() {
     let home = Home::new();
@@ -83,7 +83,7 @@ async fn imported_structures_count_as_others_do() {
     store.queue_imports(&files, 0, 30_000).await.unwrap();
     assert_eq!(store.imported_jobs(JobState::Queued).await.unwrap(), 2);
     for name in ["import-1", "import-2"] {
-        store.prioritise_job(name, 5, 30_000).await.unwrap();
+        store.prioritise_job(name, 20, 30_000).await.unwrap();
     }
     let done = lease(&store, 30_000).await;
     assert_eq!(done.candidate, "import-1");
@@ -109,7 +109,7 @@ async fn imported_structures_count_as_others_do() {
     let request =
         RelabelRequest { structures: &[import.content], again: true, reason: "doubtful", protocol: None };
     assert_eq!(store.relabel(&request, 40_000).await.unwrap().again, 1);
-    store.prioritise_job("import-1", 9, 40_000).await.unwrap();
+    store.prioritise_job("import-1", 20, 40_000).await.unwrap();
     let again = lease(&store, 40_000).await;
     assert_eq!(again.candidate, "import-1");
     store.complete(&again, &label(-6.0), 41_000).await.unwrap();

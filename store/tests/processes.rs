@@ -134,7 +134,7 @@ async fn a_starting_run_keeps_living_labellers_and_reclaims_other_leases() {
     let processes = [
         living("living", "labeller", Some(0)),
         gone("gone", "labeller", Some(1)),
-        // The holder of the lock knows better than the table.
+        // The lock overrides the table.
         living("earlier", "orchestrator", None),
         living("w", "walker", Some(0)),
     ];

@@ -1,4 +1,4 @@
-//! Making labels again, under the same protocol and under another.
+//! Repeating labels, under the same protocol and under another one.
 
 use serde_json::json;
 use store::{

@@ -102,9 +102,9 @@ pub struct Outcome {
 pub struct Counters {
     /// Candidates and control frames that reached the selector.
     pub sent: u64,
-    /// Those of them in the data set.
+    /// Number of those in the data set.
     pub accepted: u64,
-    /// Labels made.
+    /// Number of labels.
     pub labels: u64,
 }
 

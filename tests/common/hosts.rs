@@ -12,13 +12,13 @@ use super::campaign::{Outcome, Small, outcome};
 use super::processes::{assert_no_leftovers, processes_in, wait_until};
 use super::{Running, program, through};
 
-/// A campaign with the directory of its orchestrator and one for each other host.
+/// A campaign with the directories of its orchestrator and of each other host.
 pub struct Hosts {
     pub home: TempDir,
     pub others: Vec<TempDir>,
     /// Where the orchestrator listens, and where agents connect.
     pub endpoints: [String; 2],
-    /// Whether the orchestrator listens at all.
+    /// Whether the orchestrator listens for agents.
     pub listens: bool,
     /// Further options of `run` and of `agent`.
     pub options: [Vec<String>; 2],
@@ -27,7 +27,7 @@ pub struct Hosts {
 }
 
 impl Hosts {
-    /// The orchestrator has one walker of its own. `keys` are added to the section `[run]`.
+    /// The orchestrator has one local walker. `keys` are added to the section `[run]`.
     pub fn new(small: &Small, others: usize, keys: &str) -> Self {
         let home = tempfile::tempdir().unwrap();
         let path = Small { walkers: 1, ..small.clone() }.write(home.path());
@@ -70,11 +70,11 @@ impl Hosts {
         fs::read_to_string(self.home.path().join("said")).unwrap_or_default()
     }
 
-    /// All processes have ended and left nothing behind.
+    /// Checks that all processes have exited and left no files behind.
     pub fn assert_cleaned_up(&self) {
         assert_no_leftovers(self.home.path());
         for host in &self.others {
-            wait_until("every process is gone", || processes_in(host.path()).is_empty());
+            wait_until("all processes have exited", || processes_in(host.path()).is_empty());
             let left: Vec<PathBuf> =
                 fs::read_dir(host.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
             assert_eq!(left, [host.path().join("said")]);

@@ -90,7 +90,7 @@ impl LabelCampaign {
         fs::read_to_string(self.path().join("said")).unwrap_or_default()
     }
 
-    /// `calmwalk status`. Null while there is no campaign.
+    /// `calmwalk status`; null before the campaign exists.
     pub fn status(&self) -> Value {
         let output = calmwalk(self.path(), ["status", self.argument(), "--json"]);
         serde_json::from_slice(&output.stdout).unwrap_or_default()
@@ -139,8 +139,8 @@ impl LabelCampaign {
     }
 }
 
-/// Queues a structure as if a walk had collected it at this step, with its features [n × D] if there are any. Returns
-/// the name of its candidate.
+/// Queues a structure as if a walk had collected it at this step, with features [n × D] or none. Returns the name of its
+/// candidate.
 pub fn queue(location: Location, step: u64, structure: Structure, features: Vec<f64>) -> String {
     let candidate = collected(step, structure, features);
     let name = candidate.id.to_string();

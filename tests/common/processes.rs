@@ -31,7 +31,7 @@ pub fn processes_in(directory: &Path) -> Vec<Process> {
     numbers.filter_map(process).collect()
 }
 
-/// Those that run `command`.
+/// Pids of the processes that run `command`.
 pub fn processes_running(directory: &Path, command: &str) -> Vec<u32> {
     processes_in(directory).into_iter().filter(|p| p.command == command).map(|p| p.pid).collect()
 }
@@ -93,7 +93,7 @@ fn can_write(store: &str) -> bool {
     })
 }
 
-/// Stops all walkers as soon as there are `number` of them. No campaign ends until they [`resume_processes`].
+/// Stops all walkers as soon as there are `number` of them. The campaign cannot end until [`resume_processes`].
 pub fn pause_walkers(directory: &Path, number: usize) -> Vec<u32> {
     let mut walkers = Vec::new();
     wait_until(&format!("there are {number} walkers"), || {
@@ -120,7 +120,7 @@ pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
 
 /// Checks that a finished campaign left no process and nothing in shared memory.
 pub fn assert_no_leftovers(directory: &Path) {
-    wait_until("every process is gone", || processes_in(directory).is_empty());
+    wait_until("all processes have exited", || processes_in(directory).is_empty());
     let place = ShmDir::for_campaign(directory).expect("the campaign's directory");
     assert!(!place.directory().exists(), "{} is left", place.directory().display());
     let files = fs::read_dir("/dev/shm").expect("/dev/shm").flatten();

@@ -16,7 +16,7 @@ pub fn hold() -> MutexGuard<'static, ()> {
     NODE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Slurm has as many jobs as it may, until this is dropped.
+/// Keeps Slurm at its limit of jobs until this is dropped.
 pub struct FullQueue;
 
 impl FullQueue {
@@ -25,11 +25,11 @@ impl FullQueue {
         Self
     }
 
-    /// Waits until slurmctld has refused so many jobs since it was last started.
+    /// Waits until slurmctld has refused this number of jobs since its last start.
     pub fn wait_for_refusals(&self, least: usize) {
         let configuration = std::env::var_os("SLURM_CONF").expect("that of the test cluster");
         let log = Path::new(&configuration).with_file_name("slurmctld.log");
-        // slurmctld complains as well of the jobs that it finds when it starts.
+        // At startup slurmctld logs a similar message about the jobs that it finds.
         const REFUSED: &str = "job_allocate: MaxJobCount limit from slurm.conf reached";
         wait_until("Slurm has refused enough", || {
             let text = std::fs::read_to_string(&log).unwrap();

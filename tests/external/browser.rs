@@ -1,6 +1,6 @@
-//! The dashboard in a real browser, Chromium without a screen, which is driven over HTTP by `chromedriver`:
-//! every page shows what it should, nothing is fetched from elsewhere, nothing is complained of, and an action does what it says. Needs
-//! Debian's packages chromium and chromium-driver; `cargo test --test external browser::`. Pictures are left in `target/dashboard`.
+//! The dashboard in a real browser, headless Chromium driven over HTTP by `chromedriver`: every page shows its content, no
+//! other site is contacted, the console has no errors, and actions work. Needs Debian's packages chromium and
+//! chromium-driver; `cargo test --test external browser::`. Saves screenshots in `target/dashboard`.
 
 use std::fs;
 use std::path::Path;
@@ -14,19 +14,19 @@ use crate::common::http::{get, said};
 use crate::common::processes::wait_until;
 use crate::common::{Running, program, succeed};
 
-/// Leaves a picture for people to look at.
+/// Saves a screenshot for people to check.
 fn picture(browser: &Browser, name: &str) {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/dashboard");
     browser.picture(&directory.join(name), None);
 }
 
-/// A campaign that waits for labels from elsewhere: itself, its address and its token.
+/// Starts a campaign that waits for external labels. Returns it with its address and token.
 fn campaign(here: &Path) -> (Running, String, String) {
     let path = Small::default().write(here);
     let text = fs::read_to_string(&path).unwrap();
-    // Walkers wait then for ever, and walks stay under way.
+    // The queue limit blocks the walkers, so the walks never end.
     fs::write(&path, text.replace("[label]", "[label]\nconcurrency = 0\nqueue_limit = 4")).unwrap();
-    // What a campaign says is text, whatever it looks like.
+    // Names must be shown as text, even if they look like markup.
     let seeds = fs::read_to_string(here.join("seeds.extxyz")).unwrap();
     fs::write(here.join("seeds.extxyz"), seeds.replace("name=vacancy", "name=\"<b>vacancy</b>\"")).unwrap();
     let mut command = program(here);
@@ -76,7 +76,8 @@ fn every_page_shows_what_it_should_and_nothing_comes_from_elsewhere() {
     }
 }
 
-/// With all its labels: the page of force errors, and what is wide enough to be cut: tables of a candidate and of the report.
+/// With all labels: the page of force errors, and elements that might be cut off, which are the tables of a candidate and of
+/// the report.
 #[test]
 fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
     let directory = tempfile::tempdir().unwrap();
@@ -105,7 +106,7 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
             picture(&browser, &format!("errors-{colours}-{width}.png"));
             browser.show(&format!("{page}#candidate/{id}"));
             browser.wait("document.querySelectorAll('.atoms tbody tr').length > 20");
-            // Grades under two mixtures, that of neighbours, and the error.
+            // Columns: atom and element, grades under two mixtures, the neighbourhood grade, and the error.
             browser.wait("document.querySelectorAll('.atoms thead th').length === 6");
             is_not_cut(&browser, ".atoms");
             picture(&browser, &format!("labelled-{colours}-{width}.png"));
@@ -123,14 +124,14 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
         let text = browser.run("return document.querySelector('main').textContent");
         assert_eq!(head.as_str().unwrap().matches("control").count(), 1, "{head}");
         assert!(text.as_str().unwrap().contains("guard requires"), "{text}");
-        // What is over is not live.
+        // A finished campaign is not live.
         browser.wait("document.querySelector('#connection').dataset.how === 'finished'");
         let complaints = browser.log("browser");
         assert!(complaints.is_empty(), "{complaints:?}");
     }
 }
 
-/// The plots over time have one axis, whatever they have values for.
+/// All plots over time have the same axis, whichever values they show.
 fn same_time(browser: &Browser) {
     let axes = "[...document.querySelectorAll('figure svg[role=img]')].filter((one) => one.textContent.includes('time before now'))\
                 .map((one) => [...one.querySelectorAll('.grid text[text-anchor=middle]')].map((tick) => tick.textContent).join(' '))";
@@ -153,7 +154,7 @@ fn narrow(browser: &Browser, page: &str, id: &str) {
     }
 }
 
-/// A page that is as wide as a telephone, and no wider.
+/// Checks that a page fits the width of a telephone.
 fn fits(browser: &Browser, url: &str, is_there: &str) {
     browser.show(url);
     browser.wait(is_there);
@@ -179,7 +180,7 @@ fn errors(browser: &Browser) {
     assert!(!text.contains("NaN") && !text.contains("undefined"), "{text}");
 }
 
-/// Everything of these elements is seen without scrolling sideways.
+/// Checks that these elements are visible without scrolling sideways.
 fn is_not_cut(browser: &Browser, selector: &str) {
     let cut = format!(
         "[...document.querySelectorAll('{selector}')].filter((one) => one.scrollWidth > one.clientWidth).length"
@@ -202,7 +203,7 @@ fn table(browser: &Browser, page: &str) {
     browser.press(&[TAB]);
     assert_eq!(browser.run("return document.activeElement.tagName"), "SELECT", "the first filter");
     let column = "[...document.querySelectorAll('.candidates tbody tr')].map((row) => Number(row.cells[5].textContent))";
-    // With the keyboard, whose focus stays where it is.
+    // Sort with the keyboard; the focus stays on the button.
     browser.run("document.querySelector('button.sort[data-keep=gamma]').focus()");
     browser.press(&[ENTER]);
     browser.wait("document.querySelector('th[aria-sort=descending]')?.textContent.includes('γ_max')");
@@ -239,7 +240,11 @@ fn act(browser: &Browser, here: &Path, page: &str) {
     browser.wait("document.querySelector('dialog[open] input[name=token]')?.value.length === 32");
     browser.press(&[ESCAPE]);
     browser.wait("!document.querySelector('dialog')");
-    assert_eq!(browser.run("return document.activeElement.className"), "grave", "where it was before");
+    assert_eq!(
+        browser.run("return document.activeElement.className"),
+        "grave",
+        "the focus returns to the button"
+    );
     browser.press(&[ENTER]);
     browser.wait("document.querySelector('dialog[open]')?.contains(document.activeElement)");
     let state = || {
@@ -260,12 +265,12 @@ fn mixture(browser: &Browser, page: &str) {
     browser.wait(
         "[...document.querySelectorAll('h2')].some((title) => title.textContent === 'Components of Al')",
     );
-    // Structures were accepted, so something has moved.
+    // Structures were accepted, so at least one component has moved.
     browser.wait("document.querySelectorAll('svg.length rect').length > 1");
     assert_eq!(browser.run("return document.querySelector('main').textContent.includes('NaN')"), false);
 }
 
-/// Pauses the first walk that can be paused, by the keyboard's button, and lets it go on.
+/// Pauses the first walk that can be paused with its button, and resumes it.
 fn pause(browser: &Browser, here: &Path, page: &str) {
     let paused = || {
         let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
@@ -280,7 +285,7 @@ fn pause(browser: &Browser, here: &Path, page: &str) {
         assert_eq!(paused(), 1 - number, "nothing is done before it is confirmed");
         browser.run("document.querySelector('dialog form button:not([type=button])').click()");
         browser.wait("!document.querySelector('dialog')");
-        wait_until("it is done", || paused() == number);
+        wait_until("the change is stored", || paused() == number);
         if number == 1 {
             browser.wait("document.querySelector('td .state[data-state=paused]')");
             browser.wait("document.activeElement.getAttribute('aria-label')?.startsWith('Resume walk')");

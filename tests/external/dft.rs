@@ -1,5 +1,5 @@
-//! A campaign whose labels are made by a real DFT code: `configs/silicon-dft.toml` with ABINIT, of Debian's packages abinit and
-//! abinit-data.
+//! A campaign whose labels are made by a real DFT code: `configs/silicon-dft.toml` with ABINIT (Debian's packages abinit and
+//! abinit-data).
 //!
 //! cargo test --test external dft::
 
@@ -17,7 +17,7 @@ use crate::common::label_campaign::queue;
 use crate::common::processes::{calculation_processes, processes_running, signal, wait_until};
 use crate::common::{config, demo, deviation, program, random, stderr, succeed};
 
-/// Directories of calculations: a campaign has a directory in `scratch`, and each calculation one in it.
+/// Directories of calculations: `scratch` has one directory per campaign, and that one per calculation.
 fn directories(scratch: &Path) -> Vec<PathBuf> {
     let campaigns = fs::read_dir(scratch).unwrap().map(|entry| entry.unwrap().path());
     campaigns.flat_map(|home| fs::read_dir(home).unwrap()).map(|entry| entry.unwrap().path()).collect()
@@ -36,7 +36,7 @@ fn quick_demo() -> String {
     quick
 }
 
-/// The numbers of the labels are those that the same calculation gives by itself.
+/// `label-file` makes the same label as the campaign.
 #[test]
 fn the_demo_makes_at_least_ten_dft_labels() {
     let directory = tempfile::tempdir().unwrap();
@@ -66,7 +66,7 @@ fn is_abinit(command: &str) -> bool {
     command.starts_with("abinit ")
 }
 
-/// Labeller, runner and code are killed at random moments: each label is made once, none is lost and nothing is left.
+/// Labeller, runner and code are killed at random times: each label is made once, and no directory or process remains.
 #[test]
 fn labels_survive_kills_of_labeller_runner_and_code() {
     let directory = tempfile::tempdir().unwrap();
@@ -84,7 +84,7 @@ fn labels_survive_kills_of_labeller_runner_and_code() {
 
     for round in 0..6 {
         let begun = Instant::now();
-        wait_until("ABINIT is at work", || {
+        wait_until("ABINIT is running", || {
             calculation_processes(&scratch).iter().any(|(_, command)| is_abinit(command))
                 || run.try_wait().unwrap().is_some()
         });
@@ -104,8 +104,8 @@ fn labels_survive_kills_of_labeller_runner_and_code() {
         assert!(begun.elapsed() < Duration::from_secs(300));
     }
     assert!(run.wait().unwrap().success());
-    wait_until("every calculation is gone", || calculation_processes(&scratch).is_empty());
-    // What a killed labeller had only just made is cleared away by those who come a minute later.
+    wait_until("every calculation has exited", || calculation_processes(&scratch).is_empty());
+    // A later labeller removes the directories of a killed one after a minute.
     for directory in directories(&scratch) {
         let touched = Command::new("touch").args(["-d", "2 minutes ago"]).arg(directory).status();
         assert!(touched.unwrap().success());
@@ -121,7 +121,7 @@ fn labels_survive_kills_of_labeller_runner_and_code() {
     assert!(attempts > queue.as_array().unwrap().len() as u64, "nothing was killed: {queue}");
 }
 
-/// Silicon at these places, Å.
+/// Silicon atoms at these positions, Å.
 fn silicon(positions: &[Vec3], cell: [Vec3; 3]) -> Structure {
     let (species, positions) = (vec!["Si".parse().unwrap(); positions.len()], positions.to_vec());
     Structure { species, positions, cell: Cell(cell), periodic: [true; 3] }
@@ -134,7 +134,7 @@ fn attempts(here: &Path, candidate: &str) -> Vec<Value> {
     details["attempts_made"].as_array().unwrap().clone()
 }
 
-/// Checks that a guard has refused a candidate for this reason, and ABINIT has not been started.
+/// Checks that a guard rejected a candidate for this reason before ABINIT was started.
 fn is_refused(here: &Path, candidate: &str, reason: &str) {
     let [attempt] = &attempts(here, candidate)[..] else { panic!("{candidate}: more than one attempt") };
     assert_eq!(
@@ -150,7 +150,7 @@ fn guards_stand_before_abinit() {
     const GUARD: &str = "guard = { min_bond_lengths = { \"Si-Si\" = 1.8 }, min_height = 3.0, max_atoms = 8, duplicate_tolerance = 0.01";
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    // One label by the campaign itself.
+    // The campaign itself makes one label.
     let text = quick_demo().replace("# control = true", "control = false");
     let text = text.replace("# max_structures = 100 ", "max_structures = 1 ");
     let write = |guard: &str| {
@@ -163,7 +163,7 @@ fn guards_stand_before_abinit() {
     let primitive = [[0.0, 2.8, 2.8], [2.8, 0.0, 2.8], [2.8, 2.8, 0.0]];
     let pair = |x: f64| silicon(&[[0.0; 3], [x, 1.4, 1.4]], primitive);
     let row: Vec<Vec3> = (0..9).map(|k| [2.4 * f64::from(k), 0.0, 0.0]).collect();
-    // Two of each atom.
+    // Two features per atom.
     let features = |atoms: usize, scale: f64| (0..2 * atoms).map(|k| scale * (k as f64 - 1.5)).collect();
     let add = |step, structure: Structure, scale| {
         let features = features(structure.len(), scale);
@@ -192,7 +192,7 @@ fn guards_stand_before_abinit() {
     succeed(here, ["label", "--store", "campaign", "--until-empty"]);
     assert!(is_labelled(&near));
 
-    // From now on nothing is cheap enough.
+    // Every calculation is too expensive from now on.
     write(&format!("{GUARD}, max_cost = 1e-6 }}"));
     succeed(here, ["run", "campaign.toml"]);
     let dear = add(8, pair(1.5), 4.0);
@@ -200,7 +200,7 @@ fn guards_stand_before_abinit() {
     is_refused(here, &dear, "core-seconds, judging by 4 labels, where label.guard.max_cost is 0.000001");
 }
 
-/// When ABINIT has made the first label, its pseudopotential becomes another, with which it would calculate as well.
+/// After the first label, the pseudopotential is replaced by another one that ABINIT would accept as well.
 #[test]
 fn a_pseudopotential_that_is_replaced_between_two_labels_makes_none() {
     const THEIRS: &str = "/usr/share/abinit/psp";
@@ -251,7 +251,7 @@ fn a_pseudopotential_that_is_replaced_between_two_labels_makes_none() {
     }
 }
 
-/// The program itself, not a stand-in.
+/// Checks that the real program is installed.
 #[test]
 fn abinit_is_there() {
     let version =

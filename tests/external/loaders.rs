@@ -1,5 +1,6 @@
-//! What `calmwalk export` writes for gracemaker and MACE, and the artifact of `calm build`, read back by their own loaders. Needs two Pythons, named by
-//! `CALMWALK_GRACEMAKER_PYTHON` (of PyPI: tensorpotential) and `CALMWALK_MACE_PYTHON` (mace-torch); `.ci/loaders` makes both.
+//! Exports for gracemaker and MACE, and artifacts of `calm build`, read by the loaders of these programs. Needs two Pythons,
+//! named by `CALMWALK_GRACEMAKER_PYTHON` (tensorpotential from PyPI) and `CALMWALK_MACE_PYTHON` (mace-torch); `.ci/loaders`
+//! installs both.
 
 use std::path::Path;
 use std::process::Command;
@@ -11,7 +12,7 @@ use calm::Artifact;
 use crate::common::campaign::Small;
 use crate::common::{config, deviation, stderr, succeed, write_frames};
 
-/// Energy (eV), forces (eV/Å) and stress (eV/Å³) of a frame, as a loader has them.
+/// Energy (eV), forces (eV/Å) and stress (eV/Å³) of a frame, as a loader returns them.
 type Loaded = (f64, Vec<f64>, Vec<f64>);
 
 #[test]
@@ -48,7 +49,7 @@ fn gracemaker_grades_by_an_artifact_that_was_built() {
     assert!(grades.len() == 5400 && grades.iter().any(|[gamma, _]| *gamma > 1.0));
 }
 
-/// Several elements with several components, without atoms of hydrogen, and a projection of our own.
+/// Several elements with several components, no hydrogen atoms, and our own projection.
 #[test]
 fn gracemaker_grades_by_an_artifact_of_several_elements() {
     let directory = tempfile::tempdir().unwrap();
@@ -107,7 +108,7 @@ fn artifacts_of_gracemaker_give_its_grades() {
     }
 }
 
-/// γ of all atoms of `data`, by this program and by gracemaker, which agree to 10⁻⁶.
+/// γ of all atoms of `data` from this program and from gracemaker, which must agree to 10⁻⁶.
 fn both_grades(here: &Path, model: &str, artifact: &str, data: &str) -> Vec<[f64; 2]> {
     let variable = "CALMWALK_GRACEMAKER_PYTHON";
     let python = std::env::var_os(variable).unwrap_or_else(|| panic!("{variable} names no Python"));
@@ -166,7 +167,7 @@ fn loads(keys: &str, variable: &str, load: &str) {
     }
 }
 
-/// Has `load` make `frames` of the file, and prints them as JSON on the last line.
+/// Runs the Python code `load`, which sets `frames`, and prints them as JSON on the last line.
 fn loaded(here: &Path, python: &Path, load: &str) -> Vec<Loaded> {
     let script = format!(
         "import json, numpy as np\n{load}\n\
@@ -175,7 +176,7 @@ fn loaded(here: &Path, python: &Path, load: &str) -> Vec<Loaded> {
     last_line(here, python, &script)
 }
 
-/// Runs a script, and reads the JSON on the last line that it prints.
+/// Runs a script, and parses the last line of its output as JSON.
 fn last_line<T: serde::de::DeserializeOwned>(here: &Path, python: &Path, script: &str) -> T {
     let output = Command::new(python).args(["-c", script]).current_dir(here).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));

@@ -1,7 +1,7 @@
-//! Tests of the whole program that need other programs: servers, DFT codes, a terminal, a browser. The first lines of each module
-//! name what it needs. A test fails that lacks it.
+//! Tests of the whole program that need other programs: servers, DFT codes, a terminal, a browser. The module docs name the
+//! requirements. A test fails if a requirement is missing.
 //!
-//! `cargo test --test external browser::` runs those of one module.
+//! `cargo test --test external browser::` runs the tests of one module.
 
 #[path = "../common/mod.rs"]
 mod common;

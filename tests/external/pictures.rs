@@ -1,5 +1,6 @@
-//! The pictures of the README, from the campaign of `configs/aluminium.toml`, and a longer one like it: they are written anew into `docs/pictures`. Needs
-//! Debian's packages chromium, chromium-driver, tmux and fonts-dejavu; `cargo test --test external pictures:: -- --ignored`.
+//! Draws the pictures of the README in `docs/pictures`, from the campaign of `configs/aluminium.toml` and a longer variant.
+//! Needs Debian's packages chromium, chromium-driver, tmux and fonts-dejavu;
+//! `cargo test --test external pictures:: -- --ignored`.
 
 use std::fmt::Write;
 use std::fs;
@@ -11,19 +12,19 @@ use crate::common::http::{get, said};
 use crate::common::processes::signal;
 use crate::common::{Running, demo, program, stderr, succeed};
 
-/// Bytes of a picture, at most.
+/// Maximum size of a picture, bytes.
 const LARGEST: u64 = 200_000;
 
 /// Columns and lines of the terminal.
 const TERMINAL: (u32, u32) = (150, 38);
 
 #[test]
-#[ignore = "it writes the pictures of the README anew"]
+#[ignore = "it overwrites the pictures of the README"]
 fn the_readme_shows_a_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let text = demo("aluminium.toml").replace("[campaign]", "[campaign]\nmode = \"live\"");
-    // Long enough for lines over time.
+    // Long enough for the plots over time.
     let text = text
         .replace("biased_steps = 2000", "biased_steps = 12000")
         .replace("# max_per_walk = 3", "max_per_walk = 20");
@@ -36,7 +37,7 @@ fn the_readme_shows_a_campaign() {
     let browser = Browser::start(false, (1280, 960));
     browser.show(&format!("http://{address}/"));
     let terminal = Terminal::open(here);
-    // A part of what it will find, and some news.
+    // Wait until a part of the structures is found.
     browser.wait("document.querySelectorAll('.tile strong').length === 5");
     browser.wait("Number(document.querySelectorAll('.tile strong')[2].textContent.split(' ')[0]) >= 30");
     browser.picture(&picture("dashboard"), None);
@@ -107,7 +108,7 @@ impl Terminal {
         String::from_utf8(output.stdout).expect("text")
     }
 
-    /// With the sequences that give it its colours.
+    /// The screen with its escape sequences for colours.
     fn screen(&self) -> String {
         self.tmux(&["capture-pane", "-e", "-p"])
     }
@@ -119,7 +120,7 @@ impl Drop for Terminal {
     }
 }
 
-/// How a piece of a terminal's text looks.
+/// Style of a piece of text in a terminal.
 #[derive(Clone, Default)]
 struct Style {
     ink: Option<String>,
@@ -129,7 +130,7 @@ struct Style {
     turned: bool,
 }
 
-/// A terminal's screen as a page.
+/// Converts a terminal's screen to HTML.
 fn as_html(screen: &str) -> String {
     let mut page = String::from(
         "<!doctype html><meta charset=utf-8><body style='margin:0'><pre style=\"display:inline-block;margin:0;padding:8px 10px;\
@@ -150,7 +151,7 @@ fn is_codes(text: &str) -> bool {
 }
 
 impl Style {
-    /// Select graphic rendition (ECMA-48), as far as terminals' programs use it.
+    /// Applies "select graphic rendition" (ECMA-48), as far as terminal programs use it.
     fn take(&mut self, codes: &str) {
         let mut codes = codes.split(';').filter_map(|code| code.parse::<u32>().ok());
         while let Some(code) = codes.next() {
@@ -200,7 +201,7 @@ impl Style {
     }
 }
 
-/// One of a terminal's 256 colours, the first 16 as xterm has them, somewhat softer.
+/// One of a terminal's 256 colours; the first 16 are slightly softer variants of xterm's.
 fn colour(number: u32) -> String {
     const FIRST: [&str; 16] = [
         "#1b1f24", "#d7605b", "#4fae6f", "#cfa63a", "#5a9fd8", "#b57fc9", "#45b3b8", "#c5ccd3", "#7d8790",

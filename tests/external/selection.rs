@@ -12,8 +12,8 @@ use crate::common::{config, random, stderr, succeed, write_frames};
 /// Grades that differ by less are equal for both programs.
 const TOLERANCE: f64 = 1e-5;
 
-/// Gives the grades and features of `calmwalk calm score` to `grace_uq select` as a pool that was predicted, once for each list of
-/// strategies, and prints what it picks.
+/// Passes the grades and features of `calmwalk calm score` to `grace_uq select` as a predicted pool, once per list of
+/// strategies, and prints its picks.
 const SCRIPT: &str = r#"
 import contextlib, io, json, sys
 import numpy as np, pandas as pd
@@ -44,8 +44,8 @@ for parts in sys.argv[2:]:
 print(json.dumps(found))
 "#;
 
-/// Strategies that leave nothing to chance: `fps` begins with what greedy picked, three structures with all elements. The reference
-/// begins an element without picks with an atom that it draws.
+/// Strategies without randomness: `fps` starts from greedy picks, three structures with all elements. Without picks of an
+/// element, the reference starts from a random atom.
 const STRATEGIES: [&str; 4] = [
     "calm-greedy",
     "calm-greedy:3 fps-extrap:9",
@@ -109,7 +109,7 @@ fn selects(model: &str, seeds: &str) {
     }
 }
 
-/// Forty structures, displaced and strained to a different extent.
+/// Forty structures with different displacements and strains.
 fn pool(seeds: &Path, path: &Path) {
     let seeds = read_extxyz(seeds).unwrap();
     let frame = |n: usize| {
@@ -133,7 +133,7 @@ fn reference(here: &Path, artifact: &str) -> Vec<Picked> {
     let output = command.current_dir(here).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     let printed = String::from_utf8(output.stdout).unwrap();
-    // TensorFlow may write lines of its own.
+    // TensorFlow may print other lines.
     let found = printed.lines().find(|line| line.starts_with("[{"));
     serde_json::from_str(found.unwrap_or_else(|| panic!("{printed}"))).unwrap()
 }

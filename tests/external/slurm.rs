@@ -1,4 +1,4 @@
-//! Campaigns on a real Slurm, one of them kept on a PostgreSQL server:
+//! Campaigns on a real Slurm, one of them stored on a PostgreSQL server:
 //! `SLURM_CONF=$(.ci/slurm start) CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test external slurm::`.
 
 use std::collections::BTreeMap;
@@ -21,7 +21,7 @@ use crate::common::{Running, calmwalk, program, stderr, succeed};
 /// A campaign that is launched on Slurm.
 struct OnSlurm {
     home: TempDir,
-    /// Where it is kept, as an argument of commands in its directory.
+    /// Location of the campaign, as an argument of commands in its directory.
     location: String,
     options: Vec<String>,
     _node: MutexGuard<'static, ()>,
@@ -34,7 +34,7 @@ struct Job {
     state: String,
 }
 
-/// A campaign of some seconds.
+/// A campaign that takes some seconds.
 fn long() -> Small {
     Small {
         walkers: 1,
@@ -45,7 +45,7 @@ fn long() -> Small {
     }
 }
 
-/// That of the partition that jobs go to.
+/// The node of the jobs' partition.
 fn this_node() -> String {
     slurm(&["sinfo", "--noheader", "--partition=all", "--format=%N"]).trim().to_owned()
 }
@@ -61,7 +61,7 @@ impl OnSlurm {
         campaign
     }
 
-    /// The same, kept on a server, where jobs make the labels.
+    /// A campaign stored on a server, whose labels are made by labeller jobs.
     fn on_a_server(small: &Small, agents: u32, labellers: u32) -> Self {
         let server = std::env::var("CALMWALK_POSTGRES");
         let server = server.expect("CALMWALK_POSTGRES=$(.ci/postgres start) is needed");
@@ -74,29 +74,29 @@ impl OnSlurm {
         campaign
     }
 
-    /// One that does not end before [`Self::labelled`], however fast the machine is: few structures may wait for labels,
-    /// and nobody makes any.
+    /// A campaign that cannot end before [`Self::labelled`], however fast the machine: it has no labellers, and a small limit
+    /// on the label queue.
     fn unlabelled(small: &Small, agents: u32) -> Self {
         let campaign = Self::new(small, agents);
         campaign.changed("[label]\n", "[label]\nconcurrency = 0\nqueue_limit = 4\n");
         campaign
     }
 
-    /// Makes all labels, beginning when walkers wait for them.
+    /// Makes all labels, once walkers wait for them.
     fn labelled(&self) {
-        // There may be no campaign yet.
+        // The campaign may not exist yet.
         let waiting = || {
             let status = calmwalk(self.directory(), ["status", ".", "--json"]).stdout;
             serde_json::from_slice::<Value>(&status).unwrap_or_default()["labels"]["queued"].as_u64()
         };
-        wait_until("walkers have to wait", || waiting() >= Some(4));
+        wait_until("walkers wait", || waiting() >= Some(4));
         let mut labels = program(self.directory());
         labels.args(["label", "--store", "."]).stdout(Stdio::null()).stderr(Stdio::null());
         let mut labels = Running(labels.spawn().unwrap());
         assert_eq!(labels.0.wait().unwrap().code(), Some(0), "{}", self.logs());
     }
 
-    /// Replaces something in its configuration.
+    /// Replaces text in its configuration.
     fn changed(&self, from: &str, to: &str) {
         let path = self.directory().join("campaign.toml");
         let text = fs::read_to_string(&path).unwrap();
@@ -114,7 +114,7 @@ impl OnSlurm {
         command
     }
 
-    /// Launches, and returns what it says.
+    /// Launches the campaign. Returns the standard output.
     fn launched(&self) -> String {
         said(self.launch().args(&self.options).output().unwrap())
     }
@@ -123,7 +123,7 @@ impl OnSlurm {
         said(self.launch().arg("--stop").output().unwrap())
     }
 
-    /// Every job of this campaign that Slurm has not forgotten, by what it does.
+    /// Every job of this campaign that Slurm knows, by role.
     fn jobs(&self) -> BTreeMap<String, Vec<Job>> {
         let here = self.directory().canonicalize().unwrap();
         let text = slurm(&["squeue", "--noheader", "--states=all", "--format=%i|%T|%j|%Z"]);
@@ -139,7 +139,7 @@ impl OnSlurm {
         jobs
     }
 
-    /// The only job that does this.
+    /// The only job with this role.
     fn job(&self, role: &str) -> Job {
         let jobs = self.jobs();
         let [job] = &jobs[role][..] else { panic!("{role}: {jobs:?}") };
@@ -156,14 +156,14 @@ impl OnSlurm {
         fs::read_to_string(self.directory().join(format!("slurm/{role}.log"))).unwrap_or_default()
     }
 
-    /// Waits until orchestrator and agents are at work.
+    /// Waits until the walkers and agents run.
     fn at_work(&self, agents: usize) {
         let walkers = || processes_running(self.directory(), "walker").len();
         let joined = || processes_running(self.directory(), "agent").len();
-        wait_until("everybody is at work", || walkers() > agents && joined() == agents);
+        wait_until("all processes are running", || walkers() > agents && joined() == agents);
     }
 
-    /// Waits until no job is left, and checks that none has failed.
+    /// Waits until every job has ended, and checks that the orchestrator's has succeeded.
     fn finished(&self) {
         let begun = Instant::now();
         let over = |state: &str| ["COMPLETED", "CANCELLED", "FAILED", "TIMEOUT"].contains(&state);
@@ -177,8 +177,8 @@ impl OnSlurm {
         assert_no_leftovers(self.directory());
     }
 
-    /// An agent that waited to go on when the campaign was done has been taken away.
-    fn nobody_failed(&self) {
+    /// Checks that no job has failed. An agent that waited to continue when the campaign ended is cancelled.
+    fn no_job_failed(&self) {
         let good = |job: &Job| ["COMPLETED", "CANCELLED"].contains(&job.state.as_str());
         assert!(self.jobs().values().flatten().all(good), "{:?}\n{}", self.jobs(), self.logs());
     }
@@ -195,7 +195,7 @@ impl OnSlurm {
 
 impl Drop for OnSlurm {
     fn drop(&mut self) {
-        // A test that failed may have left slurmctld dead, and the next one needs it.
+        // A failed test may have left slurmctld dead, and the next one needs it.
         if std::thread::panicking() {
             ci("revive");
         }
@@ -215,7 +215,7 @@ fn restarts(id: &str) -> u32 {
     text.split_whitespace().find_map(|word| word.strip_prefix("Restarts=")?.parse().ok()).unwrap()
 }
 
-/// Its own jobs or those of others: `launch` waits for a place, and submits each job once.
+/// Whether Slurm is full of its own jobs or of others': `launch` waits for a slot, and submits each job once.
 #[test]
 fn a_launch_waits_while_slurm_accepts_no_jobs() {
     let campaign = OnSlurm::unlabelled(&Small::default(), 1);
@@ -239,7 +239,7 @@ fn a_launch_waits_while_slurm_accepts_no_jobs() {
 }
 
 #[test]
-fn a_campaign_comes_to_the_same_however_often_it_is_launched() {
+fn repeated_launches_do_not_change_the_outcome() {
     let small = long();
     let campaign = OnSlurm::unlabelled(&small, 2);
     assert_eq!(campaign.launched().matches("submitted").count(), 3);
@@ -262,13 +262,13 @@ fn a_campaign_comes_to_the_same_however_often_it_is_launched() {
         let job = campaign.job(role);
         assert_eq!((job.state.as_str(), restarts(&job.id)), ("COMPLETED", 0), "{}", campaign.logs());
     }
-    // Once more, though it is over: everybody sees that and leaves.
+    // Launch the finished campaign again: all jobs exit.
     assert_eq!(campaign.launched().matches("submitted").count(), 3);
     campaign.finished();
 }
 
 #[test]
-fn two_who_launch_at_the_same_moment_submit_each_job_once() {
+fn concurrent_launches_submit_each_job_once() {
     let campaign = OnSlurm::unlabelled(&long(), 3);
     let launches = [(); 4].map(|()| {
         let mut launch = campaign.launch();
@@ -281,7 +281,7 @@ fn two_who_launch_at_the_same_moment_submit_each_job_once() {
     let roles: Vec<_> = jobs.keys().map(String::as_str).collect();
     assert_eq!(roles, ["agent-0", "agent-1", "agent-2", "orchestrator"]);
     assert!(jobs.values().all(|jobs| jobs.len() == 1), "{jobs:?}");
-    // Even where nothing locks, Slurm holds back the second of a name.
+    // Without a lock, Slurm still holds back the second job of the same name.
     let name = slurm(&["squeue", "--noheader", "--format=%j", "--jobs", &jobs["agent-0"][0].id]);
     let script = campaign.directory().join("slurm/agent.sbatch");
     let second = slurm(&[
@@ -296,7 +296,7 @@ fn two_who_launch_at_the_same_moment_submit_each_job_once() {
     campaign.at_work(3);
     let states: Vec<_> = campaign.jobs()["agent-0"].iter().map(|job| job.state.clone()).collect();
     assert!(states.contains(&"PENDING".to_owned()) && states.contains(&"RUNNING".to_owned()), "{states:?}");
-    // The next launch takes it away, and an agent that is not asked for any more.
+    // The next launch cancels it, and an agent that is no longer requested.
     let fewer = [&["--agents=2".to_owned()], &campaign.options[1..]].concat();
     let text = said(campaign.launch().args(fewer).output().unwrap());
     assert!(text.contains(&format!("job {} (PENDING) cancelled", second.trim())), "{text}");
@@ -306,7 +306,7 @@ fn two_who_launch_at_the_same_moment_submit_each_job_once() {
 }
 
 #[test]
-fn at_the_notice_a_campaign_leaves_and_goes_on_when_it_is_requeued() {
+fn a_signalled_campaign_stops_and_continues_when_it_is_requeued() {
     let small = long();
     let campaign = OnSlurm::unlabelled(&small, 2);
     campaign.launched();
@@ -320,12 +320,12 @@ fn at_the_notice_a_campaign_leaves_and_goes_on_when_it_is_requeued() {
     campaign.labelled();
     campaign.comes_to(&uninterrupted_outcome(&small));
     assert!(campaign.log("orchestrator").contains("exit code 130"), "{}", campaign.logs());
-    campaign.nobody_failed();
+    campaign.no_job_failed();
 }
 
-/// A whole minute is the least time that Slurm gives.
+/// One minute is Slurm's shortest time limit.
 #[test]
-fn before_its_time_is_over_a_job_is_told_and_requeued() {
+fn a_job_is_signalled_before_its_time_limit_and_requeued() {
     let small = long();
     let mut campaign = OnSlurm::unlabelled(&small, 1);
     let site = campaign.directory().join("site");
@@ -337,10 +337,10 @@ fn before_its_time_is_over_a_job_is_told_and_requeued() {
     campaign.options.splice(1..1, ["--time=1".into(), format!("--template={}", site.display())]);
     campaign.launched();
     let orchestrator = campaign.job("orchestrator").id;
-    wait_until("the notice has come", || restarts(&orchestrator) == 1);
+    wait_until("the job is signalled and requeued", || restarts(&orchestrator) == 1);
     campaign.labelled();
     campaign.comes_to(&uninterrupted_outcome(&small));
-    campaign.nobody_failed();
+    campaign.no_job_failed();
 }
 
 /// `SLURM_CONF=$(.ci/slurm start) CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test external slurm:: server`
@@ -353,26 +353,26 @@ fn on_a_server_jobs_make_the_labels() {
     wait_until("labels are made", || campaign.status()["labels"]["labelled"].as_u64() > Some(0));
     let labellers = || campaign.jobs().into_iter().filter(|(role, _)| role.starts_with("labeller-"));
     assert_eq!(labellers().count(), 2);
-    // However its URL is written it is the same campaign.
+    // The same campaign is found under another form of its URL.
     let another_way =
         campaign.location.replacen("postgres://", "postgresql://", 1) + "&application_name=look";
     let text = succeed(campaign.directory(), ["status", &another_way]);
     assert!(text.contains("labeller 1") && text.contains("running"), "{text}");
     campaign.comes_to(&uninterrupted_outcome(&small));
-    campaign.nobody_failed();
+    campaign.no_job_failed();
     let made: Vec<_> = labellers().map(|(role, _)| campaign.log(&role)).collect();
     assert!(made.iter().all(|log| log.contains("exit code 0")), "{made:?}");
 }
 
 #[test]
-fn an_agent_that_is_cancelled_is_missed_by_nobody_and_launched_again() {
+fn a_cancelled_agent_is_launched_again() {
     let small = long();
     let campaign = OnSlurm::unlabelled(&small, 2);
     campaign.launched();
     campaign.at_work(2);
     let agent = campaign.job("agent-1").id;
     slurm(&["scancel", &agent]);
-    wait_until("it is gone", || campaign.job("agent-1").state == "CANCELLED");
+    wait_until("the job is cancelled", || campaign.job("agent-1").state == "CANCELLED");
     assert_eq!(restarts(&agent), 0, "{}", campaign.log("agent-1"));
     let again = campaign.launched();
     assert_eq!((again.matches("submitted").count(), again.matches(" kept").count()), (1, 2), "{again}");
@@ -387,7 +387,7 @@ fn a_campaign_survives_the_loss_of_slurmctld() {
     let campaign = OnSlurm::unlabelled(&small, 2);
     campaign.launched();
     campaign.at_work(2);
-    // So long Slurm may take to write down what it knows of jobs.
+    // Slurm may take this long to save the state of its jobs.
     std::thread::sleep(Duration::from_secs(6));
     ci("kill");
     let asked = Instant::now();
@@ -395,7 +395,7 @@ fn a_campaign_survives_the_loss_of_slurmctld() {
     assert!(text.contains("no answer from Slurm"), "{text}");
     assert!(asked.elapsed() < Duration::from_secs(20));
     assert!(campaign.status()["jobs_unknown"].is_string());
-    assert_eq!(processes_running(campaign.directory(), "agent").len(), 2, "they go on");
+    assert_eq!(processes_running(campaign.directory(), "agent").len(), 2, "the agents continue");
     ci("revive");
     campaign.labelled();
     campaign.comes_to(&uninterrupted_outcome(&small));
@@ -409,7 +409,9 @@ fn a_campaign_is_stopped_in_order_and_launched_again() {
     campaign.at_work(2);
     let text = campaign.stop();
     assert!(text.contains("3 jobs cancelled"), "{text}");
-    wait_until("no job is left", || campaign.jobs().values().flatten().all(|job| job.state == "CANCELLED"));
+    wait_until("every job is cancelled", || {
+        campaign.jobs().values().flatten().all(|job| job.state == "CANCELLED")
+    });
     assert_no_leftovers(campaign.directory());
     assert!(
         campaign.log("orchestrator").contains("stopped; run the same command again"),
@@ -418,7 +420,7 @@ fn a_campaign_is_stopped_in_order_and_launched_again() {
     );
     let status = campaign.status();
     assert_eq!(status["finished"], false);
-    // A walker that was only just starting may have died of the signal, which is written down.
+    // The signal may have killed a walker that was just starting, which is recorded.
     let processes = status["processes"].as_array().unwrap();
     assert!(processes.iter().all(|process| process["state"] != "running"), "{status}");
     assert_eq!(campaign.launched().matches("submitted").count(), 3);
@@ -449,9 +451,9 @@ fn with_certificates_agents_reach_the_orchestrator_by_the_name_of_its_node() {
 }
 
 #[test]
-fn what_cannot_go_on_is_not_requeued() {
+fn a_campaign_that_cannot_continue_is_not_requeued() {
     let campaign = OnSlurm::new(&long(), 1);
-    // It is there when the campaign is launched, and not any more when its job begins.
+    // The file exists at launch, and is missing when the job starts.
     let seeds = campaign.directory().join("seeds.extxyz");
     let mut launch = campaign.launch();
     launch.args(&campaign.options[..1]).args(["--", "--begin=now+4"]).arg(&campaign.options[2]);
@@ -480,7 +482,7 @@ fn a_dry_run_shows_everything_and_does_nothing() {
     assert!(
         !written(&campaign.directory().join("slurm")) && !written(&campaign.directory().join("endpoint"))
     );
-    // Without certificates agents have to be where the orchestrator is.
+    // Without certificates, agents must run on the orchestrator's node.
     let refused = campaign.launch().arg("--agents=2").output().unwrap();
     assert_eq!(refused.status.code(), Some(2));
     assert!(stderr(&refused).contains("--nodelist"), "{}", stderr(&refused));

@@ -1,4 +1,5 @@
-//! A build of a mixture as a chain of jobs on a real Slurm: `SLURM_CONF=$(.ci/slurm start) cargo test --test external slurm_build::`.
+//! A build of a mixture as a chain of jobs on a real Slurm:
+//! `SLURM_CONF=$(.ci/slurm start) cargo test --test external slurm_build::`.
 
 use std::fs;
 use std::path::Path;
@@ -16,7 +17,7 @@ fn submit(here: &Path, more: &[&str]) -> Output {
     command.env("CALMWALK", env!("CARGO_BIN_EXE_calmwalk")).current_dir(here).output().unwrap()
 }
 
-/// What the jobs wrote.
+/// The logs of the jobs.
 fn logs(here: &Path) -> String {
     let files = fs::read_dir(here).unwrap().flatten().map(|file| file.path());
     let logs = files.filter(|path| path.extension().is_some_and(|extension| extension == "log"));
@@ -36,7 +37,7 @@ fn a_chain_of_jobs_gives_the_bytes_of_one_process_and_continues() {
 
     let arguments = [&settings[..], &["--output", "out.npz", "--embed", "model.npz"]].concat();
     let idle = || slurm(&["squeue", "--noheader", "--partition=all"]).is_empty();
-    // Pass 1 was merged before by hand.
+    // Run and merge pass 1 without Slurm first.
     for part in ["1/2", "2/2"] {
         let part = ["--pass", "1", "--part", part];
         let build = ["calm", "build", "--model", &model, "--output", "out.npz"];

@@ -1,6 +1,6 @@
-//! `calmwalk watch` in a real terminal: keys are sent, and the screen is looked at. Needs tmux (Debian: `tmux`):
-//! `cargo test --test external watch::`. With `CALMWALK_POSTGRES=$(.ci/postgres start)`
-//! its campaigns are on that server.
+//! `calmwalk watch` in a real terminal: the tests send keys and read the screen. Needs tmux (Debian: `tmux`):
+//! `cargo test --test external watch::`. With `CALMWALK_POSTGRES=$(.ci/postgres start)` its campaigns are stored on that
+//! server.
 
 use std::fs;
 use std::path::Path;
@@ -14,7 +14,7 @@ use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::{processes_running, signal, wait_until};
 use crate::common::{Running, succeed};
 
-/// A terminal with the program in it; when that has ended, its exit code is on the screen.
+/// A terminal that runs the program, and then prints its exit code.
 struct Terminal {
     socket: String,
 }
@@ -60,7 +60,7 @@ impl Terminal {
         self.wait_for_all(&[words])
     }
 
-    /// A screen may be looked at before the whole of it is drawn.
+    /// Waits for all of these words, because the screen may be read before it is completely drawn.
     fn wait_for_all(&self, words: &[&str]) -> String {
         let mut screen = String::new();
         wait_until(&format!("the screen shows {words:?}; {}", self.screen()), || {
@@ -70,7 +70,7 @@ impl Terminal {
         screen
     }
 
-    /// The screen with its escape sequences, when it has this one.
+    /// Waits for this escape sequence. Returns the screen with its escape sequences.
     fn wait_for_sequence(&self, sequence: &str) -> String {
         let mut screen = String::new();
         wait_until(&format!("the screen has {sequence:?}"), || {
@@ -84,7 +84,7 @@ impl Terminal {
         self.tmux(&["resize-window", "-x", &width.to_string(), "-y", &height.to_string()]);
     }
 
-    /// The program has ended so, and the terminal is as it was: the screen, the cursor, and what is typed is seen.
+    /// Checks that the program has exited with this code, and that the terminal is restored: screen, cursor and echo.
     fn is_given_back(&self, code: &str) {
         let screen = self.wait_for(code);
         assert!(!screen.contains("1 walks"), "{screen}");
@@ -101,26 +101,26 @@ impl Drop for Terminal {
     }
 }
 
-/// Two walks that find nothing and are not done for a long time.
+/// Two walks that collect nothing and run for a long time.
 fn endless() -> (LabelCampaign, Running) {
     let place = LabelCampaign::new(
         &Small { steps: 1_000_000, ..Small::default() },
         &[("threshold = 1.0", "threshold = 1e6"), ("threshold = 1.0", "threshold = 1e6")],
     );
     let run = place.run();
-    wait_until("both walks are there", || {
+    wait_until("both walks exist", || {
         place.status()["walks"].as_array().is_some_and(|walks| walks.len() == 2)
     });
     (place, run)
 }
 
-/// A campaign whose walks are over and whose structures wait for labels that nobody makes.
+/// A campaign whose walks have ended and whose structures wait for labels. It has no labellers.
 fn waiting() -> LabelCampaign {
     let place = LabelCampaign::new(&Small::default(), &[("[label]", "[label]\nconcurrency = 0")]);
     let mut run = place.run();
     let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
-    wait_until("every walk is over", || {
-        // Two biased ones and their controls.
+    wait_until("every walk has ended", || {
+        // Two biased walks and their control walks.
         place.status()["walks"].as_array().is_some_and(|walks| walks.len() == 4 && walks.iter().all(over))
     });
     signal(run.0.id(), "INT");
@@ -153,7 +153,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     );
     terminal.wait_for("steps/s; mixture");
 
-    // The second walk stands still; in reproducible mode the first waits for it.
+    // Pause the second walk; in reproducible mode the first one waits for it.
     terminal.press("Down p");
     terminal.wait_for("walk 1 paused");
     terminal.wait_for("2 running (1 paused)");
@@ -162,7 +162,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     };
     assert_eq!(paused(place.status()), [false, true]);
     let mut steps = Value::Null;
-    wait_until("both stand still", || {
+    wait_until("both walks have stopped", || {
         std::thread::sleep(std::time::Duration::from_millis(1500));
         let now =
             place.status()["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
@@ -171,13 +171,13 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     terminal.wait_for("paused");
     terminal.press("r");
     terminal.wait_for("walk 1 resumed");
-    wait_until("both go on", || {
+    wait_until("both walks continue", || {
         let now: Value =
             place.status()["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
         now != steps
     });
 
-    // All of them, but only if that is meant.
+    // Pausing all walks needs a confirmation.
     terminal.press("P");
     terminal.wait_for("pause all walks that have not ended?");
     terminal.press("n");
@@ -186,7 +186,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
 
     for (width, height) in [(160, 50), (60, 12), (20, 5), (80, 24)] {
         terminal.resize(width, height);
-        wait_until("it is drawn anew", || {
+        wait_until("the screen is redrawn", || {
             let screen = terminal.screen();
             let fits = screen.lines().all(|line| line.chars().count() <= width as usize);
             let is_wide = screen.lines().any(|line| line.contains("1 walks") && line.contains("2 queue"));
@@ -202,7 +202,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
 }
 
 #[test]
-fn structures_in_the_queue_are_changed_and_candidates_told_about() {
+fn queued_structures_are_changed_and_candidates_explained() {
     let place = waiting();
     let queued = queue(&place, "queued");
     let short = |job: &Value| job["candidate"].as_str().unwrap().split_once('-').unwrap().1.to_owned();
@@ -211,14 +211,14 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     let colours = terminal.wait_for_sequence(";7m");
     assert!(!colours.contains("[38;5;"), "{colours:?}");
 
-    // The third becomes the first.
+    // Move the third job to the front.
     terminal.press("2 Down Down = C-u");
     terminal.write("99");
     terminal.press("Enter");
     terminal.wait_for("now has priority 99");
     let now = queue(&place, "queued");
     assert_eq!((short(&now[0]), &now[0]["priority"]), (short(&queued[2]), &99.into()));
-    // It is still the chosen one.
+    // It remains selected.
     terminal.press("d");
     terminal.wait_for(&format!("drop {} (queued)?", short(&queued[2])));
     terminal.press("n");
@@ -241,7 +241,7 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     terminal.press("Escape");
     terminal.wait_for(&format!("2 queue: {}", queued.len()));
 
-    // As calmwalk explain tells it.
+    // The view shows the text of `calmwalk explain`.
     terminal.press("3 /");
     terminal.write("origin = biased and gamma > 0");
     terminal.press("Enter");
@@ -250,7 +250,7 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     let screen = terminal.wait_for("trigger");
     let id = screen.lines().nth(1).unwrap().trim().to_owned();
     let story = succeed(place.path(), ["explain", place.argument(), &id]);
-    // Time passes between the two.
+    // Skip lines that change with time, and lines that are cut.
     let lasts = |line: &&str| line.chars().count() <= 100 && !line.ends_with(" ago");
     let first: Vec<_> = story.lines().filter(lasts).take(20).collect();
     assert_eq!(first.len(), 20, "{story}");
@@ -267,7 +267,7 @@ fn the_terminal_is_given_back_however_it_ends() {
     for (name, how) in [("terminated", "TERM"), ("interrupted", "INT")] {
         let terminal = Terminal::open(&place, name, (80, 24), "");
         terminal.wait_for("1 walks: 4");
-        // Charts have a colour.
+        // Charts are coloured.
         terminal.wait_for_sequence("[38;5;6m");
         signal(watching()[0], how);
         terminal.is_given_back("code 130");
@@ -275,7 +275,7 @@ fn the_terminal_is_given_back_however_it_ends() {
     let terminal = Terminal::open(&place, "closed", (80, 24), "");
     terminal.wait_for("1 walks: 4");
     drop(terminal);
-    wait_until("nobody watches", || watching().is_empty());
+    wait_until("watch has exited", || watching().is_empty());
 }
 
 #[test]
@@ -285,14 +285,16 @@ fn a_copy_is_watched_through_its_absence() {
     succeed(here, ["store", "backup", place.argument(), "copy"]);
     let terminal = Terminal::of(here, "copy", "copy", (80, 24), "");
     terminal.wait_for("1 walks: 4");
-    // A campaign that is away for a moment is no end of watching it.
+    // `watch` continues while the campaign is temporarily missing.
     fs::rename(here.join("copy"), here.join("away")).unwrap();
     terminal.wait_for("outdated, cannot read the campaign:");
     fs::rename(here.join("away"), here.join("copy")).unwrap();
-    wait_until("it is seen again", || !terminal.screen().contains("outdated, cannot read the campaign"));
+    wait_until("the copy is read again", || {
+        !terminal.screen().contains("outdated, cannot read the campaign")
+    });
     terminal.press("q");
     terminal.is_given_back("code 0");
-    // What cannot be watched is said on the terminal as it is.
+    // An error at startup is printed on the normal screen.
     fs::remove_dir_all(here.join("copy")).unwrap();
     let terminal = Terminal::of(here, "copy", "nothing", (80, 24), "");
     terminal.wait_for("calmwalk: ");

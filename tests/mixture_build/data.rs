@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::*;
 
-/// A dump with the same bits, whose atoms are in another order.
+/// A dump with bitwise equal numbers and another order of atoms.
 fn dump(frames: &[Frame], element: bool) -> String {
     let mut text = String::new();
     for (number, Frame { structure, .. }) in frames.iter().enumerate() {

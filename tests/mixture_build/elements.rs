@@ -1,4 +1,4 @@
-//! Several elements, one of which the data do not have.
+//! Several elements, one of which has no data.
 
 use super::*;
 
@@ -33,7 +33,7 @@ fn an_element_without_atoms_has_no_components() {
     assert_eq!(components("H").iter().map(|one| (**one).clone()).collect::<Vec<_>>(), [unknown]);
     assert!(["Ni", "Al"].iter().all(|symbol| components(symbol)[0].statistics().unwrap().count > 0.0));
 
-    // Every hydrogen atom is new, by artifact and by export.
+    // Every hydrogen atom is new, both to the artifact and to the export.
     let gamma = grades(here, &model, &["--artifact", "out.npz"]);
     assert_eq!(grades(here, "model.npz", &[]), gamma);
     let species = of(true)[..5].iter().flat_map(|frame| frame.structure.species.clone()).collect::<Vec<_>>();

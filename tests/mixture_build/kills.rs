@@ -1,10 +1,10 @@
-//! A build that is killed again and again.
+//! A build that is killed repeatedly.
 
 use std::time::SystemTime;
 
 use super::*;
 
-/// The pass in which a build is, from its state; 0 before its first result.
+/// The current pass of a build, from its state; 0 before the first result.
 fn pass(state: &Path) -> usize {
     let has = |name: &str| state.join(name).exists();
     match (has("pass-3"), has("partition"), has("pass-1")) {
@@ -15,7 +15,7 @@ fn pass(state: &Path) -> usize {
     }
 }
 
-/// Size and time of the last change of the results of a pass.
+/// Size and modification time of the results of a pass.
 fn results(state: &Path, pass: usize) -> Option<(u64, SystemTime)> {
     let found = fs::metadata(state.join(format!("pass-{pass}"))).ok()?;
     Some((found.len(), found.modified().ok()?))
@@ -37,7 +37,7 @@ fn ten_kills_in_all_passes_change_no_byte() {
         let mut command = program(here);
         let child = command.args(&arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         let (mut running, before) = (Running(child), results(&state, target));
-        // Kills it as soon as it has more results of the pass, or begins the pass.
+        // Kill it as soon as it starts the pass or saves a result of it.
         wait_until("the build is killed", || {
             let begun = target > 1 && before.is_none() && pass(&state) == target;
             let ended = running.0.try_wait().unwrap().is_some();
@@ -49,7 +49,7 @@ fn ten_kills_in_all_passes_change_no_byte() {
                 kills += 1;
                 seen[pass(&state)] += 1;
             }
-            // It was faster: once more from the beginning.
+            // The build finished first: start again.
             Some(code) => {
                 assert_eq!(code, 0);
                 assert!(fs::read(here.join("killed.npz")).unwrap() == expected, "after {kills} kills");

@@ -72,7 +72,7 @@ fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
     let message = refuse(here, merge("out.npz"));
     assert!(message.contains("out.npz.build: expected the directory of a build in parts"), "{message}");
 
-    // A part that is killed continues, and the others do not wait for it.
+    // A killed part continues later, and does not block the others.
     let mut command = program(here);
     let child = command.args(part("out.npz", 1, 1, 2)).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
     let mut running = Running(child.unwrap());
@@ -92,7 +92,7 @@ fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
     succeed(here, part("out.npz", 1, 1, 2));
     succeed(here, merge("out.npz"));
 
-    // Another number of parts is possible after each merge.
+    // The number of parts may change after each merge.
     let message = fail(here, &part("out.npz", 3, 1, 2));
     assert!(message.contains("pass 2 is not merged yet"), "{message}");
     succeed(here, part("out.npz", 2, 3, 3));
@@ -103,7 +103,7 @@ fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
     assert!(message.contains("its --rng-seed is 42, now it is 7"), "{message}");
     run_parts(here, "out.npz", 2, 3, "2");
     succeed(here, merge("out.npz"));
-    // One process takes what is left.
+    // A single process finishes the build.
     let (rest, _) = build(here, "out.npz", &["data.extxyz"], &[]);
     assert!(rest == whole);
 

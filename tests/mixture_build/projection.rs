@@ -1,4 +1,4 @@
-//! Models that come from training, without a projection of their features.
+//! Models as exported after training, without a projection of their features.
 
 use serde_json::Value;
 
@@ -23,7 +23,7 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
     let shown: f64 = row[row.len() - 2].parse().unwrap();
     assert!(shown < 20.0 && (shown / 100.0 - above).abs() < 5e-4, "{shown} % {above}");
 
-    // The embedded model has the keys of gracemaker's export, and all that is needed to grade and to build.
+    // The embedded model has the keys of gracemaker's export, so it can grade and build.
     let names = |path: &Path| arrays(path).into_iter().map(|(name, _)| name).collect::<Vec<_>>();
     assert_eq!(names(&here.join("model.npz")), names(&config(MODEL)));
     assert_eq!(grades(here, "model.npz", &[]), gamma);
@@ -41,7 +41,7 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
     succeed(here, again);
     assert!(fs::read(here.join("again.npz")).unwrap() == whole);
 
-    // Parts have the same projection.
+    // A build in parts has the same projection.
     for pass in ["1", "2", "3"] {
         for part in ["1/2", "2/2"] {
             succeed(here, arguments("parts.npz", &["--pass", pass, "--part", part]));

@@ -18,14 +18,14 @@ thread_local! {
 }
 
 fn count() {
-    // Not while a thread ends.
+    // Fails while a thread ends.
     let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
 }
 
 /// The system allocator with a counter.
 struct Counting;
 
-#[allow(unsafe_code)] // The only way to see allocations; everything goes to the system's allocator as it came.
+#[allow(unsafe_code)] // The only way to count allocations; every call is forwarded to the system's allocator unchanged.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count();

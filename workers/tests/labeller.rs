@@ -268,7 +268,7 @@ async fn a_result_whose_lease_was_lost_becomes_a_check() {
     assert_eq!(found, [(LabelStatus::Label, -1.0), (LabelStatus::Check, 0.0)]);
 }
 
-/// Longer than a connection waits for the database; the labeller is asked to stop meanwhile.
+/// The database is blocked for longer than a connection waits, and the labeller is asked to stop in that time.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_label_is_not_lost_while_the_database_is_locked() {
     let directory = tempfile::tempdir().unwrap();

@@ -307,7 +307,7 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
 }
 
 #[test]
-fn without_rollbacks_a_refused_walk_goes_on() {
+fn without_rollbacks_a_refused_walk_continues() {
     let min_distances = MinDistanceRule::Uniform(Uniform { min_distance: 3.0, fraction: 0.75 });
     let guard = GuardSettings { min_distances, rollback: false, ..settings().guard };
     let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();

@@ -46,7 +46,7 @@ fn faults(artifact: &Artifact) -> Vec<String> {
 }
 
 #[test]
-fn an_element_without_data_is_told_from_others() {
+fn an_element_without_data_is_distinguished() {
     for path in ["al_eam_1l/gmm_artifacts.npz", "al_eam_1l/kokkos.npz"] {
         let known = if path.ends_with("kokkos.npz") {
             Artifact::load_export(model(path))
@@ -106,7 +106,7 @@ fn what_an_update_makes_is_sound() {
 }
 
 #[test]
-fn nonsense_is_told() {
+fn nonsense_is_reported() {
     let artifact = Artifact::load(model("al_eam_1l/gmm_artifacts.npz")).unwrap();
     let silicon = Artifact::load(model("si_sw_1l/gmm_artifacts.npz")).unwrap();
     let silicon = parts(silicon.mixture.component(0, 0).unwrap()).statistics.unwrap();
@@ -178,7 +178,7 @@ fn a_covariance_of_low_rank_is_sound() {
 }
 
 #[test]
-fn a_centroid_that_is_there_twice_is_told() {
+fn a_duplicate_centroid_is_reported() {
     let mut artifact = niobium();
     let components = artifact.mixture.components(1).unwrap();
     let mut twice = parts(&components[1]);

@@ -34,7 +34,7 @@ fn every_array_is_missed_and_called_by_its_name() {
         for name in names(&model) {
             match changed_of(&model, &[(&name, None)]) {
                 Ok(_) => assert!(is_optional(&name), "{file}: {name} was not missed"),
-                // A model whose depth cannot be detected is taken for another.
+                // Without these names the loader assumes another depth, so its error names other arrays.
                 Err(_) if name == "spb_names" || name == "spbf_names" => {}
                 // Without one of its flags a feature map contradicts its version or its dimension.
                 Err(error) if name.starts_with("uq_rp_") => assert!(error.to_string().contains("'uq_")),

@@ -35,8 +35,8 @@ fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
 }
 
 impl Stages {
-    /// Passes everything through the selector without a reactor, and repeats each part of a decision by itself; then
-    /// writes the commits to a database in groups of this size.
+    /// Passes all candidates through the selector without a reactor, and repeats each part of a decision alone; then writes
+    /// the commits to a database in groups of this size.
     pub async fn measure(
         model: &Model,
         settings: &SelectorSettings,

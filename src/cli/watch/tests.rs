@@ -182,7 +182,7 @@ fn filters_apply_to_their_pane_and_errors_are_shown() {
     write(&mut state, " 1.45");
     press(&mut state, "Enter");
     assert_eq!((state.panes[QUEUE].entries.len(), &state.message), (1, &None));
-    // A quantity that the pane does not have is an error.
+    // A property that the pane lacks is an error.
     press(&mut state, "Esc /");
     write(&mut state, "max_force > 5");
     press(&mut state, "Enter");

@@ -9,7 +9,7 @@ use wire::{CampaignId, Origin};
 
 use super::common::*;
 
-/// A connection for what a store does not do.
+/// A connection for statements that the store does not offer.
 pub async fn connect(home: &Home) -> PgConnection {
     let options: PgConnectOptions = server().parse().unwrap();
     options.options([("search_path", home.schema())]).connect().await.unwrap()
@@ -63,13 +63,13 @@ async fn a_process_that_lost_the_lock_stops_writing() {
         break_the_lock(&home).await;
         match CampaignLock::acquire_at(home.location(), "second").await {
             Ok(lock) => break lock,
-            // The first took it again before.
+            // The first process reacquired the lock earlier.
             Err(error) => assert!(matches!(error, StoreError::Locked { .. }), "{error}"),
         }
     };
     let new = home.open().await.fenced_by(&second);
     let fresh = |step| commit_of(vec![candidate(0, step, Origin::Biased, Fate::Accepted)]);
-    // Also before it notices.
+    // Writes fail even before the first process notices the loss of its lock.
     for error in [
         old.commit(&fresh(7)).await.unwrap_err(),
         old.add_protocol(&protocol("other"), 0).await.unwrap_err(),

@@ -1,5 +1,6 @@
-//! Restarts the server during work, as after a crash: nothing is lost or duplicated. Run separately, since no other
-//! test can run meanwhile: `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres restart::`.
+//! Restarts the server during work, as after a crash: nothing is lost or duplicated. Run it separately, because no other test
+//! can use the server at the same time:
+//! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres restart::`.
 
 use std::process::Command;
 use std::sync::Arc;
@@ -123,7 +124,7 @@ async fn nothing_is_lost_or_duplicated_when_the_server_restarts() {
         assert_eq!(details.attempts_made.len() as u32, job.attempts);
         assert!(details.attempts_made.iter().all(|attempt| attempt.outcome.is_some()));
     }
-    // The lock was taken again, since nobody else had it.
+    // The store reacquired the lock, which no other process held.
     let lost = tokio::time::timeout(Duration::from_secs(3), lock.lost()).await;
     assert!(lost.is_err(), "{lost:?}");
     let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();

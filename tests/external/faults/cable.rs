@@ -1,4 +1,4 @@
-//! Two hosts with a cable between them: each is a namespace of the network, held by a process that sleeps.
+//! Two hosts connected by a cable. Each host is a network namespace, held open by a sleeping process.
 
 use std::fs;
 use std::path::Path;
@@ -10,10 +10,10 @@ use crate::common::processes::wait_until;
 
 /// The address of the first host.
 pub const HEAD: &str = "10.77.0.1";
-/// That of the second.
+/// The address of the second host.
 pub const NODE: &str = "10.77.0.2";
 
-/// Two hosts and the cable between them, which all go when this goes.
+/// Two hosts and the cable between them, removed on drop.
 pub struct Cable {
     head: Running,
     node: Running,
@@ -23,7 +23,7 @@ impl Cable {
     pub fn new() -> Self {
         let [head, node] = [namespace(), namespace()];
         let (here, there) = (head.0.id(), node.0.id());
-        // Made inside, so that names matter to nobody else.
+        // Create the cable inside the namespaces, so that its names cannot collide with others.
         must(&format!(
             "nsenter --net=/proc/{here}/ns/net ip link add cable type veth peer name cable netns {there}"
         ));
@@ -36,7 +36,7 @@ impl Cable {
         cable
     }
 
-    /// What programs of the first host are started with, and those of the second.
+    /// The command prefixes that start programs on the first and on the second host.
     pub fn through(&self) -> [Vec<String>; 2] {
         [&self.head, &self.node].map(|host| vec!["nsenter".to_owned(), net(host)])
     }
@@ -49,8 +49,7 @@ impl Cable {
         inside(&self.node, "ip link set cable up");
     }
 
-    /// Drops what comes in at the second host and what leaves it, each where the condition of nftables holds; `None` drops
-    /// nothing.
+    /// Drops packets that the second host receives and sends, if the nftables condition matches; `None` drops none.
     pub fn drop_where(&self, comes_in: Option<&str>, leaves: Option<&str>) {
         inside(&self.node, "nft flush ruleset");
         inside(&self.node, "nft add table ip faults");

@@ -1,4 +1,5 @@
-//! Clocks that are wrong by an hour, or jump by as much (NTP, a hand): nothing depends on them. libfaketime makes them wrong.
+//! Clocks that are wrong by an hour, or jump by an hour (NTP, or set manually): no result depends on them. libfaketime sets
+//! them.
 
 use std::cell::Cell;
 use std::fs;
@@ -36,7 +37,7 @@ fn the_clocks_of_these_tests_are_wrong() {
     }
 }
 
-/// All processes of a host jump together. `disturb` is called after each jump.
+/// The clock of a host jumps for all its processes. `disturb` is called after each jump.
 fn jumping(small: &Small, disturb: impl Fn(&Path, u64)) -> tempfile::TempDir {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
@@ -65,13 +66,13 @@ fn jumping(small: &Small, disturb: impl Fn(&Path, u64)) -> tempfile::TempDir {
 }
 
 #[test]
-fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
+fn a_clock_that_jumps_changes_nothing_and_restarts_no_process() {
     let small = Small { steps: 1600, max_per_walk: 16, ..Small::default() };
     let directory = jumping(&small, |here, _| {
         let status = calmwalk(here, ["status", ".", "--json"]);
         let status: Value = serde_json::from_slice(&status.stdout).unwrap();
         for process in status["processes"].as_array().unwrap() {
-            // One that was sent home is gone for a moment before its record is.
+            // The record of a stopped process is removed shortly after its exit.
             let state = process["state"].as_str().unwrap();
             assert!(["running", "stopping", "dead"].contains(&state), "{process}");
             assert_eq!(process["restarts"], 0, "{process}");
@@ -81,13 +82,13 @@ fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
     assert!(!said.contains("unresponsive") && !said.contains("restart"), "{said}");
 }
 
-/// What a labeller held that is killed comes back, whatever its clock said.
+/// The leases of a killed labeller return to the queue, whatever its clock showed.
 #[test]
 fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
     let small = Small { steps: 1600, max_per_walk: 16, ..Small::default() };
     let killed = Cell::new(0);
     jumping(&small, |here, jump| {
-        // After one more it would be given up.
+        // One more kill would reach the limit of restarts.
         if jump % 2 == 0
             && killed.get() < 5
             && let Some(labeller) = processes_running(here, "labeller").first()
@@ -98,7 +99,7 @@ fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
     });
 }
 
-/// One agent an hour ahead, one behind, and both jump.
+/// One agent's clock is an hour ahead, the other's an hour behind, and both jump.
 #[test]
 fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
     let small = Small {
@@ -123,7 +124,7 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
         set.push(clock);
     }
     for host in 0..2 {
-        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walker,"));
+        wait_until("the agent has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
     resume_processes(&held);
     for jump in 0.. {

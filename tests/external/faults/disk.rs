@@ -1,4 +1,4 @@
-//! The disk of a campaign is full, or the host's shared memory.
+//! The disk of a campaign or the host's shared memory is full.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ fn small() -> Small {
 /// A small disk.
 struct Disk {
     at: PathBuf,
-    /// Where it is mounted, and what is said there is kept beside it.
+    /// Directory of the mount point, which also stores the standard error of `run`.
     home: TempDir,
 }
 
@@ -37,7 +37,7 @@ impl Disk {
         Self { at, home }
     }
 
-    /// Takes all the space that is left.
+    /// Fills the remaining space.
     fn fill(&self) {
         let filler = self.at.join("filler");
         let to = format!("of={}", filler.display());
@@ -54,7 +54,7 @@ impl Disk {
         started(command.args(RUN), &self.home.path().join("said"))
     }
 
-    /// What was said since the last time.
+    /// Standard error since the last call.
     fn said(&self) -> String {
         let path = self.home.path().join("said");
         let said = fs::read_to_string(&path).unwrap();
@@ -69,7 +69,7 @@ impl Drop for Disk {
     }
 }
 
-/// It ends with a clear message, and goes on when there is space. Labellers wait for it with what they have made.
+/// `run` ends with a clear message, and continues when there is space. Labellers keep their results until then.
 #[test]
 fn a_full_disk_ends_a_run_and_loses_nothing() {
     let disk = Disk::new(256);
@@ -79,7 +79,7 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
         let mut run = disk.run();
         wait_until("the campaign advances", || Counters::of(".", &disk.at).sent > before.sent);
         std::thread::sleep(Duration::from_millis(random(full) % 200));
-        // It must not be over before the disk is full.
+        // The campaign must not end before the disk is full.
         let held = pause_walkers(&disk.at, 2);
         before = Counters::of(".", &disk.at);
         disk.fill();
@@ -89,7 +89,7 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
         let words =
             "the disk is full: nothing was written, and earlier commits are safe; free space and start again";
         assert!(said.contains(words), "{said}");
-        // Nor does one begin.
+        // A new `run` does not start either.
         assert_eq!(disk.run().0.wait().unwrap().code(), Some(1));
         let said = disk.said();
         assert!(said.contains("the disk is full"), "{said}");
@@ -102,7 +102,7 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
     assert_no_leftovers(&disk.at);
 }
 
-/// What a campaign needs of it is reserved when it begins.
+/// A campaign reserves the shared memory that it needs when it starts.
 #[test]
 fn shared_memory_that_others_fill_does_no_harm() {
     let directory = tempfile::tempdir().unwrap();
@@ -120,14 +120,14 @@ fn shared_memory_that_others_fill_does_no_harm() {
     let starter = ["nsenter".into(), format!("--mount={namespace}"), format!("--wd={}", here.display())];
     let said = here.join("said");
     let mut run = started(through(&starter, here).args(RUN), &said);
-    wait_until("walkers are at work", || Counters::of(".", here).sent > 0);
+    wait_until("walkers are running", || Counters::of(".", here).sent > 0);
     let held = pause_walkers(here, 2);
     must(&format!("{inside} sh -c '! dd if=/dev/zero of=/dev/shm/filler bs=64k'"));
-    // Those that are started now find it full.
+    // Walkers started from now on find it full.
     signal(held[0], "KILL");
     resume_processes(&held);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
-    wait_until("every process is gone", || processes_in(here).is_empty());
+    wait_until("all processes have exited", || processes_in(here).is_empty());
     must(&format!("{inside} sh -c 'rm /dev/shm/filler && ! ls /dev/shm | grep ^cw-'"));
     assert_eq!(outcome(here), uninterrupted_outcome(&small()));
 }

@@ -1,5 +1,5 @@
-//! The link between an orchestrator and an agent breaks, as programs on two hosts see it. The agent has one walker and may be
-//! one assignment ahead, so its walker goes on for an assignment or two without the link, and then waits.
+//! The link between an orchestrator and an agent breaks, as programs on two hosts see it. The agent has one walker and may
+//! prefetch one assignment, so its walker works for one or two assignments without the link, and then waits.
 
 use std::path::Path;
 use std::thread::sleep;
@@ -12,7 +12,7 @@ use crate::common::campaign::{Counters, Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
 use crate::common::processes::{pause_walkers, processes_running, resume_processes, wait_until};
 
-/// Three walks side by side: one for the orchestrator's own walker, two for the agent.
+/// Three concurrent walks: one for the orchestrator's own walker, two for the agent.
 fn small() -> Small {
     Small {
         walks_per_round: 3,
@@ -32,7 +32,8 @@ struct Linked {
 }
 
 impl Linked {
-    /// Both are at work. An agent is taken for dead after `heartbeat_timeout`, and gives up after `patience` (min).
+    /// Starts both hosts. The server declares an agent dead after `heartbeat_timeout` (s), and the agent gives up after
+    /// `patience` (min).
     fn new(heartbeat_timeout: f64, patience: f64) -> Self {
         let linked = Self::with_cable(Cable::new(), heartbeat_timeout, patience);
         linked.are_at_work();
@@ -55,9 +56,9 @@ impl Linked {
     }
 
     fn are_at_work(&self) {
-        // It does not end the campaign before the other host has joined.
+        // The orchestrator's walker must not end the campaign before the other host has joined.
         let held = pause_walkers(self.hosts.home.path(), 1);
-        wait_until("the other host is at work", || {
+        wait_until("the other host is running", || {
             !processes_running(self.hosts.others[0].path(), "walker").is_empty()
         });
         resume_processes(&held);
@@ -76,13 +77,13 @@ impl Linked {
         self.hosts.orchestrator_stderr().contains(words)
     }
 
-    /// The agent's walker has nothing to do any more.
+    /// Waits until the agent's walker is idle.
     fn walker_waits(&self) {
         let said = "unsent reports, 1 of 1 walkers idle";
         wait_until("the agent's walker waits", || self.agent_says(said));
     }
 
-    /// Waits for the end, at which the counters are at least these; returns the exit code of the agent.
+    /// Waits for the end, and checks that no counter has decreased. Returns the exit code of the agent.
     fn ends_as(mut self, expected: &Outcome, before: Counters) -> (Option<i32>, Hosts) {
         let ended = self.orchestrator.0.wait().unwrap();
         assert_eq!(ended.code(), Some(0), "{}", self.hosts.orchestrator_stderr());
@@ -100,7 +101,7 @@ fn certify(directory: &Path) {
     must(&format!("sh {script} {} {HEAD} {NODE}", directory.display()));
 }
 
-/// Nobody is taken for dead: what the walker finds meanwhile is delivered, and it goes on.
+/// The server declares no agent dead: the walker delivers what it found during the cut, and continues.
 #[test]
 fn cut_for_five_seconds() {
     let linked = Linked::new(60.0, 60.0);
@@ -117,8 +118,8 @@ fn cut_for_five_seconds() {
     );
 }
 
-/// Longer than the limit: the orchestrator's own walker gets the walks. The host that comes back joins anew; of what it
-/// brings nothing counts that somebody else has in hand or has done.
+/// Longer than the heartbeat timeout: the server reassigns the walks to the orchestrator's own walker. The host joins again
+/// after the cut; the server discards its results for walks that were reassigned or finished.
 #[test]
 fn cut_for_a_minute() {
     let linked = Linked::new(15.0, 60.0);
@@ -126,21 +127,23 @@ fn cut_for_a_minute() {
     linked.cable.cut();
     let begun = Instant::now();
     linked.walker_waits();
-    wait_until("the walks are handed on", || linked.head_says("its walks go to other walkers"));
+    wait_until("the walks are reassigned", || linked.head_says("its walks go to other walkers"));
     let handed_on = linked.counters();
-    wait_until("they go on elsewhere", || linked.counters().sent > handed_on.sent);
-    // So that there is something left to do for the host that comes back.
+    wait_until("another walker continues the walks", || linked.counters().sent > handed_on.sent);
+    // Keep work for the host until it is back.
     let held = pause_walkers(linked.hosts.home.path(), 1);
     sleep(Duration::from_secs(60).saturating_sub(begun.elapsed()));
     linked.cable.mend();
     wait_until("the agent is back", || linked.agent_says("the orchestrator answers again"));
-    wait_until("it joins anew", || linked.hosts.orchestrator_stderr().matches("): joined").count() >= 2);
+    wait_until("the agent joins again", || {
+        linked.hosts.orchestrator_stderr().matches("): joined").count() >= 2
+    });
     resume_processes(&held);
     let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
 }
 
-/// The campaign ends without the host, and the agent gives up.
+/// The campaign ends without the second host, and its agent gives up.
 #[test]
 fn cut_for_good() {
     let linked = Linked::new(2.0, 0.3);
@@ -158,7 +161,7 @@ fn cut_for_good() {
     );
 }
 
-/// What one side says is lost, then what the other says: each time both notice, and go on where they were.
+/// The link drops messages in one direction, then in the other: each time both sides notice it, and then resume.
 #[test]
 fn one_way() {
     let linked = Linked::new(300.0, 60.0);
@@ -182,7 +185,7 @@ fn one_way() {
     );
 }
 
-/// One packet in five is lost, in both directions and from the first on: the walkers wait more, that is all.
+/// The link drops one packet in five, in both directions and from the start: the walkers only wait longer.
 #[test]
 fn a_fifth_is_lost() {
     let cable = Cable::new();

@@ -1,7 +1,8 @@
-//! What goes wrong on real machines: links between hosts, full disks, wrong clocks, labellers that sleep.
+//! Faults of real machines: broken links between hosts, full disks, wrong clocks, a killed orchestrator.
 //!
-//! `cargo test --test external -- faults:: --skip postgres_faults::`, as root, where namespaces may be made (a container needs the capabilities `SYS_ADMIN` and
-//! `NET_ADMIN`), with iproute2, nftables, libfaketime, openssl and util-linux. A test fails that lacks what it needs.
+//! `cargo test --test external -- faults:: --skip postgres_faults::` needs root, permission to create namespaces (in a
+//! container, the capabilities `SYS_ADMIN` and `NET_ADMIN`), and iproute2, nftables, libfaketime, openssl and util-linux. A
+//! test fails if a requirement is missing.
 
 mod cable;
 mod clocks;
@@ -11,7 +12,7 @@ mod model;
 
 use std::process::Command;
 
-/// Runs a command of the system, which must succeed.
+/// Runs a shell command, which must succeed.
 fn must(command: &str) {
     let output = Command::new("sh").args(["-c", command]).output().expect("a shell");
     assert!(

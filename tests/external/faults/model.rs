@@ -1,4 +1,4 @@
-//! An agent on a host that does not see the orchestrator's model fetches it, and the orchestrator is killed meanwhile.
+//! An agent whose host does not have the orchestrator's model downloads it. The orchestrator is killed during the download.
 
 use std::fs;
 use std::time::Duration;
@@ -9,14 +9,14 @@ use crate::common::delay_proxy::DelayProxy;
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
 use crate::common::processes::{pause_walkers, processes_running, resume_processes, signal, wait_until};
 
-/// Long enough to kill somebody while a question is on its way.
+/// Long enough to kill the orchestrator while a request is in transit.
 const DELAY: Duration = Duration::from_secs(1);
 
 #[test]
 fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let small = Small::default();
     let mut hosts = Hosts::new(&small, 1, "agent_heartbeat_timeout = \"30s\"");
-    // The agent has another file system where the model is.
+    // The agent's host has an empty file system in place of the model's directory.
     let models = hosts.home.path().join("models");
     fs::create_dir(&models).unwrap();
     let (path, model) = (hosts.home.path().join("campaign.toml"), config("data/al_eam_1l/kokkos.npz"));
@@ -30,7 +30,7 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), DELAY);
     hosts.endpoints[1] = format!("tcp/{}", proxy.address);
 
-    // So that there is something left to do for the host that comes, and comes back.
+    // Keep work for the agent until it has joined, and joined again.
     let hold = || pause_walkers(hosts.home.path(), 1);
     let mut orchestrator = hosts.start_orchestrator();
     hold();
@@ -38,7 +38,7 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     wait_until("the agent asks for the model", || hosts.said(0).contains("downloading the model"));
     signal(orchestrator.0.id(), "KILL");
     orchestrator.0.wait().unwrap();
-    wait_until("its walker is gone", || processes_running(hosts.home.path(), "walker").is_empty());
+    wait_until("its walker has exited", || processes_running(hosts.home.path(), "walker").is_empty());
     let mut orchestrator = hosts.start_orchestrator();
     let held = hold();
     wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walker,"));

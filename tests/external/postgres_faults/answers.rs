@@ -1,4 +1,4 @@
-//! A line to the server on which answers to commits get lost: they are made, and whoever asked for them never hears of it.
+//! A connection to the server that loses replies to commits: the server commits, but the client never gets the reply.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -15,10 +15,10 @@ use crate::common::label_campaign::{LabelCampaign, on_store, queue};
 use crate::common::processes::wait_until;
 use crate::common::random;
 
-/// Of a hundred answers to commits so many get lost.
+/// Percentage of replies to commits that are lost.
 const LOST: u64 = 12;
 
-/// Where the line begins, and what it has done.
+/// The proxy's address, and its counters.
 struct LossyLine {
     here: String,
     commits: Arc<AtomicU64>,
@@ -38,7 +38,7 @@ impl LossyLine {
                 let (from, to) = (near.try_clone().unwrap(), far.try_clone().unwrap());
                 let (commits, lost, asked) = (Arc::clone(&commits), Arc::clone(&lost), Arc::clone(&breaks));
                 thread::spawn(move || {
-                    // Whoever has broken the line is the one or the other.
+                    // An error here means that either end has closed the connection.
                     let _ = questions(&from, &to, &asked, &commits, &lost);
                     close(&from, &to);
                 });
@@ -59,7 +59,7 @@ fn close(one: &TcpStream, other: &TcpStream) {
     }
 }
 
-/// What goes to the server: a message that begins a connection, then messages of a letter, a length and their content.
+/// Forwards the client's messages: a startup message, then messages of a type byte, a length and content.
 fn questions(
     mut from: &TcpStream,
     mut to: &TcpStream,
@@ -85,7 +85,7 @@ fn questions(
     }
 }
 
-/// The message that begins with this letter, if it has one, and the length of the rest with itself.
+/// Reads the rest of a message whose header (an optional type byte, and the length, which counts itself) is given.
 fn with_content(mut from: &TcpStream, mut message: Vec<u8>) -> io::Result<Vec<u8>> {
     let begin = message.len();
     let length = u32::from_be_bytes(message[begin - 4..].try_into().unwrap()) as usize;
@@ -94,7 +94,7 @@ fn with_content(mut from: &TcpStream, mut message: Vec<u8>) -> io::Result<Vec<u8
     Ok(message)
 }
 
-/// What comes back, until an answer is not to come through: then the server has made the commit, and the line breaks.
+/// Forwards the server's replies until one is to be lost: then the server has committed, and the connection breaks.
 fn answers(mut from: &TcpStream, mut to: &TcpStream, breaks: &AtomicBool) -> io::Result<()> {
     let mut buffer = vec![0; 1 << 16];
     loop {
@@ -106,7 +106,7 @@ fn answers(mut from: &TcpStream, mut to: &TcpStream, breaks: &AtomicBool) -> io:
     }
 }
 
-/// Aluminium, fcc, of four atoms.
+/// An fcc aluminium cell of four atoms.
 fn small(number: u64) -> Structure {
     let a = 4.0 + 1e-3 * number as f64;
     let half = 0.5 * a;
@@ -118,7 +118,7 @@ fn small(number: u64) -> Structure {
     }
 }
 
-/// Labellers lose answers when they take jobs, bring labels, and say that they live; each job gets one label, and none hangs.
+/// Labellers lose replies when they lease jobs, deliver labels and send heartbeats; each job gets one label, and none hangs.
 #[test]
 fn answers_to_commits_get_lost_and_no_job_does() {
     const JOBS: u64 = 47;

@@ -1,4 +1,4 @@
-//! Labellers on other hosts whose clocks are wrong by an hour, or jump: leases go by the server's clock.
+//! Labellers on other hosts whose clocks are wrong by an hour, or jump: only the server's clock decides about leases.
 
 use std::fs;
 use std::thread::sleep;
@@ -12,8 +12,7 @@ use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::{processes_running, signal, wait_until};
 use crate::common::{random, through};
 
-/// `calmwalk label` with this clock on another host, as far as one can show it: with process numbers of its own, and
-/// another boot.
+/// `calmwalk label` with this clock on a simulated other host, which has its own process ids and its own boot id.
 fn label(place: &LabelCampaign, clock: &Clock) -> Running {
     let boot = place.path().join("boot_id");
     fs::write(&boot, "11111111-2222-3333-4444-555555555555\n").unwrap();
@@ -32,7 +31,7 @@ fn clocks(place: &LabelCampaign) -> [Clock; 2] {
     })
 }
 
-/// Every label is made by one of two whose clocks are never the same, nor that of the server.
+/// Two labellers make all labels. Their clocks differ from each other and from the server's.
 #[test]
 fn labellers_with_wrong_clocks_label_everything_once() {
     let small = Small { steps: 1600, max_per_walk: 12, ..Small::default() };
@@ -62,7 +61,8 @@ fn labellers_with_wrong_clocks_label_everything_once() {
     assert_eq!(outcome_at(place.argument(), place.path()), uninterrupted_outcome(&small));
 }
 
-/// One an hour behind has a structure in hand, and does not get on for some seconds; one an hour ahead looks for work.
+/// A labeller whose clock is an hour behind holds a lease and is paused for some seconds; one whose clock is an hour ahead
+/// looks for jobs.
 #[test]
 fn a_lease_lasts_however_late_others_think_it_is() {
     let small = Small { steps: 60, ..Small::default() };
@@ -74,8 +74,8 @@ fn a_lease_lasts_however_late_others_think_it_is() {
     let slot = place.pause_labeller();
     assert_eq!(place.jobs("leased"), 1, "it was stopped too late: {}", place.said());
     let mut second = label(&place, &ahead);
-    wait_until("another looks", || processes_running(place.path(), "labeller").len() == 2);
-    // Some looks at the queue.
+    wait_until("another labeller is running", || processes_running(place.path(), "labeller").len() == 2);
+    // Long enough for the second labeller to poll the queue several times.
     sleep(Duration::from_secs(8));
     signal(slot, "CONT");
     for label in [&mut first, &mut second] {

@@ -9,7 +9,7 @@ use crate::common::hosts::uninterrupted_outcome;
 use crate::common::processes::{processes_running, signal};
 use crate::common::{Running, kills, random};
 
-/// A campaign with two agents, in which everybody is killed sooner or later and started again.
+/// A campaign with two agents, whose processes are killed and restarted.
 struct Killed {
     campaign: Campaign,
     orchestrator: Running,
@@ -24,7 +24,7 @@ impl Killed {
         Self { campaign, orchestrator, agents }
     }
 
-    /// Kills one process, or the orchestrator in its place if there is none of that kind.
+    /// Kills one process; the orchestrator if there is no process of the chosen kind.
     fn kill(&self, choice: u64) {
         let which = |mut pids: Vec<u32>| match pids.len() {
             0 => self.orchestrator.0.id(),
@@ -44,7 +44,7 @@ impl Killed {
         );
     }
 
-    /// Starts whoever was killed; whether the campaign is over.
+    /// Restarts the processes that were killed. Returns whether the campaign has ended.
     fn start_again(&mut self) -> bool {
         match self.orchestrator.0.try_wait().unwrap().map(|ended| ended.code()) {
             Some(Some(code)) => {
@@ -65,12 +65,12 @@ impl Killed {
         false
     }
 
-    /// Waits until the campaign is over and its agents have left.
+    /// Waits for the end of the campaign and of its agents.
     fn end(mut self) -> Outcome {
         while !self.start_again() {
             sleep(Duration::from_millis(20));
         }
-        // One that came late to a campaign that was over waits for the next run of it.
+        // An agent that joins after the end waits for the next run of the campaign.
         for (host, agent) in self.agents.iter_mut().enumerate() {
             signal(agent.0.id(), "TERM");
             let ended = agent.0.wait().unwrap();
@@ -84,21 +84,21 @@ impl Killed {
     }
 }
 
-/// So many kills, some in each campaign; hands each outcome to `check`.
+/// Runs campaigns with some kills in each, [`kills`] in total, and passes each outcome to `check`.
 fn killed(small: &Small, name: &str, check: impl Fn(&Outcome)) {
     let (mut done, mut campaigns) = (0, 0);
     while done < kills() {
         campaigns += 1;
         let mut killed = Killed::new(small, name);
         while done < kills() {
-            // Another instant in each campaign: one that is over before it must not be tried again for ever.
+            // Use other times in each campaign: otherwise a campaign that ends before its first kill would repeat endlessly.
             sleep(Duration::from_millis(random(done + 10_000 * campaigns) % 1500));
             if killed.start_again() {
                 break;
             }
             killed.kill(random(9000 + done));
             done += 1;
-            // Of a process that was killed there may be a moment's delay until it is seen to be so.
+            // The exit of a killed process is not visible immediately.
             sleep(Duration::from_millis(5));
         }
         check(&killed.end());
@@ -112,7 +112,7 @@ fn kills_change_nothing_in_a_reproducible_campaign() {
     killed(&small, "kills", |outcome| assert_eq!(outcome, &expected));
 }
 
-/// What is decided depends on who is first; [`Campaign::outcome`] checks the books.
+/// The decisions depend on the order of reports; [`Campaign::outcome`] checks that they are consistent.
 #[test]
 fn kills_lose_and_double_nothing_in_a_live_campaign() {
     killed(&Small { mode: "live", ..Small::default() }, "live", |_| ());

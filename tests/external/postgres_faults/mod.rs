@@ -1,5 +1,5 @@
-//! A campaign whose database is on a PostgreSQL server, on three hosts as far as one can show them: the server is restarted,
-//! or away for a minute, and processes are killed. One test after the other, since they share the server.
+//! A campaign on three simulated hosts with its database on a PostgreSQL server: the server is restarted or down for a
+//! minute, and processes are killed. The tests share the server, so they run one after the other.
 //!
 //! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test external postgres_faults:: -- --test-threads 1`, and with
 //! `CALMWALK_KILLS=200` for the long version of the kills. Tests restart, stop and start the server with

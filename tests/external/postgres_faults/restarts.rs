@@ -1,4 +1,4 @@
-//! The server is restarted, or away for longer.
+//! The server is restarted, or down for longer.
 
 use std::thread::sleep;
 use std::time::Duration;
@@ -9,12 +9,12 @@ use crate::common::hosts::uninterrupted_outcome;
 use crate::common::processes::{processes_running, signal, wait_for_process, wait_until};
 use crate::common::random;
 
-/// Some 20 s of work for two walkers.
+/// About 20 s of work for two walkers.
 fn long() -> Small {
     Small { steps: 1600, max_per_walk: 16, ..Small::default() }
 }
 
-/// In order and after crashes, while walkers and labellers are at work here and on another host.
+/// Restarts the server in order and after crashes, while walkers and labellers work on two hosts.
 #[test]
 fn restarts_change_nothing() {
     let small = long();
@@ -24,7 +24,7 @@ fn restarts_change_nothing() {
     wait_until("labels are made", || campaign.counters().labels > 0);
     let mut before = campaign.counters();
     for restart in 0..4 {
-        // Either of them: a labeller may wait longer for its next try than the walks have left.
+        // Either counter: the walks may end before a labeller tries again.
         wait_until("the campaign advances", || {
             let now = campaign.counters();
             now.sent > before.sent || now.labels > before.labels
@@ -41,7 +41,7 @@ fn restarts_change_nothing() {
     assert_eq!(campaign.outcome(), expected);
 }
 
-/// The same with everything in one process, which is several times faster.
+/// The same in a single process, which is several times faster.
 #[test]
 fn restarts_change_nothing_in_one_process() {
     let small = Small { steps: 4000, max_per_walk: 40, ..Small::default() };
@@ -69,7 +69,8 @@ fn restarts_change_nothing_in_one_process() {
     assert_eq!(campaign.outcome(), expected);
 }
 
-/// Longer than anybody may be silent. A labeller that dies meanwhile is replaced by one that waits, too.
+/// The server is down for longer than the heartbeat timeouts. A labeller that dies during this time is replaced by one that
+/// also waits.
 #[test]
 fn a_server_that_is_away_for_a_minute_is_waited_for() {
     let small = long();
@@ -80,19 +81,19 @@ fn a_server_that_is_away_for_a_minute_is_waited_for() {
     let before = campaign.counters();
     control("halt");
     let said = |words: &str| campaign.hosts.orchestrator_stderr().contains(words);
-    wait_until("it says why it waits", || {
+    wait_until("the orchestrator reports why it waits", || {
         said("waiting for the database: the database server does not answer")
     });
     let labeller = wait_for_process(campaign.home(), "labeller");
     signal(labeller, "KILL");
-    wait_until("another is there", || {
+    wait_until("another labeller is running", || {
         processes_running(campaign.home(), "labeller").first().is_some_and(|other| *other != labeller)
     });
     sleep(Duration::from_secs(60));
     assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.orchestrator_stderr());
     assert!(agent.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.said(0));
     control("resume");
-    wait_until("it says that it goes on", || said("the database answers again"));
+    wait_until("the orchestrator reports that the database answers", || said("the database answers again"));
     let after = campaign.counters();
     assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.orchestrator_stderr());

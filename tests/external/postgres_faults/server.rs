@@ -1,4 +1,4 @@
-//! The server, and campaigns on it.
+//! The PostgreSQL server, and campaigns stored on it.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +8,7 @@ use crate::common::campaign::{Counters, Outcome, Small, outcome_at};
 use crate::common::hosts::Hosts;
 use crate::common::processes::assert_no_leftovers;
 
-/// Does something to the server: `restart` in order, or after a `crash`; `halt` and `resume` it.
+/// Controls the server: `restart` in order, `crash` and restart, `halt`, `resume`.
 pub fn control(action: &str) {
     let command = std::env::var("CALMWALK_POSTGRES_CONTROL")
         .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/.ci/postgres").into());
@@ -23,14 +23,14 @@ pub fn location(name: &str) -> String {
     format!("{server}?schema=faults_{name}_{}_{}", std::process::id(), store::unix_milliseconds())
 }
 
-/// A campaign there, with `others` hosts besides the orchestrator's.
+/// A campaign stored on the server, with `others` hosts besides the orchestrator's.
 pub struct Campaign {
     pub hosts: Hosts,
     pub location: String,
 }
 
 impl Campaign {
-    /// With these keys in the section `[run]` besides.
+    /// Adds keys to the section `[run]`.
     pub fn new(small: &Small, name: &str, others: usize, keys: &str) -> Self {
         let location = location(name);
         let keys = format!("store = \"{location}\"\n{keys}");
@@ -45,7 +45,7 @@ impl Campaign {
         Counters::of(&self.location, self.home())
     }
 
-    /// Checks that nothing is lost or doubled, and nobody left.
+    /// Checks that nothing is lost or duplicated, and that all processes have exited.
     pub fn outcome(&self) -> Outcome {
         let outcome = outcome_at(&self.location, self.home());
         fs::remove_file(self.home().join("dataset.extxyz")).expect("the exported data set");

@@ -1,4 +1,4 @@
-//! A labeller in an allocation, whose calculations are steps of it.
+//! A labeller in a Slurm allocation: its calculations are job steps.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use crate::common::processes::{calculation_processes, processes_running, signal,
 use crate::common::program;
 use crate::common::slurm::slurm;
 
-/// Submits a job in which labels are made, and which lasts until calculations may end.
+/// Submits a job that runs `calmwalk label`, and lasts until the calculations are released.
 fn submit(jobs: &Jobs) {
     let (here, home) = (jobs.place.path().canonicalize().unwrap(), jobs.home.path().display());
     let label = program(&here).get_program().display().to_string();
@@ -20,21 +20,21 @@ fn submit(jobs: &Jobs) {
     slurm(&["sbatch", "--ntasks=2", "--no-requeue", &directory, &output, &script.display().to_string()]);
 }
 
-/// The tasks of a step are not children of `srun`: who only kills that leaves them behind.
+/// The tasks of a step are not children of `srun`, so killing `srun` alone leaves them running.
 #[test]
 fn a_step_ends_with_its_runner_and_its_label_is_made_again() {
     let jobs = Jobs::calling(r#"["srun", "--ntasks=1", "--overlap", "sh", "label.sh"]"#, "");
     let scratch = jobs.home.path().canonicalize().unwrap().join("scratch");
     let run = jobs.place.run();
     submit(&jobs);
-    wait_until("a step is at work", || jobs.begun().len() == 1);
-    // Nobody is left who might tidy up.
+    wait_until("a step is running", || jobs.begun().len() == 1);
+    // Kill every process that could clean up.
     for who in ["label", "labeller", "calculation-runner"] {
         processes_running(jobs.place.path(), who).into_iter().for_each(|pid| signal(pid, "KILL"));
     }
     wait_until("the step has ended", || calculation_processes(&scratch).is_empty());
     let label = jobs.place.label(&["--wait-timeout", "2m"]);
-    wait_until("it is begun again", || jobs.begun().len() == 2);
+    wait_until("the calculation is started again", || jobs.begun().len() == 2);
     jobs.go();
     let labels = jobs.finish(run, label);
     assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());

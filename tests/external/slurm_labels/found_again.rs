@@ -1,4 +1,4 @@
-//! Who goes on finds the jobs that others have submitted.
+//! A labeller finds the jobs that earlier labellers have submitted.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -15,10 +15,10 @@ fn a_labeller_that_is_killed_is_followed_by_one_that_finds_its_job() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
     let mut label = jobs.place.label(&["--wait-timeout", "2m"]);
-    wait_until("a job is at work", || jobs.begun().len() == 1);
+    wait_until("a job is running", || jobs.begun().len() == 1);
     let name = jobs.jobs()[0][2].clone();
     jobs.kill(&mut label);
-    // As many as there are structures: none of them ends before it may.
+    // At least one slot per structure, because no job ends before it is released.
     let label = jobs.place.label(&["--concurrency", "20"]);
     let waits = || {
         jobs.attempts()
@@ -35,7 +35,7 @@ fn a_labeller_that_is_killed_is_followed_by_one_that_finds_its_job() {
     assert!(seconds > 0.0);
 }
 
-/// Its `sbatch` hangs, and goes on when the job was submitted by another already.
+/// The `sbatch` of the first labeller hangs, and submits the job after another labeller has submitted it.
 #[test]
 fn a_job_that_is_submitted_twice_calculates_once() {
     let jobs = Jobs::new();
@@ -60,12 +60,12 @@ fn a_job_that_is_submitted_twice_calculates_once() {
     jobs.kill(&mut label);
     assert!(jobs.jobs().is_empty() && jobs.begun().is_empty());
     let label = jobs.place.label(&["--concurrency", "2"]);
-    wait_until("it is submitted by another", || !jobs.begun().is_empty());
+    wait_until("another labeller has submitted the job", || !jobs.begun().is_empty());
     let first = PathBuf::from(&jobs.begun()[0]);
     jobs.go();
     let labels = jobs.finish(run, label);
-    wait_until("it is submitted late", || jobs.home.path().join("late").exists());
-    wait_until("that is over", || {
+    wait_until("the first labeller has submitted the job", || jobs.home.path().join("late").exists());
+    wait_until("all jobs have ended", || {
         jobs.jobs().iter().all(|[_, state, _]| state == "COMPLETED" || state == "FAILED")
     });
     assert_eq!(jobs.begun().len(), labels);
@@ -77,12 +77,12 @@ fn while_slurm_does_not_answer_nothing_is_concluded() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
     let label = jobs.place.label(&["--wait-timeout", "2m"]);
-    wait_until("a job is at work", || jobs.begun().len() == 1);
-    // Slurm has to have written down that it runs.
+    wait_until("a job is running", || jobs.begun().len() == 1);
+    // Wait until Slurm has saved that the job runs.
     let state = PathBuf::from(std::env::var_os("SLURM_CONF").unwrap()).with_file_name("state/job_state");
     let written = |path: &Path| fs::metadata(path).and_then(|file| file.modified()).ok();
     let begun = written(&jobs.home.path().join("begun"));
-    wait_until("Slurm has written down the job", || written(&state) > begun);
+    wait_until("Slurm has saved the job", || written(&state) > begun);
     ci("kill");
     jobs.go();
     wait_until("its label is read without Slurm", || jobs.place.jobs("labelled") == 1);

@@ -1,4 +1,4 @@
-//! Slurm has as many jobs as it may, and accepts no further ones.
+//! Slurm has reached its limit of jobs, and accepts no more.
 
 use std::fs;
 
@@ -16,7 +16,7 @@ fn labels_wait_while_slurm_accepts_no_jobs() {
     let label = jobs.place.label(&["--wait-timeout", "2m", "--log", "label.log"]);
     let log = || fs::read_to_string(jobs.place.path().join("label.log")).unwrap_or_default();
     wait_until("the labeller says why it waits", || log().contains(REFUSED));
-    // sbatch itself would still wait.
+    // A plain `sbatch` would still be waiting.
     full.wait_for_refusals(3);
     assert!(jobs.jobs().is_empty() && jobs.begun().is_empty());
     assert_eq!((jobs.place.jobs("leased"), jobs.place.jobs("failed")), (1, 0), "{}", jobs.place.said());

@@ -1,4 +1,4 @@
-//! A campaign whose labels are jobs.
+//! A campaign whose labels are made by Slurm jobs.
 
 use std::fs;
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::common::processes::{processes_in, processes_running, signal, wait_unt
 use crate::common::slurm::{ci, hold, slurm};
 use crate::common::{Running, succeed};
 
-/// Says that it has begun, and ends when it may; takes 400 MB if it is told to.
+/// Appends its directory to `begun`, and ends once `go` exists; takes 400 MB if `eat` exists.
 const SCRIPT: &str = r#"
 pwd >> $HERE/begun
 if [ -e $HERE/eat ]; then
@@ -22,10 +22,10 @@ fi
 while [ ! -e $HERE/go ]; do sleep 0.1; done
 "#;
 
-/// A campaign whose labels are jobs of their own.
+/// A campaign that submits one job per label.
 pub struct Jobs {
     pub place: LabelCampaign,
-    /// Its scratch directory is there, and what tells the script what to do.
+    /// Contains the scratch directory, and the files that control the script.
     pub home: TempDir,
     _node: MutexGuard<'static, ()>,
 }
@@ -35,13 +35,13 @@ impl Jobs {
         Self::with("", "--comment=label")
     }
 
-    /// With these keys of `[label]` besides, and this option of `sbatch`.
+    /// Adds keys to `[label]`, and an option of `sbatch`.
     pub fn with(more: &str, option: &str) -> Self {
         let keys = format!("{more}\nbatch_system = \"slurm\"\nbatch_options = [{option:?}]");
         Self::calling(r#"["sh", "label.sh"]"#, &keys)
     }
 
-    /// With this command, and these keys of `[label]`.
+    /// Uses this command, with keys in `[label]`.
     pub fn calling(command: &str, keys: &str) -> Self {
         let _node = hold();
         let home = tempfile::tempdir().unwrap();
@@ -60,39 +60,39 @@ impl Jobs {
         Self { place, home, _node }
     }
 
-    /// Has every calculation end.
+    /// Lets every calculation end.
     pub fn go(&self) {
         fs::write(self.home.path().join("go"), "").unwrap();
     }
 
-    /// Directories in which calculations have begun, one for each time.
+    /// Directories of the calculations that have started, once per start.
     pub fn begun(&self) -> Vec<String> {
         let text = fs::read_to_string(self.home.path().join("begun")).unwrap_or_default();
         text.lines().map(str::to_owned).collect()
     }
 
-    /// Number, state and name of each job that Slurm knows, the oldest first.
+    /// Id, state and name of each job that Slurm knows, oldest first.
     pub fn jobs(&self) -> Vec<[String; 3]> {
         self.told("%i|%T|%j")
     }
 
-    /// Three things of each job, in the words of `squeue --format`.
+    /// Three fields of each job, given in the format of `squeue --format`.
     pub fn told(&self, format: &str) -> Vec<[String; 3]> {
         let format = format!("--format={format}|%Z|%T%N");
         let text = slurm(&["squeue", "--noheader", "--states=all", "--sort=i", &format]);
         let scratch = self.home.path().canonicalize().unwrap();
         let job = |line: &str| {
             let [a, b, c, directory, end] = line.split('|').collect::<Vec<_>>()[..] else { panic!("{line}") };
-            // One without a node was refused when it was submitted.
+            // A failed job without a node was refused at submission.
             let ours = Path::new(directory).starts_with(&scratch) && end != "FAILED";
             ours.then(|| [a, b, c].map(str::to_owned))
         };
         text.lines().filter_map(job).collect()
     }
 
-    /// Lets the campaign come to its end, and checks that each label is there once. Returns their number.
+    /// Waits for the end of the campaign, and checks that each structure has one label. Returns the number of labels.
     pub fn finish(&self, mut run: Running, mut label: Running) -> usize {
-        wait_until("the campaign is over", || {
+        wait_until("the campaign has ended", || {
             if label.0.try_wait().unwrap().is_some() {
                 label = self.place.label(&["--concurrency", "2"]);
             }
@@ -101,11 +101,11 @@ impl Jobs {
         assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", self.place.said());
         label.0.wait().unwrap();
         outcome_at(self.place.argument(), self.place.path());
-        wait_until("nobody is left", || processes_in(self.place.path()).is_empty());
+        wait_until("all processes have exited", || processes_in(self.place.path()).is_empty());
         on_store(self.place.location(), check_single_labels)
     }
 
-    /// The queue, as `queue list` has it.
+    /// The attempts at every job, as `queue show` lists them.
     pub fn attempts(&self) -> Vec<Value> {
         let list = succeed(self.place.path(), ["queue", ".", "list", "--json"]);
         let jobs: Vec<Value> = serde_json::from_str(&list).unwrap();
@@ -118,7 +118,7 @@ impl Jobs {
         jobs.iter().flat_map(show).collect()
     }
 
-    /// Kills whoever makes labels, with no time to tidy up.
+    /// Kills all labellers, so that they cannot clean up.
     pub fn kill(&self, label: &mut Running) {
         processes_running(self.place.path(), "labeller").into_iter().for_each(|pid| signal(pid, "KILL"));
         label.0.kill().unwrap();
@@ -135,7 +135,7 @@ impl Drop for Jobs {
     }
 }
 
-/// The only attempt of this class.
+/// The only failed attempt, which must have this class.
 pub fn only(jobs: &Jobs, class: &str) -> Value {
     let attempts = jobs.attempts();
     let failed: Vec<_> = attempts.into_iter().filter(|attempt| !attempt["class"].is_null()).collect();
@@ -144,7 +144,7 @@ pub fn only(jobs: &Jobs, class: &str) -> Value {
     only.clone()
 }
 
-/// No job of a name was there twice, and no calculation begun twice; so many were.
+/// Checks the number of jobs and of calculations, and that no job name and no calculation occurs twice.
 pub fn once_each(jobs: &Jobs, expected: usize) {
     let mut names: Vec<_> = jobs.jobs().into_iter().map(|[_, _, name]| name).collect();
     let mut begun = jobs.begun();

@@ -1,4 +1,4 @@
-//! Labels as jobs of their own on a real Slurm: `SLURM_CONF=$(.ci/slurm start) cargo test --test external slurm_labels::`.
+//! Labels made by Slurm jobs on a real Slurm: `SLURM_CONF=$(.ci/slurm start) cargo test --test external slurm_labels::`.
 
 mod allocation;
 mod daemon;

@@ -1,4 +1,4 @@
-//! The labels of the check of the reference are jobs, too.
+//! The labels of the reference check are made by jobs, too.
 
 use std::fs;
 
@@ -10,10 +10,10 @@ use crate::common::processes::{signal, wait_until};
 use crate::common::slurm::slurm;
 use crate::common::{Running, write_frames};
 
-/// Number of structures of the check.
+/// Number of structures in the check.
 const KNOWN: usize = 2;
 
-/// A campaign with a check of the seed structures, whose known labels are those that jobs make.
+/// A campaign with a reference check of the seed structures, whose known labels equal those that the jobs make.
 fn checked() -> Jobs {
     let jobs = Jobs::with("reference_check = { structures = \"known.extxyz\" }", "--comment=check");
     let mut frames = atoms::read_extxyz(&jobs.place.path().join("seeds.extxyz")).unwrap();
@@ -37,12 +37,12 @@ fn state_of_orchestrator(jobs: &Jobs) -> Option<Value> {
     found.map(|process| process["state"].clone())
 }
 
-/// Whatever ends `run`: its job goes on, and the next `run` waits for it.
+/// The job outlives `run`, however it ends, and the next `run` waits for the job.
 #[test]
 fn a_run_that_is_killed_in_its_check_is_followed_by_one_that_finds_the_job() {
     let jobs = checked();
     let mut run = jobs.place.run();
-    wait_until("a job of the check is at work", || jobs.begun().len() == 1);
+    wait_until("a job of the check is running", || jobs.begun().len() == 1);
     let before = jobs.jobs();
     assert_eq!(ended_by(&mut run, "KILL"), None);
     assert_eq!(state_of_orchestrator(&jobs), Some("dead".into()));
@@ -67,9 +67,9 @@ fn a_run_that_is_killed_in_its_check_is_followed_by_one_that_finds_the_job() {
 fn a_job_of_the_check_that_slurm_cancels_is_made_again() {
     let jobs = checked();
     let run = jobs.place.run();
-    wait_until("a job of the check is at work", || jobs.begun().len() == 1);
+    wait_until("a job of the check is running", || jobs.begun().len() == 1);
     slurm(&["scancel", &jobs.jobs()[0][0]]);
-    wait_until("it is begun again", || jobs.begun().len() == 2);
+    wait_until("the calculation is started again", || jobs.begun().len() == 2);
     jobs.go();
     let label = jobs.place.label(&["--wait-timeout", "2m"]);
     let labels = jobs.finish(run, label);

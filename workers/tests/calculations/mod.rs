@@ -1,4 +1,4 @@
-//! Calculations by another program, here a shell script: run, found again, ended, archived.
+//! Calculations by an external program, here a shell script: run, resumed, ended, archived.
 
 mod failures;
 mod files;

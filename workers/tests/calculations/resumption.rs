@@ -111,7 +111,7 @@ async fn a_stopped_labeller_ends_the_calculation_after_the_grace_period_and_rele
     fixture.nothing_is_left();
 }
 
-/// With a grace period the labeller ends the calculation after it, since nobody may take it over.
+/// After the grace period the labeller ends the calculation, because no other labeller may take it over.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stopped_labeller_without_a_grace_period_leaves_the_calculation_to_the_next() {
     let fixture = Fixture::new(1, WITH_CHILDREN).await;

@@ -45,7 +45,7 @@ fn the_offset_of_one_element_is_the_mean_difference() {
 }
 
 #[test]
-fn elements_are_told_apart_by_compositions() {
+fn elements_are_distinguished_by_compositions() {
     let zeros = [(O, -432.0), (SI, -107.0)];
     let compositions: [&[(u8, u32)]; 6] = [
         &[(SI, 8)],

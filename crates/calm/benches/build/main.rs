@@ -133,7 +133,7 @@ fn median(mut values: Vec<f64>) -> f64 {
     values[values.len() / 2]
 }
 
-/// Times of a pass and of what it is compared with, round by round.
+/// Times of a pass and of its reference, round by round.
 #[derive(Default)]
 struct Pair {
     own: Vec<f64>,

@@ -1,4 +1,4 @@
-//! Files of baselines: what was written comes back; hostile files are errors.
+//! Files of baselines: a round trip preserves them, and hostile files are errors.
 
 use std::io::Cursor;
 

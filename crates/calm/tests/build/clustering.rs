@@ -113,7 +113,7 @@ fn mini_batches_come_near_lloyd_without_blobs() {
     assert!((found.candidates[0].inertia / mean - 1.0).abs() < 0.01);
 }
 
-/// The first atoms, which initialise all centroids, come from a region that does not come again.
+/// The first atoms, which initialise all centroids, come from a region that does not occur again.
 #[test]
 fn centroids_move_to_regions_that_come_late() {
     let dimension = 4;
@@ -145,7 +145,7 @@ fn the_result_depends_on_seed_and_order_but_not_on_batches() {
     let other = BuildSettings { seed: 43, ..settings.clone() };
     assert_ne!(found.candidates, clusters(&other, 3, &data, 100).candidates);
     assert_ne!(found.candidates, clusters(&settings, 4, &data, 100).candidates);
-    // A build that goes on from stored shards has the same partition.
+    // A build that continues from stored shards has the same partition.
     let all = shards(&settings, &data, 700);
     let stored: Vec<ShardClusters> = serde_json::from_slice(&serde_json::to_vec(&all).unwrap()).unwrap();
     assert_eq!(stored, all);

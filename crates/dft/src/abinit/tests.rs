@@ -170,7 +170,7 @@ fn an_output_of_something_else_is_implausible() {
 }
 
 #[test]
-fn errors_that_are_printed_are_told() {
+fn printed_errors_are_reported() {
     let directory = tempfile::tempdir().unwrap();
     let printed = "--- !ERROR\nsrc_file: m_paw.F90\nmessage: |\n    PAW SPHERES ARE OVERLAPPING!\n    Action: change\n...\n";
     std::fs::write(directory.path().join("stdout"), printed).unwrap();

@@ -165,7 +165,7 @@ fn an_output_of_something_else_is_implausible() {
 }
 
 #[test]
-fn an_abort_is_told() {
+fn an_abort_is_reported() {
     let boxed = " *   ___    *\n *  /   \\   *\n * [ABORT]   *\n *  \\___/   found an unknown keyword NDIGITS   *\n *  O/| *\n * /| |   *\n ***************\n";
     let failure = parse(&silicon(), boxed).unwrap_err();
     assert_eq!(failure.class, FailureClass::Crashed);

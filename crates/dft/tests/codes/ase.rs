@@ -171,7 +171,7 @@ fn class_of(calculator: &str) -> FailureClass {
 }
 
 #[test]
-fn what_goes_wrong_is_told() {
+fn failures_are_reported() {
     use FailureClass::*;
     let raising = |error: &str| {
         let text = "class C(EMT):\n    def calculate(self, *a, **k):\n        raise ERROR('no')\ndef calculator():\n    return C()\n";

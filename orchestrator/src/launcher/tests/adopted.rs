@@ -19,7 +19,7 @@ async fn an_adopted_process_is_watched_and_ended() {
     children.adopt(1, pid, &start_time).unwrap();
     assert!(matches!(children.adopt(1, pid, &start_time), Err(AdoptError::NotAdoptable { number: 1, .. })));
     assert!(matches!(children.adopt(2, pid, &start_time), Err(AdoptError::NotAdoptable { number: 2, .. })));
-    // The other child starts and exits meanwhile.
+    // The other child starts and exits in the meantime.
     while !matches!(next(&mut children).await, ChildEvent::Ended { number: 0, .. }) {}
     assert_eq!(children.status()[1].incarnation, 0);
     children.stop();

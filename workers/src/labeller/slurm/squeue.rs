@@ -227,7 +227,7 @@ mod tests {
             );
             let remark = forgotten.remark.unwrap();
             assert!(remark.ends_with(log.lines().last().unwrap_or("an end")), "{remark}");
-            // The shell speaks after Slurm.
+            // The shell appends its message after Slurm's.
             let ended = Traces { log: format!("{log}\nTerminated"), seconds: 7.0 };
             let forgotten = infer_end(None, &ended);
             assert_eq!(forgotten.how, EndReason::Ended(exit));

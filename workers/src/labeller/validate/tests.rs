@@ -29,7 +29,7 @@ fn offsets(good: usize, bad: &[f64]) -> EnergyOffsets {
     EnergyOffsets::fit(&energies.map(label).collect::<Vec<_>>()).unwrap()
 }
 
-/// What is said of a result with this change; nothing of one that is valid.
+/// The message about a result with this change; empty if it is valid.
 fn said(change: impl FnOnce(&mut CalculationResults), offsets: Option<&EnergyOffsets>) -> String {
     let mut made = good();
     change(&mut made);
