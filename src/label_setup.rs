@@ -8,7 +8,7 @@ use serde_json::Value;
 use store::{Protocol, Store};
 use workers::labeller::LabelBounds;
 
-use crate::config::LabelSection;
+use crate::config::{LabelSection, RunSection};
 use crate::exit_status::CommandError;
 use crate::file_hash::hash;
 use crate::label_method::{MethodConfig, REFERENCE_FILE, check_protocol};
@@ -85,6 +85,14 @@ impl LabelSetup {
         let lease = lease_timeout.get();
         Ok(Self { method, protocol, attempts, bounds, lease })
     }
+}
+
+/// `run.max_restarts` of the configuration in force.
+pub async fn read_max_restarts(store: &Store) -> Result<u32, CommandError> {
+    let text = store.campaign().await?.configuration_in_force;
+    let configuration: Value = serde_json::from_str(&text).map_err(unreadable)?;
+    let section: RunSection = serde_json::from_value(configuration["run"].clone()).map_err(unreadable)?;
+    Ok(section.max_restarts)
 }
 
 /// Limits of plausible labels, from the configuration in force.

@@ -163,7 +163,10 @@ fn with_setup(home: &Path) -> LabelCampaign {
          pseudopotentials = {scratch:?}, spin_polarized = false }} }} # ",
         scratch = home.display().to_string()
     );
-    LabelCampaign::new(&Small { walkers: 1, steps: 120, ..Small::default() }, &[("[label]\nmethod", &keys)])
+    // A labeller that cannot continue fails again each time that it is restarted.
+    let restarts = ("[run]\n", "[run]\nmax_restarts = 1\n");
+    let small = Small { walkers: 1, steps: 120, ..Small::default() };
+    LabelCampaign::new(&small, &[("[label]\nmethod", &keys), restarts])
 }
 
 #[test]

@@ -9,7 +9,7 @@ use tokio_util::sync::CancellationToken;
 use super::{CommandError, ExitStatus, block_on, campaign_location, duration_between};
 use crate::config::Config;
 use crate::duration::Duration;
-use crate::label_setup::{HostOptions, LabelSetup};
+use crate::label_setup::{HostOptions, LabelSetup, read_max_restarts};
 use crate::log::LogArgs;
 use crate::output::{log_and_print, warn_if_unencrypted};
 use crate::runtime::label_pool::{self, LabelPool};
@@ -84,6 +84,7 @@ impl LabelArgs {
                 number: self.concurrency,
                 location,
                 label_setup,
+                max_restarts: read_max_restarts(&opened).await?,
                 until_empty: self.until_empty,
                 grace_period: self.grace_period.get(),
             };

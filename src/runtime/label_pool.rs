@@ -34,6 +34,8 @@ pub struct LabelPool {
     pub location: PathBuf,
     /// How to make labels.
     pub label_setup: LabelSetup,
+    /// Restarts of a labeller that fails again and again.
+    pub max_restarts: u32,
     /// Whether the labellers exit when the queue is empty and no run is active.
     pub until_empty: bool,
     /// Time that labels in progress may take after a stop.
@@ -87,9 +89,10 @@ fn children(pool: LabelPool) -> Children {
     let limits = Limits {
         heartbeat_timeout: LABELLER_TIMEOUT,
         grace_period: pool.grace_period + RELEASE_TIME,
+        max_restarts: pool.max_restarts,
         ..Limits::default()
     };
-    let LabelPool { number, location, label_setup, until_empty, grace_period } = pool;
+    let LabelPool { number, location, label_setup, until_empty, grace_period, .. } = pool;
     let slot =
         PoolConfig { parent: std::process::id(), until_empty, grace_period: grace_period.as_secs_f64() };
     let setup = LabellerConfig::new(location, label_setup);
