@@ -31,7 +31,7 @@ fn export(directory: &Path) -> Vec<Frame> {
 /// The text of the demo with one k-point instead of 2 × 2 × 2: for tests in which the numbers of the labels do not matter.
 fn quick_demo() -> String {
     let text = demo("silicon-dft.toml");
-    let quick = text.replace("k_spacing = 0.6 ", "k_spacing = 6.0 ");
+    let quick = text.replace("k_spacing = 0.6 ", "k_spacing = 4.0 ");
     assert_ne!(quick, text);
     quick
 }
