@@ -3,6 +3,7 @@
 
 mod data;
 mod elements;
+mod features;
 mod kills;
 mod parts;
 mod projection;

@@ -38,7 +38,7 @@ impl MixtureBuild {
 
     /// Clusters the shards of this process. `None` once it was stopped.
     pub(super) fn cluster(&mut self) -> Result<Option<Clustered>, CommandError> {
-        let Self { work, settings, state, bytes } = self;
+        let Self { work, settings, state, cache, bytes } = self;
         let mut known = state.known_shards()?;
         let finished: BTreeSet<(u64, ShardHash)> = known.shards().collect();
         let hashes = Mutex::new(BTreeMap::new());
@@ -51,9 +51,9 @@ impl MixtureBuild {
             (0..elements).map(|element| ShardClustering::new(settings, shard, element).map(Some)).collect()
         };
         let counters = Counters::default();
-        let progress = PassProgress::new(1, work.part, None, *bytes, &counters);
+        let progress = PassProgress::new(1, work.shards(), None, *bytes, &counters);
         let ended = run_pass(
-            work,
+            (work, cache),
             is_finished,
             begin,
             &counters,

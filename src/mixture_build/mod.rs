@@ -6,6 +6,7 @@
 
 mod cluster_log;
 mod clustering;
+mod feature_cache;
 mod identity;
 mod merge;
 mod part;
@@ -24,6 +25,7 @@ use calm::build::{
 };
 use potentials::grace::GraceModel;
 
+use self::feature_cache::FeatureCache;
 use self::identity::Identity;
 pub use self::merge::{Merged, PartsMerge};
 pub use self::part::BuildPart;
@@ -37,6 +39,7 @@ pub struct MixtureBuild {
     work: Work,
     settings: BuildSettings,
     state: BuildState,
+    cache: FeatureCache,
     /// Total size of the data files.
     bytes: u64,
 }
@@ -59,13 +62,14 @@ impl MixtureBuild {
         ShardClustering::new(&settings, 0, 0).map_err(CommandError::input)?;
         let identity = Identity::new(model_hash, projection, settings.clone(), &work.files);
         let (state, exists) = match work.part {
-            BuildPart::WHOLE => BuildState::open(output, &identity, restart)?,
-            part => BuildState::open_part(output, &identity, part)?,
+            None => BuildState::open(output, &identity, restart)?,
+            Some(part) => BuildState::open_part(output, &identity, part)?,
         };
         if exists {
             print_stderr(format_args!("continuing from {}", state.directory().display()));
         }
-        Ok(Self { bytes: work.files.total_bytes()?, work, settings, state })
+        let cache = FeatureCache::open(state.directory(), settings.dimension, work.max_feature_bytes);
+        Ok(Self { bytes: work.files.total_bytes()?, work, settings, state, cache })
     }
 
     /// Takes the passes that are left. `None` if it was stopped; the same build then continues.

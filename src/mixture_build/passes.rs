@@ -2,8 +2,10 @@
 
 use calm::build::{BuildError, CalibrationPass, ElementHistograms, ElementSums, ScatterPass, shuffled};
 use calm::build::{ShardClustering, ShardClusters};
+use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
+use super::feature_cache::{FeatureReader, FeatureWriter};
 use super::stream::{Shard, ShardHash, TrainingStructure};
 use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
@@ -85,10 +87,55 @@ impl<P: ElementPass> Element<P> {
     }
 }
 
+/// Element indices and features of the atoms of a structure, `[n]` and `[n × D]`.
+type AtomFeatures<'a> = (Vec<usize>, &'a [f64]);
+
+/// Where the features of a shard come from.
+pub enum FeatureSource<'a> {
+    /// They are computed, and written for later passes.
+    Computed { calculator: &'a mut FeatureCalculator, writer: Option<FeatureWriter<'a>> },
+    /// They are those of an earlier pass.
+    Stored { reader: FeatureReader, model: &'a GraceModel },
+}
+
+impl FeatureSource<'_> {
+    /// The features of the next structure; `None` if stored ones cannot be read.
+    fn next(&mut self, training: &TrainingStructure) -> Result<Option<AtomFeatures<'_>>, CommandError> {
+        match self {
+            Self::Computed { calculator, writer } => {
+                let elements = calculator.compute(&training.structure);
+                let elements = elements.map_err(|error| training.place.wrong(error))?;
+                let features = calculator.grace.features();
+                if let Some(writer) = writer {
+                    writer.add(features);
+                }
+                Ok(Some((elements, features)))
+            }
+            Self::Stored { reader, model } => {
+                let elements = model.element_indices(&training.structure.species);
+                let elements = elements.map_err(|error| training.place.wrong(error))?;
+                let features = reader.next(elements.len() * model.feature_dimension());
+                Ok(features.map(|features| (elements, features)))
+            }
+        }
+    }
+
+    /// Ends the shard. Whether its features were those that were written, if they were read.
+    pub fn finish(self) -> bool {
+        match self {
+            Self::Computed { writer, .. } => {
+                writer.into_iter().for_each(FeatureWriter::finish);
+                true
+            }
+            Self::Stored { reader, .. } => reader.finish(),
+        }
+    }
+}
+
 /// Takes the structures of a shard through a pass. `passes` has that of each element, and `each` is called after each structure.
-/// `None` once `stop` is cancelled.
+/// `None` once `stop` is cancelled, or if stored features cannot be read.
 pub fn run_shard<P: ElementPass>(
-    calculator: &mut FeatureCalculator,
+    source: &mut FeatureSource<'_>,
     shard: &Shard,
     seed: u64,
     passes: Vec<Option<P>>,
@@ -103,7 +150,8 @@ pub fn run_shard<P: ElementPass>(
             return Ok(None);
         }
         let structure = &shard.structures[number];
-        add(calculator, structure, &mut elements)?;
+        let Some((indices, features)) = source.next(structure)? else { return Ok(None) };
+        add(structure, &indices, features, &mut elements)?;
         for element in elements.iter_mut().filter(|element| element.weights.len() >= BATCH_ATOMS) {
             element.flush().map_err(broken)?;
         }
@@ -118,14 +166,14 @@ pub fn run_shard<P: ElementPass>(
 }
 
 fn add<P>(
-    calculator: &mut FeatureCalculator,
     structure: &TrainingStructure,
+    indices: &[usize],
+    features: &[f64],
     elements: &mut [Element<P>],
 ) -> Result<(), CommandError> {
-    let found = calculator.compute(&structure.structure).map_err(|error| structure.place.wrong(error))?;
-    let dimension = calculator.grace.model().feature_dimension();
-    let rows = calculator.grace.features().chunks_exact(dimension);
-    for (atom, (row, index)) in rows.zip(found).enumerate() {
+    let dimension = features.len() / indices.len().max(1);
+    let rows = features.chunks_exact(dimension.max(1));
+    for (atom, (row, &index)) in rows.zip(indices).enumerate() {
         if !row.iter().map(|value| value * value).sum::<f64>().is_finite() {
             return Err(structure.place.wrong(format_args!("the features of atom {atom} are not finite")));
         }

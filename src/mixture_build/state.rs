@@ -1,7 +1,7 @@
 //! The state of a build on disk, from which it continues after any interruption.
 //!
 //! The directory `A.npz.build` beside the artifact has `build.json`, which identifies the build; the log `pass-1` of the clusters
-//! of shards; `partition`, which ends pass 1; and one file each for the running sums of passes 2 and 3. Each part of a build by
+//! of shards; `partition`, which ends pass 1; one file each for the running sums of passes 2 and 3; and those of the `feature_cache`. Each part of a build by
 //! several processes has its own files, with its name (`pass-2-3of8`), and an `end-1-3of8` when it is through pass 1. Every file but
 //! the log appears complete, by renaming; all carry checksums.
 
@@ -16,6 +16,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::cluster_log::KnownShards;
+use super::feature_cache::is_feature_file;
 use super::identity::Identity;
 use super::part::BuildPart;
 use super::stream::ShardHash;
@@ -34,7 +35,8 @@ const PAUSE: u32 = 19;
 /// The directory, which this process alone uses; or the files of a part in it.
 pub struct BuildState {
     directory: PathBuf,
-    part: BuildPart,
+    /// `None` for the whole.
+    part: Option<BuildPart>,
     _locks: Vec<File>,
     /// When it was last saved, and how long that took.
     saved: Instant,
@@ -78,7 +80,7 @@ impl BuildState {
         let directory = directory(output);
         fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
         let lock = lock(&directory.join(LOCK), output, File::try_lock)?;
-        let state = Self::new(directory, BuildPart::WHOLE, vec![lock]);
+        let state = Self::new(directory, None, vec![lock]);
         let path = state.path(IDENTITY);
         // Nothing is lost with a state without results.
         if path.exists() && !restart && state.names()?.iter().any(|name| is_result(name)) {
@@ -105,7 +107,7 @@ impl BuildState {
         fs::create_dir_all(&directory).map_err(|error| cannot_create(&directory, error))?;
         let whole = lock(&directory.join(LOCK), output, File::try_lock_shared)?;
         let own = lock(&directory.join(format!("{LOCK}-{}", part.file_name())), output, File::try_lock)?;
-        let state = Self::new(directory, part, vec![whole, own]);
+        let state = Self::new(directory, Some(part), vec![whole, own]);
         if !state.path(IDENTITY).exists() {
             if state.names()?.iter().any(|name| is_result(name)) {
                 return Err(unreadable(
@@ -136,12 +138,12 @@ impl BuildState {
             )));
         }
         let lock = lock(&directory.join(LOCK), output, File::try_lock)?;
-        let state = Self::new(directory, BuildPart::WHOLE, vec![lock]);
+        let state = Self::new(directory, None, vec![lock]);
         let identity = state.identity()?;
         Ok((state, identity))
     }
 
-    fn new(directory: PathBuf, part: BuildPart, locks: Vec<File>) -> Self {
+    fn new(directory: PathBuf, part: Option<BuildPart>, locks: Vec<File>) -> Self {
         Self { directory, part, _locks: locks, saved: Instant::now(), cost: Duration::ZERO }
     }
 
@@ -190,7 +192,7 @@ impl BuildState {
 
     /// Ends pass 1 of the part.
     pub fn save_part_end(&mut self, end: &PartEnd) -> Result<(), CommandError> {
-        self.write(&format!("{END}{}", self.part.file_name()), end)
+        self.write(&format!("{END}{}", self.part.unwrap_or(BuildPart::WHOLE).file_name()), end)
     }
 
     /// The parts that are through pass 1.
@@ -244,8 +246,8 @@ impl BuildState {
     /// The name of a file of this process.
     fn own_name(&self, name: &str) -> String {
         match self.part {
-            BuildPart::WHOLE => name.to_owned(),
-            part => format!("{name}-{}", part.file_name()),
+            None => name.to_owned(),
+            Some(part) => format!("{name}-{}", part.file_name()),
         }
     }
 
@@ -266,7 +268,9 @@ impl BuildState {
 
     /// Removes the identity first: a directory without it has no state.
     fn clear(&self) -> Result<(), CommandError> {
-        let own = |name: &String| is_result(name) || (name.starts_with('.') && name.ends_with(".part"));
+        let own = |name: &String| {
+            is_result(name) || is_feature_file(name) || (name.starts_with('.') && name.ends_with(".part"))
+        };
         let rest = self.names()?.into_iter().filter(own);
         for name in std::iter::once(IDENTITY.to_owned()).chain(rest) {
             let path = self.path(&name);

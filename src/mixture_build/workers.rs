@@ -11,8 +11,9 @@ use calm::build::BuildError;
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
+use super::feature_cache::FeatureCache;
 use super::part::BuildPart;
-use super::passes::{ElementPass, ShardResult, run_shard};
+use super::passes::{ElementPass, FeatureSource, ShardResult, run_shard};
 use super::stream::{Shard, ShardReader};
 use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
@@ -26,11 +27,20 @@ pub struct Work {
     pub model: Arc<GraceModel>,
     pub files: StructureFiles,
     pub shard_size: u64,
-    /// The shards of this process.
-    pub part: BuildPart,
+    /// The part of this process; `None` if it makes the whole build.
+    pub part: Option<BuildPart>,
     pub seed: u64,
     pub threads: usize,
+    /// Disk space for the features of shards, bytes.
+    pub max_feature_bytes: u64,
     pub stop: CancellationToken,
+}
+
+impl Work {
+    /// The shards of this process.
+    pub fn shards(&self) -> BuildPart {
+        self.part.unwrap_or(BuildPart::WHOLE)
+    }
 }
 
 /// What has been done in a pass since this process began it.
@@ -51,6 +61,7 @@ pub struct Counters {
 /// What the threads of a pass share.
 struct Shared<'a, F, B> {
     work: &'a Work,
+    cache: &'a FeatureCache,
     reader: Mutex<Option<ShardReader>>,
     is_finished: F,
     begin: B,
@@ -65,16 +76,17 @@ struct Shared<'a, F, B> {
 ///
 /// Returns the number of structures in the files; `None` after a cancellation.
 pub fn run_pass<P: ElementPass>(
-    work: &Work,
+    (work, cache): (&Work, &FeatureCache),
     is_finished: impl Fn(&Shard) -> Result<bool, CommandError> + Sync,
     begin: impl Fn(u64) -> Result<Vec<Option<P>>, BuildError> + Sync,
     counters: &Counters,
     mut receive: impl FnMut(ShardResult<P::Partial>) -> Result<(), CommandError>,
     progress: impl Fn(),
 ) -> Result<Option<u64>, CommandError> {
-    let reader = ShardReader::new(&work.files, work.shard_size, work.part, Arc::clone(&counters.bytes));
+    let reader = ShardReader::new(&work.files, work.shard_size, work.shards(), Arc::clone(&counters.bytes));
     let shared = Shared {
         work,
+        cache,
         reader: Mutex::new(Some(reader)),
         is_finished,
         begin,
@@ -125,7 +137,7 @@ impl<F, B> Shared<'_, F, B> {
         B: Fn(u64) -> Result<Vec<Option<P>>, BuildError>,
     {
         let mut calculator = FeatureCalculator::new(Arc::clone(&self.work.model));
-        let (work, computed) = (self.work, &self.counters.computed);
+        let work = self.work;
         while !work.stop.is_cancelled() {
             let shard = {
                 let mut place = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
@@ -156,19 +168,47 @@ impl<F, B> Shared<'_, F, B> {
                     return None;
                 }
             }
-            let each = || {
-                computed.fetch_add(1, Ordering::Relaxed);
-            };
-            let passes = (self.begin)(shard.index).map_err(CommandError::failed);
-            let result = passes
-                .and_then(|passes| run_shard(&mut calculator, &shard, work.seed, passes, &work.stop, each));
-            match result {
+            match self.take(&mut calculator, &shard) {
                 Ok(Some(result)) => results.send(result).ok()?,
                 Ok(None) => return None,
                 Err(failure) => self.fail(shard.index, failure),
             }
         }
         None
+    }
+
+    /// Takes a shard through the pass, with the features of an earlier pass if they are there.
+    fn take<P>(
+        &self,
+        calculator: &mut FeatureCalculator,
+        shard: &Shard,
+    ) -> Result<Option<ShardResult<P::Partial>>, CommandError>
+    where
+        P: ElementPass,
+        B: Fn(u64) -> Result<Vec<Option<P>>, BuildError>,
+    {
+        let work = self.work;
+        let run = |source: &mut FeatureSource<'_>| {
+            let passes = (self.begin)(shard.index).map_err(CommandError::failed)?;
+            let each = || {
+                self.counters.computed.fetch_add(1, Ordering::Relaxed);
+            };
+            run_shard(source, shard, work.seed, passes, &work.stop, each)
+        };
+        if let Some(reader) = self.cache.reader(shard) {
+            let mut source = FeatureSource::Stored { reader, model: &work.model };
+            let found = run(&mut source);
+            // What damaged features lead to, be it an error, does not count.
+            if source.finish() || work.stop.is_cancelled() {
+                return found;
+            }
+        }
+        let mut source = FeatureSource::Computed { calculator, writer: self.cache.writer(shard) };
+        let found = run(&mut source)?;
+        if found.is_some() {
+            source.finish();
+        }
+        Ok(found)
     }
 
     /// Hands out no more shards.

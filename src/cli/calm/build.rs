@@ -70,6 +70,10 @@ pub struct CalmBuildArgs {
     /// Threads; each takes whole shards [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
+    /// Disk space beside the output for features, GB: passes 2 and 3 read there what pass 1 computed, and compute what does not fit.
+    /// 0: nothing is kept
+    #[arg(long, value_name = "GB", default_value_t = 4.0, value_parser = gigabytes)]
+    max_feature_cache: f64,
     /// Discard the saved state and start from pass 1
     #[arg(long)]
     restart: bool,
@@ -79,6 +83,11 @@ pub struct CalmBuildArgs {
     /// The part of this process: every n-th shard, from shard i. When all parts of a pass are done, run `calmwalk calm merge`
     #[arg(long, value_name = "i/n", requires = "pass")]
     part: Option<BuildPart>,
+}
+
+fn gigabytes(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
+    number.ok_or_else(|| "expected 0 to 1e6 GB".to_owned())
 }
 
 impl CalmBuildArgs {
@@ -114,9 +123,10 @@ impl CalmBuildArgs {
             model,
             files,
             shard_size: self.shard_size,
-            part: self.part.unwrap_or(BuildPart::WHOLE),
+            part: self.part,
             seed: self.rng_seed,
             threads: self.threads.map_or(cores, usize::from),
+            max_feature_bytes: (1e9 * self.max_feature_cache) as u64,
             stop: stop_token()?,
         };
         let mut build =
