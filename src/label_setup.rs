@@ -87,12 +87,12 @@ impl LabelSetup {
     }
 }
 
-/// `run.max_restarts` of the configuration in force.
+/// `run.max_restarts` of the configuration in force, or its default where another version has written none.
 pub async fn read_max_restarts(store: &Store) -> Result<u32, CommandError> {
     let text = store.campaign().await?.configuration_in_force;
     let configuration: Value = serde_json::from_str(&text).map_err(unreadable)?;
-    let section: RunSection = serde_json::from_value(configuration["run"].clone()).map_err(unreadable)?;
-    Ok(section.max_restarts)
+    let limit = configuration["run"]["max_restarts"].as_u64().and_then(|limit| u32::try_from(limit).ok());
+    Ok(limit.unwrap_or(RunSection::default().max_restarts))
 }
 
 /// Limits of plausible labels, from the configuration in force.

@@ -325,14 +325,16 @@ fn types_that_other_files_use_have_unique_names() {
     let mut found: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for (path, text) in sources(&packages.each_ref().map(String::as_str)) {
         for line in text.lines().map(str::trim_start) {
-            let Some(item) =
-                ["pub ", "pub(crate) ", "pub(super) "].iter().find_map(|start| line.strip_prefix(start))
-            else {
+            let Some(item) = line.strip_prefix("pub").and_then(|rest| match rest.strip_prefix('(') {
+                Some(scoped) => scoped.split_once(") ").map(|(_, item)| item),
+                None => rest.strip_prefix(' '),
+            }) else {
                 continue;
             };
             let kinds = ["struct ", "enum ", "trait ", "union ", "type ", "unsafe trait "];
             if let Some(rest) = kinds.iter().find_map(|kind| item.strip_prefix(kind)) {
-                let name = rest.split(|letter: char| !letter.is_alphanumeric()).next().unwrap();
+                let name =
+                    rest.split(|letter: char| !letter.is_alphanumeric() && letter != '_').next().unwrap();
                 // A macro makes types of names that it is given.
                 if name.is_empty() {
                     continue;

@@ -1,6 +1,6 @@
 """Measures `calmwalk calm build`, features included: against `grace_uq build`, with two threads, and its memory.
 
-    python measure.py CALMWALK WORK peer|threads|memory [--model al|paper] [--frames N] [--rounds N]
+    python measure.py CALMWALK WORK peer|threads|memory [--model al|paper] [--frames N] [--rounds N] [--max-feature-cache GB]
 
 The Python has ASE and gracemaker (tensorpotential 0.6.2.1), whose programs are beside it. The models are `al`, that of
 `configs/data/al_eam_1l` (its checkpoint must be named by `--checkpoint`, a folder with `model.yaml` and `checkpoint`), and
@@ -91,9 +91,9 @@ def reference(folder, table, output):
     return [*command, "--n-workers", 1, "--threads-per-worker", 1, "--restart", "--no-export"]
 
 
-def own(calmwalk, export, text, output, threads=1, shard_size=1000):
-    command = [calmwalk, "calm", "build", "--model", export, text, "--output", output, "--restart"]
-    return [*command, "--threads", threads, "--shard-size", shard_size]
+def own(arguments, export, text, output, threads=1, shard_size=1000):
+    command = [arguments.calmwalk, "calm", "build", "--model", export, text, "--output", output, "--restart"]
+    return [*command, "--threads", threads, "--shard-size", shard_size, "--max-feature-cache", arguments.max_feature_cache]
 
 
 def start(command, work, cores):
@@ -120,7 +120,7 @@ def peer(arguments, work):
         times = {}
         for name, data in [("few", few), ("many", many)]:
             times["reference", name] = timed(reference(folder, data[1], work / "reference.npz"), work)
-            times["own", name] = timed(own(arguments.calmwalk, export, data[0], work / "own.npz"), work)
+            times["own", name] = timed(own(arguments, export, data[0], work / "own.npz"), work)
         wall, processor = (
             {who: times[who, "many"][kind] - times[who, "few"][kind] for who in ("reference", "own")} for kind in (0, 1)
         )
@@ -138,11 +138,11 @@ def threads(arguments, work):
     size, ratios = max(1, arguments.frames // 8), []
     for number in range(arguments.rounds):
         begun = time.perf_counter()
-        copies = [start(own(arguments.calmwalk, export, one, work / f"copy{core}.npz", 1, size), work, str(core)) for core in (0, 1)]
+        copies = [start(own(arguments, export, one, work / f"copy{core}.npz", 1, size), work, str(core)) for core in (0, 1)]
         if any([copy.wait() for copy in copies]):
             sys.exit(f"a build failed: see {work / 'log.txt'}")
         copies = time.perf_counter() - begun
-        together, _ = timed(own(arguments.calmwalk, export, two, work / "two.npz", 2, size), work, cores="0,1")
+        together, _ = timed(own(arguments, export, two, work / "two.npz", 2, size), work, cores="0,1")
         ratios.append(copies / together)
         print(f"round {number}: two copies {copies:.2f} s, two threads {together:.2f} s, ratio {ratios[-1]:.3f}", flush=True)
     print(f"median ratio: {statistics.median(ratios):.3f}")
@@ -152,7 +152,7 @@ def memory(arguments, work):
     _, export = model_of(arguments, work)
     for atoms in (10**5, 2 * 10**5, 10**6):
         text = frames(-(-atoms // ATOMS), work)[0]
-        command = own(arguments.calmwalk, export, text, work / "own.npz", threads=2)
+        command = own(arguments, export, text, work / "own.npz", threads=2)
         words = ["/usr/bin/time", "--format", '{"kB": %M, "wall": %e, "user": %U}', *map(str, command)]
         found = subprocess.run(words, cwd=work, capture_output=True, text=True)
         if found.returncode:
@@ -170,6 +170,7 @@ def main():
     parser.add_argument("--checkpoint", type=lambda text: Path(text).resolve(), help="folder with model.yaml and checkpoint, for al")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--max-feature-cache", type=float, default=4, help="GB; 0: features are computed in each pass")
     arguments = parser.parse_args()
     work = arguments.work.resolve() / arguments.model
     work.mkdir(parents=True, exist_ok=True)

@@ -6,10 +6,11 @@ The Python has ASE and gracemaker (tensorpotential 0.6.2.1). The pool are N stru
 `configs/data/al_eam_1l`, whose model grades them, with random strains and displacements.
 
 The reference gets a pool that was predicted before: grades and features of every atom are in the table that it reads, and neither
-the start of Python nor TensorFlow counts. calmwalk gets the bare structures, and what is timed is the whole command, the evaluation of
-the model included. What it takes to pick is the difference to a command that picks one structure at random.
+the start of Python nor imports count. calmwalk gets the bare structures, and what is timed is the whole command, the evaluation of
+the model included. What picking takes, of either, is the difference to the time for one structure at random: without reading the
+pool, and without evaluation.
 
-Prints the times of each round, the median of their ratios, and how many structures both pick.
+Prints the times of each round, the ratios of their medians, and how many structures both pick.
 """
 
 import argparse
@@ -32,6 +33,7 @@ STRATEGIES = ["calm-greedy:{}", "calm-greedy:1 fps-extrap:{}"]
 REFERENCE = r"""
 import contextlib, io, json, sys, time
 import pandas as pd
+import tensorpotential.uq.cli.select
 from tensorpotential.scripts.grace_uq import main
 artifact, strategy, output = sys.argv[1:]
 sys.argv = ["grace_uq", "select", "--artifact", artifact, "--predicted", "predicted.pkl.gz", "--output", output,
@@ -90,6 +92,11 @@ def pool(frames, calmwalk, work):
     return sum(map(len, made))
 
 
+def reference(strategy, work):
+    _, printed = run([sys.executable, "-c", REFERENCE, ARTIFACT, strategy, "picked.pkl.gz"], work)
+    return json.loads([line for line in printed.splitlines() if line.startswith("[")][-1])
+
+
 def own(calmwalk, strategy, work):
     command = [calmwalk, "select", "--model", MODEL, "--artifact", ARTIFACT, "pool.extxyz", "--output", "own.extxyz", "--threads", 1,
                "--json", "--no-element-floors", "--strategy", *strategy.replace("calm-", "").split()]
@@ -110,18 +117,20 @@ def main():
     print(f"{pool(arguments.frames, calmwalk, work)} atoms in {arguments.frames} structures")
     for strategy in STRATEGIES:
         strategy = strategy.format(arguments.picks)
-        whole, picking = [], []
+        times = {key: [] for key in ("reference", "reference picks", "own", "own picks")}
         for number in range(arguments.rounds):
-            _, printed = run([sys.executable, "-c", REFERENCE, ARTIFACT, strategy, "picked.pkl.gz"], work)
-            reference, expected = json.loads([line for line in printed.splitlines() if line.startswith("[")][-1])
+            seconds, expected = reference(strategy, work)
+            times["reference"].append(seconds)
+            times["reference picks"].append(seconds - reference("random-all:1", work)[0])
             seconds, found = own(calmwalk, strategy, work)
-            without = seconds - own(calmwalk, "random:1", work)[0]
-            whole.append(reference / seconds)
-            picking.append(reference / max(without, 1e-3))
+            times["own"].append(seconds)
+            times["own picks"].append(seconds - own(calmwalk, "random:1", work)[0])
             same = next((k for k, pair in enumerate(zip(found, expected)) if pair[0] != pair[1]), min(len(found), len(expected)))
-            print(f"{strategy}, round {number}: reference {reference:.1f} s, calmwalk {seconds:.1f} s, of these {without:.2f} s to pick; "
-                  f"{len(found)} and {len(expected)} picks, the first {same} the same", flush=True)
-        print(f"{strategy}: median ratio {statistics.median(whole):.1f}, without the evaluation {statistics.median(picking):.0f}")
+            last = ", ".join(f"{key} {values[-1]:.2f} s" for key, values in times.items())
+            print(f"{strategy}, round {number}: {last}; {len(found)} and {len(expected)} picks, the first {same} the same", flush=True)
+        median = {key: statistics.median(values) for key, values in times.items()}
+        print(f"{strategy}: ratio of whole commands {median['reference'] / median['own']:.1f}, "
+              f"of picking {median['reference picks'] / median['own picks']:.1f}")
 
 
 if __name__ == "__main__":

@@ -85,7 +85,7 @@ pub struct Validation {
     pub collisions: Vec<Collision>,
     /// What labelled structures say, if there are any.
     pub labelled: Option<LabelledReport>,
-    /// The same labelled structures under several mixtures, that of the scores first; empty if there is no other.
+    /// The same labelled structures under several mixtures, that of the scores first; empty if no other was given.
     pub mixtures: Vec<ComparedMixture>,
 }
 

@@ -33,7 +33,7 @@ pub struct RelabelArgs {
     #[command(flatten)]
     location: CampaignArgs,
     /// Structures to relabel, also those labelled by the current protocol: ids, unique prefixes of ids, or decision numbers of
-    /// candidates, import-N of imported structures
+    /// candidates, import-N of structures that calmwalk import --queue queued
     #[arg(value_name = "ID")]
     ids: Vec<String>,
     /// Relabel every structure whose label comes from another protocol than the current one

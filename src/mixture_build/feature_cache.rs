@@ -1,13 +1,13 @@
 //! The features of shards on disk, in the directory of the state: a later pass reads those that an earlier one computed.
 //!
 //! The file `features-7` has the features of the structures of shard 7 in the order in which every pass takes them, as
-//! little-endian numbers, and then a checksum of the shard's hash and these. A file that is missing, damaged or of another shard
-//! costs time only: the features are computed again, and are the same.
+//! little-endian numbers, and then a checksum of the build's identity, the shard's hash and these numbers. A file that is missing,
+//! damaged or of another shard or build costs time only: the features are computed again, and are the same.
 
 use std::fs::{self, File};
 use std::io::{self, BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use super::stream::{Shard, ShardHash};
 
@@ -26,15 +26,27 @@ pub struct FeatureCache {
     limit: u64,
     /// Size of the files that are there, or are being written.
     used: AtomicU64,
+    /// What identifies the build.
+    identity: Vec<u8>,
+    /// Whether a file could not be written, as on a full disk: then no other is begun.
+    failed: AtomicBool,
 }
 
 impl FeatureCache {
-    /// Opens the files in a directory; `limit` is the largest total size in bytes.
-    pub fn open(directory: &Path, dimension: usize, limit: u64) -> Self {
+    /// Opens the files of a build in its directory; `limit` is the largest total size in bytes. Removes those beyond it.
+    pub fn open(directory: &Path, identity: Vec<u8>, dimension: usize, limit: u64) -> Self {
         let files = fs::read_dir(directory).into_iter().flatten().flatten();
-        let own = files.filter(|file| is_feature_file(&file.file_name().to_string_lossy()));
-        let used = own.filter_map(|file| Some(file.metadata().ok()?.len())).sum();
-        Self { directory: directory.to_owned(), dimension, limit, used: AtomicU64::new(used) }
+        let mut used = 0;
+        for file in files.filter(|file| is_feature_file(&file.file_name().to_string_lossy())) {
+            let size = file.metadata().map_or(0, |found| found.len());
+            if used + size <= limit {
+                used += size;
+            } else {
+                let _ = fs::remove_file(file.path());
+            }
+        }
+        let (directory, failed) = (directory.to_owned(), AtomicBool::new(false));
+        Self { directory, dimension, limit, used: AtomicU64::new(used), identity, failed }
     }
 
     /// Reads the features of a shard, if a file of the right size is there.
@@ -42,7 +54,7 @@ impl FeatureCache {
         let file = File::open(self.path(shard.index)).ok()?;
         (file.metadata().ok()?.len() == self.size(shard)).then(|| FeatureReader {
             file: BufReader::new(file),
-            hasher: hasher(&shard.hash),
+            hasher: self.hasher(&shard.hash),
             bytes: Vec::new(),
             features: Vec::new(),
         })
@@ -51,19 +63,24 @@ impl FeatureCache {
     /// Begins to write the features of a shard. `None` if there is no room for them, or a file cannot be created.
     pub fn writer(&self, shard: &Shard) -> Option<FeatureWriter<'_>> {
         let path = self.path(shard.index);
-        // What a damaged file has taken.
-        self.release(fs::metadata(&path).map_or(0, |found| found.len()));
+        // A damaged file makes room.
+        if let Ok(found) = fs::metadata(&path)
+            && fs::remove_file(&path).is_ok()
+        {
+            self.release(found.len());
+        }
         let size = self.size(shard);
         let fits = |used: u64| used.checked_add(size).filter(|sum| *sum <= self.limit);
-        let reserved = self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_ok();
-        if !reserved {
-            let _ = fs::remove_file(&path);
+        if self.failed.load(Ordering::Relaxed)
+            || self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_err()
+        {
             return None;
         }
-        let unfinished = self.directory.join(format!(".{NAME}{}-{}.part", shard.index, std::process::id()));
+        // No two threads or parts have the same shard.
+        let unfinished = self.directory.join(format!(".{NAME}{}.part", shard.index));
         match File::create(&unfinished) {
             Ok(file) => {
-                let (file, hasher) = (BufWriter::new(file), hasher(&shard.hash));
+                let (file, hasher) = (BufWriter::new(file), self.hasher(&shard.hash));
                 Some(FeatureWriter { cache: self, path, unfinished, file, hasher, size, failed: false })
             }
             Err(_) => {
@@ -85,6 +102,12 @@ impl FeatureCache {
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |used| Some(used.saturating_sub(bytes)));
     }
 
+    fn hasher(&self, hash: &ShardHash) -> blake3::Hasher {
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(&self.identity).update(hash);
+        hasher
+    }
+
     fn path(&self, shard: u64) -> PathBuf {
         self.directory.join(format!("{NAME}{shard}"))
     }
@@ -93,12 +116,6 @@ impl FeatureCache {
 /// Whether a file of this name has features.
 pub fn is_feature_file(name: &str) -> bool {
     name.starts_with(NAME)
-}
-
-fn hasher(hash: &ShardHash) -> blake3::Hasher {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update(hash);
-    hasher
 }
 
 /// Reads a file.
@@ -124,11 +141,12 @@ impl FeatureReader {
     /// Ends the file: whether the checksum, which must be all that is left, belongs to what was read.
     pub fn finish(mut self) -> bool {
         let mut found = Vec::new();
-        self.file.read_to_end(&mut found).is_ok() && found == self.hasher.finalize().as_bytes()
+        (&mut self.file).take(CHECKSUM + 1).read_to_end(&mut found).is_ok()
+            && found == self.hasher.finalize().as_bytes()
     }
 }
 
-/// Writes a file. After an error, as of a full disk, it takes nothing more, and leaves no file.
+/// Writes a file. After an error, as of a full disk, it gives back what it has taken, and no other file is begun.
 pub struct FeatureWriter<'a> {
     cache: &'a FeatureCache,
     path: PathBuf,
@@ -147,7 +165,16 @@ impl FeatureWriter<'_> {
         }
         let bytes: Vec<u8> = features.iter().flat_map(|number| number.to_le_bytes()).collect();
         self.hasher.update(&bytes);
-        self.failed = self.file.write_all(&bytes).is_err();
+        if self.file.write_all(&bytes).is_err() {
+            self.fail();
+        }
+    }
+
+    fn fail(&mut self) {
+        self.failed = true;
+        self.cache.failed.store(true, Ordering::Relaxed);
+        // The state of the build needs the room.
+        let _ = self.file.get_ref().set_len(0);
     }
 
     /// Makes the file appear.
@@ -158,10 +185,12 @@ impl FeatureWriter<'_> {
             self.file.flush()?;
             fs::rename(&self.unfinished, &self.path)
         };
-        self.failed = self.failed || end().is_err();
         // Dropping it removes what is not finished.
         if !self.failed {
-            self.size = 0;
+            match end() {
+                Ok(()) => self.size = 0,
+                Err(_) => self.fail(),
+            }
         }
     }
 }

@@ -68,7 +68,9 @@ impl MixtureBuild {
         if exists {
             print_stderr(format_args!("continuing from {}", state.directory().display()));
         }
-        let cache = FeatureCache::open(state.directory(), settings.dimension, work.max_feature_bytes);
+        let identity = serde_json::to_vec(&identity).map_err(CommandError::failed)?;
+        let cache =
+            FeatureCache::open(state.directory(), identity, settings.dimension, work.max_feature_bytes);
         Ok(Self { bytes: work.files.total_bytes()?, work, settings, state, cache })
     }
 

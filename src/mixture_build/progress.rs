@@ -88,12 +88,12 @@ impl<'a> PassProgress<'a> {
         let mut text = format!("pass {} of 3: {shards} done", self.pass);
         if computed > 0.0 {
             let rate = computed / seconds.max(1e-9);
-            // Skipped structures take no time. Later passes compute all, and take as long as this one.
+            // Skipped structures take no time. Later passes take as long as this one, or less where they read stored features.
             let whole = seconds * (computed + skipped) / (share * computed).max(1e-9);
             let left = whole * (1.0 - share);
             text += &format!(", {rate:.1} structures/s, {} left in this pass", duration(left));
             if self.later > 0 {
-                text += &format!(", {} in all", duration(left + self.later as f64 * whole));
+                text += &format!(", at most {} in all", duration(left + self.later as f64 * whole));
             }
         }
         text

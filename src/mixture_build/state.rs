@@ -266,7 +266,7 @@ impl BuildState {
         }
     }
 
-    /// Removes the identity first: a directory without it has no state.
+    /// Removes the identity first: a directory without it has no state. (Stored features carry the identity in their checksums.)
     fn clear(&self) -> Result<(), CommandError> {
         let own = |name: &String| {
             is_result(name) || is_feature_file(name) || (name.starts_with('.') && name.ends_with(".part"))

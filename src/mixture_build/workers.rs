@@ -48,7 +48,7 @@ impl Work {
 pub struct Counters {
     /// Bytes of the files that were read.
     pub bytes: Arc<AtomicU64>,
-    /// Structures whose features were computed.
+    /// Structures whose features were computed or read.
     pub computed: AtomicU64,
     /// Structures of shards that were finished before.
     pub skipped: AtomicU64,
@@ -198,9 +198,12 @@ impl<F, B> Shared<'_, F, B> {
         if let Some(reader) = self.cache.reader(shard) {
             let mut source = FeatureSource::Stored { reader, model: &work.model };
             let found = run(&mut source);
-            // What damaged features lead to, be it an error, does not count.
-            if source.finish() || work.stop.is_cancelled() {
+            if source.finish() {
                 return found;
+            }
+            // What damaged features lead to, be it an error, does not count.
+            if work.stop.is_cancelled() {
+                return Ok(None);
             }
         }
         let mut source = FeatureSource::Computed { calculator, writer: self.cache.writer(shard) };

@@ -41,16 +41,13 @@ impl ComparedMixture {
     }
 }
 
-/// The table of several mixtures; without rows if there is one. `report` is that of any of them.
+/// The table of several mixtures. `report` is that of any of them.
 pub fn table(mixtures: &[ComparedMixture], report: &LabelledReport) -> PageTable {
     let caption = "Atoms with γ or γ_{nbr} up to 1 under several mixtures, by dimension D and components K of each element: their share of all \
                    atoms, the share of them with a force error above 0.5 eV/Å, Spearman’s ρ";
     let titles =
         ["artifact", "D", "K", "score", "kept (%)", "interval", "above 0.5 (%)", "interval", "ρ", "interval"];
     let mut table = PageTable::new("mixtures", caption, &titles);
-    if mixtures.len() < 2 {
-        return table;
-    }
     let place = report.threshold(CONTAMINATION);
     for mixture in mixtures {
         for score in &mixture.scores {

@@ -71,7 +71,7 @@ pub struct CalmBuildArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     /// Disk space beside the output for features, GB: passes 2 and 3 read there what pass 1 computed, and compute what does not fit.
-    /// 0: nothing is kept
+    /// Of a build in parts, for each process. 0: nothing is kept
     #[arg(long, value_name = "GB", default_value_t = 4.0, value_parser = gigabytes)]
     max_feature_cache: f64,
     /// Discard the saved state and start from pass 1

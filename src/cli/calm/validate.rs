@@ -16,7 +16,7 @@ use super::score::load;
 use super::scorer::Scorer;
 use super::validate_labels;
 use crate::atomic_file::refuse_to_replace;
-use crate::calm_validation::labelled::{ComparedMixture, LabelledReport};
+use crate::calm_validation::labelled::ComparedMixture;
 use crate::calm_validation::{
     self, AtomScore, EnergySpread, PAGE, Subject, Validation, ValidationProgress, ValidationSettings, both,
     labelled, verdict,
@@ -28,6 +28,9 @@ use crate::page::{create_directory, write_files};
 use crate::signals::stop_token;
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
+
+/// A mixture with its file and the model of its features.
+type NamedMixture = (String, Arc<GraceModel>, Arc<Mixture>);
 
 /// Metals up to which all pairs are mixed by default.
 const MIXED: usize = 4;
@@ -94,6 +97,7 @@ impl CalmValidateArgs {
         let settings = self.settings(&model)?;
         let spread = self.ensemble(&model)?;
         let mut compared = self.compared(&features)?;
+        let mixtures = self.mixtures(&features, &mixture)?;
         let others = compared.baselines().into_iter().chain(spread).collect();
         // Fail before the long computation.
         create_directory(&self.output)?;
@@ -104,7 +108,7 @@ impl CalmValidateArgs {
                 let mut scorer = Scorer::new(model.clone(), mixture.clone());
                 let found = validate_labels::report(input, &mut scorer, &mut compared, &stop)?;
                 let Some(report) = found else { return Ok(stopped()) };
-                let Some(mixtures) = self.mixtures(input, &mixture, &report, &stop)? else {
+                let Some(mixtures) = self.compare(input, &features, mixtures, &stop)? else {
                     return Ok(stopped());
                 };
                 (Some(report), mixtures)
@@ -145,27 +149,44 @@ impl CalmValidateArgs {
         OtherScores::load(&self.model, features, &self.baseline, ensemble)
     }
 
-    /// What the labelled structures say under each mixture. `None` if it was stopped.
+    /// The mixtures to compare, that of the scores first, with their files and the models of their features; none without
+    /// `--compare-artifact`.
     fn mixtures(
         &self,
-        input: &Path,
-        mixture: &Mixture,
-        report: &LabelledReport,
-        stop: &CancellationToken,
-    ) -> Result<Option<Vec<ComparedMixture>>, CommandError> {
-        let own = self.artifact.as_ref().unwrap_or(&self.model).display().to_string();
-        let mut mixtures = vec![ComparedMixture::new(own, mixture, report)];
+        own: &FeatureModel,
+        mixture: &Arc<Mixture>,
+    ) -> Result<Vec<NamedMixture>, CommandError> {
+        if self.compare_artifact.is_empty() {
+            return Ok(Vec::new());
+        }
+        let file = self.artifact.as_ref().unwrap_or(&self.model).display().to_string();
+        let mut mixtures = vec![(file, own.model.clone(), mixture.clone())];
         for path in &self.compare_artifact {
             let (features, artifact) = load(&self.model, Some(path))?;
-            let mixture = Arc::new(artifact.mixture);
-            let mut scorer = Scorer::new(features.model.clone(), mixture.clone());
-            let mut none = OtherScores::load(&self.model, &features, &[], &[])?;
+            mixtures.push((path.display().to_string(), features.model, Arc::new(artifact.mixture)));
+        }
+        Ok(mixtures)
+    }
+
+    /// What the labelled structures say under each mixture, γ and γ_nbr alone. `None` if it was stopped.
+    fn compare(
+        &self,
+        input: &Path,
+        features: &FeatureModel,
+        mixtures: Vec<NamedMixture>,
+        stop: &CancellationToken,
+    ) -> Result<Option<Vec<ComparedMixture>>, CommandError> {
+        let mut compared = Vec::new();
+        for (file, model, mixture) in mixtures {
+            let mut scorer = Scorer::new(model, mixture.clone());
+            // Other scores could leave atoms out.
+            let mut none = OtherScores::load(&self.model, features, &[], &[])?;
             let Some(report) = validate_labels::report(input, &mut scorer, &mut none, stop)? else {
                 return Ok(None);
             };
-            mixtures.push(ComparedMixture::new(path.display().to_string(), &mixture, &report));
+            compared.push(ComparedMixture::new(file, &mixture, &report));
         }
-        Ok(Some(mixtures))
+        Ok(Some(compared))
     }
 
     /// The spread of the energies, if there are further models.

@@ -52,7 +52,7 @@ impl Selection {
             let (name, content) = structure_named(store, id).await?;
             if !all.iter().any(|structure| structure.content == content) {
                 return Err(CommandError::Input(format!(
-                    "{name} has no label to replace: see calmwalk explain (to queue a failed or dropped structure again, \
+                    "{name} has no label that calmwalk made: see calmwalk explain (to queue a failed or dropped structure again, \
                      use calmwalk queue … retry)"
                 )));
             }

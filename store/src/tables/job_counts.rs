@@ -38,9 +38,6 @@ const COUNTED_WAITING: &str = "SELECT seed_structure, candidate.formula, candida
 const IMPORTED: &str = "SELECT CAST(coalesce(sum(number), 0) AS BIGINT) FROM job_count
     WHERE state = $1 AND seed_structure = 4294967295";
 
-/// The same, counted, for tables of an earlier version.
-const COUNTED_IMPORTED: &str = "SELECT count(*) FROM job WHERE state = $1 AND decision >= 1099511627776";
-
 pub(crate) const OLDEST_LEASE: &str = "SELECT job, holder, started FROM attempt WHERE outcome IS NULL
     ORDER BY started, job LIMIT 1";
 
@@ -95,8 +92,11 @@ impl Store {
     /// Number of jobs of imported structures in that state.
     pub async fn imported_jobs(&self, state: JobState) -> Result<u64> {
         let mut transaction = self.database.begin_read().await?;
-        let sql = if have_counts(&mut transaction).await? { IMPORTED } else { COUNTED_IMPORTED };
-        let number = query(sql).bind(state.name()).fetch_one(&mut transaction).await?;
+        // Tables of a version without counts have no such jobs.
+        let number = match have_counts(&mut transaction).await? {
+            true => query(IMPORTED).bind(state.name()).fetch_one(&mut transaction).await?,
+            false => 0,
+        };
         transaction.commit().await?;
         Ok(number)
     }

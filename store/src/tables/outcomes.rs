@@ -31,8 +31,8 @@ pub(crate) const FAILURE_CLASSES: &str = "SELECT class,
     FROM attempt CROSS JOIN job ON job.number = attempt.job
     WHERE class IS NOT NULL AND job.protocol = $1 GROUP BY class ORDER BY class";
 
-pub(crate) const UNLABELLED: &str = "SELECT CASE WHEN candidate.decision IS NULL THEN 'imported' ELSE coalesce(name, '') END AS seed_name,
-        structure.formula AS formula,
+pub(crate) const UNLABELLED: &str = "SELECT CASE WHEN seed_structure = 4294967295 THEN 'imported' ELSE coalesce(name, '') END AS seed_name,
+        formula,
         CAST(sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) AS BIGINT) AS failed,
         CAST(sum(CASE WHEN state = 'labelled' THEN 1 ELSE 0 END) AS BIGINT) AS labelled,
         min(CASE WHEN state = 'failed' THEN original_gamma END) AS gamma_low,
@@ -43,15 +43,17 @@ pub(crate) const UNLABELLED: &str = "SELECT CASE WHEN candidate.decision IS NULL
         max(CASE WHEN state = 'labelled' THEN original_gamma END) AS labelled_gamma_high,
         min(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_low,
         max(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_high
-    FROM job CROSS JOIN structure ON structure.number = job.structure
-    LEFT JOIN candidate ON candidate.decision = job.decision
-    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE job.state IN ('failed', 'labelled') AND job.protocol = $1
-    AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
-                    AND standing = 'excluded')
-    GROUP BY coalesce(candidate.seed_structure, 4294967295), candidate.decision IS NULL, name, structure.formula
+    FROM (SELECT state, coalesce(candidate.seed_structure, 4294967295) AS seed_structure,
+              coalesce(candidate.formula, (SELECT structure.formula FROM structure WHERE structure.number = job.structure)) AS formula,
+              original_gamma, relative_volume
+          FROM job LEFT JOIN candidate ON candidate.decision = job.decision
+          WHERE job.state IN ('failed', 'labelled') AND job.protocol = $1
+          AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
+                          AND standing = 'excluded')) AS finished
+    LEFT JOIN seed_structure AS seed ON seed.seed = finished.seed_structure
+    GROUP BY seed_structure, name, formula
     HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
-    ORDER BY coalesce(candidate.seed_structure, 4294967295), structure.formula";
+    ORDER BY seed_structure, formula";
 
 /// The same, without the ranges of labelled structures.
 const FAILED: &str = "SELECT CASE WHEN failure.seed_structure = 4294967295 THEN 'imported' ELSE coalesce(name, '') END AS seed_name,
