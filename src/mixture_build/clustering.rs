@@ -51,7 +51,7 @@ impl MixtureBuild {
             (0..elements).map(|element| ShardClustering::new(settings, shard, element).map(Some)).collect()
         };
         let counters = Counters::default();
-        let progress = PassProgress::new(1, work.shards(), None, *bytes, &counters);
+        let progress = PassProgress::new(1, work.part, None, *bytes, &counters);
         let ended = run_pass(
             (work, cache),
             is_finished,

@@ -35,11 +35,17 @@ pub struct PassProgress<'a> {
 }
 
 impl<'a> PassProgress<'a> {
-    /// Begins a pass. A part of the work ends with it, and has no `total`.
-    pub fn new(pass: usize, part: BuildPart, total: Option<u64>, bytes: u64, counters: &'a Counters) -> Self {
+    /// Begins a pass. A process that makes a `part` ends with it, and has no `total`.
+    pub fn new(
+        pass: usize,
+        part: Option<BuildPart>,
+        total: Option<u64>,
+        bytes: u64,
+        counters: &'a Counters,
+    ) -> Self {
         let now = Instant::now();
         let bar = Bar::new(Some(PARTS), BAR);
-        let whole = part == BuildPart::WHOLE;
+        let whole = part.is_none();
         let (later, total) = (if whole { PASSES - pass } else { 0 }, total.filter(|_| whole));
         Self { pass, later, total, bytes, counters, bar, begun: now, line: Cell::new(now) }
     }

@@ -88,7 +88,7 @@ impl MixtureBuild {
         let elements = partition.elements.len();
         sums.elements.resize(elements, None);
         let counters = Counters::default();
-        let progress = PassProgress::new(pass, work.shards(), Some(partition.structures), *bytes, &counters);
+        let progress = PassProgress::new(pass, work.part, Some(partition.structures), *bytes, &counters);
         let finished = sums.finished.clone();
         let is_finished = |shard: &Shard| {
             if partition.hashes.get(shard.index as usize) != Some(&shard.hash) {
