@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, PotentialError, Structure, StructureError, shortest_distance};
-use calm::Pair;
+use calm::{NeighbourWeights, Pair};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
 /// Shortest accepted distance, Å; the shortest bond, that of H₂, is 0.74 Å. Label programs apply the same limit.
@@ -98,13 +98,13 @@ impl FeatureCalculator {
 
     /// Directed bonds of the last structure within the pair cutoffs, to average over neighbourhoods. `elements` are those that
     /// [`Self::compute`] returned.
-    pub fn pairs(&self, structure: &Structure, elements: &[usize]) -> Vec<Pair> {
+    pub fn pairs(&self, structure: &Structure, elements: &[usize], weights: NeighbourWeights) -> Vec<Pair> {
         let (model, mut bonds, mut pairs) = (self.grace.model(), Vec::new(), Vec::new());
         for (i, centre) in elements.iter().enumerate() {
             self.neighbours.bonds_within(structure, i, model.cutoff(), &mut bonds);
             pairs.extend(bonds.iter().map(|bond| {
                 let j = bond.atom as usize;
-                Pair::new(i, j, bond.r, model.pair_cutoff(*centre, elements[j]))
+                Pair { i, j, weight: weights.weight(bond.r, model.pair_cutoff(*centre, elements[j])) }
             }));
         }
         pairs

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
+use atoms::cell::{norm, sub};
 use atoms::extxyz::Frame;
 use atoms::{Cell, Structure, read_extxyz};
 use calm::Artifact;
@@ -137,6 +138,45 @@ fn forces_have_uncertainties_and_ensembles_disagree() {
     assert!(largest(&still) < 1e-6 * largest(&moved) && largest(&moved) > 0.0, "{still:?} {moved:?}");
     assert!(column(&frames, "force_deviation").iter().all(|deviation| *deviation == 0.0));
     assert!(column(&frames, "force_deviation_nbr").iter().all(|deviation| *deviation == 0.0));
+}
+
+#[test]
+fn gamma_is_averaged_with_other_weights() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let frames = training(1);
+    write_frames(&here.join("in.extxyz"), &frames);
+    let weights = ["cosine", "uniform", "uniform:3.3", "cosine:3.3"];
+    let arguments: Vec<_> = weights.iter().flat_map(|weights| ["--gamma-nbr", weights]).collect();
+    let scored = score(here, "in.extxyz", &arguments);
+    let of = |name: &str| column(&scored, name);
+    assert_eq!(of("gamma_nbr_cosine"), of("gamma_nbr"));
+
+    // The mean over the atom and its neighbours, found by distance alone.
+    let (gamma, structure) = (of("gamma"), &frames[0].structure);
+    let distance = |a: [f64; 3], b: [f64; 3]| {
+        let nearest_image = structure.cell.fractional(sub(a, b)).map(|x| x - x.round());
+        norm(structure.cell.cartesian(nearest_image))
+    };
+    let mean = |centre: &[f64; 3]| {
+        let near =
+            structure.positions.iter().zip(&gamma).filter(|(other, _)| distance(*centre, **other) < 3.3);
+        let (number, sum) = near.fold((0.0, 0.0), |(number, sum), (_, gamma)| (number + 1.0, sum + gamma));
+        assert!(number > 8.0, "{number}");
+        sum / number
+    };
+    let expected: Vec<f64> = structure.positions.iter().map(mean).collect();
+    assert!(deviation(&of("gamma_nbr_uniform_3.3"), &expected) < 1e-9);
+    for name in ["gamma_nbr_uniform", "gamma_nbr_cosine_3.3"] {
+        assert!(deviation(&of(name), &expected) > 1e-3, "{name}");
+    }
+    let refused = |weights: &str| {
+        let start =
+            ["calm", "score", "--model", &path(MODEL), "in.extxyz", "-o", "o.extxyz", "--gamma-nbr", weights];
+        refuse(here, start)
+    };
+    assert!(refused("gauss").contains("expected cosine or uniform"));
+    assert!(refused("uniform:0").contains("radius '0': expected a positive number in Å"));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use atoms::Structure;
-use calm::{Grades, Mixture, neighbourhood_average};
+use calm::{Grades, Mixture, NeighbourWeights, neighbourhood_average};
 
 use super::{DetectionRule, Subject};
 use crate::features::FeatureCalculator;
@@ -78,7 +78,7 @@ impl ValidationGrader {
         for other in &mut self.others {
             scores.push(other.score(structure, &elements, features)?);
         }
-        let pairs = self.features.pairs(structure, &elements);
+        let pairs = self.features.pairs(structure, &elements, NeighbourWeights::default());
         let average = |score: &Vec<f64>| neighbourhood_average(score, pairs.iter().copied());
         let averages = scores.iter().map(average).collect::<Result<_, _>>();
         let energy = self.features.grace.atomic_energies().iter().sum();

@@ -39,7 +39,7 @@ pub use component::{Component, ComponentError, ComponentView, Statistics};
 pub use grade::{GradeError, Grades};
 pub use linear::{LinearError, pseudo_inverse, regularised_inverse};
 pub use mixture::{ChangedComponent, Mixture, MixtureError};
-pub use neighbourhood::{Pair, neighbourhood_average};
+pub use neighbourhood::{NeighbourWeights, Pair, neighbourhood_average};
 pub use rules::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 pub use search::{Trial, UpdateEnd, UpdateOutcome, update};
 pub use soundness::{ComponentFault, UnsoundComponent};

@@ -1,6 +1,8 @@
 //! The grade averaged over the neighbourhood of each atom.
 
 use std::f64::consts::PI;
+use std::fmt::{self, Display, Formatter};
+use std::str::FromStr;
 
 /// A directed bond from `i` to `j`, including bonds to periodic images.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -18,14 +20,60 @@ impl Pair {
     ///
     /// `distance` is r_ij and `cutoff` is r_c,ij of this pair of species, Å.
     pub fn new(i: usize, j: usize, distance: f64, cutoff: f64) -> Self {
-        let weight = if distance < cutoff { 0.5 * (1.0 + (PI * distance / cutoff).cos()) } else { 0.0 };
-        Self { i, j, weight }
+        Self { i, j, weight: NeighbourWeights::default().weight(distance, cutoff) }
     }
+}
 
-    /// The pair with weight 1 within a radius, Å, 0 at or beyond it: the uniform average over these neighbours. With the
-    /// pair's cutoff as radius, they are those of [`Pair::new`], which with a smaller radius averages over fewer.
-    pub fn uniform(i: usize, j: usize, distance: f64, radius: f64) -> Self {
-        Self { i, j, weight: f64::from(distance < radius) }
+/// How much each neighbour counts in an average. By default as in the paper's Eq. 3; the others are the variants of its
+/// Supplementary Information ("Neighbourhood-averaged extrapolation grade").
+///
+/// Its text is `cosine` or `uniform`, with an optional radius in Å: `uniform:3.2`.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct NeighbourWeights {
+    /// Whether all neighbours count 1, instead of w(r) = ½[1 + cos(π r / r_c)].
+    pub is_uniform: bool,
+    /// Replaces larger cutoffs r_c of pairs, Å.
+    pub radius: Option<f64>,
+}
+
+impl NeighbourWeights {
+    /// Weight of a neighbour, 0 to 1. `distance` is r_ij and `cutoff` is r_c,ij of this pair of species, Å.
+    pub fn weight(self, distance: f64, cutoff: f64) -> f64 {
+        let cutoff = self.radius.map_or(cutoff, |radius| radius.min(cutoff));
+        match distance < cutoff {
+            false => 0.0,
+            true if self.is_uniform => 1.0,
+            true => 0.5 * (1.0 + (PI * distance / cutoff).cos()),
+        }
+    }
+}
+
+impl Display for NeighbourWeights {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        f.write_str(if self.is_uniform { "uniform" } else { "cosine" })?;
+        self.radius.map_or(Ok(()), |radius| write!(f, ":{radius}"))
+    }
+}
+
+impl FromStr for NeighbourWeights {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (kind, radius) = text.split_once(':').map_or((text, None), |(kind, radius)| (kind, Some(radius)));
+        let is_uniform = match kind {
+            "uniform" => true,
+            "cosine" => false,
+            _ => {
+                return Err(
+                    "expected cosine or uniform, with an optional radius in Å, such as uniform:3.2".into()
+                );
+            }
+        };
+        let parse =
+            |radius: &str| radius.parse().ok().filter(|radius| *radius > 0.0 && f64::is_finite(*radius));
+        let radius = radius
+            .map(|radius| parse(radius).ok_or(format!("radius '{radius}': expected a positive number in Å")));
+        Ok(Self { is_uniform, radius: radius.transpose()? })
     }
 }
 

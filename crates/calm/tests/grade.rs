@@ -1,9 +1,12 @@
 //! σ, γ, component and γ_nbr against gracemaker; the gradient against finite differences.
 
+use std::f64::consts::PI;
 use std::path::Path;
 use std::sync::Arc;
 
-use calm::{Artifact, Component, ComponentError, Grades, Mixture, Pair, neighbourhood_average};
+use calm::{
+    Artifact, Component, ComponentError, Grades, Mixture, NeighbourWeights, Pair, neighbourhood_average,
+};
 
 use crate::common::{assert_close, data, indices, niobium, numbers, optional, peer};
 
@@ -184,11 +187,33 @@ fn a_pair_counts_by_its_cosine_weight() {
 }
 
 #[test]
-fn neighbours_within_a_radius_count_alike() {
-    let pairs =
-        [(0, 1, 2.0), (0, 0, 2.9), (0, 1, 3.0), (1, 0, 3.5)].map(|(i, j, r)| Pair::uniform(i, j, r, 3.0));
-    let averaged = neighbourhood_average(&[1.0, 4.0], pairs).unwrap();
-    assert_close("average", &averaged, &[(1.0 + 4.0 + 1.0) / 3.0, 4.0], 1e-15);
+fn weights_have_a_shape_and_a_radius() {
+    let weights = |text: &str| text.parse::<NeighbourWeights>().unwrap();
+    let distances = [2.0, 2.9, 3.0, 3.5];
+    for (text, expected) in [
+        (
+            "cosine",
+            [
+                0.5,
+                0.5 * (1.0 + (PI * 0.725).cos()),
+                0.5 * (1.0 + (PI * 0.75).cos()),
+                0.5 * (1.0 + (PI * 0.875).cos()),
+            ],
+        ),
+        ("uniform", [1.0, 1.0, 1.0, 1.0]),
+        ("uniform:3", [1.0, 1.0, 0.0, 0.0]),
+        ("cosine:2.5", [0.5 * (1.0 + (PI * 0.8).cos()), 0.0, 0.0, 0.0]),
+        // The cutoff of the pair stays the largest radius.
+        ("uniform:9", [1.0, 1.0, 1.0, 1.0]),
+    ] {
+        let found = distances.map(|r| weights(text).weight(r, 4.0));
+        assert_close(text, &found, &expected, 1e-15);
+        assert_eq!((weights(text).weight(4.0, 4.0), weights(text).to_string()), (0.0, text.to_owned()));
+    }
+    assert_eq!(weights("cosine"), NeighbourWeights::default());
+    for text in ["", "gauss", "uniform:", "uniform:0", "cosine:-1", "cosine:inf", "uniform:3 Å"] {
+        assert!(text.parse::<NeighbourWeights>().is_err(), "{text}");
+    }
 }
 
 /// Shared numbers give the same bits as owned ones and compare equal.

@@ -1,4 +1,5 @@
-//! Scores beside γ that `calmwalk calm score` writes and `calm validate` tests: those of baselines, and the disagreement of an ensemble.
+//! Scores beside γ and γ_nbr that `calmwalk calm score` writes and `calm validate` tests: those of baselines, the disagreement of an
+//! ensemble, and γ averaged with other weights.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -7,7 +8,7 @@ use analysis::{EnsembleError, force_deviation};
 use atoms::{Evaluation, Structure};
 use calm::baselines::{Baseline, BaselineError, BaselineFile};
 use calm::neighbourhood::PairError;
-use calm::neighbourhood_average;
+use calm::{NeighbourWeights, neighbourhood_average};
 use potentials::grace::{GraceModel, PullBack};
 
 use super::scorer::Scorer;
@@ -21,6 +22,8 @@ use crate::features::{FeatureCalculator, FeatureError};
 pub struct OtherScores {
     files: Vec<Scores>,
     ensemble: Vec<FeatureCalculator>,
+    /// Further averages of γ.
+    averages: Vec<NeighbourWeights>,
 }
 
 /// The baselines of one file.
@@ -73,7 +76,13 @@ impl OtherScores {
         let load =
             |path: &PathBuf| GraceModel::load(path).map(|model| FeatureCalculator::new(Arc::new(model)));
         let ensemble = ensemble.iter().map(load).collect::<Result<_, _>>().map_err(CommandError::input)?;
-        Ok(Self { files, ensemble })
+        Ok(Self { files, ensemble, averages: Vec::new() })
+    }
+
+    /// The same with γ averaged with each of these weights.
+    pub fn with_averages(mut self, averages: &[NeighbourWeights]) -> Self {
+        self.averages = averages.to_vec();
+        self
     }
 
     /// The columns of [`Self::columns`], in the same order. D-optimality has the limit 1, as γ has.
@@ -85,12 +94,12 @@ impl OtherScores {
         let columns: Vec<_> = limited.chain(deviation).collect();
         let averages = columns.iter().map(|(name, limited)| (format!("{name}_nbr"), *limited));
         let own = columns.iter().map(|(name, limited)| ((*name).to_owned(), *limited));
-        own.chain(averages)
-            .map(|(name, limited)| ScoreColumn {
-                name: name.replace('_', "-"),
-                limit: limited.then_some(1.0),
-            })
-            .collect()
+        let others = own.chain(averages).map(|(name, limited)| ScoreColumn {
+            name: name.replace('_', "-"),
+            limit: limited.then_some(1.0),
+        });
+        let averages = self.averages.iter();
+        others.chain(averages.map(|weights| ScoreColumn::grade(&format!("γ_{{nbr}} {weights}")))).collect()
     }
 
     /// The baselines as scores that `calm validate` compares γ with, named as in [`Self::score_columns`].
@@ -138,6 +147,9 @@ impl OtherScores {
             })
             .collect::<Result<_, PairError>>()?;
         columns.extend(averages);
+        for weights in &self.averages {
+            columns.push((average_name(*weights), scorer.gamma_average(structure, *weights)?));
+        }
         Ok(columns)
     }
 
@@ -155,6 +167,11 @@ impl OtherScores {
         }
         Ok(force_deviation(&forces)?)
     }
+}
+
+/// `gamma_nbr_uniform_3.2` for `uniform:3.2`.
+fn average_name(weights: NeighbourWeights) -> String {
+    format!("gamma_nbr_{}", weights.to_string().replace(':', "_"))
 }
 
 fn scores(model: &Path, graded: &FeatureModel, path: &Path) -> Result<Scores, CommandError> {

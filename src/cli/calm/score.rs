@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use atoms::FileError;
 use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, write_frame};
-use calm::Artifact;
+use calm::{Artifact, NeighbourWeights};
 use npyz::{NpyWriter, WriterBuilder};
 use potentials::grace::GraceModel;
 
@@ -67,6 +67,11 @@ pub struct CalmScoreArgs {
     /// Also write the disagreement of the forces with those of this model; may be repeated
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
+    /// Also write γ averaged over the neighbours with other weights than γ_nbr has, as gamma_nbr_uniform and so on; may be repeated.
+    /// cosine counts a neighbour by its distance, uniform counts each one fully; a radius in Å limits the neighbours within the
+    /// model's cutoff, such as uniform:3.2
+    #[arg(long, value_name = "WEIGHTS[:RADIUS]")]
+    gamma_nbr: Vec<NeighbourWeights>,
     /// Also write the statistics of labelled structures to this file, with all thresholds of the force error
     #[arg(long, value_name = "FILE.json")]
     json: Option<PathBuf>,
@@ -88,7 +93,8 @@ impl CalmScoreArgs {
             refuse_to_replace(output, inputs.into_iter().chain(artifact))?;
         }
         let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
-        let mut others = OtherScores::load(&self.model, &model, &self.baseline, &self.ensemble)?;
+        let others = OtherScores::load(&self.model, &model, &self.baseline, &self.ensemble)?;
+        let mut others = others.with_averages(&self.gamma_nbr);
         let dimension = artifact.mixture.dimension();
         let mut scorer = Scorer::new(model.model, Arc::new(artifact.mixture));
         let mut frames = XyzReader::open(&self.input).map_err(CommandError::input)?;

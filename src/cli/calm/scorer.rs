@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, Structure};
 use calm::neighbourhood::{Pair, PairError};
-use calm::{GradeError, Grades, Mixture, neighbourhood_average};
+use calm::{GradeError, Grades, Mixture, NeighbourWeights, neighbourhood_average};
 use potentials::grace::{GraceModel, PullBack};
 
 use crate::features::{FeatureCalculator, FeatureError};
@@ -63,6 +63,15 @@ impl Scorer {
         self.features.grace.features()
     }
 
+    /// The average of γ over the neighbours of the last structure with other weights than γ_nbr has, [n].
+    pub fn gamma_average(
+        &self,
+        structure: &Structure,
+        weights: NeighbourWeights,
+    ) -> Result<Vec<f64>, PairError> {
+        neighbourhood_average(&self.grades.gamma, self.features.pairs(structure, &self.elements, weights))
+    }
+
     /// Evaluates and grades `structure`; with `gradient`, also computes the gradient of Σγ.
     pub fn score(&mut self, structure: &Structure, gradient: bool) -> Result<(), ScoreError> {
         let elements = self.features.compute(structure)?;
@@ -70,7 +79,7 @@ impl Scorer {
         self.cotangent.resize(features.len(), 0.0);
         let cotangent = gradient.then_some(self.cotangent.as_mut_slice());
         self.grades.evaluate(&self.mixture, &elements, features, cotangent)?;
-        self.pairs = self.features.pairs(structure, &elements);
+        self.pairs = self.features.pairs(structure, &elements, NeighbourWeights::default());
         self.elements = elements;
         self.gamma_nbr = neighbourhood_average(&self.grades.gamma, self.pairs.iter().copied())?;
         let cotangent = gradient.then_some(self.cotangent.as_slice());

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use atoms::Species;
 use atoms::prototypes::Prototype;
-use calm::Mixture;
+use calm::{Mixture, NeighbourWeights};
 use md::Fire;
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
@@ -63,6 +63,10 @@ pub struct CalmValidateArgs {
     /// errors
     #[arg(long, value_name = "LABELLED.extxyz")]
     labelled: Option<PathBuf>,
+    /// Also judge γ averaged with these weights over the neighbours of the labelled structures, as calm score --gamma-nbr does; may be
+    /// repeated
+    #[arg(long, value_name = "WEIGHTS[:RADIUS]", requires = "labelled")]
+    gamma_nbr: Vec<NeighbourWeights>,
     /// Another mixture of the model, such as one with more components; may be repeated. A table compares what γ up to 1 keeps of the
     /// labelled structures under each mixture
     #[arg(long, value_name = "CALM.npz", requires = "labelled")]
@@ -146,7 +150,8 @@ impl CalmValidateArgs {
             refuse_to_replace(&structures, [(input.as_path(), "the file of labelled structures")])?;
             ensemble = &self.ensemble;
         }
-        OtherScores::load(&self.model, features, &self.baseline, ensemble)
+        let others = OtherScores::load(&self.model, features, &self.baseline, ensemble)?;
+        Ok(others.with_averages(&self.gamma_nbr))
     }
 
     /// The mixtures to compare, that of the scores first, with their files and the models of their features; none without
