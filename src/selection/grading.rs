@@ -1,6 +1,5 @@
 //! Reads the structures of a pool and grades their atoms, a block at a time on several threads.
 
-use std::collections::HashMap;
 use std::panic::resume_unwind;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -14,6 +13,7 @@ use tokio_util::sync::CancellationToken;
 use wire::ContentHash;
 
 use super::campaign::CampaignCandidates;
+use super::compositions::Compositions;
 use super::{GradedPool, ItemPlace, PoolItem, PoolStructure, StructureSource};
 use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
@@ -68,7 +68,6 @@ impl PoolGrading {
         let bar = Bar::new((total > 0).then_some(total), BAR);
         let mut reader = PoolReader {
             files: (!pool.files.files.is_empty()).then(|| pool.files.reader(Arc::clone(&bytes))),
-            paths: &pool.files,
             campaigns: &mut pool.campaigns,
             waiting: Vec::new(),
         };
@@ -80,9 +79,13 @@ impl PoolGrading {
             .collect();
         let dimension = self.mixture.dimension();
         let atoms = Pool::new(dimension, self.window, self.all_atoms, self.memory, self.directory.clone());
-        let mut found =
-            GradedPool { pool: atoms, structures: Vec::new(), compositions: Vec::new(), evaluated: 0 };
-        let mut compositions = HashMap::new();
+        let mut found = GradedPool {
+            pool: atoms,
+            structures: Vec::new(),
+            elements: self.model.elements().len(),
+            compositions: Compositions::default(),
+            evaluated: 0,
+        };
         loop {
             let block = reader.block(BLOCK * self.threads)?;
             if block.is_empty() {
@@ -93,7 +96,7 @@ impl PoolGrading {
             }
             let graded = self.grade(&mut workers, &block);
             for (item, graded) in block.iter().zip(graded) {
-                found.add(item, &graded?, &mut compositions, self.model.elements().len())?;
+                found.add(item, &graded?)?;
             }
             let count = found.structures.len();
             bar.set(bytes.load(Ordering::Relaxed), || output::count(count, "structure"));
@@ -156,29 +159,16 @@ impl Worker {
 }
 
 impl GradedPool {
-    fn add(
-        &mut self,
-        item: &PoolItem,
-        graded: &GradedStructure,
-        compositions: &mut HashMap<Vec<u32>, u32>,
-        elements: usize,
-    ) -> Result<(), CommandError> {
-        let GradedStructure { elements: of_atoms, slots, gamma, features, evaluated } = graded;
+    fn add(&mut self, item: &PoolItem, graded: &GradedStructure) -> Result<(), CommandError> {
+        let GradedStructure { elements, slots, gamma, features, evaluated } = graded;
         self.pool
-            .push(of_atoms, slots, gamma, features)
+            .push(elements, slots, gamma, features)
             .map_err(|error| CommandError::Failed(format!("the temporary file of the features: {error}")))?;
-        let mut composition = vec![0; elements];
-        of_atoms.iter().for_each(|element| composition[*element] += 1);
-        let known = compositions.len() as u32;
-        let number = *compositions.entry(composition.clone()).or_insert(known);
-        if number == known {
-            self.compositions.push(composition);
-        }
         self.evaluated += u64::from(*evaluated);
         self.structures.push(PoolStructure {
             source: item.source,
             hash: hash(&item.structure),
-            composition: number,
+            composition: self.compositions.number(elements),
             gamma_max: calm::grade::maximum(gamma),
         });
         Ok(())
@@ -194,7 +184,6 @@ pub(super) fn hash(structure: &atoms::Structure) -> u64 {
 /// Reads blocks of structures.
 struct PoolReader<'a> {
     files: Option<StructureReader>,
-    paths: &'a StructureFiles,
     campaigns: &'a mut Vec<CampaignCandidates>,
     /// Structures of a page that did not fit the last block, in reverse order.
     waiting: Vec<PoolItem>,
@@ -216,10 +205,8 @@ impl PoolReader<'_> {
     fn next(&mut self) -> Result<Option<PoolItem>, CommandError> {
         if let Some(reader) = &mut self.files {
             if let Some((frame, file)) = reader.next()? {
-                let number = self.paths.files.iter().position(|known| known.path == file.path);
-                let frame_index = u32::try_from(reader.frame_index()).map_err(CommandError::failed)?;
-                let source =
-                    StructureSource::File { file: number.unwrap_or_default() as u32, frame: frame_index };
+                let index = u32::try_from(reader.frame_index()).map_err(CommandError::failed)?;
+                let source = StructureSource::File { file: reader.file_index() as u32, frame: index };
                 let place = ItemPlace::Line(file.path, frame.line);
                 return Ok(Some(PoolItem { structure: frame.structure, source, features: None, place }));
             }

@@ -1,6 +1,7 @@
 //! Selection of structures for labelling from files and campaigns: reads and grades a pool, and applies strategies to it.
 
 mod campaign;
+mod compositions;
 mod grading;
 mod output;
 mod picks;
@@ -12,6 +13,7 @@ use std::sync::Arc;
 use calm::selection::Pool;
 
 pub use self::campaign::CampaignCandidates;
+use self::compositions::Compositions;
 pub use self::grading::{PoolFiles, PoolGrading};
 pub use self::output::frames;
 pub use self::picks::{Pick, Picks, Rules, pick};
@@ -21,8 +23,10 @@ pub use self::strategy::{Strategy, StrategyQuota};
 pub struct GradedPool {
     pub pool: Pool,
     pub structures: Vec<PoolStructure>,
-    /// Number of atoms of each element, by element index. Many structures share one.
-    pub compositions: Vec<Vec<u32>>,
+    /// Number of elements of the model.
+    pub elements: usize,
+    /// Many structures share one.
+    compositions: Compositions,
     /// Structures whose features were computed; those of the others were in the store of their campaign.
     pub evaluated: u64,
 }
@@ -32,6 +36,7 @@ pub struct PoolStructure {
     pub source: StructureSource,
     /// Begin of its hash: files must not change before the picked structures are read again.
     pub hash: u64,
+    /// Its number among the compositions.
     pub composition: u32,
     /// Largest γ of all its atoms.
     pub gamma_max: f64,
@@ -49,12 +54,13 @@ pub enum StructureSource {
 impl GradedPool {
     /// Number of atoms of an element in a structure.
     pub fn atoms(&self, structure: usize, element: usize) -> u64 {
-        self.compositions[self.structures[structure].composition as usize][element].into()
+        self.compositions.atoms(self.structures[structure].composition, element)
     }
 
     /// Number of atoms of a structure.
     pub fn total_atoms(&self, structure: usize) -> u64 {
-        self.compositions[self.structures[structure].composition as usize].iter().map(|n| u64::from(*n)).sum()
+        let counts = self.compositions.counts(self.structures[structure].composition);
+        counts.iter().map(|(_, atoms)| u64::from(*atoms)).sum()
     }
 }
 

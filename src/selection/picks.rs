@@ -138,9 +138,8 @@ impl GradedPool {
 fn meet_floors(pool: &GradedPool, picks: &mut Vec<Pick>, floor: u64, left: &mut Option<f64>) -> Vec<usize> {
     let may_go = |pick: &Pick| pick.strategy != Strategy::Greedy.name();
     let picked: Vec<_> = picks.iter().map(|pick| (pick.structure, may_go(pick))).collect();
-    let elements = pool.compositions.first().map_or(0, Vec::len);
     let atoms = |structure: usize, element: usize| pool.atoms(structure, element);
-    let exchanges = floors::meet(pool.structures.len(), elements, atoms, &picked, floor);
+    let exchanges = floors::meet(pool.structures.len(), pool.elements, atoms, &picked, floor);
     if !exchanges.added.is_empty() {
         *left = None;
         picks.retain(|pick| !exchanges.removed.contains(&pick.structure));

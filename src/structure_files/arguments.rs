@@ -1,5 +1,6 @@
 //! The arguments of a command that reads structures from files.
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 
 use atoms::Species;
@@ -60,7 +61,7 @@ impl StructureReadingArgs {
                 PROPERTIES.join(", ")
             )));
         }
-        let mut files: Vec<StructureFile> = Vec::new();
+        let (mut files, mut known) = (Vec::with_capacity(data.len()), HashSet::new());
         for path in data {
             check_format(path)?;
             let found = std::fs::metadata(path).map_err(|error| {
@@ -72,7 +73,7 @@ impl StructureReadingArgs {
                     path.display()
                 )));
             }
-            if files.iter().any(|file| *file.path == **path) {
+            if !known.insert(path) {
                 return Err(CommandError::Input(format!("{} is given twice", path.display())));
             }
             files.push(StructureFile { path: path.as_path().into(), weight: 1.0 });

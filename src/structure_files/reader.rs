@@ -95,6 +95,11 @@ impl StructureReader {
         }
     }
 
+    /// Index of the file of the structure that came last among the files given, from 0.
+    pub fn file_index(&self) -> usize {
+        (self.given.files.len() - self.files.len()).saturating_sub(1)
+    }
+
     /// Index of the structure that came last in its file, from 0; those that did not match the filter count.
     pub fn frame_index(&self) -> u64 {
         self.in_file.saturating_sub(1)
@@ -153,5 +158,24 @@ mod tests {
         let error = reader.next().unwrap_err();
         assert!(error.to_string().contains("broken.dump:2: "), "{error}");
         assert!(reader.next().unwrap().is_none());
+    }
+
+    #[test]
+    fn structures_have_the_index_of_their_file_and_in_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = |(name, frames): (&str, usize)| {
+            let path: Arc<Path> = directory.path().join(name).into();
+            fs::write(&path, "1\n\nAl 0 0 0\n".repeat(frames)).unwrap();
+            StructureFile { path, weight: 1.0 }
+        };
+        let files = [("a.xyz", 1), ("b.xyz", 2), ("c.xyz", 1)].map(file).to_vec();
+        let files = StructureFiles { files, filter: None, dump_elements: Vec::new() };
+        let mut reader = files.reader(Arc::default());
+        let mut found = Vec::new();
+        while let Some((_, file)) = reader.next().unwrap() {
+            assert_eq!(file.path, files.files[reader.file_index()].path);
+            found.push((reader.file_index(), reader.frame_index()));
+        }
+        assert_eq!(found, [(0, 0), (1, 0), (1, 1), (2, 0)]);
     }
 }
