@@ -200,6 +200,28 @@ fn a_grade_that_tells_errors_keeps_better_structures_than_chance() {
     assert!(!printed.contains("F1") && printed.contains("–"), "{printed}");
 }
 
+/// A table that pandas writes has `True` and `False` in columns of classes.
+#[test]
+fn classes_are_numbers_or_words() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let filter = |rows: &[&str]| -> Json {
+        fs::write(here.join("t.csv"), format!("gamma_max,pred,true\n{}\n", rows.join("\n"))).unwrap();
+        let classes = ["--predicted", "pred", "--true", "true", "--class-threshold", "0.5", "--class-above"];
+        let filter = ["calm", "filter", "t.csv", "--thresholds", "1", "--json"];
+        serde_json::from_str(&succeed(here, filter.iter().chain(&classes))).unwrap()
+    };
+    let found = filter(&["0.5,True,True", "0.8,False,True", "0.9,true,FALSE", "2,False,False"]);
+    assert_eq!(found, filter(&["0.5,1,1", "0.8,0,1", "0.9,1,0", "2,0,0"]));
+    // The mean absolute error is the share of wrong classes.
+    assert_near(&found["unfiltered"]["mean_absolute_error"], 0.5);
+    assert_near(&found["steps"][0]["mean_absolute_error"], 2.0 / 3.0);
+    assert_eq!(
+        (&found["unfiltered"]["precision"], &found["unfiltered"]["recall"]),
+        (&0.5.into(), &0.5.into())
+    );
+}
+
 #[test]
 fn hostile_tables_are_refused_with_their_place() {
     let directory = tempfile::tempdir().unwrap();

@@ -67,16 +67,20 @@ pub fn read(
     Ok((rows, left_out))
 }
 
-/// The number of a cell; `None` if it is missing.
+/// The number of a cell, 1 or 0 of a class written as true or false; `None` if it is missing.
 fn number(row: &CsvRow, title: &str, place: usize, path: &Path) -> Result<Option<f64>, CommandError> {
     let cell = row.cells[place].trim();
-    if cell.is_empty() || MISSING.contains(&cell.to_lowercase().as_str()) {
-        return Ok(None);
-    }
-    let finite = cell.parse::<f64>().ok().filter(|number| number.is_finite());
-    finite.map(Some).ok_or_else(|| {
+    let found = match cell.to_lowercase().as_str() {
+        "" => return Ok(None),
+        word if MISSING.contains(&word) => return Ok(None),
+        "true" => Some(1.0),
+        "false" => Some(0.0),
+        _ => cell.parse::<f64>().ok().filter(|number| number.is_finite()),
+    };
+    found.map(Some).ok_or_else(|| {
         let place = format!("{}:{}", path.display(), row.line);
-        CommandError::Input(format!("{place}: column '{title}' is '{cell}', expected a finite number"))
+        let expected = "expected a finite number, true or false";
+        CommandError::Input(format!("{place}: column '{title}' is '{cell}', {expected}"))
     })
 }
 

@@ -20,7 +20,8 @@ const RESOLUTION: f64 = 300.0;
 /// deviation over random subsets of the same size, drawn without replacement. A grade that tells errors makes the kept structures
 /// better than these.
 ///
-/// The table is a CSV file (commas, titles in the first row) with one row for each structure. Errors have the unit of the table.
+/// The table is a CSV file (commas, titles in the first row) with one row for each structure. Errors have the unit of the table. True and
+/// false are read as 1 and 0.
 #[derive(Debug, clap::Args)]
 pub struct CalmFilterArgs {
     /// Table with one row for each structure
