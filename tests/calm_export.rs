@@ -174,20 +174,38 @@ fn newest_or_zero(here: &Path) -> u64 {
         .unwrap_or(0)
 }
 
+/// Declined candidates do not change the mixture.
+#[test]
+fn no_version_needs_features_of_declined_candidates() {
+    let seeds = &["fcc-100", "fcc-097", "fcc-103", "vacancy"];
+    let small = Small { walks_per_round: 4, seeds, ..Small::default() };
+    let directory = finished(&small, "[run]", "[run]");
+    let here = directory.path();
+    let versions = [1, newest(here) - 1];
+    let exports = || {
+        versions.map(|version| {
+            export(here, version);
+            fs::read(here.join(format!("{version}.npz"))).unwrap()
+        })
+    };
+    let before = exports();
+    assert!(before[0] != before[1]);
+    succeed(here, ["store", "compact", "here", "--drop-declined-features"]);
+    let candidates = look(here, async |store| store.candidates(0, false, u32::MAX).await.unwrap());
+    let accepted = candidates.iter().rposition(|candidate| candidate.fate == Fate::Accepted).unwrap();
+    assert!(candidates[..accepted].iter().any(|candidate| candidate.features.is_none()));
+    assert!(exports() == before);
+}
+
 #[test]
 fn what_cannot_be_exported_is_refused() {
-    let small = Small {
-        walks_per_round: 4,
-        seeds: &["fcc-100", "fcc-097", "fcc-103", "vacancy"],
-        ..Small::default()
-    };
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let path = small.write(here);
+    let path = Small::default().write(here);
     let artifact = config("data/al_eam_1l/gmm_artifacts.npz");
     fs::copy(&artifact, here.join("calm.npz")).unwrap();
     let text = fs::read_to_string(&path).unwrap().replace(artifact.to_str().unwrap(), "calm.npz");
-    fs::write(&path, text.replace("max_per_walk", "declined_features_mb = 0\nmax_per_walk")).unwrap();
+    fs::write(&path, text).unwrap();
     succeed(here, RUN);
     let newest = newest(here);
     let refused = |words: &[&str]| {
@@ -202,10 +220,6 @@ fn what_cannot_be_exported_is_refused() {
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
     let message = refused(&["--output", "x.npz", "--embed", &model]);
     assert!(message.contains("is the model of the campaign"), "{message}");
-    // A candidate was declined at an earlier version, and its features were not stored.
-    let message = refused(&["--version", &(newest - 1).to_string(), "--output", "x.npz"]);
-    assert!(message.contains("were not stored (limit: collect.declined_features_mb)"), "{message}");
-
     fs::copy(config("data/al_eam_1l/kokkos.npz"), here.join("calm.npz")).unwrap();
     let message = refused(&["--output", "x.npz"]);
     assert!(message.contains("calm.artifact: ") && message.contains("has another content"), "{message}");

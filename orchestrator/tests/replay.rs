@@ -5,7 +5,9 @@ use std::collections::{BTreeMap, HashSet};
 use atoms::{MinDistanceRule, Uniform};
 use calm::CollectionRule;
 use calm::rules::MaximumGrade;
-use orchestrator::selector::{CampaignMode, Replay, ReplayedDecision, SelectorSettings, UpdateProtocol};
+use orchestrator::selector::{
+    AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings, UpdateProtocol,
+};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
@@ -85,6 +87,30 @@ fn check_exact(campaign: &Campaign<'_>, settings: &SelectorSettings, seeds: usiz
         (version, None)
     );
     assert_eq!(replay.cut_short(), 0);
+    check_history(&log, settings, &replay);
+}
+
+/// Follows the mixture by the decisions that change it, and checks that its updates and its end are those of the replay.
+fn check_history(
+    log: &[(LoggedDecision, Option<&CandidateRecord>)],
+    settings: &SelectorSettings,
+    replay: &Replay,
+) {
+    let mut history = MixtureHistory::new(settings.search.clone(), mixture());
+    for (recorded, candidate) in log {
+        let update = match candidate.filter(|_| history.is_update(recorded)) {
+            Some(candidate) => {
+                let view = candidate.block.view();
+                let elements = grader().element_indices(&view.structure()).unwrap();
+                let atoms = AcceptedAtoms { elements: &elements, features: view.features };
+                history.apply(recorded, Some(atoms)).unwrap()
+            }
+            None => history.apply(recorded, None).unwrap(),
+        };
+        let expected = recorded.detail.get("update").map(|update| update.to_string());
+        assert_eq!(update.map(|update| update.to_string()), expected, "{recorded:?}");
+    }
+    assert_eq!(history.mixture(), replay.mixture());
 }
 
 proptest! {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use calm::Mixture;
 use orchestrator::selector::{RegradedCandidate, Regrader, Replay, SelectorError};
-use store::{Store, StoredCandidate};
+use store::{LoggedDecision, Store, StoredCandidate};
 
 use super::failure;
 use super::report::{LogEntry, ReplayReport};
@@ -29,13 +29,8 @@ pub async fn follow(
     bar: &Bar,
 ) -> Result<(), CommandError> {
     let mut prefetch = Prefetch::new(replay.is_exact());
-    for first in (1..=last).step_by(PAGE_ROWS as usize) {
-        let to = last.min(first + PAGE_ROWS - 1);
-        let page = store.decisions(first..=to).await?;
-        if page.len() as i64 != to - first + 1 {
-            return Err(damaged(first, &format!("one of the {} from it on is missing", to - first + 1)));
-        }
-        for recorded in &page {
+    for first in pages(last) {
+        for recorded in &page(store, first, last).await? {
             let candidate = match recorded.candidate {
                 Some(_) if replay.is_reached(recorded).map_err(failure)? => {
                     Some(prefetch.take(store, replay, recorded.sequence).await?)
@@ -59,7 +54,23 @@ pub async fn follow(
     Ok(())
 }
 
-fn damaged(decision: i64, problem: &str) -> CommandError {
+/// The first decisions of the pages up to decision `last`.
+pub fn pages(last: i64) -> impl Iterator<Item = i64> {
+    (1..=last).step_by(PAGE_ROWS as usize)
+}
+
+/// The page of decisions from `first` on, up to decision `last`.
+pub async fn page(store: &Store, first: i64, last: i64) -> Result<Vec<LoggedDecision>, CommandError> {
+    let to = last.min(first + PAGE_ROWS - 1);
+    let page = store.decisions(first..=to).await?;
+    match page.len() as i64 == to - first + 1 {
+        true => Ok(page),
+        false => Err(damaged(first, &format!("one of the {} from it on is missing", to - first + 1))),
+    }
+}
+
+/// An entry of the log that cannot be what was written.
+pub fn damaged(decision: i64, problem: &str) -> CommandError {
     CommandError::Failed(format!(
         "decision {decision}: {problem}: the database is damaged; restore the campaign from a backup"
     ))

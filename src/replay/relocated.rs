@@ -21,7 +21,7 @@ pub struct RelocatedFilesArgs {
     /// Path of the artifact, likewise
     #[arg(long, value_name = "FILE")]
     artifact: Option<PathBuf>,
-    /// Path of the training frames, likewise
+    /// Path of the training frames, likewise; only a replay reads them
     #[arg(long, value_name = "FILE")]
     training_frames: Option<PathBuf>,
 }

@@ -249,7 +249,7 @@ fn all(grades: &AtomGrades) -> Vec<f64> {
 }
 
 /// The first path at which two JSON values have different texts.
-fn first_difference(path: &str, before: &Value, now: &Value) -> Option<(String, Value, Value)> {
+pub fn first_difference(path: &str, before: &Value, now: &Value) -> Option<(String, Value, Value)> {
     if let (Value::Object(old), Value::Object(new)) = (before, now) {
         let keys = old.keys().chain(new.keys().filter(|key| !old.contains_key(*key)));
         let null = Value::Null;

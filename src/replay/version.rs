@@ -2,63 +2,92 @@
 
 use std::sync::Arc;
 
-use calm::Mixture;
-use store::Store;
+use calm::{Artifact, Mixture};
+use orchestrator::selector::{AcceptedAtoms, MixtureHistory};
+use serde_json::Value;
+use store::{LoggedDecision, Store};
 
-use super::report::{MissingFeatures, ReplayReport};
-use super::{BAR, RelocatedFilesArgs, follow, is_other_processor, open, overrides, relocated, resolved};
+use super::report::first_difference;
+use super::{BAR, failure, follow, is_other_processor, overrides, resolved};
+use crate::campaign;
 use crate::exit_status::CommandError;
 use crate::output::Bar;
 
-/// The mixture of a version between the first and the newest, by a replay of the decisions before it.
+/// The mixture of a version between the first and the newest, by the accepted candidates before it. `original` is the artifact
+/// with which the campaign began.
 ///
 /// # Errors
-/// Files that are missing or have another content, features that were not kept, decisions that are not reproduced.
+/// Updates that are not reproduced as recorded; a damaged database.
 pub async fn mixture_of(
     store: &Store,
     version: u64,
-    moved: &RelocatedFilesArgs,
+    original: &Artifact,
 ) -> Result<Arc<Mixture>, CommandError> {
-    let campaign = store.campaign().await?;
-    let resolved = resolved(&campaign)?;
-    let mut config = overrides::configuration(&campaign.configuration, &[])?;
-    relocated::find(&mut config, &resolved, &store.grade_files().await?, moved)?;
-    let mut replay = open(store, &config, &[]).await?;
-    let last = store.first_decision_of(version).await?;
-    let last = last.ok_or_else(|| {
+    let record = store.campaign().await?;
+    let settings = campaign::selector_settings(&overrides::configuration(&record.configuration, &[])?);
+    let other_processor = is_other_processor(&resolved(&record)?);
+    let last = store.first_decision_of(version).await?.ok_or_else(|| {
         CommandError::Failed(format!(
             "mixture version {version}: no decision made it: the database is damaged"
         ))
     })?;
-    let mut report = ReplayReport::new(&campaign, &[], is_other_processor(&resolved), last);
+    let mut history = MixtureHistory::new(settings.search, Arc::new(original.mixture.clone()));
     let bar = Bar::new(Some(last.unsigned_abs()), BAR);
-    follow::follow(store, &mut replay, &mut report, last, &bar).await?;
-    drop(bar);
-    if let Some(MissingFeatures { decision, candidate, .. }) = &report.stopped {
-        return Err(CommandError::Input(format!(
-            "mixture version {version} is the result of decision {last} and cannot be computed again: the features of candidate \
-             {candidate} (decision {decision}) were not stored (limit: collect.declined_features_mb); expected at most version {} or \
-             the newest",
-            replay.mixture().version()
-        )));
-    }
-    if let Some(difference) = &report.difference {
-        let processor = match report.other_processor {
-            true => {
-                " (the campaign was started on another type of processor, whose floating-point results differ)"
+    for first in follow::pages(last) {
+        for decision in follow::page(store, first, last).await? {
+            let update = match history.is_update(&decision) {
+                true => apply_update(store, &mut history, &decision, original).await?,
+                false => history.apply(&decision, None).map_err(failure)?,
+            };
+            if let Some(now) = update {
+                check(version, &decision, &now, other_processor)?;
             }
-            false => "",
-        };
-        return Err(CommandError::Failed(format!(
-            "mixture version {version} cannot be computed again: decision {} is not reproduced: {} was {}, and is now {}{processor}",
-            difference.decision, difference.what, difference.recorded, difference.now
-        )));
+            bar.set(decision.sequence.unsigned_abs(), String::new);
+        }
     }
-    let found = replay.mixture_of(version).map(Arc::clone);
-    found.ok_or_else(|| {
-        CommandError::Failed(format!(
-            "mixture version {version}: after decision {last} the replay has version {}",
-            replay.mixture().version()
-        ))
-    })
+    Ok(Arc::clone(history.mixture()))
+}
+
+/// Updates the mixture with the candidate of a decision. Returns what the log should have of the update.
+async fn apply_update(
+    store: &Store,
+    history: &mut MixtureHistory,
+    decision: &LoggedDecision,
+    original: &Artifact,
+) -> Result<Option<Value>, CommandError> {
+    let missing = |what| follow::damaged(decision.sequence, what);
+    let name = decision.candidate.as_deref().unwrap_or_default();
+    let candidate = store.candidate(name).await?.ok_or_else(|| missing("its candidate is missing"))?;
+    let features = candidate.features.ok_or_else(|| missing("the features of its candidate are missing"))?;
+    let index = |symbol: &str| original.symbols.iter().position(|known| known == symbol);
+    let species = candidate.block.view().structure().species;
+    let elements: Option<Vec<usize>> = species.iter().map(|species| index(species.symbol())).collect();
+    let elements = elements.ok_or_else(|| missing("the artifact lacks an element of its candidate"))?;
+    let atoms = AcceptedAtoms { elements: &elements, features: &features };
+    history.apply(decision, Some(atoms)).map_err(failure)
+}
+
+/// Compares an update with its record.
+fn check(
+    version: u64,
+    decision: &LoggedDecision,
+    now: &Value,
+    other_processor: bool,
+) -> Result<(), CommandError> {
+    let Some((what, recorded, now)) =
+        first_difference("decision.detail.update", &decision.detail["update"], now)
+    else {
+        return Ok(());
+    };
+    let processor = match other_processor {
+        true => {
+            " (the campaign was started on another type of processor, whose floating-point results differ)"
+        }
+        false => "",
+    };
+    Err(CommandError::Failed(format!(
+        "mixture version {version} cannot be computed again: decision {} is not reproduced: {what} was {recorded}, and is now {now}\
+         {processor}",
+        decision.sequence
+    )))
 }

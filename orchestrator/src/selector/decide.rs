@@ -261,7 +261,8 @@ impl DecisionState {
         }
         let view = graded.block.view();
         let elements = &graded.bonds.elements;
-        let outcome = calm::update(&self.mixture, elements, view.features, &self.update_settings())
+        let settings = update_settings(&self.settings.search, self.switched_to_additive);
+        let outcome = calm::update(&self.mixture, elements, view.features, &settings)
             .map_err(|source| SelectorError::Update { candidate: view.id(), source })?;
         self.mixture = Arc::new(self.mixture.with_changes(&outcome.changed)?);
         for change in &outcome.changed {
@@ -284,15 +285,6 @@ impl DecisionState {
     /// What the live mixture has forgotten.
     pub fn forgetting_state(&self) -> ForgettingState {
         self.forgetting.state(&self.regrader.original, self.settings.forgetting_alarm)
-    }
-
-    /// How the mixture is updated.
-    fn update_settings(&self) -> UpdateSettings {
-        let mut settings = self.settings.search.clone();
-        if self.switched_to_additive {
-            (settings.covariance_update, settings.alpha_values) = (CovarianceUpdateKind::Additive, None);
-        }
-        settings
     }
 
     /// Makes updates additive after an update that raised the alarm, if the campaign asks for it.
@@ -346,8 +338,7 @@ impl DecisionState {
         let seed_structure = walk.is_biased().then_some(walk.record.seed_structure);
         if seed_structure.is_some_and(|seed| self.restarts_mixture_after(seed)) {
             let next_version = self.mixture.version() + 1;
-            let restarted = Arc::new(self.regrader.original.at_version(next_version));
-            self.before_restart = Some(std::mem::replace(&mut self.mixture, restarted));
+            self.mixture = Arc::new(self.regrader.original.at_version(next_version));
             commit.components.clear();
             commit.restart_mixture = true;
             self.forgetting.restart();
@@ -415,7 +406,17 @@ fn grade_summary(gamma: &[f64], mixture_version: u64) -> serde_json::Value {
     json!({ "gamma_max": maximum(gamma), "atoms_above_1": above, "mixture_version": mixture_version })
 }
 
-fn update_summary(outcome: &UpdateOutcome) -> serde_json::Value {
+/// How the mixture is updated, before or after updates became additive.
+pub(super) fn update_settings(configured: &UpdateSettings, switched_to_additive: bool) -> UpdateSettings {
+    let mut settings = configured.clone();
+    if switched_to_additive {
+        (settings.covariance_update, settings.alpha_values) = (CovarianceUpdateKind::Additive, None);
+    }
+    settings
+}
+
+/// What the decision log has of an update.
+pub(super) fn update_summary(outcome: &UpdateOutcome) -> serde_json::Value {
     let places: Vec<_> = outcome.changed.iter().map(|change| (change.element, change.slot)).collect();
     json!({
         "alpha": outcome.alpha,

@@ -31,8 +31,6 @@ pub(super) struct DecisionState {
     pub min_distances: Vec<MinDistances>,
     pub regrader: Regrader,
     pub mixture: Arc<Mixture>,
-    /// The mixture that the last restart replaced.
-    pub before_restart: Option<Arc<Mixture>>,
     pub forgetting: Forgetting,
     /// Updates are additive from here on: the mixture had forgotten too much.
     pub switched_to_additive: bool,
@@ -96,7 +94,6 @@ impl DecisionState {
             min_distances,
             regrader: Regrader { grader: Arc::new(grader), original },
             mixture,
-            before_restart: None,
             forgetting,
             switched_to_additive: value(ADDITIVE)? > 0,
             walks,

@@ -104,16 +104,6 @@ impl Replay {
         &self.decisions.mixture
     }
 
-    /// The mixture of this version, if it is in force or was replaced by the last restart: the decision that ends a seed
-    /// structure's last walk restarts the mixture together with the end of the walk.
-    pub fn mixture_of(&self, version: u64) -> Option<&Arc<Mixture>> {
-        let before_restart = self.decisions.before_restart.as_ref();
-        before_restart
-            .into_iter()
-            .chain([&self.decisions.mixture])
-            .find(|mixture| mixture.version() == version)
-    }
-
     /// Number of walks that ended because of a limit in the log, but would have continued with these rules.
     pub fn cut_short(&self) -> u64 {
         self.cut_short
@@ -335,7 +325,7 @@ impl Replay {
     }
 }
 
-fn damaged(recorded: &LoggedDecision, problem: &str) -> ReplayError {
+pub(super) fn damaged(recorded: &LoggedDecision, problem: &str) -> ReplayError {
     let LoggedDecision { sequence, kind, .. } = recorded;
     ReplayError::Damaged { sequence: *sequence, kind: kind.clone(), problem: problem.to_owned() }
 }

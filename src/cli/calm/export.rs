@@ -20,8 +20,8 @@ use crate::replay::{self, RelocatedFilesArgs};
 /// to grade structures by what the campaign has covered, with calm score, gracemaker or LAMMPS, or to begin another campaign. Reads
 /// the campaign only, which may be running.
 ///
-/// The store has the newest version. Earlier ones are computed from the stored candidates, as by calmwalk replay. Version 0 is the
-/// original mixture. Numbers are rounded to single precision, as in every artifact.
+/// The store has the newest version. Earlier ones are computed from the accepted candidates, whose features are always stored, and every
+/// update must be as recorded. Version 0 is the original mixture. Numbers are rounded to single precision, as in every artifact.
 #[derive(Debug, clap::Args)]
 pub struct CalmExportArgs {
     #[command(flatten)]
@@ -107,7 +107,7 @@ impl CalmExportArgs {
                     restored.map_err(|error| CommandError::Failed(format!("damaged database: {error}")))?,
                 )
             }
-            version => replay::mixture_of(store, version, &self.moved).await?,
+            version => replay::mixture_of(store, version, &original).await?,
         };
         let (campaign, newest) = (campaign.id.to_string(), newest.version);
         Ok(Version { campaign, newest, artifact, model, original, mixture })
