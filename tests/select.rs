@@ -129,7 +129,7 @@ fn wrong_selections_are_refused() {
     let here = directory.path();
     pool(&here.join("pool.extxyz"), 2);
     let out = ["--output", "out.extxyz"];
-    let cases: [(&[&str], &str); 8] = [
+    let cases: [(&[&str], &str); 9] = [
         (
             &["pool.extxyz", "--strategy", "fps"],
             "--strategy fps: expected a number of structures, as in fps:25, or -n",
@@ -140,6 +140,7 @@ fn wrong_selections_are_refused() {
         (&["pool.extxyz", "--update-target", "0"], "--update-target: found 0, expected"),
         (&["pool.extxyz", "--memory=-1"], "--memory -1: expected"),
         (&["pool.cif"], "pool.cif: unknown format"),
+        (&["pool.extxyz", "--no-evaluation"], "--campaign"),
         (&[], "<POOL>"),
     ];
     for (arguments, why) in cases {
@@ -158,6 +159,36 @@ fn wrong_selections_are_refused() {
     assert!(
         succeed(here, own.iter().chain(&["--strategy", "fps-all:1"])).contains("selected 1 structure of 2")
     );
+}
+
+#[test]
+fn candidates_without_stored_features_are_left_out_on_request() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let seeds = &["fcc-100", "fcc-097", "fcc-103", "vacancy"];
+    let path = Small { walks_per_round: 4, seeds, ..Small::default() }.write(here);
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text.replace("max_per_walk", "declined_features_mb = 0\nmax_per_walk")).unwrap();
+    succeed(here, ["run", "campaign.toml"]);
+    let pool = |more: &[&str]| {
+        let common = ["--campaign", "campaign", "--strategy", "random:1", "--no-element-floors"];
+        select(here, &[&common[..], more].concat())["pool"].clone()
+    };
+    let (all, stored, declined) =
+        (pool(&[]), pool(&["--no-evaluation"]), pool(&["--no-evaluation", "--declined"]));
+    let missing = all["features_computed"].as_u64().unwrap();
+    assert!(missing > 0, "{all}");
+    assert_eq!(all["candidates_left_out"], 0);
+    for (pool, kept) in [(&stored, &all["features_from_stores"]), (&declined, &0.into())] {
+        assert_eq!((&pool["structures"], &pool["features_computed"]), (kept, &0.into()));
+        assert_eq!(pool["candidates_left_out"], missing);
+    }
+    let (model, artifact) = (file("kokkos.npz"), file("gmm_artifacts.npz"));
+    let own = ["select", "--model", &model, "--artifact", &artifact, "--output", "out.extxyz", "-n", "1"];
+    let printed = succeed(here, own.iter().chain(&["--campaign", "campaign", "--no-evaluation"]));
+    let plural = if missing == 1 { "" } else { "s" };
+    let line = format!("left out {missing} candidate{plural} without stored features of this model\n");
+    assert!(printed.contains(&line), "{printed}");
 }
 
 #[test]

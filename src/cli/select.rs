@@ -15,8 +15,8 @@ use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::file_hash;
 use crate::output::{TextTable, count, decimals, print, print_json, print_stderr};
 use crate::selection::{
-    CampaignCandidates, GradedPool, Pick, Picks, PoolFiles, PoolGrading, Rules, Strategy, StrategyQuota,
-    StructureSource, frames, pick,
+    CampaignCandidates, CandidateChoice, GradedPool, Pick, Picks, PoolFiles, PoolGrading, Rules, Strategy,
+    StrategyQuota, StructureSource, frames, pick,
 };
 use crate::signals::stop_token;
 use crate::structure_files::StructureReadingArgs;
@@ -61,6 +61,10 @@ pub struct SelectArgs {
     /// Of campaigns, only declined candidates
     #[arg(long, requires = "campaign")]
     declined: bool,
+    /// Of campaigns, leave out candidates whose features are not stored or belong to another model; otherwise the model is evaluated on
+    /// them
+    #[arg(long, requires = "campaign")]
+    no_evaluation: bool,
     /// Strategies in order, each with its number of structures: greedy, fps, fps-all, d-optimal, random, random-extrap
     #[arg(long, value_name = "NAME[:N]", num_args = 1.., value_delimiter = ',', default_value = "greedy")]
     strategy: Vec<StrategyQuota>,
@@ -126,7 +130,7 @@ impl SelectArgs {
                 strategy.name()
             )));
         }
-        let mut pool = PoolFiles { files, campaigns: self.campaigns()? };
+        let mut pool = PoolFiles { files, campaigns: self.campaigns(mixture.dimension())? };
         let grading = PoolGrading {
             model: Arc::clone(&model),
             mixture: Arc::clone(&mixture),
@@ -220,14 +224,20 @@ impl SelectArgs {
         }
     }
 
-    fn campaigns(&self) -> Result<Vec<CampaignCandidates>, CommandError> {
+    /// `dimension` is that of the features.
+    fn campaigns(&self, dimension: usize) -> Result<Vec<CampaignCandidates>, CommandError> {
         if self.campaign.is_empty() {
             return Ok(Vec::new());
         }
-        let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
+        let choice = CandidateChoice {
+            model_hash: file_hash::hash(&self.model).map_err(CommandError::input)?,
+            dimension,
+            declined_only: self.declined,
+            no_evaluation: self.no_evaluation,
+        };
         let campaigns = self.campaign.iter().zip(0..);
         let open = |(path, number): (&PathBuf, u32)| {
-            CampaignCandidates::open(&campaign_location::parse(path)?, number, &hash, self.declined)
+            CampaignCandidates::open(&campaign_location::parse(path)?, number, choice.clone())
         };
         campaigns.map(open).collect()
     }
@@ -301,6 +311,11 @@ impl SelectionReport<'_> {
         elements.filter(|element| element.pool > 0).collect()
     }
 
+    /// Candidates that were left out because the model would have been evaluated on them.
+    fn left_out(&self) -> u64 {
+        self.files.campaigns.iter().map(|campaign| campaign.left_out).sum()
+    }
+
     fn atoms<'p>(&self, picks: impl IntoIterator<Item = &'p &'p Pick>) -> u64 {
         picks.into_iter().map(|pick| self.pool.total_atoms(pick.structure)).sum()
     }
@@ -360,6 +375,10 @@ impl SelectionReport<'_> {
                     count(evaluated, "structure")
                 )?;
             }
+            if self.command.no_evaluation {
+                let left_out = count(self.left_out(), "candidate");
+                writeln!(out, "left out {left_out} without stored features of this model")?;
+            }
             writeln!(
                 out,
                 "selected {} of {}; wrote {}",
@@ -388,6 +407,7 @@ impl SelectionReport<'_> {
                 "atoms_within_window": atoms_within,
                 "features_computed": self.pool.evaluated,
                 "features_from_stores": pool.len() as u64 - self.pool.evaluated,
+                "candidates_left_out": self.left_out(),
             },
             "strategies": strategies.collect::<Vec<_>>(),
             "elements": elements.collect::<Vec<_>>(),

@@ -10,6 +10,19 @@ use crate::exit_status::CommandError;
 /// Candidates per read; each has up to megabytes of features.
 const PAGE: u32 = 16;
 
+/// Which candidates of campaigns are part of a pool, and which of their stored features are used.
+#[derive(Clone, Debug)]
+pub struct CandidateChoice {
+    /// BLAKE3 hash of the model. Features that a campaign with another model has stored are not used.
+    pub model_hash: String,
+    /// Dimension D of the features.
+    pub dimension: usize,
+    /// Leave out accepted candidates.
+    pub declined_only: bool,
+    /// Leave out candidates without stored features that can be used.
+    pub no_evaluation: bool,
+}
+
 /// The candidates of a campaign's biased walks, in decision order.
 pub struct CampaignCandidates {
     pub store: Store,
@@ -17,25 +30,20 @@ pub struct CampaignCandidates {
     number: u32,
     /// Id of the campaign.
     pub id: String,
-    /// Leave out accepted candidates.
-    declined_only: bool,
+    choice: CandidateChoice,
     /// The stored features are those of the model.
     same_model: bool,
     last: i64,
+    /// Candidates that were left out because the store has no features of them for the model.
+    pub left_out: u64,
     /// Every candidate was read.
     pub(super) is_read: bool,
     runtime: tokio::runtime::Runtime,
 }
 
 impl CampaignCandidates {
-    /// Opens campaign `number` of the pool for reading. Its stored features are used if its model has the BLAKE3 hash
-    /// `model_hash`.
-    pub fn open(
-        location: &Location,
-        number: u32,
-        model_hash: &str,
-        declined_only: bool,
-    ) -> Result<Self, CommandError> {
+    /// Opens campaign `number` of the pool for reading.
+    pub fn open(location: &Location, number: u32, choice: CandidateChoice) -> Result<Self, CommandError> {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(CommandError::failed)?;
         let (store, campaign) = runtime.block_on(async {
@@ -45,9 +53,9 @@ impl CampaignCandidates {
         })?;
         let configuration: Value =
             serde_json::from_str(&campaign.resolved_configuration).map_err(CommandError::failed)?;
-        let same_model = configuration["files"]["potential.model"] == model_hash;
+        let same_model = configuration["files"]["potential.model"] == choice.model_hash;
         let id = campaign.id.to_string();
-        Ok(Self { store, number, id, declined_only, same_model, last: 0, is_read: false, runtime })
+        Ok(Self { store, number, id, choice, same_model, last: 0, left_out: 0, is_read: false, runtime })
     }
 
     /// The next candidates; none at the end.
@@ -56,8 +64,14 @@ impl CampaignCandidates {
             let page = self.runtime.block_on(self.store.candidates(self.last, false, PAGE))?;
             let Some(last) = page.last() else { return Ok(Vec::new()) };
             self.last = last.decision;
-            let kept = page.into_iter().filter(|found| !self.declined_only || found.fate != Fate::Accepted);
-            let items: Vec<_> = kept.map(|found| self.item(found)).collect();
+            let declined_only = self.choice.declined_only;
+            let kept = page.into_iter().filter(|found| !declined_only || found.fate != Fate::Accepted);
+            let mut items: Vec<_> = kept.map(|found| self.item(found)).collect();
+            if self.choice.no_evaluation {
+                let all = items.len();
+                items.retain(|item| item.features.is_some());
+                self.left_out += (all - items.len()) as u64;
+            }
             if !items.is_empty() {
                 return Ok(items);
             }
@@ -66,10 +80,12 @@ impl CampaignCandidates {
 
     fn item(&self, found: StoredCandidate) -> PoolItem {
         let view = found.block.view();
+        let structure = view.structure();
+        let size = structure.len() * self.choice.dimension;
         PoolItem {
-            structure: view.structure(),
+            structure,
             source: StructureSource::Candidate { campaign: self.number, decision: found.decision },
-            features: found.features.filter(|_| self.same_model),
+            features: found.features.filter(|features| self.same_model && features.len() == size),
             place: ItemPlace::Candidate(view.id().to_string()),
         }
     }

@@ -139,8 +139,7 @@ impl Worker {
     fn grade(&mut self, mixture: &Mixture, item: &PoolItem) -> Result<GradedStructure, CommandError> {
         let wrong = |error: &dyn std::fmt::Display| CommandError::Input(format!("{}: {error}", item.place));
         let size = item.structure.len() * mixture.dimension();
-        let known = item.features.as_ref().filter(|features| features.len() == size);
-        let (elements, features) = match known {
+        let (elements, features) = match &item.features {
             Some(features) => {
                 let model = self.calculator.grace.model();
                 let elements =
@@ -154,7 +153,7 @@ impl Worker {
         };
         self.grades.evaluate(mixture, &elements, &features, None).map_err(|error| wrong(&error))?;
         let (slots, gamma) = (self.grades.component.clone(), self.grades.gamma.clone());
-        Ok(GradedStructure { elements, slots, gamma, features, evaluated: known.is_none() })
+        Ok(GradedStructure { elements, slots, gamma, features, evaluated: item.features.is_none() })
     }
 }
 

@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use calm::selection::Pool;
 
-pub use self::campaign::CampaignCandidates;
+pub use self::campaign::{CampaignCandidates, CandidateChoice};
 use self::compositions::Compositions;
 pub use self::grading::{PoolFiles, PoolGrading};
 pub use self::output::frames;
