@@ -24,17 +24,26 @@ done
 [ $# -gt 1 ] || usage
 shift
 build=("$@")
+# What `calm merge` must be told, too.
 merge=()
 output=
 while [ $# -gt 0 ]; do
+    name=$1
     case $1 in
-        --output | -o | --model | --embed)
+        --model=* | --output=* | --embed=* | --feature-variant=*) name=${1%%=*} value=${1#*=} ;;
+        --model | --output | --embed | --feature-variant | -o)
             [ $# -gt 1 ] || usage
-            merge+=("$1" "$2")
-            case $1 in --output | -o) output=$2 ;; esac
+            value=$2
             shift
             ;;
+        -o?*)
+            name=-o value=${1#-o}
+            value=${value#=}
+            ;;
+        *) name= ;;
     esac
+    [ -z "$name" ] || merge+=("$name" "$value")
+    case $name in --output | -o) output=$value ;; esac
     shift
 done
 [ -n "$output" ] || usage

@@ -53,12 +53,16 @@ fn a_chain_of_jobs_gives_the_bytes_of_one_process_and_continues() {
     assert!(fs::read(here.join("out.npz")).unwrap() == fs::read(here.join("whole.npz")).unwrap());
     assert!(here.join("model.npz").exists() && !here.join("out.npz.build").exists());
 
-    let arguments = [&settings[..], &["--output", "again.npz"]].concat();
+    // Other features, of which `calm merge` must be told; the other spelling of options.
+    let linear = ["--feature-variant=linear"];
+    let whole = ["calm", "build", "--model", &model, "--output", "linear.npz"];
+    succeed(here, whole.iter().chain(&settings).chain(&linear));
+    let arguments = [&settings[..], &linear, &["--output=again.npz"]].concat();
     let submitted = submit(here, &arguments);
     assert!(String::from_utf8(submitted.stdout).unwrap().starts_with("pass 1: 3 parts in job "));
     wait_until("the jobs have ended", idle);
     assert!(here.join("again.npz").exists(), "{}", logs(here));
-    assert!(fs::read(here.join("again.npz")).unwrap() == fs::read(here.join("whole.npz")).unwrap());
+    assert!(fs::read(here.join("again.npz")).unwrap() == fs::read(here.join("linear.npz")).unwrap());
 
     let refused = submit(here, &["data.extxyz"]);
     assert_eq!(refused.status.code(), Some(2));
