@@ -1,7 +1,8 @@
 //! How fast the passes of a build are on one thread. Prints a table.
 //!
-//! Passes 2 and 3 are compared with the bare matrix products of the same shapes: for each block of 128 atoms, XᵀX (its lower
-//! half, in pass 2) or XS (in pass 3) of ready matrices, and no assignment, copy or histogram. Pass 1 is compared with
+//! Passes 2 and 3 are compared with the bare matrix products of the same shapes: for each block of 128 atoms, XᵀX (all of it, and
+//! its lower half as pass 2 computes it) or XS and XT (T is the upper triangle of S in the panels of pass 3, three quarters of the
+//! multiply-adds of XS) of ready matrices, and no assignment, copy or histogram. Pass 1 is compared with
 //! scikit-learn's mini-batch k-means as gracemaker's builder uses it, if `CALMWALK_GRACEMAKER_PYTHON` names a Python that has
 //! it. All ratios are medians over rounds in which a pass and what it is compared with follow each other, on one core; times are
 //! those of the processor.
@@ -10,11 +11,13 @@
 
 mod peer;
 
+use std::cmp::Ordering;
 use std::hint::black_box;
 
 use calm::build::{BuildSettings, BuiltComponent, CalibrationPass, ScatterPass, ShardClustering, components};
 use faer::linalg::matmul::matmul;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
+use faer::prelude::ReborrowMut;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 
 use peer::Peer;
@@ -27,6 +30,8 @@ const ATOMS: usize = 20_000;
 const BATCH: usize = 512;
 /// Atoms of a block in passes 2 and 3.
 const BLOCK: usize = 128;
+/// Columns of a panel of the triangle in pass 3.
+const PANEL: usize = 66;
 const ROUNDS: usize = 31;
 /// Rounds of pass 1 with its peer, which takes seconds.
 const PEER_ROUNDS: usize = 7;
@@ -115,6 +120,33 @@ impl Data {
             black_box(&mut products);
         }
     }
+
+    /// XT of each block, in panels of columns over the rows down to the diagonal.
+    fn bare_panels(&self, triangles: &[Vec<f64>]) {
+        let mut products = vec![0.0; BLOCK * DIMENSION];
+        for (block, triangle) in self.blocks().zip(triangles.iter().cycle()) {
+            let out = &mut products[..block.nrows() * DIMENSION];
+            let mut out = MatMut::from_row_major_slice_mut(out, block.nrows(), DIMENSION);
+            let triangle = MatRef::from_row_major_slice(triangle, DIMENSION, DIMENSION);
+            for first in (0..DIMENSION).step_by(PANEL) {
+                let columns = PANEL.min(DIMENSION - first);
+                let panel = triangle.submatrix(0, first, first + columns, columns);
+                let out = out.rb_mut().subcols_mut(first, columns);
+                matmul(out, Accum::Replace, block.subcols(0, first + columns), panel, 1.0, Par::Seq);
+            }
+            black_box(&mut products);
+        }
+    }
+}
+
+/// T of S: T_ij = 2 S_ij for i < j, T_ii = S_ii.
+fn upper_triangle(inverse: &[f64]) -> Vec<f64> {
+    let element = |(index, value): (usize, &f64)| match (index / DIMENSION).cmp(&(index % DIMENSION)) {
+        Ordering::Less => 2.0 * value,
+        Ordering::Equal => *value,
+        Ordering::Greater => 0.0,
+    };
+    inverse.iter().enumerate().map(element).collect()
 }
 
 /// Processor time of this thread, s: other programs disturb it less than wall time.
@@ -187,7 +219,9 @@ fn main() {
         }
     }
     drop(peer);
-    let [mut half, mut full, mut third] = [const { Pair { own: Vec::new(), other: Vec::new() } }; 3];
+    let triangles: Vec<_> = components.iter().map(|component| upper_triangle(&component.inverse)).collect();
+    let [mut half, mut full, mut whole, mut panels] =
+        [const { Pair { own: Vec::new(), other: Vec::new() } }; 4];
     for _ in 0..ROUNDS {
         // Without the inverses, which do not depend on the number of atoms.
         let scatter = || {
@@ -197,9 +231,11 @@ fn main() {
         };
         half.push(seconds(scatter), seconds(|| data.bare_scatter(true)));
         full.push(seconds(scatter), seconds(|| data.bare_scatter(false)));
-        third.push(seconds(|| data.calibration(&components)), seconds(|| data.bare_calibration(&components)));
+        whole.push(seconds(|| data.calibration(&components)), seconds(|| data.bare_calibration(&components)));
+        panels.push(seconds(|| data.calibration(&components)), seconds(|| data.bare_panels(&triangles)));
     }
     half.print("2", "XᵀX, lower half", atoms);
     full.print("2", "XᵀX, all", atoms);
-    third.print("3", "XS", atoms);
+    whole.print("3", "XS", atoms);
+    panels.print("3", "XT, triangle in panels", atoms);
 }
