@@ -5,6 +5,15 @@ use serde_json::Value;
 use super::*;
 use crate::common::campaign::{Small, outcome};
 
+/// Name, type and rank of each array, by name.
+fn kinds(path: &Path) -> Vec<(String, String, usize)> {
+    let kind = |(name, bytes): (String, Vec<u8>)| {
+        let array = npyz::NpyFile::new(&bytes[..]).unwrap();
+        (name, array.dtype().descr(), array.shape().len())
+    };
+    arrays(path).into_iter().map(kind).collect()
+}
+
 #[test]
 fn a_model_without_a_projection_is_built_graded_and_embedded() {
     let directory = tempfile::tempdir().unwrap();
@@ -23,9 +32,8 @@ fn a_model_without_a_projection_is_built_graded_and_embedded() {
     let shown: f64 = row[row.len() - 2].parse().unwrap();
     assert!(shown < 20.0 && (shown / 100.0 - above).abs() < 5e-4, "{shown} % {above}");
 
-    // The embedded model has the keys of gracemaker's export, so it can grade and build.
-    let names = |path: &Path| arrays(path).into_iter().map(|(name, _)| name).collect::<Vec<_>>();
-    assert_eq!(names(&here.join("model.npz")), names(&config(MODEL)));
+    // The embedded model has the keys of gracemaker's export, with their types and ranks, so it can grade and build.
+    assert_eq!(kinds(&here.join("model.npz")), kinds(&config(MODEL)));
     assert_eq!(grades(here, "model.npz", &[]), gamma);
     let again = [
         "calm",
