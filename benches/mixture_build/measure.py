@@ -11,7 +11,8 @@ densities; cutoff 6 Å), which is made here with random weights: the time does n
 - `peer`: both programs build from N and from 3 N frames, on one core with one thread, in turn; the differences of the two
   times are those of 2 N frames in steady state, without start and compilation. Prints the ratio of each round and the median.
 - `threads`: one build of 2 N frames with two threads, against two builds of N frames at once with one thread, in turn.
-- `memory`: peak memory of builds from 10⁵, 2 · 10⁵ and 10⁶ atoms, which are one, two and ten shards.
+- `memory`: peak memory of builds from 10⁵, 2 · 10⁵ and 10⁶ atoms with two threads, in shards of 400 structures. These are 3, 5 and
+  24 shards, so each of the two threads holds a shard at every size.
 """
 
 import argparse
@@ -152,7 +153,7 @@ def memory(arguments, work):
     _, export = model_of(arguments, work)
     for atoms in (10**5, 2 * 10**5, 10**6):
         text = frames(-(-atoms // ATOMS), work)[0]
-        command = own(arguments, export, text, work / "own.npz", threads=2)
+        command = own(arguments, export, text, work / "own.npz", threads=2, shard_size=400)
         words = ["/usr/bin/time", "--format", '{"kB": %M, "wall": %e, "user": %U}', *map(str, command)]
         found = subprocess.run(words, cwd=work, capture_output=True, text=True)
         if found.returncode:
