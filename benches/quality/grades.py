@@ -1,15 +1,16 @@
 """Compares the grades of mixtures that `calmwalk calm build` and `grace_uq build` make, on held-out DFT data.
 
-    python grades.py CALMWALK DATASETS WORK [Si Mo …] [--epochs N]
+    python grades.py CALMWALK DATASETS WORK [Si Mo W] [--epochs N]
 
 The Python has ASE, SciPy and gracemaker (tensorpotential 0.6.2.1), whose programs are beside it. DATASETS has
-`<element>_mlearn_train.xyz` and `_test.xyz` (Zuo et al., J. Phys. Chem. A 124, 731 (2020); energy, forces). For each
-element, gracemaker trains a small GRACE-1L potential without the hottest molecular dynamics and without surfaces. Both
+`<element>_<source>_train.xyz` and `_test.xyz` (energy, forces): Si and Mo of Zuo et al., J. Phys. Chem. A 124, 731 (2020), W of
+Li et al., npj Comput. Mater. 6, 70 (2020). For each element, gracemaker trains a small GRACE-1L potential without the hottest molecular dynamics and without surfaces. Both
 programs build a mixture from these training frames with three random seeds, the projection of the features being the same.
 Held out are the test set, the hottest frames and the surfaces. `calmwalk calm score` grades them with each mixture.
 
 Prints Spearman's ρ of the grade and the length of the error of the force, and the area under the ROC curve for errors above
-1 eV/Å, of γ and γ_nbr, over all held-out atoms. Steps whose result stands in WORK are not repeated.
+1 eV/Å, of γ and γ_nbr, over all held-out atoms; ρ also of two other averages of γ, which count all neighbours within the cutoff
+alike, or within the first coordination shell. Steps whose result stands in WORK are not repeated.
 """
 
 import argparse
@@ -25,8 +26,9 @@ from scipy.stats import rankdata, spearmanr
 
 SEEDS = (42, 43, 44)
 LARGE = 1.0  # eV/Å
-CUTOFF = {"Si": 5.0, "Mo": 5.5}
-HOTTEST = {"Si": "3374 K", "Mo": "6000 K"}
+CUTOFF = {"Si": 5.0, "Mo": 5.5, "W": 5.5}  # Å
+SHELL = {"Si": 2.8, "Mo": 2.9, "W": 2.95}  # Å; beyond the first coordination shell, 2.35, 2.73 and 2.75 Å, and within the second
+HOTTEST = {"Si": "3374 K", "Mo": "6000 K", "W": "Md 4000"}
 
 INPUT = """
 seed: 42
@@ -71,11 +73,18 @@ def gracemaker(name):
     return Path(sys.executable).parent / name
 
 
+def dataset(element, part, datasets):
+    """The frames of a file."""
+    found = list(datasets.glob(f"{element}_*_{part}.xyz"))
+    if len(found) != 1:
+        sys.exit(f"{datasets}: {len(found)} files {element}_*_{part}.xyz; expected one")
+    return read(found[0], ":")
+
+
 def frames(element, datasets, work):
     """Writes training and held-out frames, with energy and forces alone."""
-    held_out = read(datasets / f"{element}_mlearn_test.xyz", ":")
-    training = []
-    for atoms in read(datasets / f"{element}_mlearn_train.xyz", ":"):
+    held_out, training = dataset(element, "test", datasets), []
+    for atoms in dataset(element, "train", datasets):
         new = HOTTEST[element] in atoms.info["description"] or atoms.info["config_type"] == "Surface"
         (held_out if new else training).append(atoms)
     for name, found in [("training", training), ("held_out", held_out)]:
@@ -124,19 +133,22 @@ def roc_auc(score, positive):
     return (rankdata(score)[positive].sum() - count * (count + 1) / 2) / (count * (len(score) - count))
 
 
-def measure(artifact, calmwalk, work):
-    """Components; ρ and AUC of γ, of γ_nbr; share of atoms with γ > 1; errors of the forces, eV/Å."""
-    scored = work / "scored.extxyz"
+def measure(artifact, calmwalk, element, work):
+    """Components; ρ and AUC of γ, of γ_nbr; ρ of two other averages; share of atoms with γ > 1; errors of the forces, eV/Å."""
+    scored, shell = work / "scored.extxyz", SHELL[element]
     options = ["--model", work / "kokkos.npz", "--artifact", artifact, work / "held_out.extxyz", "--output", scored]
+    options += ["--gamma-nbr", "uniform", "--gamma-nbr", f"uniform:{shell}"]
     run(calmwalk, "calm", "score", *options, where=work)
     known, found = read(work / "held_out.extxyz", ":"), read(scored, ":")
     errors = np.concatenate([f.get_forces() - k.get_forces() for f, k in zip(found, known, strict=True)])
     errors = np.linalg.norm(errors, axis=1)
-    grades = [np.concatenate([f.arrays[name] for f in found]) for name in ("gamma", "gamma_nbr")]
+    names = ("gamma", "gamma_nbr", "gamma_nbr_uniform", f"gamma_nbr_uniform_{shell}")
+    *grades, uniform, first_shell = (np.concatenate([f.arrays[name] for f in found]) for name in names)
     large = errors > LARGE
     components = int((np.load(artifact)["counts_0"] > 0).sum())
     quality = [function for grade in grades for function in (spearmanr(grade, errors)[0], roc_auc(grade, large))]
-    return [components, *quality, (grades[0] > 1).mean()], errors
+    averages = [spearmanr(grade, errors)[0] for grade in (uniform, first_shell)]
+    return [components, *quality, *averages, (grades[0] > 1).mean()], errors
 
 
 def once(path, make):
@@ -154,10 +166,10 @@ def compare(element, epochs, calmwalk, datasets, work):
         path = work / f"grace_uq_{seed}.npz"
         once(path, lambda: reference_mixture(seed, path, work))
         once(work / "kokkos.npz", lambda: export(path, work))
-        table["grace_uq build"].append(measure(path, calmwalk, work)[0])
+        table["grace_uq build"].append(measure(path, calmwalk, element, work)[0])
         path = work / f"calmwalk_{seed}.npz"
         once(path, lambda: own_mixture(seed, path, calmwalk, work))
-        found, errors = measure(path, calmwalk, work)
+        found, errors = measure(path, calmwalk, element, work)
         table["calmwalk calm build"].append(found)
     training, held_out = (read(work / f"{name}.extxyz", ":") for name in ("training", "held_out"))
     atoms = [sum(map(len, found)) for found in (training, held_out)]
@@ -166,8 +178,10 @@ def compare(element, epochs, calmwalk, datasets, work):
         f"\n{element}: {len(training)} training frames ({atoms[0]} atoms), {len(held_out)} held out ({atoms[1]} atoms); "
         f"errors of held-out forces: root mean square {rms:.2f} eV/Å, {large} atoms above {LARGE:.0f} eV/Å\n"
     )
-    print("| build | random seed | components | ρ(γ) | AUC(γ) | ρ(γ_nbr) | AUC(γ_nbr) | γ > 1 |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    columns = ["build", "random seed", "components", "ρ(γ)", "AUC(γ)", "ρ(γ_nbr)", "AUC(γ_nbr)", "ρ(uniform)",
+               f"ρ(uniform, {SHELL[element]} Å)", "γ > 1"]
+    print(f"| {' | '.join(columns)} |")
+    print("|" + " --- |" * len(columns))
     for name, rows in table.items():
         for seed, (components, *quality, above) in zip(SEEDS, rows, strict=True):
             numbers = " | ".join(f"{value:.4f}" for value in quality)
@@ -185,7 +199,7 @@ def main():
     parser.add_argument("datasets", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--epochs", type=int, default=60, help="of the training")
-    parser.add_argument("elements", nargs="*", default=["Si", "Mo"])
+    parser.add_argument("elements", nargs="*", default=list(CUTOFF))
     arguments = parser.parse_args()
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
     for element in arguments.elements:
