@@ -1,6 +1,6 @@
 """Measures `calmwalk select` against `grace_uq select`, on one core with one thread.
 
-    python measure.py CALMWALK WORK [--frames N] [--picks N] [--rounds N]
+    python measure.py CALMWALK WORK [--frames N] [--picks N] [--rounds N] [--checkpoint FOLDER]
 
 The Python has ASE and gracemaker (tensorpotential 0.6.2.1). The pool are N structures of 108 aluminium atoms: the frames of
 `configs/data/al_eam_1l`, whose model grades them, with random strains and displacements.
@@ -9,6 +9,11 @@ The reference gets a pool that was predicted before: grades and features of ever
 the start of Python nor imports count. calmwalk gets the bare structures, and what is timed is the whole command, the evaluation of
 the model included. What picking takes, of either, is the difference to the time for one structure at random: without reading the
 pool, and without evaluation.
+
+With `--checkpoint`, a folder with `model.yaml` and `checkpoint` of the same model, the reference also gets the bare structures, and
+predicts them itself. Its start, imports and compilation are those of the same job on the first 20 structures of the pool, which is
+subtracted. Nothing is subtracted from calmwalk's time, so the ratio of whole jobs is a lower limit. Compilations that only a
+larger pool needs count as the reference's time.
 
 Prints the times of each round, the ratios of their medians, and how many structures both pick.
 """
@@ -23,10 +28,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from ase.io import read, write
 
 DATA = Path(__file__).resolve().parents[2] / "configs" / "data" / "al_eam_1l"
 MODEL, ARTIFACT = DATA / "kokkos.npz", DATA / "gmm_artifacts.npz"
+# Structures of the pool that shows what the reference's start takes.
+FEW = 20
 # Farthest points begin with a greedy pick: the reference begins with an atom that it draws otherwise.
 STRATEGIES = ["calm-greedy:{}", "calm-greedy:1 fps-extrap:{}"]
 
@@ -35,9 +43,9 @@ import contextlib, io, json, sys, time
 import pandas as pd
 import tensorpotential.uq.cli.select
 from tensorpotential.scripts.grace_uq import main
-artifact, strategy, output = sys.argv[1:]
-sys.argv = ["grace_uq", "select", "--artifact", artifact, "--predicted", "predicted.pkl.gz", "--output", output,
-            "--no-element-stratified", "--strategy", *strategy.split()]
+artifact, strategy, output, *pool = sys.argv[1:]
+sys.argv = ["grace_uq", "select", "--artifact", artifact, *pool, "--output", output, "--no-element-stratified",
+            "--strategy", *strategy.split()]
 begun = time.perf_counter()
 try:
     with contextlib.redirect_stdout(io.StringIO()):
@@ -46,17 +54,17 @@ except SystemExit as end:
     if end.code:
         raise
 seconds = time.perf_counter() - begun
-print(json.dumps([seconds, [info["number"] for info in pd.read_pickle(output)["info"]]]))
+print(json.dumps([seconds, [int(atoms.info["number"]) for atoms in pd.read_pickle(output)["ase_atoms"]]]))
 """
 
 PREDICT = r"""
 import numpy as np, pandas as pd
 from ase.io import read
 features, rows, first = np.load("z.npy"), [], 0
-for number, atoms in enumerate(read("scored.extxyz", ":")):
+for atoms in read("scored.extxyz", ":"):
     n = len(atoms)
     atoms.calc = None
-    rows.append(dict(ase_atoms=atoms, energy=0.0, forces=np.zeros((n, 3)), info={"number": number}, energy_predicted=0.0,
+    rows.append(dict(ase_atoms=atoms, energy=0.0, forces=np.zeros((n, 3)), energy_predicted=0.0,
                      forces_predicted=np.zeros((n, 3)), gamma=atoms.arrays["gamma"], sigma=atoms.arrays["sigma"],
                      features=features[first:first + n]))
     first += n
@@ -77,24 +85,41 @@ def run(command, work):
 
 
 def pool(frames, calmwalk, work):
-    """Writes the pool, and the table of it that the reference reads."""
+    """Writes the pool, and tables of it, bare and predicted, and of its first structures for the reference."""
     random, known, made = np.random.default_rng(1), read(DATA / "seed_frames.extxyz", ":"), []
     for number in range(frames):
         atoms = known[number % len(known)].copy()
-        atoms.calc, atoms.info = None, {}
+        atoms.calc, atoms.info = None, {"number": number}
         atoms.set_cell(atoms.cell * (1.0 + 0.04 * random.uniform(-1, 1)), scale_atoms=True)
         atoms.positions += 0.04 * (1 + number % 5) * random.uniform(-1, 1, atoms.positions.shape)
         made.append(atoms)
     write(work / "pool.extxyz", made)
+    for name, some in [("few", made[:FEW]), ("pool", made)]:
+        pd.DataFrame({"ase_atoms": some}).to_pickle(work / f"{name}.pkl.gz")
     run([calmwalk, "calm", "score", "--model", MODEL, "--artifact", ARTIFACT, "pool.extxyz", "--output", "scored.extxyz",
          "--features", "z.npy"], work)
     run([sys.executable, "-c", PREDICT], work)
     return sum(map(len, made))
 
 
-def reference(strategy, work):
-    _, printed = run([sys.executable, "-c", REFERENCE, ARTIFACT, strategy, "picked.pkl.gz"], work)
+def reference(strategy, work, pool=("--predicted", "predicted.pkl.gz")):
+    """Time, s, and the picked structures."""
+    _, printed = run([sys.executable, "-c", REFERENCE, ARTIFACT, strategy, "picked.pkl.gz", *pool], work)
     return json.loads([line for line in printed.splitlines() if line.startswith("[")][-1])
+
+
+def whole_reference(strategy, checkpoint, work):
+    """The same from bare structures, without start and compilation."""
+    model = ["--model", checkpoint / "model.yaml", "--checkpoint", checkpoint / "checkpoint.index"]
+    model += ["--n-workers", 1, "--threads-per-worker", 1]
+    start, _ = reference(strategy, work, ["--dataset", "few.pkl.gz", *model])
+    seconds, picks = reference(strategy, work, ["--dataset", "pool.pkl.gz", *model])
+    return seconds - start, picks
+
+
+def same_picks(found, expected):
+    """How many of the first picks are the same."""
+    return next((k for k, pair in enumerate(zip(found, expected)) if pair[0] != pair[1]), min(len(found), len(expected)))
 
 
 def own(calmwalk, strategy, work):
@@ -111,7 +136,10 @@ def main():
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--picks", type=int, default=100)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--checkpoint", type=lambda text: Path(text).resolve(), help="folder with model.yaml and checkpoint")
     arguments = parser.parse_args()
+    if arguments.checkpoint and arguments.frames <= FEW:
+        parser.error(f"--frames {arguments.frames}: expected more than {FEW} with --checkpoint")
     calmwalk, work = arguments.calmwalk.resolve(), arguments.work.resolve()
     work.mkdir(parents=True, exist_ok=True)
     print(f"{pool(arguments.frames, calmwalk, work)} atoms in {arguments.frames} structures")
@@ -125,12 +153,18 @@ def main():
             seconds, found = own(calmwalk, strategy, work)
             times["own"].append(seconds)
             times["own picks"].append(seconds - own(calmwalk, "random:1", work)[0])
-            same = next((k for k, pair in enumerate(zip(found, expected)) if pair[0] != pair[1]), min(len(found), len(expected)))
+            picks = f"{len(found)} and {len(expected)} picks, the first {same_picks(found, expected)} the same"
+            if arguments.checkpoint:
+                seconds, expected = whole_reference(strategy, arguments.checkpoint, work)
+                times.setdefault("reference from bare structures", []).append(seconds)
+                picks += f", from bare structures {len(expected)}, the first {same_picks(found, expected)} the same"
             last = ", ".join(f"{key} {values[-1]:.2f} s" for key, values in times.items())
-            print(f"{strategy}, round {number}: {last}; {len(found)} and {len(expected)} picks, the first {same} the same", flush=True)
+            print(f"{strategy}, round {number}: {last}; {picks}", flush=True)
         median = {key: statistics.median(values) for key, values in times.items()}
         print(f"{strategy}: ratio of whole commands {median['reference'] / median['own']:.1f}, "
               f"of picking {median['reference picks'] / median['own picks']:.1f}")
+        if arguments.checkpoint:
+            print(f"{strategy}: ratio of whole jobs {median['reference from bare structures'] / median['own']:.1f}")
 
 
 if __name__ == "__main__":
