@@ -295,6 +295,9 @@ fn mixtures_of_several_dimensions_are_compared() {
     assert_ne!(mixtures[2]["scores"][0]["spearman"], mixtures[0]["scores"][0]["spearman"]);
     let table = std::fs::read_to_string(here.join("out/tables/mixtures.csv")).unwrap();
     assert_eq!(table.lines().count(), 7, "{table}");
+    assert!(table.lines().next().unwrap().ends_with(",AUC > 1 eV/Å,interval"), "{table}");
+    let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
+    assert!(page.contains("id=\"table-mixtures\""));
 
     let silicon = config("data/si_sw_1l/gmm_artifacts.npz").display().to_string();
     let start = ["calm", "validate", "--model", &model, "--output", "new"];

@@ -4,6 +4,7 @@
 use calm::Mixture;
 use serde::Serialize;
 
+use super::collect::LARGE_ERROR;
 use super::report::{LabelledReport, ScoreReport};
 use super::tables::{CONTAMINATION, cells};
 use crate::page::{PageTable, count, text};
@@ -44,11 +45,23 @@ impl ComparedMixture {
 /// The table of several mixtures. `report` is that of any of them.
 pub fn table(mixtures: &[ComparedMixture], report: &LabelledReport) -> PageTable {
     let caption = "Atoms with γ or γ_{nbr} up to 1 under several mixtures, by dimension D and components K of each element: their share of all \
-                   atoms, the share of them with a force error above 0.5 eV/Å, Spearman’s ρ";
-    let titles =
-        ["artifact", "D", "K", "score", "kept (%)", "interval", "above 0.5 (%)", "interval", "ρ", "interval"];
+                   atoms, the share of them with a force error above 0.5 eV/Å; Spearman’s ρ and ROC-AUC for errors above 1 eV/Å of all atoms";
+    let titles = [
+        "artifact",
+        "D",
+        "K",
+        "score",
+        "kept (%)",
+        "interval",
+        "above 0.5 (%)",
+        "interval",
+        "ρ",
+        "interval",
+        "AUC > 1 eV/Å",
+        "interval",
+    ];
     let mut table = PageTable::new("mixtures", caption, &titles);
-    let place = report.threshold(CONTAMINATION);
+    let (place, large) = (report.threshold(CONTAMINATION), report.threshold(LARGE_ERROR));
     for mixture in mixtures {
         for score in &mixture.scores {
             let kept = score.confident.as_ref();
@@ -62,6 +75,7 @@ pub fn table(mixtures: &[ComparedMixture], report: &LabelledReport) -> PageTable
             row.extend(cells(kept.map(|kept| kept.retention).unwrap_or_default(), 100.0, 1));
             row.extend(cells(contamination, 100.0, 2));
             row.extend(cells(score.spearman, 1.0, 3));
+            row.extend(cells(large.map(|k| score.auc[k]).unwrap_or_default(), 1.0, 3));
             table.rows.push(row);
         }
     }
