@@ -297,7 +297,15 @@ fn mixtures_of_several_dimensions_are_compared() {
     assert_eq!(table.lines().count(), 7, "{table}");
     assert!(table.lines().next().unwrap().ends_with(",AUC > 1 eV/Å,interval"), "{table}");
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
-    assert!(page.contains("id=\"table-mixtures\""));
+    assert!(page.contains("id=\"table-mixtures\"") && page.contains("id=\"figure-mixture-contamination\""));
+    // One curve for each mixture, and one of all atoms.
+    let curves = std::fs::read_to_string(here.join("out/figures/mixture-contamination.csv")).unwrap();
+    let kept = &mixtures[2]["scores"][1]["confident"]["contamination"];
+    assert_eq!(curves.lines().count(), 1 + 4 * kept.as_array().unwrap().len());
+    let linear = curves.lines().find(|line| line.starts_with("\"3: D = 128, K = 1 (")).unwrap();
+    let (_, numbers) = linear.split_once(" % kept)\",").unwrap();
+    let numbers: Vec<f64> = numbers.split(',').map(|number| number.parse().unwrap()).collect();
+    assert!(deviation(&numbers[..2], &[0.01, kept[0]["value"].as_f64().unwrap()]) < 1e-12, "{linear}");
 
     let silicon = config("data/si_sw_1l/gmm_artifacts.npz").display().to_string();
     let start = ["calm", "validate", "--model", &model, "--output", "new"];

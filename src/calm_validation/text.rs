@@ -81,6 +81,7 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -
                 table("confident"),
                 figure("auc-sweep"),
                 table("quantiles"),
+                figure("mixture-contamination"),
                 table("mixtures"),
             ]),
         ),

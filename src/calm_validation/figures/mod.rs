@@ -23,5 +23,7 @@ pub fn all(validation: &Validation) -> Vec<FigureEntry> {
         part("solutions", "Solid solutions", solutions::draw(validation)),
     ];
     figures.extend(validation.labelled.iter().flat_map(labelled::figures));
+    let mixtures = |report| labelled::mixtures_figure(&validation.mixtures, report);
+    figures.extend(validation.labelled.iter().filter_map(mixtures));
     figures
 }

@@ -5,6 +5,8 @@ mod reliability;
 
 use ::figures::{Colour, Stroke};
 
+pub use self::curves::mixtures;
+
 use super::report::{IntervalEstimate, LabelledReport};
 use crate::page::FigureEntry;
 

@@ -35,7 +35,7 @@ impl ComparedMixture {
     }
 
     /// The smallest and the largest K.
-    fn range(&self) -> String {
+    pub fn range(&self) -> String {
         let [low, high] =
             [self.components.iter().min(), self.components.iter().max()].map(|k| k.copied().unwrap_or(0));
         if low == high { low.to_string() } else { format!("{low}–{high}") }

@@ -2,7 +2,8 @@
 
 use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, Panel, Rectangle, Stroke};
 
-use super::super::report::{IntervalEstimate, LabelledReport};
+use super::super::ComparedMixture;
+use super::super::report::{Confident, IntervalEstimate, LabelledReport};
 use super::{runs, stroke};
 use crate::csv::{Csv, number};
 use crate::page::style::WIDTH;
@@ -18,18 +19,11 @@ const SWEEP: (f64, f64) = (0.05, 5.0);
 const ERROR: &str = "threshold of the force error (eV Å^{−1})";
 
 pub fn contamination(report: &LabelledReport) -> FigureEntry {
-    let (low, high) = (report.thresholds[0], report.thresholds[report.thresholds.len() - 1]);
-    let x = Axis::new(ERROR, AxisScale::Logarithmic, low, high);
-    let y = Axis::new("probability of a larger error", AxisScale::Linear, 0.0, 1.0);
-    let mut chart = Chart::new("contamination", "Contamination of the confident set", x, y);
-    chart.panel.vertical_line(0.5);
-    let all = report.unfiltered.iter().map(|value| IntervalEstimate { value: *value, interval: None });
-    chart.curve("no filter", Colour::INK.dashed(1.1), &report.thresholds, &all.collect::<Vec<_>>());
+    const TITLE: &str = "Contamination of the confident set";
+    let mut chart = unfiltered("contamination", TITLE, report);
     for (k, score) in report.scores.iter().enumerate() {
         let (Some(limit), Some(confident)) = (score.limit, &score.confident) else { continue };
-        let kept =
-            confident.retention.value.map_or(String::new(), |kept| format!(" ({:.1} % kept)", 100.0 * kept));
-        let name = format!("{} ≤ {limit}{kept}", score.name);
+        let name = format!("{} ≤ {limit}{}", score.name, kept(confident));
         chart.curve(&name, stroke(k), &report.thresholds, &confident.contamination);
     }
     let caption = format!(
@@ -38,7 +32,49 @@ pub fn contamination(report: &LabelledReport) -> FigureEntry {
         level(report),
         report.atoms
     );
-    chart.finish("Contamination of the confident set", caption)
+    chart.finish(TITLE, caption)
+}
+
+/// The same for γ_nbr up to 1 under several mixtures. `report` is that of any of them. `None` without mixtures or force labels.
+pub fn mixtures(mixtures: &[ComparedMixture], report: &LabelledReport) -> Option<FigureEntry> {
+    const TITLE: &str = "Contamination under several mixtures";
+    if mixtures.is_empty() || report.atoms == 0 {
+        return None;
+    }
+    let mut chart = unfiltered("mixture-contamination", TITLE, report);
+    for (k, mixture) in mixtures.iter().enumerate() {
+        let Some(confident) = mixture.scores.get(1).and_then(|average| average.confident.as_ref()) else {
+            continue;
+        };
+        let (dimension, components) = (mixture.dimension, mixture.range());
+        let name = format!("{}: D = {dimension}, K = {components}{}", k + 1, kept(confident));
+        chart.curve(&name, stroke(k), &report.thresholds, &confident.contamination);
+    }
+    let files = mixtures.iter().enumerate().map(|(k, mixture)| format!("{}, {}", k + 1, mixture.artifact));
+    let caption = format!(
+        "Probability that an atom with γ_{{nbr}} up to 1 has a force error above a threshold, under mixtures of dimension D with K components \
+         of each element, with {} intervals; dashed, all atoms; vertical line, 0.5 eV Å^{{−1}}. Mixtures: {}.",
+        level(report),
+        files.collect::<Vec<_>>().join("; ")
+    );
+    Some(chart.finish(TITLE, caption))
+}
+
+/// A chart of contamination with the curve of all atoms.
+fn unfiltered(name: &'static str, title: &str, report: &LabelledReport) -> Chart {
+    let (low, high) = (report.thresholds[0], report.thresholds[report.thresholds.len() - 1]);
+    let x = Axis::new(ERROR, AxisScale::Logarithmic, low, high);
+    let y = Axis::new("probability of a larger error", AxisScale::Linear, 0.0, 1.0);
+    let mut chart = Chart::new(name, title, x, y);
+    chart.panel.vertical_line(0.5);
+    let all = report.unfiltered.iter().map(|value| IntervalEstimate { value: *value, interval: None });
+    chart.curve("no filter", Colour::INK.dashed(1.1), &report.thresholds, &all.collect::<Vec<_>>());
+    chart
+}
+
+/// The share of the atoms that a limit keeps, for legends.
+fn kept(confident: &Confident) -> String {
+    confident.retention.value.map_or(String::new(), |kept| format!(" ({:.1} % kept)", 100.0 * kept))
 }
 
 pub fn areas(report: &LabelledReport) -> FigureEntry {
