@@ -18,8 +18,8 @@ use super::validate_labels;
 use crate::atomic_file::refuse_to_replace;
 use crate::calm_validation::labelled::ComparedMixture;
 use crate::calm_validation::{
-    self, AtomScore, EnergySpread, PAGE, Subject, Validation, ValidationProgress, ValidationSettings, both,
-    labelled, verdict,
+    self, AtomScore, EnergySpread, MixtureScore, PAGE, Subject, Validation, ValidationProgress,
+    ValidationSettings, both, labelled, verdict,
 };
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
@@ -29,8 +29,8 @@ use crate::signals::stop_token;
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
-/// A mixture with its file and the model of its features.
-type NamedMixture = (String, Arc<GraceModel>, Arc<Mixture>);
+/// A mixture with its file and its features.
+type NamedMixture = (PathBuf, FeatureModel, Arc<Mixture>);
 
 /// Metals up to which all pairs are mixed by default.
 const MIXED: usize = 4;
@@ -67,9 +67,9 @@ pub struct CalmValidateArgs {
     /// repeated
     #[arg(long, value_name = "WEIGHTS[:RADIUS]", requires = "labelled")]
     gamma_nbr: Vec<NeighbourWeights>,
-    /// Another mixture of the model, such as one with more components; may be repeated. A table compares what γ up to 1 keeps of the
-    /// labelled structures under each mixture
-    #[arg(long, value_name = "CALM.npz", requires = "labelled")]
+    /// Another mixture of the model, such as one of other features or with more components; may be repeated. Its γ is a score beside γ.
+    /// With --labelled, a table and a figure also compare what γ up to 1 keeps of the labelled structures under each mixture
+    #[arg(long, value_name = "CALM.npz")]
     compare_artifact: Vec<PathBuf>,
     /// Directory for the files, created if it does not exist; files of an earlier validation are replaced
     #[arg(long, short, value_name = "DIR")]
@@ -102,7 +102,8 @@ impl CalmValidateArgs {
         let spread = self.ensemble(&model)?;
         let mut compared = self.compared(&features)?;
         let mixtures = self.mixtures(&features, &mixture)?;
-        let others = compared.baselines().into_iter().chain(spread).collect();
+        let further = mixture_scores(&features, mixtures.get(1..).unwrap_or_default());
+        let others = further.into_iter().chain(compared.baselines()).chain(spread).collect();
         // Fail before the long computation.
         create_directory(&self.output)?;
         let stop = stop_token()?;
@@ -112,7 +113,7 @@ impl CalmValidateArgs {
                 let mut scorer = Scorer::new(model.clone(), mixture.clone());
                 let found = validate_labels::report(input, &mut scorer, &mut compared, &stop)?;
                 let Some(report) = found else { return Ok(stopped()) };
-                let Some(mixtures) = self.compare(input, &features, mixtures, &stop)? else {
+                let Some(mixtures) = self.compare(input, mixtures, &stop)? else {
                     return Ok(stopped());
                 };
                 (Some(report), mixtures)
@@ -154,8 +155,7 @@ impl CalmValidateArgs {
         Ok(others.with_averages(&self.gamma_nbr))
     }
 
-    /// The mixtures to compare, that of the scores first, with their files and the models of their features; none without
-    /// `--compare-artifact`.
+    /// The mixtures to compare, that of γ first, with their files and features; none without `--compare-artifact`.
     fn mixtures(
         &self,
         own: &FeatureModel,
@@ -164,11 +164,11 @@ impl CalmValidateArgs {
         if self.compare_artifact.is_empty() {
             return Ok(Vec::new());
         }
-        let file = self.artifact.as_ref().unwrap_or(&self.model).display().to_string();
-        let mut mixtures = vec![(file, own.model.clone(), mixture.clone())];
+        let file = self.artifact.as_ref().unwrap_or(&self.model).clone();
+        let mut mixtures = vec![(file, own.clone(), mixture.clone())];
         for path in &self.compare_artifact {
             let (features, artifact) = load(&self.model, Some(path))?;
-            mixtures.push((path.display().to_string(), features.model, Arc::new(artifact.mixture)));
+            mixtures.push((path.clone(), features, Arc::new(artifact.mixture)));
         }
         Ok(mixtures)
     }
@@ -177,19 +177,18 @@ impl CalmValidateArgs {
     fn compare(
         &self,
         input: &Path,
-        features: &FeatureModel,
         mixtures: Vec<NamedMixture>,
         stop: &CancellationToken,
     ) -> Result<Option<Vec<ComparedMixture>>, CommandError> {
         let mut compared = Vec::new();
-        for (file, model, mixture) in mixtures {
-            let mut scorer = Scorer::new(model, mixture.clone());
+        for (file, features, mixture) in mixtures {
+            let mut scorer = Scorer::new(features.model.clone(), mixture.clone());
             // Other scores could leave atoms out.
-            let mut none = OtherScores::load(&self.model, features, &[], &[])?;
+            let mut none = OtherScores::load(&self.model, &features, &[], &[])?;
             let Some(report) = validate_labels::report(input, &mut scorer, &mut none, stop)? else {
                 return Ok(None);
             };
-            compared.push(ComparedMixture::new(file, &mixture, &report));
+            compared.push(ComparedMixture::new(file.display().to_string(), &mixture, &report));
         }
         Ok(Some(compared))
     }
@@ -238,6 +237,18 @@ impl CalmValidateArgs {
             seed: self.rng_seed,
         })
     }
+}
+
+/// γ under each of these mixtures as a score with the name of its file. `graded` has the features that γ grades.
+fn mixture_scores(graded: &FeatureModel, mixtures: &[NamedMixture]) -> Vec<Box<dyn AtomScore>> {
+    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let score = |(path, features, mixture): &NamedMixture| {
+        let is_only = mixtures.iter().filter(|(other, ..)| stem(other) == stem(path)).count() == 1;
+        let name = if is_only { stem(path) } else { path.display().to_string() };
+        let own = (features.projection() != graded.projection()).then(|| features.clone());
+        Box::new(MixtureScore::new(format!("γ ({name})"), mixture.clone(), own)) as Box<dyn AtomScore>
+    };
+    mixtures.iter().map(score).collect()
 }
 
 fn stopped() -> ExitStatus {
