@@ -295,7 +295,7 @@ fn labelled_structures_have_a_section() {
         let of_validation = std::fs::read(here.join("out").join(kind).join(file)).unwrap();
         assert!(of_validation == std::fs::read(here.join("drawn").join(file)).unwrap(), "{file}");
     };
-    for table in ["label-errors.csv", "ranks.csv", "confident.csv", "quantiles.csv"] {
+    for table in ["label-errors.csv", "ranks.csv", "confident.csv", "auc-thresholds.csv", "quantiles.csv"] {
         same(table, "tables");
     }
     for figure in ["reliability.svg", "contamination.csv", "auc-sweep.png"] {
@@ -304,6 +304,7 @@ fn labelled_structures_have_a_section() {
     let rho = found["labelled"]["scores"][0]["spearman"]["value"].as_f64().unwrap();
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
     assert!(page.contains("<h2>Labelled structures</h2>") && page.contains("id=\"table-ranks\""));
+    assert!(page.contains("id=\"table-auc-thresholds\""));
     assert!(
         page.contains(&format!("In 3 labelled structures, Spearman’s ρ of γ and force error is {rho:.3}."))
     );

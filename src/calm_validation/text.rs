@@ -80,6 +80,8 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -
                 figure("contamination"),
                 table("confident"),
                 figure("auc-sweep"),
+                table("auc-thresholds"),
+                table("worst-deciles"),
                 table("quantiles"),
                 figure("mixture-contamination"),
                 table("mixtures"),

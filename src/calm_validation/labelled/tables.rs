@@ -10,11 +10,15 @@ use crate::page::{PageTable, TableCell, count, percent, real, text};
 /// The force error of the paper's table of contamination, eV/Å.
 pub(super) const CONTAMINATION: f64 = 0.5;
 
+/// Thresholds of the table of areas under the ROC curve, eV/Å; its titles have them too.
+const AUC_THRESHOLDS: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
+
 /// All tables that have rows.
 pub fn all(report: &LabelledReport) -> Vec<PageTable> {
     let mut tables = vec![errors(report)];
     if report.atoms > 0 {
-        tables.extend([ranks(report), confident(report), quantiles(report)]);
+        tables.extend([ranks(report), confident(report), auc_thresholds(report), worst_deciles(report)]);
+        tables.push(quantiles(report));
     }
     tables.retain(|table| !table.rows.is_empty());
     tables
@@ -111,6 +115,42 @@ fn confident(report: &LabelledReport) -> PageTable {
                    1 eV/Å";
     let titles = ["", "kept (%)", INTERVAL, "above 0.5 (%)", INTERVAL, "above 1 (%)", INTERVAL];
     PageTable { rows, ..PageTable::new("confident", caption, &titles) }
+}
+
+fn auc_thresholds(report: &LabelledReport) -> PageTable {
+    let places = AUC_THRESHOLDS.map(|error| report.threshold(error));
+    let row = |score: &ScoreReport| {
+        let of = |place: Option<usize>| place.map(|k| score.auc[k]).unwrap_or_default();
+        let areas = places.into_iter().flat_map(|place| cells(of(place), 1.0, 3));
+        [name(score)].into_iter().chain(areas).collect()
+    };
+    let caption = "ROC-AUC of a score as a test for force errors above a threshold (eV/Å)";
+    let titles = ["score", "> 0.1", INTERVAL, "> 0.3", INTERVAL, "> 1", INTERVAL, "> 3", INTERVAL];
+    PageTable {
+        rows: report.scores.iter().map(row).collect(),
+        ..PageTable::new("auc-thresholds", caption, &titles)
+    }
+}
+
+/// By element and score; without rows if there is only one element.
+fn worst_deciles(report: &LabelledReport) -> PageTable {
+    let caption = "ROC-AUC of a score as a test for the worst decile of each element: the atoms with a force error above the threshold \
+                   (eV/Å), the 90 % quantile of the sampled atoms of the element";
+    let titles = ["element", "sampled atoms", "threshold", "score", "AUC", INTERVAL];
+    let mut table = PageTable::new("worst-deciles", caption, &titles);
+    let elements = report.scores.first().map_or(0, |score| score.worst_decile_by_element.len());
+    if elements < 2 {
+        return table;
+    }
+    for k in 0..elements {
+        for score in &report.scores {
+            let of = &score.worst_decile_by_element[k];
+            let mut row = vec![text(of.element), count(of.atoms as u64), real(of.threshold, 3), name(score)];
+            row.extend(cells(of.auc, 1.0, 3));
+            table.rows.push(row);
+        }
+    }
+    table
 }
 
 fn quantiles(report: &LabelledReport) -> PageTable {

@@ -135,6 +135,34 @@ fn the_worst_decile_is_that_of_each_element() {
 }
 
 #[test]
+fn areas_are_shown_by_element_and_by_threshold() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    let rows = |name: &str| {
+        let tables = tables(&report);
+        let table = tables.iter().find(|table| table.name == name).unwrap();
+        let csv = String::from_utf8(table.csv().into_bytes()).unwrap();
+        csv.lines().skip(1).map(|line| line.split(',').map(str::to_owned).collect()).collect::<Vec<Vec<_>>>()
+    };
+    let number = |cell: &str| cell.parse::<f64>().ok();
+    for (row, score) in rows("auc-thresholds").iter().zip(&report.scores) {
+        for (k, threshold) in [0.1, 0.3, 1.0, 3.0].into_iter().enumerate() {
+            let place = report.threshold(threshold).unwrap();
+            assert_eq!(number(&row[1 + 2 * k]), score.auc[place].value, "{threshold}");
+        }
+    }
+    let deciles = rows("worst-deciles");
+    let places = [("Al", 0), ("Ni", 1)].into_iter().flat_map(|element| [(element, 0), (element, 1)]);
+    for (row, ((symbol, element), score)) in deciles.iter().zip(places) {
+        let of = &report.scores[score].worst_decile_by_element[element];
+        assert_eq!((row[0].as_str(), row[1].as_str()), (symbol, of.atoms.to_string().as_str()));
+        assert_eq!((number(&row[2]), number(&row[4])), (Some(of.threshold), of.auc.value));
+        let (low, high) = of.auc.interval.unwrap();
+        assert_eq!(row[5], format!("{low} to {high}"));
+    }
+}
+
+#[test]
 fn energies_are_compared_with_and_without_offsets() {
     let samples: Vec<_> = (0..45).map(sample).collect();
     let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
@@ -211,9 +239,25 @@ fn figures_and_tables_show_every_score() {
         for words in ["labelled structure", "d_nn", "γ ≤ 1", "> 5", "stress components"] {
             assert!(text.contains(words), "{text}");
         }
-        // A single structure has no energy offsets.
-        let errors = if number == 1 { 3 } else { 4 };
-        let rows: Vec<_> = tables(&report).iter().map(|table| table.rows.len()).collect();
-        assert_eq!(rows, [errors, 2, 2, 7]);
+        let rows: Vec<_> = tables(&report).iter().map(|table| (table.name, table.rows.len())).collect();
+        // A single structure has no energy offsets, and this one has one element.
+        let expected: &[_] = match number {
+            1 => &[
+                ("label-errors", 3),
+                ("ranks", 2),
+                ("confident", 2),
+                ("auc-thresholds", 2),
+                ("quantiles", 7),
+            ],
+            _ => &[
+                ("label-errors", 4),
+                ("ranks", 2),
+                ("confident", 2),
+                ("auc-thresholds", 2),
+                ("worst-deciles", 4),
+                ("quantiles", 7),
+            ],
+        };
+        assert_eq!(rows, expected);
     }
 }
