@@ -2,6 +2,7 @@
 //! potential and labels, and distributions of what was collected. Functions take and return plain numbers; reading
 //! data and drawing results happens elsewhere.
 
+mod binned_errors;
 mod binned_quantiles;
 mod bins;
 mod bootstrap;
@@ -23,6 +24,7 @@ mod ranked_errors;
 mod systematic_sample;
 mod wilson;
 
+pub use binned_errors::{BinStatistics, BinnedErrors};
 pub use binned_quantiles::{QuantileBin, binned_quantiles};
 pub use bins::Bins;
 pub use bootstrap::Bootstrap;

@@ -3,11 +3,16 @@
 /// The quantile `q` (0 to 1) of ascending values, interpolated linearly at index q (n − 1), counted from 0
 /// (type 7 of Hyndman and Fan, the default of NumPy). `None` without values.
 pub fn quantile(ascending: &[f64], q: f64) -> Option<f64> {
-    let last = ascending.len().checked_sub(1)?;
+    quantile_by_index(ascending.len(), q, |index| ascending[index])
+}
+
+/// The same of `number` values in ascending order, which `value` has by their index.
+pub(crate) fn quantile_by_index(number: usize, q: f64, value: impl Fn(usize) -> f64) -> Option<f64> {
+    let last = number.checked_sub(1)?;
     let place = q.clamp(0.0, 1.0) * last as f64;
     let below = place.floor() as usize;
     let above = (below + 1).min(last);
-    let (low, high) = (ascending[below], ascending[above]);
+    let (low, high) = (value(below), value(above));
     Some(low + (place - below as f64) * (high - low))
 }
 

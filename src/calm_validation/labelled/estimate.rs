@@ -1,9 +1,10 @@
 //! The report of what was collected.
 
 mod atoms;
+mod bins;
 mod structures;
 
-use analysis::{Bootstrap, ForceErrors};
+use analysis::Bootstrap;
 
 use self::atoms::AtomStatistics;
 use self::structures::StructureStatistics;
@@ -22,7 +23,8 @@ type Values = Vec<Option<f64>>;
 
 impl LabelledErrors {
     /// The report. The intervals cost about 40 ns for each draw, sampled atom and score, on all cores: some 15 seconds of one core
-    /// for 200,000 atoms and two scores, and little for small sets.
+    /// for 200,000 atoms and two scores, and little for small sets. Those of the bins take one more pass over the sampled atoms for
+    /// each draw and score with a limit.
     pub fn report(&self, bootstrap: Bootstrap) -> LabelledReport {
         let structures = StructureStatistics::new(&self.sample.items().collect::<Vec<_>>());
         let [energy, energy_without_offsets, forces, stress] = self.mean_errors(&structures, bootstrap);
@@ -103,7 +105,9 @@ impl LabelledErrors {
                     worst_decile,
                     worst_decile_by_element: worst_decile_by_element.map(element).collect(),
                     confident: column.limit.map(|_| self.confident(k, retention, contamination)),
-                    bins: self.bins[k].iter().flat_map(ForceErrors::bins).map(Into::into).collect(),
+                    bins: self.bins[k]
+                        .as_ref()
+                        .map_or(Vec::new(), |errors| bins::with_intervals(errors, sampled, k, bootstrap)),
                     bands: atoms::bands(sampled, k),
                     error_histograms: column.limit.and_then(|limit| ErrorHistograms::new(sampled, k, limit)),
                 }

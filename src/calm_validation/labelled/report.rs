@@ -120,11 +120,11 @@ pub struct Bin {
     pub atoms: u64,
     /// Share of all atoms.
     pub share: f64,
-    pub median: Option<f64>,
-    pub p90: Option<f64>,
+    pub median: IntervalEstimate,
+    pub p90: IntervalEstimate,
     pub p99: Option<f64>,
     /// Share of the atoms of the bin with a force error above 1 eV/Å.
-    pub large: Option<f64>,
+    pub large: IntervalEstimate,
 }
 
 /// Quantiles of the force error of the sampled atoms between two scores, eV/Å.
@@ -154,10 +154,20 @@ impl LabelledReport {
     }
 }
 
-impl From<ErrorBin> for Bin {
-    fn from(bin: ErrorBin) -> Self {
-        let ErrorBin { above, up_to, atoms, share, median, p90, p99, large, .. } = bin;
-        Self { above, up_to, atoms, share, median, p90, p99, large }
+impl Bin {
+    /// With the intervals of median, 90 % quantile and share of large errors.
+    pub fn new(bin: &ErrorBin, [median, p90, large]: [Option<(f64, f64)>; 3]) -> Self {
+        let estimate = |value, interval| IntervalEstimate { value, interval };
+        Self {
+            above: bin.above,
+            up_to: bin.up_to,
+            atoms: bin.atoms,
+            share: bin.share,
+            median: estimate(bin.median, median),
+            p90: estimate(bin.p90, p90),
+            p99: bin.p99,
+            large: estimate(bin.large, large),
+        }
     }
 }
 

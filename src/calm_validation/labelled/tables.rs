@@ -157,13 +157,26 @@ fn quantiles(report: &LabelledReport) -> PageTable {
     let row = |score: &ScoreReport, bin: &Bin| {
         let mut row = vec![name(score), text(range(bin.above, bin.up_to)), count(bin.atoms)];
         row.push(percent(Some(bin.share)));
-        row.extend([bin.median, bin.p90, bin.p99].map(|error| real(error, 3)));
-        row.push(percent(bin.large));
+        row.extend([bin.median, bin.p90].into_iter().flat_map(|error| cells(error, 1.0, 3)));
+        row.push(real(bin.p99, 3));
+        row.extend(cells(bin.large, 100.0, 1));
         row
     };
     let rows = report.scores.iter().flat_map(|score| score.bins.iter().map(move |bin| row(score, bin)));
     let caption = "Force errors (eV/Å) by bins of a score";
-    let titles = ["score", "bin", "atoms", "atoms (%)", "median", "p90", "p99", "above 1 eV/Å (%)"];
+    let titles = [
+        "score",
+        "bin",
+        "atoms",
+        "atoms (%)",
+        "median",
+        INTERVAL,
+        "p90",
+        INTERVAL,
+        "p99",
+        "above 1 eV/Å (%)",
+        INTERVAL,
+    ];
     PageTable { rows: rows.collect(), ..PageTable::new("quantiles", caption, &titles) }
 }
 

@@ -6,6 +6,7 @@ use atoms::Species;
 use atoms::cell::{norm, sub};
 use atoms::extxyz::FrameLabels;
 
+use super::report::IntervalEstimate;
 use super::*;
 
 const BOOTSTRAP: Bootstrap = Bootstrap { draws: 60, level: 0.9, seed: 3 };
@@ -132,6 +133,32 @@ fn the_worst_decile_is_that_of_each_element() {
     }
     assert_eq!(areas.len(), 2);
     assert_near(report.scores[0].worst_decile.value, Some(0.5 * (areas[0] + areas[1])));
+}
+
+#[test]
+fn bins_have_intervals() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    let (errors, scores) = atoms(&samples);
+    let bins = &report.scores[0].bins;
+    let in_first = errors.iter().zip(&scores[0]).filter(|(_, score)| **score <= 0.5);
+    let mut ascending: Vec<_> = in_first.map(|(error, _)| *error).collect();
+    ascending.sort_by(f64::total_cmp);
+    assert_eq!((bins[0].atoms, bins[0].up_to), (ascending.len() as u64, Some(0.5)));
+    assert_near(bins[0].median.value, quantile(&ascending, 0.5));
+    assert_near(bins[0].p90.value, quantile(&ascending, 0.9));
+    // Errors are at most √3 / 2 times the score, so none of this bin is large, and in no draw.
+    assert_eq!((bins[0].large.value, bins[0].large.interval), (Some(0.0), Some((0.0, 0.0))));
+    for estimate in [bins[0].median, bins[0].p90, bins[5].large] {
+        let (low, high) = estimate.interval.unwrap();
+        assert!(low < high && (low..=high).contains(&estimate.value.unwrap()), "{estimate:?}");
+    }
+    // No score is above 5.
+    let IntervalEstimate { value, interval } = bins[6].median;
+    assert_eq!((bins[6].atoms, value, interval), (0, None, None));
+    let quantiles = tables(&report).into_iter().find(|table| table.name == "quantiles").unwrap();
+    let (low, high) = bins[0].median.interval.unwrap();
+    assert_eq!(quantiles.rows[0][5].exact, format!("{low} to {high}"));
 }
 
 #[test]

@@ -94,7 +94,7 @@ impl AtomStatistics {
 }
 
 /// Numbers of the structures with sampled atoms, from 0.
-fn units(sampled: &[&SampledAtom]) -> Vec<u32> {
+pub fn units(sampled: &[&SampledAtom]) -> Vec<u32> {
     let runs = sampled.chunk_by(|a, b| a.structure == b.structure);
     runs.enumerate().flat_map(|(unit, run)| vec![unit as u32; run.len()]).collect()
 }
