@@ -298,13 +298,13 @@ fn labelled_structures_have_a_section() {
     for table in ["label-errors.csv", "ranks.csv", "confident.csv", "auc-thresholds.csv", "quantiles.csv"] {
         same(table, "tables");
     }
-    for figure in ["reliability.svg", "contamination.csv", "auc-sweep.png"] {
+    for figure in ["reliability.svg", "error-histograms.csv", "contamination.csv", "auc-sweep.png"] {
         same(figure, "figures");
     }
     let rho = found["labelled"]["scores"][0]["spearman"]["value"].as_f64().unwrap();
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
     assert!(page.contains("<h2>Labelled structures</h2>") && page.contains("id=\"table-ranks\""));
-    assert!(page.contains("id=\"table-auc-thresholds\""));
+    assert!(page.contains("id=\"table-auc-thresholds\"") && page.contains("id=\"figure-error-histograms\""));
     assert!(
         page.contains(&format!("In 3 labelled structures, Spearman’s ρ of γ and force error is {rho:.3}."))
     );

@@ -76,6 +76,7 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -
                 )),
                 table("label-errors"),
                 figure("reliability"),
+                figure("error-histograms"),
                 table("ranks"),
                 figure("contamination"),
                 table("confident"),

@@ -1,13 +1,14 @@
 //! The figures of the report, with captions and data.
 
 mod curves;
+mod error_histograms;
 mod reliability;
 
-use ::figures::{Colour, Stroke};
+use ::figures::{Colour, Point, Stroke};
 
 pub use self::curves::mixtures;
 
-use super::report::{IntervalEstimate, LabelledReport};
+use super::report::{ErrorHistograms, IntervalEstimate, LabelledReport};
 use crate::page::FigureEntry;
 
 /// The figures, none without force labels.
@@ -15,11 +16,29 @@ pub fn all(report: &LabelledReport) -> Vec<FigureEntry> {
     if report.atoms == 0 {
         return Vec::new();
     }
-    let mut figures = vec![curves::areas(report)];
+    let mut figures = Vec::new();
     if report.scores.iter().any(|score| score.confident.is_some()) {
-        figures.splice(0..0, [reliability::draw(report), curves::contamination(report)]);
+        figures.push(reliability::draw(report));
+        figures.extend(error_histograms::draw(report));
+        figures.push(curves::contamination(report));
     }
+    figures.push(curves::areas(report));
     figures
+}
+
+/// Outlines of the histograms of the atoms within and beyond the limit: (error, share of these atoms), from zero to zero.
+fn outlines(histograms: &ErrorHistograms) -> [Vec<Point>; 2] {
+    let edges = &histograms.edges;
+    histograms.populations.each_ref().map(|population| {
+        let all = population.counts.iter().sum::<u64>().max(1) as f64;
+        let mut outline = vec![[edges[0], 0.0]];
+        for (edges, count) in edges.windows(2).zip(&population.counts) {
+            let share = *count as f64 / all;
+            outline.extend([[edges[0], share], [edges[1], share]]);
+        }
+        outline.push([edges[edges.len() - 1], 0.0]);
+        outline
+    })
 }
 
 /// Line of the curve with this number: colours, then dashes.

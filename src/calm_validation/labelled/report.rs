@@ -141,10 +141,17 @@ pub struct Band {
 pub struct ErrorHistograms {
     /// Edges of the bins, eV/Å.
     pub edges: Vec<f64>,
-    /// Atoms with a score up to the limit.
-    pub within: Vec<u64>,
-    /// Atoms with a larger score.
-    pub beyond: Vec<u64>,
+    /// Atoms with a score up to the limit, and those with a larger one.
+    pub populations: [ErrorPopulation; 2],
+}
+
+/// Force errors of sampled atoms, eV/Å.
+#[derive(Clone, Debug, Serialize)]
+pub struct ErrorPopulation {
+    /// Atoms by bin.
+    pub counts: Vec<u64>,
+    pub mean: Option<f64>,
+    pub median: Option<f64>,
 }
 
 impl LabelledReport {

@@ -102,6 +102,11 @@ fn a_report_has_the_statistics_of_its_atoms() {
     };
     let kept: Vec<_> =
         errors.iter().zip(&scores[0]).filter(|(_, score)| **score <= 1.0).map(|(x, _)| *x).collect();
+    let histograms = report.scores[0].error_histograms.as_ref().unwrap();
+    let [within, beyond] = &histograms.populations;
+    assert_near(within.mean, Some(kept.iter().sum::<f64>() / kept.len() as f64));
+    assert!(beyond.mean > within.mean && beyond.median > within.median, "{histograms:?}");
+    assert_eq!(beyond.counts.iter().sum::<u64>(), 360 - kept.len() as u64);
     let confident = report.scores[0].confident.as_ref().unwrap();
     assert_near(confident.retention.value, share(&|score| score <= 1.0, &scores[0]));
     for (k, threshold) in report.thresholds.iter().enumerate() {
@@ -252,7 +257,7 @@ fn figures_and_tables_show_every_score() {
         let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
         let figures = figures(&report);
         let names: Vec<_> = figures.iter().map(|figure| figure.name).collect();
-        assert_eq!(names, ["reliability", "contamination", "auc-sweep"]);
+        assert_eq!(names, ["reliability", "error-histograms", "contamination", "auc-sweep"]);
         for figure in figures {
             let drawn = figure.drawn.unwrap();
             assert!(!to_svg(&drawn.figure).contains("NaN"), "{}", figure.name);

@@ -75,8 +75,8 @@ pub struct CalmScoreArgs {
     /// Also write the statistics of labelled structures to this file, with all thresholds of the force error
     #[arg(long, value_name = "FILE.json")]
     json: Option<PathBuf>,
-    /// Also draw the statistics of labelled structures into this directory: force errors by grade, contamination and ROC-AUC by
-    /// threshold of the force error, as SVG, PNG and CSV
+    /// Also draw the statistics of labelled structures into this directory: force errors by grade and on either side of its
+    /// limit, contamination and ROC-AUC by threshold of the force error, as SVG, PNG and CSV
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Also write a table with one row for each structure, for calm filter: line of the input, largest γ and γ_nbr, energy per

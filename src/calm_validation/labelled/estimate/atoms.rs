@@ -4,7 +4,7 @@ use analysis::{Exceedance, Histogram, RankedErrors, binned_quantiles, quantile};
 use atoms::Species;
 
 use super::super::collect::{SampledAtom, ScoreColumn, THRESHOLDS};
-use super::super::report::{Band, ErrorHistograms};
+use super::super::report::{Band, ErrorHistograms, ErrorPopulation};
 use super::Values;
 
 /// Bins of a decade, for bands and histograms.
@@ -122,11 +122,21 @@ impl ErrorHistograms {
     /// `None` without an error above zero.
     pub fn new(sampled: &[&SampledAtom], column: usize, limit: f64) -> Option<Self> {
         let edges = decade_edges(sampled.iter().map(|atom| atom.error));
-        let counts = |is_within: bool| {
+        if edges.len() < 2 {
+            return None;
+        }
+        let population = |is_within: bool| {
             let atoms = sampled.iter().filter(|atom| (atom.scores[column] <= limit) == is_within);
-            Histogram::from_values(edges.clone(), atoms.map(|atom| atom.error)).counts().to_vec()
+            let mut errors: Vec<_> = atoms.map(|atom| atom.error).collect();
+            errors.sort_by(f64::total_cmp);
+            let sum = errors.iter().sum::<f64>();
+            ErrorPopulation {
+                counts: Histogram::from_values(edges.clone(), errors.iter().copied()).counts().to_vec(),
+                mean: (!errors.is_empty()).then(|| sum / errors.len() as f64),
+                median: quantile(&errors, 0.5),
+            }
         };
-        (edges.len() > 1).then(|| Self { within: counts(true), beyond: counts(false), edges: edges.clone() })
+        Some(Self { populations: [true, false].map(population), edges })
     }
 }
 

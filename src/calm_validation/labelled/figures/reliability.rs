@@ -3,6 +3,7 @@
 use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, MarginalSide, Panel, Rectangle};
 
 use super::super::report::{Band, ErrorHistograms, LabelledReport, ScoreReport};
+use super::outlines;
 use crate::csv::{Csv, number};
 use crate::page::style::WIDTH;
 use crate::page::{FigureContent, FigureEntry};
@@ -105,22 +106,12 @@ fn draw_scores(
 /// Distributions of the error of either population, to the right.
 fn draw_errors(figure: &mut Figure, histograms: &ErrorHistograms, place: Rectangle, y: &Axis) {
     let right = Rectangle { x: place.right() + 3.0, width: 30.0, ..place };
-    let shares = |counts: &[u64]| -> Vec<f64> {
-        let all = counts.iter().sum::<u64>().max(1) as f64;
-        counts.iter().map(|count| *count as f64 / all).collect()
-    };
-    let populations =
-        [(shares(&histograms.within), Colour::BLUE), (shares(&histograms.beyond), Colour::VERMILLION)];
-    let most = populations.iter().flat_map(|(shares, _)| shares).copied().fold(0.0, f64::max);
+    let outlines = outlines(histograms);
+    let most = outlines.iter().flatten().map(|[_, share]| *share).fold(0.0, f64::max);
     let share = Axis::new("", AxisScale::Linear, 0.0, 1.05 * most).without_ticks();
     let mut panel = Panel::new(right, share, y.clone().with_title("").without_ticks());
-    for (shares, colour) in populations {
-        let edges = &histograms.edges;
-        let mut outline = vec![[0.0, edges[0]]];
-        for (edges, share) in edges.windows(2).zip(&shares) {
-            outline.extend([[*share, edges[0]], [*share, edges[1]]]);
-        }
-        outline.push([0.0, edges[edges.len() - 1]]);
+    for (outline, colour) in outlines.into_iter().zip([Colour::BLUE, Colour::VERMILLION]) {
+        let outline: Vec<_> = outline.into_iter().map(|[error, share]| [share, error]).collect();
         panel.polygons([outline.clone()], Some(colour.faint(0.18)), None);
         panel.line(outline, colour.line(0.9));
     }
