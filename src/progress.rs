@@ -23,7 +23,7 @@ const LINE_INTERVAL: Duration = Duration::from_secs(10);
 pub struct RunDisplay {
     bars: Option<Bars>,
     names: BTreeMap<WalkId, String>,
-    steps: BTreeMap<WalkId, u64>,
+    steps: WalkSteps,
     /// Steps of a whole walk.
     walk_steps: u64,
     accepted: u64,
@@ -36,6 +36,13 @@ pub struct RunDisplay {
     /// Whether the display has warned of early ends.
     warned: bool,
     last_line: Instant,
+}
+
+/// The step of each walk, and their sum, which every notice of the reactor asks for.
+#[derive(Default)]
+struct WalkSteps {
+    of_walk: BTreeMap<WalkId, u64>,
+    sum: u64,
 }
 
 struct Bars {
@@ -54,10 +61,10 @@ impl RunDisplay {
         forgetting: ForgettingRule,
         stop: CancellationToken,
     ) -> Self {
-        let (mut names, mut steps) = (BTreeMap::new(), BTreeMap::new());
+        let (mut names, mut steps) = (BTreeMap::new(), WalkSteps::default());
         for (walk, name, step) in walks {
             names.insert(walk, name);
-            steps.insert(walk, step);
+            steps.set(walk, step);
         }
         let bars = std::io::stderr().is_terminal().then(Bars::new);
         let mut display = Self {
@@ -81,7 +88,7 @@ impl RunDisplay {
     pub fn notice(&mut self, notice: &Notice<'_>) {
         match notice {
             Notice::Progress(walk, progress) => {
-                self.steps.insert(*walk, progress.step);
+                self.steps.set(*walk, progress.step);
                 self.waiting = false;
             }
             Notice::Committed(commit) => self.committed(commit),
@@ -105,7 +112,7 @@ impl RunDisplay {
                 let name = format!("{} (control)", self.name(partner));
                 self.names.entry(record.walk).or_insert(name);
             }
-            self.steps.insert(record.walk, record.progress.step);
+            self.steps.set(record.walk, record.progress.step);
         }
         for candidate in &commit.candidates {
             let view = candidate.block.view();
@@ -144,7 +151,7 @@ impl RunDisplay {
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "ended") {
             if let Some(walk) = decision.walk {
                 // The walk will not make its remaining steps.
-                self.steps.insert(walk, self.walk_steps);
+                self.steps.set(walk, self.walk_steps);
                 let text = |key: &str| decision.detail[key].as_str().unwrap_or_default();
                 self.ends.add(walk.0, text("end"), text("reason"));
                 let end = words::as_text(text("end"));
@@ -189,7 +196,7 @@ impl RunDisplay {
     }
 
     fn draw(&mut self) {
-        let (done, all) = (self.steps.values().sum::<u64>(), self.steps.len() as u64 * self.walk_steps);
+        let (done, all) = (self.steps.sum, self.steps.of_walk.len() as u64 * self.walk_steps);
         if let Some(bars) = &self.bars {
             bars.steps.set_length(all);
             bars.steps.set_position(done.min(all));
@@ -198,6 +205,13 @@ impl RunDisplay {
             self.last_line = Instant::now();
             print_stderr(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
         }
+    }
+}
+
+impl WalkSteps {
+    fn set(&mut self, walk: WalkId, step: u64) {
+        let before = self.of_walk.insert(walk, step).unwrap_or(0);
+        self.sum = self.sum - before + step;
     }
 }
 
@@ -212,5 +226,21 @@ impl Bars {
         let message = all.add(ProgressBar::new_spinner());
         message.set_style(style("{wide_msg}"));
         Self { steps, message, all }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A walk that rolls back is at an earlier step than before.
+    #[test]
+    fn the_sum_follows_the_step_of_each_walk() {
+        let mut steps = WalkSteps::default();
+        for (walk, step, sum) in [(0, 0, 0), (1, 30, 30), (0, 50, 80), (1, 10, 60), (7, 5, 65), (0, 60, 75)] {
+            steps.set(WalkId(walk), step);
+            assert_eq!(steps.sum, sum);
+            assert_eq!(steps.sum, steps.of_walk.values().sum::<u64>());
+        }
     }
 }
