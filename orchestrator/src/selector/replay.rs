@@ -3,7 +3,7 @@
 //! The actions of walkers are taken from the log: which structures they offered and when, rollbacks, and ends of walks.
 //! The decisions are made again. With the same rules, every decision must be the same.
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 use calm::Mixture;
@@ -60,7 +60,8 @@ pub struct ReplayedDecision {
 /// A replay.
 pub struct Replay {
     decisions: DecisionState,
-    seeds: Vec<SeedPlan>,
+    /// Index of each seed structure by its name.
+    seeds: HashMap<String, usize>,
     /// Imported structures in order of import.
     imported: Vec<ContentHash>,
     /// Configuration keys that differ from the campaign's.
@@ -85,6 +86,7 @@ impl Replay {
         let decisions =
             DecisionState::restore(settings, &seeds, grader, original, training, SelectorSnapshot::default());
         let decisions = decisions.map_err(|source| ReplayError::Settings(Box::new(source)))?;
+        let seeds = seeds.into_iter().enumerate().map(|(index, seed)| (seed.name, index)).collect();
         Ok(Self { decisions, seeds, imported, set, following: VecDeque::new(), cut_short: 0 })
     }
 
@@ -237,7 +239,7 @@ impl Replay {
         let id = if self.is_exact() { self.decisions.next_walk_id() } else { walk(recorded)? };
         match read(recorded)? {
             Detail::Biased { seed_structure: name, conditions } => {
-                let seed = self.seeds.iter().position(|seed| seed.name == name);
+                let seed = self.seeds.get(&name).copied();
                 let seed =
                     seed.ok_or_else(|| damaged(recorded, &format!("there is no seed structure '{name}'")))?;
                 Ok(Some(self.decisions.start_walk(id, seed, &name, conditions)))
