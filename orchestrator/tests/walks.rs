@@ -75,6 +75,33 @@ fn complete_rounds_are_decided_in_walk_order() {
     );
 }
 
+/// Lost and interrupted walks are given out again before later ones; paused ones when they are resumed; those that have
+/// reported not at all.
+#[test]
+fn walks_of_a_round_are_assigned_in_order_whatever_happens_to_them() {
+    let four = SelectorSettings { walks_per_round: 4, ..settings(CampaignMode::Reproducible) };
+    let mut selector = begin(&four, 5);
+    selector.set_paused([WalkId(1)].into());
+    let [first, third] = [(); 2].map(|()| next_assignment(&mut selector));
+    assert_eq!([first.walk, third.walk], [WalkId(0), WalkId(2)]);
+    selector.assignment_lost(third.walk);
+    decided(&mut selector, common::report(&first, Outcome::Interrupted, at(4)));
+    selector.set_paused([].into());
+    let assignments = [(); 4].map(|()| next_assignment(&mut selector));
+    assert_eq!(assignments.each_ref().map(|assignment| assignment.walk.0), [0, 1, 2, 3]);
+    assert!(is_waiting(&mut selector), "the fifth walk is not in the round");
+    let [rest @ .., last] = assignments.map(|a| common::report(&a, Outcome::StepsDone, at(10)));
+    for report in rest {
+        let walk = report.walk;
+        assert!(selector.report(report).unwrap().is_none());
+        selector.assignment_lost(walk);
+        assert!(is_waiting(&mut selector));
+    }
+    decided(&mut selector, last);
+    let next = next_assignment(&mut selector);
+    assert_eq!((next.walk, next.number), (WalkId(0), 1));
+}
+
 #[test]
 fn live_walks_do_not_wait_for_each_other() {
     let mut selector = begin(&settings(CampaignMode::Live), 3);

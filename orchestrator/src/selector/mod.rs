@@ -55,10 +55,14 @@ pub struct Selector {
     decisions: DecisionState,
     /// The walker that has each assigned walk in hand, until it reports or is lost.
     in_hand: BTreeMap<WalkId, u32>,
-    /// Walks of the current round, with the reports received so far.
-    in_round: BTreeMap<WalkId, Option<RegradedReport>>,
+    /// Walks of the current round that have not reported yet (reproducible mode), …
+    outstanding: BTreeSet<WalkId>,
+    /// … and the reports of the others.
+    reports: BTreeMap<WalkId, RegradedReport>,
     /// Walks that get no assignments for now.
     paused: BTreeSet<WalkId>,
+    /// Biased and control walks that can be assigned.
+    ready: [BTreeSet<WalkId>; 2],
 }
 
 impl Selector {
@@ -74,8 +78,19 @@ impl Selector {
         snapshot: SelectorSnapshot,
     ) -> Result<Self, SelectorError> {
         let decisions = DecisionState::restore(settings, &seeds, grader, original, training, snapshot)?;
-        let (in_hand, in_round, paused) = (BTreeMap::new(), BTreeMap::new(), BTreeSet::new());
-        Ok(Self { campaign, seeds, decisions, in_hand, in_round, paused })
+        let mut selector = Self {
+            campaign,
+            seeds,
+            decisions,
+            in_hand: BTreeMap::new(),
+            outstanding: BTreeSet::new(),
+            reports: BTreeMap::new(),
+            paused: BTreeSet::new(),
+            ready: Default::default(),
+        };
+        let walks: Vec<WalkId> = selector.decisions.walks.iter().map(|walk| walk.record.walk).collect();
+        selector.update_ready(walks);
+        Ok(selector)
     }
 
     /// The mixture for the assignments of [`Selector::next_assignment`].
@@ -111,7 +126,9 @@ impl Selector {
     /// added. Resumes walks that ended because of a limit that has been raised since. The commit is empty if nothing
     /// changes.
     pub fn start_walks(&mut self) -> Commit {
-        self.decisions.start_walks(&self.seeds)
+        let commit = self.decisions.start_walks(&self.seeds);
+        self.update_ready(commit.walks.iter().map(|walk| walk.walk));
+        commit
     }
 
     /// Enables raising the threshold of the collection rule while more than `limit` label jobs are unfinished (see
@@ -129,7 +146,9 @@ impl Selector {
     /// Sets the paused walks, which get no assignments. In reproducible mode their round waits for them, and so do the
     /// other walks: decisions do not depend on who was paused when.
     pub fn set_paused(&mut self, walks: BTreeSet<WalkId>) {
-        self.paused = walks;
+        let before = std::mem::replace(&mut self.paused, walks);
+        let changed: Vec<WalkId> = before.symmetric_difference(&self.paused).copied().collect();
+        self.update_ready(changed);
     }
 
     /// Number of unfinished label jobs above which walkers wait: `limit`, or a larger number if the threshold is raised
@@ -168,7 +187,7 @@ impl Selector {
         let mode = self.decisions.settings.mode;
         let in_round = match mode {
             CampaignMode::Live => true,
-            CampaignMode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
+            CampaignMode::Reproducible => self.outstanding.contains(&id),
         };
         let is_current = |walk: &&Walk| in_round && walk.record.assignments == number && !walk.has_ended();
         if self.decisions.walks.get(id).filter(is_current).is_none() {
@@ -178,18 +197,24 @@ impl Selector {
         if matches!(report.outcome, Outcome::Interrupted) {
             let walk = self.decisions.walk_mut(id);
             walk.interrupt(report);
-            return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
+            let commit = Commit { walks: vec![walk.to_record()], ..Commit::default() };
+            self.update_ready([id]);
+            return Ok(Some(commit));
         }
         let reports = match mode {
             CampaignMode::Live => vec![report],
             CampaignMode::Reproducible => {
-                self.in_round.insert(id, Some(report));
-                if self.in_round.values().any(Option::is_none) {
+                self.outstanding.remove(&id);
+                self.reports.insert(id, report);
+                self.update_ready([id]);
+                if !self.outstanding.is_empty() {
                     return Ok(None);
                 }
-                std::mem::take(&mut self.in_round).into_values().flatten().collect()
+                std::mem::take(&mut self.reports).into_values().collect()
             }
         };
-        self.decisions.decide(reports, &self.in_hand).map(Some)
+        let commit = self.decisions.decide(reports, &self.in_hand)?;
+        self.update_ready(commit.walks.iter().map(|walk| walk.walk));
+        Ok(Some(commit))
     }
 }

@@ -19,7 +19,7 @@ pub enum Scheduling {
 impl Selector {
     /// The next assignment for an idle walker, which has it in hand from then on.
     pub fn next_assignment(&mut self, walker: u32) -> Scheduling {
-        if self.decisions.settings.mode == CampaignMode::Reproducible && self.in_round.is_empty() {
+        if self.decisions.settings.mode == CampaignMode::Reproducible && self.outstanding.is_empty() {
             self.start_round();
         }
         match self.next_walk() {
@@ -29,23 +29,34 @@ impl Selector {
         }
     }
 
-    /// The next walk that is ready. In live mode, control walks get their share of the assignments while biased walks are
-    /// ready, too.
+    /// The first walk that is ready. In live mode, control walks get their share of the assignments while biased walks
+    /// are ready, too.
     fn next_walk(&self) -> Option<WalkId> {
-        let is_ready = |id: &WalkId| !self.in_hand.contains_key(id) && !self.paused.contains(id);
-        let walks = &self.decisions.walks;
-        match self.decisions.settings.mode {
+        let [biased, control] = self.ready.each_ref().map(|walks| walks.first().copied());
+        let (Some(biased), Some(control)) = (biased, control) else { return biased.or(control) };
+        Some(match self.decisions.settings.mode {
             // A round has as many control walks as biased ones.
-            CampaignMode::Reproducible => {
-                let outstanding = self.in_round.iter().filter(|(_, report)| report.is_none());
-                outstanding.map(|(id, _)| *id).find(is_ready)
+            CampaignMode::Reproducible => biased.min(control),
+            CampaignMode::Live if self.is_turn_of_controls() => control,
+            CampaignMode::Live => biased,
+        })
+    }
+
+    /// Finds out again whether these walks can be assigned. Called for every walk that was begun, resumed, ended, paused,
+    /// assigned, reported on, lost, or taken into a round, so that no assignment needs a look at all walks.
+    pub(super) fn update_ready(&mut self, walks: impl IntoIterator<Item = WalkId>) {
+        for id in walks {
+            let Some(walk) = self.decisions.walks.get(id) else { continue };
+            let is_due = match self.decisions.settings.mode {
+                CampaignMode::Reproducible => self.outstanding.contains(&id),
+                CampaignMode::Live => !walk.has_ended(),
+            };
+            let ready = &mut self.ready[usize::from(!walk.is_biased())];
+            if is_due && !self.in_hand.contains_key(&id) && !self.paused.contains(&id) {
+                ready.insert(id);
+            } else {
+                ready.remove(&id);
             }
-            CampaignMode::Live => match [true, false].map(|biased| walks.unfinished(biased).find(is_ready)) {
-                [Some(biased), Some(control)] => {
-                    Some(if self.is_turn_of_controls() { control } else { biased })
-                }
-                [biased, control] => biased.or(control),
-            },
         }
     }
 
@@ -80,6 +91,7 @@ impl Selector {
     /// Takes back a walk from a walker that will not report on it; another walker gets it.
     pub fn assignment_lost(&mut self, id: WalkId) {
         self.in_hand.remove(&id);
+        self.update_ready([id]);
     }
 
     /// Starts a round with the first unfinished biased walks and as many control walks.
@@ -87,16 +99,19 @@ impl Selector {
         for biased in [true, false] {
             let unfinished = self.decisions.walks.unfinished(biased);
             let taken = unfinished.take(self.decisions.settings.walks_per_round);
-            self.in_round.extend(taken.map(|id| (id, None)));
+            self.outstanding.extend(taken);
         }
-        if !self.in_round.is_empty() {
+        if !self.outstanding.is_empty() {
             self.decisions.round += 1;
         }
+        let round: Vec<WalkId> = self.outstanding.iter().copied().collect();
+        self.update_ready(round);
     }
 
     fn assign(&mut self, id: WalkId, walker: u32) -> Assignment {
-        let walk = self.decisions.walks.get_mut(id);
         self.in_hand.insert(id, walker);
+        self.update_ready([id]);
+        let walk = self.decisions.walks.get_mut(id);
         walk.record.state = "running".to_owned();
         Assignment {
             campaign: self.campaign,
