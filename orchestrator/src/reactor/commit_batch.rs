@@ -1,5 +1,8 @@
 //! Combines commits into one transaction, with the same result as writing them one after the other.
 
+use std::collections::HashSet;
+use std::hash::Hash;
+
 use store::records::Commit;
 
 /// Appends `later` to `commit`.
@@ -17,8 +20,10 @@ pub fn append(commit: &mut Commit, later: Commit) {
     replace(&mut commit.values, values, |(name, _)| name.clone());
 }
 
-/// Appends `newer`, and removes older records with the same key.
-fn replace<T, K: PartialEq>(records: &mut Vec<T>, newer: Vec<T>, key: impl Fn(&T) -> K) {
-    records.retain(|old| newer.iter().all(|new| key(new) != key(old)));
+/// Appends `newer`, and removes older records with the same key. There are few older ones: a walker reports once until the
+/// commit with its report is written.
+fn replace<T, K: Eq + Hash>(records: &mut Vec<T>, newer: Vec<T>, key: impl Fn(&T) -> K) {
+    let replaced: HashSet<K> = newer.iter().map(&key).collect();
+    records.retain(|old| !replaced.contains(&key(old)));
     records.extend(newer);
 }

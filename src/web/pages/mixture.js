@@ -56,9 +56,12 @@ function overall({ version, decision, feature_dimension: dimension, components }
 
 /** Sums and extremes of each element, in the order of the potential. */
 function byElement(components) {
-  const names = [...new Set(components.map((component) => component.element))];
-  return names.map((name) => {
-    const own = components.filter((component) => component.element === name);
+  const groups = new Map();
+  for (const component of components) {
+    if (!groups.has(component.element)) groups.set(component.element, []);
+    groups.get(component.element).push(component);
+  }
+  return [...groups].map(([name, own]) => {
     const sum = (key) => (own.some((one) => one[key] == null) ? null : own.reduce((total, one) => total + one[key], 0));
     const largest = (key) => own.reduce((most, one) => (one[key] != null && (most == null || one[key] > most) ? one[key] : most), null);
     return { name, own, moved: own.filter((one) => one.moved).length, before: sum("environments_before"), now: sum("environments"),
