@@ -110,6 +110,27 @@ fn a_candidate_that_cannot_be_graded_is_left_out() {
     assert_eq!(kinds(&decided(&mut selector, report)), ["accepted"]);
 }
 
+/// The covariance shrinks in the direction of the training atom, whose σ² is then no longer finite.
+#[test]
+fn an_update_under_which_a_training_atom_has_no_grade_is_left_out() {
+    let training = TrainingFrames::new(&[0], &[0.0, 0.0, 1.3e154], &mixture()).unwrap();
+    let mut selector = try_restore(&live(), 1, Some(training), SelectorSnapshot::default()).unwrap();
+    selector.start_walks();
+    let commit = next_candidate(&mut selector, 5, 1, NEW);
+    assert_eq!(kinds(&commit), ["left_out"]);
+    let error = commit.decisions[0].detail["error"].as_str().unwrap();
+    assert!(error.starts_with("grading the training frames under the live mixture: σ² of atom 0"), "{error}");
+    assert_eq!((commit.candidates.len(), commit.components.len(), value(&commit, "left_out")), (0, 0, "1"));
+    assert_eq!(selector.mixture().as_ref(), mixture().as_ref());
+    assert_eq!(selector.forgetting_level(), 0.0);
+
+    let assignment = next_assignment(&mut selector);
+    assert_eq!(assignment.verdict, Some(Verdict::Declined(DeclineReason::LeftOut)));
+    let report = offer(&selector, &assignment, 6, structure(2, SHORTEST), [0.0, 0.0, 3.0]);
+    assert_eq!(kinds(&decided(&mut selector, report)), ["accepted"]);
+    assert_eq!(selector.mixture().version(), 1);
+}
+
 /// The second walk ends once the first has reached the limit of their seed structure, and continues with a larger limit.
 #[test]
 fn walks_of_one_seed_structure_share_a_limit() {

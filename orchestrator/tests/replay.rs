@@ -6,21 +6,30 @@ use atoms::{MinDistanceRule, Uniform};
 use calm::CollectionRule;
 use calm::rules::MaximumGrade;
 use orchestrator::selector::{
-    AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings, UpdateProtocol,
+    AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings, SelectorSnapshot,
+    TrainingFrames, UpdateProtocol,
 };
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
-use store::records::{CandidateRecord, ComponentRecord, Fate, LoggedDecision};
+use store::records::{CandidateRecord, Commit, ComponentRecord, Fate, LoggedDecision};
 use wire::ContentHash;
 
 use crate::common::eventful::{Campaign, acts, any_settings, scripts};
 use crate::common::scripted::{Event, Script};
-use crate::common::{SHORTEST, grader, kinds, mixture, positive, seed, settings, structure};
+use crate::common::{
+    SHORTEST, decided, grader, kinds, mixture, next_assignment, offer, positive, seed, settings, structure,
+    try_restore,
+};
 
 /// The decisions of a campaign as restored from a store, each with its candidate.
 fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a CandidateRecord>)> {
-    let candidates = campaign.commits.iter().flat_map(|commit| &commit.candidates);
+    logged(&campaign.commits)
+}
+
+/// The same of commits.
+fn logged(commits: &[Commit]) -> Vec<(LoggedDecision, Option<&CandidateRecord>)> {
+    let candidates = commits.iter().flat_map(|commit| &commit.candidates);
     let candidates: BTreeMap<_, _> = candidates.map(|c| (c.block.view().id().to_string(), c)).collect();
     let logged = |(decision, sequence): (&store::records::Decision, i64)| {
         let candidate = decision.candidate.map(|id| id.to_string());
@@ -36,7 +45,7 @@ fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a Candid
         };
         (decision, record)
     };
-    campaign.store.decisions.iter().zip(1..).map(logged).collect()
+    commits.iter().flat_map(|commit| &commit.decisions).zip(1..).map(logged).collect()
 }
 
 fn open(campaign: &Campaign<'_>, settings: &SelectorSettings, seeds: usize, set: &[&str]) -> Replay {
@@ -202,6 +211,32 @@ fn control_frames_that_were_labelled_although_too_close_are_left_out_in_a_replay
         }
     }
     assert_eq!(changed, 1, "{log:?}");
+}
+
+/// An update under which a training atom has no grade is left out again.
+#[test]
+fn updates_that_were_left_out_are_left_out_in_a_replay() {
+    let live = settings(CampaignMode::Live);
+    let training = TrainingFrames::new(&[0], &[0.0, 0.0, 1.3e154], &mixture()).unwrap();
+    let mut selector = try_restore(&live, 1, Some(training.clone()), SelectorSnapshot::default()).unwrap();
+    let mut commits = vec![selector.start_walks()];
+    for (number, z) in [(1, [0.0, 3.0, 0.0]), (2, [0.0, 0.0, 3.0])] {
+        let assignment = next_assignment(&mut selector);
+        let report = offer(&selector, &assignment, number, structure(number, SHORTEST), z);
+        commits.push(decided(&mut selector, report));
+    }
+    assert_eq!(commits.iter().flat_map(kinds).collect::<Vec<_>>(), ["begun", "left_out", "accepted"]);
+    let (none, seeds) = (HashSet::new(), vec![seed(0)]);
+    let mut replay = Replay::new(live, none, seeds, grader(), mixture(), Some(training), Vec::new()).unwrap();
+    let log = logged(&commits);
+    for ((recorded, _), now) in log.iter().zip(follow(&mut replay, &log)) {
+        let now = now.unwrap().decision;
+        assert_eq!(
+            (now.kind, &now.detail.to_string()),
+            (recorded.kind.as_str(), &recorded.detail.to_string())
+        );
+    }
+    assert_eq!(replay.mixture(), selector.mixture());
 }
 
 /// The campaigns above cover what they should: rules change in the middle of them, and imports are met.

@@ -174,9 +174,9 @@ impl DecisionState {
         self.min_distances[seed_structure].violation(&graded.bonds.shortest)
     }
 
-    /// Declines a candidate that cannot be graded, or that the mixture cannot be updated with, or a control frame with
-    /// atoms too close. Its walk goes on: each later frame of a control walk is still matched by step. The log has the
-    /// reason; the candidate is not stored.
+    /// Declines a candidate that cannot be graded, or that the mixture cannot be updated with (training atoms must still
+    /// have a grade), or a control frame with atoms too close. Its walk goes on: each later frame of a control walk is
+    /// still matched by step. The log has the reason; the candidate is not stored.
     pub fn leave_out(&mut self, id: WalkId, step: u64, error: &str, commit: &mut Commit) {
         self.left_out += 1;
         commit.decisions.push(self.decision(LEFT_OUT, id, json!({ "step": step, "error": error })));
@@ -249,7 +249,7 @@ impl DecisionState {
     }
 
     /// Updates the mixture to cover the candidate, and adds the new version to the commit. Returns whether the mixture
-    /// has forgotten too much.
+    /// has forgotten too much. An error changes nothing.
     fn update(
         &mut self,
         graded: &RegradedCandidate,
@@ -264,14 +264,15 @@ impl DecisionState {
         let settings = update_settings(&self.settings.search, self.switched_to_additive);
         let outcome = calm::update(&self.mixture, elements, view.features, &settings)
             .map_err(|source| SelectorError::Update { candidate: view.id(), source })?;
-        self.mixture = Arc::new(self.mixture.with_changes(&outcome.changed)?);
+        let updated = Arc::new(self.mixture.with_changes(&outcome.changed)?);
+        let changed = outcome.changed.iter().map(|change| (change.element, change.slot)).collect();
+        self.forgetting.update(&self.regrader.original, &updated, &changed)?;
+        self.mixture = updated;
         for change in &outcome.changed {
             let (element, slot) = (change.element as u32, change.slot as u32);
             commit.components.push(ComponentRecord { element, slot, bytes: change.component.to_bytes() });
         }
         detail["update"] = update_summary(&outcome);
-        let changed = outcome.changed.iter().map(|change| (change.element, change.slot)).collect();
-        self.forgetting.update(&self.regrader.original, &self.mixture, &changed)?;
         let state = self.forgetting_state();
         if let Some(training) = state.training {
             detail["training_frames"] = json!(training);

@@ -50,8 +50,8 @@ pub enum SelectorError {
     /// A database that does not match the campaign.
     #[error("cannot continue the campaign's database: {0}")]
     Snapshot(String),
-    /// Training frames that do not match the mixture.
-    #[error("grading the training frames: {source}")]
+    /// A mixture under which training atoms have no grade: of a database, or after the update for a candidate.
+    #[error("grading the training frames under the live mixture: {source}")]
     Training {
         /// The error.
         source: calm::GradeError,
@@ -59,8 +59,11 @@ pub enum SelectorError {
 }
 
 impl SelectorError {
-    /// Whether one candidate is at fault, so that the campaign can go on without it.
+    /// Whether an error in a decision is the fault of its candidate, so that the campaign can go on without it.
     pub(super) fn is_of_candidate(&self) -> bool {
-        matches!(self, Self::Grade { .. } | Self::TooClose { .. } | Self::Update { .. })
+        matches!(
+            self,
+            Self::Grade { .. } | Self::TooClose { .. } | Self::Update { .. } | Self::Training { .. }
+        )
     }
 }

@@ -38,25 +38,23 @@ impl Forgetting {
         Self { symbols, training, growth: BTreeMap::new() }
     }
 
-    /// Takes an update of these components, by element and slot.
+    /// Takes an update of these components, by element and slot. Changes nothing if a training atom cannot be graded.
     pub fn update(
         &mut self,
         original: &Mixture,
         live: &Mixture,
         changed: &BTreeSet<(usize, usize)>,
     ) -> Result<(), SelectorError> {
+        if let Some(training) = &mut self.training {
+            let elements: BTreeSet<usize> = changed.iter().map(|(element, _)| *element).collect();
+            training.regrade(live, |element| elements.contains(&element))?;
+        }
         for &(element, slot) in changed {
             let components = original.component(element, slot).zip(live.component(element, slot));
             let growth = components.and_then(|(before, now)| mean_square_growth(before, now));
             self.growth.extend(growth.map(|growth| ((element, slot), growth)));
         }
-        match &mut self.training {
-            Some(training) => {
-                let elements: BTreeSet<usize> = changed.iter().map(|(element, _)| *element).collect();
-                training.regrade(live, |element| elements.contains(&element))
-            }
-            None => Ok(()),
-        }
+        Ok(())
     }
 
     /// The original mixture is in force again.

@@ -14,7 +14,7 @@ use super::error::SelectorError;
 /// potential was trained on.
 #[derive(Clone, Debug)]
 pub struct TrainingFrames {
-    /// The atoms of each element follow one another: element index and place of each.
+    /// The atoms of each element follow one another: element index and place of each, by ascending index.
     elements: Vec<(usize, Range<usize>)>,
     /// Features, [atoms × D].
     features: Vec<f64>,
@@ -63,24 +63,30 @@ impl TrainingFrames {
     /// Shares of the atoms of one element with γ > 1, under the original and under the live mixture. `None` if there are
     /// fewer than `least`.
     pub(super) fn shares_of(&self, element: usize, least: usize) -> Option<[f64; 2]> {
-        let (_, range) = self.elements.iter().find(|(known, _)| *known == element)?;
+        let place = self.elements.binary_search_by_key(&element, |(known, _)| *known).ok()?;
+        let (_, range) = &self.elements[place];
         let share = |gamma: &[f64]| count_above(gamma, 1.0) as f64 / gamma.len() as f64;
         let shares = || [&self.original, &self.live].map(|gamma| share(&gamma[range.clone()]));
         (range.len() >= least).then(shares)
     }
 
-    /// Grades the atoms again whose element is among `changed`; those of others have the same grades as before.
+    /// Grades the atoms again whose element is among `changed`; those of others have the same grades as before. Changes
+    /// nothing if an atom cannot be graded.
     pub fn regrade(
         &mut self,
         mixture: &Mixture,
         changed: impl Fn(usize) -> bool,
     ) -> Result<(), SelectorError> {
         let dimension = mixture.dimension();
-        for (element, range) in self.elements.iter().filter(|(element, _)| changed(*element)) {
+        let regraded = |(element, range): &(usize, Range<usize>)| {
             let features = &self.features[range.start * dimension..range.end * dimension];
             let graded = gamma(mixture, &vec![*element; range.len()], features);
-            self.live[range.clone()]
-                .copy_from_slice(&graded.map_err(|source| SelectorError::Training { source })?);
+            graded.map(|graded| (range.clone(), graded))
+        };
+        let changed = self.elements.iter().filter(|(element, _)| changed(*element));
+        let regraded: Result<Vec<_>, GradeError> = changed.map(regraded).collect();
+        for (range, graded) in regraded.map_err(|source| SelectorError::Training { source })? {
+            self.live[range].copy_from_slice(&graded);
         }
         Ok(())
     }
