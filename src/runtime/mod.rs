@@ -34,6 +34,7 @@ use crate::campaign::LoadedCampaign;
 use crate::config::{Config, QueueFull};
 use crate::exit_status::CommandError;
 use crate::forgetting::ForgettingRule;
+use crate::output::count;
 use crate::progress::RunDisplay;
 use crate::signals::cancel_on_signal;
 pub use listen::Listen;
@@ -133,19 +134,28 @@ fn wanted_walkers(campaign: &LoadedCampaign) -> u32 {
     }
 }
 
-/// A sentence about walkers that can have nothing to do, if there are any: rounds have too few walks for them.
+/// A sentence about walkers that can have nothing to do, if there are any: rounds, or the campaign, have too few walks for
+/// them. A control walk begins after its biased walk, so never more walks are under way than there are biased ones.
 pub fn idle_walkers(campaign: &LoadedCampaign) -> Option<String> {
     let Config { campaign: section, run, .. } = &campaign.config;
     let walkers = wanted_walkers(campaign) as usize;
-    let walks = run.walks_per_round.get() * (1 + usize::from(section.control));
-    (section.mode == CampaignMode::Reproducible && walkers > walks).then(|| {
+    let biased: usize = campaign.seed_structures.iter().map(|named| named.seed.walks.len()).sum();
+    let of_round = match section.mode {
+        CampaignMode::Reproducible => {
+            run.walks_per_round.get().saturating_mul(1 + usize::from(section.control))
+        }
+        CampaignMode::Live => usize::MAX,
+    };
+    let (walks, limit) = if biased < of_round {
+        let control = if section.control { ", each followed by its control walk" } else { "" };
+        (biased, format!("the campaign has {}{control}", count(biased, "biased walk")))
+    } else {
         let control = if section.control { ", and as many control walks" } else { "" };
-        format!(
-            "at most {walks} of the {walkers} walkers have something to do at a time: a round has {} biased walks \
-             (run.walks_per_round){control}",
-            run.walks_per_round
-        )
-    })
+        let round = count(run.walks_per_round.get(), "biased walk");
+        (of_round, format!("a round has {round} (run.walks_per_round){control}"))
+    };
+    (walkers > walks)
+        .then(|| format!("at most {walks} of the {walkers} walkers have something to do at a time: {limit}"))
 }
 
 /// Number of processor cores that this process may use.
