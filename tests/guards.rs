@@ -117,6 +117,35 @@ fn control_frames_with_atoms_too_close_are_left_out() {
     assert!(page.contains("control frames with atoms too close"));
 }
 
+/// The limit is near the distance of neighbours in the crystal, so that the guard refuses nearly every structure.
+#[test]
+fn walks_without_rollbacks_go_on_after_refusals() {
+    let keys = "max_consecutive_rejections = 2\nmax_rollbacks = 1\n\
+                min_distances = { rule = \"per_pair\", pairs = { \"Al-Al\" = 2.8 } }";
+    for rollback in [true, false] {
+        let directory = tempfile::tempdir().unwrap();
+        let here = directory.path();
+        let config = Small { seeds: &["fcc-100"], max_per_walk: 100, ..Small::default() }.write(here);
+        let text = fs::read_to_string(&config).unwrap();
+        let text = text.replace("[campaign]", "[campaign]\ncontrol = false");
+        fs::write(&config, text.replace("[guard]", &format!("[guard]\nrollback = {rollback}\n{keys}")))
+            .unwrap();
+        succeed(here, ["run", "campaign.toml"]);
+        let status = json(here, ["status", "campaign"]);
+        let walk = &status["walks"][0];
+        let number = |what: &str| walk[what].as_u64().unwrap();
+        assert_eq!(status["candidates"]["rejected_by_guards"], walk["rejected"]);
+        if rollback {
+            assert_eq!((number("returns"), number("segment")), (1, 1), "{walk}");
+            continue;
+        }
+        assert!(number("rejected") > 2, "{walk}");
+        assert_eq!((number("returns"), number("segment"), number("step")), (0, 0, 260), "{walk}");
+        assert_eq!(walk["state"], "completed", "{walk}");
+        assert!(succeed(here, ["replay", "campaign"]).contains("all reproduced bit by bit"));
+    }
+}
+
 #[test]
 fn impossible_guards_are_wrong_input() {
     let directory = tempfile::tempdir().unwrap();

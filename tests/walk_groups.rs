@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use atoms::extxyz::ExtxyzValue;
+use atoms::extxyz::{ExtxyzValue, Frame};
 use atoms::read_extxyz;
 use serde_json::{Value, json};
 
@@ -94,6 +94,31 @@ fn walks_of_all_groups_share_a_mixture_and_give_the_same_bytes_for_any_number_of
         table.lines().skip(1).map(|line| line.split(',').next().unwrap().to_owned()).collect();
     assert_eq!(groups, ["hot", "hot", "hot", "hot", "hole", "hole"], "{table}");
     assert!(succeed(here, ["replay", "campaign"]).contains("all reproduced bit by bit"));
+}
+
+/// Equilibration at the start of the ramp, and no jump from the volume of the seed structure.
+#[test]
+fn ramps_begin_at_their_own_volume() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let groups = "[[walks]]\nname = \"wide\"\nvolume_ramps = [{ from = 1.1, to = 1.25 }]\n";
+    write(here, groups, 2, "");
+    succeed(here, ["run", "campaign.toml"]);
+    succeed(here, ["export", "campaign", "--control", "--output", "all.extxyz"]);
+    let seeds = read_extxyz(&here.join("seeds.extxyz")).unwrap();
+    let frames = read_extxyz(&here.join("all.extxyz")).unwrap();
+    let origins = |origin: &str| frames.iter().any(|frame| frame.info["origin"].text() == Some(origin));
+    assert!(origins("biased") && origins("control"));
+    for frame in &frames {
+        let number = |key: &str| frame.info[key].number().unwrap();
+        // 20 steps of equilibration, and 120 steps of the ramp.
+        let expected = 1.1 + 0.15 * (number("step") - 20.0) / 120.0;
+        let of = |seed: &&Frame| seed.info["name"].text() == frame.info["seed_structure"].text();
+        let before = seeds.iter().find(of).unwrap().structure.cell.volume();
+        let volume = frame.structure.cell.volume() / before;
+        assert!(number("step") > 20.0 && (number("relative_volume") - expected).abs() < 1e-9, "{expected}");
+        assert!((volume - expected).abs() < 1e-6, "{volume}, not {expected}");
+    }
 }
 
 #[test]
