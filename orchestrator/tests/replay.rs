@@ -6,8 +6,8 @@ use atoms::{MinDistanceRule, Uniform};
 use calm::CollectionRule;
 use calm::rules::MaximumGrade;
 use orchestrator::selector::{
-    AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings, SelectorSnapshot,
-    TrainingFrames, UpdateProtocol,
+    AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings,
+    SelectorSnapshot, TrainingFrames, UpdateProtocol,
 };
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
