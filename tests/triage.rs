@@ -9,7 +9,7 @@ use atoms::read_extxyz;
 
 use crate::common::campaign::Small;
 use crate::common::npz::with_changed_arrays;
-use crate::common::{calmwalk, config, demo, refuse, stderr, succeed};
+use crate::common::{calmwalk, config, demo, program, refuse, stderr, succeed};
 
 /// `n`³ atoms of simple cubic aluminium with the edge `a`, Å, whose first atom is displaced.
 fn cubic(name: &str, n: u8, a: f64, displacement: f64) -> String {
@@ -168,6 +168,22 @@ fn elements_that_the_mixture_has_no_data_of_are_shown() {
         assert!((expected == "ready") != row["remark"].contains('H'), "{row:?}");
         let gamma: f64 = row["gamma_max"].parse().unwrap();
         assert!((gamma > 10.0) == (expected != "ready"), "{name}: {gamma}");
+    }
+}
+
+/// What `validate` warns of, the other commands that load a campaign say too.
+#[test]
+fn skipped_structures_are_listed_before_a_start() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, &cubic("close", 3, 2.8, 2.7));
+    let launch = ["launch", "campaign.toml", "--on", "slurm", "--agents=0", "--directory", ".", "--dry-run"];
+    for arguments in [&["estimate", "campaign.toml"][..], &launch] {
+        // Hide Slurm's commands, which may be installed without a working Slurm.
+        let output = program(here).args(arguments).env("PATH", "").output().unwrap();
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(0), "{said}");
+        assert!(said.contains("seed structure 'close' (") && said.contains(") is skipped: "), "{said}");
     }
 }
 

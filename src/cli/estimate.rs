@@ -78,6 +78,7 @@ struct CampaignEstimate {
 impl EstimateArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let campaign = LoadedCampaign::load(&self.config)?;
+        campaign.print_warnings();
         let estimate = self.estimate(&campaign)?;
         if self.json {
             print_json(&as_json(&estimate))?;

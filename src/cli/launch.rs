@@ -117,6 +117,7 @@ impl LaunchArgs {
             block_on(self.stop(&slurm, &names))??;
         } else {
             let campaign = LoadedCampaign::load(&self.config)?;
+            campaign.print_warnings();
             if self.directory.is_none() {
                 block_on(campaign_location::check_former_locations(&campaign, &directory))??;
             }
