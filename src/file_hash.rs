@@ -1,15 +1,17 @@
 //! BLAKE3 hashes of files.
 
-use std::fs;
+use std::fs::File;
 use std::path::Path;
 
 use npz::NpzFile;
 
 use crate::exit_status::CommandError;
 
-/// The BLAKE3 hash of a file.
+/// The BLAKE3 hash of a file of any size, which is read piece by piece.
 pub fn hash(path: &Path) -> std::io::Result<String> {
-    Ok(blake3::hash(&fs::read(path)?).to_string())
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(File::open(path)?)?;
+    Ok(hasher.finalize().to_string())
 }
 
 /// The BLAKE3 hash of a model's weights and projection matrix: that of its export without the arrays of a mixture.
@@ -49,4 +51,21 @@ pub fn verify_hash(path: &Path, expected: &str) -> Result<(), CommandError> {
         "{}: the file has another content (BLAKE3 {found}) than when this run began ({expected}); restore the old file",
         path.display()
     )))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_has_the_hash_of_its_bytes() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        for length in [0, 1, 65_536, 200_001] {
+            let bytes: Vec<u8> = (0..length).map(|k: u32| (k % 251) as u8).collect();
+            std::fs::write(&path, &bytes).unwrap();
+            assert_eq!(hash(&path).unwrap(), blake3::hash(&bytes).to_string());
+        }
+        assert!(hash(directory.path()).is_err());
+    }
 }

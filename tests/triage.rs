@@ -178,7 +178,7 @@ fn skipped_structures_are_listed_before_a_start() {
     let here = directory.path();
     write(here, &cubic("close", 3, 2.8, 2.7));
     let launch = ["launch", "campaign.toml", "--on", "slurm", "--agents=0", "--directory", ".", "--dry-run"];
-    for arguments in [&["estimate", "campaign.toml"][..], &launch] {
+    for arguments in [&["estimate", "campaign.toml"][..], &launch[..]] {
         // Hide Slurm's commands, which may be installed without a working Slurm.
         let output = program(here).args(arguments).env("PATH", "").output().unwrap();
         let said = stderr(&output);

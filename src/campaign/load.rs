@@ -19,6 +19,7 @@ use crate::all_cores;
 use crate::artifact_checks::{check_belongs_to, check_sound};
 use crate::config::{ConfigError, LabelMethod, OnInvalid, PotentialConfig, Warning, location};
 use crate::feature_variant::with_projection;
+use crate::file_hash;
 use crate::label_method::{self, REFERENCE_FILE};
 
 /// Largest number of seed-structure atoms that are graded.
@@ -272,10 +273,10 @@ impl Loader<'_> {
 
     /// A key and the hash of the file that it names.
     pub fn hash(&self, key: &str, file: &Spanned<PathBuf>) -> Result<(String, String), ConfigError> {
-        let bytes = std::fs::read(file.get_ref()).map_err(|error| {
+        let hash = file_hash::hash(file.get_ref()).map_err(|error| {
             self.file_error(key, file, format!("cannot read {}: {error}", file.get_ref().display()))
         })?;
-        Ok((key.to_owned(), blake3::hash(&bytes).to_string()))
+        Ok((key.to_owned(), hash))
     }
 }
 

@@ -6,6 +6,7 @@ use serde_json::Value;
 
 use crate::config::Config;
 use crate::exit_status::CommandError;
+use crate::file_hash;
 
 /// Key of the model in the configuration, as those below.
 pub const MODEL: &str = "potential.model";
@@ -72,8 +73,7 @@ pub fn find_one(
 
 fn check(path: &Path, expected: &str) -> Result<(), String> {
     let shown = path.display();
-    let bytes = std::fs::read(path).map_err(|error| format!("cannot read {shown}: {error}"))?;
-    let found = blake3::hash(&bytes).to_string();
+    let found = file_hash::hash(path).map_err(|error| format!("cannot read {shown}: {error}"))?;
     if found == expected {
         return Ok(());
     }
