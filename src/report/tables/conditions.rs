@@ -1,5 +1,7 @@
 //! Results by the conditions of walks.
 
+use std::collections::HashMap;
+
 use store::WalkStatus;
 use wire::WalkConditions;
 
@@ -49,13 +51,20 @@ pub fn conditions(data: &ReportData) -> PageTable {
 /// The biased walks by their conditions, repeats together, in order of the first.
 fn by_conditions(walks: &[WalkStatus]) -> Vec<(WalkConditions, Vec<&WalkStatus>)> {
     let mut all: Vec<(WalkConditions, Vec<&WalkStatus>)> = Vec::new();
+    let mut places = HashMap::new();
     for walk in walks.iter().filter(|walk| walk.origin == "biased") {
-        let Some(conditions) = &walk.conditions else { continue };
-        let conditions = WalkConditions { repeat: 0, ..conditions.clone() };
-        match all.iter_mut().find(|(known, _)| *known == conditions) {
-            Some((_, walks)) => walks.push(walk),
-            None => all.push((conditions, vec![walk])),
+        let Some(WalkConditions { group, temperature, tau, volume_ramp, repeat: _ }) = &walk.conditions
+        else {
+            continue;
+        };
+        // Numbers have no hash, their bits have.
+        let ramp = volume_ramp.map(|(from, to)| (from.to_bits(), to.to_bits()));
+        let place = *places.entry((group, temperature.to_bits(), tau.to_bits(), ramp)).or_insert(all.len());
+        if place == all.len() {
+            let (group, temperature, tau, volume_ramp) = (group.clone(), *temperature, *tau, *volume_ramp);
+            all.push((WalkConditions { group, temperature, tau, volume_ramp, repeat: 0 }, Vec::new()));
         }
+        all[place].1.push(walk);
     }
     all
 }

@@ -1,6 +1,6 @@
 //! Results by seed structure.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
 use store::WalkStatus;
 
@@ -32,13 +32,13 @@ pub fn seed_structures(data: &ReportData) -> PageTable {
     for fate in &data.fates_by_seed {
         fates.entry(fate.part).or_default().insert(&fate.fate, fate.number);
     }
+    let walks_by_seed = by_seed_structure(&data.status.walks);
     for seed in &data.seeds {
         let fate =
             |name: &str| fates.get(&seed.index.into()).and_then(|of| of.get(name)).copied().unwrap_or(0);
         let biased = data.collections.biased.labels.get(&seed.index).copied().unwrap_or_default();
         let control = data.collections.control.labels.get(&seed.index).copied().unwrap_or_default();
-        let of_seed = |walk: &&WalkStatus| walk.seed_structure == seed.name && walk.origin == "biased";
-        let (walks, ended) = states(data.status.walks.iter().filter(of_seed));
+        let (walks, ended) = states(walks_by_seed.get(seed.name.as_str()).into_iter().flatten().copied());
         let names = ["accepted", "covered", "duplicate", "too_close", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
         row.push(count(names.iter().map(|name| fate(name)).sum()));
@@ -48,4 +48,33 @@ pub fn seed_structures(data: &ReportData) -> PageTable {
         table.rows.push(row);
     }
     table
+}
+
+/// The biased walks from each seed structure, by its name.
+fn by_seed_structure(walks: &[WalkStatus]) -> HashMap<&str, Vec<&WalkStatus>> {
+    let mut all: HashMap<&str, Vec<&WalkStatus>> = HashMap::new();
+    for walk in walks.iter().filter(|walk| walk.origin == "biased") {
+        all.entry(&walk.seed_structure).or_default().push(walk);
+    }
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_seed_structure_has_its_biased_walks() {
+        let walk = |walk, seed_structure: &str, origin: &str| WalkStatus {
+            walk,
+            seed_structure: seed_structure.to_owned(),
+            origin: origin.to_owned(),
+            ..WalkStatus::default()
+        };
+        let walks =
+            [walk(0, "b", "biased"), walk(1, "a", "biased"), walk(2, "b", "control"), walk(3, "b", "biased")];
+        let found = by_seed_structure(&walks);
+        let numbers = |name: &str| found[name].iter().map(|walk| walk.walk).collect::<Vec<_>>();
+        assert_eq!((numbers("a"), numbers("b"), found.len()), (vec![1], vec![0, 3], 2));
+    }
 }
