@@ -60,6 +60,10 @@ fn updates_become_additive_and_a_replay_agrees() {
     let training = &status(here)["training_frames"];
     let growth = check_elements(here, training);
     assert!(text.contains(&format!("component 0 of Al is forgotten most: σ² × {growth:.2}")), "{text}");
+    assert!(
+        text.contains("\ntraining data of  component  atoms with γ > 1 (%)  mean σ² × start\nAl "),
+        "{text}"
+    );
     assert_eq!(training["elements"][0]["share_above_one"], training["share_above_one"]);
     // The log has the fields of earlier versions.
     let decisions = on_store(Location::from(&*here.join("campaign")), async |store| {
@@ -82,6 +86,22 @@ fn check_elements(here: &Path, training: &Json) -> f64 {
     let row = table.lines().find(|line| line.contains("mean σ² of training atoms")).unwrap();
     assert!(row.contains(&format!("Al × {growth:.2} (")), "{row}");
     assert!(row.contains(&format!("component 0 × {growth:.2})")), "{row}");
+    let row = |name: &str| -> Vec<String> {
+        let text = fs::read_to_string(here.join(format!("report/tables/{name}.csv"))).unwrap();
+        let [_, row] = text.lines().collect::<Vec<_>>()[..] else { panic!("{text}") };
+        row.split(',').map(str::to_owned).collect()
+    };
+    let is = |cell: &str, expected: f64| (cell.parse::<f64>().unwrap() / expected - 1.0).abs() < 1e-12;
+    let (of_element, of_component) = (row("forgetting"), row("forgetting-components"));
+    match element["share_above_one"].as_f64() {
+        Some(share) => {
+            let shown: f64 = of_element[1].parse().unwrap();
+            assert!((shown - 100.0 * share).abs() < 1e-9, "{of_element:?}");
+        }
+        None => assert_eq!(of_element[1], ""),
+    }
+    assert!(of_element[0] == "Al" && is(&of_element[2], growth), "{of_element:?}");
+    assert!(of_component[..2] == ["Al", "0"] && is(&of_component[2], growth), "{of_component:?}");
     growth
 }
 
@@ -101,6 +121,10 @@ fn the_covariances_raise_the_alarm_without_training_frames() {
     assert!(said.contains(alarm) && said.contains("(calm.max_mean_square_growth: 1.05)"), "{said}");
     let training = &status(here)["training_frames"];
     assert_eq!((&training["alarm"], &training["share_above_one"]), (&true.into(), &Json::Null));
+    assert_eq!(
+        (&training["level_of_share"], &training["level_of_growth"]),
+        (&0.0_f64.into(), &training["level"])
+    );
     let growth = check_elements(here, training);
     assert!((training["level"].as_f64().unwrap() / (growth / 1.05) - 1.0).abs() < 1e-12, "{training}");
     assert!(training["elements"][0]["share_above_one"].is_null());

@@ -1,6 +1,8 @@
 //! What the selector stores about the mixture: forgetting and staleness.
 
 use calm::Staleness;
+use calm::forgetting::ElementForgetting;
+use serde::Deserialize;
 use serde_json::{Value, json};
 use store::records::{LEFT_OUT, STALENESS, TRAINING_FRAMES};
 
@@ -12,6 +14,11 @@ impl MixtureValues {
     /// The grades of the training frames under the newest mixture; null if they are not monitored.
     pub fn training_frames(&self) -> Value {
         self.read(TRAINING_FRAMES).unwrap_or_default()
+    }
+
+    /// What the newest mixture has forgotten, see [`forgetting_by_element`].
+    pub fn forgetting(&self) -> Vec<ElementForgetting> {
+        forgetting_by_element(&self.training_frames())
     }
 
     /// The fraction of the training atoms with γ > 1, if they are monitored.
@@ -44,6 +51,14 @@ impl MixtureValues {
         let (_, text) = self.0.iter().find(|(key, _)| key == name)?;
         serde_json::from_str(text).ok()
     }
+}
+
+/// The elements with a changed component in the value [`TRAINING_FRAMES`]. Those whose mean σ² has grown most come first.
+pub fn forgetting_by_element(training_frames: &Value) -> Vec<ElementForgetting> {
+    let mut elements =
+        Vec::<ElementForgetting>::deserialize(&training_frames["elements"]).unwrap_or_default();
+    elements.sort_by(|a, b| b.mean_square_growth.total_cmp(&a.mean_square_growth));
+    elements
 }
 
 #[cfg(test)]

@@ -481,6 +481,10 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
             (&"Al".into(), &live["share_above_one"])
         );
         assert_eq!(alarm, live["share_above_one"].as_f64().unwrap() > 0.2);
+        assert_eq!(
+            (&watched["level_of_share"], &watched["level_of_growth"]),
+            (&watched["level"], &0.0_f64.into())
+        );
         alarms.push(alarm);
     }
     assert!(!alarms[0] && alarms[7], "{alarms:?}");
@@ -500,6 +504,11 @@ fn forgetting_raises_an_alarm_without_training_frames() {
             assert!(detail["forgetting"]["elements"][0]["share_above_one"].is_null());
             let growth = detail["forgetting"]["elements"][0]["mean_square_growth"].as_f64().unwrap();
             assert_eq!(detail["forgetting_alarm"], growth > 1.5);
+            let watched: serde_json::Value = serde_json::from_str(value(commit, "training_frames")).unwrap();
+            assert_eq!(
+                (&watched["level_of_share"], &watched["level_of_growth"]),
+                (&0.0_f64.into(), &watched["level"])
+            );
             growth
         })
         .collect();

@@ -39,7 +39,8 @@ pub struct StatusArgs {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Show all walks and processes instead of a selection that fits a screen (JSON always contains all)
+    /// Show all walks and processes, and what is forgotten of each element and component, instead of a selection that fits a
+    /// screen (JSON always contains all)
     #[arg(long)]
     all: bool,
     /// Number of walks to show, or all: running walks with the largest γ first [default: as many as fit a screen]
@@ -92,6 +93,9 @@ fn write(
     let lines = head.iter().filter(|byte| **byte == b'\n').count();
     let page = page.fitted(lines, if matches!(jobs, BatchJobs::Known(_)) { 3 } else { 2 }, walks);
     let status = &snapshot.status;
+    if page.is_unlimited() {
+        mixture::write_forgetting(out, &snapshot.mixture, &page)?;
+    }
     walks::write(out, &status.walks, status.led, &page)?;
     processes::write(out, &status.processes, &page)?;
     jobs.write(out, &page)

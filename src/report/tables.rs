@@ -2,6 +2,7 @@
 
 mod conditions;
 mod facts;
+mod forgetting;
 mod labels;
 mod seed_structures;
 mod settings;
@@ -31,8 +32,13 @@ fn states<'a>(walks: impl Iterator<Item = &'a WalkStatus>) -> (u64, String) {
 
 /// All tables with rows, in the order of the page.
 pub fn all(data: &ReportData) -> Vec<PageTable> {
-    let mut tables =
-        vec![facts::summary(data), conditions::conditions(data), seed_structures::seed_structures(data)];
+    let mut tables = vec![
+        facts::summary(data),
+        forgetting::elements(data),
+        forgetting::components(data),
+        conditions::conditions(data),
+        seed_structures::seed_structures(data),
+    ];
     if let Some(found) = &data.labels {
         tables.extend([
             labels::correlations(&found.statistics),

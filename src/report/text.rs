@@ -22,7 +22,7 @@ fn sections<'a>(data: &ReportData, parts: &'a [FigureEntry], tables: &'a [PageTa
         ))
     });
     vec![
-        ("Summary", blocks(vec![table("summary")])),
+        ("Summary", blocks(vec![table("summary"), table("forgetting"), table("forgetting-components")])),
         ("Collected structures", blocks(vec![why, numbered("collection"), table("seed-structures")])),
         (
             "Biased against control walks",

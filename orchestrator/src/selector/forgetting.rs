@@ -31,6 +31,10 @@ pub(super) struct ForgettingState {
     pub elements: Vec<ElementForgetting>,
     /// How near the alarm is: it is raised above 1.
     pub level: f64,
+    /// The same from the shares of sampled atoms with γ > 1 alone.
+    level_of_share: f64,
+    /// The same from the growth of the mean σ² of elements without a sample alone.
+    level_of_growth: f64,
 }
 
 impl Forgetting {
@@ -69,11 +73,17 @@ impl Forgetting {
     pub fn state(&self, original: &Mixture, alarm: ForgettingAlarm) -> ForgettingState {
         let elements: BTreeSet<usize> = self.growth.keys().map(|(element, _)| *element).collect();
         let elements: Vec<_> = elements.into_iter().map(|element| self.element(original, element)).collect();
-        let levels = elements.iter().map(|(element, before)| alarm.level_of(element, *before));
+        let level = |is_sampled: bool| {
+            let of_kind = elements.iter().filter(|(_, before)| before.is_some() == is_sampled);
+            of_kind.map(|(element, before)| alarm.level_of(element, *before)).fold(0.0, f64::max)
+        };
         let training = self.training.as_ref().map(|training| (training.original(), training.live()));
-        let total = training.map(|(before, live)| alarm.level_of_share(before, live));
+        let total = training.map_or(0.0, |(before, live)| alarm.level_of_share(before, live));
+        let (level_of_share, level_of_growth) = (level(true).max(total), level(false));
         ForgettingState {
-            level: levels.chain(total).fold(0.0, f64::max),
+            level: level_of_share.max(level_of_growth),
+            level_of_share,
+            level_of_growth,
             training: training.map(|(_, live)| live),
             elements: elements.into_iter().map(|(element, _)| element).collect(),
         }
@@ -120,6 +130,8 @@ impl ForgettingState {
         let mut value = self.training.map_or_else(|| json!({}), |training| json!(training));
         value["elements"] = json!(self.elements);
         value["level"] = json!(self.level);
+        value["level_of_share"] = json!(self.level_of_share);
+        value["level_of_growth"] = json!(self.level_of_growth);
         value["alarm"] = json!(self.is_alarming());
         value
     }

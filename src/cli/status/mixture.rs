@@ -2,10 +2,11 @@
 
 use std::io::{self, Write};
 
-use calm::forgetting::ElementForgetting;
+use calm::forgetting::{ComponentForgetting, ElementForgetting};
 use monitor::mixture_values::MixtureValues;
 
 use super::page::StatusLayout;
+use crate::output::{TextTable, decimals};
 
 /// Writes the lines below the version of the mixture.
 pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &StatusLayout, mode: &str) -> io::Result<()> {
@@ -20,11 +21,9 @@ pub fn write(out: &mut dyn Write, values: &MixtureValues, page: &StatusLayout, m
             &format!("training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"),
         )?;
     }
-    let elements: Vec<ElementForgetting> =
-        serde_json::from_value(training["elements"].clone()).unwrap_or_default();
+    let elements = values.forgetting();
     let is_sampled = number("share_above_one").is_some();
-    let worst = elements.iter().max_by(|a, b| a.mean_square_growth.total_cmp(&b.mean_square_growth));
-    if let Some(worst) = worst.filter(|_| page.is_unlimited() || !is_sampled) {
+    if let Some(worst) = elements.first().filter(|_| page.is_unlimited() || !is_sampled) {
         page.titled(out, "", &describe_worst(worst, !is_sampled && training["alarm"] == true))?;
     }
     let components = elements.iter().filter_map(|of| Some((of, of.worst_component()?)));
@@ -63,11 +62,29 @@ fn describe_worst(worst: &ElementForgetting, alarm: bool) -> String {
     format!("of its training data, {element} is forgotten most: σ² × {mean_square_growth:.2}{share}{alarm}")
 }
 
+/// Writes a table of what is forgotten of every element and of its components, the worst element first.
+pub fn write_forgetting(out: &mut dyn Write, values: &MixtureValues, page: &StatusLayout) -> io::Result<()> {
+    let elements = values.forgetting();
+    let mut table =
+        TextTable::new(&["training data of", ">component", ">atoms with γ > 1 (%)", ">mean σ² × start"]);
+    let mut rows = 0;
+    for ElementForgetting { element, mean_square_growth, share_above_one, components } in &elements {
+        let share = decimals(share_above_one.map(|share| 100.0 * share), 1);
+        table.push(vec![element.clone(), "all".to_owned(), share, format!("{mean_square_growth:.2}")]);
+        for ComponentForgetting { component, mean_square_growth } in components {
+            let growth = format!("{mean_square_growth:.2}");
+            table.push(vec![element.clone(), component.to_string(), "–".to_owned(), growth]);
+        }
+        rows += 1 + components.len();
+    }
+    if rows == 0 { Ok(()) } else { page.table(out, &table, rows, rows, "components") }
+}
+
 #[cfg(test)]
 mod tests {
     use calm::Staleness;
     use serde_json::json;
-    use store::records::STALENESS;
+    use store::records::{STALENESS, TRAINING_FRAMES};
 
     use super::*;
 
@@ -94,5 +111,32 @@ mod tests {
         );
         let none = MixtureValues(Vec::new());
         assert_eq!(text(&none, "live"), "");
+    }
+
+    #[test]
+    fn every_element_and_component_is_listed_on_request() {
+        let component =
+            |component: u32, growth: f64| json!({ "component": component, "mean_square_growth": growth });
+        let training = json!({ "elements": [
+            { "element": "O", "mean_square_growth": 1.5, "share_above_one": 0.125,
+              "components": [component(0, 1.25), component(3, 2.0)] },
+            { "element": "U", "mean_square_growth": 6.5, "share_above_one": null, "components": [component(1, 6.5)] },
+        ] });
+        let values = MixtureValues(vec![(TRAINING_FRAMES.into(), training.to_string())]);
+        let (mut out, page) = (Vec::new(), StatusLayout { width: 120, ..StatusLayout::unlimited() });
+        write_forgetting(&mut out, &values, &page).unwrap();
+        let text = String::from_utf8(out).unwrap();
+        let rows: Vec<Vec<_>> = text.lines().skip(2).map(|line| line.split_whitespace().collect()).collect();
+        let expected = [
+            ["U", "all", "–", "6.50"],
+            ["U", "1", "–", "6.50"],
+            ["O", "all", "12.5", "1.50"],
+            ["O", "0", "–", "1.25"],
+            ["O", "3", "–", "2.00"],
+        ];
+        assert_eq!(rows, expected, "{text}");
+        let mut nothing = Vec::new();
+        write_forgetting(&mut nothing, &MixtureValues(Vec::new()), &page).unwrap();
+        assert!(nothing.is_empty());
     }
 }

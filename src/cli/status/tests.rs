@@ -25,7 +25,7 @@ pub fn large() -> Snapshot {
     let staleness = json!({ "counts": { "0": 900_000, "3": 100_000 }, "largest": 3 });
     let training = json!({
         "atoms": 20_000, "median": 0.51, "percentile_95": 1.2, "maximum": 7.0, "share_above_one": 0.25, "alarm": true,
-        "level": 1.25, "elements": [{ "element": "Mo", "mean_square_growth": 2.5, "share_above_one": 0.25,
+        "level": 1.25, "level_of_share": 1.25, "level_of_growth": 0.5, "elements": [{ "element": "Mo", "mean_square_growth": 2.5, "share_above_one": 0.25,
             "components": [{ "component": 3, "mean_square_growth": 6.1 }] }],
     });
     let values = [(STALENESS, staleness), (TRAINING_FRAMES, training)];

@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 
 use calm::CollectionRule;
 use calm::forgetting::{ComponentForgetting, ElementForgetting};
+use monitor::mixture_values::forgetting_by_element;
 use serde_json::Value;
-use store::records::LEFT_OUT;
+use store::records::{LEFT_OUT, TRAINING_FRAMES};
 
 use super::super::report_data::ReportData;
 use super::super::style::grouped;
@@ -59,16 +60,14 @@ pub fn summary(data: &ReportData) -> PageTable {
     row("imported structures", grouped(status.imported));
     row("cost of labels", format!("{:.4} core-hours", status.budget.used.core_hours));
     let mut mixture = format!("version {}", status.mixture_version);
-    let training = data.values.get("training_frames");
+    let training = data.values.get(TRAINING_FRAMES);
     let number = |key: &str| training.and_then(|training| training[key].as_f64());
     if let Some((median, share)) = number("median").zip(number("share_above_one")) {
         mixture +=
             &format!("; training atoms under it: median γ {median:.2}, {:.1} % above 1", 100.0 * share);
     }
     row("mixture", mixture);
-    let forgotten = training.map(|training| training["elements"].clone()).unwrap_or_default();
-    let mut forgotten: Vec<ElementForgetting> = serde_json::from_value(forgotten).unwrap_or_default();
-    forgotten.sort_by(|a, b| b.mean_square_growth.total_cmp(&a.mean_square_growth));
+    let forgotten = training.map(forgetting_by_element).unwrap_or_default();
     if !forgotten.is_empty() {
         let element = |of: &ElementForgetting| {
             let share = of.share_above_one.map(|share| format!("{:.1} % above 1", 100.0 * share));

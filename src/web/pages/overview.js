@@ -12,6 +12,9 @@ export const TITLE = "Overview";
 /** Largest number of walks shown; running ones come first. */
 const WALKS = 40;
 
+/** Largest number of elements shown of those with sampled training atoms, and of the others. */
+const ELEMENTS = 4;
+
 const WALK_COLUMNS = [["walk", true], ["seed structure"], ["origin"], ["state"], ["step", true], ["T", true], ["V/V₀", true],
   ["γ_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["rejected", true]];
 
@@ -68,10 +71,25 @@ function summary(status) {
       `${whole(status.labels_last_hour)} made in the last hour`),
     tile("Mixture", `version ${whole(version)}`,
       training?.atoms ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
-      ...(training?.elements ?? []).toSorted((a, b) => b.mean_square_growth - a.mean_square_growth).map((of) => `${of.element}: mean σ² of training atoms × ${of.mean_square_growth.toFixed(2)}`).slice(0, 4),
-      training?.alarm ? element("span", { class: "wrong" }, "forgetting: above calm.forgetting_alarm") : "",
+      ...forgotten(training?.elements ?? []),
+      training?.alarm ? element("span", { class: "wrong" }, `forgetting: above ${exceeded(training)}`) : "",
       staleness ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
   ];
+}
+
+/** The elements that are forgotten most: by the share of their sampled atoms above 1, and without a sample by the growth of σ². */
+function forgotten(elements) {
+  const most = (of) => elements.filter((one) => of(one) != null).toSorted((a, b) => of(b) - of(a)).slice(0, ELEMENTS);
+  const growth = (one) => `mean σ² of training atoms × ${one.mean_square_growth.toFixed(2)}`;
+  return [
+    ...most((one) => one.share_above_one).map((one) => `${one.element}: ${percent(one.share_above_one)} above 1, ${growth(one)}`),
+    ...most((one) => (one.share_above_one == null ? one.mean_square_growth : null)).map((one) => `${one.element}: ${growth(one)}`),
+  ];
+}
+
+/** The keys whose limits the mixture exceeds. */
+function exceeded({ level_of_share: share, level_of_growth: growth }) {
+  return [share > 1 && "calm.forgetting_alarm", growth > 1 && "calm.max_mean_square_growth"].filter(Boolean).join(" and ");
 }
 
 /** Number of ended walks, with early ends. */
