@@ -171,6 +171,37 @@ fn elements_that_the_mixture_has_no_data_of_are_shown() {
     }
 }
 
+/// A program without files for an element skips its structures, as a potential does that does not know it.
+#[test]
+fn structures_that_a_program_cannot_label_are_skipped() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    for element in ["Al", "Ni"] {
+        let potcar = format!(
+            "VRHFIN ={element}: s2p1\nTITEL = PAW_PBE {element} 01Jan2000\nPOMASS = 1.000; ZVAL = 3.000\nEnd of Dataset\n"
+        );
+        fs::write(here.join(format!("POTCAR.{element}")), potcar).unwrap();
+    }
+    let vasp = "method = { vasp = { command = [\"sh\"], version = \"5.4.4\", pseudopotentials = \".\", \
+                pseudopotential_variants = { Al = \"Al\", Ni = \"Ni\" } } } #";
+    let text = demo("nickel-aluminium-hydrogen.toml").replace("\nmethod = ", &format!("\n{vasp}"));
+    fs::write(here.join("c.toml"), &text).unwrap();
+    let output = calmwalk(here, ["validate", "c.toml", "--csv", "seeds.csv"]);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    let expected = ["seed structure 'ni-h' (", ":1) is skipped: pseudopotential of H: none is selected"];
+    assert!(expected.iter().all(|words| said.contains(words)), "{said}");
+    for (name, row) in rows(&here.join("seeds.csv")) {
+        let expected = if row["formula"].contains('H') { "skipped" } else { "ready" };
+        assert_eq!(row["state"], expected, "{name}: {row:?}");
+    }
+    let strict = text.replace("# on_invalid = \"skip\"", "on_invalid = \"error\"");
+    fs::write(here.join("c.toml"), strict).unwrap();
+    let message = refuse(here, ["validate", "c.toml"]);
+    let expected = ["label.method.vasp: pseudopotential of H: ", " (seed structure 'ni-h', "];
+    assert!(expected.iter().all(|words| message.contains(words)), "{message}");
+}
+
 /// What `validate` warns of, the other commands that load a campaign say too.
 #[test]
 fn skipped_structures_are_listed_before_a_start() {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use atoms::{NeighbourList, Structure};
 use calm::forgetting::GradeDistribution;
 use calm::{Artifact, ArtifactError, Grades, Mixture, Projection};
+use dft::SetupError;
 use orchestrator::selector::{TrainingFrames, UpdateProtocol};
 use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
@@ -208,15 +209,15 @@ impl Loader<'_> {
         }))
     }
 
-    /// The label protocol and the hashes of its files. Seed structures with elements that a label potential does not know
-    /// are left out if the configuration allows it and others remain.
+    /// The label protocol and the hashes of its files. Seed structures that cannot be labelled are left out if the
+    /// configuration allows it and others remain.
     pub fn protocol(
         &self,
         seeds: &mut SeedStructures,
     ) -> Result<(Protocol, Vec<(String, String)>), ConfigError> {
         let (settings, hashes) = match &self.config.label.method {
             LabelMethod::Potential(reference) => self.reference(reference, seeds)?,
-            LabelMethod::Code(settings) => (self.code(settings, &seeds.valid)?, Vec::new()),
+            LabelMethod::Code(settings) => (self.code(settings, seeds)?, Vec::new()),
         };
         Ok((label_method::protocol(self.config.label.protocol_name(), settings), hashes))
     }
@@ -226,49 +227,60 @@ impl Loader<'_> {
         reference: &PotentialConfig,
         seeds: &mut SeedStructures,
     ) -> Result<(Value, Vec<(String, String)>), ConfigError> {
+        let file = reference.file.get_ref();
         let wrong = |message: String| self.file_error(REFERENCE_FILE, &reference.file, message);
         let potential = reference.load().map_err(wrong)?;
-        let unknown = |named: &SourcedStructure| {
-            named
-                .seed
-                .structure
-                .species
-                .iter()
-                .find(|species| !potential.species().contains(species))
-                .copied()
-        };
         let known: Vec<_> = potential.species().iter().map(|species| species.symbol()).collect();
         let knows = format!("the label potential knows {}", known.join(", "));
-        let first = seeds.valid.iter().find_map(|named| Some((named, unknown(named)?)));
-        if let Some((SourcedStructure { seed, source, .. }, species)) = first
-            && (self.config.seed_structures.on_invalid == OnInvalid::Error
-                || seeds.valid.iter().all(|named| unknown(named).is_some()))
-        {
-            return Err(wrong(format!(
-                "{}: {knows}, but seed structure '{}' ({source}) has {species}",
-                reference.file.get_ref().display(),
-                seed.name
-            )));
-        }
-        seeds.skip(|named| unknown(named).map(|species| format!("{knows}, but the structure has {species}")));
+        let unknown = |structure: &Structure| {
+            let species = structure.species.iter().find(|species| !potential.species().contains(species));
+            species.map(|species| format!("{knows}, but the structure has {species}"))
+        };
+        let reasons = seeds.valid.iter().map(|named| unknown(&named.seed.structure)).collect();
+        self.skip_unlabelled(seeds, reasons)
+            .map_err(|message| wrong(format!("{}: {message}", file.display())))?;
         let hash = self.hash(REFERENCE_FILE, &reference.file)?;
         Ok((label_method::potential_identity(reference.kind, &hash.1), vec![hash]))
     }
 
-    /// Protocol settings of a program, which must be installed with all it needs for every seed structure.
-    fn code(&self, settings: &dft::DftSettings, seeds: &[SourcedStructure]) -> Result<Value, ConfigError> {
+    /// Protocol settings of a program, which must be installed.
+    fn code(&self, settings: &dft::DftSettings, seeds: &mut SeedStructures) -> Result<Value, ConfigError> {
         let key = format!("label.method.{}", settings.name());
         let at = || location(self.path, self.text, &key);
         let wrong = |message: String| ConfigError::File { at: at(), key: key.clone(), message };
         let code = settings.prepare(&self.config.label.pass_environment);
         let code = code.map_err(|error| wrong(error.to_string()))?;
-        for named in seeds {
+        // A setting is wrong for any structure, files may be missing for an element.
+        let unsupported = |named: &SourcedStructure| {
             let species = named.seed.structure.species.iter().copied().collect();
-            let supported = code.supports(&species);
-            let of_seed = |error| format!("{error} (seed structure '{}', {})", named.seed.name, named.source);
-            supported.map_err(|error| wrong(of_seed(error)))?;
-        }
+            match code.supports(&species) {
+                Ok(()) => Ok(None),
+                Err(error @ SetupError::Pseudopotential { .. }) => Ok(Some(error.to_string())),
+                Err(error) => Err(wrong(with_seed(&error.to_string(), named))),
+            }
+        };
+        let reasons = seeds.valid.iter().map(unsupported).collect::<Result<_, _>>()?;
+        self.skip_unlabelled(seeds, reasons).map_err(wrong)?;
         Ok(label_method::code_identity(settings.name(), &*code))
+    }
+
+    /// Leaves out the seed structures for which there is a reason. Fails with the first reason if the configuration
+    /// requires all of them, or if none remains.
+    fn skip_unlabelled(
+        &self,
+        seeds: &mut SeedStructures,
+        reasons: Vec<Option<String>>,
+    ) -> Result<(), String> {
+        let is_refused =
+            self.config.seed_structures.on_invalid == OnInvalid::Error || reasons.iter().all(Option::is_some);
+        let first =
+            seeds.valid.iter().zip(&reasons).find_map(|(named, reason)| Some((named, reason.as_ref()?)));
+        if let Some((named, reason)) = first.filter(|_| is_refused) {
+            return Err(with_seed(reason, named));
+        }
+        let mut reasons = reasons.into_iter();
+        seeds.skip(|_| reasons.next().flatten());
+        Ok(())
     }
 
     /// A key and the hash of the file that it names.
@@ -278,6 +290,11 @@ impl Loader<'_> {
         })?;
         Ok((key.to_owned(), hash))
     }
+}
+
+/// A message about a seed structure.
+fn with_seed(message: &str, SourcedStructure { seed, source, .. }: &SourcedStructure) -> String {
+    format!("{message} (seed structure '{}', {source})", seed.name)
 }
 
 /// Computes features of structures one after another.

@@ -62,7 +62,7 @@ pub struct SkippedStructure {
 
 impl SeedStructures {
     /// Leaves out the structures for which there is a reason.
-    pub fn skip(&mut self, reason: impl Fn(&SourcedStructure) -> Option<String>) {
+    pub fn skip(&mut self, mut reason: impl FnMut(&SourcedStructure) -> Option<String>) {
         for named in mem::take(&mut self.valid) {
             match reason(&named) {
                 None => self.valid.push(named),

@@ -87,9 +87,9 @@ function forgotten(elements) {
   ];
 }
 
-/** The keys whose limits the mixture exceeds. */
+/** The keys whose limits the mixture exceeds. Campaigns of early versions have none. */
 function exceeded({ level_of_share: share, level_of_growth: growth }) {
-  return [share > 1 && "calm.forgetting_alarm", growth > 1 && "calm.max_mean_square_growth"].filter(Boolean).join(" and ");
+  return [share > 1 && "calm.forgetting_alarm", growth > 1 && "calm.max_mean_square_growth"].filter(Boolean).join(" and ") || "the limit";
 }
 
 /** Number of ended walks, with early ends. */
