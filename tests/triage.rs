@@ -9,7 +9,7 @@ use atoms::read_extxyz;
 
 use crate::common::campaign::Small;
 use crate::common::npz::with_changed_arrays;
-use crate::common::{calmwalk, config, demo, program, refuse, stderr, succeed};
+use crate::common::{calmwalk, config, demo, program, refuse, stderr, succeed, write_frames};
 
 /// `n`³ atoms of simple cubic aluminium with the edge `a`, Å, whose first atom is displaced.
 fn cubic(name: &str, n: u8, a: f64, displacement: f64) -> String {
@@ -169,6 +169,23 @@ fn elements_that_the_mixture_has_no_data_of_are_shown() {
         let gamma: f64 = row["gamma_max"].parse().unwrap();
         assert!((gamma > 10.0) == (expected != "ready"), "{name}: {gamma}");
     }
+}
+
+/// Hydrogen atoms that start 7 Å apart may meet in a walk.
+#[test]
+fn pairs_of_elements_that_are_far_apart_have_windows_too() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let frames = read_extxyz(&config("data/nickel_aluminium_hydrogen_seeds.extxyz")).unwrap();
+    write_frames(&here.join("seeds.extxyz"), &frames[..1]);
+    let seeds = config("data/nickel_aluminium_hydrogen_seeds.extxyz").display().to_string();
+    let text = demo("nickel-aluminium-hydrogen.toml").replace(&seeds, "seeds.extxyz");
+    fs::write(here.join("c.toml"), text).unwrap();
+    let shown = succeed(here, ["validate", "c.toml"]);
+    let rows: Vec<Vec<_>> = shown.lines().map(|line| line.split_whitespace().collect()).collect();
+    let row = rows.iter().find(|row| row.first() == Some(&"H-H")).unwrap_or_else(|| panic!("{shown}"));
+    assert_eq!(row[..], ["H-H", "0.62", "–", "0.600", "0.550", "0.780"]);
+    assert!(rows.iter().any(|row| row.first() == Some(&"H-Ni")), "{shown}");
 }
 
 /// A program without files for an element skips its structures, as a potential does that does not know it.

@@ -12,14 +12,14 @@ use crate::config::{Config, Warning, location};
 /// Number of pairs that a warning names.
 const MAX_SHOWN: usize = 5;
 
-/// A pair of elements that are neighbours in a seed structure.
+/// A pair of elements that occur together in a seed structure.
 #[derive(Clone, Debug)]
 pub struct PairRange {
     /// The elements.
     pub pair: ElementPair,
-    /// Their shortest distance in all seed structures, Å.
+    /// Their shortest distance in all seed structures, Å; infinite if they are farther apart than the cutoff everywhere.
     pub shortest: f64,
-    /// Name of the seed structure with that distance.
+    /// Name of the seed structure with that distance; empty if it is infinite.
     pub seed_structure: String,
     /// The lowest of the limits of `guard.min_distances` in walks from all seed structures, Å.
     pub limit: f64,
@@ -27,12 +27,13 @@ pub struct PairRange {
     pub zbl: Option<ZblWindow>,
 }
 
-/// All pairs with a distance within the cutoff of the model, those nearest to guard or repulsion first.
+/// All pairs of elements that occur together in a seed structure, those nearest to guard or repulsion first. Atoms that
+/// start farther apart than the cutoff may meet in a walk.
 pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure]) -> Vec<PairRange> {
     let mut ranges: BTreeMap<ElementPair, PairRange> = BTreeMap::new();
     for SourcedStructure { seed, geometry, .. } in seeds {
         let limits: BTreeMap<_, _> = config.guard.min_distances.limits(&geometry.shortest).iter().collect();
-        for (pair, distance) in geometry.shortest.iter().filter(|(_, distance)| distance.is_finite()) {
+        for (pair, distance) in geometry.shortest.iter() {
             let range = ranges.entry(pair).or_insert_with(|| PairRange {
                 pair,
                 shortest: f64::INFINITY,

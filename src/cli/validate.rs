@@ -145,7 +145,7 @@ fn write_short_range(out: &mut dyn Write, ranges: &[PairRange], shown: usize) ->
         table.push(vec![
             pair.to_string(),
             format!("{:.2}", pair.covalent_radii()),
-            format!("{shortest:.3}"),
+            decimals(Some(*shortest).filter(|shortest| shortest.is_finite()), 3),
             format!("{limit:.3}"),
             decimals(zbl.map(|window| window.inner), 3),
             decimals(zbl.map(|window| window.outer), 3),
