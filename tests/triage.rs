@@ -1,4 +1,4 @@
-//! Checks of seed structures by `validate` before a campaign starts.
+//! Checks of seed structures by `validate` and `estimate` before a campaign starts.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -6,6 +6,7 @@ use std::fs;
 use std::path::Path;
 
 use atoms::read_extxyz;
+use serde_json::{Value, json};
 
 use crate::common::campaign::Small;
 use crate::common::npz::with_changed_arrays;
@@ -106,6 +107,34 @@ fn seed_structures_are_graded_and_measured() {
         assert!(time("cubic") > 0.0 && time("large") > 0.0);
         assert!((time("cubic") / time("strained") / (work("cubic") / work("strained")) - 1.0).abs() < 1e-9);
     }
+}
+
+#[test]
+fn an_estimate_examines_seed_structures_too() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let seeds = [cubic("cubic", 3, 2.8, 0.0), cubic("strained", 3, 2.5, 0.5), cubic("close", 3, 2.8, 2.7)];
+    write(here, &seeds.concat());
+    let shown = succeed(here, ["estimate", "campaign.toml", "--csv", "seeds.csv"]);
+    let rows = rows(&here.join("seeds.csv"));
+    assert_eq!((rows.len(), rows["close"]["state"].as_str()), (5, "skipped"));
+    let candidates = rows.values().filter(|row| row["state"] == "candidate").count();
+    let remark = format!("\n  start    {candidates} of 4 seed structures meet the collection rule");
+    let tables = ["\nseed structure  labels  atoms", "\nseed structure  atoms  formula  closest pair"];
+    assert!(candidates > 0 && shown.contains(&remark), "{shown}");
+    assert!(tables.iter().all(|titles| shown.contains(titles)), "{shown}");
+
+    let plan: Value = serde_json::from_str(&succeed(here, ["estimate", "campaign.toml", "--json"])).unwrap();
+    for seed in plan["seed_structures"].as_array().unwrap() {
+        let (row, found) = (&rows[seed["seed_structure"].as_str().unwrap()], &seed["triage"]);
+        assert_eq!((&found["state"], &found["formula"]), (&json!(row["state"]), &json!(row["formula"])));
+        let gamma = found["gamma_max"].as_f64().unwrap();
+        assert!((row["gamma_max"].parse::<f64>().unwrap() / gamma - 1.0).abs() < 1e-9, "{found}");
+        assert_eq!(found["distances"][0]["pair"], "Al-Al");
+    }
+    let [skipped] = plan["skipped"].as_array().unwrap().as_slice() else { panic!("{plan}") };
+    assert_eq!(skipped["seed_structure"], "close");
+    assert!(skipped["reason"].as_str().unwrap().starts_with("the shortest Al-Al distance is "), "{plan}");
 }
 
 #[test]

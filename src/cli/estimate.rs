@@ -1,5 +1,6 @@
 //! `calmwalk estimate`
 
+use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -9,8 +10,9 @@ use monitor::label_cost::{CoreHours, CostEstimator};
 use serde_json::json;
 use store::{Location, Store};
 
+use super::seed_table::SeedTable;
 use super::{CommandError, ExitStatus, block_on, campaign_location};
-use crate::campaign::{LoadedCampaign, StepTimes, WalkTime};
+use crate::campaign::{LoadedCampaign, SkippedStructure, WalkTime};
 use crate::disk_forecast;
 use crate::output::{TextTable, count, print, print_json};
 use crate::wording;
@@ -23,7 +25,9 @@ const SHOWN: usize = 20;
 ///
 /// Shows the largest number of labels that the configuration allows, their expected cost, the time of the walks and the disk use.
 /// The time of the walks follows from a few steps measured on this host. The cost of a label is extrapolated from the labels of
-/// another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk label-file`). `calmwalk validate` shows the seed structures: elements, distances, grades, those that are skipped.
+/// another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk label-file`). Grades every seed structure
+/// as `calmwalk validate` does, and shows the worst: elements, closest pair, γ_max, whether the collection rule is met
+/// (docs/seed-structures.md).
 #[derive(Debug, clap::Args)]
 pub struct EstimateArgs {
     /// Configuration of the campaign (TOML)
@@ -36,9 +40,12 @@ pub struct EstimateArgs {
     /// Cost of one label of the first seed structure, in core-seconds
     #[arg(long, value_name = "CORE_SECONDS", value_parser = core_seconds)]
     core_seconds: Option<f64>,
-    /// List every seed structure instead of the first 20 (JSON always lists all)
+    /// List every seed structure instead of the first 20 and the 20 worst (JSON always lists all)
     #[arg(long)]
     all: bool,
+    /// Write a table of all seed structures, as `calmwalk validate --csv` does, to this file
+    #[arg(long, value_name = "FILE.csv")]
+    csv: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -62,7 +69,10 @@ struct SeedEstimate {
 }
 
 /// The estimate for the campaign.
-struct CampaignEstimate {
+struct CampaignEstimate<'a> {
+    /// What is known of the seed structures before their walks start.
+    table: SeedTable<'a>,
+    skipped: &'a [SkippedStructure],
     seed_structures: Vec<SeedEstimate>,
     /// Upper limit. Smaller than the sum over the seed structures if a key of the configuration limits the total.
     labels: u64,
@@ -88,10 +98,10 @@ impl EstimateArgs {
         Ok(ExitStatus::Done)
     }
 
-    fn estimate(&self, campaign: &LoadedCampaign) -> Result<CampaignEstimate, CommandError> {
+    fn estimate<'a>(&self, campaign: &'a LoadedCampaign) -> Result<CampaignEstimate<'a>, CommandError> {
         let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
-        let times = StepTimes::measure(campaign)?;
+        let table = SeedTable::examine(campaign, self.csv.as_deref())?;
         let config = &campaign.config;
         let copies = config.labels_of_each();
         let seed_structures: Vec<_> = campaign
@@ -103,7 +113,7 @@ impl EstimateArgs {
                 size,
                 labels: u64::from(copies) * config.most_structures_of(seed.seed.walks.len()),
                 cost_per_label: costs.as_ref().and_then(|costs| costs.predict([(size, 1)])),
-                walks: times.of(seed),
+                walks: table.walk_time(seed),
             })
             .collect();
         let sum = seed_structures.iter().map(|seed| seed.labels).sum();
@@ -119,8 +129,10 @@ impl EstimateArgs {
             limited_by: limit.and(config.budget().structures_by),
             cost: cost.map(|cost| cost.scaled(fraction)),
             cost_source,
-            walks: times.total(&campaign.seed_structures),
+            walks: table.total_walk_time(),
             disk: disk_forecast::estimate(campaign),
+            skipped: &campaign.skipped,
+            table,
         })
     }
 
@@ -160,8 +172,10 @@ async fn fit_costs(location: &Location) -> Result<CostEstimator, CommandError> {
     if costs.measured() == 0 { Err(none()) } else { Ok(costs) }
 }
 
-fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: bool) -> io::Result<()> {
-    let CampaignEstimate { seed_structures, labels, limited_by, cost, cost_source, walks, disk } = estimate;
+fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate<'_>, all: bool) -> io::Result<()> {
+    let CampaignEstimate {
+        table, seed_structures, labels, limited_by, cost, cost_source, walks, disk, ..
+    } = estimate;
     let limit = limited_by.as_ref().map_or(String::new(), |key| format!(", limited by {key}"));
     writeln!(out, "{}: at most {}{limit}", path.display(), count(*labels, "label"))?;
     match cost {
@@ -181,6 +195,17 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
     let walks = walks.map_or("no step could be measured".to_owned(), wording::cost::walks);
     writeln!(out, "  walks    {walks}")?;
     writeln!(out, "  disk     {}", wording::disk::forecast(disk))?;
+    for remark in table.remarks() {
+        writeln!(out, "  start    {remark}")?;
+    }
+    let shown = if all { usize::MAX } else { SHOWN };
+    write_labels(out, seed_structures, shown)?;
+    writeln!(out)?;
+    table.write(out, shown)
+}
+
+/// The labels of the first `shown` seed structures.
+fn write_labels(out: &mut dyn Write, seed_structures: &[SeedEstimate], shown: usize) -> io::Result<()> {
     let mut table = TextTable::new(&[
         "seed structure",
         ">labels",
@@ -190,7 +215,7 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
         ">core-hours per label",
         ">walk",
     ]);
-    let shown = if all { seed_structures.len() } else { SHOWN.min(seed_structures.len()) };
+    let shown = shown.min(seed_structures.len());
     for SeedEstimate { name, size, labels, cost_per_label, walks } in &seed_structures[..shown] {
         table.push(vec![
             name.clone(),
@@ -209,7 +234,8 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
     }
 }
 
-fn as_json(estimate: &CampaignEstimate) -> serde_json::Value {
+fn as_json(estimate: &CampaignEstimate<'_>) -> serde_json::Value {
+    let triage: HashMap<_, _> = estimate.table.to_json().into_iter().collect();
     let hours = |walks: Option<WalkTime>| {
         walks.map(|time| json!({ "biased": time.biased / 3600.0, "control": time.control / 3600.0 }))
     };
@@ -218,11 +244,17 @@ fn as_json(estimate: &CampaignEstimate) -> serde_json::Value {
         json!({
             "seed_structure": seed.name, "labels": seed.labels, "atoms": atoms, "electrons": electrons,
             "k_points": k_points, "core_hours_each": seed.cost_per_label, "walk_hours": hours(seed.walks),
+            "triage": triage.get(seed.name.as_str()),
         })
+    };
+    let skipped = |of: &SkippedStructure| {
+        let SkippedStructure { seed, source, reason } = of;
+        json!({ "seed_structure": seed.name, "source": source, "reason": reason })
     };
     json!({
         "labels": estimate.labels, "limited_by": estimate.limited_by, "core_hours": estimate.cost,
         "walk_hours": hours(estimate.walks), "disk": estimate.disk,
         "seed_structures": estimate.seed_structures.iter().map(of_seed).collect::<Vec<_>>(),
+        "skipped": estimate.skipped.iter().map(skipped).collect::<Vec<_>>(),
     })
 }

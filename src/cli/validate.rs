@@ -1,31 +1,27 @@
 //! `calmwalk validate`
 
-mod seed_table;
-
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use calm::Artifact;
 
+use super::seed_table::SeedTable;
 use super::{CommandError, ExitStatus};
-use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::campaign::{LoadedCampaign, PairRange, Remark, SeedTriage, StepTimes, triage};
+use crate::campaign::{LoadedCampaign, PairRange};
 use crate::disk_forecast;
-use crate::output::{Bar, TextTable, count, decimals, print};
+use crate::output::{TextTable, count, decimals, print};
 use crate::runtime;
 use crate::wording;
 
 /// Number of pairs of elements, and of seed structures, that are shown.
 const SHOWN: usize = 20;
 
-const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
-
 /// Check a configuration and all files that it refers to
 ///
 /// Reports all errors with file, line and key (exit code 2). Valid but suspicious values are warnings on standard error and do
 /// not change the exit code. Grades every seed structure under the original mixture, measures a few steps on this host to
-/// estimate the time of walks, and shows the worst seed structures.
+/// estimate the time of walks, and shows the worst seed structures, each with the pair of elements that is closest to its
+/// limit. --csv has all seed structures with all their pairs (docs/seed-structures.md).
 #[derive(Debug, clap::Args)]
 pub struct ValidateArgs {
     /// Configuration of a campaign (TOML)
@@ -34,7 +30,7 @@ pub struct ValidateArgs {
     /// List every pair of elements and every seed structure instead of the first 20
     #[arg(long)]
     all: bool,
-    /// Write a table of all seed structures, including skipped ones, to this file
+    /// Write a table of all seed structures, including skipped ones, with the distances of all pairs of elements to this file
     #[arg(long, value_name = "FILE.csv")]
     csv: Option<PathBuf>,
 }
@@ -43,52 +39,25 @@ impl ValidateArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let campaign = LoadedCampaign::load(&self.config)?;
         campaign.print_warnings();
-        let csv = self.csv.as_deref().map(AtomicFile::create).transpose()?;
-        let seeds = graded(&campaign);
-        let times = StepTimes::measure(&campaign)?;
-        if let (Some(mut file), Some(path)) = (csv, &self.csv) {
-            let bytes = seed_table::csv(&campaign, &seeds, &times).into_bytes();
-            file.write_all(&bytes).map_err(|error| cannot_write(path, error))?;
-            file.finish()?;
-        }
+        let seeds = SeedTable::examine(&campaign, self.csv.as_deref())?;
         let shown = if self.all { usize::MAX } else { SHOWN };
         print(|out| {
             write(out, &self.config, &campaign)?;
-            write_seeds(out, &campaign, &seeds, &times)?;
+            write_seeds(out, &campaign, &seeds)?;
             write_short_range(out, &campaign.pair_ranges, shown)?;
             writeln!(out)?;
-            seed_table::write(out, &seeds, &times, shown)
+            seeds.write(out, shown)
         })?;
         Ok(ExitStatus::Done)
     }
 }
 
-/// Grades the seed structures with a progress bar.
-fn graded(campaign: &LoadedCampaign) -> Vec<SeedTriage<'_>> {
-    let (bar, done) = (Bar::new(Some(campaign.seed_structures.len() as u64), BAR), AtomicU64::new(0));
-    triage(campaign, || bar.set(done.fetch_add(1, Ordering::Relaxed) + 1, || "seed structures".to_owned()))
-}
-
 /// How many seed structures are noteworthy, how long walks take, and whether walkers wait.
-fn write_seeds(
-    out: &mut dyn Write,
-    campaign: &LoadedCampaign,
-    seeds: &[SeedTriage<'_>],
-    times: &StepTimes,
-) -> io::Result<()> {
-    let number = |is: fn(&Remark) -> bool| seeds.iter().filter(|found| is(&found.remark)).count();
-    let remarks = [
-        (number(|remark| *remark == Remark::Candidate), "meet the collection rule before their walks start"),
-        (
-            number(|remark| matches!(remark, Remark::NotInMixture(_))),
-            "have an element that the mixture has no data of",
-        ),
-        (number(|remark| matches!(remark, Remark::Ungraded(_))), "cannot be graded"),
-    ];
-    for (number, words) in remarks.into_iter().filter(|(number, _)| *number > 0) {
-        writeln!(out, "  at the start     {number} of {} {words}", count(seeds.len(), "seed structure"))?;
+fn write_seeds(out: &mut dyn Write, campaign: &LoadedCampaign, seeds: &SeedTable<'_>) -> io::Result<()> {
+    for remark in seeds.remarks() {
+        writeln!(out, "  at the start     {remark}")?;
     }
-    let walks = times.total(seeds.iter().map(|found| found.seed));
+    let walks = seeds.total_walk_time();
     let walks = walks.map_or("no step could be measured".to_owned(), wording::cost::walks);
     writeln!(out, "  walks            {walks}")?;
     match runtime::idle_walkers(campaign) {
