@@ -4,7 +4,7 @@
 
 The Python has ASE and gracemaker (tensorpotential 0.6.2.1), whose programs are beside it. WORK receives
 
-    model.npz     GRACE-2L "medium" with random weights, 89 elements, and a mixture of 16 components an element
+    model.npz     GRACE-2L "medium" with random weights, 89 elements, and a mixture of up to 16 components an element
     seeds.extxyz  1,000 seed structures of 1 to 200 atoms, of one to six elements
     training.extxyz   the 1,068 structures of 60 atoms that the mixture is built from
 

@@ -1,13 +1,14 @@
 """Measures a campaign at the size of a foundation model: time and memory of each command, and of the orchestrator.
 
     python make_model.py WORK          # once; needs gracemaker
-    python measure.py CALMWALK WORK [SECONDS]
+    python measure.py CALMWALK WORK [SECONDS] [--seed-structures N]
 
 CALMWALK is the program (release build). WORK has model.npz, gmm_artifacts.npz, seeds.extxyz and training.extxyz of
-make_model.py. The campaign runs for SECONDS (default 240), is interrupted, and is continued for as long. Python's standard
-library is enough.
+make_model.py. The campaign runs for SECONDS (default 240), is interrupted, and is continued for as long. With
+--seed-structures it has the first N seed structures alone, in WORK/campaign-N. Python's standard library is enough.
 """
 
+import argparse
 import json
 import os
 import shutil
@@ -98,17 +99,54 @@ def command_line(pid):
         return b""
 
 
+def first_frames(text, number):
+    """The first frames of an extended XYZ file."""
+    lines, end = text.splitlines(keepends=True), 0
+    for frame in range(number):
+        if end >= len(lines):
+            sys.exit(f"seeds.extxyz has {frame} seed structures, fewer than {number}")
+        end += int(lines[end]) + 2
+    return "".join(lines[:end])
+
+
+def write_config(work, number):
+    """Writes the configuration, with the first `number` seed structures or all. Returns its path."""
+    text = (HERE / "campaign.toml").read_text()
+    if number is None:
+        config = work / "campaign.toml"
+    else:
+        config, seeds = work / f"campaign-{number}.toml", f"seeds-{number}.extxyz"
+        (work / seeds).write_text(first_frames((work / "seeds.extxyz").read_text(), number))
+        assert '"seeds.extxyz"' in text
+        text = text.replace('"seeds.extxyz"', f'"{seeds}"')
+    config.write_text(text)
+    return config
+
+
+def views(calmwalk, directory):
+    """Measures the commands that only read."""
+    finished("status", [calmwalk, "status", directory])
+    finished("status --all", [calmwalk, "status", directory, "--all"])
+    finished("status --json", [calmwalk, "status", directory, "--json"])
+    finished("report", [calmwalk, "report", directory, "--output", directory.with_name(directory.name + "-report")])
+
+
 def main():
-    calmwalk, work = (Path(word).resolve() for word in sys.argv[1:3])
-    seconds = float(sys.argv[3]) if len(sys.argv) > 3 else 240.0
-    config, directory = work / "campaign.toml", work / "campaign"
-    shutil.copyfile(HERE / "campaign.toml", config)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("calmwalk", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("seconds", type=float, nargs="?", default=240.0)
+    parser.add_argument("--seed-structures", type=int, metavar="N", help="the first N seed structures alone")
+    arguments = parser.parse_args()
+    calmwalk, work, seconds = arguments.calmwalk.resolve(), arguments.work.resolve(), arguments.seconds
+    config = write_config(work, arguments.seed_structures)
+    directory = config.with_suffix("")
     shutil.rmtree(directory, ignore_errors=True)
     finished("validate", [calmwalk, "validate", config])
     run("first run", calmwalk, config, directory, seconds)
-    finished("status", [calmwalk, "status", directory])
+    views(calmwalk, directory)
     run("restarted", calmwalk, config, directory, seconds)
-    finished("status", [calmwalk, "status", directory])
+    views(calmwalk, directory)
     finished("store check", [calmwalk, "store", "check", directory])
     size = sum(file.stat().st_size for file in directory.rglob("*") if file.is_file())
     print(f"the campaign's directory has {size / 1e6:.0f} MB")
