@@ -121,7 +121,7 @@ fn whole_seed_structures_go_to_one_part() {
     assert!(ids(&train).is_sorted_by_key(|id| order[id.as_str()]), "in the order of the decisions");
     assert!(split(&[])[0].2 == bytes, "the same bytes each time");
     let others: Vec<_> =
-        (1..9).map(|seed| split(&["--split-seed", &seed.to_string()])[0].1.clone()).collect();
+        (1..9).map(|seed| split(&["--split-rng-seed", &seed.to_string()])[0].1.clone()).collect();
     assert!(others.iter().any(|other| *other != train_seeds), "another seed gives another split");
     // A selection does not change the part of the other seed structures.
     let [(_, high_seeds, _), _] = split(&["--where", "gamma > 1.5"]);

@@ -38,7 +38,7 @@ pub struct ImportArgs {
     /// Queue the structures for labelling, such as those of calmwalk select
     #[arg(long, conflicts_with = "protocol")]
     queue: bool,
-    /// Priority in the queue, higher first; that of candidates is 0 unless it was changed
+    /// Priority in the queue; higher values are labelled first. Candidates have 10, control frames 0
     #[arg(long, value_name = "N", requires = "queue", default_value_t = 0, allow_negative_numbers = true)]
     priority: i32,
 }

@@ -58,8 +58,8 @@ pub struct CalmFilterArgs {
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = clap::value_parser!(u32).range(..=100_000))]
     draws: u32,
     /// Random seed
-    #[arg(long, default_value_t = 42)]
-    seed: u64,
+    #[arg(long, value_name = "N", default_value_t = 42)]
+    rng_seed: u64,
     /// Leave out rows in which one of the numbers is empty or nan
     #[arg(long)]
     skip_missing: bool,
@@ -86,7 +86,7 @@ impl CalmFilterArgs {
             refuse_to_replace(output, [(self.table.as_path(), "the table")])?;
         }
         let (rows, left_out) = reliability_filter::read(&self.table, &self.columns(), self.skip_missing)?;
-        let report = FilterReport::new(&rows, left_out, &self.thresholds, self.draws, self.seed);
+        let report = FilterReport::new(&rows, left_out, &self.thresholds, self.draws, self.rng_seed);
         if let Some(path) = &self.csv {
             write(path, &reliability_filter::csv(&report).into_bytes())?;
         }

@@ -64,8 +64,8 @@ pub struct ExportArgs {
     #[arg(long, value_name = "NAME=SHARE,…")]
     split: Option<Shares>,
     /// Random seed of the split
-    #[arg(long, value_name = "NUMBER", default_value_t = 0, requires = "split")]
-    split_seed: u64,
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "split")]
+    split_rng_seed: u64,
     /// Export the labels of this protocol; required if there are labels of several protocols
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
@@ -245,7 +245,7 @@ impl ExportArgs {
         let seeds = store.seed_structures().await?.into_iter();
         let seeds: Vec<_> = seeds.map(|seed| (seed.index, seed.name)).collect();
         let assigned = shares
-            .assign(&seeds, self.split_seed)
+            .assign(&seeds, self.split_rng_seed)
             .map_err(|error| CommandError::Input(format!("--split: {error}")))?;
         let mut parts = Vec::new();
         for (number, name) in shares.names().enumerate() {

@@ -150,7 +150,7 @@ function attempt(made) {
   const lasted = made.ended == null ? `since ${time(made.started)}` : `after ${duration(made.ended - made.started)}`;
   const failed = made.class ? ` (${words(made.class)})` : "";
   const line = `attempt ${made.attempt}: ${how}${failed} ${lasted}, by ${made.holder}`;
-  const more = [made.calculation && `calculation ${made.calculation}`, made.remedies && `changed after failures: ${made.remedies}`, made.difference, made.log]
+  const more = [made.calculation && `calculation ${made.calculation}`, made.remedies && `retry adjustments: ${made.remedies}`, made.difference, made.log]
     .filter(Boolean).join("\n");
   return more ? element("details", { class: "attempt" }, element("summary", {}, line), element("pre", { tabindex: "0" }, more))
     : element("p", { class: "attempt" }, line);
