@@ -48,7 +48,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     let mut run = place.run();
     // The campaign must not end before both slots have been seen.
     let held = pause_walkers(place.path(), small.walkers);
-    wait_until("both slots show in status", || {
+    wait_until("both label workers show in status", || {
         let status = place.status();
         let processes = status["processes"].as_array().cloned().unwrap_or_default();
         let slots =
@@ -92,7 +92,7 @@ fn the_job_of_a_killed_labeller_is_labelled_by_the_next() {
     place.pause_labeller();
     label.0.kill().unwrap();
     label.0.wait().unwrap();
-    wait_until("its slot has exited", || processes_in(place.path()).is_empty());
+    wait_until("its label worker has exited", || processes_in(place.path()).is_empty());
     assert_ne!(place.job(&name).job.state, JobState::Labelled);
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
     let job = place.job(&name);

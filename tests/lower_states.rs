@@ -13,7 +13,7 @@ use crate::common::{refuse, succeed};
 /// Converges to −2.5 eV after the moments were changed; without a change only if the file `converges` exists, to the energy
 /// in it.
 const SCRIPT: &str = r#"
-case "$CALMWALK_REMEDIES" in
+case "$CALMWALK_RETRY_ADJUSTMENTS" in
     *other_moments*) energy=-2.5 ;;
     *) energy=$(cat "HERE/converges") || exit 3 ;;
 esac

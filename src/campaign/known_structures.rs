@@ -42,7 +42,7 @@ impl Loader<'_> {
             let label = label(&frame).map_err(of_frame)?;
             frame.structure.validate().map_err(|error| of_frame(error.to_string()))?;
             let refused =
-                self.config.label.bounds().refuses(label.energy, &label.forces, label.stress.as_ref());
+                self.config.label.bounds().rejects(label.energy, &label.forces, label.stress.as_ref());
             if let Some(refused) = refused {
                 return Err(of_frame(format!(
                     "{refused} (energies in eV, forces in eV/Å, stresses in eV/Å³)"

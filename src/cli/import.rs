@@ -55,7 +55,7 @@ impl ImportedFile {
     /// Applies the campaign's bounds for its own labels.
     fn check(&self, bounds: &LabelBounds) -> Result<(), CommandError> {
         for ((_, _, label), line) in self.frames.iter().zip(&self.lines) {
-            if let Some(problem) = bounds.refuses(label.energy, &label.forces, label.stress.as_ref()) {
+            if let Some(problem) = bounds.rejects(label.energy, &label.forces, label.stress.as_ref()) {
                 return Err(CommandError::Input(format!(
                     "{}:{line}: {problem}: nothing was imported; correct the label, remove the frame, or raise the limit if it is \
                      correct",

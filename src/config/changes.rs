@@ -95,7 +95,7 @@ pub enum Refused {
         shown(after),
         campaign_has(key, before),
         reason(key),
-        remedy(key)
+        alternative(key)
     )]
     Key {
         /// Dotted key.
@@ -109,7 +109,7 @@ pub enum Refused {
     #[error(
         "{key}: the contents of the file changed (BLAKE3 {after}; this campaign started with {before}): {}. Restore the old file{}",
         reason(key),
-        remedy(key)
+        alternative(key)
     )]
     File {
         /// Dotted key of the configuration that names the file.
@@ -154,7 +154,8 @@ fn is_label(key: &str) -> bool {
     key.starts_with("label.method")
 }
 
-fn remedy(key: &str) -> &'static str {
+/// What the user can do instead of restoring the old value.
+fn alternative(key: &str) -> &'static str {
     if !is_label(key) {
         return "";
     }

@@ -78,7 +78,7 @@ pub fn lease_timeout() -> Duration {
     Duration::from_seconds(600)
 }
 
-/// As many as the longest ladder of remedies has steps.
+/// As many as the longest ladder of retry adjustments has steps.
 pub fn max_attempts() -> NonZeroU32 {
     nonzero(4)
 }

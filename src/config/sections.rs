@@ -391,7 +391,7 @@ impl LabelSection {
         self.protocol.as_deref().unwrap_or(self.method.name())
     }
 
-    /// Bounds beyond which a label is refused.
+    /// Bounds beyond which a label is rejected.
     pub fn bounds(&self) -> LabelBounds {
         LabelBounds {
             max_force: self.max_force.get(),

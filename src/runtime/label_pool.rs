@@ -79,7 +79,7 @@ pub async fn run(
     }
     let failure = failure.or_else(|| all_failed_message(&mut manager.labellers.children));
     match failure.filter(|_| !stop.is_cancelled()) {
-        Some(why) => Err(CommandError::Failed(format!("no slot is left: {why}"))),
+        Some(why) => Err(CommandError::Failed(format!("all labellers failed: {why}"))),
         None if stop.is_cancelled() => Ok(ExitStatus::Interrupted),
         None => Ok(ExitStatus::Done),
     }

@@ -83,7 +83,7 @@ fn assignment_metrics(text: &mut MetricsText, metrics: &AgentMetrics) {
     let outcomes = [
         ("candidate", assignments.candidate),
         ("steps_done", assignments.steps_done),
-        ("paused", assignments.paused),
+        ("interrupted", assignments.interrupted),
         ("ended", assignments.ended),
         ("lost", assignments.lost),
     ];

@@ -65,7 +65,7 @@ fn log_outcome(work: &WorkItem, made: &AssignmentReport<Candidate>, time: Durati
     let outcome = match &made.outcome {
         Outcome::Candidate(_) => "candidate",
         Outcome::StepsDone => "steps_done",
-        Outcome::Interrupted => "paused",
+        Outcome::Interrupted => "interrupted",
         Outcome::Ended(_) => "ended",
     };
     debug!(

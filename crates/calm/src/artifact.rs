@@ -403,7 +403,7 @@ impl ElementComponents {
         };
         let thresholds = thresholds.filter(|row| row.len() >= slots).cloned();
         let thresholds = thresholds
-            .ok_or_else(|| invalid(file, &key, format!("{slots} slots"), "at most one for each threshold"))?;
+            .ok_or_else(|| invalid(file, &key, format!("{slots} components"), "at most one for each threshold"))?;
         if slots == 0 || dimension == 0 {
             return Err(invalid(file, &key, format!("shape {:?}", centroids.shape), "at least one centroid"));
         }

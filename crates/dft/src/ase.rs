@@ -2,7 +2,7 @@
 //!
 //! The script reads `input.json` and the user's `calculator.py` in its directory and writes `result.json`
 //! atomically. `input.json` has `species`, `positions` and `cell` (Å), `periodic`, `moments` (μ_B, or null) and
-//! `remedies`, the names of the retry adjustments. `result.json` is either `{"converged": {…}}` with `species`,
+//! `retry_adjustments`, their names. `result.json` is either `{"converged": {…}}` with `species`,
 //! `positions`, `cell`, `energy` (eV, the one consistent with the forces), `energy_without_smearing`, `forces`
 //! (eV/Å), `stress` (eV/Å³, xx yy zz yz xz xy), `moments`, `magnetisation` (μ_B) and `steps`, null where
 //! absent; or `{"failure": {"class": …, "message": …}}`. In both cases `by` has the versions of ASE and of the
@@ -139,7 +139,7 @@ impl DftBackend for Ase {
             "cell": structure.cell.0,
             "periodic": structure.periodic,
             "moments": (!table.is_empty()).then(|| moments::initial(structure, table, adjustments)),
-            "remedies": adjustments.iter().map(|adjustment| adjustment.name()).collect::<Vec<_>>(),
+            "retry_adjustments": adjustments.iter().map(|adjustment| adjustment.name()).collect::<Vec<_>>(),
         });
         let files = [
             (SCRIPT_FILE, SCRIPT.into()),

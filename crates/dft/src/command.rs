@@ -6,7 +6,7 @@
 //! (μ_B). If `free_energy` is present, it is the one consistent with the forces. Exit code 0 states that the
 //! calculation converged and the file is complete. Other codes are failures: 3 not converged, 4 out of memory,
 //! 5 the structure cannot be calculated, any other: crashed. Its output is kept with the failure. After a
-//! failure the variable `CALMWALK_REMEDIES` lists the adjustments of the retry, separated by commas
+//! failure the variable `CALMWALK_RETRY_ADJUSTMENTS` lists the adjustments of the retry, separated by commas
 //! (`more_steps`, `slower_mixing`, `other_algorithm`, `other_moments`, `more_memory`, `more_time`,
 //! `other_node`). None of them may change the converged numbers.
 
@@ -110,7 +110,7 @@ impl DftBackend for Command {
         let mut files = self.files.clone();
         files.insert(STRUCTURE.to_owned(), text);
         let names: Vec<_> = adjustments.iter().map(|adjustment| adjustment.name()).collect();
-        let environment = BTreeMap::from([("CALMWALK_REMEDIES".to_owned(), names.join(","))]);
+        let environment = BTreeMap::from([("CALMWALK_RETRY_ADJUSTMENTS".to_owned(), names.join(","))]);
         Ok(CalculationInput {
             files,
             command: self.command.clone(),

@@ -17,7 +17,7 @@ const SCRIPT: &str = r#"
   cat more; echo
   tail -n +3 structure.extxyz | while read -r line; do echo "$line 0.5 -0.25 1e-3 2.0"; done
 } > label.extxyz
-echo "$CALMWALK_REMEDIES" > remedies
+echo "$CALMWALK_RETRY_ADJUSTMENTS" > adjustments
 exit "$(cat code)"
 "#;
 
@@ -82,7 +82,7 @@ fn a_script_makes_a_label() {
         electronic_steps: None,
     };
     assert_eq!(calculated, expected);
-    assert_eq!(std::fs::read_to_string(place.path().join("remedies")).unwrap(), "more_steps,other_moments\n");
+    assert_eq!(std::fs::read_to_string(place.path().join("adjustments")).unwrap(), "more_steps,other_moments\n");
     assert_eq!(code.size(&oxide()).atoms, 3);
     assert_eq!(label("energy=2", 0).unwrap().stress, None);
 }

@@ -29,7 +29,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 ///
 /// Writes every frame with the model's energy (eV), forces (eV/Å) and, for periodic cells, stress (eV/Å³, tension positive),
 /// and per atom gamma (extrapolation grade γ), gamma_nbr (its neighbourhood average), sigma (Mahalanobis distance σ) and
-/// component (nearest component of the atom's element, from 0). Rejects structures with atoms closer than 0.4 Å, and mixtures
+/// component (nearest component of the atom's element, from 0). Refuses structures with atoms closer than 0.4 Å, and mixtures
 /// that cannot come from training data. With an artifact of other features of the model (`calm build --feature-variant`), those are
 /// graded.
 ///

@@ -211,8 +211,8 @@ impl WatchState {
                 return None;
             }
             PromptKind::Filter => match self.parse_filter(text) {
-                Ok(condition) => {
-                    self.filter(Some(condition));
+                Ok(filter) => {
+                    self.filter(Some(filter));
                     return None;
                 }
                 Err(error) => error,
@@ -233,10 +233,10 @@ impl WatchState {
 impl WatchState {
     /// Parses a filter, and checks that the pane has its quantities.
     fn parse_filter(&self, text: &str) -> Result<StructureFilter, String> {
-        let condition: StructureFilter = text.parse().map_err(|error| format!("invalid filter: {error}"))?;
+        let filter: StructureFilter = text.parse().map_err(|error| format!("invalid filter: {error}"))?;
         let is_not_known = |name: &&str| UNKNOWN_QUANTITIES[self.focus].contains(name);
-        match condition.names().into_iter().find(is_not_known) {
-            None => Ok(condition),
+        match filter.names().into_iter().find(is_not_known) {
+            None => Ok(filter),
             Some(name) => {
                 let pane = ["walks", "label jobs", "decisions"][self.focus];
                 Err(format!(

@@ -8,9 +8,9 @@ import { decimals, digits, whole } from "./format.js";
 export const TITLE = "Mixture";
 
 const ELEMENTS = [["element"], ["components", true], ["moved", true], ["environments at the start", true], ["gained", true],
-  ["largest condition number", true], ["largest distance", true], [""]];
+  ["largest condition number", true], ["largest component distance", true], [""]];
 const COMPONENTS = [["component", true], ["θ", true], ["environments at the start", true], ["gained", true], ["weighted", true],
-  ["condition number", true], ["widest growth", true], ["strongest shrinkage", true], ["training σ²", true], ["distance", true], [""]];
+  ["condition number", true], ["widest growth", true], ["strongest shrinkage", true], ["training σ²", true], ["component distance", true], [""]];
 
 /** Width of the longest bar. */
 const BAR = 120;

@@ -44,7 +44,7 @@ pub struct AssignmentCounts {
     /// Ran to their last step.
     pub steps_done: u64,
     /// Stopped because the walker was asked to stop.
-    pub paused: u64,
+    pub interrupted: u64,
     /// Ended with the walk.
     pub ended: u64,
     /// Lost with their walker.
@@ -97,7 +97,7 @@ impl AgentMetrics {
             SlotReport::Report(report) => match report.outcome {
                 Outcome::Candidate(_) => &mut counts.candidate,
                 Outcome::StepsDone => &mut counts.steps_done,
-                Outcome::Interrupted => &mut counts.paused,
+                Outcome::Interrupted => &mut counts.interrupted,
                 Outcome::Ended(_) => &mut counts.ended,
             },
         };

@@ -1,4 +1,4 @@
-//! Differences that remedies make in the input of a calculation.
+//! Differences that retry adjustments make in the input of a calculation.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;

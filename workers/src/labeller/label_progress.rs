@@ -26,7 +26,7 @@ pub enum LabelOutcome {
         /// eV/Å³, tension positive
         stress: Option<Matrix3>,
     },
-    /// No attempt or remedy is left. Contains the last failure.
+    /// No attempt or retry adjustment is left. Contains the last failure.
     Failed(String),
 }
 

@@ -129,7 +129,7 @@ impl Method {
         }
     }
 
-    /// Whether no remedy is left after this failure.
+    /// Whether no retry adjustment is left after this failure.
     pub(super) fn has_no_remedy(&self, lease: &Lease, failure: &Failure) -> bool {
         match self {
             // Every attempt would give the same result.

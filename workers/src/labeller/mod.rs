@@ -271,7 +271,7 @@ async fn deliver_attempt(
     if let Some(ended) = &ended {
         retry_until_written(stop, || store.record_cost(lease, ended.core_seconds, log)).await?;
     }
-    // A failure without a remedy is not tried again.
+    // A failure without a retry adjustment is not tried again.
     let no_remedy = validated.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
     let attempts = if no_remedy { 1 } else { settings.attempts };
     let outcome =

@@ -70,7 +70,7 @@ impl RecordedLabel<'_> {
         Ok(self.progress(store).await?.outcome.and_then(|outcome| outcome.label().ok()))
     }
 
-    /// Makes the label, unless the store has it. Each failure applies the next remedy, as in the queue. A label that
+    /// Makes the label, unless the store has it. Each failure applies the next retry adjustment, as in the queue. A label that
     /// failed for good is tried again from the start. `None` after a stop request: a calculation under way continues,
     /// and the next call for the same key waits for it.
     ///

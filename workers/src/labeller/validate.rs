@@ -41,16 +41,16 @@ impl Default for LabelBounds {
 
 impl LabelBounds {
     /// The bound that finite values of a label exceed, as text. Takes energy, eV; forces, [n], eV/Å; stress, eV/Å³.
-    pub fn refuses(&self, energy: f64, forces: &[Vec3], stress: Option<&Matrix3>) -> Option<String> {
+    pub fn rejects(&self, energy: f64, forces: &[Vec3], stress: Option<&Matrix3>) -> Option<String> {
         let larger = |largest: f64, x: f64| if x.abs() > largest.abs() { x } else { largest };
         let stress = stress.into_iter().flatten().flatten().copied().fold(0.0, larger);
         let force = forces.iter().map(|force| norm(*force)).fold(0.0, f64::max);
-        self.refuses_energy(energy, forces.len())
-            .or_else(|| self.refuses_stress(stress))
-            .or_else(|| self.refuses_force(force))
+        self.exceeded_energy(energy, forces.len())
+            .or_else(|| self.exceeded_stress(stress))
+            .or_else(|| self.exceeded_force(force))
     }
 
-    fn refuses_energy(&self, energy: f64, atoms: usize) -> Option<String> {
+    fn exceeded_energy(&self, energy: f64, atoms: usize) -> Option<String> {
         let (energy, bound) = (energy / atoms.max(1) as f64, self.max_energy_per_atom);
         let (found, largest) = (number(energy), number(bound));
         (energy.abs() > bound).then(|| {
@@ -58,7 +58,7 @@ impl LabelBounds {
         })
     }
 
-    fn refuses_stress(&self, stress: f64) -> Option<String> {
+    fn exceeded_stress(&self, stress: f64) -> Option<String> {
         let bound = self.max_stress;
         let (gpa, found, largest) = (number(stress * GPA), number(stress), number(bound));
         (stress.abs() > bound).then(|| {
@@ -68,7 +68,7 @@ impl LabelBounds {
         })
     }
 
-    fn refuses_force(&self, force: f64) -> Option<String> {
+    fn exceeded_force(&self, force: f64) -> Option<String> {
         let (found, largest) = (number(force), number(self.max_force));
         (force > self.max_force)
             .then(|| format!("a force of {found} eV/Å, beyond label.max_force = {largest} eV/Å"))
@@ -88,8 +88,8 @@ pub(super) fn validate(
 ) -> Result<CalculationResults, Failure> {
     let problem = wrong_length(&results, structure.len())
         .or_else(|| non_finite(&results))
-        .or_else(|| bounds.refuses(results.energy, &results.forces, results.stress.as_ref()))
-        .or_else(|| bounds.refuses_energy(results.energy_without_smearing?, structure.len()))
+        .or_else(|| bounds.rejects(results.energy, &results.forces, results.stress.as_ref()))
+        .or_else(|| bounds.exceeded_energy(results.energy_without_smearing?, structure.len()))
         .or_else(|| energy_mismatch(&results, structure, bounds, expected?));
     match problem {
         Some(problem) => Err(FailureClass::Implausible.with_message(problem)),

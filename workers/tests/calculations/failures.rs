@@ -1,4 +1,4 @@
-//! Failures: retries with remedies, limits, programs that cannot be started.
+//! Failures: retries with adjustments, limits, programs that cannot be started.
 
 use std::fs;
 
@@ -34,12 +34,12 @@ async fn a_job_without_a_remedy_fails_and_others_continue() {
     let fixture = Fixture::new(2, "[ $(cat $HERE/begun | wc -l) -gt 4 ] || exit 3; echo -7.5 > energy").await;
     let attempts = |settings: &mut LabellerSettings| settings.attempts = 100;
     fixture.labeller_with(attempts).await.ended().await.unwrap();
-    // Three remedies after the first try.
+    // Three adjustments after the first try.
     let job = fixture.job().await;
     assert_eq!((job.job.state, job.job.attempts), (JobState::Failed, 4));
     let other = fixture.store.queue_show(&fixture.candidates[1]).await.unwrap();
     assert_eq!((other.job.state, other.job.attempts), (JobState::Labelled, 1));
-    // Requeued by hand, it starts from the first remedy.
+    // Requeued by hand, it starts from the first adjustment.
     fixture.store.retry_job(&fixture.candidates[0], 0).await.unwrap();
     fixture.work().await;
     let job = fixture.job().await;

@@ -30,8 +30,8 @@ def main():
     if task["moments"] is not None:
         atoms.set_initial_magnetic_moments(task["moments"])
     try:
-        takes_remedies = len(inspect.signature(user.calculator).parameters) > 0
-        atoms.calc = user.calculator(set(task["remedies"])) if takes_remedies else user.calculator()
+        takes_adjustments = len(inspect.signature(user.calculator).parameters) > 0
+        atoms.calc = user.calculator(set(task["retry_adjustments"])) if takes_adjustments else user.calculator()
         result = calculate(atoms, user)
     except Exception as error:
         traceback.print_exc()

@@ -35,7 +35,7 @@ fn the_task_is_the_structure_with_its_moments_and_adjustments() {
         "cell": [[4.0, 0.0, 0.0], [0.5, 4.0, 0.0], [0.0, 0.0, 0.0]],
         "periodic": [true, true, false],
         "moments": null,
-        "remedies": [],
+        "retry_adjustments": [],
     });
     assert_eq!(task(&ase(InitialMagneticMoments::new()), &[]), plain);
     let changed = task(
@@ -43,7 +43,7 @@ fn the_task_is_the_structure_with_its_moments_and_adjustments() {
         &[RetryAdjustment::SlowerMixing, RetryAdjustment::OtherMoments],
     );
     assert_eq!(changed["moments"], json!([1.5, 0.5]));
-    assert_eq!(changed["remedies"], json!(["slower_mixing", "other_moments"]));
+    assert_eq!(changed["retry_adjustments"], json!(["slower_mixing", "other_moments"]));
 }
 
 /// Reads this result for the structure [`copper`].

@@ -90,7 +90,7 @@ pub enum SharedMixtureError {
         living: usize,
     },
     /// A reader number without a slot.
-    #[error("no slot for reader {reader}: the shared mixture has {readers} slots, counted from 0")]
+    #[error("no reader index {reader}: the shared mixture has {readers} reader indices, counted from 0")]
     NoSlot {
         /// The reader.
         reader: u32,
@@ -99,7 +99,7 @@ pub enum SharedMixtureError {
     },
     /// The slot is in use.
     #[error(
-        "reader {reader} is already open in process {process}; if that process is dead, release its slot first"
+        "reader {reader} is already open in process {process}; if that process is dead, release its reader index first"
     )]
     SlotTaken {
         /// The reader.

@@ -132,7 +132,7 @@ impl DeltaReceiver {
         for (&(element, slot), bytes) in part.keys.iter().zip(part.bytes.chunks_exact(length.max(1))) {
             let component = Component::from_bytes(bytes)?;
             let entry = self.elements.get_mut(element as usize).and_then(|of| of.get_mut(slot as usize));
-            let entry = entry.ok_or_else(|| wrong(format!("no slot {slot} of element {element}")))?;
+            let entry = entry.ok_or_else(|| wrong(format!("no component {slot} of element {element}")))?;
             *entry = Some(Arc::new(component));
         }
         self.received += part.keys.len() as u32;
