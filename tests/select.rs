@@ -119,7 +119,7 @@ fn several_strategies_pick_from_what_is_left() {
     let other = select(here, &[&["pool.extxyz", "--rng-seed", "1", "--strategy"], &parts[..]].concat());
     assert_ne!(other["picks"], found["picks"]);
     // Atoms above the window are ignored.
-    let within = select(here, &["pool.extxyz", "--gamma-max", "1.5", "--gamma-min", "1.1", "-n", "1"]);
+    let within = select(here, &["pool.extxyz", "--max-gamma", "1.5", "--min-gamma", "1.1", "-n", "1"]);
     assert!(within["picks"][0]["gamma_max"].as_f64() < Some(1.51));
 }
 
@@ -136,9 +136,9 @@ fn wrong_selections_are_refused() {
         ),
         (&["pool.extxyz", "-n", "3", "--strategy", "greedy", "fps:2"], "-n is for a single strategy"),
         (&["pool.extxyz", "--strategy", "gredy"], "unknown strategy 'gredy'"),
-        (&["pool.extxyz", "--gamma-min", "2", "--gamma-max", "1"], "--gamma-min 2, --gamma-max 1: expected"),
+        (&["pool.extxyz", "--min-gamma", "2", "--max-gamma", "1"], "--min-gamma 2, --max-gamma 1: expected"),
         (&["pool.extxyz", "--update-target", "0"], "--update-target: found 0, expected"),
-        (&["pool.extxyz", "--memory=-1"], "--memory -1: expected"),
+        (&["pool.extxyz", "--memory=-1"], "--memory -1: expected a number of GB"),
         (&["pool.cif"], "pool.cif: unknown format"),
         (&["pool.extxyz", "--no-evaluation"], "--campaign"),
         (&[], "<POOL>"),

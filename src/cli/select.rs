@@ -26,7 +26,7 @@ use crate::structure_files::StructureReadingArgs;
 /// Grades every structure of the pool and picks with one strategy or with several in a row, each from what is left:
 ///
 /// greedy: the structure with the largest γ first; after each pick, a copy of the mixture learns it (additive update). Ends when no γ is
-/// above --gamma-min, or after N structures.
+/// above --min-gamma, or after N structures.
 ///
 /// fps (fps-extrap): farthest points over the atoms with γ within the window, of features that the mixture whitens; structures in the
 /// order in which their first atom is picked. Starts from what is picked already. fps-all: over all atoms, of plain features.
@@ -71,21 +71,21 @@ pub struct SelectArgs {
     /// Number of structures, for a single strategy [default for greedy: all that it finds]
     #[arg(long, short = 'n', value_name = "N")]
     number: Option<usize>,
-    /// Lower limit of the window: atoms with γ above it count
+    /// Lower limit of the grade window: atoms with γ above it count
     #[arg(long, value_name = "GAMMA", default_value_t = 1.0)]
-    gamma_min: f64,
-    /// Upper limit of the window: atoms with γ above it are left out, such as those of broken structures [default: none]
+    min_gamma: f64,
+    /// Upper limit of the grade window: atoms with γ above it are left out, such as those of broken structures [default: none]
     #[arg(long, value_name = "GAMMA")]
-    gamma_max: Option<f64>,
-    /// Greedy: an update brings the γ of a picked structure below this
+    max_gamma: Option<f64>,
+    /// Greedy: γ that an update must reach for a picked structure
     #[arg(long, value_name = "GAMMA", default_value_t = 1.25)]
     update_target: f64,
-    /// Least number of atoms of each element in what is selected [default: D + 1, the feature dimension plus one; greedy alone: none]
+    /// Minimum number of atoms of each element in what is selected [default: D + 1, the feature dimension plus one; greedy alone: none]
     ///
     /// Structures with many atoms of an element that has fewer take the place of the last ones that greedy has not picked.
     #[arg(long, value_name = "ATOMS")]
     min_per_element: Option<u64>,
-    /// No least number of atoms of each element
+    /// No minimum number of atoms of each element
     #[arg(long, conflicts_with = "min_per_element")]
     no_element_floors: bool,
     /// Random seed
@@ -94,8 +94,8 @@ pub struct SelectArgs {
     /// Threads [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Features in memory, GiB; the others are in a temporary file beside the output
-    #[arg(long, value_name = "GIB", default_value_t = 4.0)]
+    /// Features in memory, GB; the others are in a temporary file beside the output
+    #[arg(long, value_name = "GB", default_value_t = 4.0)]
     memory: f64,
     /// File for the selected structures, extended XYZ; an existing file is replaced at the end
     #[arg(long, short, value_name = "OUT.extxyz")]
@@ -187,13 +187,13 @@ impl SelectArgs {
     }
 
     fn window(&self) -> Result<Window, CommandError> {
-        let window = Window { above: self.gamma_min, up_to: self.gamma_max.unwrap_or(f64::INFINITY) };
+        let window = Window { above: self.min_gamma, up_to: self.max_gamma.unwrap_or(f64::INFINITY) };
         if window.above >= 0.0 && window.above < window.up_to {
             return Ok(window);
         }
         let Window { above, up_to } = window;
         Err(CommandError::Input(format!(
-            "--gamma-min {above}, --gamma-max {up_to}: expected a lower limit of 0 or more that is below the upper one"
+            "--min-gamma {above}, --max-gamma {up_to}: expected a lower limit of 0 or more that is below the upper one"
         )))
     }
 
@@ -204,9 +204,9 @@ impl SelectArgs {
 
     fn memory_bytes(&self) -> Result<usize, CommandError> {
         if self.memory.is_finite() && self.memory >= 0.0 {
-            return Ok((self.memory * f64::from(1 << 30)) as usize);
+            return Ok((1e9 * self.memory) as usize);
         }
-        Err(CommandError::Input(format!("--memory {}: expected a number of GiB, 0 or more", self.memory)))
+        Err(CommandError::Input(format!("--memory {}: expected a number of GB, 0 or more", self.memory)))
     }
 
     /// That of the output.
