@@ -182,13 +182,13 @@ fn walk_settings() -> WalkSettings {
         rng_seed: 1,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
-        equilibration: 500,
-        steps: 2000,
+        equilibration_steps: 500,
+        biased_steps: 2000,
         bias_averaging_steps: 10,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nmin_atoms = 3")
             .unwrap(),
-        gap: 200,
+        min_interval: 200,
         min_interval_after_decline: 20,
         zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
         guard: GuardSettings {

@@ -54,7 +54,7 @@ impl StepTimes {
             Threads::new(campaign.config.run.threads_per_walker.get()).map_err(CommandError::failed)?;
         let mut settings = campaign.walk_settings();
         // Only the bias of the walk differs from that of its control walk, and the volume is that of the seed structure.
-        (settings.equilibration, settings.steps) = (0, u64::MAX);
+        (settings.equilibration_steps, settings.biased_steps) = (0, u64::MAX);
         let context =
             WalkContext { model: Arc::clone(&campaign.model), threads, settings: Arc::new(settings) };
         let mixture = Arc::new(campaign.artifact.mixture.clone());

@@ -15,9 +15,9 @@ pub struct WalkSettings {
     /// Time step, fs; `None` for the paper's rule (2 fs; 0.5 fs with H, He, Li or Be).
     pub time_step: Option<f64>,
     /// Unbiased steps at the start, at the volume at which the ramp starts.
-    pub equilibration: u64,
+    pub equilibration_steps: u64,
     /// Biased steps after equilibration.
-    pub steps: u64,
+    pub biased_steps: u64,
     /// Steps over which the two norms of τ_r are exponentially averaged.
     pub bias_averaging_steps: u64,
     /// Neighbour-list skin, Å.
@@ -25,7 +25,7 @@ pub struct WalkSettings {
     /// When a structure becomes a candidate.
     pub collection: calm::CollectionRule,
     /// Minimum number of steps between two accepted structures of a walk.
-    pub gap: u64,
+    pub min_interval: u64,
     /// Minimum number of steps between two candidates after one that was declined or rejected.
     pub min_interval_after_decline: u64,
     /// Windows of the switched ZBL repulsion; `None` without one.

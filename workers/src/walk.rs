@@ -120,7 +120,7 @@ impl<'a> RunningWalk<'a> {
             None => {}
             Some(Verdict::Accepted) => {
                 self.state.collected.push(CollectionPoint { branch: step, beyond: 0 });
-                self.state.next_offer = step + self.settings.gap;
+                self.state.next_offer = step + self.settings.min_interval;
             }
             Some(Verdict::Declined(_)) => {
                 self.state.next_offer = step + self.settings.min_interval_after_decline
@@ -133,7 +133,7 @@ impl<'a> RunningWalk<'a> {
         stopping: &impl Fn() -> bool,
         on_progress: &impl Fn(WalkProgress),
     ) -> Result<Outcome<Candidate>, WalkError> {
-        let last = self.settings.equilibration + self.settings.steps;
+        let last = self.settings.equilibration_steps + self.settings.biased_steps;
         loop {
             if self.step() >= last {
                 return Ok(Outcome::Ended(WalkEnd::Steps));
@@ -161,7 +161,7 @@ impl<'a> RunningWalk<'a> {
     }
 
     fn advance_one_step(&mut self) -> Result<(), WalkError> {
-        let equilibrated = self.step() >= self.settings.equilibration;
+        let equilibrated = self.step() >= self.settings.equilibration_steps;
         self.potential.tau = if equilibrated { self.state.tau } else { 0.0 };
         self.dynamics.step(&mut self.potential)?;
         let (structure, neighbours) = (self.dynamics.structure(), self.dynamics.neighbours());
@@ -179,7 +179,7 @@ impl<'a> RunningWalk<'a> {
             let wanted = self.assignment.frame_steps.contains(&step);
             return if wanted { Ok(Some(Outcome::Candidate(self.candidate()?))) } else { Ok(None) };
         }
-        let biased_steps = step.checked_sub(self.settings.equilibration);
+        let biased_steps = step.checked_sub(self.settings.equilibration_steps);
         let Some(biased_steps) = biased_steps else { return Ok(None) };
         let too_close = self.is_too_close();
         if biased_steps % self.settings.guard.checkpoint_interval == 0 && !too_close {

@@ -45,12 +45,12 @@ fn settings() -> WalkSettings {
         rng_seed: 3,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
-        equilibration: 20,
-        steps: 600,
+        equilibration_steps: 20,
+        biased_steps: 600,
         bias_averaging_steps: 10,
         skin: 0.5,
         collection: toml::from_str("rule = 'atom_count'").unwrap(),
-        gap: 200,
+        min_interval: 200,
         min_interval_after_decline: 20,
         zbl: uniform_zbl(1.6, 2.4),
         guard: GuardSettings {
@@ -237,7 +237,7 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
     let last = reports.last().unwrap();
     assert!(last.progress.returns >= 1, "{last:?}");
     assert_eq!(last.progress.segment, last.progress.returns);
-    assert!(last.progress.last_return.is_some_and(|(from, to)| from > to && to >= settings.equilibration));
+    assert!(last.progress.last_return.is_some_and(|(from, to)| from > to && to >= settings.equilibration_steps));
     assert_eq!(last.progress.tau, 2.0 * 0.5_f64.powi(last.progress.returns as i32));
     assert!(last.progress.refused >= u64::from(5 * last.progress.returns));
     let candidates = reports.iter().filter(|report| matches!(report.outcome, Outcome::Candidate(_))).count();
@@ -248,7 +248,7 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
 #[test]
 fn the_interval_between_collections_holds_across_roll_backs() {
     let guard = GuardSettings { tau_factor: 0.8, max_rollbacks: 6, ..settings().guard };
-    let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), gap: 120, guard, ..settings() };
+    let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), min_interval: 120, guard, ..settings() };
     let reports = whole_walk(&settings, first_of("fcc-097", WalkConditions { tau: 2.0, ..conditions() }));
     let candidate = |report: &AssignmentReport<Candidate>| match &report.outcome {
         Outcome::Candidate(candidate) => Some((candidate.id.segment, candidate.id.step)),
@@ -279,7 +279,7 @@ fn the_skin_changes_nothing() {
     cluster.species.truncate(5);
     cluster.positions.truncate(5);
     let ends = [0.1, 0.5, 3.0].map(|skin| {
-        let settings = WalkSettings { skin, steps: 4000, collection: never(), ..settings() };
+        let settings = WalkSettings { skin, biased_steps: 4000, collection: never(), ..settings() };
         let conditions = WalkConditions { temperature: 6000.0, ..conditions() };
         let report = run(&settings, &Assignment { conditions, ..assignment(cluster.clone(), 4020) });
         (report.outcome, report.progress.step)

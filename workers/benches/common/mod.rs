@@ -73,13 +73,13 @@ fn settings(threshold: f64) -> WalkSettings {
         rng_seed: 3,
         thermostat: ThermostatSettings::Langevin(LangevinSettings { friction: 0.01 }),
         time_step: None,
-        equilibration: EQUILIBRATION,
-        steps: 10_000_000,
+        equilibration_steps: EQUILIBRATION,
+        biased_steps: 10_000_000,
         bias_averaging_steps: 10,
         skin: 0.5,
         collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
             .expect("a rule"),
-        gap: 200,
+        min_interval: 200,
         min_interval_after_decline: 20,
         zbl: Some(ZblWindows::Uniform(ZblWindow { inner: 1.6, outer: 2.4 })),
         guard: GuardSettings {

@@ -61,7 +61,7 @@ impl WalkState {
             collected.beyond += collected.branch - step;
             collected.branch = step;
         }
-        let offers = self.collected.iter().map(|c| c.branch + settings.gap.saturating_sub(c.beyond));
+        let offers = self.collected.iter().map(|c| c.branch + settings.min_interval.saturating_sub(c.beyond));
         offers.max().unwrap_or(0).max(step + settings.min_interval_after_decline)
     }
 }
@@ -81,8 +81,8 @@ pub(super) fn start(
     let time_step = settings.time_step.unwrap_or_else(|| md::default_time_step(&structure.species));
     let mut start = State::thermal(structure, conditions.temperature, &stream);
     let ramp = conditions.volume_ramp.map(|(from, to)| {
-        let ramp = VolumeRamp::new(&start, from, to, settings.steps);
-        VolumeRamp { start: settings.equilibration, ..ramp }
+        let ramp = VolumeRamp::new(&start, from, to, settings.biased_steps);
+        VolumeRamp { start: settings.equilibration_steps, ..ramp }
     });
     // Equilibration runs at the volume at which the ramp begins.
     if let Some(ramp) = ramp.filter(|ramp| ramp.from != 1.0) {
