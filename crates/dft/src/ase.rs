@@ -47,8 +47,7 @@ pub struct AseSettings {
     pub calculator: PathBuf,
     /// Initial magnetic moment of each element, μ_B. Default: 1 for the elements not listed; without this table
     /// no atom has a moment.
-    #[serde(rename = "initial_magnetic_moments")]
-    pub moments: InitialMagneticMoments,
+    pub initial_magnetic_moments: InitialMagneticMoments,
 }
 
 impl Default for AseSettings {
@@ -57,7 +56,7 @@ impl Default for AseSettings {
             command: vec!["python3".into()],
             environment: BTreeMap::new(),
             calculator: PathBuf::new(),
-            moments: InitialMagneticMoments::new(),
+            initial_magnetic_moments: InitialMagneticMoments::new(),
         }
     }
 }
@@ -114,7 +113,8 @@ pub struct Ase {
 impl DftBackend for Ase {
     fn identity(&self) -> Value {
         // Destructure, so that a new setting cannot be forgotten here.
-        let AseSettings { command: _, environment: _, calculator: _, moments } = &self.settings;
+        let AseSettings { command: _, environment: _, calculator: _, initial_magnetic_moments: moments } =
+            &self.settings;
         json!({
             "code": "ase", "ase": self.versions.ase, "recipe": INPUT_VERSION, "version": self.versions.version,
             "calculator": blake3::hash(&self.calculator).to_hex().to_string(), "moments": moments,
@@ -132,7 +132,7 @@ impl DftBackend for Ase {
         adjustments: &BTreeSet<RetryAdjustment>,
     ) -> Result<CalculationInput, Failure> {
         structure.validate().map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
-        let table = &self.settings.moments;
+        let table = &self.settings.initial_magnetic_moments;
         let task = json!({
             "species": structure.species,
             "positions": structure.positions,

@@ -83,18 +83,15 @@ pub struct VaspSettings {
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised (`ISPIN`).
-    #[serde(rename = "spin_polarized")]
-    pub spin: bool,
+    pub spin_polarized: bool,
     /// Initial magnetic moment of each element, μ_B (`MAGMOM`). Default: 1.
-    #[serde(rename = "initial_magnetic_moments")]
-    pub moments: InitialMagneticMoments,
+    pub initial_magnetic_moments: InitialMagneticMoments,
     /// Tolerance of the energy in the last electronic step, eV (`EDIFF`).
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
     /// Maximum number of electronic steps (`NELM`).
-    #[serde(rename = "max_scf_steps")]
     #[schemars(range(min = 1))]
-    pub steps: u32,
+    pub max_scf_steps: u32,
     /// Vacuum along non-periodic directions, Å.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
@@ -122,10 +119,10 @@ impl Default for VaspSettings {
             k_spacing: 0.125,
             smearing: Smearing::Gaussian,
             smearing_width: 0.1,
-            spin: true,
-            moments: InitialMagneticMoments::new(),
+            spin_polarized: true,
+            initial_magnetic_moments: InitialMagneticMoments::new(),
             energy_tolerance: 1e-6,
-            steps: 100,
+            max_scf_steps: 100,
             vacuum: 10.0,
             kpar: 1,
             ncore: 1,
@@ -145,7 +142,7 @@ impl VaspSettings {
         positive("smearing_width", self.smearing_width)?;
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("max_scf_steps", self.steps, 1)?;
+        at_least("max_scf_steps", self.max_scf_steps, 1)?;
         at_least("kpar", self.kpar, 1)?;
         at_least("ncore", self.ncore, 1)?;
         let needed = |key, missing: bool, expected: &str| match missing {
@@ -257,10 +254,10 @@ impl DftBackend for Vasp {
             k_spacing,
             smearing,
             smearing_width,
-            spin,
-            moments,
+            spin_polarized: spin,
+            initial_magnetic_moments: moments,
             energy_tolerance,
-            steps: _,
+            max_scf_steps: _,
             vacuum,
             kpar: _,
             ncore: _,
@@ -292,7 +289,7 @@ impl DftBackend for Vasp {
                 &part.map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?.content,
             );
         }
-        let moments = moments::initial(structure, &self.settings.moments, adjustments);
+        let moments = moments::initial(structure, &self.settings.initial_magnetic_moments, adjustments);
         let moments: Vec<f64> = order.iter().map(|atom| moments[*atom]).collect();
         let k_spacing = self.settings.k_spacing;
         let files = [

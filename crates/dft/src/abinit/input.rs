@@ -61,8 +61,11 @@ fn electrons(
 ) {
     let structure = &padded.structure;
     // Bands are counted with the moments of the first attempt, so that every attempt has the same number.
-    let counted =
-        if settings.spin { moments::initial(structure, &settings.moments, &BTreeSet::new()) } else { vec![] };
+    let counted = if settings.spin_polarized {
+        moments::initial(structure, &settings.initial_magnetic_moments, &BTreeSet::new())
+    } else {
+        vec![]
+    };
     let moment: f64 = counted.iter().map(|moment| moment.abs()).sum();
     let electrons: f64 =
         structure.species.iter().filter_map(|s| pseudopotentials.get(s)).map(|p| p.valence).sum();
@@ -72,9 +75,9 @@ fn electrons(
     if pseudopotentials.values().any(|p| p.paw) {
         *text += &format!("pawecutdg {:?} eV\n", settings.fine_cutoff.unwrap_or(2.0 * settings.cutoff));
     }
-    if settings.spin {
+    if settings.spin_polarized {
         *text += "nsppol 2\nspinat\n";
-        for moment in moments::initial(structure, &settings.moments, adjustments) {
+        for moment in moments::initial(structure, &settings.initial_magnetic_moments, adjustments) {
             *text += &format!("  0 0 {moment:?}\n");
         }
     }
@@ -84,7 +87,7 @@ fn electrons(
 
 fn steps(text: &mut String, settings: &AbinitSettings, paw: bool, adjustments: &BTreeSet<RetryAdjustment>) {
     let factor = if adjustments.contains(&RetryAdjustment::MoreSteps) { 3 } else { 1 };
-    *text += &format!("nstep {}\n", settings.steps.saturating_mul(factor));
+    *text += &format!("nstep {}\n", settings.max_scf_steps.saturating_mul(factor));
     if adjustments.contains(&RetryAdjustment::SlowerMixing) {
         *text += "diemix 0.25\nnpulayit 15\n";
     }

@@ -67,18 +67,15 @@ pub struct AbinitSettings {
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
-    #[serde(rename = "spin_polarized")]
-    pub spin: bool,
+    pub spin_polarized: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
-    #[serde(rename = "initial_magnetic_moments")]
-    pub moments: InitialMagneticMoments,
+    pub initial_magnetic_moments: InitialMagneticMoments,
     /// Tolerance of the energy between electronic steps, met twice in a row, eV.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
     /// Maximum number of electronic steps.
-    #[serde(rename = "max_scf_steps")]
     #[schemars(range(min = 1))]
-    pub steps: u32,
+    pub max_scf_steps: u32,
     /// Vacuum along non-periodic directions, Å.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
@@ -96,10 +93,10 @@ impl Default for AbinitSettings {
             k_spacing: 0.125,
             smearing: Smearing::Gaussian,
             smearing_width: 0.1,
-            spin: true,
-            moments: InitialMagneticMoments::new(),
+            spin_polarized: true,
+            initial_magnetic_moments: InitialMagneticMoments::new(),
             energy_tolerance: 1e-6,
-            steps: 200,
+            max_scf_steps: 200,
             vacuum: 10.0,
         }
     }
@@ -117,7 +114,7 @@ impl AbinitSettings {
         positive("smearing_width", self.smearing_width)?;
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("max_scf_steps", self.steps, 1)?;
+        at_least("max_scf_steps", self.max_scf_steps, 1)?;
         let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
         let pseudopotentials =
@@ -193,10 +190,10 @@ impl DftBackend for Abinit {
             k_spacing,
             smearing,
             smearing_width,
-            spin,
-            moments,
+            spin_polarized: spin,
+            initial_magnetic_moments: moments,
             energy_tolerance,
-            steps: _,
+            max_scf_steps: _,
             vacuum,
         } = &self.settings;
         json!({

@@ -29,7 +29,7 @@ fn abinit(settings: AbinitSettings) -> Abinit {
 
 /// The settings that give `INPUT`.
 fn settings() -> AbinitSettings {
-    AbinitSettings { cutoff: 200.0, k_spacing: 1.2, steps: 60, ..AbinitSettings::default() }
+    AbinitSettings { cutoff: 200.0, k_spacing: 1.2, max_scf_steps: 60, ..AbinitSettings::default() }
 }
 
 fn input(settings: AbinitSettings, adjustments: &[RetryAdjustment]) -> String {
@@ -120,7 +120,10 @@ fn calculations_read_copies_of_what_was_hashed() {
 fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
     let identity = |settings: AbinitSettings| abinit(settings).identity();
     let plain = identity(settings());
-    assert_eq!(identity(AbinitSettings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
+    assert_eq!(
+        identity(AbinitSettings { max_scf_steps: 7, command: vec!["mpirun".into()], ..settings() }),
+        plain
+    );
     assert_ne!(identity(AbinitSettings { cutoff: 400.0, ..settings() }), plain);
     assert_ne!(identity(AbinitSettings { smearing_width: 0.2, ..settings() }), plain);
 }

@@ -58,14 +58,16 @@ struct Spins {
 impl Spins {
     fn new(cp2k: &Cp2k, structure: &Structure, adjustments: &BTreeSet<RetryAdjustment>) -> Self {
         let electrons = cp2k.electrons(structure).round() as u64;
-        let initial = |adjustments| moments::initial(structure, &cp2k.settings.moments, adjustments);
-        let sum =
-            |moments: Vec<f64>| if cp2k.settings.spin { moments.iter().sum::<f64>().abs() } else { 0.0 };
+        let initial =
+            |adjustments| moments::initial(structure, &cp2k.settings.initial_magnetic_moments, adjustments);
+        let sum = |moments: Vec<f64>| {
+            if cp2k.settings.spin_polarized { moments.iter().sum::<f64>().abs() } else { 0.0 }
+        };
         let parity = electrons % 2;
         // The nearest value that this number of electrons allows.
         let unpaired =
             2 * ((sum(initial(adjustments)) - parity as f64) / 2.0).round().max(0.0) as u64 + parity;
-        let unpaired = if cp2k.settings.spin { unpaired.min(electrons) } else { 0 };
+        let unpaired = if cp2k.settings.spin_polarized { unpaired.min(electrons) } else { 0 };
         // The same number of orbitals for every retry adjustment.
         let orbitals = (0.6 * (electrons as f64 + sum(initial(&BTreeSet::new())))).ceil() as u64 + 4;
         let occupied = [electrons.div_ceil(2) + unpaired / 2, (electrons / 2).saturating_sub(unpaired / 2)];
@@ -74,7 +76,7 @@ impl Spins {
 }
 
 fn method(settings: &Cp2kSettings, spins: &Spins) -> String {
-    let spin = match settings.spin {
+    let spin = match settings.spin_polarized {
         true => format!("    UKS T\n    MULTIPLICITY {}\n", spins.multiplicity),
         false => String::new(),
     };
@@ -104,7 +106,7 @@ fn k_points(mesh: [u32; 3]) -> String {
 
 fn steps(settings: &Cp2kSettings, spins: &Spins, adjustments: &BTreeSet<RetryAdjustment>) -> String {
     let has = |adjustment| adjustments.contains(&adjustment);
-    let steps = settings.steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 });
+    let steps = settings.max_scf_steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 });
     // Broyden's method stagnates below 0.2. Pulay's oscillates or stops at a bad condition number even in
     // simple cases, and with Kerker's CP2K reports convergence far too early.
     let careful = has(RetryAdjustment::SlowerMixing) || has(RetryAdjustment::OtherAlgorithm);
@@ -112,7 +114,7 @@ fn steps(settings: &Cp2kSettings, spins: &Spins, adjustments: &BTreeSet<RetryAdj
         (if careful { 0.2 } else { 0.4 }, if has(RetryAdjustment::OtherAlgorithm) { 4 } else { 8 });
     let mixing = format!("METHOD BROYDEN_MIXING\n        ALPHA {alpha:?}\n        NBROYDEN {memory}");
     let [up, down] = spins.empty;
-    let empty = if settings.spin { format!("{up} {down}") } else { up.to_string() };
+    let empty = if settings.spin_polarized { format!("{up} {down}") } else { up.to_string() };
     let temperature = settings.smearing_width / atoms::units::BOLTZMANN;
     format!(
         "    &SCF\n      SCF_GUESS ATOMIC\n      EPS_SCF {:?}\n      MAX_SCF {steps}\n      ADDED_MOS {empty}\n      \
@@ -133,7 +135,7 @@ fn structure(cp2k: &Cp2k, structure: &Structure, adjustments: &BTreeSet<RetryAdj
         let _ = writeln!(text, "      {species} {x:?} {y:?} {z:?}");
     }
     text += "    &END COORD\n";
-    let initial = moments::initial(structure, &cp2k.settings.moments, adjustments);
+    let initial = moments::initial(structure, &cp2k.settings.initial_magnetic_moments, adjustments);
     let moments = BTreeMap::from_iter(structure.species.iter().zip(initial));
     for (species, moment) in moments {
         let potential = cp2k.kind(*species).map_or("", |kind| kind.potential.as_str());
@@ -142,7 +144,7 @@ fn structure(cp2k: &Cp2k, structure: &Structure, adjustments: &BTreeSet<RetryAdj
             "    &KIND {species}\n      BASIS_SET {}\n      POTENTIAL {potential}",
             cp2k.settings.basis
         );
-        if cp2k.settings.spin {
+        if cp2k.settings.spin_polarized {
             let _ = writeln!(text, "      MAGNETIZATION {moment:?}");
         }
         text += "    &END KIND\n";

@@ -75,18 +75,15 @@ pub struct Cp2kSettings {
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
-    #[serde(rename = "spin_polarized")]
-    pub spin: bool,
+    pub spin_polarized: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
-    #[serde(rename = "initial_magnetic_moments")]
-    pub moments: InitialMagneticMoments,
+    pub initial_magnetic_moments: InitialMagneticMoments,
     /// CP2K's `EPS_SCF`: tolerance of the density between electronic steps.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub density_tolerance: f64,
     /// Maximum number of electronic steps.
-    #[serde(rename = "max_scf_steps")]
     #[schemars(range(min = 1))]
-    pub steps: u32,
+    pub max_scf_steps: u32,
     /// Vacuum along non-periodic directions, Å.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
@@ -104,10 +101,10 @@ impl Default for Cp2kSettings {
             relative_cutoff: 816.0,
             k_spacing: 0.125,
             smearing_width: 0.1,
-            spin: true,
-            moments: InitialMagneticMoments::new(),
+            spin_polarized: true,
+            initial_magnetic_moments: InitialMagneticMoments::new(),
             density_tolerance: 1e-7,
-            steps: 200,
+            max_scf_steps: 200,
             vacuum: 10.0,
         }
     }
@@ -126,7 +123,7 @@ impl Cp2kSettings {
         positive("smearing_width", self.smearing_width)?;
         positive("density_tolerance", self.density_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("max_scf_steps", self.steps, 1)?;
+        at_least("max_scf_steps", self.max_scf_steps, 1)?;
         let kinds = data::find(self)?;
         let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
@@ -182,10 +179,10 @@ impl DftBackend for Cp2k {
             relative_cutoff,
             k_spacing,
             smearing_width,
-            spin,
-            moments,
+            spin_polarized: spin,
+            initial_magnetic_moments: moments,
             density_tolerance,
-            steps: _,
+            max_scf_steps: _,
             vacuum,
         } = &self.settings;
         json!({

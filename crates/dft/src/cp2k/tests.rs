@@ -113,7 +113,10 @@ fn calculations_read_the_entries_that_were_hashed() {
 fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
     let identity = |settings: Cp2kSettings| cp2k(settings).identity();
     let plain = identity(settings());
-    assert_eq!(identity(Cp2kSettings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
+    assert_eq!(
+        identity(Cp2kSettings { max_scf_steps: 7, command: vec!["mpirun".into()], ..settings() }),
+        plain
+    );
     assert_ne!(identity(Cp2kSettings { relative_cutoff: 400.0, ..settings() }), plain);
     let error = Cp2kSettings { cutoff: 600.0, ..settings() }
         .prepare(&PassedEnvironment::default())

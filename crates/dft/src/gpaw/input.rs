@@ -46,7 +46,9 @@ pub(super) fn write(
         species: &structure.species,
         positions: &structure.positions,
         cell: &structure.cell.0,
-        moments: settings.spin.then(|| moments::initial(structure, &settings.moments, adjustments)),
+        moments: settings
+            .spin_polarized
+            .then(|| moments::initial(structure, &settings.initial_magnetic_moments, adjustments)),
         setups: DATA_DIRECTORY,
         cutoff: settings.cutoff,
         parameters: parameters(
@@ -77,17 +79,17 @@ fn parameters(
         "setups": settings.pseudopotential_variants,
         "kpts": { "size": mesh, "gamma": true },
         "symmetry": { "point_group": false },
-        "spinpol": settings.spin,
+        "spinpol": settings.spin_polarized,
         "occupations": occupations(settings.smearing, settings.smearing_width),
         // GPAW's criterion is per valence electron.
         "convergence": {
             "energy": settings.energy_tolerance / electrons.max(1.0),
             "forces": settings.force_tolerance,
         },
-        "maxiter": settings.steps,
+        "maxiter": settings.max_scf_steps,
     });
     if adjustments.contains(&RetryAdjustment::MoreSteps) {
-        parameters["maxiter"] = json!(settings.steps.saturating_mul(3));
+        parameters["maxiter"] = json!(settings.max_scf_steps.saturating_mul(3));
     }
     if adjustments.contains(&RetryAdjustment::SlowerMixing) {
         parameters["mixer"] = json!({ "beta": 0.02, "nmaxold": 8, "weight": 100.0 });

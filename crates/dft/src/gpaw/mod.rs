@@ -62,11 +62,9 @@ pub struct GpawSettings {
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub smearing_width: f64,
     /// Whether the calculation is spin-polarised.
-    #[serde(rename = "spin_polarized")]
-    pub spin: bool,
+    pub spin_polarized: bool,
     /// Initial magnetic moment of each element, μ_B. Default: 1.
-    #[serde(rename = "initial_magnetic_moments")]
-    pub moments: InitialMagneticMoments,
+    pub initial_magnetic_moments: InitialMagneticMoments,
     /// Tolerance of the energy over the last three electronic steps, eV.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub energy_tolerance: f64,
@@ -74,9 +72,8 @@ pub struct GpawSettings {
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub force_tolerance: f64,
     /// Maximum number of electronic steps.
-    #[serde(rename = "max_scf_steps")]
     #[schemars(range(min = 1))]
-    pub steps: u32,
+    pub max_scf_steps: u32,
     /// Vacuum along non-periodic directions, Å.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub vacuum: f64,
@@ -93,11 +90,11 @@ impl Default for GpawSettings {
             k_spacing: 0.125,
             smearing: Smearing::Gaussian,
             smearing_width: 0.1,
-            spin: true,
-            moments: InitialMagneticMoments::new(),
+            spin_polarized: true,
+            initial_magnetic_moments: InitialMagneticMoments::new(),
             energy_tolerance: 1e-6,
             force_tolerance: 1e-3,
-            steps: 200,
+            max_scf_steps: 200,
             vacuum: 10.0,
         }
     }
@@ -115,7 +112,7 @@ impl GpawSettings {
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("force_tolerance", self.force_tolerance)?;
         positive("vacuum", self.vacuum)?;
-        at_least("max_scf_steps", self.steps, 1)?;
+        at_least("max_scf_steps", self.max_scf_steps, 1)?;
         let environment = self.environment();
         let versions = Versions::query(&self.command, &environment, passed)?;
         let setups = setups::find(&versions.setup_paths, &self.pseudopotential_variants)?;
@@ -195,11 +192,11 @@ impl DftBackend for Gpaw {
             k_spacing,
             smearing,
             smearing_width,
-            spin,
-            moments,
+            spin_polarized: spin,
+            initial_magnetic_moments: moments,
             energy_tolerance,
             force_tolerance,
-            steps: _,
+            max_scf_steps: _,
             vacuum,
         } = &self.settings;
         json!({
@@ -213,8 +210,8 @@ impl DftBackend for Gpaw {
     fn supports(&self, species: &BTreeSet<Species>) -> Result<(), SetupError> {
         for species in species {
             let valence = self.setup(*species)?.valence;
-            let moment = self.settings.moments.get(species).copied().unwrap_or_default();
-            if self.settings.spin && moment.abs() > valence {
+            let moment = self.settings.initial_magnetic_moments.get(species).copied().unwrap_or_default();
+            if self.settings.spin_polarized && moment.abs() > valence {
                 return Err(SetupError::Setting {
                     key: "initial_magnetic_moments",
                     found: format!("{species} = {moment}"),

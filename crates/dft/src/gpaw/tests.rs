@@ -103,10 +103,10 @@ fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
     let identity = |settings: GpawSettings| gpaw(settings).identity();
     let plain = identity(GpawSettings::default());
     assert_eq!(plain["pseudopotentials"], json!({ "Si": "abc" }));
-    let slower = GpawSettings { steps: 7, command: vec!["mpirun".into()], ..GpawSettings::default() };
+    let slower = GpawSettings { max_scf_steps: 7, command: vec!["mpirun".into()], ..GpawSettings::default() };
     assert_eq!(identity(slower), plain);
     assert_ne!(identity(GpawSettings { cutoff: 400.0, ..GpawSettings::default() }), plain);
-    assert_ne!(identity(GpawSettings { spin: false, ..GpawSettings::default() }), plain);
+    assert_ne!(identity(GpawSettings { spin_polarized: false, ..GpawSettings::default() }), plain);
 }
 
 #[test]
@@ -180,8 +180,10 @@ fn elements_without_a_setup_are_refused_by_name() {
     assert_eq!(code.supports(&BTreeSet::from(["Si".parse().unwrap()])), Ok(()));
     let error = code.supports(&BTreeSet::from(["U".parse().unwrap()])).unwrap_err().to_string();
     assert!(error.starts_with("pseudopotential of U: no setup U.PBE (or .gz) in /setups"), "{error}");
-    let magnetic =
-        GpawSettings { moments: BTreeMap::from([("Si".parse().unwrap(), 5.0)]), ..GpawSettings::default() };
+    let magnetic = GpawSettings {
+        initial_magnetic_moments: BTreeMap::from([("Si".parse().unwrap(), 5.0)]),
+        ..GpawSettings::default()
+    };
     let error = gpaw(magnetic).supports(&BTreeSet::from(["Si".parse().unwrap()])).unwrap_err().to_string();
     assert_eq!(error, "initial_magnetic_moments: found Si = 5, expected at most its 4 valence electrons");
 }

@@ -57,17 +57,17 @@ impl ElementTable {
             true => given.chain(entries.pseudopotential_variants.keys().copied()).collect(),
             false => given.chain(settings.elements.iter().copied()).collect(),
         };
-        filled.moments.retain(|species, _| elements.contains(species));
+        filled.initial_magnetic_moments.retain(|species, _| elements.contains(species));
         for species in elements {
             if let Entry::Vacant(vacant) = filled.pseudopotential_variants.entry(species) {
                 vacant.insert(self.variant(&entries, species)?);
             }
             let of_table = entries.initial_magnetic_moments.get(&species).copied();
             let moment = of_table.unwrap_or(entries.default_magnetic_moment);
-            filled.moments.entry(species).or_insert(moment);
+            filled.initial_magnetic_moments.entry(species).or_insert(moment);
         }
         // What holds without an entry needs none.
-        filled.moments.retain(|_, moment| *moment != DEFAULT_MOMENT);
+        filled.initial_magnetic_moments.retain(|_, moment| *moment != DEFAULT_MOMENT);
         Ok(filled)
     }
 
@@ -145,14 +145,15 @@ mod tests {
     fn entries_of_the_settings_come_first() {
         let mut settings = with_table(&["Fe", "O"]);
         settings.pseudopotential_variants = [("Fe".parse().unwrap(), "Fe".to_owned())].into();
-        settings.moments = [("O".parse().unwrap(), 1.0), ("Al".parse().unwrap(), 3.0)].into();
+        settings.initial_magnetic_moments =
+            [("O".parse().unwrap(), 1.0), ("Al".parse().unwrap(), 3.0)].into();
         let filled = ElementTable::MpRelaxSet.fill(&settings).unwrap();
         let written_out = VaspSettings {
             pseudopotential_variants: species(&["Fe", "O"])
                 .into_iter()
                 .zip(["Fe".into(), "O".into()])
                 .collect(),
-            moments: [("Fe".parse().unwrap(), 5.0)].into(),
+            initial_magnetic_moments: [("Fe".parse().unwrap(), 5.0)].into(),
             ..VaspSettings::default()
         };
         assert_eq!(filled, written_out);
@@ -185,7 +186,10 @@ mod tests {
             .unwrap();
         let filled = ElementTable::File(path.clone()).fill(&with_table(&["Fe"])).unwrap();
         let iron = "Fe".parse().unwrap();
-        assert_eq!((filled.pseudopotential_variants[&iron].as_str(), filled.moments[&iron]), ("Fe_sv", 0.6));
+        assert_eq!(
+            (filled.pseudopotential_variants[&iron].as_str(), filled.initial_magnetic_moments[&iron]),
+            ("Fe_sv", 0.6)
+        );
         std::fs::remove_file(&path).unwrap();
         let message = ElementTable::File(path.clone()).fill(&with_table(&["Fe"])).unwrap_err().to_string();
         assert!(message.contains("mine.toml: No such file"), "{message}");

@@ -90,18 +90,19 @@ pub(super) fn incar(
         ("LCHARG", ".FALSE.".to_owned()),
         (
             "NELM",
-            (settings.steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 })).to_string(),
+            (settings.max_scf_steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 }))
+                .to_string(),
         ),
         ("ALGO", if has(RetryAdjustment::OtherAlgorithm) { "All" } else { "Normal" }.to_owned()),
-        ("ISPIN", if settings.spin { "2" } else { "1" }.to_owned()),
+        ("ISPIN", if settings.spin_polarized { "2" } else { "1" }.to_owned()),
     ];
-    if settings.spin {
+    if settings.spin_polarized {
         lines.push(("MAGMOM", runs(moments)));
         lines.push(("LORBIT", "10".to_owned()));
     }
     if has(RetryAdjustment::SlowerMixing) {
         lines.extend([("AMIX", "0.1".to_owned()), ("BMIX", "0.0001".to_owned())]);
-        if settings.spin {
+        if settings.spin_polarized {
             lines.extend([("AMIX_MAG", "0.4".to_owned()), ("BMIX_MAG", "0.0001".to_owned())]);
         }
     }

@@ -9,7 +9,7 @@ use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
 
 fn settings() -> AbinitSettings {
-    AbinitSettings { cutoff: 300.0, k_spacing: 0.8, spin: false, ..AbinitSettings::default() }
+    AbinitSettings { cutoff: 300.0, k_spacing: 0.8, spin_polarized: false, ..AbinitSettings::default() }
 }
 
 #[test]
@@ -36,14 +36,21 @@ fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
 fn iron_is_a_magnet() {
     let pseudopotentials = "/usr/share/abinit/psp/Pseudodojo_paw_pbe_standard".into();
     let moments = BTreeMap::from([("Fe".parse().unwrap(), 3.0)]);
-    let iron = AbinitSettings { pseudopotentials, moments, spin: true, cutoff: 500.0, ..settings() };
+    let iron = AbinitSettings {
+        pseudopotentials,
+        initial_magnetic_moments: moments,
+        spin_polarized: true,
+        cutoff: 500.0,
+        ..settings()
+    };
     let calculated = label(&iron.prepare(&PassedEnvironment::default()).unwrap(), &structures::iron());
     checks::magnet(&calculated, 2.0, 0.2);
 }
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = AbinitSettings { steps: 5, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let few =
+        AbinitSettings { max_scf_steps: 5, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::silicon());
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();

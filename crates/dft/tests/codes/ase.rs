@@ -203,7 +203,7 @@ fn adjustments_and_moments_reach_the_calculator() {
     );
     let place = TempDir::new().unwrap();
     let mut settings = settings(&place, &text);
-    settings.moments = [("Cu".parse().unwrap(), 3.0)].into();
+    settings.initial_magnetic_moments = [("Cu".parse().unwrap(), 3.0)].into();
     let code = settings.prepare(&PassedEnvironment::default()).unwrap();
     let found = run(&code, &alloy(), &[RetryAdjustment::OtherMoments, RetryAdjustment::MoreSteps]).unwrap();
     assert_eq!(found.magnetic_moments, Some(vec![0.5, 1.5, 0.5, 1.5, 0.5, 0.5, 1.5, 0.5]));

@@ -31,7 +31,7 @@ fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
 #[test]
 fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
     // At Γ only: this checks sign, unit and order.
-    let code = Cp2kSettings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }
+    let code = Cp2kSettings { spin_polarized: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::silicon();
@@ -41,7 +41,8 @@ fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Cp2kSettings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let few =
+        Cp2kSettings { max_scf_steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::oxygen());
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();

@@ -7,7 +7,7 @@ use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
 
 fn settings() -> GpawSettings {
-    GpawSettings { cutoff: 250.0, k_spacing: 1.2, spin: false, ..GpawSettings::default() }
+    GpawSettings { cutoff: 250.0, k_spacing: 1.2, spin_polarized: false, ..GpawSettings::default() }
 }
 
 #[test]
@@ -34,7 +34,7 @@ fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
 
 #[test]
 fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
-    let code = GpawSettings { spin: true, cutoff: 400.0, vacuum: 5.0, ..settings() }
+    let code = GpawSettings { spin_polarized: true, cutoff: 400.0, vacuum: 5.0, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::oxygen();
@@ -46,7 +46,8 @@ fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = GpawSettings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
+    let few =
+        GpawSettings { max_scf_steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::silicon());
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();

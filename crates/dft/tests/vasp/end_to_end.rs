@@ -14,7 +14,7 @@ use super::{alumina, assert_close, data, expected, settings, text};
 fn input(structure: &Structure, adjustments: &[RetryAdjustment]) -> CalculationInput {
     let directory = TempDir::new().unwrap();
     let mut settings = settings(directory.path(), "5.4.4", &["Al", "O"]);
-    settings.moments = [("O".parse().unwrap(), 0.25)].into();
+    settings.initial_magnetic_moments = [("O".parse().unwrap(), 0.25)].into();
     let code = settings.prepare().unwrap();
     code.input(structure, &BTreeSet::from_iter(adjustments.iter().copied())).unwrap()
 }

@@ -15,7 +15,7 @@ fn the_paper_s_protocol_is_the_default() {
     let dft::DftSettings::Vasp(settings) = settings else { panic!("{}", settings.name()) };
     assert_eq!((settings.cutoff, settings.k_spacing, settings.smearing_width), (500.0, 0.125, 0.1));
     assert_eq!(
-        (settings.smearing, settings.energy_tolerance, settings.spin),
+        (settings.smearing, settings.energy_tolerance, settings.spin_polarized),
         (dft::Smearing::Gaussian, 1e-6, true)
     );
     assert!(settings.tags.is_empty());
@@ -31,13 +31,13 @@ fn the_identity_holds_what_changes_a_label() {
         change(&mut settings);
         identity(&settings) == identity(&first)
     };
-    assert!(same(&|settings| settings.steps = 7));
+    assert!(same(&|settings| settings.max_scf_steps = 7));
     assert!(same(&|settings| settings.kpar = 4));
     assert!(same(&|settings| settings.command.push("-x".to_owned())));
     assert!(!same(&|settings| settings.version = "5.4".to_owned()));
     assert!(!same(&|settings| settings.cutoff = 520.0));
     assert!(!same(&|settings| settings.k_spacing = 0.2));
-    assert!(!same(&|settings| settings.moments = [("O".parse().unwrap(), 2.0)].into()));
+    assert!(!same(&|settings| settings.initial_magnetic_moments = [("O".parse().unwrap(), 2.0)].into()));
     assert!(!same(&|settings| drop(settings.tags.insert("LASPH".into(), ".TRUE.".into()))));
     assert_eq!(identity(&first)["pseudopotentials"]["O"]["title"], "PAW_PBE O 01Jan2000");
 }
@@ -46,17 +46,17 @@ fn the_identity_holds_what_changes_a_label() {
 fn the_identity_is_the_same_with_a_table_as_with_its_entries_written_out() {
     let home = TempDir::new().unwrap();
     let mut written_out = settings(home.path(), "5.4.4", &["Al", "O"]);
-    written_out.moments = ["Al", "O"].map(|symbol| (symbol.parse().unwrap(), 0.6)).into();
+    written_out.initial_magnetic_moments = ["Al", "O"].map(|symbol| (symbol.parse().unwrap(), 0.6)).into();
     let mut with_table = VaspSettings {
         element_table: Some(ElementTable::MpRelaxSet),
         elements: ["Al", "O"].map(|symbol| symbol.parse().unwrap()).into(),
         pseudopotential_variants: [].into(),
-        moments: [].into(),
+        initial_magnetic_moments: [].into(),
         ..written_out.clone()
     };
     let identity = |settings: &VaspSettings| settings.prepare().unwrap().identity();
     assert_eq!(identity(&with_table), identity(&written_out));
-    with_table.moments = [("O".parse().unwrap(), 2.0)].into();
+    with_table.initial_magnetic_moments = [("O".parse().unwrap(), 2.0)].into();
     assert_ne!(identity(&with_table), identity(&written_out));
     // A table selects more potentials than there are.
     with_table.elements.push("Fe".parse().unwrap());
