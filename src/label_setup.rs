@@ -24,11 +24,11 @@ pub struct LabelSetup {
     /// The protocol of new jobs.
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
-    pub attempts: u32,
+    pub max_attempts: u32,
     /// Limits of plausible labels.
     pub bounds: LabelBounds,
     /// How long a job is leased.
-    pub lease: Duration,
+    pub lease_timeout: Duration,
 }
 
 /// Options for the host on which labels are made.
@@ -64,7 +64,7 @@ impl LabelSetup {
         here: HostOptions<'_>,
     ) -> Result<Self, CommandError> {
         let text = store.campaign().await?.configuration_in_force;
-        let EffectiveConfig { label: LabelLimits { max_attempts: attempts, bounds, lease_timeout } } =
+        let EffectiveConfig { label: LabelLimits { max_attempts, bounds, lease_timeout } } =
             serde_json::from_str(&text).map_err(unreadable)?;
         let noted = store.metadata(LABEL_METHOD_KEY).await?.ok_or_else(|| {
             CommandError::Failed(
@@ -82,8 +82,8 @@ impl LabelSetup {
             )));
         }
         let method = method_for_this_host(noted, &protocol, here)?;
-        let lease = lease_timeout.get();
-        Ok(Self { method, protocol, attempts, bounds, lease })
+        let lease_timeout = lease_timeout.get();
+        Ok(Self { method, protocol, max_attempts, bounds, lease_timeout })
     }
 }
 

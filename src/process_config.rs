@@ -51,7 +51,7 @@ pub struct WalkerConfig {
     /// Parent process. The walker ends with it.
     pub parent: u32,
     /// How to connect to the orchestrator.
-    pub door: ConnectInfo,
+    pub connect_info: ConnectInfo,
     /// The model.
     pub model: ModelFiles,
     /// Threads that evaluate it.
@@ -75,7 +75,7 @@ pub struct AgentConfig {
     /// Heartbeat timeout of a walker, s.
     pub heartbeat_timeout: f64,
     /// Largest number of restarts.
-    pub restarts: u32,
+    pub max_restarts: u32,
 }
 
 /// Configuration of a labeller process.
@@ -87,7 +87,7 @@ pub struct LabellerConfig {
     /// Number of restarts so far.
     pub restarts: u32,
     /// Settings of a labeller that `calmwalk label` started.
-    pub slot: Option<PoolConfig>,
+    pub pool: Option<PoolConfig>,
     /// Directory of the campaign, or URL of its store.
     pub location: PathBuf,
     /// How labels are made.
@@ -95,11 +95,11 @@ pub struct LabellerConfig {
     /// The protocol.
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
-    pub attempts: u32,
+    pub max_attempts: u32,
     /// Limits of plausible labels.
     pub bounds: LabelBounds,
     /// How long a job is leased.
-    pub lease: Duration,
+    pub lease_timeout: Duration,
     /// Its log. An adopted labeller keeps its original log.
     pub log: Option<log::LogConfig>,
 }
@@ -135,9 +135,9 @@ pub fn to_bytes(setup: &impl Serialize) -> Vec<u8> {
 impl LabellerConfig {
     /// Configuration of a labeller without a number.
     pub fn new(location: PathBuf, label_setup: LabelSetup) -> Self {
-        let LabelSetup { method, protocol, attempts, bounds, lease } = label_setup;
-        let (number, restarts, slot, log) = (None, 0, None, log::child_config());
-        Self { number, restarts, slot, location, method, protocol, attempts, bounds, lease, log }
+        let LabelSetup { method, protocol, max_attempts, bounds, lease_timeout } = label_setup;
+        let (number, restarts, pool, log) = (None, 0, None, log::child_config());
+        Self { number, restarts, pool, location, method, protocol, max_attempts, bounds, lease_timeout, log }
     }
 
     /// Hash of everything but number and log. A running labeller with another hash must be replaced.

@@ -80,7 +80,7 @@ impl LabelArgs {
                 Location::Server(url) => url.as_str().into(),
             };
             let protocol = label_setup.protocol.clone();
-            let slots = LabelPool {
+            let pool = LabelPool {
                 number: self.concurrency,
                 location,
                 label_setup,
@@ -88,7 +88,7 @@ impl LabelArgs {
                 until_empty: self.until_empty,
                 grace_period: self.grace_period.get(),
             };
-            let ended = label_pool::run(&opened, slots, &stop).await?;
+            let ended = label_pool::run(&opened, pool, &stop).await?;
             let is_in_force = opened.is_in_force(protocol.hash).await?;
             opened.close().await;
             if ended == ExitStatus::Interrupted || is_in_force {

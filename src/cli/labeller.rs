@@ -25,8 +25,8 @@ impl LabellerArgs {
         launcher::set_process_name(c"calmwalk").map_err(CommandError::failed)?;
         let setup: LabellerConfig = process_config::from_stdin()?;
         log::init(setup.log.clone(), "labeller", setup.number)?;
-        match &setup.slot {
-            Some(slot) => launcher::end_with_parent(slot.parent).map_err(CommandError::failed)?,
+        match &setup.pool {
+            Some(pool) => launcher::end_with_parent(pool.parent).map_err(CommandError::failed)?,
             None => launcher::start_own_session().map_err(CommandError::failed)?,
         }
         let method = setup.method.load(&setup.protocol)?;
@@ -49,26 +49,26 @@ async fn label(setup: LabellerConfig, method: Method, closing: &Shutdown) -> Res
     let (pid, now) = (std::process::id(), unix_milliseconds());
     let record = ProcessRecord::new(ProcessRecord::LABELLER, setup.number, pid, now);
     // Only labellers of `calmwalk run` are taken over by the next run.
-    let hash = setup.slot.is_none().then(|| setup.hash());
+    let hash = setup.pool.is_none().then(|| setup.hash());
     let record = ProcessRecord { setup: hash, restarts: setup.restarts, ..record };
-    let slot = setup.slot.as_ref();
+    let pool = setup.pool.as_ref();
     let settings = LabellerSettings {
         holder: record.id.clone(),
         protocol: setup.protocol,
-        attempts: setup.attempts,
+        attempts: setup.max_attempts,
         bounds: setup.bounds,
-        exit_policy: if slot.is_none_or(|slot| slot.until_empty) {
+        exit_policy: if pool.is_none_or(|pool| pool.until_empty) {
             ExitPolicy::UntilEmpty
         } else {
             ExitPolicy::UntilFinished
         },
         timing: Timing {
-            lease: setup.lease,
-            grace: slot.map(|slot| Duration::from_secs_f64(slot.grace_period)),
+            lease: setup.lease_timeout,
+            grace: pool.map(|pool| Duration::from_secs_f64(pool.grace_period)),
             ..Timing::default()
         },
     };
-    let reports = slot.is_some();
+    let reports = pool.is_some();
     let report = |line: &str| {
         if reports {
             print_stderr(line);

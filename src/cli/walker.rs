@@ -21,13 +21,14 @@ pub struct WalkerArgs {}
 impl WalkerArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let setup: WalkerConfig = process_config::from_stdin()?;
-        log::init(setup.log.clone(), "walker", Some(setup.door.walker()))?;
+        log::init(setup.log.clone(), "walker", Some(setup.connect_info.walker()))?;
         launcher::set_process_name(c"calmwalk").map_err(CommandError::failed)?;
         launcher::end_with_parent(setup.parent).map_err(CommandError::failed)?;
         let stopping = signals::stop_token()?;
         let threads = Threads::new(setup.threads).map_err(CommandError::failed)?;
         let context = WalkContext { model: setup.model.load()?, threads, settings: Arc::new(setup.settings) };
-        let mut transport = IpcWalker::connect(&setup.door, stopping).map_err(CommandError::failed)?;
+        let mut transport =
+            IpcWalker::connect(&setup.connect_info, stopping).map_err(CommandError::failed)?;
         let ended = walker::run(&context, &mut transport);
         match (ended, transport.failure()) {
             (_, Some(failure)) => Err(CommandError::failed(failure)),

@@ -183,7 +183,7 @@ async fn run_in(
     let line = server.handle();
     let limits = Limits {
         heartbeat_timeout: Duration::from_secs_f64(setup.heartbeat_timeout),
-        max_restarts: setup.restarts,
+        max_restarts: setup.max_restarts,
         ..Limits::default()
     };
     let walkers = Children::new(walkers, limits, launch(setup, threads, line.clone()));
@@ -208,7 +208,7 @@ fn launch(
         line.expect(number, incarnation);
         let setup = WalkerConfig {
             parent,
-            door: line.connect_info(number, incarnation),
+            connect_info: line.connect_info(number, incarnation),
             model: setup.model.clone(),
             threads,
             settings: setup.settings.clone(),

@@ -43,7 +43,7 @@ impl AgentService {
             settings: run.campaign.walk_settings(),
             message_bytes: run.campaign.largest_message(),
             heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
-            restarts: config.run.max_restarts,
+            max_restarts: config.run.max_restarts,
         };
         let bootstrap = AgentBootstrap { setup: process_config::to_bytes(&setup), files };
         let heartbeat_timeout = config.run.agent_heartbeat_timeout.get();

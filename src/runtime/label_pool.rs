@@ -50,7 +50,7 @@ pub async fn run(
     pool: LabelPool,
     stop: &CancellationToken,
 ) -> Result<ExitStatus, CommandError> {
-    let attempts = pool.label_setup.attempts;
+    let attempts = pool.label_setup.max_attempts;
     let mut manager = PoolManager {
         store,
         labellers: Labellers::new(children(pool), Default::default(), attempts),
@@ -93,12 +93,12 @@ fn children(pool: LabelPool) -> Children {
         ..Limits::default()
     };
     let LabelPool { number, location, label_setup, until_empty, grace_period, .. } = pool;
-    let slot =
+    let pool =
         PoolConfig { parent: std::process::id(), until_empty, grace_period: grace_period.as_secs_f64() };
     let setup = LabellerConfig::new(location, label_setup);
     Children::new(number, limits, move |_, incarnation| {
         let restarts = incarnation.saturating_sub(1);
-        let setup = LabellerConfig { restarts, slot: Some(slot.clone()), ..setup.clone() };
+        let setup = LabellerConfig { restarts, pool: Some(pool.clone()), ..setup.clone() };
         Launch::this_program(["labeller"], process_config::to_bytes(&setup))
     })
 }
@@ -166,7 +166,7 @@ struct LabelPoolDisplay {
 }
 
 impl LabelPoolDisplay {
-    fn child_line(&mut self, slot: u32, line: &str) {
+    fn child_line(&mut self, worker: u32, line: &str) {
         if line.starts_with("labelled ") {
             self.labels += 1;
             if self.bar.is_shown() {
@@ -174,7 +174,7 @@ impl LabelPoolDisplay {
             }
         }
         // The labeller has logged it already.
-        self.bar.suspend(|| print_stderr(format_args!("label worker {slot}: {line}")));
+        self.bar.suspend(|| print_stderr(format_args!("label worker {worker}: {line}")));
     }
 
     fn queue(&mut self, jobs: bool, led: bool) {

@@ -153,9 +153,9 @@ async fn make(
     missing: Vec<(usize, RecordedLabel<'_>)>,
 ) -> Result<Vec<Labelled>, CommandError> {
     let RunContext { campaign, store, stop, .. } = run;
-    let slots = campaign.config.label.concurrency.max(1).min(missing.len());
+    let workers = campaign.config.label.concurrency.max(1).min(missing.len());
     let next = Mutex::new(missing.into_iter());
-    let slot = async || {
+    let worker = async || {
         let method = campaign.method()?.load(&campaign.protocol)?;
         let mut made = Vec::new();
         loop {
@@ -167,7 +167,7 @@ async fn make(
         method.end();
         Ok::<_, CommandError>(made)
     };
-    let made = try_join_all((0..slots).map(|_| slot())).await?;
+    let made = try_join_all((0..workers).map(|_| worker())).await?;
     Ok(made.into_iter().flatten().collect())
 }
 

@@ -158,10 +158,10 @@ fn start_labellers(
     let RunContext { campaign, store, process, .. } = run;
     let label = &campaign.config.label;
     let mut labellers = JoinSet::new();
-    for slot in 0..label.concurrency {
+    for worker in 0..label.concurrency {
         let method = campaign.method()?.load(&campaign.protocol)?;
         let settings = LabellerSettings {
-            holder: format!("{}/{slot}", process.id),
+            holder: format!("{}/{worker}", process.id),
             protocol: campaign.protocol.clone(),
             attempts: label.max_attempts.get(),
             bounds: label.bounds(),

@@ -28,7 +28,7 @@ pub fn walker_launcher(
         line.expect(number, incarnation);
         let setup = WalkerConfig {
             parent,
-            door: line.connect_info(number, incarnation),
+            connect_info: line.connect_info(number, incarnation),
             model: model.clone(),
             threads,
             settings: settings.clone(),
@@ -49,13 +49,13 @@ pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labe
     let label_setup = LabelSetup {
         method: campaign.method()?,
         protocol: campaign.protocol.clone(),
-        attempts: label.max_attempts.get(),
+        max_attempts: label.max_attempts.get(),
         bounds: label.bounds(),
-        lease: label.lease_timeout.get(),
+        lease_timeout: label.lease_timeout.get(),
     };
     let setup = LabellerConfig::new(location, label_setup);
-    let (hash, slots) = (setup.hash(), label.concurrency as u32);
-    let mut labellers = Children::new(slots, limits, move |number, incarnation| {
+    let (hash, number) = (setup.hash(), label.concurrency as u32);
+    let mut labellers = Children::new(number, limits, move |number, incarnation| {
         let restarts = incarnation.saturating_sub(1);
         let setup = LabellerConfig { number: Some(number), restarts, ..setup.clone() };
         Launch::this_program(["labeller"], process_config::to_bytes(&setup)).for_own_session()
