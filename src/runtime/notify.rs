@@ -47,8 +47,8 @@ impl<'a> Notifier<'a> {
     ) -> Result<Option<Self>, StoreError> {
         let settings = &config.notify;
         let Some(command) = settings.command.clone() else { return Ok(None) };
-        let told = store.metadata(METADATA_KEY).await?;
-        let told = told.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
+        let sent = store.metadata(METADATA_KEY).await?;
+        let sent = sent.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
         let stall = settings.stall_timeout.get();
         Ok(Some(Self {
             store,
@@ -56,7 +56,7 @@ impl<'a> Notifier<'a> {
             command,
             limit: settings.time_limit.get(),
             interval: MAX_CHECK_INTERVAL.min(stall / 4).max(Duration::from_millis(100)),
-            tracker: NotificationTracker::new(settings.clone(), told),
+            tracker: NotificationTracker::new(settings.clone(), sent),
             forgetting: ForgettingRule::new(&config.calm),
             commands: JoinSet::new(),
         }))
@@ -87,8 +87,8 @@ impl<'a> Notifier<'a> {
             return Ok(());
         }
         // Store this first, so that no event is reported twice.
-        let told = serde_json::to_string(self.tracker.sent()).map_err(CommandError::failed)?;
-        self.store.set_metadata(METADATA_KEY, &told).await?;
+        let sent = serde_json::to_string(self.tracker.sent()).map_err(CommandError::failed)?;
+        self.store.set_metadata(METADATA_KEY, &sent).await?;
         let snapshot = Snapshot::read(self.store).await?;
         let state = snapshot.to_json().map_err(CommandError::failed)?;
         due.into_iter().for_each(|due| self.notify(due, &state));

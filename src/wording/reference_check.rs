@@ -116,10 +116,10 @@ pub mod tests {
     #[test]
     fn the_summary_has_the_largest_differences() {
         let mut check = example();
-        let told = summary(&check);
+        let text = summary(&check);
         let expected = "failed, 3 structures; largest differences: energy 0.0040 eV/atom, force 0.2000 eV/Å, stress 0.0040 eV/Å³; \
                         1 without label; energies of 1 not judged: too few structures with these elements";
-        assert_eq!(told, expected);
+        assert_eq!(text, expected);
         check.state = CheckState::Accepted;
         assert!(summary(&check).starts_with("accepted, 3 structures; "));
     }

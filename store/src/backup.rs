@@ -18,16 +18,16 @@ use crate::tables::processes::LEASED;
 
 impl Store {
     /// Copies a snapshot of the campaign into a new directory `target`, which appears once it is complete and on
-    /// disk. The copy has no processes; its leased jobs return to the queue. `tell` receives progress and total, in
+    /// disk. The copy has no processes; its leased jobs return to the queue. `on_progress` receives progress and total, in
     /// bytes or rows.
     ///
     /// # Errors
     /// [`crate::StoreError::BackupExists`] if anything exists at `target`.
-    pub async fn backup(&self, target: &Path, now: i64, tell: impl FnMut(u64, u64)) -> Result<()> {
+    pub async fn backup(&self, target: &Path, now: i64, on_progress: impl FnMut(u64, u64)) -> Result<()> {
         let unfinished = StagedDirectory::beside(target)?;
         match &self.database {
-            Database::Sqlite(file) => file.copy_into(unfinished.path(), tell).await?,
-            Database::Postgres(server) => from_postgres::copy(server, unfinished.path(), tell).await?,
+            Database::Sqlite(file) => file.copy_into(unfinished.path(), on_progress).await?,
+            Database::Postgres(server) => from_postgres::copy(server, unfinished.path(), on_progress).await?,
         }
         let copy = DatabaseFile::open(unfinished.path()).await?;
         let store = Self { database: Database::Sqlite(copy.clone()) };

@@ -124,7 +124,7 @@ impl Agent {
                 },
                 Some(exchanged) = state.in_flight.next() => state.exchanged(exchanged)?,
                 joined = answer_to(&mut state.joining) => state.has_joined(joined?),
-                (told, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(told, took)? { watch(OrchestratorEvent::Stop) },
+                (reply, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(reply, took)? { watch(OrchestratorEvent::Stop) },
                 _ = ticks.tick() => state.poll(self.orchestrator_timeout)?.into_iter().for_each(&mut watch),
                 () = &mut stop => {}
                 // The orchestrator no longer knew of this agent, or it would have waited.
@@ -196,18 +196,18 @@ impl ExchangeState {
     fn start(&mut self, slots: Vec<Slot>) {
         self.mark_heard();
         self.metrics().joins += 1;
-        for (slot, told) in self.pool.start(slots) {
-            self.exchange(slot, told);
+        for (slot, report) in self.pool.start(slots) {
+            self.exchange(slot, report);
         }
     }
 
     /// Starts to deliver the result of a slot's assignment and to ask for the next one.
-    fn exchange(&mut self, mut slot: Slot, told: SlotReport) {
-        self.delivering += usize::from(!matches!(told, SlotReport::Empty));
+    fn exchange(&mut self, mut slot: Slot, report: SlotReport) {
+        self.delivering += usize::from(!matches!(report, SlotReport::Empty));
         let joined = Arc::clone(&self.joined);
         self.in_flight.push(Box::pin(async move {
-            let result = slot.exchange(&joined, &told).await;
-            (slot, told, result)
+            let result = slot.exchange(&joined, &report).await;
+            (slot, report, result)
         }));
     }
 
@@ -226,8 +226,8 @@ impl ExchangeState {
             }
             Incoming::Lost { walker, crashed } => self.pool.walker_lost(walker, crashed),
         };
-        if let Some((slot, told)) = next {
-            self.exchange(slot, told);
+        if let Some((slot, report)) = next {
+            self.exchange(slot, report);
         }
         self.update_metrics();
     }
@@ -243,11 +243,11 @@ impl ExchangeState {
         self.delivering + self.pool.unsent()
     }
 
-    fn exchanged(&mut self, (slot, told, result): ExchangeResult) -> Result<(), LinkError> {
+    fn exchanged(&mut self, (slot, report, result): ExchangeResult) -> Result<(), LinkError> {
         self.mark_heard();
-        self.delivering -= usize::from(!matches!(told, SlotReport::Empty));
+        self.delivering -= usize::from(!matches!(report, SlotReport::Empty));
         if result.is_ok() {
-            self.metrics().delivered(&told);
+            self.metrics().delivered(&report);
         }
         match result {
             Ok(Some(work)) => {
@@ -256,7 +256,7 @@ impl ExchangeState {
             }
             Ok(None) => self.pool.slot_closed(),
             Err(LinkError::RejoinRequired(_)) => {
-                self.pool.keep_unsent(told);
+                self.pool.keep_unsent(report);
                 self.rejoin();
             }
             Err(parted) => return Err(parted),
@@ -317,10 +317,10 @@ impl ExchangeState {
 
     fn handle_stop_reply(
         &mut self,
-        told: Result<Option<bool>, LinkError>,
+        reply: Result<Option<bool>, LinkError>,
         took: Duration,
     ) -> Result<bool, LinkError> {
-        match told {
+        match reply {
             Ok(None) => return Ok(false),
             Err(LinkError::RejoinRequired(_)) => self.rejoin(),
             Err(parted) => return Err(parted),
@@ -328,7 +328,7 @@ impl ExchangeState {
         }
         self.mark_heard();
         self.metrics().round_trip = Some(took);
-        Ok(matches!(told, Ok(Some(true))))
+        Ok(matches!(reply, Ok(Some(true))))
     }
 
     /// Sends the progress of a walk, once a second.
@@ -347,8 +347,8 @@ impl ExchangeState {
     /// their assignments as not started, and they start again.
     async fn flush(&mut self) {
         while self.delivering > 0 {
-            let Some((_, told, _)) = self.in_flight.next().await else { return };
-            self.delivering -= usize::from(!matches!(told, SlotReport::Empty));
+            let Some((_, report, _)) = self.in_flight.next().await else { return };
+            self.delivering -= usize::from(!matches!(report, SlotReport::Empty));
         }
     }
 }

@@ -10,7 +10,7 @@ use crate::{CalculationResults, Exit, Failure, FailureClass};
 pub(crate) fn failure_without_result(exit: Exit, directory: &Path, logs: &[&str]) -> Failure {
     let ends =
         logs.iter().filter_map(|log| Some(format!("{log} ends with: {}", tail(&directory.join(log))?)));
-    let told = ends.collect::<Vec<_>>().join("; ");
+    let messages = ends.collect::<Vec<_>>().join("; ");
     let Failure { class, message } = exit.failure();
     let (class, message) = match exit {
         // If we did not send the signal, the kernel did; shells and launchers return 128 + 9.
@@ -18,11 +18,11 @@ pub(crate) fn failure_without_result(exit: Exit, directory: &Path, logs: &[&str]
             FailureClass::OutOfMemory,
             "killed, probably by the kernel because memory was exhausted".to_owned(),
         ),
-        Exit::Code(_) | Exit::Signal(_) if mentions_memory(&told) => (FailureClass::OutOfMemory, message),
+        Exit::Code(_) | Exit::Signal(_) if mentions_memory(&messages) => (FailureClass::OutOfMemory, message),
         Exit::Code(0) => (class, format!("{message}, but left no complete result")),
         _ => (class, message),
     };
-    class.with_message(if told.is_empty() { message } else { format!("{message}; {told}") })
+    class.with_message(if messages.is_empty() { message } else { format!("{message}; {messages}") })
 }
 
 fn mentions_memory(log: &str) -> bool {

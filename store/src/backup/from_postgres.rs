@@ -92,7 +92,7 @@ const OPERATIONS: CopiedTable = table!("operation" { number: I, time: I, kind: T
 pub(super) async fn copy(
     server: &PostgresServer,
     directory: &Path,
-    mut tell: impl FnMut(u64, u64),
+    mut on_progress: impl FnMut(u64, u64),
 ) -> Result<()> {
     let mut from = Transaction::Postgres(server.begin_read().await?, server.clock);
     // Their checksums are marked as unknown.
@@ -107,7 +107,7 @@ pub(super) async fn copy(
         for table in tables() {
             copy_table(&mut from, into, table, |rows| {
                 copied += rows;
-                tell(copied, all);
+                on_progress(copied, all);
             })
             .await?;
         }
@@ -136,7 +136,7 @@ async fn copy_table(
     from: &mut Transaction,
     into: &Database,
     table: &CopiedTable,
-    mut told: impl FnMut(u64),
+    mut on_rows: impl FnMut(u64),
 ) -> Result<()> {
     let name = table.name;
     if !exists(from, table).await? {
@@ -151,7 +151,7 @@ async fn copy_table(
             let (rows, end) = (page.len(), page.len() < table.page);
             let page = page.iter().map(|row| values(row, table)).collect::<Result<_>>()?;
             execute_rows(&mut transaction, table.insert, table.columns, page).await?;
-            told(rows as u64);
+            on_rows(rows as u64);
             if end {
                 return transaction.commit().await;
             }

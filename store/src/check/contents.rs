@@ -99,7 +99,7 @@ fn fault<C: Content>(row: &SqlRow, (table, columns): Checked) -> Option<String> 
 /// Checks rows and collects findings.
 pub(super) struct Contents<'a> {
     transaction: &'a mut Transaction,
-    tell: &'a mut dyn FnMut(u64, u64),
+    on_progress: &'a mut dyn FnMut(u64, u64),
     read: u64,
     all: u64,
     findings: Vec<Finding>,
@@ -108,10 +108,10 @@ pub(super) struct Contents<'a> {
 impl<'a> Contents<'a> {
     pub async fn check(
         transaction: &'a mut Transaction,
-        tell: &'a mut dyn FnMut(u64, u64),
+        on_progress: &'a mut dyn FnMut(u64, u64),
     ) -> Result<Vec<Finding>> {
         let all = query(ROWS).fetch_one(&mut *transaction).await?;
-        let mut contents = Self { transaction, tell, read: 0, all, findings: Vec::new() };
+        let mut contents = Self { transaction, on_progress, read: 0, all, findings: Vec::new() };
         contents.table::<StructureContent>((&STRUCTURE, &[]), STRUCTURES).await?;
         contents.table::<CandidateContent>((&CANDIDATE, &LONG_COLUMNS), CANDIDATES).await?;
         contents.table::<LabelContent>((&LABEL, &[]), LABELS).await?;
@@ -155,7 +155,7 @@ impl<'a> Contents<'a> {
 
     fn have_read(&mut self, rows: u64) {
         self.read += rows;
-        (self.tell)(self.read, self.all);
+        (self.on_progress)(self.read, self.all);
     }
 
     fn found(&mut self, faults: Vec<String>) {

@@ -19,13 +19,13 @@ pub use self::finding::Finding;
 const RESTORE: &str = "the file is damaged; restore the campaign from a backup";
 
 impl Store {
-    /// Checks everything. `tell` receives the number of rows read and the total. This crate treats components of
+    /// Checks everything. `on_progress` receives the number of rows read and the total. This crate treats components of
     /// the mixture as bytes: check those of [`Store::load_components`] with the crate that decodes them.
-    pub async fn check(&self, mut tell: impl FnMut(u64, u64)) -> Result<Vec<Finding>> {
+    pub async fn check(&self, mut on_progress: impl FnMut(u64, u64)) -> Result<Vec<Finding>> {
         let mut transaction = self.database.begin_read().await?;
         let mut findings = Vec::new();
         own_check(&mut transaction, &mut findings).await?;
-        match ours(&mut transaction, &mut findings, &mut tell).await {
+        match ours(&mut transaction, &mut findings, &mut on_progress).await {
             // An error of the database itself: it is reported already, or here.
             Err(StoreError::Damaged { what, reason }) => {
                 findings.push(Finding { what: format!("{what} cannot be read ({reason})"), then: RESTORE });
@@ -47,7 +47,7 @@ impl Store {
 async fn ours(
     transaction: &mut Transaction,
     findings: &mut Vec<Finding>,
-    tell: &mut dyn FnMut(u64, u64),
+    on_progress: &mut dyn FnMut(u64, u64),
 ) -> Result<()> {
     for rule in rules::all_rules() {
         findings.extend(rule.find(transaction).await?);
@@ -57,7 +57,7 @@ async fn ours(
     findings.extend(rules::job_counts(transaction).await?);
     findings.extend(rules::leases(transaction).await?);
     findings.extend(rules::sums(transaction).await?);
-    findings.extend(Contents::check(transaction, tell).await?);
+    findings.extend(Contents::check(transaction, on_progress).await?);
     Ok(())
 }
 

@@ -61,8 +61,8 @@ impl Leadership {
         let query = sqlx::query_scalar(sql).bind(format!("process {pid} ({who}) on {}", this_host()));
         let query = query.bind(process_start_time(pid).unwrap_or_default());
         let generation = query.fetch_one(&mut connection).await?;
-        let (tell, successor) = watch::channel(None);
-        let holder = hold(connection, options, url.schema.clone(), generation, tell);
+        let (announce, successor) = watch::channel(None);
+        let holder = hold(connection, options, url.schema.clone(), generation, announce);
         Ok(Self { generation, location: url.to_string(), successor, holder_task: tokio::spawn(holder) })
     }
 
@@ -94,7 +94,7 @@ async fn hold(
     options: PgConnectOptions,
     schema: String,
     generation: i64,
-    tell: watch::Sender<Option<String>>,
+    announce: watch::Sender<Option<String>>,
 ) {
     loop {
         while matches!(timeout(ANSWER_TIMEOUT, connection.ping()).await, Ok(Ok(()))) {
@@ -105,7 +105,7 @@ async fn hold(
                 Ok(Ok(Reacquired::Held(connection))) => break connection,
                 Ok(Ok(Reacquired::Lost(holder))) => {
                     // The receiver may be gone.
-                    let _ = tell.send(Some(holder));
+                    let _ = announce.send(Some(holder));
                     return;
                 }
                 // Not yet: the server cannot be reached, or has not noticed that the old connection broke.

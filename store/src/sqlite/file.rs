@@ -58,9 +58,9 @@ impl DatabaseFile {
         if busy { Err(StoreError::Busy) } else { Ok(()) }
     }
 
-    /// Copies a snapshot of the database into another directory, which has none. `tell` receives the approximate
+    /// Copies a snapshot of the database into another directory, which has none. `on_progress` receives the approximate
     /// number of bytes written, and the total. Does not sync the copy to disk.
-    pub async fn copy_into(&self, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
+    pub async fn copy_into(&self, directory: &Path, mut on_progress: impl FnMut(u64, u64)) -> Result<()> {
         let (unfinished, path) = (directory.join(UNFINISHED), directory.join(DATABASE));
         let failed = |source| StoreError::File { path: path.clone(), source };
         let all = self.size()?;
@@ -71,7 +71,7 @@ impl DatabaseFile {
             tokio::select! {
                 copied = &mut copying => break copied.map(drop)?,
                 () = tokio::time::sleep(COPY_PROGRESS_INTERVAL) => {
-                    tell(fs::metadata(&unfinished).map_or(0, |file| file.len()).min(all), all);
+                    on_progress(fs::metadata(&unfinished).map_or(0, |file| file.len()).min(all), all);
                 }
             }
         }

@@ -89,9 +89,9 @@ impl AgentMetrics {
     }
 
     /// Counts what the orchestrator has accepted.
-    pub(super) fn delivered(&mut self, told: &SlotReport) {
+    pub(super) fn delivered(&mut self, report: &SlotReport) {
         let counts = &mut self.assignments;
-        let count = match told {
+        let count = match report {
             SlotReport::Empty => return,
             SlotReport::Lost { .. } => &mut counts.lost,
             SlotReport::Report(report) => match report.outcome {
@@ -176,14 +176,14 @@ mod tests {
             })
         };
         let ended = || report(Outcome::Ended(WalkEnd::Steps));
-        for told in [
+        for sent in [
             SlotReport::Empty,
             report(Outcome::StepsDone),
             ended(),
             ended(),
             SlotReport::Lost { crashed: true },
         ] {
-            metrics.delivered(&told);
+            metrics.delivered(&sent);
         }
         let expected = AssignmentCounts { steps_done: 1, ended: 2, lost: 1, ..AssignmentCounts::default() };
         assert_eq!(metrics.assignments, expected);

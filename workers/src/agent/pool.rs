@@ -83,8 +83,8 @@ impl<S> AssignmentPool<S> {
     }
 
     /// Keeps a report that could not be delivered.
-    pub(super) fn keep_unsent(&mut self, told: SlotReport) {
-        if let SlotReport::Report(report) = told {
+    pub(super) fn keep_unsent(&mut self, report: SlotReport) {
+        if let SlotReport::Report(report) = report {
             self.unsent.push_back(report);
         }
     }

@@ -19,7 +19,7 @@ pub enum ExitPolicy {
 ///
 /// It needs no orchestrator: while none is alive, it continues as `settings.exit_policy` says. An orchestrator that
 /// starts later adopts labellers of earlier runs. The labeller also exits after the current label if another
-/// labeller with the same number has replaced it. `tell` receives a line for each job.
+/// labeller with the same number has replaced it. `on_line` receives a line for each job.
 ///
 /// # Errors
 /// Errors of the database, also if it was deleted or replaced. Releases leases and records the error if that is
@@ -31,14 +31,14 @@ pub async fn serve(
     process: ProcessRecord,
     shutdown: &Shutdown,
     now: impl Fn() -> i64,
-    tell: impl Fn(&str),
+    on_line: impl Fn(&str),
 ) -> Result<(), StoreError> {
     let (interval, exit_policy) = (settings.timing.heartbeat_interval, settings.exit_policy);
     // A lease whose holder has no record would be released.
     retry_until_written(&shutdown.stop, || store.upsert_process(&process)).await?;
     let holder = settings.holder.clone();
     let ended = tokio::select! {
-        ended = run(store.clone(), method, settings, shutdown, &now, tell) => ended,
+        ended = run(store.clone(), method, settings, shutdown, &now, on_line) => ended,
         error = run_heartbeat(&store, process.clone(), exit_policy, shutdown, interval, &now) => Err(error),
     };
     match ended {

@@ -136,7 +136,7 @@ enum QueuePoll {
 /// How long a labeller that is asked to stop waits for a calculation that can continue without it.
 const DETACH_DELAY: Duration = Duration::from_secs(5);
 
-/// Labels until there is no more work. `now` returns ms since 1970; `tell` receives a line for each job.
+/// Labels until there is no more work. `now` returns ms since 1970; `on_line` receives a line for each job.
 ///
 /// A busy database or a full disk does not end the labeller: it polls the queue again later, and retries the
 /// delivery of a label, for up to a minute after `shutdown` was requested.
@@ -149,9 +149,9 @@ pub async fn run(
     settings: LabellerSettings,
     shutdown: &Shutdown,
     now: impl Fn() -> i64,
-    tell: impl Fn(&str),
+    on_line: impl Fn(&str),
 ) -> Result<(), StoreError> {
-    let done = label_jobs(&store, &method, &settings, shutdown, now, tell).await;
+    let done = label_jobs(&store, &method, &settings, shutdown, now, on_line).await;
     method.end();
     done
 }
@@ -162,11 +162,11 @@ async fn label_jobs(
     settings: &LabellerSettings,
     shutdown: &Shutdown,
     now: impl Fn() -> i64,
-    tell: impl Fn(&str),
+    on_line: impl Fn(&str),
 ) -> Result<(), StoreError> {
     let announce = |line: &str| {
         info!("{line}");
-        tell(line);
+        on_line(line);
     };
     let (mut idle, mut offsets) = (Duration::ZERO, Offsets::default());
     let stop = &shutdown.stop;
@@ -242,7 +242,7 @@ async fn label_jobs(
                 );
             }
         }
-        tell(&line);
+        on_line(&line);
         if let Some(ended) = ended {
             method.archive(store, &lease, stop, ended, validated.is_err()).await?;
         }
