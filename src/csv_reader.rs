@@ -50,7 +50,7 @@ enum Fault {
 
 impl CsvError {
     /// Wrong input, which names the file.
-    pub fn of(self, path: &Path) -> CommandError {
+    pub fn in_file(self, path: &Path) -> CommandError {
         let place = self.line.map_or(String::new(), |line| format!(":{line}"));
         CommandError::Input(format!("{}{place}: {}", path.display(), self.fault))
     }
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn what_is_wrong_is_named() {
-        let of = |error: CsvError| error.of(Path::new("t.csv")).to_string();
+        let of = |error: CsvError| error.in_file(Path::new("t.csv")).to_string();
         for (text, reason) in [
             ("", "t.csv: no rows"),
             ("\n \n", "t.csv: no rows"),

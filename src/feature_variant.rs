@@ -58,7 +58,7 @@ impl FeatureModel {
         model: GraceModel,
         variant: Option<FeatureVariant>,
     ) -> Result<Self, CommandError> {
-        Self::of(model, variant).ok_or_else(|| {
+        Self::from_model(model, variant).ok_or_else(|| {
             CommandError::Input(format!(
                 "{}: the model has no projection of its features (uq_rp_matrix): give its artifact with --artifact, or build one \
                  with calmwalk calm build",
@@ -67,7 +67,7 @@ impl FeatureModel {
         })
     }
 
-    fn of(model: GraceModel, variant: Option<FeatureVariant>) -> Option<Self> {
+    fn from_model(model: GraceModel, variant: Option<FeatureVariant>) -> Option<Self> {
         let form = match variant {
             Some(FeatureVariant::Normalised) => FeatureForm::Normalised,
             Some(FeatureVariant::Linear) => FeatureForm::Linear,

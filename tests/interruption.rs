@@ -143,7 +143,7 @@ fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
         let directory = tempfile::tempdir().unwrap();
         small.write(directory.path());
         let mut running = start(directory.path(), &[]);
-        wait_until("structures are found", || Counters::of(".", directory.path()).sent > 0);
+        wait_until("structures are found", || Counters::read(".", directory.path()).sent > 0);
         // The campaign must not end before the signal.
         let held = pause_walkers(directory.path(), 2);
         signal(running.0.id(), name);

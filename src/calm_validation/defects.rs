@@ -83,7 +83,8 @@ fn tasks(settings: &ValidationSettings, distance: impl Fn(Species) -> f64) -> Ve
     let of = |species: &Species| {
         let (species, prototype) = (*species, species.ground_state().prototype);
         let d = distance(species);
-        let facets = Facet::of(prototype).iter().map(move |facet| (DefectKind::Surface, Some(*facet)));
+        let facets =
+            Facet::for_prototype(prototype).iter().map(move |facet| (DefectKind::Surface, Some(*facet)));
         let has_boundary = matches!(prototype, Prototype::Fcc | Prototype::Bcc);
         let boundary = has_boundary.then_some((DefectKind::GrainBoundary, None));
         let all = [(DefectKind::Vacancy, None)].into_iter().chain(facets).chain(boundary);

@@ -80,12 +80,12 @@ impl StepTimes {
     pub fn total<'a>(&self, seeds: impl IntoIterator<Item = &'a SourcedStructure>) -> Option<WalkTime> {
         seeds
             .into_iter()
-            .map(|seed| self.of(seed))
+            .map(|seed| self.for_seed(seed))
             .try_fold(WalkTime::default(), |sum, of| Some(sum.plus(of?)))
     }
 
     /// The time of all walks from a seed structure. `None` if no step could be measured.
-    pub fn of(&self, seed: &SourcedStructure) -> Option<WalkTime> {
+    pub fn for_seed(&self, seed: &SourcedStructure) -> Option<WalkTime> {
         let class = class(seed);
         let (_, rate) = self.classes.iter().min_by_key(|(measured, _)| measured.abs_diff(class))?;
         let time = |[biased, unbiased]: [f64; 2]| work(seed) * (biased * rate[0] + unbiased * rate[1]);

@@ -88,7 +88,7 @@ impl<'a> SeedTable<'a> {
 
     /// The time of the walks from a seed structure. `None` if no step could be measured.
     pub fn walk_time(&self, seed: &SourcedStructure) -> Option<WalkTime> {
-        self.times.of(seed)
+        self.times.for_seed(seed)
     }
 
     /// The time of all walks. `None` if no step could be measured.
@@ -143,7 +143,7 @@ impl<'a> SeedTable<'a> {
                 decimals(found.gamma_max, 2),
                 found.atoms_above.to_string(),
                 found.needed_atoms.to_string(),
-                self.times.of(found.seed).map_or("–".to_owned(), |time| wall_time(time.biased)),
+                self.times.for_seed(found.seed).map_or("–".to_owned(), |time| wall_time(time.biased)),
                 words(&found.remark),
             ]);
         }
@@ -197,7 +197,7 @@ fn skipped_row(SkippedStructure { seed, source, reason }: &SkippedStructure) -> 
 fn row(found: &SeedTriage<'_>, times: &StepTimes) -> Vec<String> {
     let structure = &found.seed.seed.structure;
     let closest = found.pairs.first();
-    let time = times.of(found.seed);
+    let time = times.for_seed(found.seed);
     let hours = |seconds: Option<f64>| number(seconds.map(|seconds| seconds / SECONDS_PER_HOUR));
     let distances =
         found.pairs.iter().map(|pair| format!("{} {:.4} {:.4}", pair.pair, pair.distance, pair.limit));

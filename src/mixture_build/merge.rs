@@ -134,7 +134,7 @@ fn complete(
     begun: impl Iterator<Item = BuildPart>,
     done: impl Fn(BuildPart) -> bool,
 ) -> Result<Vec<BuildPart>, CommandError> {
-    let mut divisions: Vec<u64> = begun.map(BuildPart::of).collect();
+    let mut divisions: Vec<u64> = begun.map(BuildPart::total).collect();
     divisions.sort_unstable();
     divisions.dedup();
     if let Some(of) = divisions.iter().find(|of| BuildPart::all(**of).all(&done)) {

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub struct BuildPart {
     /// i, from 1.
     number: u64,
-    /// n
+    /// Number of parts.
     of: u64,
 }
 
@@ -36,8 +36,8 @@ impl BuildPart {
         (shards + self.of - self.number) / self.of
     }
 
-    /// n
-    pub fn of(self) -> u64 {
+    /// Number of parts.
+    pub fn total(self) -> u64 {
         self.of
     }
 

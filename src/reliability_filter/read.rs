@@ -34,15 +34,15 @@ pub fn read(
 ) -> Result<(Vec<GradedRow>, usize), CommandError> {
     let file = File::open(path)
         .map_err(|error| CommandError::Input(format!("{}: cannot be opened: {error}", path.display())))?;
-    let mut table = CsvReader::new(BufReader::new(file)).map_err(|error| error.of(path))?;
-    let place = |title| table.column(title).map(|place| (title, place)).map_err(|error| error.of(path));
+    let mut table = CsvReader::new(BufReader::new(file)).map_err(|error| error.in_file(path))?;
+    let place = |title| table.column(title).map(|place| (title, place)).map_err(|error| error.in_file(path));
     let titles = match columns.errors {
         ErrorColumns::Error(error) => vec![columns.grade, error],
         ErrorColumns::Values { predicted, actual, .. } => vec![columns.grade, predicted, actual],
     };
     let places = titles.into_iter().map(place).collect::<Result<Vec<_>, _>>()?;
     let (mut rows, mut left_out) = (Vec::new(), 0);
-    while let Some(row) = table.next().map_err(|error| error.of(path))? {
+    while let Some(row) = table.next().map_err(|error| error.in_file(path))? {
         let mut numbers = Vec::with_capacity(places.len());
         for (title, place) in &places {
             match number(&row, title, *place, path)? {

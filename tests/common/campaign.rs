@@ -110,7 +110,7 @@ pub struct Counters {
 
 impl Counters {
     /// Reads `status`. Zero before the campaign exists.
-    pub fn of(location: &str, directory: &Path) -> Self {
+    pub fn read(location: &str, directory: &Path) -> Self {
         let output = super::calmwalk(directory, ["status", location, "--json"]);
         let status = serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap_or_default();
         let count = |path| status.pointer(path).and_then(serde_json::Value::as_u64).unwrap_or(0);

@@ -21,10 +21,10 @@ struct Terminal {
 
 impl Terminal {
     fn open(place: &LabelCampaign, name: &str, size: (u32, u32), environment: &str) -> Self {
-        Self::of(place.path(), place.argument(), name, size, environment)
+        Self::watch(place.path(), place.argument(), name, size, environment)
     }
 
-    fn of(here: &Path, campaign: &str, name: &str, size: (u32, u32), environment: &str) -> Self {
+    fn watch(here: &Path, campaign: &str, name: &str, size: (u32, u32), environment: &str) -> Self {
         let terminal = Self { socket: format!("calmwalk-{}-{name}", std::process::id()) };
         let (width, height) = (size.0.to_string(), size.1.to_string());
         let program = env!("CARGO_BIN_EXE_calmwalk");
@@ -283,7 +283,7 @@ fn a_copy_is_watched_through_its_absence() {
     let place = waiting();
     let here = place.path();
     succeed(here, ["store", "backup", place.argument(), "copy"]);
-    let terminal = Terminal::of(here, "copy", "copy", (80, 24), "");
+    let terminal = Terminal::watch(here, "copy", "copy", (80, 24), "");
     terminal.wait_for("1 walks: 4");
     // `watch` continues while the campaign is temporarily missing.
     fs::rename(here.join("copy"), here.join("away")).unwrap();
@@ -296,7 +296,7 @@ fn a_copy_is_watched_through_its_absence() {
     terminal.is_given_back("code 0");
     // An error at startup is printed on the normal screen.
     fs::remove_dir_all(here.join("copy")).unwrap();
-    let terminal = Terminal::of(here, "copy", "nothing", (80, 24), "");
+    let terminal = Terminal::watch(here, "copy", "nothing", (80, 24), "");
     terminal.wait_for("calmwalk: ");
     terminal.is_given_back("code 2");
 }

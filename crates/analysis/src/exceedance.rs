@@ -24,18 +24,18 @@ impl Exceedance {
 
     /// Adds an item, `times` times.
     pub fn add(&mut self, error: f64, is_kept: bool, times: u32) {
-        self.add_place(self.place(error), is_kept, times);
+        self.add_to_bin(self.bin_index(error), is_kept, times);
     }
 
     /// The number of thresholds that this error exceeds.
-    pub fn place(&self, error: f64) -> usize {
+    pub fn bin_index(&self, error: f64) -> usize {
         self.thresholds.partition_point(|threshold| *threshold < error)
     }
 
-    /// As [`Self::add`], with the error's [`Self::place`].
-    pub fn add_place(&mut self, place: usize, is_kept: bool, times: u32) {
-        self.all[place] += u64::from(times);
-        self.kept[place] += u64::from(times) * u64::from(is_kept);
+    /// As [`Self::add`], with the error's [`Self::bin_index`].
+    pub fn add_to_bin(&mut self, bin: usize, is_kept: bool, times: u32) {
+        self.all[bin] += u64::from(times);
+        self.kept[bin] += u64::from(times) * u64::from(is_kept);
     }
 
     /// Share of all items that is kept; `None` without items.

@@ -37,15 +37,15 @@ impl RankedErrors {
     pub fn new(errors: &[f64], units: &[u32], scores: &[Vec<f64>]) -> Self {
         let is_complete = scores.iter().all(|scores| scores.len() == errors.len());
         assert!(errors.len() == units.len() && is_complete, "a unit and scores for each error");
-        let ascending = Order::of(errors).items;
+        let ascending = Order::from_values(errors).items;
         let permuted =
             |values: &[f64]| -> Vec<f64> { ascending.iter().map(|i| values[*i as usize]).collect() };
         let sorted = permuted(errors);
         Self {
-            errors: Order::of(&sorted),
+            errors: Order::from_values(&sorted),
             sorted,
             units: ascending.iter().map(|i| units[*i as usize]).collect(),
-            scores: scores.iter().map(|scores| Order::of(&permuted(scores))).collect(),
+            scores: scores.iter().map(|scores| Order::from_values(&permuted(scores))).collect(),
         }
     }
 
@@ -82,7 +82,7 @@ impl RankedErrors {
 }
 
 impl Order {
-    fn of(values: &[f64]) -> Self {
+    fn from_values(values: &[f64]) -> Self {
         let mut items: Vec<_> = (0..values.len() as u32).collect();
         items.sort_by(|i, j| values[*i as usize].total_cmp(&values[*j as usize]));
         let runs = items.chunk_by(|i, j| values[*i as usize] == values[*j as usize]);

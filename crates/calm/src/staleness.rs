@@ -60,7 +60,7 @@ mod tests {
 
     use super::*;
 
-    fn of(ages: &[u64]) -> Staleness {
+    fn from_ages(ages: &[u64]) -> Staleness {
         let mut staleness = Staleness::default();
         ages.iter().for_each(|age| staleness.add(*age));
         staleness
@@ -69,7 +69,7 @@ mod tests {
     #[test]
     fn small_ages_are_exact() {
         let ages: Vec<u64> = (0..100).map(|k| if k < 60 { 0 } else { k - 59 }).collect();
-        let staleness = of(&ages);
+        let staleness = from_ages(&ages);
         assert_eq!((staleness.decisions(), staleness.share_of_newest()), (100, 0.6));
         let quantiles = [0.5, 0.6, 0.61, 0.9, 1.0].map(|share| staleness.quantile(share));
         assert_eq!((quantiles, staleness.largest()), ([0, 0, 1, 30, 40], 40));
@@ -82,7 +82,7 @@ mod tests {
         fn quantiles_are_accurate_to_a_thirtieth(
             mut ages in prop::collection::vec(prop_oneof![0..200_u64, any::<u64>()], 1..200), share in 0.0..=1.0_f64,
         ) {
-            let staleness = of(&ages);
+            let staleness = from_ages(&ages);
             ages.sort_unstable();
             let rank = ((share * ages.len() as f64).ceil() as usize).max(1);
             let (exact, found) = (ages[rank - 1], staleness.quantile(share));

@@ -27,7 +27,7 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
     let mut figure = Figure::new("bond-scans", description, WIDTH, grid.total_height());
     legend_rows(&mut figure, &keys);
     for (k, scan) in scans.iter().enumerate() {
-        let place = grid.place(k);
+        let place = grid.panel_rectangle(k);
         let others: Vec<_> =
             validation.bond_scans.iter().filter(|other| is_other_crystal(scan, other)).collect();
         let above = Rectangle { height: ENERGIES, ..place };

@@ -26,7 +26,7 @@ pub fn draw(validation: &Validation, name: &'static str, kind: DefectKind) -> Re
     let mut figure = Figure::new(name, &description, WIDTH, grid.total_height());
     legend_rows(&mut figure, &keys);
     for (k, defects) in panels.iter().enumerate() {
-        draw_panel(&mut figure, kind, defects, grid.place(k), letter(k));
+        draw_panel(&mut figure, kind, defects, grid.panel_rectangle(k), letter(k));
     }
     Ok(FigureContent { figure, caption: caption(kind, &graded), numbers: numbers(validation, &all) })
 }
@@ -48,15 +48,17 @@ fn keys(kind: DefectKind, panels: &[&[&Defect]]) -> Vec<(LegendKey, String)> {
             names.push(defect.name);
         }
     }
-    let mut keys: Vec<_> =
-        names.iter().map(|name| (LegendKey::Line(strokes(place(name))[0]), (*name).to_owned())).collect();
+    let mut keys: Vec<_> = names
+        .iter()
+        .map(|name| (LegendKey::Line(strokes(colour_index(name))[0]), (*name).to_owned()))
+        .collect();
     keys.push((LegendKey::Line(Colour::INK.line(1.0)), "γ".into()));
     keys.push((LegendKey::Line(Colour::INK.dashed(1.0)), "γ_{nbr}".into()));
     keys
 }
 
-/// Place of a facet among the colours.
-fn place(name: &str) -> usize {
+/// Index of the colour of a facet.
+fn colour_index(name: &str) -> usize {
     ["(111)", "(100)", "(110)", "(0001)"].iter().position(|facet| *facet == name).unwrap_or(0)
 }
 
@@ -77,7 +79,7 @@ fn draw_panel(figure: &mut Figure, kind: DefectKind, defects: &[&Defect], place:
         panel.line([[low, *crystal], [high, *crystal]], Colour::GREY.line(0.5));
     }
     for defect in defects {
-        let k = if kind == DefectKind::Surface { self::place(defect.name) } else { 0 };
+        let k = if kind == DefectKind::Surface { colour_index(defect.name) } else { 0 };
         let [solid, dashed] = strokes(k);
         let points =
             |of: fn(&Shell) -> f64| defect.shells.iter().map(move |shell| [shell.distance, of(shell)]);

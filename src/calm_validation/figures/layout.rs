@@ -34,7 +34,7 @@ impl PanelGrid {
     }
 
     /// The area of panel `k`.
-    pub fn place(&self, k: usize) -> Rectangle {
+    pub fn panel_rectangle(&self, k: usize) -> Rectangle {
         let columns = self.columns() as f64;
         let width = (WIDTH / columns - LEFT - RIGHT).min(WIDEST);
         let margin = 0.5 * (WIDTH - columns * (LEFT + width + RIGHT));

@@ -47,7 +47,7 @@ fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &PanelGrid, fir
     let share = format!("{b} in {a}–{b} (%)");
     let [gamma, average] = [curve(|of| of.scores[0]), curve(|of| of.averages[0])];
     let values = gamma.iter().chain(&average).map(|[_, y]| *y);
-    let mut panel = Panel::new(grid.place(first), shares(&share), axis("mean γ", values));
+    let mut panel = Panel::new(grid.panel_rectangle(first), shares(&share), axis("mean γ", values));
     panel.line([[0.0, 1.0], [100.0, 1.0]], Colour::GREY.dashed(0.7));
     panel.line(average, Colour::VERMILLION.dashed(1.2));
     panel.line(gamma.clone(), line(0));
@@ -56,7 +56,7 @@ fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &PanelGrid, fir
     panel.draw(figure);
 
     let y = Axis::new("atoms above 1 (%)", AxisScale::Linear, 0.0, 103.0);
-    let mut panel = Panel::new(grid.place(first + 1), shares(&share), y);
+    let mut panel = Panel::new(grid.panel_rectangle(first + 1), shares(&share), y);
     panel.line(curve(|of| 100.0 * of.averages_above_1), Colour::VERMILLION.dashed(1.2));
     let above = curve(|of| 100.0 * of.above_1);
     panel.line(above.clone(), line(0));
@@ -72,7 +72,8 @@ fn draw_solution(figure: &mut Figure, solution: &Solution, grid: &PanelGrid, fir
     let [of_a, of_b] = [groups(a), groups(b)];
     let values = of_a.iter().chain(&of_b).map(|[_, y]| *y);
     let y = axis("mean γ", values);
-    let mut panel = Panel::new(grid.place(first + 2), shares(&format!("{b} in the first shell (%)")), y);
+    let mut panel =
+        Panel::new(grid.panel_rectangle(first + 2), shares(&format!("{b} in the first shell (%)")), y);
     panel.line([[0.0, 1.0], [100.0, 1.0]], Colour::GREY.dashed(0.7));
     for (points, marker, colour) in [(of_a, Marker::Disc, Colour::BLUE), (of_b, Marker::Square, Colour::INK)]
     {

@@ -127,7 +127,7 @@ impl LabelledErrors {
         let atoms = graded.species.len();
         let is_complete = graded.scores.iter().all(|scores| scores.len() == atoms);
         assert!(graded.scores.len() == self.columns.len() && is_complete, "a score of each atom and column");
-        let structure = SampledStructure::of(graded);
+        let structure = SampledStructure::from_labelled(graded);
         let SampledStructure { energy, forces, stress, .. } = &structure;
         if energy.number + forces.number + stress.number == 0.0 {
             return;
@@ -164,7 +164,7 @@ impl LabelledErrors {
 }
 
 impl SampledStructure {
-    fn of(graded: &LabelledStructure) -> Self {
+    fn from_labelled(graded: &LabelledStructure) -> Self {
         let mut found = Self::default();
         let (predicted, labels) = (graded.predicted, graded.labels);
         if let (Some(model), Some(label)) = (predicted.energy, labels.energy) {

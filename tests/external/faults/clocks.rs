@@ -46,13 +46,13 @@ fn jumping(small: &Small, disturb: impl Fn(&Path, u64)) -> tempfile::TempDir {
     let mut command = through(&clock.starter(), here);
     let said = here.join("said");
     let mut run = started(command.args(["run", "campaign.toml", "--directory", "."]), &said);
-    wait_until("the campaign advances", || Counters::of(".", here).labels > 0);
-    let mut before = Counters::of(".", here);
+    wait_until("the campaign advances", || Counters::read(".", here).labels > 0);
+    let mut before = Counters::read(".", here);
     for jump in 0.. {
         clock.set(["+1h", "-1h", "+0", "-1h", "+1h"][jump as usize % 5]);
         disturb(here, jump);
         sleep(Duration::from_millis(200 + random(jump) % 1000));
-        let after = Counters::of(".", here);
+        let after = Counters::read(".", here);
         assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
         before = after;
         if let Some(ended) = run.0.try_wait().unwrap() {

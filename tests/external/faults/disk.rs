@@ -74,14 +74,14 @@ impl Drop for Disk {
 fn a_full_disk_ends_a_run_and_loses_nothing() {
     let disk = Disk::new(256);
     small().write(&disk.at);
-    let mut before = Counters::of(".", &disk.at);
+    let mut before = Counters::read(".", &disk.at);
     for full in 0..2 {
         let mut run = disk.run();
-        wait_until("the campaign advances", || Counters::of(".", &disk.at).sent > before.sent);
+        wait_until("the campaign advances", || Counters::read(".", &disk.at).sent > before.sent);
         std::thread::sleep(Duration::from_millis(random(full) % 200));
         // The campaign must not end before the disk is full.
         let held = pause_walkers(&disk.at, 2);
-        before = Counters::of(".", &disk.at);
+        before = Counters::read(".", &disk.at);
         disk.fill();
         resume_processes(&held);
         assert_eq!(run.0.wait().unwrap().code(), Some(1));
@@ -94,7 +94,7 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
         let said = disk.said();
         assert!(said.contains("the disk is full"), "{said}");
         disk.make_space();
-        let after = Counters::of(".", &disk.at);
+        let after = Counters::read(".", &disk.at);
         assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
     }
     assert_eq!(disk.run().0.wait().unwrap().code(), Some(0), "{}", disk.said());
@@ -120,7 +120,7 @@ fn shared_memory_that_others_fill_does_no_harm() {
     let starter = ["nsenter".into(), format!("--mount={namespace}"), format!("--wd={}", here.display())];
     let said = here.join("said");
     let mut run = started(through(&starter, here).args(RUN), &said);
-    wait_until("walkers are running", || Counters::of(".", here).sent > 0);
+    wait_until("walkers are running", || Counters::read(".", here).sent > 0);
     let held = pause_walkers(here, 2);
     must(&format!("{inside} sh -c '! dd if=/dev/zero of=/dev/shm/filler bs=64k'"));
     // Walkers started from now on find it full.

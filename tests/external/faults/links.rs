@@ -66,7 +66,7 @@ impl Linked {
     }
 
     fn counters(&self) -> Counters {
-        Counters::of(".", self.hosts.home.path())
+        Counters::read(".", self.hosts.home.path())
     }
 
     fn agent_says(&self, words: &str) -> bool {

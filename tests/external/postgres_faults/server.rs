@@ -42,7 +42,7 @@ impl Campaign {
     }
 
     pub fn counters(&self) -> Counters {
-        Counters::of(&self.location, self.home())
+        Counters::read(&self.location, self.home())
     }
 
     /// Checks that nothing is lost or duplicated, and that all processes have exited.

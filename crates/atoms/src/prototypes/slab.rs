@@ -41,7 +41,7 @@ impl Facet {
     }
 
     /// The low-index facets of a crystal.
-    pub fn of(prototype: Prototype) -> &'static [Self] {
+    pub fn for_prototype(prototype: Prototype) -> &'static [Self] {
         if prototype.is_cubic() { &[Self::F111, Self::F100, Self::F110] } else { &[Self::Basal] }
     }
 

@@ -30,7 +30,7 @@ impl Reference {
     }
 
     /// The features of the atoms of an element.
-    fn of(&self, element: usize) -> Vec<f64> {
+    fn features_of(&self, element: usize) -> Vec<f64> {
         let rows = self.features.chunks_exact(DIMENSION).zip(&self.elements);
         rows.filter(|(_, own)| **own == element).flat_map(|(row, _)| row.to_vec()).collect()
     }
@@ -39,7 +39,7 @@ impl Reference {
     fn build(&self, element: usize) -> BuiltElement {
         let slots = numbers(&self.steps, &format!("step1_centroids_{element}"));
         let real: Vec<f64> = slots.into_iter().filter(|value| *value < 1e9).collect();
-        let features = self.of(element);
+        let features = self.features_of(element);
         let weights = |features: &[f64]| vec![1.0; features.len() / DIMENSION];
         let mut sums = scatter(DIMENSION, &real, &features, &weights(&features), &[77]);
         // The reference's sums pass through single precision.

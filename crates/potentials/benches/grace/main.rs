@@ -51,7 +51,7 @@ fn report(model: &Model, peak: Peak) {
         println!("\n{}, {precision} precision", model.name);
         let cases: Vec<Case> = EDGES.iter().map(|edge| Case::new(model, *edge, precision)).collect();
         let peer = Peer::start(model, precision, &cases);
-        report_cases(cases, peer, peak.of(precision));
+        report_cases(cases, peer, peak.rates(precision));
     }
     threads::report(model, EDGES[1]);
 }

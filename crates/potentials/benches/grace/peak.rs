@@ -27,7 +27,7 @@ pub struct Peak {
 
 impl Peak {
     /// The rates for the per-channel numbers of this precision.
-    pub fn of(self, precision: Precision) -> Rates {
+    pub fn rates(self, precision: Precision) -> Rates {
         match precision {
             Precision::Double => self.double,
             Precision::Mixed => self.single,

@@ -53,7 +53,7 @@ impl AtomStatistics {
         Self {
             ranked: ranked(&all, columns.len()),
             elements: elements.into_iter().map(element).collect(),
-            atoms: all.iter().map(|(atom, unit)| (*unit, counts.place(atom.error))).collect(),
+            atoms: all.iter().map(|(atom, unit)| (*unit, counts.bin_index(atom.error))).collect(),
             kept: columns.iter().enumerate().map(is_kept).collect(),
             structures: units.last().map_or(0, |last| *last as usize + 1),
         }
@@ -81,8 +81,8 @@ impl AtomStatistics {
         for (k, (statistics, kept)) in whole.iter().zip(&self.kept).enumerate() {
             let areas: Vec<_> = by_element.iter().map(|statistics| statistics[k].auc[0]).collect();
             let mut counts = Exceedance::new(&THRESHOLDS);
-            for ((unit, place), is_kept) in self.atoms.iter().zip(kept) {
-                counts.add_place(*place, *is_kept, multiplicities[*unit as usize]);
+            for ((unit, bin), is_kept) in self.atoms.iter().zip(kept) {
+                counts.add_to_bin(*bin, *is_kept, multiplicities[*unit as usize]);
             }
             values.extend([statistics.spearman, mean(&areas), counts.retention()]);
             values.extend_from_slice(&statistics.auc);
