@@ -31,14 +31,14 @@ impl MixtureBuild {
             return Ok(Some(partition));
         }
         let Some(found) = self.cluster()? else { return Ok(None) };
-        let partition = found.combine(&self.settings, self.work.model.elements().len())?;
+        let partition = found.combine(&self.settings, self.context.model.elements().len())?;
         self.state.save_partition(&partition)?;
         Ok(Some(partition))
     }
 
     /// Clusters the shards of this process. `None` once it was stopped.
     pub(super) fn cluster(&mut self) -> Result<Option<Clustered>, CommandError> {
-        let Self { work, settings, state, cache, bytes } = self;
+        let Self { context, settings, state, cache, bytes } = self;
         let mut known = state.known_shards()?;
         let finished: BTreeSet<(u64, ShardHash)> = known.shards().collect();
         let hashes = Mutex::new(BTreeMap::new());
@@ -46,14 +46,14 @@ impl MixtureBuild {
             hashes.lock().unwrap_or_else(PoisonError::into_inner).insert(shard.index, shard.hash);
             Ok(finished.contains(&(shard.index, shard.hash)))
         };
-        let elements = work.model.elements().len();
+        let elements = context.model.elements().len();
         let begin = |shard| {
             (0..elements).map(|element| ShardClustering::new(settings, shard, element).map(Some)).collect()
         };
         let counters = Counters::default();
-        let progress = PassProgress::new(1, work.part, None, *bytes, &counters);
+        let progress = PassProgress::new(1, context.part, None, *bytes, &counters);
         let ended = run_pass(
-            (work, cache),
+            (context, cache),
             is_finished,
             begin,
             &counters,

@@ -30,13 +30,13 @@ use self::identity::Identity;
 pub use self::merge::{Merged, PartsMerge};
 pub use self::part::BuildPart;
 use self::state::{BuildState, PartEnd};
-pub use self::workers::Work;
+pub use self::workers::PassContext;
 use crate::exit_status::CommandError;
 use crate::output::print_stderr;
 
 /// A build under way.
 pub struct MixtureBuild {
-    work: Work,
+    context: PassContext,
     settings: BuildSettings,
     state: BuildState,
     cache: FeatureCache,
@@ -52,7 +52,7 @@ impl MixtureBuild {
     /// # Errors
     /// Invalid settings; the state of another build (unless `restart`, which is for the whole).
     pub fn open(
-        work: Work,
+        context: PassContext,
         settings: BuildSettings,
         model_hash: String,
         projection: &Projection,
@@ -60,8 +60,8 @@ impl MixtureBuild {
         restart: bool,
     ) -> Result<Self, CommandError> {
         ShardClustering::new(&settings, 0, 0).map_err(CommandError::input)?;
-        let identity = Identity::new(model_hash, projection, settings.clone(), &work.files);
-        let (state, exists) = match work.part {
+        let identity = Identity::new(model_hash, projection, settings.clone(), &context.files);
+        let (state, exists) = match context.part {
             None => BuildState::open(output, &identity, restart)?,
             Some(part) => BuildState::open_part(output, &identity, part)?,
         };
@@ -70,8 +70,8 @@ impl MixtureBuild {
         }
         let identity = serde_json::to_vec(&identity).map_err(CommandError::failed)?;
         let cache =
-            FeatureCache::open(state.directory(), identity, settings.dimension, work.max_feature_bytes);
-        Ok(Self { bytes: work.files.total_bytes()?, work, settings, state, cache })
+            FeatureCache::open(state.directory(), identity, settings.dimension, context.max_feature_bytes);
+        Ok(Self { bytes: context.files.total_bytes()?, context, settings, state, cache })
     }
 
     /// Takes the passes that are left. `None` if it was stopped; the same build then continues.
@@ -84,7 +84,7 @@ impl MixtureBuild {
         let Some(components) = self.components(&partition)? else { return Ok(None) };
         let Some(histograms) = self.histograms(&partition, &components)? else { return Ok(None) };
         let settings = self.settings.clone();
-        mixture(&self.work.model, projection, projection_seed, settings, components, histograms).map(Some)
+        mixture(&self.context.model, projection, projection_seed, settings, components, histograms).map(Some)
     }
 
     /// Takes the part through one pass, from 1 to 3. Returns whether it came to the end; otherwise it was stopped, and the same

@@ -104,7 +104,7 @@ impl FeatureSource<'_> {
         match self {
             Self::Computed { calculator, writer } => {
                 let elements = calculator.compute(&training.structure);
-                let elements = elements.map_err(|error| training.place.wrong(error))?;
+                let elements = elements.map_err(|error| training.position.wrong(error))?;
                 let features = calculator.grace.features();
                 if let Some(writer) = writer {
                     writer.add(features);
@@ -113,7 +113,7 @@ impl FeatureSource<'_> {
             }
             Self::Stored { reader, model } => {
                 let elements = model.element_indices(&training.structure.species);
-                let elements = elements.map_err(|error| training.place.wrong(error))?;
+                let elements = elements.map_err(|error| training.position.wrong(error))?;
                 let features = reader.next(elements.len() * model.feature_dimension());
                 Ok(features.map(|features| (elements, features)))
             }
@@ -175,7 +175,7 @@ fn add<P>(
     let rows = features.chunks_exact(dimension.max(1));
     for (atom, (row, &index)) in rows.zip(indices).enumerate() {
         if !row.iter().map(|value| value * value).sum::<f64>().is_finite() {
-            return Err(structure.place.wrong(format_args!("the features of atom {atom} are not finite")));
+            return Err(structure.position.wrong(format_args!("the features of atom {atom} are not finite")));
         }
         let element = &mut elements[index];
         if element.pass.is_none() && structure.weight == 0.0 {
@@ -185,7 +185,7 @@ fn add<P>(
         if element.pass.is_none() {
             let message =
                 "pass 1 found no atom of its element; did the file change? Begin anew with --restart";
-            return Err(structure.place.wrong(format_args!("atom {atom}: {message}")));
+            return Err(structure.position.wrong(format_args!("atom {atom}: {message}")));
         }
         element.features.extend_from_slice(row);
         element.weights.push(structure.weight);

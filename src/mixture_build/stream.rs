@@ -7,14 +7,14 @@ use atoms::Structure;
 
 use super::part::BuildPart;
 use crate::exit_status::CommandError;
-use crate::structure_files::{Place, StructureFiles, StructureReader};
+use crate::structure_files::{FileLine, StructureFiles, StructureReader};
 
-/// A structure with its place in the files.
+/// A structure with its position in the files.
 pub struct TrainingStructure {
     pub structure: Structure,
     /// Of its atoms.
     pub weight: f64,
-    pub place: Place,
+    pub position: FileLine,
 }
 
 /// The structures of a shard, in the order of the files.
@@ -53,11 +53,11 @@ impl ShardReader {
                 let Some((frame, file)) = self.structures.next()? else { break };
                 self.count += 1;
                 if self.part.has(index) {
-                    let place = Place { file: file.path, line: frame.line };
+                    let position = FileLine { file: file.path, line: frame.line };
                     structures.push(TrainingStructure {
                         structure: frame.structure,
                         weight: file.weight,
-                        place,
+                        position,
                     });
                 }
             }

@@ -80,15 +80,15 @@ impl MixtureBuild {
         begin: impl Fn(usize) -> Result<Option<P>, BuildError> + Sync,
         to_row: impl Fn(&P::Partial) -> Vec<f64>,
     ) -> Result<Option<ElementTotals>, CommandError> {
-        let Self { work, state, cache, bytes, .. } = self;
+        let Self { context, state, cache, bytes, .. } = self;
         let mut sums = state.sums(pass)?;
-        if sums.finished.len() as u64 == work.shards().count(partition.hashes.len() as u64) {
+        if sums.finished.len() as u64 == context.shards().count(partition.hashes.len() as u64) {
             return Ok(Some(sums.elements));
         }
         let elements = partition.elements.len();
         sums.elements.resize(elements, None);
         let counters = Counters::default();
-        let progress = PassProgress::new(pass, work.part, Some(partition.structures), *bytes, &counters);
+        let progress = PassProgress::new(pass, context.part, Some(partition.structures), *bytes, &counters);
         let finished = sums.finished.clone();
         let is_finished = |shard: &Shard| {
             if partition.hashes.get(shard.index as usize) != Some(&shard.hash) {
@@ -97,7 +97,7 @@ impl MixtureBuild {
             Ok(finished.contains(&shard.index))
         };
         let ended = run_pass(
-            (work, cache),
+            (context, cache),
             is_finished,
             |_| (0..elements).map(&begin).collect(),
             &counters,
@@ -152,7 +152,7 @@ pub(super) fn histograms_from_sums(
 }
 
 fn changed_since_pass_1(shard: &Shard) -> CommandError {
-    let place = shard.structures.first().map_or(String::new(), |first| format!(" (from {})", first.place));
+    let place = shard.structures.first().map_or(String::new(), |first| format!(" (from {})", first.position));
     CommandError::Input(format!(
         "the structures of shard {}{place} have changed since pass 1; restore the files, or begin anew with --restart",
         shard.index

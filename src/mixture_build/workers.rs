@@ -23,7 +23,7 @@ use crate::structure_files::StructureFiles;
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
 
 /// What all passes share.
-pub struct Work {
+pub struct PassContext {
     pub model: Arc<GraceModel>,
     pub files: StructureFiles,
     pub shard_size: u64,
@@ -36,7 +36,7 @@ pub struct Work {
     pub stop: CancellationToken,
 }
 
-impl Work {
+impl PassContext {
     /// The shards of this process.
     pub fn shards(&self) -> BuildPart {
         self.part.unwrap_or(BuildPart::WHOLE)
@@ -60,7 +60,7 @@ pub struct Counters {
 
 /// What the threads of a pass share.
 struct Shared<'a, F, B> {
-    work: &'a Work,
+    context: &'a PassContext,
     cache: &'a FeatureCache,
     reader: Mutex<Option<ShardReader>>,
     is_finished: F,
@@ -76,16 +76,17 @@ struct Shared<'a, F, B> {
 ///
 /// Returns the number of structures in the files; `None` after a cancellation.
 pub fn run_pass<P: ElementPass>(
-    (work, cache): (&Work, &FeatureCache),
+    (context, cache): (&PassContext, &FeatureCache),
     is_finished: impl Fn(&Shard) -> Result<bool, CommandError> + Sync,
     begin: impl Fn(u64) -> Result<Vec<Option<P>>, BuildError> + Sync,
     counters: &Counters,
     mut receive: impl FnMut(ShardResult<P::Partial>) -> Result<(), CommandError>,
     progress: impl Fn(),
 ) -> Result<Option<u64>, CommandError> {
-    let reader = ShardReader::new(&work.files, work.shard_size, work.shards(), Arc::clone(&counters.bytes));
+    let reader =
+        ShardReader::new(&context.files, context.shard_size, context.shards(), Arc::clone(&counters.bytes));
     let shared = Shared {
-        work,
+        context,
         cache,
         reader: Mutex::new(Some(reader)),
         is_finished,
@@ -94,8 +95,8 @@ pub fn run_pass<P: ElementPass>(
         failures: Mutex::default(),
     };
     let structures = thread::scope(|scope| {
-        let (send, results) = mpsc::sync_channel(work.threads);
-        let threads: Vec<_> = (0..work.threads)
+        let (send, results) = mpsc::sync_channel(context.threads);
+        let threads: Vec<_> = (0..context.threads)
             .map(|_| {
                 let (send, shared) = (send.clone(), &shared);
                 scope.spawn(move || shared.take_shards(&send))
@@ -125,7 +126,7 @@ pub fn run_pass<P: ElementPass>(
     if let Some((_, failure)) = failures.into_iter().min_by_key(|(shard, _)| *shard) {
         return Err(failure);
     }
-    Ok(structures.filter(|_| !work.stop.is_cancelled()))
+    Ok(structures.filter(|_| !context.stop.is_cancelled()))
 }
 
 impl<F, B> Shared<'_, F, B> {
@@ -136,9 +137,9 @@ impl<F, B> Shared<'_, F, B> {
         F: Fn(&Shard) -> Result<bool, CommandError>,
         B: Fn(u64) -> Result<Vec<Option<P>>, BuildError>,
     {
-        let mut calculator = FeatureCalculator::new(Arc::clone(&self.work.model));
-        let work = self.work;
-        while !work.stop.is_cancelled() {
+        let mut calculator = FeatureCalculator::new(Arc::clone(&self.context.model));
+        let context = self.context;
+        while !context.stop.is_cancelled() {
             let shard = {
                 let mut place = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
                 let reader = place.as_mut()?;
@@ -187,22 +188,22 @@ impl<F, B> Shared<'_, F, B> {
         P: ElementPass,
         B: Fn(u64) -> Result<Vec<Option<P>>, BuildError>,
     {
-        let work = self.work;
+        let context = self.context;
         let run = |source: &mut FeatureSource<'_>| {
             let passes = (self.begin)(shard.index).map_err(CommandError::failed)?;
             let each = || {
                 self.counters.computed.fetch_add(1, Ordering::Relaxed);
             };
-            run_shard(source, shard, work.seed, passes, &work.stop, each)
+            run_shard(source, shard, context.seed, passes, &context.stop, each)
         };
         if let Some(reader) = self.cache.reader(shard) {
-            let mut source = FeatureSource::Stored { reader, model: &work.model };
+            let mut source = FeatureSource::Stored { reader, model: &context.model };
             let found = run(&mut source);
             if source.finish() {
                 return found;
             }
             // What damaged features lead to, be it an error, does not count.
-            if work.stop.is_cancelled() {
+            if context.stop.is_cancelled() {
                 return Ok(None);
             }
         }

@@ -12,7 +12,7 @@ use std::sync::atomic::AtomicU64;
 use atoms::Species;
 
 pub use self::arguments::{StructureArgs, StructureReadingArgs};
-pub use self::reader::{Place, StructureReader};
+pub use self::reader::{FileLine, StructureReader};
 use crate::exit_status::CommandError;
 use crate::filter::StructureFilter;
 

@@ -27,21 +27,21 @@ pub struct StructureReader {
     failed: bool,
 }
 
-/// Where a structure stands.
+/// File and line of a structure.
 #[derive(Debug, Clone)]
-pub struct Place {
+pub struct FileLine {
     pub file: Arc<Path>,
     /// From 1.
     pub line: usize,
 }
 
-impl std::fmt::Display for Place {
+impl std::fmt::Display for FileLine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{}:{}", self.file.display(), self.line)
     }
 }
 
-impl Place {
+impl FileLine {
     /// Wrong input, which names file and line.
     pub fn wrong(&self, reason: impl std::fmt::Display) -> CommandError {
         CommandError::Input(format!("{self}: {reason}"))

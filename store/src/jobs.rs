@@ -38,7 +38,7 @@ pub enum FailOutcome {
     /// It waits for another attempt.
     Requeued,
     /// It has no attempts left.
-    GivenUp,
+    Failed,
     /// The lease had been lost before: this attempt no longer decides about the job.
     LeaseLost,
 }

@@ -109,7 +109,7 @@ async fn failures_count_and_releases_do_not() {
     let second = lease(&store, "h", 3).await.unwrap();
     assert!(second.earlier_calculations.is_empty(), "that one ended");
     assert_eq!(second.failures, ["not converged"]);
-    assert_eq!(store.fail(&second, "not converged", "SCF", LIMIT, 4).await.unwrap(), FailOutcome::GivenUp);
+    assert_eq!(store.fail(&second, "not converged", "SCF", LIMIT, 4).await.unwrap(), FailOutcome::Failed);
     let details = store.queue_show(&names[0]).await.unwrap();
     assert_eq!((details.job.state, details.job.failures), (JobState::Failed, 2));
     let outcomes: Vec<_> = details.attempts_made.iter().map(|a| a.outcome.as_deref().unwrap()).collect();

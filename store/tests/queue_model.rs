@@ -160,7 +160,7 @@ impl Run {
                 let Some((job, lease)) = self.pick(which) else { return };
                 let expected = if job.state == JobState::Leased && job.attempts == lease.attempt {
                     job.fail();
-                    if job.state == JobState::Failed { FailOutcome::GivenUp } else { FailOutcome::Requeued }
+                    if job.state == JobState::Failed { FailOutcome::Failed } else { FailOutcome::Requeued }
                 } else {
                     FailOutcome::LeaseLost
                 };

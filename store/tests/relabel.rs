@@ -121,7 +121,7 @@ async fn a_label_that_cannot_be_remade_stays() {
     let first = lease(&store, &dft, 300).await.unwrap();
     assert_eq!(store.fail(&first, "crashed", "", 2, 301).await.unwrap(), FailOutcome::Requeued);
     let second = lease(&store, &dft, 302).await.unwrap();
-    assert_eq!(store.fail(&second, "crashed", "", 2, 303).await.unwrap(), FailOutcome::GivenUp);
+    assert_eq!(store.fail(&second, "crashed", "", 2, 303).await.unwrap(), FailOutcome::Failed);
     assert_eq!(jobs(&store, structures[0]).await, [("dft".into(), JobState::Labelled)]);
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
@@ -194,7 +194,7 @@ async fn another_protocol_supersedes_label_by_label() {
     // The first is labelled under the new protocol, the second fails.
     assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     let in_vain = lease(&store, &fine, 310).await.unwrap();
-    assert_eq!(store.fail(&in_vain, "crashed", "", 1, 311).await.unwrap(), FailOutcome::GivenUp);
+    assert_eq!(store.fail(&in_vain, "crashed", "", 1, 311).await.unwrap(), FailOutcome::Failed);
     let superseded = ("dft".to_owned(), JobState::Superseded);
     assert_eq!(jobs(&store, structures[0]).await, [superseded, ("fine".into(), JobState::Labelled)]);
     assert_eq!(jobs(&store, structures[1]).await, [old, ("fine".into(), JobState::Failed)]);

@@ -16,7 +16,7 @@ use crate::feature_variant::{FeatureModel, FeatureVariant};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, TextTable, print, print_stderr};
 use crate::signals::stop_token;
-use crate::structure_files::{Place, StructureArgs, StructureFiles};
+use crate::structure_files::{FileLine, StructureArgs, StructureFiles};
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
@@ -203,14 +203,14 @@ fn read(
         if stop.is_cancelled() {
             return Ok(false);
         }
-        let place = Place { file: file.path, line: frame.line };
-        let elements = calculator.compute(&frame.structure).map_err(|error| place.wrong(error))?;
+        let position = FileLine { file: file.path, line: frame.line };
+        let elements = calculator.compute(&frame.structure).map_err(|error| position.wrong(error))?;
         let needs_forces =
             builders.iter().any(|builder| builder.needs_sweep() && builder.kind().has_force_form());
         let rows = if needs_forces { calculator.force_rows() } else { Vec::new() };
         for builder in builders.iter_mut().filter(|builder| builder.needs_sweep()) {
-            builder.add(&elements, calculator.features()).map_err(|error| place.wrong(error))?;
-            builder.add_forces(&rows).map_err(|error| place.wrong(error))?;
+            builder.add(&elements, calculator.features()).map_err(|error| position.wrong(error))?;
+            builder.add_forces(&rows).map_err(|error| position.wrong(error))?;
         }
         count += 1;
         bar.set(bytes.load(Ordering::Relaxed), || {

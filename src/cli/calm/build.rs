@@ -15,7 +15,7 @@ use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 use crate::file_hash;
-use crate::mixture_build::{self, BuildPart, Work};
+use crate::mixture_build::{self, BuildPart, PassContext};
 use crate::output::{TextTable, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{StructureArgs, StructureFiles};
@@ -119,7 +119,7 @@ impl CalmBuildArgs {
             shard_size: self.shard_size,
         };
         let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
-        let work = Work {
+        let context = PassContext {
             model,
             files,
             shard_size: self.shard_size,
@@ -129,8 +129,14 @@ impl CalmBuildArgs {
             max_feature_bytes: (1e9 * self.max_feature_cache) as u64,
             stop: stop_token()?,
         };
-        let mut build =
-            mixture_build::MixtureBuild::open(work, settings, hash, &projection, &self.output, self.restart)?;
+        let mut build = mixture_build::MixtureBuild::open(
+            context,
+            settings,
+            hash,
+            &projection,
+            &self.output,
+            self.restart,
+        )?;
         if let (Some(pass), Some(part)) = (self.pass, self.part) {
             return end_part(pass, part, build.run_part(pass)?);
         }

@@ -13,7 +13,7 @@ use crate::artifact_checks::load_artifact;
 use crate::cli::{CommandError, ExitStatus};
 use crate::features::FeatureCalculator;
 use crate::output::{self, Bar, TextTable, decimals, print, print_json};
-use crate::structure_files::{Place, StructureArgs};
+use crate::structure_files::{FileLine, StructureArgs};
 
 /// Atoms of each element whose grades are kept for quantiles and ranks.
 const SAMPLED: usize = 50_000;
@@ -97,13 +97,13 @@ impl CalmCompareArgs {
         let mut grades = [Grades::default(), Grades::default()];
         let mut count = 0;
         while let Some((frame, file)) = structures.next()? {
-            let place = Place { file: file.path, line: frame.line };
-            let elements = calculator.compute(&frame.structure).map_err(|error| place.wrong(error))?;
+            let position = FileLine { file: file.path, line: frame.line };
+            let elements = calculator.compute(&frame.structure).map_err(|error| position.wrong(error))?;
             let features = &calculator.grace.features()[..elements.len() * dimension];
             for (grades, artifact) in grades.iter_mut().zip(artifacts) {
                 grades
                     .evaluate(&artifact.mixture, &elements, features, None)
-                    .map_err(|error| place.wrong(error))?;
+                    .map_err(|error| position.wrong(error))?;
             }
             for (atom, element) in elements.into_iter().enumerate() {
                 gradings[element].add([grades[0].gamma[atom], grades[1].gamma[atom]]);

@@ -212,7 +212,7 @@ impl Store {
             true => {
                 match end_without_label(&mut transaction, lease.job, AttemptEnd::Lost("lost"), now).await? {
                     JobState::Queued => FailOutcome::Requeued,
-                    _ => FailOutcome::GivenUp,
+                    _ => FailOutcome::Failed,
                 }
             }
         };
@@ -237,7 +237,7 @@ impl Store {
             let how = AttemptEnd::Failed { class, log, limit: attempt_limit };
             match end_without_label(&mut transaction, lease.job, how, now).await? {
                 JobState::Queued => FailOutcome::Requeued,
-                _ => FailOutcome::GivenUp,
+                _ => FailOutcome::Failed,
             }
         } else {
             record_failure(&mut transaction, lease.job, lease.attempt, class, log).await?;

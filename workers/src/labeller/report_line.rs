@@ -26,7 +26,7 @@ pub(super) fn format_report(
         (Err(failure), DeliveryOutcome::Failed(FailOutcome::Requeued)) => {
             format!("{candidate} failed and waits for another attempt: {failure}")
         }
-        (Err(failure), DeliveryOutcome::Failed(FailOutcome::GivenUp)) => {
+        (Err(failure), DeliveryOutcome::Failed(FailOutcome::Failed)) => {
             format!("{candidate} has no attempts left: {failure}")
         }
         (Err(failure), _) => format!("{candidate} failed, and another labeller has it now: {failure}"),
