@@ -8,7 +8,7 @@
 # `calmwalk run --tls` on the first and `calmwalk agent --tls` on the others. Agents check that the name of the
 # orchestrator's certificate is the one that they connect to; where it may run on several hosts its certificate has all
 # their names, after '='. Run again with more names it adds to what is there.
-# Keep DIR/authority-key.pem to yourself: whoever has it can take part in the campaign.
+# Keep DIR/authority-key.pem to yourself: anyone who has it can take part in the campaign.
 set -euf
 umask 077
 directory=$1

@@ -14,7 +14,7 @@ use crate::exit_status::CommandError;
 /// Shorter work shows no bar.
 const BAR_AFTER: Duration = Duration::from_secs(1);
 
-/// Writes to standard output. A closed pipe (`| head`) is no failure.
+/// Writes to standard output. A closed pipe (`| head`) is not a failure.
 pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), CommandError> {
     let mut out = BufWriter::new(io::stdout().lock());
     match write(&mut out).and_then(|()| out.flush()) {

@@ -1,4 +1,4 @@
-//! Budgets end a campaign in order, and a larger budget continues it; effects of a long label queue.
+//! Budgets end a campaign cleanly, and a larger budget continues it; effects of a long label queue.
 
 use std::fs;
 use std::path::Path;

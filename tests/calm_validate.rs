@@ -384,7 +384,7 @@ fn wrong_arguments_are_named() {
     let silicon = config("data/si_sw_1l/kokkos.npz");
     let silicon = silicon.to_str().unwrap();
     assert!(refused(&["--output", "out", "--ensemble", silicon]).contains("does not support Al"));
-    assert!(refused(&["--output", "file"]).contains("file is no directory"));
+    assert!(refused(&["--output", "file"]).contains("file is not a directory"));
     assert!(!here.join("out").exists());
     assert_eq!(std::fs::read_to_string(here.join("file")).unwrap(), "kept");
 }

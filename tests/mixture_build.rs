@@ -245,7 +245,7 @@ fn changed_data_and_damaged_states_are_noticed() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
     fs::write(&path, bytes).unwrap();
-    assert!(fail(here, &arguments).contains("damaged; begin anew with --restart"));
+    assert!(fail(here, &arguments).contains("damaged; start over with --restart"));
     write_frames(&here.join("data.extxyz"), &frames);
     let (anew, _) = build(here, "out.npz", &["data.extxyz"], &["--threads", "1", "--restart"]);
     let (other, _) = build(here, "other.npz", &["data.extxyz"], &[]);

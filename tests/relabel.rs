@@ -156,11 +156,11 @@ fn doubtful_labels_are_made_again_by_the_same_protocol() {
         refuse(place.path(), ["relabel", place.argument(), "--where", "max_force > 1e9"])
             .contains("no labelled structure")
     );
-    relabel(&place, &[doubtful, "--reason", "a sick node"]);
+    relabel(&place, &[doubtful, "--reason", "a faulty node"]);
     let listed = succeed(place.path(), ["queue", place.argument(), "list", "--state", "queued"]);
     assert!(listed.contains(doubtful) && listed.contains("queued again"), "{listed}");
     let shown = succeed(place.path(), ["queue", place.argument(), "show", doubtful]);
-    assert!(shown.contains("relabel   requested: a sick node"), "{shown}");
+    assert!(shown.contains("relabel   requested: a faulty node"), "{shown}");
     assert_eq!(place.export(), bytes, "the label stays");
     check(&place);
     assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());

@@ -8,7 +8,7 @@ use wire::ContentHash;
 
 use crate::energy_offsets::{energy_offsets, labelled_energy};
 
-/// Least number of labelled structures that must support a composition before its energy error is shown. One alone
+/// Minimum number of labelled structures that must support a composition before its energy error is shown. One alone
 /// would have no error.
 const MIN_SUPPORT: f64 = 2.0;
 /// Largest number of errors kept for quantiles. Beyond it a systematic sample is kept.

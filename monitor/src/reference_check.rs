@@ -15,7 +15,7 @@ use crate::energy_offsets::labelled_energy;
 /// Metadata key of the last check.
 pub const METADATA_KEY: &str = "reference_check";
 
-/// Least number of structures that must support a composition before its energy is judged. One alone would have no
+/// Minimum number of structures that must support a composition before its energy is judged. One alone would have no
 /// difference from the offsets.
 const MIN_SUPPORT: f64 = 2.0;
 

@@ -54,11 +54,11 @@ pub enum Notice<'a> {
     Committed(&'a Commit),
     /// Walkers wait because this many label jobs are unfinished.
     QueueFull(u64),
-    /// Of the connected walkers, so many have a walk in hand from now on.
+    /// Number of walkers that are busy from now on.
     Walkers {
-        /// With a walk in hand.
+        /// Walkers with an assignment.
         busy: usize,
-        /// All.
+        /// All connected walkers.
         all: usize,
     },
 }

@@ -262,7 +262,7 @@ async fn a_failed_batch_writes_nothing_and_is_not_answered() {
     assert_eq!(stored.remove(0), 2, "the one from before");
     let answered: Vec<_> =
         (0..WALKS).filter(|walk| matches!(answers[*walk].try_recv(), Ok(Some(_)))).collect();
-    assert_eq!(answered, stored, "who is answered is stored, and nobody else");
+    assert_eq!(answered, stored, "exactly the answered walks are stored");
     if stored.is_empty() {
         assert_eq!(live.store.decision_log_text().await.unwrap(), before);
     }

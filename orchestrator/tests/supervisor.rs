@@ -202,7 +202,7 @@ fn a_stop_terminates_and_then_kills() {
     assert_eq!(supervisor.stop(s(1)), terminate);
     assert_eq!(status(&supervisor, 1, s(1)).state, ChildState::Exited, "it is not started again");
     assert_eq!(supervisor.ended(0, signal(15), s(2)).unwrap().then, ChildState::Exited);
-    assert_eq!(status(&supervisor, 0, s(2)).last_failure, None, "as it was told");
+    assert_eq!(status(&supervisor, 0, s(2)).last_failure, None, "it ended as requested");
     assert_eq!(supervisor.ended(3, signal(11), s(2)).unwrap().then, ChildState::Exited);
     assert_eq!(status(&supervisor, 3, s(2)).last_failure, Some(signal(11)));
     assert_eq!(supervisor.next_deadline(), Some(s(31)));
@@ -224,7 +224,7 @@ fn children_interrupted_from_outside_are_restarted() {
     let mut supervisor = started(1);
     supervisor.stop(s(1));
     supervisor.ended(0, interrupted, s(1));
-    assert_eq!(status(&supervisor, 0, s(1)).last_failure, None, "as it was told");
+    assert_eq!(status(&supervisor, 0, s(1)).last_failure, None, "it ended as requested");
 }
 
 #[test]

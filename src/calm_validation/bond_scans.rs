@@ -42,7 +42,7 @@ pub struct BondScan {
     pub energy: Option<f64>,
     /// The scan.
     pub points: Vec<ScanPoint>,
-    /// What each score tells.
+    /// What each score detects.
     pub detection: Vec<Detection>,
 }
 

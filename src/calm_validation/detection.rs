@@ -28,7 +28,7 @@ impl DetectionRule {
     pub const TENFOLD: Self = Self::TimesMedian(10.0);
 }
 
-/// What a score tells of a bond scan. Values are `None` where the scan has no distance of that regime.
+/// Which regimes of a bond scan a score detects. Values are `None` where the scan has no distance of that regime.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Detection {
     /// Compression is detected.

@@ -91,7 +91,7 @@ pub struct Validation {
     pub mixtures: Vec<ComparedMixture>,
 }
 
-/// A score and what its bond scans tell.
+/// A score and what its bond scans show.
 #[derive(Clone, Debug, Serialize)]
 pub struct ScoreDescription {
     /// Its name.

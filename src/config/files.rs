@@ -28,9 +28,9 @@ pub enum PotentialKind {
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PotentialConfig {
-    /// What it holds.
+    /// Format of the file.
     pub kind: PotentialKind,
-    /// Where it is.
+    /// Path of the potential file.
     #[schemars(with = "PathBuf")]
     pub file: Spanned<PathBuf>,
 }

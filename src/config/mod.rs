@@ -192,7 +192,7 @@ impl Config {
         1 + u32::from(self.campaign.control)
     }
 
-    /// Most structures that may be collected from a seed structure with so many walks.
+    /// Most structures that may be collected from a seed structure with `walks` walks.
     pub fn most_structures_of(&self, walks: usize) -> u64 {
         let all = u64::from(self.collect.max_per_walk.get()).saturating_mul(walks as u64);
         self.collect.max_per_seed_structure.map_or(all, |most| all.min(most.get().into()))

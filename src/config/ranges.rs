@@ -49,7 +49,7 @@ const TAU: &str = "it is the bias as a part of the force: 0.15 to 2";
 const CUTOFF: &str = "it is in eV: 1 Ry is 13.6 eV, 1 Ha is 27.2 eV";
 const K_SPACING: &str = "it is in 1/Å with 2π included: the paper's is 0.125";
 const STRESS: &str = "it is in eV/Å³: 1 GPa is 0.00624 eV/Å³";
-const PER_ATOM: &str = "it is that of an atom, in eV: 1 meV is 0.001";
+const PER_ATOM: &str = "give the value per atom, in eV: 1 meV is 0.001";
 const SMEARING: &str = "it is in eV: 1 Ry is 13.6 eV, 1000 K are 0.086 eV";
 const VACUUM: &str = "it is in Å";
 const BOND_FRACTION: &str = "it is a fraction of the bond's length in the seed structure";
@@ -110,13 +110,13 @@ pub static RANGES: [Range; 91] = [
     range("label.max_attempts", "", [0.0, 1e9], [1.0, 20.0], ""),
     range("label.max_force", "eV/Å", [0.0, 1e9], [5.0, 1e5], ""),
     range("label.max_stress", "eV/Å³", [0.0, 1e9], [0.01, 1e3], STRESS),
-    range("label.max_energy_per_atom", "eV", [0.0, 1e12], [10.0, 1e7], "it is that of an atom, in eV"),
+    range("label.max_energy_per_atom", "eV", [0.0, 1e12], [10.0, 1e7], "give the value per atom, in eV"),
     range(
         "label.max_energy_difference_per_atom",
         "eV",
         [0.0, 1e12],
         [0.1, 1e4],
-        "it is that of an atom, in eV",
+        "give the value per atom, in eV",
     ),
     range("label.min_state_difference", "eV/atom", [0.0, 1e3], [1e-5, 0.1], PER_ATOM),
     range("label.cores", "", [0.0, 4096.0], [1.0, 2048.0], ""),
@@ -125,8 +125,8 @@ pub static RANGES: [Range; 91] = [
     range("label.queue_limit", "", [0.0, 1e9], [1.0, 1e6], ""),
     range("label.guard.min_height", "Å", [0.0, 1e3], [1.0, 50.0], "it is in Å"),
     range("label.guard.max_edge_ratio", "", [0.0, 1e6], [1.0, 100.0], ""),
-    range("label.guard.min_volume_per_atom", "Å³", [0.0, 1e3], [1.0, 50.0], "it is that of an atom, in Å³"),
-    range("label.guard.max_volume_per_atom", "Å³", [0.0, 1e6], [5.0, 1e3], "it is that of an atom, in Å³"),
+    range("label.guard.min_volume_per_atom", "Å³", [0.0, 1e3], [1.0, 50.0], "give the value per atom, in Å³"),
+    range("label.guard.max_volume_per_atom", "Å³", [0.0, 1e6], [5.0, 1e3], "give the value per atom, in Å³"),
     range("label.guard.max_atoms", "", [0.0, 1e9], [1.0, 1e5], ""),
     range("label.reference_check.max_energy_difference", "eV/atom", [0.0, 1e3], [1e-4, 0.1], PER_ATOM),
     range("label.reference_check.max_force_difference", "eV/Å", [0.0, 1e3], [1e-3, 0.5], ""),

@@ -25,7 +25,7 @@ use crate::duration::Duration;
 #[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CampaignSection {
-    /// `reproducible`: rounds of a fixed number of walks. `live`: every walk goes on as soon as it can.
+    /// `reproducible`: rounds of a fixed number of walks. `live`: walks do not wait for each other.
     pub mode: CampaignMode,
     /// Seed of all random numbers of the campaign.
     pub rng_seed: u64,
@@ -185,10 +185,10 @@ pub struct CollectSection {
     pub criterion: CollectionRule,
     /// Grade at which an update of the mixture is strong enough.
     pub update_target: calm::UpdateRule,
-    /// Least number of steps between two collected structures of a walk.
+    /// Minimum number of steps between two collected structures of a walk.
     #[serde(default = "defaults::min_interval")]
     pub min_interval: u64,
-    /// Least number of steps after a candidate that was declined or rejected.
+    /// Minimum number of steps after a candidate that was declined or rejected.
     #[serde(default = "defaults::min_interval_after_decline")]
     pub min_interval_after_decline: NonZeroU64,
     /// Largest number of structures collected by one walk.
@@ -220,9 +220,9 @@ pub struct GuardSection {
     pub rollback: bool,
     /// Number of rejected configurations in a row after which a walk rolls back to a checkpoint.
     pub max_consecutive_rejections: NonZeroU32,
-    /// Number of returns to a checkpoint after which the walk ends.
+    /// Number of rollbacks after which the walk ends.
     pub max_rollbacks: u32,
-    /// Factor on τ at each return to a checkpoint.
+    /// Factor on τ at each rollback.
     pub tau_factor: Fraction,
     /// Number of steps between checkpoints.
     pub checkpoint_interval: NonZeroU64,

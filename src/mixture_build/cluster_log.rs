@@ -89,7 +89,7 @@ impl KnownShards {
     pub fn read(&self, index: u64, hash: ShardHash) -> Result<Option<Vec<ShardClusters>>, CommandError> {
         let Some(&(number, position)) = self.places.get(&(index, hash)) else { return Ok(None) };
         let log = &self.logs[number];
-        let damaged = || unreadable(&log.path, "the file is damaged; begin anew with --restart");
+        let damaged = || unreadable(&log.path, "the file is damaged; start over with --restart");
         let mut header = [0; HEADER];
         log.file.read_exact_at(&mut header, position).map_err(|error| unreadable(&log.path, error))?;
         let (size, .., checksum) = fields(&header);

@@ -86,7 +86,7 @@ impl Clustered {
             let found = known.read(index, hash)?.ok_or_else(|| {
                 let path = known.path().display();
                 CommandError::Failed(format!(
-                    "{path}: the clusters of shard {index} are missing; remove the directory and begin anew"
+                    "{path}: the clusters of shard {index} are missing; remove the directory and start over"
                 ))
             })?;
             for (partitioner, of_element) in partitioners.iter_mut().zip(&found) {

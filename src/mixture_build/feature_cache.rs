@@ -127,7 +127,7 @@ pub struct FeatureReader {
 }
 
 impl FeatureReader {
-    /// The next so many numbers. `None` if the file cannot be read.
+    /// The next `count` numbers. `None` if the file cannot be read.
     pub fn next(&mut self, count: usize) -> Option<&[f64]> {
         self.bytes.resize(count * size_of::<f64>(), 0);
         self.file.read_exact(&mut self.bytes).ok()?;

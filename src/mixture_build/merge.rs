@@ -92,7 +92,7 @@ impl PartsMerge {
             if structures.is_some_and(|before| before != *found) {
                 return Err(CommandError::Failed(format!(
                     "part {part} of pass 1 found {found} structures in the data files, part 1 found {}: the files have changed; \
-                     remove {} and begin anew",
+                     remove {} and start over",
                     structures.unwrap_or_default(),
                     self.state.directory().display()
                 )));

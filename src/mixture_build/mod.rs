@@ -45,7 +45,7 @@ pub struct MixtureBuild {
 }
 
 impl MixtureBuild {
-    /// Begins a build, or continues the one whose state lies beside `output`. Of a part of the work, other parts may be under way.
+    /// Begins a build, or continues the one whose state is beside `output`. Of a part of the work, other parts may be under way.
     ///
     /// `model_hash` is the BLAKE3 hash of the model's file, `projection` that of its features.
     ///

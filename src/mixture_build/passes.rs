@@ -184,7 +184,7 @@ fn add<P>(
         }
         if element.pass.is_none() {
             let message =
-                "pass 1 found no atom of its element; did the file change? Begin anew with --restart";
+                "pass 1 found no atom of its element; did the file change? Start over with --restart";
             return Err(structure.position.wrong(format_args!("atom {atom}: {message}")));
         }
         element.features.extend_from_slice(row);

@@ -112,7 +112,7 @@ impl BuildState {
             if state.names()?.iter().any(|name| is_result(name)) {
                 return Err(unreadable(
                     &state.directory,
-                    format_args!("it has results but no {IDENTITY}; remove it and begin anew"),
+                    format_args!("it has results but no {IDENTITY}; remove it and start over"),
                 ));
             }
             // Parts that begin together write the same.
@@ -319,7 +319,7 @@ impl BuildState {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(unreadable(&path, error)),
         };
-        let damaged = || unreadable(&path, "the file is damaged; begin anew with --restart");
+        let damaged = || unreadable(&path, "the file is damaged; start over with --restart");
         let (checksum, content) = bytes.split_at_checked(blake3::OUT_LEN).ok_or_else(damaged)?;
         if blake3::hash(content).as_bytes() != checksum {
             return Err(damaged());
@@ -330,7 +330,7 @@ impl BuildState {
     /// The failure to continue the state of another build.
     pub fn other_build(&self, difference: &str) -> CommandError {
         CommandError::Input(format!(
-            "{} has the state of another build: {difference}; repeat the command that began it, or begin anew with --restart",
+            "{} has the state of another build: {difference}; repeat the command that began it, or start over with --restart",
             self.directory.display()
         ))
     }

@@ -115,7 +115,7 @@ impl MixtureBuild {
         let Some(structures) = ended? else { return Ok(None) };
         if structures != partition.structures {
             return Err(CommandError::Input(format!(
-                "the data files have {} now, pass 1 found {}; begin anew with --restart",
+                "the data files have {} now, pass 1 found {}; start over with --restart",
                 output::count(structures, "structure"),
                 partition.structures
             )));
@@ -154,7 +154,7 @@ pub(super) fn histograms_from_sums(
 fn changed_since_pass_1(shard: &Shard) -> CommandError {
     let place = shard.structures.first().map_or(String::new(), |first| format!(" (from {})", first.position));
     CommandError::Input(format!(
-        "the structures of shard {}{place} have changed since pass 1; restore the files, or begin anew with --restart",
+        "the structures of shard {}{place} have changed since pass 1; restore the files, or start over with --restart",
         shard.index
     ))
 }

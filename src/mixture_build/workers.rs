@@ -202,7 +202,7 @@ impl<F, B> Shared<'_, F, B> {
             if source.finish() {
                 return found;
             }
-            // What damaged features lead to, be it an error, does not count.
+            // Results and errors from damaged features do not count.
             if context.stop.is_cancelled() {
                 return Ok(None);
             }

@@ -105,7 +105,7 @@ pub fn write_files(directory: &Path, files: &[PageFile]) -> Result<(), CommandEr
 /// Creates the directory of a page.
 pub fn create_directory(directory: &Path) -> Result<(), CommandError> {
     if directory.exists() && !directory.is_dir() {
-        return Err(CommandError::Input(format!("{} is no directory", directory.display())));
+        return Err(CommandError::Input(format!("{} is not a directory", directory.display())));
     }
     fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))
 }

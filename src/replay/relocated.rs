@@ -16,13 +16,13 @@ const TRAINING_FRAMES: &str = "calm.training_frames";
 /// Files that are not where the campaign last found them.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct RelocatedFilesArgs {
-    /// Path of the model file, if it is no longer where the last run found it
+    /// Path of the model file, if it has moved since the last run
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// Path of the artifact, likewise
+    /// Path of the artifact, if it has moved
     #[arg(long, value_name = "FILE")]
     artifact: Option<PathBuf>,
-    /// Path of the training frames, likewise; only a replay reads them
+    /// Path of the training frames, if they have moved; only a replay reads them
     #[arg(long, value_name = "FILE")]
     training_frames: Option<PathBuf>,
 }

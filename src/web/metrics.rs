@@ -109,7 +109,7 @@ fn walks(text: &mut MetricsText, status: &CampaignStatus) {
     if let Some(busy) = status.walkers_busy {
         text.gauge(
             "calmwalk_walkers_busy_ratio",
-            "Average share of the walkers that have a walk in hand.",
+            "Average share of the walkers that are busy.",
             &[(&[], busy)],
         );
     }

@@ -38,7 +38,7 @@ pub fn table(check: &ReferenceCheck) -> String {
     String::from_utf8_lossy(&text).into_owned()
 }
 
-/// How a check stands, in one word.
+/// The state of a check, in one word.
 pub fn state(check: &ReferenceCheck) -> &'static str {
     match check.state {
         CheckState::Running => "running",
@@ -48,7 +48,7 @@ pub fn state(check: &ReferenceCheck) -> &'static str {
     }
 }
 
-/// How a check stands, with the largest differences.
+/// The state of a check, with the largest differences.
 pub fn summary(check: &ReferenceCheck) -> String {
     let part = |what: &str, overall: Option<Overall>, unit: &str| {
         overall.map(|overall| format!("{what} {:.4} {unit}", overall.largest))

@@ -170,7 +170,7 @@ mod tests {
         let record = own(ProcessRecord::LABELLER);
         assert!(!record.is_dead());
         let elsewhere = ProcessRecord { pid: u32::MAX, ..elsewhere(&record) };
-        assert!(!elsewhere.is_local() && !elsewhere.is_dead(), "nobody can know from here");
+        assert!(!elsewhere.is_local() && !elsewhere.is_dead(), "unknown on another host");
         let renamed = ProcessRecord { host: "another name".into(), ..record.clone() };
         assert!(renamed.is_local() && !renamed.is_dead());
         assert!(ProcessRecord { pid: u32::MAX, ..renamed.clone() }.is_dead());

@@ -259,7 +259,7 @@ async fn a_lower_result_supersedes_the_label_when_it_arrives() {
     let logged = operations(&store).await;
     assert_eq!(logged.iter().map(|detail| &detail["by"]).collect::<Vec<_>>(), ["label.on_lower_state"; 2]);
     assert_eq!(logged[1]["label"]["source"], "x, frame 0");
-    assert_eq!(store.manual_operations(1).await.unwrap(), [], "nobody did it by hand");
+    assert_eq!(store.manual_operations(1).await.unwrap(), [], "it is not a manual operation");
     whole(&store).await;
 }
 

@@ -467,7 +467,7 @@ async fn the_cost_of_a_calculation_is_counted_once() {
     store.record_calculation(&first, "here", &made).await.unwrap();
     assert_eq!(core_seconds(3000).await, 12.0, "under way, on four cores");
     assert_eq!(store.release_all("a", 3000).await.unwrap(), 1);
-    assert_eq!(core_seconds(3000).await, 12.0, "nobody knows more");
+    assert_eq!(core_seconds(3000).await, 12.0, "the cost since then is unknown");
     let second = lease(&store, "b", 3000).await.unwrap();
     assert_eq!((second.earlier_calculations.as_slice(), second.attempt), (&["here".to_owned()][..], 2));
     store.record_calculation(&second, "here", &made).await.unwrap();

@@ -335,7 +335,7 @@ async fn a_stop_waits_for_the_current_label_while_heartbeats_continue() {
     gate.wait_for_labels(1).await;
     labeller.shutdown.stop.cancel();
     let own = async || store.processes(Some("labeller")).await.unwrap().remove(0);
-    until("nobody can see that it stops", async || own().await.state == "stopping").await;
+    until("its record says that it stops", async || own().await.state == "stopping").await;
     let first = own().await.last_seen;
     until("no sign of life comes", async || own().await.last_seen > first).await;
     assert!(!labeller.task.is_finished());

@@ -35,7 +35,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_state_that_nobody_knows_is_that_of_a_living_job() {
+    fn an_unknown_state_is_that_of_a_living_job() {
         let expected = [
             ("PENDING", JobPhase::Pending),
             ("REQUEUE_HOLD", JobPhase::Pending),

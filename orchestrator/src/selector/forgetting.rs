@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use super::error::SelectorError;
 use super::training_frames::TrainingFrames;
 
-/// Least number of sampled atoms of an element for which the share above 1 means something.
+/// Minimum number of sampled atoms of an element for which the share above 1 means something.
 const MIN_ATOMS: usize = 50;
 
 /// Compares the live mixture with the original one.

@@ -43,12 +43,12 @@ pub enum UpdateProtocol {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum OnForgetting {
-    /// The campaign says so and goes on.
+    /// Print a warning and continue.
     #[default]
     Warn,
-    /// The run stops in order, and goes on when the limit is raised.
+    /// Stop the run; resume after raising the limit.
     Pause,
-    /// Later updates are additive, and forget nothing more.
+    /// Make later updates additive, which forget nothing.
     Additive,
 }
 

@@ -93,7 +93,7 @@ impl fmt::Display for ExitReason {
             }
             Self::Unresponsive(silence) => write!(f, "silent for {} s, killed", silence.as_secs_f64()),
             Self::StopTimeout(grace) => {
-                write!(f, "still there {} s after it was told to end, killed", grace.as_secs_f64())
+                write!(f, "killed: still running {} s after SIGTERM", grace.as_secs_f64())
             }
             Self::StartFailed { reason, .. } => write!(f, "could not be started: {reason}"),
             Self::Unknown => f.write_str("ended, it is not known how"),

@@ -57,7 +57,7 @@ struct BaselineSettingsArgs {
     /// D-optimality: how much the score of a training atom may exceed 1
     #[arg(long, value_name = "X", default_value_t = BaselineSettings::default().tolerance)]
     tolerance: f64,
-    /// D-optimality: most sweeps over the data
+    /// D-optimality: maximum number of sweeps over the data
     #[arg(long, value_name = "N", default_value_t = BaselineSettings::default().max_sweeps)]
     max_sweeps: usize,
     /// D-optimality: how far training atoms must reach in a direction for it to count, relative to the largest norm of features

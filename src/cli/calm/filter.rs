@@ -16,8 +16,8 @@ const RESOLUTION: f64 = 300.0;
 /// Show what a threshold of the grade keeps of a table of structures, against random subsets
 ///
 /// For each threshold: the structures with at most this grade, their mean absolute error and, with --class-threshold, precision,
-/// recall and F1 of telling a class, such as the stable structures of Matbench Discovery. Beside each number: mean and standard
-/// deviation over random subsets of the same size, drawn without replacement. A grade that tells errors makes the kept structures
+/// recall and F1 of membership of a class, such as the stable structures of Matbench Discovery. Beside each number: mean and standard
+/// deviation over random subsets of the same size, drawn without replacement. A grade that predicts errors makes the kept structures
 /// better than these.
 ///
 /// The table is a CSV file (commas, titles in the first row) with one row for each structure. Errors have the unit of the table. True and

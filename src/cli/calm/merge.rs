@@ -16,7 +16,7 @@ use crate::output::print;
 /// Merge the parts of a pass of `calmwalk calm build --part`
 ///
 /// Run it when all parts of a pass are done: after pass 1 it finds the components, after pass 2 their covariances, and after pass 3
-/// it writes the artifact. The result is that of a build by one process, whatever the number of parts.
+/// it writes the artifact. The result does not depend on the number of parts.
 #[derive(Debug, clap::Args)]
 pub struct CalmMergeArgs {
     /// GRACE model (kokkos.npz) of the build

@@ -39,7 +39,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// Keeps all other data of the frame. Renames its energy, forces, stress and virial to REF_energy, REF_forces and so on, unless
 /// it already has reference labels; then it replaces the plain ones, which come from another model.
 ///
-/// If frames have labels, also prints the errors of the model, and how well γ and γ_nbr of an atom tell large force errors:
+/// If frames have labels, also prints the errors of the model, and how well γ and γ_nbr of an atom predict large force errors:
 /// Spearman's ρ, ROC-AUC, what γ ≤ 1 keeps, and quantiles by bins of γ, with intervals by bootstrap over structures.
 #[derive(Debug, clap::Args)]
 pub struct CalmScoreArgs {

@@ -59,7 +59,7 @@ pub struct CalmValidateArgs {
     /// with γ
     #[arg(long, value_name = "MODEL.npz")]
     ensemble: Vec<PathBuf>,
-    /// Structures with labels, extended XYZ. The page also shows how well γ, γ_nbr and the other scores of an atom tell large force
+    /// Structures with labels, extended XYZ. The page also shows how well γ, γ_nbr and the other scores of an atom predict large force
     /// errors
     #[arg(long, value_name = "LABELLED.extxyz")]
     labelled: Option<PathBuf>,

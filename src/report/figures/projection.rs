@@ -16,7 +16,7 @@ const CONTOUR_SHARE: f64 = 0.95;
 const GRID: usize = 128;
 /// Largest number of atoms drawn of each origin.
 const MAX_DRAWN: usize = 1500;
-/// Least number of atoms for a contour.
+/// Minimum number of atoms for a contour.
 const MIN_ATOMS: usize = 50;
 
 pub fn draw(collections: &Collections) -> Result<FigureContent, String> {

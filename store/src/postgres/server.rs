@@ -21,7 +21,7 @@ const IDLE_TIMEOUT: Duration = Duration::from_secs(60);
 /// How long to wait for an unreachable server, and for a connection, before an operation fails.
 const RECONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a run and every commit wait for a server that cannot be reached. A run has nothing else to do
-/// meanwhile; a run that gives up continues later from the same state, but somebody has to start it.
+/// meanwhile; a run that gives up continues later from the same state, but the user has to start it.
 pub const SERVER_RECONNECT_TIMEOUT: Duration = Duration::from_secs(3600);
 /// How long to probe the server for the reason of a missing connection.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(3);

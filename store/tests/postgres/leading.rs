@@ -47,7 +47,7 @@ async fn a_lock_whose_connection_broke_is_taken_again() {
     let store = home.create().await.fenced_by(&lock);
     break_the_lock(&home).await;
     let lost = tokio::time::timeout(Duration::from_secs(4), lock.lost()).await;
-    assert!(lost.is_err(), "nobody else took it: {lost:?}");
+    assert!(lost.is_err(), "no other process took it: {lost:?}");
     let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
     assert!(matches!(error, StoreError::Locked { .. }), "{error}");
     assert_eq!(accept(&store, 1).await.len(), 1);

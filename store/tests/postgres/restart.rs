@@ -96,7 +96,7 @@ async fn nothing_is_lost_or_duplicated_when_the_server_restarts() {
     for _ in 0..RESTARTS {
         let before = committed.load(Ordering::Relaxed);
         while committed.load(Ordering::Relaxed) < before + 5 {
-            assert!(!committing.is_finished(), "it commits until it is told that it is done");
+            assert!(!committing.is_finished(), "it commits until the server confirms it");
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
         tokio::task::spawn_blocking(restart).await.unwrap();

@@ -159,7 +159,7 @@ mod tests {
         metrics.record_progress(WALK, &at(1, 901));
         assert_eq!((metrics.steps, metrics.assignments_received, metrics.mixture_version), (51, 3, Some(7)));
         metrics.record_progress(WalkId(4), &at(0, 7));
-        assert_eq!(metrics.steps, 51, "nobody works on that walk here");
+        assert_eq!(metrics.steps, 51, "no walker here has that walk");
     }
 
     #[test]

@@ -172,7 +172,7 @@ impl CodeMethod {
         let handle = self.start(self.prepare_directory(&directory, prepared, &[]).await?).await?;
         let never = CancellationToken::new();
         let attempt = self.outcome(structure.clone(), handle, prepared.time_limit, &never).await?;
-        Ok(attempt.expect("nobody asks to stop"))
+        Ok(attempt.expect("no stop is requested"))
     }
 
     /// Everything that is needed before anything is started.

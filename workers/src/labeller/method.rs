@@ -147,7 +147,7 @@ pub(super) async fn evaluate(
     method: Arc<Mutex<ReferenceMethod>>,
     structure: Structure,
 ) -> Result<CalculationResults, Failure> {
-    // One that panicked has taken everybody with it who could see it.
+    // A panic has ended every labeller that shares the lock.
     let label = move || method.lock().unwrap_or_else(PoisonError::into_inner).label(&structure);
     spawn_blocking(label).await.unwrap_or_else(|crash| panic::resume_unwind(crash.into_panic()))
 }

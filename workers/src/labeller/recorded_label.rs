@@ -32,7 +32,7 @@ pub struct RecordedLabel<'a> {
     pub attempts: u32,
 }
 
-/// Ends the calculations of labels whose keys begin with `prefix` and are not among `keys`: nobody wants them any more. What
+/// Ends the calculations of labels whose keys begin with `prefix` and are not among `keys`: their results are no longer needed. What
 /// cannot be ended now is tried again by the next call.
 ///
 /// # Errors

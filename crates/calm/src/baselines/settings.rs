@@ -104,7 +104,7 @@ impl FromStr for BaselineKind {
 pub struct BaselineSettings {
     /// D-optimality: the largest |coefficient| of a training atom may exceed 1 by this.
     pub tolerance: f64,
-    /// D-optimality: most sweeps over the data.
+    /// D-optimality: maximum number of sweeps over the data.
     pub max_sweeps: usize,
     /// D-optimality: a direction counts as present if a training atom reaches further along it than this times the
     /// largest norm of all (centred) features.

@@ -51,7 +51,7 @@ pub struct AbinitSettings {
     pub environment: BTreeMap<String, String>,
     /// Directory of the pseudopotentials, `Si.psp8` or `Si.xml`.
     pub pseudopotentials: PathBuf,
-    /// File names that differ from that pattern: `{ Zn = "Zn-sp.psp8" }`.
+    /// File names other than `Si.psp8` and `Si.xml`: `{ Zn = "Zn-sp.psp8" }`.
     pub pseudopotential_variants: BTreeMap<Species, String>,
     /// Plane-wave cutoff, eV.
     #[schemars(extend("exclusiveMinimum" = 0))]
