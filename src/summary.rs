@@ -103,7 +103,7 @@ impl fmt::Display for Summary {
         if let Some(line) = energies::errors(&energy) {
             writeln!(f, "energy error of the potential: {line}")?;
         }
-        writeln!(f, "{}", energy.offsets.note)
+        writeln!(f, "{}", energies::offsets(&energy.offsets))
     }
 }
 

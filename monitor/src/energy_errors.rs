@@ -27,8 +27,9 @@ pub struct OffsetSummary {
     pub left_out: usize,
     /// The offset of each element. Empty without a fit.
     pub elements: Vec<OffsetEntry>,
-    /// Summary as text, or why there is no fit.
-    pub note: String,
+    /// Why there is no fit. `None` with a fit.
+    #[serde(skip)]
+    pub too_few: Option<TooFewLabels>,
 }
 
 /// The offset of an element.
@@ -88,9 +89,12 @@ impl ProtocolEnergyOffsets {
 
     /// The fit for display and JSON.
     pub fn summary(&self) -> OffsetSummary {
-        let note = self.note();
-        let Ok(fit) = &self.0 else {
-            return OffsetSummary { structures: 0, left_out: 0, elements: Vec::new(), note };
+        let fit = match &self.0 {
+            Ok(fit) => fit,
+            Err(too_few) => {
+                let too_few = Some(*too_few);
+                return OffsetSummary { structures: 0, left_out: 0, elements: Vec::new(), too_few };
+            }
         };
         let elements = fit.elements().map(|found| OffsetEntry {
             element: Species::from_atomic_number(found.element).map_or("?", Species::symbol),
@@ -101,47 +105,8 @@ impl ProtocolEnergyOffsets {
             structures: fit.structures(),
             left_out: fit.left_out(),
             elements: elements.collect(),
-            note,
+            too_few: None,
         }
-    }
-
-    fn note(&self) -> String {
-        let fit = match &self.0 {
-            Ok(fit) => fit,
-            Err(TooFewLabels { structures, needed }) => {
-                return format!(
-                    "no energy errors: fitting the element offsets between labels and the potential takes at least {needed} \
-                     labelled structures; there {}",
-                    match structures {
-                        1 => "is 1".to_owned(),
-                        n => format!("are {n}"),
-                    }
-                );
-            }
-        };
-        let elements: Vec<_> = fit.elements().collect();
-        let symbol = |element: u8| Species::from_atomic_number(element).map_or("?", Species::symbol);
-        let offset =
-            |found: &analysis::ElementOffset| format!("{} {:.4}", symbol(found.element), found.offset);
-        let offsets: Vec<_> = elements.iter().map(offset).collect();
-        let mut note = format!(
-            "energy errors exclude the element offsets (eV/atom, E_label − E_model): {}; least squares over {} labelled \
-             structures",
-            offsets.join(", "),
-            fit.structures()
-        );
-        if fit.left_out() > 0 {
-            note += &format!(", without {} outliers", fit.left_out());
-        }
-        let together: Vec<_> = elements.iter().filter(|found| !found.is_separate).collect();
-        if !together.is_empty() {
-            let symbols: Vec<_> = together.iter().map(|found| symbol(found.element)).collect();
-            note += &format!(
-                "; the labelled compositions do not determine the offsets of {} separately, only sums",
-                symbols.join(", ")
-            );
-        }
-        note
     }
 }
 

@@ -55,7 +55,7 @@ impl Snapshot {
         })
     }
 
-    /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
+    /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system and without sentences.
     pub fn to_json(&self) -> serde_json::Result<Value> {
         let Self { campaign, origin, status, mixture, disk, labels, end, check } = self;
         let mut json = serde_json::to_value(status)?;

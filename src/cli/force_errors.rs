@@ -36,7 +36,7 @@ impl ForceErrorsArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let (protocol, statistics) = block_on(self.read())??;
         if self.json {
-            print_json(&statistics.to_json(&protocol))?;
+            print_json(&wording::json::force_errors(&statistics, &protocol))?;
         } else {
             print(|out| write(out, &protocol, &statistics))?;
         }
@@ -132,7 +132,7 @@ fn write_energies(out: &mut dyn Write, statistics: &LabelStatistics) -> io::Resu
     if let Some(line) = wording::energies::errors(&energies) {
         writeln!(out, "energy error |E_model − E_label|: {line}")?;
     }
-    writeln!(out, "{}", energies.offsets.note)
+    writeln!(out, "{}", wording::energies::offsets(&energies.offsets))
 }
 
 fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<()> {

@@ -26,7 +26,7 @@ use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, decimals, print, print_json};
 use crate::wording::cost::two_digits;
 use crate::wording::disk::megabytes;
-use crate::wording::{budget, reference_check, walk_ends};
+use crate::wording::{self, budget, reference_check, walk_ends};
 
 /// Show the progress of a campaign
 ///
@@ -54,7 +54,7 @@ impl StatusArgs {
         let snapshot = block_on(read(&location))??;
         let jobs = block_on(BatchJobs::query(&location))?;
         if self.json {
-            let mut json = snapshot.to_json().map_err(CommandError::failed)?;
+            let mut json = wording::json::snapshot(&snapshot).map_err(CommandError::failed)?;
             jobs.add_to(&mut json);
             print_json(&json)?;
         } else {
@@ -145,7 +145,7 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> 
 /// The check of the reference with its differences.
 fn write_check(out: &mut dyn Write, page: &StatusLayout, check: &ReferenceCheck) -> io::Result<()> {
     page.titled(out, "check", &format!("reference {}", reference_check::summary(check)))?;
-    check.faults().try_for_each(|fault| page.titled(out, "", &fault))?;
+    reference_check::faults(check).try_for_each(|fault| page.titled(out, "", &fault))?;
     reference_check::table(check).lines().try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
 }
 

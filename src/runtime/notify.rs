@@ -20,6 +20,7 @@ use crate::exit_status::CommandError;
 use crate::forgetting::{ForgettingMeasurement, ForgettingRule};
 use crate::notify::{METADATA_KEY, Notification, NotificationTracker};
 use crate::output::log_and_warn;
+use crate::wording;
 
 /// Longest interval between checks.
 const MAX_CHECK_INTERVAL: Duration = Duration::from_secs(15);
@@ -90,7 +91,7 @@ impl<'a> Notifier<'a> {
         let sent = serde_json::to_string(self.tracker.sent()).map_err(CommandError::failed)?;
         self.store.set_metadata(METADATA_KEY, &sent).await?;
         let snapshot = Snapshot::read(self.store).await?;
-        let state = snapshot.to_json().map_err(CommandError::failed)?;
+        let state = wording::json::snapshot(&snapshot).map_err(CommandError::failed)?;
         due.into_iter().for_each(|due| self.notify(due, &state));
         Ok(())
     }

@@ -86,7 +86,7 @@ async fn judge(
     print_stderr(wording::reference_check::table(&check).trim_end());
     write(store, &check).await?;
     let overall = json!({ "energy": check.energy(), "force": check.force(), "stress": check.stress() });
-    let faults: Vec<_> = check.faults().collect();
+    let faults: Vec<_> = wording::reference_check::faults(&check).collect();
     let detail = json!({
         "state": check.state, "protocol": check.protocol, "structures": check.structures, "overall": overall,
         "faults": faults,

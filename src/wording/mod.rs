@@ -6,6 +6,7 @@ pub mod disk;
 pub mod energies;
 #[cfg(test)]
 mod glossary;
+pub mod json;
 pub mod labels;
 pub mod reference_check;
 pub mod unlabelled;

@@ -1,6 +1,8 @@
 //! The check of the reference in words.
 
-use monitor::reference_check::{CheckState, DifferenceBounds, FrameDifference, Overall, ReferenceCheck};
+use monitor::reference_check::{
+    CheckFault, CheckState, CheckedQuantity, DifferenceBounds, FrameDifference, Overall, ReferenceCheck,
+};
 
 use crate::output::{TextTable, count, decimals};
 
@@ -73,6 +75,27 @@ pub fn summary(check: &ReferenceCheck) -> String {
     format!("{}, {structures}{differences}{failed}{unjudged}", state(check))
 }
 
+/// A sentence for each fault.
+pub fn faults(check: &ReferenceCheck) -> impl Iterator<Item = String> {
+    check.faults().map(sentence)
+}
+
+fn sentence(fault: CheckFault<'_>) -> String {
+    match fault {
+        CheckFault::NoLabel { frame, reason } => format!("{}: no label: {reason}", frame.frame),
+        CheckFault::AboveBound { frame: FrameDifference { frame, formula, .. }, quantity, found, bound } => {
+            let (what, key, unit) = match quantity {
+                CheckedQuantity::Energy => ("the energy", "max_energy_difference", "eV/atom"),
+                CheckedQuantity::Force => ("a force", "max_force_difference", "eV/Å"),
+                CheckedQuantity::Stress => ("the stress", "max_stress_difference", "eV/Å³"),
+            };
+            format!(
+                "{frame} ({formula}): {what} differs by {found:.4} {unit}, more than label.reference_check.{key} = {bound} {unit}"
+            )
+        }
+    }
+}
+
 #[cfg(test)]
 pub mod tests {
     use super::*;
@@ -111,6 +134,20 @@ pub mod tests {
         assert_eq!(cells(1)[1..], ["Al32", "0.0040", "0.2000", "0.00400"]);
         assert_eq!(cells(3)[1..], ["Al32", "–", "–", "–", "crashed:", "exit", "code", "1"]);
         assert_eq!(cells(6), ["bound", "0.005", "0.05", "0.005"]);
+    }
+
+    #[test]
+    fn each_fault_names_its_frame_and_the_key_of_its_bound() {
+        let mut check = example();
+        check.frames.iter_mut().for_each(|frame| frame.frame = "known.extxyz:1".to_owned());
+        check.frames[1].energy = Some(-0.02);
+        let expected = [
+            "known.extxyz:1 (Al32): a force differs by 0.2000 eV/Å, more than label.reference_check.max_force_difference = 0.05 eV/Å",
+            "known.extxyz:1 (Al32): the energy differs by -0.0200 eV/atom, more than label.reference_check.max_energy_difference = \
+             0.005 eV/atom",
+            "known.extxyz:1: no label: crashed: exit code 1",
+        ];
+        assert_eq!(faults(&check).collect::<Vec<_>>(), expected);
     }
 
     #[test]

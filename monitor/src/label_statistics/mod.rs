@@ -96,7 +96,7 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
 }
 
 impl LabelStatistics {
-    /// The JSON of `calmwalk force-errors`, for labels of this protocol.
+    /// The JSON of `calmwalk force-errors`, for labels of this protocol, without sentences.
     pub fn to_json(&self, protocol: &Protocol) -> Value {
         json::to_json(protocol, self)
     }

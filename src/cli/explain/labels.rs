@@ -125,7 +125,7 @@ fn write_label(out: &mut dyn Write, label: &CandidateLabel, atoms: usize) -> io:
         None if model.energy_offsets.structures == 0 => {}
         None => line(out, "", "E_model − E_label: not shown, too few labels for this composition")?,
     }
-    line(out, "", &model.energy_offsets.note)
+    line(out, "", &wording::energies::offsets(&model.energy_offsets))
 }
 
 /// The time since then.

@@ -13,6 +13,7 @@ use store::{Location, Store};
 
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, decimals, print, print_json};
+use crate::wording;
 
 /// Indent of lines without a title.
 const INDENT: &str = "             ";
@@ -41,7 +42,7 @@ impl ExplainArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let details = block_on(read(self.location.get()?, &self.id))??;
         if self.json {
-            print_json(&details)?
+            print_json(&wording::json::candidate(&details).map_err(CommandError::failed)?)?
         } else {
             print(|out| write(out, &details))?
         }

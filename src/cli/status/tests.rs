@@ -221,7 +221,7 @@ fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
 fn every_key_is_documented_and_every_documented_key_is_there() {
     let mut found = BTreeSet::new();
     for jobs in [BatchJobs::Known(vec![job()]), BatchJobs::Unknown("no answer".into())] {
-        let mut json = large().to_json().unwrap();
+        let mut json = crate::wording::json::snapshot(&large()).unwrap();
         jobs.add_to(&mut json);
         assert_eq!(json["version"], FORMAT);
         keys(&json, "", &mut found);

@@ -54,7 +54,8 @@ pub fn summary(data: &ReportData) -> PageTable {
         let energies = found.statistics.energies.summary();
         row(
             "energy error",
-            wording::energies::errors(&energies).unwrap_or_else(|| energies.offsets.note.clone()),
+            wording::energies::errors(&energies)
+                .unwrap_or_else(|| wording::energies::offsets(&energies.offsets)),
         );
     }
     row("imported structures", grouped(status.imported));

@@ -13,6 +13,7 @@ use wire::ContentHash;
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult, json};
+use crate::wording;
 
 /// A structure with its candidate.
 struct StructureRecord {
@@ -26,7 +27,9 @@ struct StructureRecord {
 
 /// `GET /api/candidates/ID`: what `calmwalk explain ID --json` prints.
 pub async fn details(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> ApiResult {
-    json(&candidate_details::read(&dashboard.store, &id).await?)
+    let details = candidate_details::read(&dashboard.store, &id).await?;
+    let details = wording::json::candidate(&details);
+    json(&details.map_err(|error| ApiError::new(StatusCode::INTERNAL_SERVER_ERROR, error))?)
 }
 
 /// `GET /api/candidates/ID/structure`: species, positions and cell (Å).

@@ -7,6 +7,7 @@ use store::Store;
 
 use super::Dashboard;
 use super::response::{ApiError, ApiResult};
+use crate::wording;
 
 /// `GET /api/errors`: what `calmwalk force-errors --json` prints.
 pub async fn force_errors(State(dashboard): State<Dashboard>) -> ApiResult {
@@ -17,5 +18,6 @@ async fn compute(store: Store) -> Result<String, ApiError> {
     let none =
         || ApiError::new(StatusCode::NOT_FOUND, "the campaign has no label protocol, and so no labels");
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
-    Ok(label_statistics::read(&store, protocol.hash).await?.to_json(&protocol).to_string())
+    let statistics = label_statistics::read(&store, protocol.hash).await?;
+    Ok(wording::json::force_errors(&statistics, &protocol).to_string())
 }

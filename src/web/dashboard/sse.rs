@@ -16,6 +16,7 @@ use tokio::task::JoinHandle;
 use super::Dashboard;
 use super::response::{self, ApiResult};
 use super::time_series::{TimeSeries, TimeSeriesPoint};
+use crate::wording;
 
 /// Shortest interval between polls while a client listens.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
@@ -61,7 +62,7 @@ async fn poll(store: Store, publish: watch::Sender<Option<Arc<str>>>, samples: A
         let text = match Snapshot::read(&store).await {
             Ok(snapshot) => {
                 let sample = TimeSeriesPoint::new(&snapshot.status, unix_milliseconds());
-                let status = snapshot.to_json().unwrap_or_default();
+                let status = wording::json::snapshot(&snapshot).unwrap_or_default();
                 let text = json!({ "status": status, "sample": sample }).to_string();
                 samples.lock().unwrap_or_else(PoisonError::into_inner).add(sample);
                 text

@@ -1,0 +1,37 @@
+//! The JSON of `monitor`, with the sentences that its documents describe.
+
+use monitor::Snapshot;
+use monitor::candidate_details::CandidateDetails;
+use monitor::label_statistics::LabelStatistics;
+use serde_json::Value;
+use store::Protocol;
+
+use super::{energies, reference_check};
+
+/// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
+pub fn snapshot(snapshot: &Snapshot) -> serde_json::Result<Value> {
+    let mut json = snapshot.to_json()?;
+    if let Some(check) = &snapshot.check {
+        json["reference_check"]["faults"] = reference_check::faults(check).collect();
+    }
+    Ok(json)
+}
+
+/// The JSON of `calmwalk force-errors`, for labels of this protocol.
+pub fn force_errors(statistics: &LabelStatistics, protocol: &Protocol) -> Value {
+    let mut json = statistics.to_json(protocol);
+    json["energy"]["offsets"]["note"] = energies::offsets(&statistics.energies.summary().offsets).into();
+    json
+}
+
+/// The JSON of `calmwalk explain` (docs/explain.md).
+pub fn candidate(details: &CandidateDetails) -> serde_json::Result<Value> {
+    let mut json = serde_json::to_value(details)?;
+    for (number, label) in details.labels.iter().enumerate() {
+        if let Some(model) = &label.model {
+            let note = energies::offsets(&model.energy_offsets);
+            json["labels"][number]["model"]["energy_offsets"]["note"] = note.into();
+        }
+    }
+    Ok(json)
+}
