@@ -47,7 +47,7 @@ const HOUSE: [(&str, &str, &[&str]); 15] = [
 ];
 
 /// Files of `workers` that may use the store: a walker never opens the database.
-const USERS_OF_THE_STORE: [&str; 3] = ["labeller", "refitter", "lib.rs"];
+const USERS_OF_THE_STORE: [&str; 2] = ["labeller", "lib.rs"];
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -154,7 +154,7 @@ fn packages_do_not_depend_indirectly_on_forbidden_ones() {
     }
 }
 
-/// In `workers`, only labeller and refitter use the store.
+/// In `workers`, only the labeller uses the store.
 #[test]
 fn walkers_do_not_open_the_store() {
     let mut open = vec![root().join("workers/src")];

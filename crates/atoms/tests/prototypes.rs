@@ -6,6 +6,8 @@ use atoms::{Bond, NeighbourList, Species, Structure, shortest_distance};
 
 const CUBIC: [(Prototype, usize); 4] =
     [(Prototype::Fcc, 12), (Prototype::Bcc, 8), (Prototype::Diamond, 4), (Prototype::SimpleCubic, 6)];
+/// The hexagonal close packing of spheres.
+const IDEAL_HCP: Prototype = Prototype::Hcp { c_over_a: 1.632_993_161_855_452 };
 
 fn aluminium() -> Species {
     "Al".parse().unwrap()
@@ -31,7 +33,7 @@ fn shortest(structure: &Structure) -> f64 {
 
 #[test]
 fn crystals_have_their_coordination() {
-    for (prototype, expected) in CUBIC.into_iter().chain([(Prototype::IDEAL_HCP, 12)]) {
+    for (prototype, expected) in CUBIC.into_iter().chain([(IDEAL_HCP, 12)]) {
         let crystal = prototype.structure(aluminium(), 2.86);
         assert!(coordination(&crystal, 2.86).iter().all(|found| *found == expected), "{prototype}");
         assert!((shortest(&crystal) - 2.86).abs() < 1e-12, "{prototype}");
@@ -62,7 +64,7 @@ fn a_vacancy_lowers_the_coordination_of_its_neighbours() {
         (Prototype::Fcc, 108, 12),
         (Prototype::Bcc, 128, 8),
         (Prototype::Diamond, 216, 4),
-        (Prototype::IDEAL_HCP, 150, 12),
+        (IDEAL_HCP, 150, 12),
     ] {
         let found = vacancy(prototype, aluminium(), 2.7);
         assert_eq!(found.structure.len(), sites - 1);
@@ -91,7 +93,7 @@ fn slabs_have_their_facets() {
         (Diamond, F100, 9, 2, 4),
         (Diamond, F110, 11, 3, 4),
         (SimpleCubic, F100, 9, 5, 6),
-        (Prototype::IDEAL_HCP, Basal, 9, 9, 12),
+        (IDEAL_HCP, Basal, 9, 9, 12),
     ] {
         let found = slab(prototype, aluminium(), 2.8, facet);
         let (structure, name) = (&found.structure, format!("{prototype} {}", facet.name()));

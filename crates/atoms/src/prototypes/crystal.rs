@@ -24,9 +24,6 @@ pub enum Prototype {
 }
 
 impl Prototype {
-    /// The hexagonal close packing of spheres.
-    pub const IDEAL_HCP: Self = Self::Hcp { c_over_a: 1.632_993_161_855_452 };
-
     /// Whether all axes are equivalent.
     pub fn is_cubic(self) -> bool {
         !matches!(self, Self::Hcp { .. })

@@ -53,11 +53,6 @@ impl FeatureRows {
         self.rows == 0
     }
 
-    /// Bytes in the temporary file.
-    pub fn file_bytes(&self) -> u64 {
-        self.written + self.buffer.len() as u64
-    }
-
     /// Adds a row, `[D]`.
     ///
     /// # Errors
@@ -125,7 +120,7 @@ mod tests {
         for k in 0..100 {
             rows.push(&row(k)).unwrap();
         }
-        assert_eq!((rows.len(), rows.file_bytes()), (100, 96 * 24_000));
+        assert_eq!((rows.len(), rows.written + rows.buffer.len() as u64), (100, 96 * 24_000));
         assert!(rows.written > 0 && !rows.buffer.is_empty());
         for range in [0..1, 3..5, 4..6, 0..100, 40..60, 90..100, 99..100, 7..7, 100..100] {
             let mut found = Vec::new();
