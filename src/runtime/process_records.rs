@@ -132,7 +132,7 @@ fn new_record(kind: &str, number: u32, pid: u32) -> ProcessRecord {
 /// The record of a process with its end.
 fn with_end(mut record: ProcessRecord, ended: &ChildExit) -> ProcessRecord {
     record.state = match ended.then {
-        ChildState::BackingOff { .. } => "backing off".to_owned(),
+        ChildState::BackingOff { .. } => "backing_off".to_owned(),
         then => then.to_string(),
     };
     record.remark = ended.reason.to_string();

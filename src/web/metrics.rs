@@ -163,7 +163,7 @@ fn processes(text: &mut MetricsText, status: &CampaignStatus) {
     let mut kinds: BTreeMap<(&str, &str), u64> = BTreeMap::new();
     for process in &status.processes {
         // Other states contain free text.
-        let known = ["running", "stopping", "backing off", "unresponsive", "dead"];
+        let known = ["running", "stopping", "backing_off", "unresponsive", "dead"];
         let state = known.into_iter().find(|state| process.state == *state).unwrap_or("failed");
         *kinds.entry((&process.kind, state)).or_default() += 1;
     }

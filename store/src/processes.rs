@@ -34,7 +34,7 @@ pub struct ProcessRecord {
     pub started: i64,
     /// Last heartbeat, ms since 1970.
     pub last_seen: i64,
-    /// Its state (`running`, `stopping`, `backing off`, `failed` …), see [`crate::Store::status`].
+    /// Its state (`running`, `stopping`, `backing_off`, `failed` …), see [`crate::Store::status`].
     pub state: String,
     /// How often it was restarted in this run of the campaign.
     pub restarts: u32,

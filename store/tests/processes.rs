@@ -165,14 +165,14 @@ async fn status_shows_dead_and_failed_processes() {
     let processes = [
         said("a", 0, "running"),
         said("b", 1, "failed"),
-        said("c", 2, "backing off"),
+        said("c", 2, "backing_off"),
         living("o", "orchestrator", None),
     ];
     store.upsert_processes(&processes).await.unwrap();
     let states = async || -> Vec<String> {
         store.status().await.unwrap().processes.into_iter().map(|process| process.state).collect()
     };
-    assert_eq!(states().await, ["running", "dead", "failed", "backing off"]);
+    assert_eq!(states().await, ["running", "dead", "failed", "backing_off"]);
     // Without its orchestrator the third is not restarted.
     store.upsert_process(&gone("o", "orchestrator", None)).await.unwrap();
     assert_eq!(states().await, ["dead", "dead", "failed", "dead"]);

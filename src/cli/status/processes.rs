@@ -67,7 +67,7 @@ fn line(process: &ProcessRecord, now: i64) -> Vec<String> {
     vec![
         format!("{}{number}", process.kind),
         pid(process),
-        process.state.clone(),
+        process.state.replace('_', " "),
         process.restarts.to_string(),
         ago(process.silence.unwrap_or(now - process.last_seen)),
         first_line(&process.remark),
@@ -153,11 +153,12 @@ mod tests {
     fn processes_in_trouble_have_priority() {
         let mut processes = vec![process("orchestrator", None, "running")];
         processes.extend((0..100).map(|number| process("walker", number, "running")));
-        processes[90].state = "backing off".into();
+        processes[90].state = "backing_off".into();
         let short = text(&processes, false);
         assert!(
             short.contains("walker 89  ") && short.contains("walker 17 ") && !short.contains("walker 18 ")
         );
+        assert!(short.contains("backing off"), "{short}");
         assert!(short.starts_with("\nprocess") && short.contains("orchestrator"), "{short}");
         assert!(short.ends_with("… and 81 more processes (use --all)\n"), "{short}");
         assert_eq!(text(&processes, true).lines().count(), 103);

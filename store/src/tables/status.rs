@@ -43,7 +43,7 @@ pub(super) use walks;
 
 impl Store {
     /// A snapshot of the campaign's state. Processes are ordered by kind and number. A dead process has the state
-    /// `dead`, whatever state it reported last, unless it has `failed`, or is `backing off` and an orchestrator
+    /// `dead`, whatever state it reported last, unless it has `failed`, or is `backing_off` and an orchestrator
     /// lives. A process on another host without a heartbeat for a minute is `unresponsive`. A walk stopped by a time
     /// limit has the state `budget`. While no process leads the campaign, walks are shown at their checkpoints and
     /// have no speed.
@@ -191,7 +191,7 @@ fn with_visible_state(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
     let led = processes.iter().any(ProcessRecord::is_leading);
     for process in &mut processes {
         let state = process.state.as_str();
-        let stays = state.starts_with("failed") || (led && state.starts_with("backing off"));
+        let stays = state.starts_with("failed") || (led && state == "backing_off");
         if process.is_dead() && !stays {
             process.state = "dead".to_owned();
         } else if process.is_unresponsive() && matches!(state, "running" | "stopping") {
