@@ -70,7 +70,7 @@ fn check_grades(details: &Value, stored: &StoredCandidate) {
         assert_eq!(atom["gamma_selector"], stored.selector.gamma[k]);
         assert_eq!(atom["gamma_original"], stored.original.gamma[k]);
         assert_eq!(atom["gamma_nbr_original"], stored.original.gamma_nbr[k]);
-        let biased = details["kind"] == "biased";
+        let biased = details["origin"] == "biased";
         assert_eq!(atom["triggered"], biased && view.gamma[k] > 1.0);
     }
     assert_eq!(grades["walker"]["mixture_version"], view.mixture_version());
@@ -121,6 +121,7 @@ fn every_candidate_has_its_history() {
         if let Some(components) = decided["update"]["components"].as_array() {
             let symbols = vec![Value::from("Al"); components.len()];
             assert_eq!(decided["update"]["component_elements"], Value::from(symbols));
+            assert!(decided["update"]["covariance_update"].is_string(), "{decided}");
             let text = succeed(here, ["explain", "here", name]);
             assert!(text.contains("components changed: component 0 of Al"), "{text}");
         }
@@ -246,7 +247,7 @@ fn imported_structures_have_theirs_and_what_is_not_there_is_refused() {
     succeed(here, ["import", "here", "moved.extxyz"]);
     let details = explain(here, "import-1");
     assert_eq!(
-        (&details["kind"], &details["frame"], &details["decision"]),
+        (&details["origin"], &details["frame"], &details["decision"]),
         (&"imported".into(), &0.into(), &Value::Null)
     );
     assert_eq!(details["labels"][0]["energy"].as_f64(), frames[0].labels().unwrap().energy);

@@ -41,7 +41,7 @@ pub struct Update {
     /// The configured rule that chooses α.
     pub rule: Option<UpdateRule>,
     /// Convex or additive.
-    pub combination: Option<String>,
+    pub covariance_update: Option<String>,
     /// The recorded result.
     #[serde(flatten)]
     pub found: LoggedUpdate,
@@ -125,7 +125,7 @@ impl Update {
         let training_frames = detail.get("training_frames").cloned().map(serde_json::from_value);
         Ok(Some(Self {
             rule: serde_json::from_value(rules["collect"]["update_target"].clone()).ok(),
-            combination: rules["calm"]["covariance_update"].as_str().map(str::to_owned),
+            covariance_update: rules["calm"]["covariance_update"].as_str().map(str::to_owned),
             component_elements: found.components.iter().map(symbol).collect(),
             found,
             training_frames: training_frames.transpose().map_err(damaged)?,

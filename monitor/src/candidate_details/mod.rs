@@ -38,7 +38,7 @@ pub struct CandidateDetails {
     /// Name of the candidate, or `import-N`.
     pub id: String,
     /// `biased`, `control` or `imported`.
-    pub kind: &'static str,
+    pub origin: &'static str,
     /// Summary of the structure.
     pub structure: StructureSummary,
     /// Source file of an imported structure.
@@ -120,8 +120,8 @@ async fn read_candidate(store: &Store, named: CandidateRef) -> Result<CandidateD
     let rules = rules(store).await?;
     let view = stored.block.view();
     let (structure, content) = (view.structure(), view.id().content);
-    let kind = view.origin().name();
-    let mut details = CandidateDetails::new(store, &named.candidate, kind, &structure, content).await?;
+    let origin = view.origin().name();
+    let mut details = CandidateDetails::new(store, &named.candidate, origin, &structure, content).await?;
     details.same_structure.retain(|other| *other != named);
     details.found = Some(Discovery::read(store, &stored, &rules).await?);
     details.grades = Some(CandidateGrades::new(&stored, &rules, &logged));
@@ -136,7 +136,7 @@ impl CandidateDetails {
     async fn new(
         store: &Store,
         id: &str,
-        kind: &'static str,
+        origin: &'static str,
         structure: &Structure,
         content: ContentHash,
     ) -> Result<Self, StoreError> {
@@ -145,7 +145,7 @@ impl CandidateDetails {
             format: FORMAT,
             campaign: store.campaign().await?.id.to_string(),
             id: id.to_owned(),
-            kind,
+            origin,
             structure: StructureSummary::new(structure, content),
             file: None,
             frame: None,

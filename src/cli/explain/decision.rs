@@ -46,12 +46,12 @@ fn describe(reason: &str) -> &'static str {
 
 fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Result<()> {
     let found = &update.found;
-    let combination = update.combination.as_deref().unwrap_or_default();
+    let kind = update.covariance_update.as_deref().unwrap_or_default();
     let (rule, counted) = match update.rule {
         Some(rule) => (rule.condition(atoms), rule.goal(atoms).threshold),
         None => ("rule not recorded".to_owned(), f64::NAN),
     };
-    line(out, "update", &format!("{combination}, until {rule}"))?;
+    line(out, "update", &format!("{kind}, until {rule}"))?;
     let mut table = TextTable::new(&[">α", ">γ_max reached", &format!(">atoms γ > {counted}")]);
     for trial in &found.trials {
         table.push(vec![

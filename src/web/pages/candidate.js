@@ -36,12 +36,12 @@ export async function show(content, address, signal) {
   content.append(section("Not recorded", element("ul", {}, details.not_recorded.map((what) => element("li", {}, what)))));
 }
 
-function head({ id, kind, decision, jobs }) {
+function head({ id, origin, decision, jobs }) {
   const fate = decision && (decision.reason ?? decision.kind);
-  return element("p", { class: "head" }, state(kind), fate && fate !== kind && state(fate), jobs.map((job) => state(job.state)), element("code", {}, id));
+  return element("p", { class: "head" }, state(origin), fate && fate !== origin && state(fate), jobs.map((job) => state(job.state)), element("code", {}, id));
 }
 
-function about({ kind, structure, found, file, frame, same_structure: same, same_import: imported }) {
+function about({ structure, found, file, frame, same_structure: same, same_import: imported }) {
   const { atoms, formula, volume } = structure;
   const near = found?.distances;
   return facts([
@@ -88,7 +88,7 @@ function decided(decision) {
     ["decision", decision.reason ? `${decision.kind}: ${words(decision.reason)}` : decision.kind],
     ["threshold raised", decision.raised_by && `by a factor of ${digits(decision.raised_by)} to ${digits(decision.raised_threshold)}, because of a long label queue`],
     ["mixture afterwards", `version ${whole(decision.mixture_version)}`],
-    ["update", update && `${update.combination ?? ""} with α = ${digits(update.alpha)}; ${ENDS[update.ended_by]}`],
+    ["update", update && `${update.covariance_update ?? ""} with α = ${digits(update.alpha)}; ${ENDS[update.ended_by]}`],
     ["γ_max afterwards", update && decimals(update.gamma_max_after, 3)],
     ["components changed", update && update.components.map(([index, component], k) =>
       `${component} of ${update.component_elements[k] ?? `element ${index} of the model`}`).join(", ")],
