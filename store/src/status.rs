@@ -90,11 +90,11 @@ pub struct LabelJobCounts {
     /// Of an earlier protocol: a job of a later protocol replaces them.
     pub superseded: u64,
     /// Queued or leased jobs whose structure has a label, which stays until the new one arrives.
-    pub again: u64,
+    pub relabelling: u64,
     /// Labels that could not be made again: the existing labels stay.
-    pub again_in_vain: u64,
+    pub relabel_failed: u64,
     /// Of these, labels to be made under another protocol: their jobs count as failed.
-    pub failed_again: u64,
+    pub failed_under_new_protocol: u64,
     /// Labels excluded from the data set by hand. Their jobs in this campaign count as labelled.
     pub excluded: u64,
     /// Structures whose label is not the lowest known state ([`crate::Store::lower_states`]).

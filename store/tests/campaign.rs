@@ -181,8 +181,8 @@ async fn status_counts_everything_once() {
     });
     assert_eq!(status["candidates"], candidates);
     let labels = serde_json::json!({
-        "queued": 2, "leased": 0, "labelled": 0, "failed": 0, "dropped": 0, "superseded": 0, "failed_again": 0,
-        "again": 0, "again_in_vain": 0, "excluded": 0, "lower_states": 0,
+        "queued": 2, "leased": 0, "labelled": 0, "failed": 0, "dropped": 0, "superseded": 0, "failed_under_new_protocol": 0,
+        "relabelling": 0, "relabel_failed": 0, "excluded": 0, "lower_states": 0,
     });
     assert_eq!(status["labels"], labels);
     assert_eq!((&status["imported"], &status["round"]), (&1.into(), &1.into()));

@@ -285,7 +285,7 @@ async fn a_requested_label_of_a_higher_state_is_kept_as_a_check() {
     assert_eq!(exported(&store).await, [-1.0, -1.5]);
     let labels = store.status().await.unwrap().labels;
     assert_eq!(
-        (labels.labelled, labels.queued, labels.again, labels.lower_states),
+        (labels.labelled, labels.queued, labels.relabelling, labels.lower_states),
         (2, 0, 0, 0),
         "the request is met"
     );

@@ -85,7 +85,7 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     assert_eq!(again(&store, &structures, true).await, RelabelCounts::default(), "it waits already");
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
-    assert_eq!((labels.queued, labels.labelled, labels.again, labels.again_in_vain), (2, 0, 1, 0));
+    assert_eq!((labels.queued, labels.labelled, labels.relabelling, labels.relabel_failed), (2, 0, 1, 0));
     assert_eq!(store.unfinished_jobs().await.unwrap(), 1, "walks did not find it");
     assert_eq!(store.finished(dft.hash, 0, 9).await.unwrap().len(), 1);
     whole(&store).await;
@@ -106,7 +106,7 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     assert_eq!(old.label, label(-1.0));
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     let labels = store.status().await.unwrap().labels;
-    assert_eq!((labels.queued, labels.labelled, labels.again), (1, 1, 0));
+    assert_eq!((labels.queued, labels.labelled, labels.relabelling), (1, 1, 0));
     let operation = store.operations(0, 100).await.unwrap().pop().unwrap();
     assert_eq!((operation.kind.as_str(), &operation.detail["again"]), ("relabel", &json!(1)));
     whole(&store).await;
@@ -125,7 +125,7 @@ async fn a_label_that_cannot_be_remade_stays() {
     assert_eq!(jobs(&store, structures[0]).await, [("dft".into(), JobState::Labelled)]);
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
-    assert_eq!((labels.labelled, labels.failed, labels.again, labels.again_in_vain), (1, 0, 0, 1));
+    assert_eq!((labels.labelled, labels.failed, labels.relabelling, labels.relabel_failed), (1, 0, 0, 1));
     whole(&store).await;
     // It may be requested again, and a late result satisfies the request.
     assert_eq!(again(&store, &structures, true).await, AGAIN);
@@ -133,7 +133,7 @@ async fn a_label_that_cannot_be_remade_stays() {
     assert!(third.failures.is_empty());
     assert_eq!(store.release_all("host", 401).await.unwrap(), 1);
     assert_eq!(store.complete(&third, &label(-1.5), 402).await.unwrap(), CompleteOutcome::Label);
-    assert_eq!(store.status().await.unwrap().labels.again_in_vain, 0);
+    assert_eq!(store.status().await.unwrap().labels.relabel_failed, 0);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;
 }
@@ -188,7 +188,7 @@ async fn another_protocol_supersedes_label_by_label() {
     let old = ("dft".to_owned(), JobState::Labelled);
     assert_eq!(jobs(&store, structures[0]).await, [old.clone(), ("fine".into(), JobState::Queued)]);
     let labels = store.status().await.unwrap().labels;
-    assert_eq!((labels.queued, labels.labelled, labels.failed, labels.again), (5, 2, 0, 2));
+    assert_eq!((labels.queued, labels.labelled, labels.failed, labels.relabelling), (5, 2, 0, 2));
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0]);
 
     // The first is labelled under the new protocol, the second fails.
@@ -202,7 +202,7 @@ async fn another_protocol_supersedes_label_by_label() {
     assert_eq!(history(&store, structures[0]).await, expected);
     assert_eq!((exported(&store, &dft).await, exported(&store, &fine).await), (vec![-2.0], vec![-1.5]));
     let labels = store.status().await.unwrap().labels;
-    assert_eq!((labels.labelled, labels.failed, labels.again, labels.again_in_vain), (2, 1, 0, 1));
+    assert_eq!((labels.labelled, labels.failed, labels.relabelling, labels.relabel_failed), (2, 1, 0, 1));
     whole(&store).await;
 
     // Those without a label get their first under the new protocol; the failed one is requested again.
@@ -214,7 +214,7 @@ async fn another_protocol_supersedes_label_by_label() {
     assert_eq!(exported(&store, &dft).await, [0.0; 0]);
     assert_eq!(exported(&store, &fine).await, [-1.5, -2.5, -3.0, -4.0, -5.0]);
     let labels = store.status().await.unwrap().labels;
-    assert_eq!((labels.queued, labels.labelled, labels.failed, labels.again_in_vain), (0, 5, 0, 0));
+    assert_eq!((labels.queued, labels.labelled, labels.failed, labels.relabel_failed), (0, 5, 0, 0));
     whole(&store).await;
 }
 
@@ -302,5 +302,5 @@ async fn two_protocols_cannot_share_a_name() {
     let order = RelabelRequest { structures: &structures, again: false, reason: "", protocol: Some(new) };
     assert!(matches!(store.relabel(&order, 1).await, Err(StoreError::ProtocolName(_))));
     assert_eq!(store.protocol_in_force().await.unwrap().unwrap(), protocol("dft"));
-    assert_eq!(store.status().await.unwrap().labels.again, 0, "all or nothing");
+    assert_eq!(store.status().await.unwrap().labels.relabelling, 0, "all or nothing");
 }

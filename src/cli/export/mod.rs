@@ -166,14 +166,21 @@ impl ExportArgs {
                 )?;
             }
             let store::LabelJobCounts {
-                queued, leased, failed, dropped, again, failed_again, excluded, ..
+                queued,
+                leased,
+                failed,
+                dropped,
+                relabelling,
+                failed_under_new_protocol,
+                excluded,
+                ..
             } = labels;
             if excluded > 0 {
                 writeln!(out, "not exported: {excluded} with excluded labels (see calmwalk exclude --list)")?;
             }
             // Structures that wait for a replacement label have a label.
-            let (waiting, failed) =
-                ((queued + leased).saturating_sub(again), failed.saturating_sub(failed_again));
+            let waiting = (queued + leased).saturating_sub(relabelling);
+            let failed = failed.saturating_sub(failed_under_new_protocol);
             if waiting + failed + dropped == 0 {
                 return writeln!(out, "all accepted structures are labelled");
             }

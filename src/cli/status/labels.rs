@@ -94,8 +94,8 @@ fn describe_queue(status: &CampaignStatus) -> String {
 /// Structures that are relabelled, and failed attempts at it.
 fn describe_relabelling(labels: &LabelJobCounts) -> Option<String> {
     let parts = [
-        (labels.again, "being relabelled keep their labels until then"),
-        (labels.again_in_vain, "failed to be relabelled and keep their labels"),
+        (labels.relabelling, "being relabelled keep their labels until then"),
+        (labels.relabel_failed, "failed to be relabelled and keep their labels"),
     ];
     let parts = parts.iter().filter(|(count, _)| *count > 0);
     let parts: Vec<_> = parts.map(|(count, what)| format!("{count} {what}")).collect();

@@ -174,9 +174,9 @@ fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> LabelJobCounts {
         failed: number("failed"),
         dropped: number("dropped"),
         superseded: number("superseded"),
-        again: asked("queued") + asked("leased"),
-        again_in_vain: asked("labelled") + asked("failed"),
-        failed_again: asked("failed"),
+        relabelling: asked("queued") + asked("leased"),
+        relabel_failed: asked("labelled") + asked("failed"),
+        failed_under_new_protocol: asked("failed"),
         excluded: 0,
         lower_states: 0,
     }
