@@ -369,7 +369,7 @@ pub fn selector_settings(config: &Config) -> SelectorSettings {
         collection: collect.criterion,
         max_per_walk: collect.max_per_walk.get(),
         max_per_seed_structure: collect.max_per_seed_structure.map(NonZeroU32::get),
-        max_structures: config.most_structures(),
+        max_structures: config.max_structures(),
         control: campaign.control,
         control_share: campaign.control_share.get(),
         min_distances: guard.min_distances.clone(),

@@ -23,7 +23,7 @@ pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
     let seeds = || campaign.seed_structures.iter().map(|named| named.seed.structure.len() as u64);
     let number = seeds().len() as u64;
     let walks = || campaign.seed_structures.iter().map(|named| named.seed.walks.len());
-    let collected = walks().map(|walks| config.most_structures_of(walks)).fold(0, u64::saturating_add);
+    let collected = walks().map(|walks| config.max_structures_of(walks)).fold(0, u64::saturating_add);
     let collected =
         config.collect.max_structures.map_or(collected, |total| collected.min(total.get().into()));
     let copies = if config.campaign.control { 2 } else { 1 };
@@ -36,7 +36,7 @@ pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
         structures: copies * collected * mean,
         rest: EMPTY_DATABASE_BYTES + copies * checkpoints + mixture as u64,
         declined: config.collect.declined_features_mb * 1_000_000,
-        most_structures: copies * collected,
+        max_structures: copies * collected,
     }
 }
 

@@ -95,7 +95,7 @@ fn a_finished_campaign_is_shown() {
     let walks = status["walks"].as_array().unwrap();
     assert!(walks.len() == 4 && walks.iter().all(|walk| walk["state"] == "quota_reached"));
 
-    assert_eq!((&status["disk"]["at_the_end"], &status["led"]), (&Value::Null, &false.into()));
+    assert_eq!((&status["disk"]["at_the_end"], &status["run_active"]), (&Value::Null, &false.into()));
     let shown = succeed(here, ["status", "small"]);
     assert!(!shown.contains("when all is collected"), "{shown}");
     assert!(

@@ -63,13 +63,13 @@ fn walks_are_seen_to_advance_and_a_copy_says_the_same() {
         (&paused["walks"][0]["paused"], &paused["walks"][0]["steps_per_second"]),
         (&true.into(), &Value::Null)
     );
-    assert_eq!(paused["led"], true);
+    assert_eq!(paused["run_active"], true);
     assert!(paused["disk"]["at_the_end"].as_u64() >= paused["disk"]["bytes"].as_u64(), "{paused}");
 
     drop(run);
     let killed = status("campaign");
     assert_eq!((&killed["expected_end"]["time"], &killed["finished"]), (&Value::Null, &false.into()));
-    assert_eq!((&killed["led"], &killed["steps_per_second"]), (&false.into(), &Value::Null));
+    assert_eq!((&killed["run_active"], &killed["steps_per_second"]), (&false.into(), &Value::Null));
     assert!(
         killed["walks"].as_array().unwrap().iter().all(|walk| walk["steps_per_second"].is_null()),
         "{killed}"

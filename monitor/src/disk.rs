@@ -17,7 +17,7 @@ pub struct DiskForecast {
     pub declined: u64,
     /// Largest number of structures and control frames. 0 in campaigns of early versions.
     #[serde(default)]
-    pub most_structures: u64,
+    pub max_structures: u64,
 }
 
 /// Disk use of the store.
@@ -42,8 +42,8 @@ impl DiskForecast {
     /// What will be added to `structures` structures and control frames, which take `bytes` together with everything
     /// else.
     pub fn remaining_bytes(&self, structures: u64, bytes: u64) -> u64 {
-        let left = self.most_structures.saturating_sub(structures);
-        match self.most_structures {
+        let left = self.max_structures.saturating_sub(structures);
+        match self.max_structures {
             0 => self.bytes().saturating_sub(bytes),
             most => (u128::from(self.structures) * u128::from(left) / u128::from(most)) as u64,
         }
@@ -62,11 +62,11 @@ mod tests {
     #[test]
     fn remaining_space_is_that_of_structures_not_yet_collected() {
         let forecast =
-            DiskForecast { structures: 1_000_000, rest: 500_000, declined: 7, most_structures: 100 };
+            DiskForecast { structures: 1_000_000, rest: 500_000, declined: 7, max_structures: 100 };
         for (structures, expected) in [(0, 1_000_000), (25, 750_000), (100, 0), (120, 0)] {
             assert_eq!(forecast.remaining_bytes(structures, 40_000_000), expected, "{structures}");
         }
-        let early = DiskForecast { most_structures: 0, ..forecast };
+        let early = DiskForecast { max_structures: 0, ..forecast };
         assert_eq!((early.remaining_bytes(3, 400_000), early.remaining_bytes(3, 9_000_000)), (1_100_000, 0));
     }
 }

@@ -29,7 +29,7 @@ impl ExpectedEnd {
         let steps_per_walk = steps("equilibration_steps") + steps("biased_steps");
         let under_way = status.walks.iter().filter(|walk| walk.is_active());
         let left: u64 = under_way.map(|walk| steps_per_walk.saturating_sub(walk.step)).sum();
-        let speed = status.steps_per_second.filter(|speed| status.led && *speed > 0.0);
+        let speed = status.steps_per_second.filter(|speed| status.run_active && *speed > 0.0);
         let walks_hours = match left {
             0 => Some(0.0),
             left => speed.map(|speed| left as f64 / speed / SECONDS_PER_HOUR),
@@ -38,7 +38,7 @@ impl ExpectedEnd {
         let budget = &status.budget;
         let budget_hours = budget.limits.wall_hours.map(|limit| (limit - budget.used.wall_hours).max(0.0));
         let hours = walks_hours.zip(labels_hours).map(|(walks, labels)| walks.max(labels));
-        let hours = match (hours, budget_hours.filter(|_| status.led)) {
+        let hours = match (hours, budget_hours.filter(|_| status.run_active)) {
             (Some(hours), Some(budget)) => Some(hours.min(budget)),
             (hours, budget) => hours.or(budget),
         };
@@ -59,7 +59,7 @@ mod tests {
         let status = CampaignStatus {
             walks: vec![walk("running", 4_000), walk("waiting", 0), walk("quota_reached", 7)],
             steps_per_second: Some(10.0),
-            led: true,
+            run_active: true,
             ..CampaignStatus::default()
         };
         (
@@ -82,7 +82,7 @@ mod tests {
         assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &queue).time, None, "no labellers");
         status.budget.limits = Budget { wall_hours: Some(0.5), ..Budget::default() };
         assert!((hours(&ExpectedEnd::extrapolate(&status, &configuration, &queue)) - 0.5).abs() < 0.01);
-        status.led = false;
+        status.run_active = false;
         assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &queue).time, None, "no orchestrator");
     }
 }

@@ -111,13 +111,13 @@ impl EstimateArgs {
             .map(|(seed, size)| SeedEstimate {
                 name: seed.seed.name.clone(),
                 size,
-                labels: u64::from(copies) * config.most_structures_of(seed.seed.walks.len()),
+                labels: u64::from(copies) * config.max_structures_of(seed.seed.walks.len()),
                 cost_per_label: costs.as_ref().and_then(|costs| costs.predict([(size, 1)])),
                 walks: table.walk_time(seed),
             })
             .collect();
         let sum = seed_structures.iter().map(|seed| seed.labels).sum();
-        let limit = config.most_structures().map(|limit| u64::from(copies) * u64::from(limit));
+        let limit = config.max_structures().map(|limit| u64::from(copies) * u64::from(limit));
         let cost = costs
             .and_then(|costs| costs.predict(seed_structures.iter().map(|seed| (seed.size, seed.labels))));
         // It is not known in advance which seed structures reach fewer labels: scale all costs alike.

@@ -123,7 +123,7 @@ impl RelabelArgs {
 
     /// How the labels will be computed.
     async fn next(&self, store: &Store, location: &Location) -> Result<String, CommandError> {
-        if store.status().await?.led {
+        if store.status().await?.run_active {
             return Ok("the campaign is running: its labellers compute the labels".to_owned());
         }
         let origin = Provenance::read(store).await?;

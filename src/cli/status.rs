@@ -96,7 +96,7 @@ fn write(
     if page.is_unlimited() {
         mixture::write_forgetting(out, &snapshot.mixture, &page)?;
     }
-    walks::write(out, &status.walks, status.led, &page)?;
+    walks::write(out, &status.walks, status.run_active, &page)?;
     processes::write(out, &status.processes, &page)?;
     jobs.write(out, &page)
 }
@@ -177,7 +177,7 @@ pub fn expected_end(end: &ExpectedEnd) -> Option<String> {
 
 fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_active()).count();
-    let state = if status.led { "running" } else { "unfinished" };
+    let state = if status.run_active { "running" } else { "unfinished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),
         ended => format!("{ended} ended ({})", walk_ends::without_causes(ends)),

@@ -193,13 +193,13 @@ impl Config {
     }
 
     /// Most structures that may be collected from a seed structure with `walks` walks.
-    pub fn most_structures_of(&self, walks: usize) -> u64 {
+    pub fn max_structures_of(&self, walks: usize) -> u64 {
         let all = u64::from(self.collect.max_per_walk.get()).saturating_mul(walks as u64);
         self.collect.max_per_seed_structure.map_or(all, |most| all.min(most.get().into()))
     }
 
     /// Most structures that may be collected, each with all its labels.
-    pub fn most_structures(&self) -> Option<u32> {
+    pub fn max_structures(&self) -> Option<u32> {
         Some(self.limit_of_structures()?.0)
     }
 

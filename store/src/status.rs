@@ -25,7 +25,7 @@ pub struct CampaignStatus {
     /// Structures imported with their labels.
     pub imported: u64,
     /// Whether a process runs the campaign, as far as this host can tell.
-    pub led: bool,
+    pub run_active: bool,
     /// Version of the mixture.
     pub mixture_version: u64,
     /// Round (reproducible mode) or 0.

@@ -73,7 +73,7 @@ pub fn large() -> Snapshot {
                 structures: 9 << 33,
                 rest: 1 << 32,
                 declined: 1 << 30,
-                most_structures: 200_000,
+                max_structures: 200_000,
             }),
         },
         labels: LabelQueue {
@@ -145,7 +145,7 @@ fn status() -> CampaignStatus {
         imported: 10_000,
         mixture_version: 80_000,
         round: 1_000_000,
-        led: true,
+        run_active: true,
         steps_per_second: Some(123_456.7),
         walks: (0..1000).map(walk).collect(),
         processes: (0..1000).map(process).collect(),

@@ -33,7 +33,12 @@ fn select(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
 }
 
 /// Writes a table of the walks.
-pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &StatusLayout) -> io::Result<()> {
+pub fn write(
+    out: &mut dyn Write,
+    walks: &[WalkStatus],
+    run_active: bool,
+    page: &StatusLayout,
+) -> io::Result<()> {
     let shown = select(walks, page.walks);
     if shown.is_empty() {
         return Ok(());
@@ -42,21 +47,21 @@ pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &Status
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
     let name = if page.walks == usize::MAX { usize::MAX } else { NAME };
     for walk in &shown {
-        table.push(line(walk, &varied, led, name));
+        table.push(line(walk, &varied, run_active, name));
     }
     page.table(out, &table, shown.len(), walks.len(), "walks")
 }
 
 /// The row of a walk below [`TITLES`], with at most `name` characters of its name. `varied`: the conditions that
-/// distinguish walks. `led`: whether an orchestrator runs.
-pub fn line(walk: &WalkStatus, varied: &VariedConditions, led: bool, name: usize) -> Vec<String> {
+/// distinguish walks. `run_active`: whether an orchestrator runs.
+pub fn line(walk: &WalkStatus, varied: &VariedConditions, run_active: bool, name: usize) -> Vec<String> {
     let control = if walk.origin == "control" { "c: " } else { "" };
     let conditions = walk.conditions.as_ref().map_or(String::new(), |conditions| varied.describe(conditions));
     let of_seed = cut(&format!("{control}{}", walk.seed_structure), name);
     let name = if conditions.is_empty() { of_seed } else { format!("{of_seed} ({conditions})") };
     let state = match walk.state.as_str() {
         _ if walk.paused => "paused".to_owned(),
-        "running" if !led => "stopped".to_owned(),
+        "running" if !run_active => "stopped".to_owned(),
         state => state.replace('_', " "),
     };
     vec![

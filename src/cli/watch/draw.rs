@@ -105,7 +105,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState) {
     let paused = status.walks.iter().filter(|walk| walk.paused).count();
     let paused = if paused == 0 { String::new() } else { format!(" ({paused} paused)") };
     let ended = status.walks.len() - under_way;
-    let state_of_walks = if status.led { "running" } else { "unfinished" };
+    let state_of_walks = if status.run_active { "running" } else { "unfinished" };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {speed:.1} steps/s"));
     let Candidates { seen, accepted, control, .. } = &status.candidates;

@@ -35,12 +35,16 @@ pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
     &["energy", "energy_per_atom", "max_force", "retry_adjustment"],
 ];
 
-/// The entries of walks that match the filter. `led`: whether an orchestrator runs.
-pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&StructureFilter>) -> Vec<PaneEntry> {
+/// The entries of walks that match the filter. `run_active`: whether an orchestrator runs.
+pub fn walk_entries(
+    walks: &[WalkStatus],
+    run_active: bool,
+    filter: Option<&StructureFilter>,
+) -> Vec<PaneEntry> {
     let matches = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.matches(&facts_of_walk(walk)));
     let tone = |walk: &WalkStatus| match walk.state.as_str() {
         _ if walk.paused => Tone::Attention,
-        "running" if led => Tone::Active,
+        "running" if run_active => Tone::Active,
         "running" => Tone::Plain,
         "waiting" => Tone::Plain,
         "trapped" | "diverged" | "invalid_start" => Tone::Attention,
@@ -49,7 +53,7 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&StructureFi
     let varied = VariedConditions::among(walks.iter().filter_map(|walk| walk.conditions.as_ref()));
     let entry = |walk: &WalkStatus| PaneEntry {
         key: walk.walk.to_string(),
-        columns: walks::line(walk, &varied, led, walks::NAME),
+        columns: walks::line(walk, &varied, run_active, walks::NAME),
         tone: tone(walk),
         candidate: None,
     };

@@ -162,9 +162,10 @@ impl WatchState {
 
     /// Updates the panes and charts.
     pub fn update_panes(&mut self) {
-        let store::CampaignStatus { walks, led, .. } = &self.snapshot.status;
+        let store::CampaignStatus { walks, run_active, .. } = &self.snapshot.status;
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
-        of_walks.set_entries(entries::walk_entries(walks, *led, of_walks.filter.as_ref()), walks.len());
+        of_walks
+            .set_entries(entries::walk_entries(walks, *run_active, of_walks.filter.as_ref()), walks.len());
         of_queue
             .set_entries(entries::job_entries(&self.jobs, walks, of_queue.filter.as_ref()), self.jobs.len());
         let decisions = entries::decision_entries(self.decisions.iter(), walks, of_decisions.filter.as_ref());

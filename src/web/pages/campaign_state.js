@@ -2,5 +2,5 @@
 
 /** `finished`, `running`, or `stopped` if no process runs the campaign. */
 export function campaignState(status) {
-  return status.finished ? "finished" : status.led ? "running" : "stopped";
+  return status.finished ? "finished" : status.run_active ? "running" : "stopped";
 }

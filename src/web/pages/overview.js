@@ -57,7 +57,7 @@ function summary(status) {
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
-    tile("Walks", `${whole(underWay)} ${status.led ? "running" : "unfinished"}`, ended(status.ends, walks.length - underWay),
+    tile("Walks", `${whole(underWay)} ${status.run_active ? "running" : "unfinished"}`, ended(status.ends, walks.length - underWay),
       status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
       `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
@@ -142,7 +142,7 @@ function budget(status) {
 }
 
 /** `changed` is called after walks were paused or resumed; false if they cannot be. */
-function walks({ walks: all, led }, changed) {
+function walks({ walks: all, run_active }, changed) {
   const order = [...all].sort((a, b) => isUnderWay(b) - isUnderWay(a) || a.walk - b.walk);
   const change = (some, isPaused) => () => {
     // The next update confirms it.
@@ -151,7 +151,7 @@ function walks({ walks: all, led }, changed) {
   };
   const button = (walk) => (isUnderWay(walk) || walk.paused) && pauseButton(walk.walk, walk.paused, change([walk], !walk.paused));
   const rows = order.slice(0, WALKS).map((walk) => [
-    whole(walk.walk), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : !led && walk.state === "running" ? "stopped" : walk.state), walk.reason && ` ${walk.reason}`),
+    whole(walk.walk), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : !run_active && walk.state === "running" ? "stopped" : walk.state), walk.reason && ` ${walk.reason}`),
     whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.rejected), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;

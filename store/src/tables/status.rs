@@ -71,11 +71,11 @@ impl Store {
         let (mixture_version, round) = last.unwrap_or_default();
         let imported = query("SELECT count(*) FROM import").fetch_one(&mut transaction).await?;
         let processes = processes::all(&mut transaction).await?;
-        let led = processes.iter().any(ProcessRecord::is_leading);
+        let run_active = processes.iter().any(ProcessRecord::is_leading);
         let (limits, used) = budget::read(&mut transaction, now).await?;
         let paused = pauses::read(&mut transaction).await?;
         let mut total = TotalThroughput::default();
-        if led {
+        if run_active {
             apply_progress(&mut walks, &walk_progress::recent(&mut transaction, now).await?);
             total = walk_progress::total(&mut transaction, now).await?;
         }
@@ -91,7 +91,7 @@ impl Store {
         Ok(CampaignStatus {
             candidates: candidates(&fates, rejected),
             imported,
-            led,
+            run_active,
             mixture_version,
             round,
             finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_active) && no_more_labels,
@@ -188,10 +188,10 @@ fn with_visible_state(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
     let ranks = [ProcessRecord::ORCHESTRATOR, ProcessRecord::WALKER, ProcessRecord::LABELLER];
     let rank = |kind: &str| ranks.iter().position(|k| *k == kind).unwrap_or(ranks.len());
     processes.sort_by_key(|process| (rank(&process.kind), process.number));
-    let led = processes.iter().any(ProcessRecord::is_leading);
+    let run_active = processes.iter().any(ProcessRecord::is_leading);
     for process in &mut processes {
         let state = process.state.as_str();
-        let stays = state.starts_with("failed") || (led && state == "backing_off");
+        let stays = state.starts_with("failed") || (run_active && state == "backing_off");
         if process.is_dead() && !stays {
             process.state = "dead".to_owned();
         } else if process.is_unresponsive() && matches!(state, "running" | "stopping") {
