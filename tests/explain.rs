@@ -226,6 +226,8 @@ fn explain_describes_copies_and_failed_labels_in_words() {
         before,
         "explain does not change the copy"
     );
+    let actions = &explain(here, &accepted)["jobs"][0]["manual_actions"];
+    assert_eq!(actions.as_array().map(Vec::len), Some(3), "{actions}");
     let declined = succeed(here, ["explain", "here", &of_kind("declined")]);
     assert!(declined.contains("declined: ") && declined.contains("no label job"), "{declined}");
     let control = succeed(here, ["explain", "here", &of_kind("control")]);

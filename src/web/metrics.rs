@@ -156,7 +156,7 @@ fn label_queue(text: &mut MetricsText, status: &CampaignStatus) {
         &[(&[], core_seconds)],
     );
     let seconds = used.wall_hours * SECONDS_PER_HOUR;
-    text.counter("calmwalk_under_way_seconds_total", "Running time of the campaign.", &[(&[], seconds)]);
+    text.counter("calmwalk_running_seconds_total", "Running time of the campaign.", &[(&[], seconds)]);
 }
 
 fn processes(text: &mut MetricsText, status: &CampaignStatus) {

@@ -25,7 +25,7 @@ mod tests {
     #[test]
     fn usage_is_shown_with_limits() {
         let limits = Budget { labels: Some(10), wall_hours: Some(2.0), ..Budget::default() };
-        let used = BudgetUse { labels: 7, under_way: 1, core_hours: 9.0, wall_hours: 0.25 };
+        let used = BudgetUse { labels: 7, attempts_in_progress: 1, core_hours: 9.0, wall_hours: 0.25 };
         let mut budget = BudgetStatus { limits, used, used_up: None };
         assert_eq!(describe(&budget).unwrap(), "labels 7 of 10; running time 0.250 of 2 h");
         budget.used_up = Some("collect.max_structures".into());

@@ -21,8 +21,8 @@ pub struct Budget {
 pub struct BudgetUse {
     /// Labels made, including late results that were stored as checks.
     pub labels: u64,
-    /// Attempts that are under way.
-    pub under_way: u64,
+    /// Attempts in progress.
+    pub attempts_in_progress: u64,
     /// Core-hours of label attempts, including those in progress.
     pub core_hours: f64,
     /// Wall-clock hours, summed over all runs.
@@ -58,7 +58,7 @@ impl Budget {
 
     /// Whether no further attempt may start. A running attempt may still deliver the last label.
     pub fn forbids_attempts(&self, used: &BudgetUse) -> bool {
-        let labels = used.labels + used.under_way;
+        let labels = used.labels + used.attempts_in_progress;
         self.time_used_up(used).is_some() || self.labels.is_some_and(|limit| labels >= limit)
     }
 }
@@ -69,7 +69,7 @@ mod tests {
 
     #[test]
     fn a_limit_is_reached_when_use_equals_it() {
-        let used = BudgetUse { labels: 3, under_way: 2, core_hours: 1.5, wall_hours: 0.25 };
+        let used = BudgetUse { labels: 3, attempts_in_progress: 2, core_hours: 1.5, wall_hours: 0.25 };
         let none = Budget::default();
         assert!(none.is_none() && none.time_used_up(&used).is_none() && !none.forbids_attempts(&used));
         for (labels, allows) in [(6, true), (5, false), (4, false)] {

@@ -58,5 +58,5 @@ pub struct LaterCoveredCandidates {
     /// In decision order.
     pub candidates: Vec<CoveredCandidate>,
     /// The last decision that was examined, if there may be more after it.
-    pub looked_until: Option<i64>,
+    pub searched_until: Option<i64>,
 }

@@ -33,7 +33,7 @@ async fn no_more_labels_start_than_the_budget_permits() {
     assert!(lease().await.is_none());
     assert!(!store.has_pending_labels(40).await.unwrap(), "what is queued waits for a larger budget");
     let (_, used) = store.budget(40).await.unwrap();
-    assert_eq!((used.labels, used.under_way), (2, 0));
+    assert_eq!((used.labels, used.attempts_in_progress), (2, 0));
     limit(&store, Budget { labels: Some(3), ..Budget::default() }).await;
     assert!(store.has_pending_labels(40).await.unwrap() && lease().await.is_some());
     limit(&store, Budget::default()).await;

@@ -42,7 +42,7 @@ async fn a_candidate_is_found_with_related_records() {
     for staleness in [None, Some(9), Some(1)] {
         // A page of the log is read as a whole.
         let found = store.covered_since(1, 4, staleness).await.unwrap();
-        assert_eq!((found.candidates, found.looked_until), (vec![later(1, 5), later(3, 7)], None));
+        assert_eq!((found.candidates, found.searched_until), (vec![later(1, 5), later(3, 7)], None));
     }
     assert_eq!(store.covered_since(1, 3, None).await.unwrap().candidates, []);
 

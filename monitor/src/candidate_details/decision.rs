@@ -80,7 +80,7 @@ pub struct Coverage {
     /// those versions together.
     pub later: Vec<CoveredCandidate>,
     /// The last decision that was checked for that, if there are more.
-    pub looked_until: Option<i64>,
+    pub searched_until: Option<i64>,
 }
 
 impl DecisionDetails {
@@ -100,7 +100,7 @@ impl DecisionDetails {
         if update.is_some() {
             let most = largest_staleness(store).await?;
             let later = store.covered_since(logged.sequence, logged.mixture_version, most).await?;
-            (coverage.later, coverage.looked_until) = (later.candidates, later.looked_until);
+            (coverage.later, coverage.searched_until) = (later.candidates, later.searched_until);
         }
         Ok(Self {
             number: logged.sequence,

@@ -23,7 +23,7 @@ pub struct LabelJob {
     /// Known core-seconds of all its attempts. `None` if none are known.
     pub core_seconds: Option<f64>,
     /// Manual actions on the job and its labels: `drop`, `retry`, `prioritise`, `exclude`, `include`.
-    pub by_hand: Vec<ManualAction>,
+    pub manual_actions: Vec<ManualAction>,
 }
 
 /// A manual action on a job.
@@ -94,10 +94,10 @@ pub(super) async fn jobs(store: &Store, content: ContentHash) -> Result<Vec<Labe
     for details in store.jobs_of(content).await? {
         let known = details.attempts_made.iter().filter_map(|attempt| attempt.core_seconds);
         let core_seconds = known.reduce(|sum, seconds| sum + seconds);
-        let by_hand = store.manual_operations(details.job.job).await?;
+        let manual_actions = store.manual_operations(details.job.job).await?;
         jobs.push(LabelJob {
             core_seconds,
-            by_hand: by_hand.into_iter().map(ManualAction::from_operation).collect(),
+            manual_actions: manual_actions.into_iter().map(ManualAction::from_operation).collect(),
             details,
         });
     }

@@ -125,7 +125,7 @@ fn write_coverage(out: &mut dyn Write, decision: &DecisionDetails, coverage: &Co
         return Ok(());
     }
     let searched =
-        coverage.looked_until.map_or(String::new(), |last| format!(" (searched up to decision {last})"));
+        coverage.searched_until.map_or(String::new(), |last| format!(" (searched up to decision {last})"));
     if coverage.later.is_empty() {
         let none = "no later candidate of a walker that had not seen this update was declined as covered";
         return line(out, "covered", &format!("{none}{searched}"));

@@ -51,7 +51,7 @@ fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
     if *overruled {
         line(out, "", "queued by the user: bypasses the labellers' guard")?;
     }
-    for done in &job.by_hand {
+    for done in &job.manual_actions {
         let to = done.priority.map_or(String::new(), |priority| format!(", to {priority}"));
         let why = done.reason.as_ref().map_or(String::new(), |reason| format!(" ({reason})"));
         line(out, "", &format!("by the user: {}{to}{why}, {} ago", done.action, elapsed_since(done.time)))?;

@@ -156,7 +156,12 @@ fn status() -> CampaignStatus {
                 wall_hours: Some(1000.0),
                 structures_by: Some("budget.labels".into()),
             },
-            used: BudgetUse { labels: 140_000, under_way: 1024, core_hours: 654_321.0, wall_hours: 900.0 },
+            used: BudgetUse {
+                labels: 140_000,
+                attempts_in_progress: 1024,
+                core_hours: 654_321.0,
+                wall_hours: 900.0,
+            },
             used_up: Some("budget.labels".into()),
         },
         finished: false,

@@ -118,7 +118,7 @@ function trace(found, grades, signal) {
   return section("Earlier", place);
 }
 
-function covered({ by, later, looked_until: until }) {
+function covered({ by, later, searched_until: until }) {
   const list = (named) => element("ul", {}, named.slice(0, 50).map((one) => element("li", {}, link(one))));
   const more = (named) => (named.length > 50 ? element("p", { class: "quiet" }, `… and ${whole(named.length - 50)} more`) : "");
   const parts = [];
@@ -134,14 +134,14 @@ function labels({ jobs, labels: made }, reload, signal) {
 }
 
 function job(found) {
-  const { holder, attempts_made: attempts, by_hand: byHand } = found;
+  const { holder, attempts_made: attempts, manual_actions: manual } = found;
   return element("div", {}, facts([
     ["job", `${found.job}, protocol ${found.protocol}`],
     ["state", element("span", {}, state(found.state), ` priority ${found.priority}`)],
     ["excluded", found.excluded && `its label is excluded from exports and statistics: ${found.excluded}`],
     ["leased by", holder && `${holder}, until ${time(found.expires)}`],
     ["cost", found.core_seconds == null ? null : digits(found.core_seconds, "core-seconds")],
-    ["manual actions", byHand.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}${done.reason ? ` (${done.reason})` : ""}, ${time(done.time)}`).join("; ")],
+    ["manual actions", manual.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}${done.reason ? ` (${done.reason})` : ""}, ${time(done.time)}`).join("; ")],
   ]), attempts.map(attempt));
 }
 

@@ -94,10 +94,10 @@ impl Store {
 pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Budget, BudgetUse)> {
     let limits = limits(transaction).await?;
     let now = transaction.time(now).await?;
-    let (labels, under_way, milliseconds) = attempts(transaction, now).await?;
+    let (labels, attempts_in_progress, milliseconds) = attempts(transaction, now).await?;
     let used = BudgetUse {
         labels,
-        under_way,
+        attempts_in_progress,
         core_hours: milliseconds as f64 / MILLISECONDS_PER_HOUR,
         wall_hours: time_under_way(transaction).await? as f64 / MILLISECONDS_PER_HOUR,
     };

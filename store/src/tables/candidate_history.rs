@@ -267,7 +267,7 @@ impl Store {
                 return Ok(found);
             }
             if last >= decision + MAX_DECISIONS {
-                found.looked_until = Some(last);
+                found.searched_until = Some(last);
                 return Ok(found);
             }
         }
