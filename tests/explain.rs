@@ -81,7 +81,7 @@ fn check_grades(details: &Value, stored: &StoredCandidate) {
 /// Checks the label, and the errors of the potential's forces.
 fn check_label(details: &Value, stored: &StoredCandidate) {
     let labels = details["labels"].as_array().unwrap();
-    assert_eq!((labels.len(), &labels[0]["standing"]), (1, &"label".into()));
+    assert_eq!((labels.len(), &labels[0]["status"]), (1, &"label".into()));
     assert_eq!(details["jobs"][0]["state"], "labelled");
     assert_eq!(details["jobs"][0]["attempts_made"][0]["outcome"], "labelled");
     let model = &labels[0]["model"];

@@ -236,9 +236,9 @@ fn a_damaged_database_is_refused_with_what_is_damaged() {
         here,
         &[
             "PRAGMA writable_schema = ON; CREATE TABLE kept AS SELECT * FROM sqlite_schema WHERE name = 'label_of'",
-            "UPDATE label SET standing = 'superseded' WHERE number = 2",
+            "UPDATE label SET status = 'superseded' WHERE number = 2",
             "DELETE FROM sqlite_schema WHERE name = 'label_of'; PRAGMA writable_schema = RESET",
-            "UPDATE label SET standing = 'label' WHERE number = 2",
+            "UPDATE label SET status = 'label' WHERE number = 2",
             "PRAGMA writable_schema = ON; INSERT INTO sqlite_schema SELECT * FROM kept; DROP TABLE kept;
              PRAGMA writable_schema = RESET",
         ],

@@ -237,11 +237,8 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     let job = place.job(&name);
     let outcomes: Vec<_> = job.attempts_made.iter().map(|attempt| attempt.outcome.as_deref()).collect();
     assert_eq!(outcomes, [Some("check"), Some("labelled")]);
-    let standings: Vec<_> = job.energies.iter().map(|(standing, _)| *standing).collect();
-    assert_eq!(
-        (job.job.state, standings),
-        (JobState::Labelled, vec![LabelStatus::Label, LabelStatus::Check])
-    );
+    let statuses: Vec<_> = job.energies.iter().map(|(status, _)| *status).collect();
+    assert_eq!((job.job.state, statuses), (JobState::Labelled, vec![LabelStatus::Label, LabelStatus::Check]));
     assert_eq!(place.export(), exported);
 }
 

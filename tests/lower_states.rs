@@ -165,8 +165,7 @@ fn the_lower_state_becomes_the_label_where_the_configuration_says_so() {
         "{found:?}"
     );
     let labels = read_json(&place, &["explain", &name])["labels"].clone();
-    let standings: Vec<_> =
-        labels.as_array().unwrap().iter().map(|label| label["standing"].clone()).collect();
-    assert_eq!(standings, ["superseded", "check", "label"]);
+    let statuses: Vec<_> = labels.as_array().unwrap().iter().map(|label| label["status"].clone()).collect();
+    assert_eq!(statuses, ["superseded", "check", "label"]);
     check(here, argument);
 }

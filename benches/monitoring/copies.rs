@@ -56,7 +56,7 @@ const MORE: [&str; 12] = [
             1 + 0.001 * (number % 100)
         FROM (SELECT *, 1000 * (unixepoch() - 12 * ((SELECT max(number) FROM job) - number)) AS time FROM job) AS job
         CROSS JOIN new ON new.decision = job.decision WHERE job.state IN ('labelled', 'failed')",
-    "INSERT INTO label (structure, protocol, standing, energy, forces, job, attempt, received, checksum)
+    "INSERT INTO label (structure, protocol, status, energy, forces, job, attempt, received, checksum)
         SELECT job.structure, job.protocol, 'label', energy, copy.forces, job.number, 1, ended, 0
         FROM job CROSS JOIN new ON new.decision = job.decision CROSS JOIN copy ON copy.i = new.i
         CROSS JOIN attempt ON attempt.job = job.number
@@ -67,7 +67,7 @@ const MORE: [&str; 12] = [
         WHERE key IN ('labels_made', 'core_milliseconds', 'label_core_milliseconds')",
     "WITH RECURSIVE n(i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 999)
         INSERT OR IGNORE INTO walk SELECT i, origin, partner, seed_structure, CASE WHEN i % 10 = 0 THEN 'running' ELSE state END, reason,
-            assignments, accepted, step, segment, tau, temperature, relative_volume, gamma_max, refused, returns, selector_state, checkpoint,
+            assignments, accepted, step, segment, tau, temperature, relative_volume, gamma_max, rejected, rollbacks, selector_state, checkpoint,
             NULL, NULL
         FROM n CROSS JOIN (SELECT * FROM walk LIMIT 1)",
 ];

@@ -185,7 +185,7 @@ fn assignments_of_lost_walkers_are_assigned_again() {
 }
 
 fn returned(segment: u32, step: u64) -> WalkProgress {
-    WalkProgress { segment, returns: segment, tau: 0.125, last_return: Some((7, 3)), ..at(step) }
+    WalkProgress { segment, rollbacks: segment, tau: 0.125, last_rollback: Some((7, 3)), ..at(step) }
 }
 
 #[test]

@@ -33,7 +33,7 @@ pub struct Throughput {
 
 #[derive(Debug, Default)]
 struct WalkThroughput {
-    pace: WalkProgressRecord,
+    record: WalkProgressRecord,
     speed: Speed,
     /// Steps in this run, including repeated ones.
     steps: u64,
@@ -103,13 +103,13 @@ impl Throughput {
         let known = self.walks.contains_key(&walk.0);
         let entry = self.walks.entry(walk.0).or_default();
         // The steps of earlier runs do not count, and neither does a rollback to a checkpoint.
-        if known && entry.pace.segment == progress.segment {
-            let made = progress.step.saturating_sub(entry.pace.step);
+        if known && entry.record.segment == progress.segment {
+            let made = progress.step.saturating_sub(entry.record.step);
             entry.steps += made;
             self.steps += made;
         }
         entry.speed.update(entry.steps, now);
-        entry.pace = WalkProgressRecord {
+        entry.record = WalkProgressRecord {
             walk: walk.0,
             seen: now,
             segment: progress.segment,
@@ -129,7 +129,7 @@ impl Throughput {
         self.busy.update(None, now);
         let changed = std::mem::take(&mut self.changed);
         let all = TotalThroughput { steps_per_second: self.all.average, walkers_busy: self.busy.average };
-        (changed.iter().map(|walk| self.walks[walk].pace.clone()).collect(), all)
+        (changed.iter().map(|walk| self.walks[walk].record.clone()).collect(), all)
     }
 }
 
@@ -163,8 +163,8 @@ mod tests {
             throughput.notice(&Notice::Progress(walk, at(0, step)), 1000 * second);
         }
         let (changed, _) = throughput.take_changes(200_000);
-        let pace = changed[0].steps_per_second.unwrap();
-        assert!((pace - 50.0).abs() < 2.0, "{pace}");
+        let speed = changed[0].steps_per_second.unwrap();
+        assert!((speed - 50.0).abs() < 2.0, "{speed}");
         assert_eq!((changed[0].walk, changed[0].step, changed[0].seen), (3, 10_900, 199_000));
         assert_eq!(throughput.take_changes(201_000).0, [], "nothing new was heard");
     }

@@ -103,8 +103,8 @@ fn walks(text: &mut MetricsText, status: &CampaignStatus) {
     let samples: Vec<_> =
         labels.iter().zip(states.values()).map(|(labels, count)| (&labels[..], *count as f64)).collect();
     text.gauge("calmwalk_walks", "Walks by state.", &samples);
-    if let Some(pace) = status.steps_per_second {
-        text.gauge("calmwalk_steps_per_second", "Steps per second of all walks together.", &[(&[], pace)]);
+    if let Some(speed) = status.steps_per_second {
+        text.gauge("calmwalk_steps_per_second", "Steps per second of all walks together.", &[(&[], speed)]);
     }
     if let Some(busy) = status.walkers_busy {
         text.gauge(

@@ -103,7 +103,7 @@ pub static COMPONENT: CheckedTable =
 pub static WALK: CheckedTable = checked!("walk" by walk Integer {
     walk: Integer, origin: Text, partner: Integer, seed_structure: Integer, state: Text, reason: Text,
     assignments: Integer, accepted: Integer, step: Integer, segment: Integer, tau: Real, temperature: Real,
-    relative_volume: Real, gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
+    relative_volume: Real, gamma_max: Real, rejected: Integer, rollbacks: Integer, selector_state: Text,
 });
 
 /// Conditions of walks, which have never been without checksums.
@@ -209,7 +209,7 @@ macro_rules! joined {
         walk.assignments AS walk__assignments, walk.accepted AS walk__accepted, walk.step AS walk__step,
         walk.segment AS walk__segment, walk.tau AS walk__tau, walk.temperature AS walk__temperature,
         walk.relative_volume AS walk__relative_volume, walk.gamma_max AS walk__gamma_max,
-        walk.refused AS walk__refused, walk.returns AS walk__returns, walk.selector_state AS walk__selector_state,
+        walk.rejected AS walk__rejected, walk.rollbacks AS walk__rollbacks, walk.selector_state AS walk__selector_state,
         walk.checksum AS walk__checksum"
     };
     (structure) => {

@@ -258,7 +258,7 @@ impl LabelStatus {
     pub(crate) fn named(name: &str) -> Option<Self> {
         [Self::Label, Self::Check, Self::Superseded, Self::Excluded]
             .into_iter()
-            .find(|standing| standing.name() == name)
+            .find(|status| status.name() == name)
     }
 }
 

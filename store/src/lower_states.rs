@@ -35,7 +35,7 @@ impl Default for LowerStateRule {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StateResult {
     /// Its status.
-    pub standing: LabelStatus,
+    pub status: LabelStatus,
     /// Its origin, as text.
     pub source: String,
     /// Energy per atom, eV.
@@ -78,7 +78,7 @@ impl StateResult {
     pub(crate) fn new(record: &LabelRecord) -> Self {
         let details = &record.label.details;
         Self {
-            standing: record.status,
+            status: record.status,
             source: record.source.to_string(),
             energy_per_atom: record.label.energy / record.label.forces.len().max(1) as f64,
             magnetisation: details.magnetisation,

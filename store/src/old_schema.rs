@@ -7,8 +7,13 @@ use crate::checksum::UNKNOWN;
 
 /// The first version whose rows have checksums.
 pub const FIRST_WITH_CHECKSUMS: i64 = 9;
-/// The first version with `walk.assignments`, which was `turn`.
-const FIRST_WITH_ASSIGNMENTS: i64 = 15;
+/// Renamed columns: the first version with the new name, the table, and the names before and now.
+const RENAMED: [(i64, &str, &str, &str); 4] = [
+    (15, "walk", "turn", "assignments"),
+    (16, "walk", "refused", "rejected"),
+    (16, "walk", "returns", "rollbacks"),
+    (16, "label", "standing", "status"),
+];
 
 /// Tables without checksums before [`FIRST_WITH_CHECKSUMS`], with their checksum columns.
 const CHECKSUMS: [(&str, &[&str]); 12] = [
@@ -36,8 +41,8 @@ pub fn views(schema: &str, version: i64) -> Option<String> {
             added.entry(table).or_default().extend(unknown);
         }
     }
-    if version < FIRST_WITH_ASSIGNMENTS {
-        added.entry("walk").or_default().push("turn AS assignments".to_owned());
+    for (_, table, before, now) in RENAMED.into_iter().filter(|(first, ..)| version < *first) {
+        added.entry(table).or_default().push(format!("{before} AS {now}"));
     }
     let view = |(table, columns): (&&str, &Vec<String>)| {
         let columns = columns.join(", ");

@@ -137,8 +137,8 @@ pub struct WalkStatus {
     pub accepted: u32,
     /// Structures rejected by the walker's guard.
     pub rejected: i64,
-    /// Returns to a checkpoint.
-    pub returns: u32,
+    /// Roll backs to a checkpoint.
+    pub rollbacks: u32,
 }
 
 impl WalkStatus {
@@ -167,8 +167,8 @@ impl FromRow for WalkStatus {
             gamma_max: row.get("gamma_max")?,
             steps_per_second: row.get("steps_per_second")?,
             accepted: row.get("accepted")?,
-            rejected: row.get("refused")?,
-            returns: row.get("returns")?,
+            rejected: row.get("rejected")?,
+            rollbacks: row.get("rollbacks")?,
         })
     }
 }

@@ -62,8 +62,8 @@ const COLUMNS: [(&str, &[&str]); 12] = [
             "temperature",
             "relative_volume",
             "gamma_max",
-            "refused",
-            "returns",
+            "rejected",
+            "rollbacks",
             "checkpoint",
             "checksum",
             "checkpoint_checksum",
@@ -316,9 +316,9 @@ async fn a_label_missing_in_its_index_is_detected() {
 async fn lose_from_index(directory: &Path, label: i64) {
     let mut connection = connect(directory).await;
     let take = "PRAGMA writable_schema = ON; CREATE TABLE kept AS SELECT * FROM sqlite_schema WHERE name = 'label_of';";
-    let out = format!("UPDATE label SET standing = 'superseded' WHERE number = {label};");
+    let out = format!("UPDATE label SET status = 'superseded' WHERE number = {label};");
     let hide = "DELETE FROM sqlite_schema WHERE name = 'label_of'; PRAGMA writable_schema = RESET;";
-    let back = format!("UPDATE label SET standing = 'label' WHERE number = {label};");
+    let back = format!("UPDATE label SET status = 'label' WHERE number = {label};");
     let show = "PRAGMA writable_schema = ON; INSERT INTO sqlite_schema SELECT * FROM kept; DROP TABLE kept;
         PRAGMA writable_schema = RESET;";
     for sql in [take, &out, hide, &back, show] {
@@ -352,6 +352,8 @@ async fn without_checksums(directory: &Path) {
     let mut sql = "DROP TABLE walk_conditions; DROP TRIGGER label_has_checksum; DROP INDEX label_excluded;
         DROP INDEX label_other;
         ALTER TABLE process RENAME COLUMN start_time TO birth; ALTER TABLE walk RENAME COLUMN assignments TO turn;
+        ALTER TABLE walk RENAME COLUMN rejected TO refused; ALTER TABLE walk RENAME COLUMN rollbacks TO returns;
+        ALTER TABLE label RENAME COLUMN status TO standing; ALTER TABLE walk_progress RENAME TO pace;
         ALTER TABLE label DROP COLUMN excluded; ALTER TABLE label DROP COLUMN exclusion; "
         .to_owned();
     for table in [
@@ -385,7 +387,7 @@ async fn a_label_without_a_checksum_is_refused() {
     let directory = tempfile::tempdir().unwrap();
     full(directory.path(), 4).await.close().await;
     let mut connection = connect(directory.path()).await;
-    let sql = "INSERT INTO label (structure, protocol, standing, energy, forces, received)
+    let sql = "INSERT INTO label (structure, protocol, status, energy, forces, received)
                SELECT structure, protocol, 'check', energy, forces, received FROM label LIMIT 1";
     let error = sqlx::query(sql).execute(&mut connection).await.unwrap_err().to_string();
     assert!(error.contains("start this labeller anew"), "{error}");

@@ -138,7 +138,7 @@ async fn the_lower_of_two_states_is_proposed_and_taken_by_hand() {
         (state.label.source.as_str(), state.lower.source.as_str()),
         ("attempt 2 of job 1", "attempt 1 of job 1")
     );
-    assert_eq!((state.label.standing, state.lower.standing), (LabelStatus::Label, LabelStatus::Superseded));
+    assert_eq!((state.label.status, state.lower.status), (LabelStatus::Label, LabelStatus::Superseded));
 
     // All or nothing.
     let unknown = [names[0].clone(), "99.0.1".to_owned()];

@@ -62,7 +62,13 @@ async fn version_1(directory: &Path) -> String {
         if columns.is_empty() {
             continue;
         }
-        let renamed = |name: &String| if name == "turn" { "assignments".to_owned() } else { name.clone() };
+        let renamed = |name: &String| match name.as_str() {
+            "turn" => "assignments".to_owned(),
+            "refused" => "rejected".to_owned(),
+            "returns" => "rollbacks".to_owned(),
+            "standing" => "status".to_owned(),
+            _ => name.clone(),
+        };
         let columns = columns.iter().map(renamed).collect::<Vec<_>>().join(", ");
         let copy = format!("INSERT INTO main.{table} SELECT {columns} FROM other.{table}");
         sqlx::query(AssertSqlSafe(copy)).execute(&mut connection).await.unwrap();
@@ -111,7 +117,7 @@ async fn a_campaign_of_version_1_continues() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 15);
+    assert_eq!(version(directory.path()).await, 16);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
@@ -140,11 +146,13 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
     store.close().await;
     let mut connection = connect(&directory.path().join(DATABASE)).await;
     let sql = "ALTER TABLE process RENAME COLUMN start_time TO birth;
-        ALTER TABLE walk RENAME COLUMN assignments TO turn; PRAGMA user_version = 13;
+        ALTER TABLE walk RENAME COLUMN assignments TO turn; ALTER TABLE walk RENAME COLUMN rejected TO refused;
+        ALTER TABLE walk RENAME COLUMN rollbacks TO returns; ALTER TABLE walk_progress RENAME TO pace;
+        ALTER TABLE label RENAME COLUMN status TO standing; PRAGMA user_version = 13;
         DELETE FROM _sqlx_migrations WHERE version > 13;";
     sqlx::raw_sql(sql).execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    for (writes, expected) in [(false, 13), (true, 15)] {
+    for (writes, expected) in [(false, 13), (true, 16)] {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         assert_eq!(store.load_walks().await.unwrap(), walks);

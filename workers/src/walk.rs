@@ -218,13 +218,13 @@ impl<'a> RunningWalk<'a> {
     /// Counts a refusal by the shortest-bond guard. After too many in a row the walk rolls back, or ends.
     fn record_refusal(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let guard = &self.settings.guard;
-        self.state.refused += 1;
+        self.state.rejected += 1;
         self.state.max_consecutive_rejections += 1;
         self.state.next_offer = self.step() + self.settings.min_interval_after_decline;
         if !guard.rollback || self.state.max_consecutive_rejections < guard.max_consecutive_rejections {
             return Ok(None);
         }
-        if self.state.returns == guard.max_rollbacks || self.state.good.is_empty() {
+        if self.state.rollbacks == guard.max_rollbacks || self.state.good.is_empty() {
             return Ok(Some(Outcome::Ended(WalkEnd::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
         }
         self.roll_back()?;
@@ -236,12 +236,12 @@ impl<'a> RunningWalk<'a> {
         let (mut checkpoint, bias) = self.state.good.swap_remove(0);
         self.state.good.clear();
         self.state.segment += 1;
-        self.state.returns += 1;
+        self.state.rollbacks += 1;
         self.state.max_consecutive_rejections = 0;
         self.state.tau *= self.settings.guard.tau_factor;
         checkpoint.stream = self.stream();
         let cutoff = self.dynamics.neighbours().cutoff();
-        self.state.last_return = Some((self.step(), checkpoint.state.step));
+        self.state.last_rollback = Some((self.step(), checkpoint.state.step));
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
         self.state.next_offer = self.state.offer_after_rollback(self.step(), self.settings);
@@ -267,9 +267,9 @@ impl<'a> RunningWalk<'a> {
             temperature: self.dynamics.temperature(),
             relative_volume: self.relative_volume(),
             gamma_max: self.state.gamma_max,
-            refused: self.state.refused,
-            returns: self.state.returns,
-            last_return: self.state.last_return,
+            rejected: self.state.rejected,
+            rollbacks: self.state.rollbacks,
+            last_rollback: self.state.last_rollback,
         }
     }
 

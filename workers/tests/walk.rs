@@ -235,11 +235,11 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
     let settings = WalkSettings { zbl: uniform_zbl(1.0, 1.8), ..settings() };
     let reports = whole_walk(&settings, first_of("fcc-100", WalkConditions { tau: 2.0, ..conditions() }));
     let last = reports.last().unwrap();
-    assert!(last.progress.returns >= 1, "{last:?}");
-    assert_eq!(last.progress.segment, last.progress.returns);
-    assert!(last.progress.last_return.is_some_and(|(from, to)| from > to && to >= settings.equilibration_steps));
-    assert_eq!(last.progress.tau, 2.0 * 0.5_f64.powi(last.progress.returns as i32));
-    assert!(last.progress.refused >= u64::from(5 * last.progress.returns));
+    assert!(last.progress.rollbacks >= 1, "{last:?}");
+    assert_eq!(last.progress.segment, last.progress.rollbacks);
+    assert!(last.progress.last_rollback.is_some_and(|(from, to)| from > to && to >= settings.equilibration_steps));
+    assert_eq!(last.progress.tau, 2.0 * 0.5_f64.powi(last.progress.rollbacks as i32));
+    assert!(last.progress.rejected >= u64::from(5 * last.progress.rollbacks));
     let candidates = reports.iter().filter(|report| matches!(report.outcome, Outcome::Candidate(_))).count();
     assert!(candidates >= 2, "after its return the walk collects again");
 }
@@ -302,7 +302,7 @@ fn a_walk_that_cannot_leave_a_trap_ends() {
         matches!(&last.outcome, Outcome::Ended(WalkEnd::Trapped { guard }) if guard == "shortest-bond"),
         "{last:?}"
     );
-    assert_eq!(last.progress.returns, settings.guard.max_rollbacks);
+    assert_eq!(last.progress.rollbacks, settings.guard.max_rollbacks);
     assert!(last.progress.step < 600);
 }
 
@@ -316,8 +316,8 @@ fn without_rollbacks_a_refused_walk_continues() {
     let reports = whole_walk(&settings, first);
     let last = reports.last().unwrap();
     assert!(matches!(&last.outcome, Outcome::Ended(WalkEnd::Steps)), "{last:?}");
-    assert_eq!((last.progress.returns, last.progress.segment), (0, 0));
-    assert!(last.progress.refused > u64::from(settings.guard.max_consecutive_rejections), "{last:?}");
+    assert_eq!((last.progress.rollbacks, last.progress.segment), (0, 0));
+    assert!(last.progress.rejected > u64::from(settings.guard.max_consecutive_rejections), "{last:?}");
 }
 
 #[test]

@@ -185,9 +185,9 @@ pub struct WalkProgress {
     /// Largest γ of the last graded step.
     pub gamma_max: f64,
     /// Number of rejections by the walker's guard.
-    pub refused: u64,
+    pub rejected: u64,
     /// Number of rollbacks.
-    pub returns: u32,
+    pub rollbacks: u32,
     /// Start and target step of the last rollback, for the decision log; not stored with the progress.
-    pub last_return: Option<(u64, u64)>,
+    pub last_rollback: Option<(u64, u64)>,
 }

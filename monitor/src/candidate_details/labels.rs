@@ -47,7 +47,7 @@ pub struct CandidateLabel {
     /// Its hash.
     pub protocol_hash: String,
     /// Its current status.
-    pub standing: LabelStatus,
+    pub status: LabelStatus,
     /// Its source, as text.
     pub source: String,
     /// When it was stored, ms since 1970.
@@ -139,12 +139,12 @@ impl ManualAction {
 impl CandidateLabel {
     fn new(label: StructureLabel, model: Option<ForceError>) -> Self {
         let StructureLabel { protocol, record } = label;
-        let LabelRecord { status: standing, label, source, received, superseded, excluded } = record;
+        let LabelRecord { status, label, source, received, superseded, excluded } = record;
         let atoms = label.forces.len().max(1) as f64;
         Self {
             protocol: protocol.name,
             protocol_hash: protocol.hash.to_string(),
-            standing,
+            status,
             source: source.to_string(),
             received,
             superseded,

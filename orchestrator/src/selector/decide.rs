@@ -79,9 +79,9 @@ impl DecisionState {
         walk.set_last_step(steps_per_assignment);
         if returned {
             let progress = &report.progress;
-            let (from, to) = progress.last_return.unzip();
+            let (from, to) = progress.last_rollback.unzip();
             let detail = json!({
-                "segment": progress.segment, "from": from, "to": to, "tau": progress.tau, "returns": progress.returns,
+                "segment": progress.segment, "from": from, "to": to, "tau": progress.tau, "returns": progress.rollbacks,
             });
             commit.decisions.push(self.decision("segment", report.walk, detail));
         }

@@ -108,5 +108,5 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
 }
 
 fn progress(state: &State) -> WalkProgress {
-    WalkProgress { segment: state.segment, returns: state.segment, ..at(state.step) }
+    WalkProgress { segment: state.segment, rollbacks: state.segment, ..at(state.step) }
 }

@@ -83,8 +83,8 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
 }
 
 fn write_label(out: &mut dyn Write, label: &CandidateLabel, atoms: usize) -> io::Result<()> {
-    let CandidateLabel { protocol, protocol_hash, standing, source, energy, energy_per_atom, .. } = label;
-    let status = format!("{standing:?}").to_lowercase();
+    let CandidateLabel { protocol, protocol_hash, status, source, energy, energy_per_atom, .. } = label;
+    let status = format!("{status:?}").to_lowercase();
     line(
         out,
         &status,

@@ -139,7 +139,7 @@ fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
         None => format!(
             "; its guard rejected {}, it rolled back {}",
             count(walk.rejected, "structure"),
-            count(walk.returns, "time")
+            count(walk.rollbacks, "time")
         ),
     };
     let (state, step, accepted) = (walk.state.replace('_', " "), walk.step, walk.accepted);

@@ -42,7 +42,7 @@ pub fn conditions(data: &ReportData) -> PageTable {
             count(accepted),
             real(accepted as f64 / number as f64, 2),
             count(sum(|walk| walk.rejected.unsigned_abs())),
-            count(sum(|walk| walk.returns.into())),
+            count(sum(|walk| walk.rollbacks.into())),
         ]);
     }
     table

@@ -171,7 +171,7 @@ function adjustments({ retry_adjustments: names = [] }) {
 function label(made) {
   const { model } = made;
   return facts([
-    [made.standing, `protocol ${made.protocol}; ${made.source}; ${time(made.received)}`],
+    [made.status, `protocol ${made.protocol}; ${made.source}; ${time(made.received)}`],
     ["excluded", made.excluded && `${made.excluded.reason}; ${time(made.excluded.time)}`],
     ["superseded", made.superseded && `${made.superseded.reason}; ${time(made.superseded.time)}`],
     ["retry adjustments", adjustments(made.details)],

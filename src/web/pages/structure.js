@@ -15,7 +15,7 @@ const BY = { gamma_original: "γ, original mixture", gamma_walker: "γ, the walk
 /** The view with its table. `grades` may be missing. */
 export function view(found, grades, labels) {
   const structure = { ...found, positions: found.positions.map((at) => inCell(at, found)) };
-  const errors = labels.find((label) => label.standing === "label")?.model?.atoms;
+  const errors = labels.find((label) => label.status === "label")?.model?.atoms;
   const atoms = structure.species.map((species, k) => ({ ...grades?.[k], atom: k, species, error: errors?.[k], at: structure.positions[k] }));
   const choices = Object.keys(BY).filter((key) => atoms.some((atom) => atom[key] != null));
   const state = { turned: [[1, 0, 0], [0, 0.2, 0.98], [0, -0.98, 0.2]], zoom: 1, picked: null, by: choices[0] };

@@ -66,7 +66,7 @@ const TABLES: [CopiedTable; 17] = [
     table!("component" { element: I, slot: I, bytes: B, checksum: I }),
     table!("walk" {
         walk: I, origin: T, partner: I, seed_structure: I, state: T, reason: T, assignments: I, accepted: I, step: I,
-        segment: I, tau: R, temperature: R, relative_volume: R, gamma_max: R, refused: I, returns: I,
+        segment: I, tau: R, temperature: R, relative_volume: R, gamma_max: R, rejected: I, rollbacks: I,
         selector_state: T, checkpoint: B, checksum: I, checkpoint_checksum: I,
     }),
     table!("walk_conditions" { walk: I, conditions: T, checksum: I }),
@@ -79,7 +79,7 @@ const TABLES: [CopiedTable; 17] = [
         core_seconds: R, remedies: T, difference: T, atoms: I, electrons: R, k_points: I,
     }),
     table!("label" {
-        number: I, structure: I, protocol: I, standing: T, energy: R, forces: B, stress: B, job: I, attempt: I,
+        number: I, structure: I, protocol: I, status: T, energy: R, forces: B, stress: B, job: I, attempt: I,
         file: T, frame: I, correction: T, received: I, details: T,
         superseded: I, reason: T, checksum: I, excluded: I, exclusion: T,
     }),

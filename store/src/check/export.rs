@@ -14,7 +14,7 @@ const PAGE: u32 = 4096;
 
 /// Every label of a protocol, in table order and without an index.
 const LABELLED: &str = "SELECT number, structure FROM label NOT INDEXED
-    WHERE number > $1 AND protocol = $2 AND standing = 'label' ORDER BY number LIMIT $3";
+    WHERE number > $1 AND protocol = $2 AND status = 'label' ORDER BY number LIMIT $3";
 
 const DROPPED: &str = "SELECT structure FROM job NOT INDEXED WHERE protocol = $1 AND state = 'dropped'";
 

@@ -70,8 +70,8 @@ const LOSSES: [ConsistencyRule; 7] = [
         then: LOST,
     },
     ConsistencyRule {
-        finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
-                SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.standing IN ('label', 'excluded'))",
+        finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE status = 'superseded' AND NOT EXISTS (
+                SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.status IN ('label', 'excluded'))",
         what: "superseded labels of structures without another label, of the structure",
         then: LOST,
     },
@@ -174,7 +174,7 @@ macro_rules! disagreeing {
         concat!(
             "SELECT count(*), CAST(min(job.number) AS TEXT) FROM job WHERE (state = 'labelled') <> EXISTS (
             SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
-            AND standing IN ('label', 'excluded')) AND state <> 'dropped'",
+            AND status IN ('label', 'excluded')) AND state <> 'dropped'",
             $but
         )
     };

@@ -16,10 +16,10 @@ use crate::old_schema::{self, FIRST_WITH_CHECKSUMS};
 use crate::tables::checksums;
 
 /// The newest migration.
-const SCHEMA: i64 = 15;
+const SCHEMA: i64 = 16;
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 14] = [
+pub(crate) static STEPS: [MigrationSource; 15] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -34,6 +34,7 @@ pub(crate) static STEPS: [MigrationSource; 14] = [
     (13, "queued imports", include_str!("../../migrations/postgres/0013_queued_imports.sql")),
     (14, "start time", include_str!("../../migrations/postgres/0014_start_time.sql")),
     (15, "assignments", include_str!("../../migrations/postgres/0015_assignments.sql")),
+    (16, "words", include_str!("../../migrations/postgres/0016_words.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

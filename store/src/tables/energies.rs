@@ -10,10 +10,11 @@ use crate::error::{Result, StoreError};
 use crate::outcomes::LabelledEnergies;
 
 /// The newest labels of structures that were not dropped.
-const ENERGIES: &str = "SELECT job.decision AS decision, formula, candidate.energy AS model, label.energy AS label
+const ENERGIES: &str =
+    "SELECT job.decision AS decision, formula, candidate.energy AS model, label.energy AS label
     FROM label CROSS JOIN job ON job.structure = label.structure AND job.protocol = label.protocol
     CROSS JOIN candidate ON candidate.decision = job.decision
-    WHERE label.protocol = $1 AND standing = 'label' AND job.state <> 'dropped' AND candidate.energy IS NOT NULL
+    WHERE label.protocol = $1 AND status = 'label' AND job.state <> 'dropped' AND candidate.energy IS NOT NULL
     ORDER BY label.number DESC LIMIT $2";
 
 struct EnergyRow {

@@ -19,16 +19,16 @@ const STRUCTURE_OF_CANDIDATE: &str = "SELECT coalesce(structure, 0) FROM candida
 const STRUCTURE_OF_IMPORT: &str = "SELECT structure FROM import WHERE number = $1";
 
 /// Labels of a structure that count or are excluded.
-pub(crate) const LABEL_STATUS: &str = "SELECT protocol.name AS protocol, standing, exclusion FROM label
+pub(crate) const LABEL_STATUS: &str = "SELECT protocol.name AS protocol, status, exclusion FROM label
     CROSS JOIN protocol ON protocol.number = label.protocol
-    WHERE label.structure = $1 AND standing IN ('label', 'excluded')
+    WHERE label.structure = $1 AND status IN ('label', 'excluded')
     ORDER BY label.protocol, label.number";
 
-const EXCLUDE: &str = "UPDATE label SET standing = 'excluded', excluded = $2, exclusion = $3
-    WHERE structure = $1 AND standing = 'label'";
+const EXCLUDE: &str = "UPDATE label SET status = 'excluded', excluded = $2, exclusion = $3
+    WHERE structure = $1 AND status = 'label'";
 
-const INCLUDE: &str = "UPDATE label SET standing = 'label', excluded = NULL, exclusion = NULL
-    WHERE structure = $1 AND standing = 'excluded'";
+const INCLUDE: &str = "UPDATE label SET status = 'label', excluded = NULL, exclusion = NULL
+    WHERE structure = $1 AND status = 'excluded'";
 
 /// The newest job of a structure, and its state.
 const JOB: &str = "SELECT number, state FROM job WHERE structure = $1 ORDER BY number DESC LIMIT 1";
@@ -38,17 +38,17 @@ const ALL: &str = "SELECT coalesce((SELECT id FROM candidate WHERE candidate.str
         (SELECT 'import-' || CAST(import.number AS TEXT) FROM import WHERE import.structure = label.structure), '') AS id,
         protocol.name AS protocol, excluded, exclusion
     FROM label CROSS JOIN protocol ON protocol.number = label.protocol
-    WHERE standing = 'excluded' ORDER BY excluded, label.number";
+    WHERE status = 'excluded' ORDER BY excluded, label.number";
 
 /// Why labels of jobs are excluded.
 const EXCLUSIONS_BY_JOB: &str = "SELECT job.number, exclusion FROM label
-    CROSS JOIN job ON job.structure = label.structure AND job.protocol = label.protocol WHERE standing = 'excluded'";
+    CROSS JOIN job ON job.structure = label.structure AND job.protocol = label.protocol WHERE status = 'excluded'";
 
-const COUNT: &str = "SELECT count(*) FROM label WHERE standing = 'excluded'";
+const COUNT: &str = "SELECT count(*) FROM label WHERE status = 'excluded'";
 
 struct LabelStatusRow {
     protocol: String,
-    standing: String,
+    status: String,
     exclusion: Option<String>,
 }
 
@@ -59,7 +59,7 @@ struct ExcludedRow {
     exclusion: String,
 }
 
-from_columns!(LabelStatusRow { protocol, standing, exclusion });
+from_columns!(LabelStatusRow { protocol, status, exclusion });
 from_columns!(ExcludedRow { id, protocol, excluded, exclusion });
 
 /// A structure named by the user.
@@ -179,7 +179,7 @@ async fn change(
         insert_operation(transaction, now, kind, &detail).await?;
     }
     let before =
-        labels.into_iter().find(|label| label.standing == "excluded").and_then(|label| label.exclusion);
+        labels.into_iter().find(|label| label.status == "excluded").and_then(|label| label.exclusion);
     let excluded = reason.map(|reason| before.filter(|_| !changed).unwrap_or(reason.to_owned()));
     Ok(ExclusionChange { id, protocols, changed, excluded })
 }
@@ -203,7 +203,7 @@ pub(super) async fn check_has_label(transaction: &mut Transaction, structure: i6
     if labels.is_empty() {
         return Err(no_label(id.to_owned(), newest_job(transaction, structure).await?));
     }
-    match labels.iter().any(|label| label.standing == "label") {
+    match labels.iter().any(|label| label.status == "label") {
         true => Ok(()),
         false => Err(StoreError::NoLabel { id: id.to_owned(), why: "its label is excluded".to_owned() }),
     }

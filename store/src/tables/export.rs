@@ -24,7 +24,7 @@ pub(crate) const CANDIDATES: &str = concat!(
     joined!(structure),
     ", label.*
     FROM candidate
-    CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND standing = 'label'
+    CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND status = 'label'
     CROSS JOIN structure ON structure.number = candidate.structure
     CROSS JOIN decision ON decision.sequence = candidate.decision
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
@@ -43,7 +43,7 @@ pub(crate) const IMPORTS: &str = concat!(
     joined!(structure),
     ", label.*
     FROM import
-    CROSS JOIN label ON label.structure = import.structure AND label.protocol = $1 AND standing = 'label'
+    CROSS JOIN label ON label.structure = import.structure AND label.protocol = $1 AND status = 'label'
     CROSS JOIN structure ON structure.number = import.structure
     WHERE import.number > $2
     AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.structure = import.structure)

@@ -12,7 +12,7 @@ use crate::records::{Label, LabelDetails};
 
 /// A label as a row.
 pub(super) struct LabelRow {
-    standing: String,
+    status: String,
     energy: f64,
     forces: Vec<u8>,
     stress: Option<Vec<u8>>,
@@ -32,7 +32,7 @@ impl FromRow for LabelRow {
     fn from_row(row: &SqlRow) -> Result<Self> {
         LABEL.verify(row, Names::Plain)?;
         Ok(Self {
-            standing: row.get("standing")?,
+            status: row.get("status")?,
             energy: row.get("energy")?,
             forces: row.get("forces")?,
             stress: row.get("stress")?,
@@ -57,10 +57,10 @@ impl LabelRow {
             .ok_or_else(|| StoreError::damaged("a label", "its forces have a wrong length"))
     }
 
-    /// The label with its source and standing.
+    /// The label with its source and status.
     pub(super) fn into_record(self) -> Result<LabelRecord> {
         let unknown = || StoreError::damaged("a label", "unknown status or source");
-        let status = LabelStatus::named(&self.standing).ok_or_else(unknown)?;
+        let status = LabelStatus::named(&self.status).ok_or_else(unknown)?;
         let source = match (self.job, self.attempt, self.file, self.frame) {
             (Some(job), Some(attempt), None, None) => LabelSource::Attempt { job, attempt },
             (None, None, Some(file), Some(frame)) => LabelSource::Import { file, frame },

@@ -34,12 +34,12 @@ impl Store {
         }
         let job = job_row(&mut transaction, lease.job).await?;
         let sql =
-            "SELECT standing FROM label WHERE structure = $1 AND protocol = $2 AND job = $3 AND attempt = $4";
+            "SELECT status FROM label WHERE structure = $1 AND protocol = $2 AND job = $3 AND attempt = $4";
         let before = query(sql).bind(job.structure).bind(job.protocol);
         let before = before.bind(lease.job).bind(lease.attempt).fetch_optional(&mut transaction).await?;
         let before: Option<String> = before;
-        if let Some(standing) = before {
-            let check = standing == LabelStatus::Check.name();
+        if let Some(status) = before {
+            let check = status == LabelStatus::Check.name();
             return Ok(if check { CompleteOutcome::KeptAsCheck } else { CompleteOutcome::Label });
         }
         let source = LabelSource::Attempt { job: lease.job, attempt: lease.attempt };
@@ -117,7 +117,7 @@ pub(super) async fn add(
     }
     let sql =
         "INSERT INTO label (structure, protocol, energy, forces, stress, job, attempt, file, frame, received, details,
-                            checksum, standing)
+                            checksum, status)
          VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13) RETURNING number";
     let row = vec![
         structure.into(),

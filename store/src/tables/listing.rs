@@ -15,7 +15,7 @@ impl FromRow for ListedCandidate {
         CANDIDATE.verify(row, Names::Joined)?;
         DECISION.verify(row, Names::Joined)?;
         let reason: Option<String> = row.get("candidate__reason")?;
-        let has_label = row.get::<Option<String>>("standing")?.is_some();
+        let has_label = row.get::<Option<String>>("status")?.is_some();
         let label =
             has_label.then(|| LabelRow::from_row(row)?.into_record()).transpose()?.map(|found| found.label);
         Ok(Self {
@@ -65,7 +65,7 @@ macro_rules! page {
             LEFT JOIN job ON job.number = (SELECT max(newest.number) FROM job AS newest
                                            WHERE newest.structure = candidate.structure)
             LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = job.protocol
-                AND standing = 'label'
+                AND status = 'label'
             CROSS JOIN decision ON sequence = candidate.decision
             LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
             WHERE ",
@@ -120,7 +120,7 @@ pub(crate) const QUEUE: &str = lines!(
         CROSS JOIN candidate ON candidate.decision = job.decision
         CROSS JOIN decision ON sequence = candidate.decision
         LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = job.protocol
-            AND standing = 'label'
+            AND status = 'label'
         LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
         ORDER BY job.priority DESC, job.decision"
 );

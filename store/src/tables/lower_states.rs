@@ -29,9 +29,9 @@ macro_rules! pairs {
             "SELECT ",
             $columns,
             " FROM label AS other
-            CROSS JOIN label AS own ON own.structure = other.structure AND own.protocol = other.protocol AND own.standing = 'label'
+            CROSS JOIN label AS own ON own.structure = other.structure AND own.protocol = other.protocol AND own.status = 'label'
             CROSS JOIN structure ON structure.number = own.structure
-            WHERE other.standing IN ('check', 'superseded') AND other.excluded IS NULL
+            WHERE other.status IN ('check', 'superseded') AND other.excluded IS NULL
             AND other.energy < own.energy - CAST($1 AS DOUBLE PRECISION) * structure.atoms
             AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = own.structure AND job.protocol = own.protocol
                 AND job.state = 'dropped')",
@@ -56,12 +56,12 @@ pub(crate) const COUNT: &str = pairs!("count(DISTINCT other.structure)", "");
 const LABEL: &str = "SELECT * FROM label WHERE number = $1";
 
 const SUPERSEDE: &str =
-    "UPDATE label SET standing = 'superseded', superseded = $2, reason = $3 WHERE number = $1";
+    "UPDATE label SET status = 'superseded', superseded = $2, reason = $3 WHERE number = $1";
 
-const KEEP_AS_CHECK: &str = "UPDATE label SET standing = 'check' WHERE number = $1";
+const KEEP_AS_CHECK: &str = "UPDATE label SET status = 'check' WHERE number = $1";
 
 const MAKE_LABEL: &str =
-    "UPDATE label SET standing = 'label', superseded = NULL, reason = NULL WHERE number = $1";
+    "UPDATE label SET status = 'label', superseded = NULL, reason = NULL WHERE number = $1";
 
 /// Numbers of a label in force and of a lower result.
 struct StatePair {

@@ -26,7 +26,7 @@ pub(crate) const NEAR: &str = concat!(
     " FROM (SELECT candidate.decision AS place FROM candidate
           CROSS JOIN job ON job.structure = candidate.structure AND job.protocol = $4 AND job.state = 'labelled'
           AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-                          AND label.protocol = job.protocol AND standing = 'excluded')
+                          AND label.protocol = job.protocol AND status = 'excluded')
           WHERE formula = $1 AND fate = 'accepted' AND energy IS NOT NULL AND candidate.decision <> $2
           ORDER BY abs(energy - $3) LIMIT $5) AS page
     CROSS JOIN candidate ON candidate.decision = place

@@ -10,7 +10,7 @@ const JOB: [&str; 4] = ["hash", "protocol", "decision", "priority"];
 const INSERT_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state)
     SELECT structure.number, new.protocol, new.decision, new.priority, CASE WHEN EXISTS (
         SELECT 1 FROM label WHERE label.structure = structure.number AND label.protocol = new.protocol
-        AND standing IN ('label', 'excluded')) THEN 'labelled' ELSE 'queued' END
+        AND status IN ('label', 'excluded')) THEN 'labelled' ELSE 'queued' END
     FROM {rows} CROSS JOIN structure ON structure.hash = new.hash WHERE TRUE
     ON CONFLICT (structure, protocol) DO NOTHING";
 

@@ -49,7 +49,7 @@ pub(crate) const UNLABELLED: &str = "SELECT CASE WHEN seed_structure = 429496729
           FROM job LEFT JOIN candidate ON candidate.decision = job.decision
           WHERE job.state IN ('failed', 'labelled') AND job.protocol = $1
           AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
-                          AND standing = 'excluded')) AS finished
+                          AND status = 'excluded')) AS finished
     LEFT JOIN seed_structure AS seed ON seed.seed = finished.seed_structure
     GROUP BY seed_structure, name, formula
     HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
@@ -64,7 +64,7 @@ const FAILED: &str = "SELECT CASE WHEN failure.seed_structure = 4294967295 THEN 
         - (SELECT count(*) FROM label CROSS JOIN job AS own ON own.structure = label.structure AND own.protocol = label.protocol
            CROSS JOIN structure AS excluded ON excluded.number = own.structure
            LEFT JOIN candidate AS found ON found.decision = own.decision
-           WHERE label.protocol = $1 AND standing = 'excluded' AND own.state = 'labelled'
+           WHERE label.protocol = $1 AND status = 'excluded' AND own.state = 'labelled'
            AND coalesce(found.seed_structure, 4294967295) = failure.seed_structure
            AND excluded.formula = failure.formula) AS labelled,
         min(original_gamma) AS gamma_low, max(original_gamma) AS gamma_high,
@@ -90,10 +90,10 @@ pub(crate) const FINISHED: &str = concat!(
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
     LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
     WHERE candidate.decision > $1 AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-        AND label.protocol = job.protocol AND standing = 'excluded')
+        AND label.protocol = job.protocol AND status = 'excluded')
     AND (job.state IN ('labelled', 'failed')
         OR (job.state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-            AND label.protocol = job.protocol AND standing = 'label')))
+            AND label.protocol = job.protocol AND status = 'label')))
     ORDER BY candidate.decision LIMIT $3"
 );
 

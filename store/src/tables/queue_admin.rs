@@ -262,7 +262,7 @@ impl Store {
         let mut change = self.change("retry", id, &allowed, "failed and dropped").await?;
         let sql = "UPDATE job SET failures = 0, overruled = 1, state = CASE WHEN EXISTS (
                        SELECT 1 FROM label WHERE label.structure = job.structure
-                       AND label.protocol = job.protocol AND standing IN ('label', 'excluded')
+                       AND label.protocol = job.protocol AND status IN ('label', 'excluded')
                    ) THEN 'labelled' ELSE 'queued' END WHERE number = $1";
         query(sql).bind(change.job).execute(&mut change.transaction).await?;
         change.log("retry", json!({}), now).await

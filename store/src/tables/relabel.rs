@@ -27,7 +27,7 @@ pub(crate) const LABELLED: &str =
         coalesce(candidate.seed_structure, 4294967295) AS seed_structure, structure.formula AS formula,
         structure.atoms AS atoms
     FROM job
-    CROSS JOIN label ON label.structure = job.structure AND label.protocol = job.protocol AND standing IN ('label', 'excluded')
+    CROSS JOIN label ON label.structure = job.structure AND label.protocol = job.protocol AND status IN ('label', 'excluded')
     CROSS JOIN structure ON structure.number = job.structure
     CROSS JOIN protocol ON protocol.number = job.protocol
     LEFT JOIN candidate ON candidate.decision = job.decision
@@ -43,7 +43,7 @@ macro_rules! request {
             FROM {rows} CROSS JOIN structure ON structure.hash = new.hash
             CROSS JOIN job AS own ON own.structure = structure.number AND own.number = (
                 SELECT max(job.number) FROM job CROSS JOIN label ON label.structure = job.structure
-                AND label.protocol = job.protocol AND standing IN ('label', 'excluded')
+                AND label.protocol = job.protocol AND status IN ('label', 'excluded')
                 WHERE job.structure = structure.number AND job.state <> 'dropped')
             WHERE TRUE
             ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = 1,
@@ -61,13 +61,13 @@ const WITHDRAW_REQUESTS: &str =
     "UPDATE job SET state = 'labelled', relabel = NULL, relabel_after = NULL, holder = NULL,
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label
-        WHERE label.structure = job.structure AND label.protocol = job.protocol AND standing IN ('label', 'excluded'))";
+        WHERE label.structure = job.structure AND label.protocol = job.protocol AND status IN ('label', 'excluded'))";
 
 /// Moves jobs of earlier protocols without a label to the protocol in force, unless that has a job for the
 /// structure in another state.
 const MOVE_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
     SELECT structure, CAST($1 AS BIGINT), decision, priority, CASE WHEN EXISTS (SELECT 1 FROM label
-            WHERE label.structure = job.structure AND label.protocol = $1 AND standing IN ('label', 'excluded'))
+            WHERE label.structure = job.structure AND label.protocol = $1 AND status IN ('label', 'excluded'))
             THEN 'labelled' ELSE 'queued' END, overruled, relabel, 0
         FROM job WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')
     ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = excluded.overruled,
@@ -83,8 +83,8 @@ const END_ATTEMPTS: &str = "UPDATE attempt SET ended = $1, outcome = 'dropped' W
     AND EXISTS (SELECT 1 FROM job WHERE job.number = attempt.job AND state <> 'leased')";
 
 /// Labels that belong to a job of the structure. Others belong to other data sets.
-const SUPERSEDE: &str = "UPDATE label SET standing = 'superseded', superseded = $2, reason = $3
-    WHERE structure = $1 AND standing IN ('label', 'excluded') AND EXISTS (SELECT 1 FROM job
+const SUPERSEDE: &str = "UPDATE label SET status = 'superseded', superseded = $2, reason = $3
+    WHERE structure = $1 AND status IN ('label', 'excluded') AND EXISTS (SELECT 1 FROM job
         WHERE job.structure = label.structure AND job.protocol = label.protocol)";
 
 const SUPERSEDE_JOBS: &str =
@@ -150,7 +150,7 @@ impl Store {
         let sql = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed')
                    AND protocol <> coalesce((SELECT number FROM protocol WHERE hash = $1), 0)
                    AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-                                   AND label.protocol = job.protocol AND standing IN ('label', 'excluded'))";
+                                   AND label.protocol = job.protocol AND status IN ('label', 'excluded'))";
         query(sql).bind(protocol.0.to_vec()).fetch_one(&self.database).await
     }
 

@@ -19,7 +19,7 @@ const COLLECTED: &str = concat!(
     FROM candidate
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
     LEFT JOIN job ON job.structure = candidate.structure AND job.protocol = $1
-    LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND standing = 'label'
+    LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND status = 'label'
     WHERE candidate.decision > $2 AND fate = 'accepted'
     ORDER BY candidate.decision LIMIT $3"
 );

@@ -33,7 +33,7 @@ macro_rules! walks {
             ", walk, coalesce(name, '') AS seed_structure, origin, state, reason, FALSE AS paused, step, segment,
                 CASE WHEN relative_volume > 0 THEN tau END AS tau, CASE WHEN relative_volume > 0 THEN temperature END AS temperature,
                 nullif(relative_volume, 0) AS relative_volume, nullif(gamma_max, 0) AS gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted,
-                refused, returns
+                rejected, rollbacks
             FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ",
             $which
         )
@@ -64,7 +64,7 @@ impl Store {
         for walk in &mut walks {
             walk.conditions = conditions.remove(&WalkId(walk.walk));
         }
-        let rejected = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
+        let rejected = query("SELECT CAST(coalesce(sum(rejected), 0) AS BIGINT) FROM walk");
         let rejected: u64 = rejected.fetch_one(&mut transaction).await?;
         let sql = "SELECT mixture_version, round FROM decision ORDER BY sequence DESC LIMIT 1";
         let last: Option<(u64, u64)> = query(sql).fetch_optional(&mut transaction).await?;

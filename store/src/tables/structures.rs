@@ -10,7 +10,7 @@ use crate::error::Result;
 
 /// Whether there is a label, excluded or not.
 pub(crate) const CURRENT: &str = "SELECT EXISTS (SELECT 1 FROM label WHERE structure = $1 AND protocol = $2
-    AND standing IN ('label', 'excluded'))";
+    AND status IN ('label', 'excluded'))";
 
 /// Name of the first candidate with a structure, or `import-N`.
 const NAME: &str =

@@ -12,7 +12,7 @@ use crate::walk_progress::{TotalThroughput, WalkProgressRecord};
 const MAX_AGE: i64 = 60_000;
 
 /// The campaign key of the total.
-const TOTAL_KEY: &str = "pace";
+const TOTAL_KEY: &str = "throughput";
 
 const COLUMNS: [&str; 9] = [
     "walk",
@@ -26,7 +26,7 @@ const COLUMNS: [&str; 9] = [
     "gamma_max",
 ];
 
-const UPSERT: &str = "INSERT INTO pace ({columns}) SELECT * FROM {rows} WHERE TRUE
+const UPSERT: &str = "INSERT INTO walk_progress ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (walk) DO UPDATE SET {excluded}";
 
 impl Store {
@@ -69,10 +69,13 @@ fn finite(number: Option<f64>) -> Option<f64> {
 
 /// Progress reported within the last minute; empty for tables of an earlier version.
 pub(super) async fn recent(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgressRecord>> {
-    if !transaction.has_table("pace").await? {
+    if !transaction.has_table("walk_progress").await? {
         return Ok(Vec::new());
     }
-    query("SELECT * FROM pace WHERE seen > $1 ORDER BY walk").bind(now - MAX_AGE).fetch_all(transaction).await
+    query("SELECT * FROM walk_progress WHERE seen > $1 ORDER BY walk")
+        .bind(now - MAX_AGE)
+        .fetch_all(transaction)
+        .await
 }
 
 /// Throughput of all walks together; empty without a report in the last minute.

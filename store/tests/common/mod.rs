@@ -141,7 +141,7 @@ pub fn walk(walk: u32, assignments: u64) -> WalkRecord {
             step: 100 * assignments,
             tau: 0.5,
             temperature: 310.0,
-            refused: 2,
+            rejected: 2,
             ..WalkProgress::default()
         },
         selector_state: "{}".into(),

@@ -19,7 +19,10 @@ const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
     DROP TABLE walk_conditions;
     ALTER TABLE process RENAME COLUMN start_time TO birth; ALTER TABLE leader RENAME COLUMN start_time TO birth;
-    ALTER TABLE walk RENAME COLUMN assignments TO turn;
+    ALTER TABLE walk RENAME COLUMN assignments TO turn; ALTER TABLE walk RENAME COLUMN rejected TO refused;
+    ALTER TABLE walk RENAME COLUMN rollbacks TO returns; ALTER TABLE walk_progress RENAME TO pace;
+    ALTER TABLE label RENAME CONSTRAINT label_status_check TO label_standing_check;
+    ALTER TABLE label RENAME COLUMN status TO standing;
     DELETE FROM _sqlx_migrations WHERE version > 8";
 
 async fn exported(location: impl Into<Location>) -> Vec<String> {

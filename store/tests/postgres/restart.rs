@@ -119,7 +119,7 @@ async fn nothing_is_lost_or_duplicated_when_the_server_restarts() {
     for job in jobs {
         assert_eq!(job.state, JobState::Labelled);
         let details = store.queue_show(&job.candidate).await.unwrap();
-        let labels = details.energies.iter().filter(|(standing, _)| *standing == store::LabelStatus::Label);
+        let labels = details.energies.iter().filter(|(status, _)| *status == store::LabelStatus::Label);
         assert_eq!(labels.count(), 1);
         assert_eq!(details.attempts_made.len() as u32, job.attempts);
         assert!(details.attempts_made.iter().all(|attempt| attempt.outcome.is_some()));

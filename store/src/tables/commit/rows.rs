@@ -71,8 +71,8 @@ pub(super) const WALK: [&str; 20] = [
     "temperature",
     "relative_volume",
     "gamma_max",
-    "refused",
-    "returns",
+    "rejected",
+    "rollbacks",
     "selector_state",
     "checksum",
     "checkpoint",
@@ -326,8 +326,8 @@ fn walk(walk: &WalkRecord) -> Result<Row> {
         progress.temperature.into(),
         progress.relative_volume.into(),
         progress.gamma_max.into(),
-        integer("number of refusals", progress.refused)?.into(),
-        progress.returns.into(),
+        integer("number of rejections", progress.rejected)?.into(),
+        progress.rollbacks.into(),
         (&walk.selector_state).into(),
     ];
     let mut row = WALKS.with_checksum(row);

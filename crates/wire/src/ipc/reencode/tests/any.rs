@@ -34,7 +34,14 @@ fn end() -> impl Strategy<Value = WalkEnd> {
 fn progress() -> impl Strategy<Value = WalkProgress> {
     let numbers = [(); 4].map(|()| -1e3..1e9);
     (any::<u64>(), any::<u32>(), numbers, any::<u64>(), any::<u32>(), any::<Option<(u64, u64)>>()).prop_map(
-        |(step, segment, [tau, temperature, relative_volume, gamma_max], refused, returns, last_return)| {
+        |(
+            step,
+            segment,
+            [tau, temperature, relative_volume, gamma_max],
+            rejected,
+            rollbacks,
+            last_rollback,
+        )| {
             WalkProgress {
                 step,
                 segment,
@@ -42,9 +49,9 @@ fn progress() -> impl Strategy<Value = WalkProgress> {
                 temperature,
                 relative_volume,
                 gamma_max,
-                refused,
-                returns,
-                last_return,
+                rejected,
+                rollbacks,
+                last_rollback,
             }
         },
     )

@@ -1,0 +1,8 @@
+-- What migrations/sqlite/0016_words.sql renames.
+ALTER TABLE label RENAME COLUMN standing TO status;
+ALTER TABLE label RENAME CONSTRAINT label_standing_check TO label_status_check;
+ALTER TABLE walk RENAME COLUMN refused TO rejected;
+ALTER TABLE walk RENAME COLUMN returns TO rollbacks;
+ALTER TABLE pace RENAME TO walk_progress;
+UPDATE campaign SET key = 'throughput' WHERE key = 'pace';
+UPDATE campaign SET value = replace(value, '"most_structures":', '"max_structures":') WHERE key = 'note/forecast';
