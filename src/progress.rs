@@ -8,7 +8,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use monitor::walk_ends::WalkEnds;
 use orchestrator::reactor::Notice;
 use serde::Deserialize;
-use store::{Fate, words};
+use store::Fate;
 use tokio_util::sync::CancellationToken;
 use wire::{Origin, WalkId};
 
@@ -120,7 +120,7 @@ impl RunDisplay {
             let what = match candidate.fate {
                 Fate::Accepted if view.origin() == Origin::Control => "control frame".to_owned(),
                 Fate::Accepted => "accepted".to_owned(),
-                Fate::Declined(reason) => format!("declined ({})", words::as_text(reason.name())),
+                Fate::Declined(reason) => format!("declined ({})", reason.name().replace('_', " ")),
             };
             self.accepted += u64::from(candidate.fate == Fate::Accepted && view.origin() == Origin::Biased);
             self.show(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
@@ -154,7 +154,7 @@ impl RunDisplay {
                 self.steps.set(walk, self.walk_steps);
                 let text = |key: &str| decision.detail[key].as_str().unwrap_or_default();
                 self.ends.add(walk.0, text("end"), text("reason"));
-                let end = words::as_text(text("end"));
+                let end = text("end").replace('_', " ");
                 self.show(&format!("{}: ended ({end}) at step {}", self.name(walk), decision.detail["step"]));
             }
         }

@@ -31,7 +31,7 @@ const MORE: [&str; 12] = [
         id TEXT, x REAL)",
     "INSERT INTO new WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < $1)
         SELECT i + (SELECT max(sequence) FROM decision), i, hash IS NOT NULL,
-            CASE WHEN hash IS NOT NULL THEN NULL WHEN i % 7 = 0 THEN 'guard' WHEN i % 3 = 0 THEN 'duplicate' ELSE 'covered' END,
+            CASE WHEN hash IS NOT NULL THEN NULL WHEN i % 7 = 0 THEN 'too_close' WHEN i % 3 = 0 THEN 'duplicate' ELSE 'covered' END,
             (SELECT max(number) FROM structure) + i / 20, coalesce(hash, randomblob(32)),
             coalesce(copy.id, (SELECT substr(value, 1, 8) FROM campaign WHERE key = 'id') || '-' || (i % 1000) || '.0.' || i || '-'
                 || lower(hex(randomblob(8)))),
@@ -57,7 +57,7 @@ const MORE: [&str; 12] = [
         FROM (SELECT *, 1000 * (unixepoch() - 12 * ((SELECT max(number) FROM job) - number)) AS time FROM job) AS job
         CROSS JOIN new ON new.decision = job.decision WHERE job.state IN ('labelled', 'failed')",
     "INSERT INTO label (structure, protocol, status, energy, forces, job, attempt, received, checksum)
-        SELECT job.structure, job.protocol, 'label', energy, copy.forces, job.number, 1, ended, 0
+        SELECT job.structure, job.protocol, 'label', energy, copy.forces, job.number, 1, ended, -1
         FROM job CROSS JOIN new ON new.decision = job.decision CROSS JOIN copy ON copy.i = new.i
         CROSS JOIN attempt ON attempt.job = job.number
         CROSS JOIN (SELECT energy FROM label WHERE structure = (SELECT structure FROM one) LIMIT 1) WHERE job.state = 'labelled'",

@@ -28,7 +28,7 @@ const PAGES: [&str; 8] = [
     "/api/candidates?limit=50",
     "/api/candidates?limit=50&order=gamma",
     "/api/candidates?limit=50&order=volume&ascending=true",
-    "/api/candidates?limit=50&fate=guard",
+    "/api/candidates?limit=50&fate=too_close",
     "/api/candidates?limit=50&order=queue&state=queued",
     "/api/candidates?limit=50&where=gamma+%3E+2.9",
     "/api/mixture",

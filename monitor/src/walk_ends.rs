@@ -1,7 +1,7 @@
 //! Counts how walks ended and why, and gives advice on early ends.
 
 use serde::Serialize;
-use store::{WalkStatus, words};
+use store::WalkStatus;
 
 /// Fewer early ends are not a pattern yet.
 const MIN_EARLY_ENDS: u64 = 3;
@@ -48,7 +48,7 @@ pub struct EndCount {
 #[serde(transparent)]
 pub struct WalkEnds(Vec<EndCount>);
 
-/// Why a walk with this state, as views show it, and reason ended early. `None` for a walk that is running, made all its steps,
+/// Why a walk with this state and reason ended early. `None` for a walk that is running, made all its steps,
 /// collected all it may, or ended with a budget.
 pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
     let has = |words: &str| reason.contains(words);
@@ -96,9 +96,8 @@ impl WalkEnds {
         ends
     }
 
-    /// Counts a walk that has ended; `end` as stored or as shown.
+    /// Counts a walk that has ended.
     pub fn add(&mut self, walk: u32, end: &str, reason: &str) {
-        let end = words::shown(end);
         let cause = early_end_cause(end, reason);
         if let Some(count) = self.0.iter_mut().find(|count| count.end == end && count.cause == cause) {
             count.walks += 1;

@@ -71,7 +71,7 @@ fn come(selector: &mut Selector, number: usize, event: &Event) -> Option<Assignm
         }
         Event::StepsDone => Outcome::StepsDone,
         Event::Paused => Outcome::Interrupted,
-        Event::Ended => Outcome::Ended(WalkEnd::Steps),
+        Event::Ended => Outcome::Ended(WalkEnd::Completed),
     };
     Some(report(&assignment, outcome, progress))
 }

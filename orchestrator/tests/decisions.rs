@@ -226,7 +226,7 @@ fn the_limit_per_seed_structure_is_enforced() {
     assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
     let commit = next_candidate(&mut selector, 6, 2, NEW);
     assert_eq!(kinds(&commit), ["accepted", "ended"]);
-    assert_eq!((commit.walks[0].state.as_str(), commit.walks[0].accepted), ("collected", 2));
+    assert_eq!((commit.walks[0].state.as_str(), commit.walks[0].accepted), ("quota_reached", 2));
     assert_eq!(next_assignment(&mut selector).walk.0, 1);
 }
 
@@ -429,7 +429,7 @@ fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
     while let orchestrator::selector::Scheduling::Assign(assignment) = selector.next_assignment(0) {
         let done = wire::messages::Outcome::StepsDone;
         reports.push(match assignment.walk.0 {
-            0 => ended(&assignment, 10, WalkEnd::Steps),
+            0 => ended(&assignment, 10, WalkEnd::Completed),
             _ => common::report(&assignment, done, common::at(10)),
         });
     }

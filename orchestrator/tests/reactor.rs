@@ -364,7 +364,7 @@ async fn assignments_that_crash_walkers_end_their_walk() {
         threads.into_iter().for_each(|thread| thread.join().unwrap());
         let walk = store.load_walks().await.unwrap().remove(0);
         let expected = "3 walkers crashed in this assignment";
-        assert_eq!((walk.state == "blew_up", walk.reason == expected), (fault, fault));
+        assert_eq!((walk.state == "diverged", walk.reason == expected), (fault, fault));
         let log = store.decision_log_text().await.unwrap();
         assert_eq!(log.contains(expected), fault, "{log}");
     }

@@ -106,7 +106,7 @@ proptest! {
         for candidate in campaign.commits.iter().flat_map(|commit| &commit.candidates) {
             let shortest = grader().bonds(&candidate.block.view().structure()).unwrap().shortest.shortest();
             let permitted = shortest >= 0.75 * SHORTEST;
-            prop_assert!(permitted || candidate.fate == Fate::Declined(DeclineReason::Guard), "{} Å", shortest);
+            prop_assert!(permitted || candidate.fate == Fate::Declined(DeclineReason::TooClose), "{} Å", shortest);
         }
         for walk in campaign.store.walks.values().filter(|walk| walk.origin == Origin::Control) {
             let of_walk = |kind: &'static str| {
@@ -119,7 +119,7 @@ proptest! {
             let left_out = of_walk("left_out").map(|decision| decision.detail["step"].as_u64().unwrap());
             let mut found: Vec<u64> = frames.chain(left_out).collect();
             found.sort_unstable();
-            let until = if walk.state == "collected" { u64::MAX } else { walk.progress.step };
+            let until = if walk.state == "quota_reached" { u64::MAX } else { walk.progress.step };
             prop_assert_eq!(found, wanted.filter(|step| *step <= until).collect::<Vec<_>>());
             prop_assert_eq!(walk.accepted as usize, of_walk("control").count());
         }

@@ -67,7 +67,7 @@ fn complete_rounds_are_decided_in_walk_order() {
     assert_eq!((value(&commit, "round"), selector.mixture().version()), ("1", 1));
     // A walk that ends makes room for the next.
     let (first, second) = (next_assignment(&mut selector), next_assignment(&mut selector));
-    assert!(selector.report(ended(&first, 20, WalkEnd::Steps)).unwrap().is_none());
+    assert!(selector.report(ended(&first, 20, WalkEnd::Completed)).unwrap().is_none());
     decided(&mut selector, common::report(&second, Outcome::StepsDone, at(15)));
     assert_eq!(
         [next_assignment(&mut selector).walk, next_assignment(&mut selector).walk],
@@ -159,8 +159,8 @@ fn late_reports_of_lost_walkers_count_once() {
         // Reports after the end of a walk are ignored.
         selector.assignment_lost(assignment.walk);
         let last = next_assignment(&mut selector);
-        decided(&mut selector, ended(&last, 30, WalkEnd::Steps));
-        assert!(selector.report(ended(&last, 30, WalkEnd::Steps)).unwrap().is_none());
+        decided(&mut selector, ended(&last, 30, WalkEnd::Completed));
+        assert!(selector.report(ended(&last, 30, WalkEnd::Completed)).unwrap().is_none());
     }
 }
 
@@ -174,7 +174,7 @@ fn assignments_of_lost_walkers_are_assigned_again() {
         let second = next_assignment(&mut selector);
         assert_eq!(first, second);
         selector.assignment_lost(WalkId(7));
-        let commit = decided(&mut selector, ended(&second, 30, WalkEnd::Steps));
+        let commit = decided(&mut selector, ended(&second, 30, WalkEnd::Completed));
         assert_eq!(kinds(&commit), ["ended"]);
         selector.assignment_lost(second.walk);
         assert!(
@@ -195,7 +195,10 @@ fn rollbacks_are_logged_once() {
     let commit = decided(&mut selector, common::report(&assignment, Outcome::StepsDone, returned(2, 8)));
     assert_eq!(kinds(&commit), ["segment"]);
     let detail = &commit.decisions[0].detail;
-    assert_eq!(*detail, serde_json::json!({ "segment": 2, "from": 7, "to": 3, "tau": 0.125, "returns": 2 }));
+    assert_eq!(
+        *detail,
+        serde_json::json!({ "segment": 2, "from": 7, "to": 3, "tau": 0.125, "rollbacks": 2 })
+    );
     assert_eq!(commit.walks[0].progress.segment, 2);
     let assignment = next_assignment(&mut selector);
     assert_eq!(assignment.last_step, 18);
@@ -221,14 +224,14 @@ fn rollbacks_before_an_interruption_are_logged() {
 fn every_end_is_logged_with_its_reason() {
     let reason = || "forces are not finite".to_owned();
     let ends = [
-        (WalkEnd::Steps, "steps", ""),
+        (WalkEnd::Completed, "completed", ""),
         (
             WalkEnd::Trapped { guard: "shortest-bond".into() },
             "trapped",
             "rejected by the shortest-bond guard again and again",
         ),
-        (WalkEnd::BlewUp { reason: reason() }, "blew_up", "forces are not finite"),
-        (WalkEnd::BadStart { reason: reason() }, "bad_start", "forces are not finite"),
+        (WalkEnd::Diverged { reason: reason() }, "diverged", "forces are not finite"),
+        (WalkEnd::InvalidStart { reason: reason() }, "invalid_start", "forces are not finite"),
     ];
     let mut selector = begin(&settings(CampaignMode::Live), ends.len());
     let assignments = [(); 4].map(|()| next_assignment(&mut selector));
@@ -236,7 +239,7 @@ fn every_end_is_logged_with_its_reason() {
         let commit = decided(&mut selector, ended(assignment, 3, end));
         let detail = &commit.decisions[0].detail;
         // A walk that could not be resumed keeps its step.
-        let step = if name == "bad_start" { 0 } else { 3 };
+        let step = if name == "invalid_start" { 0 } else { 3 };
         assert_eq!(
             *detail,
             serde_json::json!({ "end": name, "reason": reason, "step": step, "accepted": 0 })
@@ -262,7 +265,7 @@ fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
         store.commit(&decided(&mut selector, report));
     }
     let assignment = next_assignment(&mut selector);
-    let commit = decided(&mut selector, ended(&assignment, 30, WalkEnd::BlewUp { reason: "hot".into() }));
+    let commit = decided(&mut selector, ended(&assignment, 30, WalkEnd::Diverged { reason: "hot".into() }));
     store.commit(&commit);
     selector
 }
@@ -326,7 +329,7 @@ fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
         store.commit(&commit);
     }
     assert!(matches!(selector.next_assignment(0), Scheduling::Done), "a control has no control");
-    assert_eq!(store.walks[&WalkId(1)].state, "collected");
+    assert_eq!(store.walks[&WalkId(1)].state, "quota_reached");
     assert_eq!(store.known.len(), 3, "control frames are not what later candidates are compared with");
 }
 
@@ -356,7 +359,7 @@ fn a_control_frame_with_atoms_too_close_is_left_out() {
         store.commit(&commit);
     }
     let control = &store.walks[&WalkId(1)];
-    assert_eq!((control.state.as_str(), control.accepted), ("collected", 1));
+    assert_eq!((control.state.as_str(), control.accepted), ("quota_reached", 1));
     assert!(matches!(selector.next_assignment(0), Scheduling::Done));
 }
 

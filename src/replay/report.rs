@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use orchestrator::selector::{Replay, ReplayError, ReplayedDecision};
 use serde::Serialize;
 use serde_json::{Value, json};
-use store::{AtomGrades, LoggedDecision, NewestMixture, StoredCandidate, words};
+use store::{AtomGrades, LoggedDecision, NewestMixture, StoredCandidate};
 
 use super::RuleOverride;
 
@@ -209,7 +209,7 @@ impl FateCounts {
 
 /// Why a candidate was declined. `None` if it was accepted.
 fn reason(kind: &str, detail: &Value) -> Option<String> {
-    (kind == "declined").then(|| words::shown(detail["reason"].as_str().unwrap_or_default()).to_owned())
+    (kind == "declined").then(|| detail["reason"].as_str().unwrap_or_default().to_owned())
 }
 
 /// The step in the name of a decision's candidate, `campaign-walk.segment.step-content`.

@@ -4,7 +4,6 @@ use dft::FailureClass;
 use monitor::reference_check::CheckState;
 use monitor::walk_ends::EarlyEndCause;
 use serde::Serialize;
-use store::words::shown;
 use store::{JobState, LabelStatus};
 use wire::messages::{DeclineReason, WalkEnd};
 
@@ -28,14 +27,14 @@ fn json(word: impl Serialize) -> String {
 fn every_status_word_is_explained() {
     let none = String::new;
     let ends = [
-        WalkEnd::Steps,
-        WalkEnd::Collected,
+        WalkEnd::Completed,
+        WalkEnd::QuotaReached,
         WalkEnd::Budget,
         WalkEnd::Trapped { guard: none() },
-        WalkEnd::BlewUp { reason: none() },
-        WalkEnd::BadStart { reason: none() },
+        WalkEnd::Diverged { reason: none() },
+        WalkEnd::InvalidStart { reason: none() },
     ];
-    let ends = ends.iter().map(|end| shown(end.name()).to_owned());
+    let ends = ends.iter().map(|end| end.name().to_owned());
     let causes = {
         use EarlyEndCause::*;
         [TooHot, NotFinite, LostAtom, Crashed, Trapped, InvalidStart, Other].map(json)
@@ -54,7 +53,10 @@ fn every_status_word_is_explained() {
         "configuration",
     ];
     let reasons = DeclineReason::ALL.into_iter().filter(|reason| *reason != DeclineReason::LeftOut);
-    let classes = FailureClass::ALL.iter().map(|class| class.name()).chain(["refused", "lost_too_often"]);
+    let classes = FailureClass::ALL
+        .iter()
+        .map(|class| class.name())
+        .chain(["rejected_by_label_guard", "lost_too_often"]);
     let own = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect::<Vec<_>>();
     let statuses = [LabelStatus::Label, LabelStatus::Check, LabelStatus::Superseded, LabelStatus::Excluded];
     let checks = [CheckState::Running, CheckState::Passed, CheckState::Failed, CheckState::Accepted];
@@ -62,11 +64,11 @@ fn every_status_word_is_explained() {
         ("Walks", own(&["waiting", "running", "stopped", "paused"]).into_iter().chain(ends).collect()),
         ("Causes of early ends", causes.to_vec()),
         ("Decisions", own(&decisions)),
-        ("Reasons to decline", reasons.map(|reason| shown(reason.name()).to_owned()).collect()),
+        ("Reasons to decline", reasons.map(|reason| reason.name().to_owned()).collect()),
         ("Label jobs", JobState::ALL.map(|state| state.name().to_owned()).to_vec()),
         ("Labels", statuses.map(json).to_vec()),
         ("Reference check", checks.map(json).to_vec()),
-        ("Failure classes", classes.map(|class| shown(class).to_owned()).collect()),
+        ("Failure classes", classes.map(str::to_owned).collect()),
         ("Events of notifications", NotifyEvent::ALL.map(|event| event.name().to_owned()).to_vec()),
     ] {
         let known = column(&format!("**{title}**"));

@@ -13,7 +13,8 @@ use crate::database::row::SqlRow;
 use crate::database::value::{ColumnType, SqlValue, replace_nul};
 use crate::error::{Result, StoreError};
 
-/// Stands for the missing checksums of tables of an earlier version that are opened read-only.
+/// Stands for checksums of tables of an earlier version that are opened read-only, where they are missing or belong to
+/// words of that version.
 pub const UNKNOWN: i64 = -1;
 
 /// A table with row checksums.
@@ -230,8 +231,27 @@ impl CheckedTable {
 
     /// Computes the checksum of a row whose columns have these names.
     pub fn compute(&self, row: &SqlRow, names: Names) -> Result<i64> {
-        let values = self.columns.iter().map(|column| column.kind.read(row, column.called(names)));
-        Ok(checksum(&values.collect::<Result<Vec<_>>>()?))
+        Ok(checksum(&self.values(row, names)?))
+    }
+
+    /// The values that the checksum covers, in its order.
+    pub fn values(&self, row: &SqlRow, names: Names) -> Result<Vec<SqlValue>> {
+        self.columns.iter().map(|column| column.kind.read(row, column.called(names))).collect()
+    }
+
+    /// Names of the columns that the checksum covers, in its order.
+    pub fn column_names(&self) -> impl Iterator<Item = &'static str> {
+        self.columns.iter().map(|column| column.name)
+    }
+
+    /// The stored checksum of a row, or the computed one if it has none.
+    pub fn stored_or_computed(&self, row: &SqlRow) -> Result<i64> {
+        stored(row, self.checksum.name)?.map_or_else(|| self.compute(row, Names::Plain), Ok)
+    }
+
+    /// Whether a row has no checksum yet.
+    pub fn lacks_checksum(&self, row: &SqlRow) -> Result<bool> {
+        Ok(stored(row, self.checksum.name)?.is_none())
     }
 
     /// Verifies a row.
@@ -268,6 +288,11 @@ impl CheckedColumn {
         hasher.finalize().into()
     }
 
+    /// The stored checksum of the column in a row, or the computed one if there is none.
+    pub fn stored_or_computed(&self, row: &SqlRow) -> Result<i64> {
+        stored(row, self.checksum)?.map_or_else(|| self.compute(row), Ok)
+    }
+
     /// Computes the checksum of the column in a row.
     pub fn compute(&self, row: &SqlRow) -> Result<i64> {
         let (number, bytes): (i64, Option<Vec<u8>>) = (row.get(self.key)?, row.get(self.name)?);
@@ -286,6 +311,11 @@ impl CheckedColumn {
         let number: i64 = row.get(self.key)?;
         compare(found, self.compute(row)?, || format!("{} {number}", self.what))
     }
+}
+
+/// A stored checksum, unless it is missing or marked as unknown.
+fn stored(row: &SqlRow, name: &str) -> Result<Option<i64>> {
+    Ok(row.get::<Option<i64>>(name)?.filter(|found| *found != UNKNOWN))
 }
 
 fn compare(found: Option<i64>, computed: i64, what: impl FnOnce() -> String) -> Result<()> {

@@ -8,7 +8,6 @@ use crate::database::{FromRow, SqlRow, from_columns};
 use crate::error::Result;
 use crate::exclude::Exclusion;
 use crate::records::{JobState, Label};
-use crate::words;
 
 /// The running label attempt that started first.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -202,7 +201,7 @@ impl FromRow for Attempt {
             started: row.get("started")?,
             ended: row.get("ended")?,
             outcome: row.get("outcome")?,
-            class: row.get::<Option<String>>("class")?.map(|class| words::shown(&class).to_owned()),
+            class: row.get("class")?,
             log: row.get("log")?,
             made: CalculationRecord {
                 cores: row.get_or_default("cores")?,

@@ -39,7 +39,6 @@ mod status;
 mod store;
 mod tables;
 mod walk_progress;
-pub mod words;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 

@@ -62,7 +62,7 @@ pub struct LabelUsage {
 /// How often a failure class occurred.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct FailureCount {
-    /// The class, as views show it ([`crate::words`]).
+    /// The class.
     pub class: String,
     /// Jobs that met it and were labelled later.
     pub labelled: u64,

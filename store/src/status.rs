@@ -9,7 +9,6 @@ use crate::database::{FromRow, SqlRow};
 use crate::error::Result;
 use crate::jobs::OldestLease;
 use crate::processes::ProcessRecord;
-use crate::words;
 
 /// Everything that `status` shows.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -112,7 +111,7 @@ pub struct WalkStatus {
     pub conditions: Option<WalkConditions>,
     /// `biased` or `control`.
     pub origin: String,
-    /// `waiting`, `running`, or the reason why it ended ([`crate::words`]).
+    /// `waiting`, `running`, or the name of its end ([`wire::messages::WalkEnd`]).
     pub state: String,
     /// Why it ended, as text.
     pub reason: String,
@@ -156,7 +155,7 @@ impl FromRow for WalkStatus {
             seed_structure: row.get("seed_structure")?,
             conditions: None,
             origin: row.get("origin")?,
-            state: words::shown(&row.get::<String>("state")?).to_owned(),
+            state: row.get("state")?,
             reason: row.get("reason")?,
             paused: row.get("paused")?,
             step: row.get("step")?,

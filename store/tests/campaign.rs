@@ -38,7 +38,7 @@ fn mixed_commit() -> Commit {
     let candidates = vec![
         candidate(0, 10, Origin::Biased, Fate::Accepted),
         declined,
-        candidate(1, 30, Origin::Biased, Fate::Declined(DeclineReason::Guard)),
+        candidate(1, 30, Origin::Biased, Fate::Declined(DeclineReason::TooClose)),
         candidate(2, 10, Origin::Control, Fate::Accepted),
     ];
     Commit {
@@ -198,7 +198,7 @@ async fn status_counts_everything_once() {
     store.upsert_process(&next).await.unwrap();
     store.remove_process("a").await.unwrap();
     let mut walks = store.load_walks().await.unwrap();
-    walks.iter_mut().for_each(|walk| walk.state = "steps".into());
+    walks.iter_mut().for_each(|walk| walk.state = "completed".into());
     store.commit(&Commit { walks, ..Commit::default() }).await.unwrap();
     for job in store.queue_list(None, 10, 0).await.unwrap() {
         assert!(!store.status().await.unwrap().finished);
@@ -242,7 +242,7 @@ async fn walks_can_be_paused_and_resumed_at_any_time() {
     };
     let error = pause(&[0], true).await.unwrap_err();
     assert_eq!(error.to_string(), "the campaign has no walk 0; no walk has started yet");
-    let ended = WalkRecord { state: "blew_up".into(), ..walk(2, 1) };
+    let ended = WalkRecord { state: "diverged".into(), ..walk(2, 1) };
     store.commit(&Commit { walks: vec![walk(0, 1), walk(1, 1), ended], ..Commit::default() }).await.unwrap();
     assert_eq!(pause(&[1, 0, 1], true).await.unwrap(), [1, 0]);
     assert_eq!(pause(&[1], true).await.unwrap(), [0_u32; 0], "it is paused already");
@@ -266,7 +266,7 @@ async fn walks_can_be_paused_and_resumed_at_any_time() {
     // The end of a walk ends its pause.
     store
         .commit(&Commit {
-            walks: vec![WalkRecord { state: "steps".into(), ..walk(1, 2) }],
+            walks: vec![WalkRecord { state: "completed".into(), ..walk(1, 2) }],
             ..Commit::default()
         })
         .await
@@ -289,13 +289,13 @@ async fn the_newest_decisions_are_summarized() {
         walk: Some(WalkId(0)),
         candidate: None,
         mixture_version: 2,
-        detail: serde_json::json!({ "end": "steps", "step": 7 }),
+        detail: serde_json::json!({ "end": "completed", "step": 7 }),
     });
     store.commit(&commit).await.unwrap();
     let newest = store.newest_decisions(0, 10).await.unwrap();
     let short: Vec<_> = newest.iter().map(|d| (d.sequence, d.kind.as_str(), d.mixture_version)).collect();
     assert_eq!(short, [(3, "ended", 2), (2, "declined", 2), (1, "accepted", 1)]);
-    assert_eq!((&newest[0].detail["end"], &newest[0].candidate), (&"steps".into(), &None));
+    assert_eq!((&newest[0].detail["end"], &newest[0].candidate), (&"completed".into(), &None));
     let declined = newest[1].candidate.as_ref().unwrap();
     assert_eq!(
         (declined.reason.as_deref(), declined.step, declined.origin),

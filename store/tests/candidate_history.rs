@@ -15,7 +15,7 @@ async fn a_candidate_is_found_with_related_records() {
     let records = [
         candidate(0, 4, Origin::Biased, Fate::Accepted),
         candidate(1, 5, Origin::Biased, covered),
-        candidate(1, 6, Origin::Biased, Fate::Declined(DeclineReason::Guard)),
+        candidate(1, 6, Origin::Biased, Fate::Declined(DeclineReason::TooClose)),
         candidate(11, 7, Origin::Biased, covered),
     ];
     let named = |k: usize| CandidateRef { decision: k as i64 + 1, candidate: name_of(&records[k]) };

@@ -164,6 +164,47 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
     }
 }
 
+/// A campaign of version 15 with the words of that version.
+async fn version_15(directory: &Path) -> SqliteConnection {
+    let store = create(directory).await;
+    write_former_words(&store).await;
+    store.close().await;
+    let mut connection = connect(&directory.join(DATABASE)).await;
+    sqlx::raw_sql(TO_VERSION_15).execute(&mut connection).await.unwrap();
+    sqlx::raw_sql("PRAGMA user_version = 15").execute(&mut connection).await.unwrap();
+    connection
+}
+
+#[tokio::test]
+async fn words_of_version_15_are_read_and_renamed() {
+    let directory = tempfile::tempdir().unwrap();
+    version_15(directory.path()).await.close().await.unwrap();
+    let store = Store::open_read_only(directory.path()).await.unwrap();
+    check_present_words(&store).await;
+    store.close().await;
+    assert_eq!(version(directory.path()).await, 15);
+    let store = Store::open(directory.path()).await.unwrap();
+    check_present_words(&store).await;
+    store.close().await;
+    let mut connection = connect(&directory.path().join(DATABASE)).await;
+    let sql = "SELECT (SELECT count(*) FROM candidate WHERE checksum = -1),
+        (SELECT count(*) FROM candidate WHERE reason = 'too_close'), (SELECT class FROM attempt)";
+    let found: (i64, i64, String) = sqlx::query_as(sql).fetch_one(&mut connection).await.unwrap();
+    assert_eq!(found, (0, 1, "node_failure".to_owned()));
+}
+
+#[tokio::test]
+async fn a_new_word_covers_up_no_damage() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut connection = version_15(directory.path()).await;
+    let sql = "UPDATE decision SET mixture_version = 77 WHERE sequence = 4";
+    sqlx::query(sql).execute(&mut connection).await.unwrap();
+    connection.close().await.unwrap();
+    let store = Store::open(directory.path()).await.unwrap();
+    let found = store.check(|_, _| {}).await.unwrap();
+    assert!(found.len() == 1 && found[0].what.contains("decision 4"), "{found:?}");
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn several_processes_may_migrate_it() {
     for _ in 0..10 {

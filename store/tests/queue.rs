@@ -500,10 +500,13 @@ async fn the_cost_of_a_calculation_is_counted_once() {
     let third = lease(&store, "c", 6000).await.unwrap();
     store.record_calculation(&third, "there", &made).await.unwrap();
     store.record_cost(&third, 1.5, "").await.unwrap();
-    assert_eq!(store.release_lost(&third, "lost_node", "gone", 9000).await.unwrap(), FailOutcome::Requeued);
+    assert_eq!(
+        store.release_lost(&third, "node_failure", "gone", 9000).await.unwrap(),
+        FailOutcome::Requeued
+    );
     assert_eq!(core_seconds(9000).await, 19.5);
     let fourth = lease(&store, "c", 9000).await.unwrap();
-    assert_eq!((fourth.failures.as_slice(), fourth.overruled), (&["lost_node".to_owned()][..], false));
+    assert_eq!((fourth.failures.as_slice(), fourth.overruled), (&["node_failure".to_owned()][..], false));
     let found = store.check(|_, _| ()).await.unwrap();
     assert!(found.iter().all(|finding| !finding.what.contains("sum of")), "{found:?}");
     assert_eq!(store.lease_status(&third).await.unwrap(), LeaseStatus::LeasedAgain { calculation: None });

@@ -47,7 +47,7 @@ pub fn advance(
     let mut running = match RunningWalk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(error) => {
-            let end = WalkEnd::BadStart { reason: error.to_string() };
+            let end = WalkEnd::InvalidStart { reason: error.to_string() };
             let checkpoint = assignment.checkpoint.clone().unwrap_or_default();
             return AssignmentReport {
                 walk,
@@ -59,7 +59,7 @@ pub fn advance(
         }
     };
     let outcome = running.run(&stopping, &on_progress).unwrap_or_else(|error| {
-        Outcome::Ended(WalkEnd::BlewUp { reason: format!("at step {}: {error}", running.step()) })
+        Outcome::Ended(WalkEnd::Diverged { reason: format!("at step {}: {error}", running.step()) })
     });
     AssignmentReport {
         walk,
@@ -136,7 +136,7 @@ impl<'a> RunningWalk<'a> {
         let last = self.settings.equilibration_steps + self.settings.biased_steps;
         loop {
             if self.step() >= last {
-                return Ok(Outcome::Ended(WalkEnd::Steps));
+                return Ok(Outcome::Ended(WalkEnd::Completed));
             }
             if self.step() >= self.assignment.last_step {
                 return Ok(Outcome::StepsDone);
@@ -167,7 +167,7 @@ impl<'a> RunningWalk<'a> {
         let (structure, neighbours) = (self.dynamics.structure(), self.dynamics.neighbours());
         let (evaluation, temperature) = (self.dynamics.evaluation(), self.dynamics.temperature());
         match guard::blown_up(&self.settings.guard, structure, neighbours, evaluation, temperature) {
-            Some(reason) => Err(WalkError::BlewUp(reason)),
+            Some(reason) => Err(WalkError::Diverged(reason)),
             None => Ok(()),
         }
     }

@@ -81,7 +81,7 @@ fn log_outcome(work: &WorkItem, made: &AssignmentReport<Candidate>, time: Durati
 }
 
 fn crash_report(work: &WorkItem) -> AssignmentReport<Candidate> {
-    let end = WalkEnd::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
+    let end = WalkEnd::InvalidStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
     AssignmentReport {
         walk: work.assignment.walk,
         assignment: work.assignment.number,

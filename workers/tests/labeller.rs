@@ -379,7 +379,7 @@ async fn a_labeller_may_wait_for_the_end_of_the_campaign() {
         tokio::time::sleep(Duration::from_millis(300)).await;
         assert!(!labeller.task.is_finished());
     }
-    let over = store::WalkRecord { state: "steps".into(), ..walk(0, 2) };
+    let over = store::WalkRecord { state: "completed".into(), ..walk(0, 2) };
     store.commit(&store::Commit { walks: vec![over], ..store::Commit::default() }).await.unwrap();
     labeller.ended().await.unwrap();
     assert_eq!((number(&store, JobState::Labelled).await, names(&store).await), (4, vec![]));

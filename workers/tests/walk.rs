@@ -170,7 +170,7 @@ fn damaged_checkpoints_do_not_stop_a_walker() {
         let go = || advance(&context, &next, Arc::clone(&mixture), || false, |_| {});
         let report = catch_unwind(AssertUnwindSafe(go));
         let report = report.unwrap_or_else(|_| panic!("a panic at mutation {number}"));
-        refused += u32::from(matches!(report.outcome, Outcome::Ended(WalkEnd::BadStart { .. })));
+        refused += u32::from(matches!(report.outcome, Outcome::Ended(WalkEnd::InvalidStart { .. })));
     }
     assert!(refused > 0);
 }
@@ -284,7 +284,7 @@ fn the_skin_changes_nothing() {
         let report = run(&settings, &Assignment { conditions, ..assignment(cluster.clone(), 4020) });
         (report.outcome, report.progress.step)
     });
-    let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(WalkEnd::BlewUp { reason }) if reason.contains("no neighbour"));
+    let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(WalkEnd::Diverged { reason }) if reason.contains("no neighbour"));
     assert!(lost(&ends[0].0), "{:?}", ends[0]);
     assert!(ends.iter().all(|end| *end == ends[0]), "{ends:?}");
 }
@@ -315,7 +315,7 @@ fn without_rollbacks_a_refused_walk_continues() {
     let first = first_of("fcc-100", WalkConditions { volume_ramp: None, ..conditions() });
     let reports = whole_walk(&settings, first);
     let last = reports.last().unwrap();
-    assert!(matches!(&last.outcome, Outcome::Ended(WalkEnd::Steps)), "{last:?}");
+    assert!(matches!(&last.outcome, Outcome::Ended(WalkEnd::Completed)), "{last:?}");
     assert_eq!((last.progress.rollbacks, last.progress.segment), (0, 0));
     assert!(last.progress.rejected > u64::from(settings.guard.max_consecutive_rejections), "{last:?}");
 }
@@ -327,7 +327,7 @@ fn a_diverging_walk_ends_with_its_reason() {
     let conditions = WalkConditions { temperature: 2500.0, ..conditions() };
     let first = Assignment { conditions, ..assignment(seed_structure("fcc-100"), 600) };
     let report = run(&settings, &first);
-    let Outcome::Ended(WalkEnd::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };
+    let Outcome::Ended(WalkEnd::Diverged { reason }) = report.outcome else { panic!("{report:?}") };
     assert!(reason.contains("above the allowed 900 K"), "{reason}");
 }
 

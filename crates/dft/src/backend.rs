@@ -89,7 +89,7 @@ impl Exit {
             Self::Signal(signal) => FailureClass::Crashed.with_message(format!("ended by signal {signal}")),
             Self::TimeLimit => FailureClass::TimeLimit.with_message("exceeded its time limit"),
             Self::OutOfMemory => FailureClass::OutOfMemory.with_message("exceeded its memory limit"),
-            Self::LostNode => FailureClass::LostNode.with_message("the node it ran on was lost"),
+            Self::LostNode => FailureClass::NodeFailure.with_message("the node it ran on was lost"),
         }
     }
 }

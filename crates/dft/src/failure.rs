@@ -16,7 +16,7 @@ pub enum FailureClass {
     /// The structure cannot be calculated; another attempt would fail too.
     BadInput,
     /// The node was lost.
-    LostNode,
+    NodeFailure,
     /// The program reports success, but its numbers are wrong.
     Implausible,
     /// Another program, or another version, than the protocol's ran. The fault is in the host, not in the
@@ -42,7 +42,7 @@ impl FailureClass {
         Self::TimeLimit,
         Self::NotConverged,
         Self::BadInput,
-        Self::LostNode,
+        Self::NodeFailure,
         Self::Implausible,
         Self::OtherProgram,
     ];
@@ -55,7 +55,7 @@ impl FailureClass {
             Self::TimeLimit => "time_limit",
             Self::NotConverged => "not_converged",
             Self::BadInput => "bad_input",
-            Self::LostNode => "lost_node",
+            Self::NodeFailure => "node_failure",
             Self::Implausible => "implausible",
             Self::OtherProgram => "other_program",
         }
@@ -80,7 +80,7 @@ impl fmt::Display for FailureClass {
             Self::TimeLimit => "time limit",
             Self::NotConverged => "not converged",
             Self::BadInput => "bad input",
-            Self::LostNode => "node failure",
+            Self::NodeFailure => "node failure",
             Self::Implausible => "implausible result",
             Self::OtherProgram => "another program",
         })

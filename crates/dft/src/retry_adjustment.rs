@@ -64,7 +64,7 @@ fn escalation(class: FailureClass) -> &'static [&'static [RetryAdjustment]] {
         FailureClass::OutOfMemory => &[&[MoreMemory], &[OtherNode]],
         FailureClass::Crashed => &[&[], &[OtherNode]],
         FailureClass::Implausible => &[&[SlowerMixing, OtherMoments]],
-        FailureClass::BadInput | FailureClass::LostNode | FailureClass::OtherProgram => &[],
+        FailureClass::BadInput | FailureClass::NodeFailure | FailureClass::OtherProgram => &[],
     }
 }
 
@@ -73,7 +73,7 @@ fn escalation(class: FailureClass) -> &'static [&'static [RetryAdjustment]] {
 pub fn adjustments(failures: &[FailureClass]) -> Option<BTreeSet<RetryAdjustment>> {
     let mut changes = BTreeSet::new();
     for class in BTreeSet::from_iter(failures) {
-        if *class == FailureClass::LostNode {
+        if *class == FailureClass::NodeFailure {
             changes.insert(RetryAdjustment::OtherNode);
             continue;
         }
@@ -100,8 +100,8 @@ mod tests {
             RetryAdjustment::MoreTime,
         ];
         assert_eq!(mixed, BTreeSet::from(expected));
-        assert_eq!(adjustments(&[LostNode; 26]), Some(BTreeSet::from([RetryAdjustment::OtherNode])));
-        for class in FailureClass::ALL.into_iter().filter(|class| *class != LostNode) {
+        assert_eq!(adjustments(&[NodeFailure; 26]), Some(BTreeSet::from([RetryAdjustment::OtherNode])));
+        for class in FailureClass::ALL.into_iter().filter(|class| *class != NodeFailure) {
             assert_eq!(adjustments(&[class; 26]), None, "{class} is tried for ever");
         }
     }

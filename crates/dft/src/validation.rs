@@ -143,7 +143,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let class = |exit| failure_without_result(exit, directory.path(), &["stdout", "stderr"]).class;
         assert_eq!(class(Exit::TimeLimit), FailureClass::TimeLimit);
-        assert_eq!(class(Exit::LostNode), FailureClass::LostNode);
+        assert_eq!(class(Exit::LostNode), FailureClass::NodeFailure);
         assert_eq!(class(Exit::Signal(9)), FailureClass::OutOfMemory);
         assert_eq!(class(Exit::Signal(11)), FailureClass::Crashed);
         assert_eq!(class(Exit::Code(0)), FailureClass::Crashed);

@@ -100,7 +100,7 @@ fn the_exit_code_tells_the_class() {
         (Exit::Signal(9), OutOfMemory),
         (Exit::Signal(11), Crashed),
         (Exit::TimeLimit, TimeLimit),
-        (Exit::LostNode, LostNode),
+        (Exit::LostNode, NodeFailure),
     ] {
         assert_eq!(code.read(&oxide(), place.path(), exit).unwrap_err().class, class);
     }

@@ -58,7 +58,7 @@ pub enum DeclineReason {
     /// An identical structure is already known.
     Duplicate,
     /// The selector's guard: atoms are too close.
-    Guard,
+    TooClose,
     /// The seed structure or the campaign has reached its maximum number of structures.
     Budget,
     /// The grade is below the threshold, which was raised because many structures wait for labels.
@@ -70,14 +70,14 @@ pub enum DeclineReason {
 impl DeclineReason {
     /// All reasons, in the order of summaries.
     pub const ALL: [Self; 6] =
-        [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget, Self::Backlog, Self::LeftOut];
+        [Self::Covered, Self::Duplicate, Self::TooClose, Self::Budget, Self::Backlog, Self::LeftOut];
 
-    /// The serialized name: `"covered"`, `"duplicate"`, `"guard"`, `"budget"`, `"backlog"` or `"left_out"`.
+    /// The serialized name: `"covered"`, `"duplicate"`, `"too_close"`, `"budget"`, `"backlog"` or `"left_out"`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Covered => "covered",
             Self::Duplicate => "duplicate",
-            Self::Guard => "guard",
+            Self::TooClose => "too_close",
             Self::Budget => "budget",
             Self::Backlog => "backlog",
             Self::LeftOut => "left_out",
@@ -104,9 +104,9 @@ pub enum Outcome<C = CandidateBlock> {
 #[serde(rename_all = "snake_case")]
 pub enum WalkEnd {
     /// All steps are done.
-    Steps,
+    Completed,
     /// The maximum number of structures of this walk, or of its seed structure, was collected.
-    Collected,
+    QuotaReached,
     /// The campaign has reached its maximum number of structures.
     Budget,
     /// A guard rejected it too often, after the allowed number of rollbacks.
@@ -115,27 +115,28 @@ pub enum WalkEnd {
         guard: String,
     },
     /// Non-finite forces, an unphysical temperature, or lost atoms.
-    BlewUp {
+    Diverged {
         /// Details.
         reason: String,
     },
     /// The walk cannot start from its seed structure.
-    BadStart {
+    InvalidStart {
         /// Details.
         reason: String,
     },
 }
 
 impl WalkEnd {
-    /// The serialized name: `"steps"`, `"collected"`, `"budget"`, `"trapped"`, `"blew_up"` or `"bad_start"`.
+    /// The serialized name: `"completed"`, `"quota_reached"`, `"budget"`, `"trapped"`, `"diverged"` or
+    /// `"invalid_start"`.
     pub fn name(&self) -> &'static str {
         match self {
-            Self::Steps => "steps",
-            Self::Collected => "collected",
+            Self::Completed => "completed",
+            Self::QuotaReached => "quota_reached",
             Self::Budget => "budget",
             Self::Trapped { .. } => "trapped",
-            Self::BlewUp { .. } => "blew_up",
-            Self::BadStart { .. } => "bad_start",
+            Self::Diverged { .. } => "diverged",
+            Self::InvalidStart { .. } => "invalid_start",
         }
     }
 }

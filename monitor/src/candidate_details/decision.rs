@@ -5,7 +5,7 @@ use calm::{Staleness, Trial, UpdateEnd, UpdateRule};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use store::records::STALENESS;
-use store::{LoggedDecision, Store, StoreError, StoredCandidate, words};
+use store::{LoggedDecision, Store, StoreError, StoredCandidate};
 
 use super::{CandidateRef, CoveredCandidate};
 
@@ -106,7 +106,7 @@ impl DecisionDetails {
             number: logged.sequence,
             round: logged.round,
             kind: logged.kind.clone(),
-            reason: reason.map(|reason| words::shown(&reason).to_owned()),
+            reason,
             raised_by: detail["raised_by"].as_f64(),
             raised_threshold: detail["threshold"].as_f64(),
             mixture_version: logged.mixture_version,

@@ -110,7 +110,7 @@ pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Assignm
     AssignmentReport {
         walk: assignment.walk,
         assignment: assignment.number,
-        outcome: block.map_or(Outcome::Ended(WalkEnd::Steps), Outcome::Candidate),
+        outcome: block.map_or(Outcome::Ended(WalkEnd::Completed), Outcome::Candidate),
         checkpoint,
         progress: progress(assignment.number),
     }

@@ -53,7 +53,7 @@ impl DecisionState {
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
                 // A control walk that missed its last frame will not provide it in a later assignment.
                 Outcome::StepsDone if self.walks[id].missed_its_frames() => {
-                    self.end_walk(id, &WalkEnd::Steps, &mut commit);
+                    self.end_walk(id, &WalkEnd::Completed, &mut commit);
                 }
                 Outcome::StepsDone | Outcome::Interrupted => {}
             }
@@ -71,7 +71,7 @@ impl DecisionState {
         let walk = self.walks.count_report(report.walk);
         let returned = report.progress.segment > walk.state.segment;
         walk.state.segment = walk.state.segment.max(report.progress.segment);
-        if !matches!(report.outcome, Outcome::Ended(WalkEnd::BadStart { .. })) {
+        if !matches!(report.outcome, Outcome::Ended(WalkEnd::InvalidStart { .. })) {
             walk.record.checkpoint = Some(report.checkpoint.clone());
             walk.record.progress = report.progress.clone();
         }
@@ -81,7 +81,7 @@ impl DecisionState {
             let progress = &report.progress;
             let (from, to) = progress.last_rollback.unzip();
             let detail = json!({
-                "segment": progress.segment, "from": from, "to": to, "tau": progress.tau, "returns": progress.rollbacks,
+                "segment": progress.segment, "from": from, "to": to, "tau": progress.tau, "rollbacks": progress.rollbacks,
             });
             commit.decisions.push(self.decision("segment", report.walk, detail));
         }
@@ -138,7 +138,7 @@ impl DecisionState {
         self.act_on_alarm(id, alarm, commit);
         self.walk_mut(id).state.verdict = Some(verdict);
         if self.has_collected_enough(&self.walks[id]) {
-            self.end_walk(id, &WalkEnd::Collected, commit);
+            self.end_walk(id, &WalkEnd::QuotaReached, commit);
         }
         Ok(())
     }
@@ -163,7 +163,7 @@ impl DecisionState {
         walk.record.accepted += 1;
         walk.state.wanted.retain(|wanted| *wanted > candidate.step);
         if walk.state.wanted.is_empty() {
-            self.end_walk(id, &WalkEnd::Collected, commit);
+            self.end_walk(id, &WalkEnd::QuotaReached, commit);
         }
         Ok(())
     }
@@ -185,7 +185,7 @@ impl DecisionState {
         if !walk.is_biased() {
             walk.state.wanted.retain(|wanted| *wanted > step);
             if walk.state.wanted.is_empty() {
-                self.end_walk(id, &WalkEnd::Collected, commit);
+                self.end_walk(id, &WalkEnd::QuotaReached, commit);
             }
         }
     }
@@ -220,7 +220,7 @@ impl DecisionState {
         });
     }
 
-    /// The first applicable reason to decline, in the order guard, duplicate, budget, covered, backlog.
+    /// The first applicable reason to decline, in the order too close, duplicate, budget, covered, backlog.
     fn reason_to_decline(
         &self,
         id: WalkId,
@@ -229,7 +229,7 @@ impl DecisionState {
     ) -> Option<DeclineReason> {
         let walk = &self.walks[id];
         if self.too_close(id, graded).is_some() {
-            Some(DeclineReason::Guard)
+            Some(DeclineReason::TooClose)
         } else if self.known.contains(&content) {
             Some(DeclineReason::Duplicate)
         } else if self.has_collected_enough(walk) || self.is_budget_exhausted() {
@@ -363,7 +363,7 @@ impl DecisionState {
             (WalkEnd::Budget, self.walks.unfinished(true).filter(is_idle).collect())
         } else {
             let of_full_seeds = self.full_seeds.iter().flat_map(|seed| self.walks.unfinished_of_seed(*seed));
-            (WalkEnd::Collected, of_full_seeds.filter(is_idle).collect())
+            (WalkEnd::QuotaReached, of_full_seeds.filter(is_idle).collect())
         };
         over.iter().for_each(|id| self.end_walk(*id, &end, commit));
         self.full_seeds.retain(|seed| self.walks.unfinished_of_seed(*seed).next().is_some());
@@ -396,9 +396,9 @@ impl DecisionState {
 /// Why a walk ended, as text, if the name of the end is not sufficient.
 fn describe_end(end: &WalkEnd) -> String {
     match end {
-        WalkEnd::Steps | WalkEnd::Collected | WalkEnd::Budget => String::new(),
+        WalkEnd::Completed | WalkEnd::QuotaReached | WalkEnd::Budget => String::new(),
         WalkEnd::Trapped { guard } => format!("rejected by the {guard} guard again and again"),
-        WalkEnd::BlewUp { reason } | WalkEnd::BadStart { reason } => reason.clone(),
+        WalkEnd::Diverged { reason } | WalkEnd::InvalidStart { reason } => reason.clone(),
     }
 }
 

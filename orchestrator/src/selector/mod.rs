@@ -171,7 +171,7 @@ impl Selector {
         let Some(walk) = self.decisions.walks.get(id) else { return Ok(None) };
         let WalkRecord { assignments: number, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) =
-            (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::BlewUp { reason }));
+            (checkpoint.unwrap_or_default(), Outcome::Ended(WalkEnd::Diverged { reason }));
         self.report(AssignmentReport { walk: id, assignment: number, outcome, checkpoint, progress })
     }
 

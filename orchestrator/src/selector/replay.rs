@@ -293,7 +293,7 @@ impl Replay {
         let Detail { end, reason, step } = read(recorded)?;
         // Other walks of its seed structure may have collected enough.
         let enough = self.decisions.has_collected_enough(&self.decisions.walks[id]);
-        let collected = end == WalkEnd::Collected.name() && !enough;
+        let collected = end == WalkEnd::QuotaReached.name() && !enough;
         if collected && self.is_exact() {
             // The selector itself would have ended the walk.
             return Ok(None);

@@ -111,6 +111,6 @@ impl Walk {
     /// Whether it ended only because of a limit.
     pub fn ended_by_budget(&self) -> bool {
         self.is_biased()
-            && [WalkEnd::Collected, WalkEnd::Budget].iter().any(|end| self.record.state == end.name())
+            && [WalkEnd::QuotaReached, WalkEnd::Budget].iter().any(|end| self.record.state == end.name())
     }
 }

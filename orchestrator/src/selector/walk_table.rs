@@ -177,7 +177,7 @@ mod tests {
             }
             Step::End(number) => {
                 if let Some(id) = one(table, number, |walk| !walk.has_ended()) {
-                    table.end(id, "collected", String::new());
+                    table.end(id, "quota_reached", String::new());
                 }
             }
             Step::Resume(number) => {

@@ -52,7 +52,7 @@ pub fn advance(
         .map_or_else(State::default, |bytes| serde_json::from_slice(bytes).unwrap());
     let mut steps = 0;
     let outcome = loop {
-        let Some(event) = script.get(state.events) else { break Outcome::Ended(WalkEnd::Steps) };
+        let Some(event) = script.get(state.events) else { break Outcome::Ended(WalkEnd::Completed) };
         if state.step >= assignment.last_step {
             break Outcome::StepsDone;
         }
@@ -103,7 +103,9 @@ fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut S
             let block = block(assignment, mixture, &progress(state), structure, [f64::NAN; DIMENSION]);
             Some(Outcome::Candidate(block))
         }
-        Event::BlowUp => Some(Outcome::Ended(WalkEnd::BlewUp { reason: format!("at step {}", state.step) })),
+        Event::BlowUp => {
+            Some(Outcome::Ended(WalkEnd::Diverged { reason: format!("at step {}", state.step) }))
+        }
     }
 }
 

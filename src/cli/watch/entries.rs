@@ -1,7 +1,7 @@
 //! Walks, label jobs and decisions as entries of the panes, and their quantities for filters.
 
 use atoms::Species;
-use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus, words};
+use store::{DecidedCandidate, JobState, QueueEntry, RecentDecision, WalkStatus};
 use wire::WalkConditions;
 use wire::conditions::VariedConditions;
 
@@ -116,7 +116,7 @@ fn decision_entry(decision: &RecentDecision) -> PaneEntry {
     };
     let what = match (found.and_then(|found| found.reason.as_deref()), detail["end"].as_str()) {
         (Some(reason), _) => format!("{kind}: {}", reason.replace('_', " ")),
-        (None, Some(end)) => format!("{kind}: {}", words::as_text(end)),
+        (None, Some(end)) => format!("{kind}: {}", end.replace('_', " ")),
         (None, None) => kind.clone(),
     };
     let name = found.map(|found| found.seed_structure.as_str()).or_else(|| detail["seed_structure"].as_str());

@@ -95,8 +95,8 @@ pub(super) async fn copy(
     mut on_progress: impl FnMut(u64, u64),
 ) -> Result<()> {
     let mut from = Transaction::Postgres(server.begin_read().await?, server.clock);
-    // Their checksums are marked as unknown.
-    let without_checksums = !from.has_column("label", "checksum").await?;
+    // Some of their checksums are marked as unknown.
+    let earlier_version = !from.has_column("label", "status").await?;
     let tables = || TABLES.iter().chain([&OPERATIONS]);
     let mut all = 0;
     for table in tables() {
@@ -112,7 +112,7 @@ pub(super) async fn copy(
             .await?;
         }
         rebuild_totals(into).await?;
-        if without_checksums {
+        if earlier_version {
             let mut transaction = into.begin().await?;
             checksums::fill(&mut transaction).await?;
             transaction.commit().await?;

@@ -35,7 +35,7 @@ impl Store {
         Ok(findings)
     }
 
-    /// Recomputes the checksum of every row, after rows were written without this program.
+    /// Computes the missing checksums, after rows were written without this program.
     #[doc(hidden)]
     pub async fn write_checksums(&self) -> Result<()> {
         let mut transaction = self.database.begin_as_leader().await?;

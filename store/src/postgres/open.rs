@@ -12,8 +12,8 @@ use crate::database::{Database, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
 use crate::migrations::{MigrationSource, migrator, schema_error};
-use crate::old_schema::{self, FIRST_WITH_CHECKSUMS};
-use crate::tables::checksums;
+use crate::old_schema::{self, FIRST_WITH_CHECKSUMS, FIRST_WITH_PRESENT_WORDS};
+use crate::tables::{checksums, renamed_words};
 
 /// The newest migration.
 const SCHEMA: i64 = 16;
@@ -63,15 +63,18 @@ impl PostgresServer {
         if found < SCHEMA && writes {
             server.migrate(url).await?;
         }
-        if let Some(views) = old_schema::views(&url.schema, found).filter(|_| !writes) {
-            server = server.with_views(url, views.into());
+        if found < SCHEMA && !writes {
+            let columns = columns(url, &mut *server.connection().await?).await?;
+            if let Some(views) = old_schema::views(&url.schema, found, &columns) {
+                server = server.with_views(url, views.into());
+            }
         }
         server.campaign().await?.ok_or_else(missing)?;
         Ok(server)
     }
 
-    /// Migrates the tables to the newest version, checksums included, in one transaction. Only one process does so
-    /// at a time.
+    /// Migrates the tables to the newest version, checksums and words included, in one transaction. Only one process
+    /// does so at a time.
     async fn migrate(&self, url: &ServerUrl) -> Result<()> {
         let mut transaction = Transaction::Postgres(self.begin().await?, self.clock);
         let one = "SELECT 1::BIGINT FROM pg_advisory_xact_lock(hashtext($1))";
@@ -83,6 +86,9 @@ impl PostgresServer {
         MIGRATIONS.run_direct(None, &mut **connection, false).await.map_err(schema_error)?;
         if found < Some(FIRST_WITH_CHECKSUMS) {
             checksums::fill(&mut transaction).await?;
+        }
+        if found < Some(FIRST_WITH_PRESENT_WORDS) {
+            renamed_words::rename(&mut transaction).await?;
         }
         transaction.commit().await
     }
@@ -114,6 +120,13 @@ pub(super) async fn make_tables(url: &ServerUrl, server: &PostgresServer) -> Res
     }
     drop(connection);
     MIGRATIONS.run(&server.pool).await.map_err(schema_error)
+}
+
+/// The name of each table in the schema with each of its columns.
+async fn columns(url: &ServerUrl, connection: &mut PgConnection) -> Result<Vec<(String, String)>> {
+    let sql = "SELECT table_name::TEXT, column_name::TEXT FROM information_schema.columns
+        WHERE table_schema = $1 ORDER BY table_name, ordinal_position";
+    Ok(sqlx::query_as(sql).bind(&url.schema).fetch_all(connection).await?)
 }
 
 /// Version of the campaign's tables in the schema; `None` without tables.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use sqlx::ConnectOptions;
 use sqlx::migrate::Migrator;
-use sqlx::sqlite::{SqliteConnection, SqlitePool};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqlitePool};
 
 use super::file::{BUSY_TIMEOUT, DatabaseFile, UNFINISHED, make_private, options, readers, writer};
 use super::file_identity::FileIdentity;
@@ -17,8 +17,8 @@ use crate::error::{Result, StoreError};
 use crate::file_names::DATABASE;
 use crate::filesystem::check_directory;
 use crate::migrations::{MigrationSource, migrator, schema_error};
-use crate::old_schema::{self, FIRST_WITH_CHECKSUMS};
-use crate::tables::checksums;
+use crate::old_schema::{self, FIRST_WITH_CHECKSUMS, FIRST_WITH_PRESENT_WORDS};
+use crate::tables::{checksums, renamed_words};
 
 /// `PRAGMA application_id` of a campaign: "CALM".
 pub(super) const APPLICATION: i64 = 0x4341_4c4d;
@@ -119,12 +119,16 @@ impl DatabaseFile {
         };
         let version = identify(&path, immutable).await?;
         let options = options(&path).read_only(true).immutable(immutable);
-        let readers = readers(options, old_schema::views("main", version).map(Arc::from));
+        let views = match version {
+            SCHEMA => None,
+            _ => old_schema::views("main", version, &columns(&options).await?),
+        };
+        let readers = readers(options, views.map(Arc::from));
         Ok(Self { writer: None, readers, file: FileIdentity::read(&path)? })
     }
 }
 
-/// Migrates the tables to the newest version, checksums included, in one transaction.
+/// Migrates the tables to the newest version, checksums and words included, in one transaction.
 async fn migrate(writer: &SqlitePool) -> Result<()> {
     let mut transaction = writer.begin_with("BEGIN IMMEDIATE").await?;
     let found: i64 = sqlx::query_scalar("PRAGMA user_version").fetch_one(&mut *transaction).await?;
@@ -134,7 +138,18 @@ async fn migrate(writer: &SqlitePool) -> Result<()> {
     if found < FIRST_WITH_CHECKSUMS {
         checksums::fill(&mut transaction).await?;
     }
+    if found < FIRST_WITH_PRESENT_WORDS {
+        renamed_words::rename(&mut transaction).await?;
+    }
     transaction.commit().await
+}
+
+/// The name of each table with each of its columns.
+async fn columns(options: &SqliteConnectOptions) -> Result<Vec<(String, String)>> {
+    let sql = "SELECT found.name, info.name FROM sqlite_schema AS found
+        CROSS JOIN pragma_table_info(found.name) AS info WHERE found.type = 'table'";
+    let mut connection = options.connect().await?;
+    Ok(sqlx::query_as(sql).fetch_all(&mut connection).await?)
 }
 
 fn existing(directory: &Path) -> Result<PathBuf> {

@@ -96,7 +96,12 @@ impl Paged {
             let page = query(self.page).bind(after).bind(PAGE).rows(&mut *transaction).await?;
             let Some(last) = page.last() else { return Ok(()) };
             after = last.get(self.key)?;
-            let rows = page.iter().map(|row| self.checksums(row, long)).collect::<Result<_>>()?;
+            let mut rows = Vec::new();
+            for row in &page {
+                if self.table.lacks_checksum(row)? {
+                    rows.push(self.checksums(row, long)?);
+                }
+            }
             execute_rows(transaction, self.update, self.columns, rows).await?;
         }
     }
@@ -104,9 +109,9 @@ impl Paged {
     /// Key of the row, and its checksums.
     fn checksums(&self, row: &SqlRow, long: &[&CheckedColumn]) -> Result<Vec<SqlValue>> {
         let mut values: Vec<SqlValue> =
-            vec![row.get::<i64>(self.key)?.into(), self.table.compute(row, Names::Plain)?.into()];
+            vec![row.get::<i64>(self.key)?.into(), self.table.stored_or_computed(row)?.into()];
         for column in long {
-            values.push(column.compute(row)?.into());
+            values.push(column.stored_or_computed(row)?.into());
         }
         Ok(values)
     }
@@ -134,7 +139,7 @@ fn collect_fault(verified: Result<()>, faults: &mut Vec<String>) {
     faults.extend(verified.err().map(|error| error.to_string()));
 }
 
-/// Computes every checksum from what is stored.
+/// Computes the missing checksums from what is stored.
 pub(crate) async fn fill(transaction: &mut Transaction) -> Result<()> {
     for paged in [&STRUCTURES, &SEED_STRUCTURES, &PROTOCOLS, &DECISIONS, &LABELS, &IMPORTS] {
         paged.fill(transaction, &[]).await?;
@@ -143,23 +148,23 @@ pub(crate) async fn fill(transaction: &mut Transaction) -> Result<()> {
     CANDIDATES.fill(transaction, &LONG_COLUMNS).await?;
     for key in CAMPAIGN_KEYS {
         for row in query(CAMPAIGN_VALUE).bind(key).rows(&mut *transaction).await? {
-            let checksum = CAMPAIGN.compute(&row, Names::Plain)?;
+            let checksum = CAMPAIGN.stored_or_computed(&row)?;
             query(SET_CAMPAIGN).bind(checksum).bind(key).execute(&mut *transaction).await?;
         }
     }
     for row in query(VALUES).rows(&mut *transaction).await? {
-        let (checksum, name) = (VALUE.compute(&row, Names::Plain)?, row.get::<String>("name")?);
+        let (checksum, name) = (VALUE.stored_or_computed(&row)?, row.get::<String>("name")?);
         query(SET_VALUE).bind(checksum).bind(name).execute(&mut *transaction).await?;
     }
     let mut last = (-1, -1);
     while let Some((row, key)) = next(transaction, NEXT_COMPONENT, ["element", "slot"], last).await? {
-        let set = query(SET_COMPONENT).bind(COMPONENT.compute(&row, Names::Plain)?);
+        let set = query(SET_COMPONENT).bind(COMPONENT.stored_or_computed(&row)?);
         set.bind(key.0).bind(key.1).execute(&mut *transaction).await?;
         last = key;
     }
     let mut last = (-1, -1);
     while let Some((row, key)) = next(transaction, NEXT_ARCHIVE, ["job", "attempt"], last).await? {
-        let set = query(SET_ARCHIVE).bind(ARCHIVE.compute(&row, Names::Plain)?);
+        let set = query(SET_ARCHIVE).bind(ARCHIVE.stored_or_computed(&row)?);
         set.bind(key.0).bind(key.1).execute(&mut *transaction).await?;
         last = key;
     }

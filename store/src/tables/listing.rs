@@ -8,7 +8,6 @@ use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
 use crate::listing::{ListCursor, ListOrder, ListedCandidate};
 use crate::records::{JobState, Label};
-use crate::words;
 
 impl FromRow for ListedCandidate {
     fn from_row(row: &SqlRow) -> Result<Self> {
@@ -22,7 +21,7 @@ impl FromRow for ListedCandidate {
             decision: row.get("candidate__decision")?,
             id: row.get("candidate__id")?,
             origin: row.get("candidate__origin")?,
-            fate: words::shown(&reason.map_or_else(|| row.get("candidate__fate"), Ok)?).to_owned(),
+            fate: reason.map_or_else(|| row.get("candidate__fate"), Ok)?,
             walk: row.get("candidate__walk")?,
             segment: row.get("candidate__segment")?,
             step: row.get("candidate__step")?,
@@ -146,7 +145,7 @@ impl Store {
         query.bind(decision).bind(limit).fetch_all(&self.database).await
     }
 
-    /// The same in decision order, for one origin and fate. `reason` belongs to `declined`, as views show it.
+    /// The same in decision order, for one origin and fate. `reason` belongs to `declined`.
     pub async fn list_fate(
         &self,
         origin: &str,
@@ -158,7 +157,7 @@ impl Store {
         let fate = if reason.is_some() { "declined" } else { "accepted" };
         let query = query(if descending { NEWEST_OF_FATE } else { OLDEST_OF_FATE });
         let query = query.bind(after.unwrap_or(first(descending).decision)).bind(origin).bind(fate);
-        query.bind(reason.map(words::stored)).bind(limit).fetch_all(&self.database).await
+        query.bind(reason).bind(limit).fetch_all(&self.database).await
     }
 
     /// Candidates whose jobs have a state, in the order in which they would be leased. `after` holds priority and

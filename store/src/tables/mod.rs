@@ -27,6 +27,7 @@ pub mod queue;
 pub mod queue_admin;
 pub mod recent;
 pub mod relabel;
+pub mod renamed_words;
 pub mod report;
 mod restore;
 pub mod status;

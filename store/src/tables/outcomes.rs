@@ -9,7 +9,6 @@ use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
 use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
-use crate::words;
 
 /// The newest first: the cost of labels may change with the machine. Imported structures have no seed structure.
 pub(crate) const COSTS: &str =
@@ -137,7 +136,7 @@ impl Store {
             query(FAILURE_CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let count = |(class, labelled, failed, unfinished): (String, u64, u64, u64)| FailureCount {
-            class: words::shown(&class).to_owned(),
+            class,
             labelled,
             failed,
             unfinished,
@@ -229,7 +228,7 @@ impl FromRow for FinishedCandidate {
             gamma: row.get("candidate__original_gamma")?,
             gamma_nbr: row.get("candidate__original_gamma_nbr")?,
             relative_volume: row.get("candidate__relative_volume")?,
-            class: row.get::<Option<String>>("class")?.map(|class| words::shown(&class).to_owned()),
+            class: row.get("class")?,
             unlabelled,
         })
     }

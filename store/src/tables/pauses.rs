@@ -10,7 +10,6 @@ use super::protocols::set_campaign_value;
 use crate::Store;
 use crate::database::{Transaction, query};
 use crate::error::{Result, StoreError};
-use crate::words;
 
 /// The campaign key of the list.
 const KEY: &str = "paused_walks";
@@ -68,7 +67,7 @@ async fn check(transaction: &mut Transaction, walk: WalkId, paused: bool) -> Res
             Err(StoreError::UnknownWalk { walk, walks })
         }
         Some("waiting" | "running") => Ok(()),
-        Some(state) if paused => Err(StoreError::EndedWalk { walk, state: words::as_text(state) }),
+        Some(state) if paused => Err(StoreError::EndedWalk { walk, state: state.replace('_', " ") }),
         Some(_) => Ok(()),
     }
 }

@@ -6,7 +6,6 @@ use crate::checksum::{CANDIDATE, DECISION, Names, joined};
 use crate::database::{FromRow, SqlRow, query};
 use crate::error::{Result, StoreError};
 use crate::recent::{DecidedCandidate, RecentDecision};
-use crate::words;
 
 /// Uses the primary key of the decision log. The details of decisions on candidates are read only to verify their
 /// checksums.
@@ -53,11 +52,10 @@ impl FromRow for RecentDecision {
 fn candidate(row: &SqlRow) -> Result<Option<DecidedCandidate>> {
     let Some(candidate) = row.get("candidate__id")? else { return Ok(None) };
     CANDIDATE.verify(row, Names::Joined)?;
-    let reason: Option<String> = row.get("candidate__reason")?;
     Ok(Some(DecidedCandidate {
         candidate,
         origin: origin(&row.get::<String>("candidate__origin")?)?,
-        reason: reason.map(|reason| words::shown(&reason).to_owned()),
+        reason: row.get("candidate__reason")?,
         step: row.get("candidate__step")?,
         seed_structure: row.get("seed_name")?,
         atoms: row.get("candidate__atoms")?,

@@ -10,7 +10,6 @@ use crate::database::{FromRow, SqlRow, query};
 use crate::error::Result;
 use crate::records::JobState;
 use crate::report::{CollectedStructure, FateCount};
-use crate::words;
 
 const COLLECTED: &str = concat!(
     "SELECT candidate.decision AS decision, original_checksum, block, original_grades, state AS job_state, ",
@@ -88,10 +87,6 @@ impl FromRow for CollectedStructure {
 
 impl FromRow for FateCount {
     fn from_row(row: &SqlRow) -> Result<Self> {
-        Ok(Self {
-            part: row.get("part")?,
-            fate: words::shown(&row.get::<String>("fate")?).to_owned(),
-            number: row.get("number")?,
-        })
+        Ok(Self { part: row.get("part")?, fate: row.get("fate")?, number: row.get("number")? })
     }
 }

@@ -153,7 +153,7 @@ fn candidates(fates: &[(String, String, u64)], rejected_by_guards: u64) -> Candi
             "accepted" => candidates.accepted += count,
             "covered" => declined.covered += count,
             "duplicate" => declined.duplicate += count,
-            "guard" => declined.too_close += count,
+            "too_close" => declined.too_close += count,
             "budget" => declined.budget += count,
             "backlog" => declined.backlog += count,
             _ => {}

@@ -1,6 +1,7 @@
 //! A small campaign for tests.
 #![allow(dead_code, unused_imports, reason = "each test file uses its part")]
 
+mod former_words;
 mod home;
 
 use atoms::{Cell, Structure};
@@ -12,6 +13,7 @@ use store::{
 use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
+pub use former_words::{TO_VERSION_15, check_present_words, write_former_words};
 pub use home::{Home, server};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);

@@ -1,5 +1,7 @@
 //! Tables of an earlier version on a server.
 
+use sqlx::ConnectOptions;
+use sqlx::sqlite::SqliteConnectOptions;
 use store::{ExportFilter, Fate, Location, Store};
 use wire::Origin;
 
@@ -67,5 +69,38 @@ async fn tables_without_checksums_are_read_copied_and_migrated() {
     home.execute("UPDATE label SET energy = -1.5 WHERE number = 1").await;
     let found = store.check(|_, _| {}).await.unwrap();
     assert!(found.len() == 1 && found[0].what.contains("label 1"), "{found:?}");
+    store.close().await;
+}
+
+#[tokio::test]
+async fn words_of_version_15_are_read_copied_and_renamed() {
+    let home = Home::new();
+    let store = home.create().await;
+    write_former_words(&store).await;
+    store.close().await;
+    home.execute(TO_VERSION_15).await;
+    home.execute("ALTER TABLE label RENAME CONSTRAINT label_status_check TO label_standing_check").await;
+    let copies = tempfile::tempdir().unwrap();
+    let copy = copies.path().join("copy");
+    let store = home.open_read_only().await;
+    check_present_words(&store).await;
+    store.backup(&copy, 3, |_, _| {}).await.unwrap();
+    store.close().await;
+    let copied = Store::open(copy.as_path()).await.unwrap();
+    check_present_words(&copied).await;
+    copied.close().await;
+    let options = SqliteConnectOptions::new().filename(copy.join(store::DATABASE));
+    let mut connection = options.connect().await.unwrap();
+    let sql = "SELECT (SELECT count(*) FROM decision WHERE checksum = -1),
+        (SELECT count(*) FROM candidate WHERE checksum = -1), (SELECT count(*) FROM walk WHERE checksum = -1)";
+    let unknown: (i64, i64, i64) = sqlx::query_as(sql).fetch_one(&mut connection).await.unwrap();
+    assert_eq!(unknown, (0, 0, 0), "the copy has all checksums");
+    let store = home.open().await;
+    check_present_words(&store).await;
+    store.close().await;
+    home.execute("UPDATE decision SET mixture_version = 77 WHERE sequence = 4").await;
+    let store = home.open().await;
+    let found = store.check(|_, _| {}).await.unwrap();
+    assert!(found.len() == 1 && found[0].what.contains("decision 4"), "{found:?}");
     store.close().await;
 }

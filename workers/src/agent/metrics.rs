@@ -175,7 +175,7 @@ mod tests {
                 progress: at(0, 1),
             })
         };
-        let ended = || report(Outcome::Ended(WalkEnd::Steps));
+        let ended = || report(Outcome::Ended(WalkEnd::Completed));
         for sent in [
             SlotReport::Empty,
             report(Outcome::StepsDone),

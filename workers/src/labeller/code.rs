@@ -356,7 +356,7 @@ impl CodeMethod {
         handle.clear(&self.slurm).await?;
         self.reap();
         let result =
-            Err(FailureClass::LostNode.with_message("the process that kept the calculation was killed"));
+            Err(FailureClass::NodeFailure.with_message("the process that kept the calculation was killed"));
         Ok(LabelAttempt { result, ended: None })
     }
 
@@ -443,7 +443,7 @@ fn failed_nodes(failed: &[String]) -> Vec<String> {
 
 /// The handle of a calculation that failed and may succeed on another node, with its node.
 fn failed_on_node(attempt: &LabelAttempt) -> Option<CalculationHandle> {
-    use FailureClass::{Crashed, LostNode, OutOfMemory};
+    use FailureClass::{Crashed, NodeFailure, OutOfMemory};
     let LabelAttempt {
         result: Err(failure),
         ended: Some(EndedCalculation { handle: CalculationHandle::Slurm(job), node, .. }),
@@ -451,7 +451,7 @@ fn failed_on_node(attempt: &LabelAttempt) -> Option<CalculationHandle> {
     else {
         return None;
     };
-    let may_help = matches!(failure.class, Crashed | LostNode | OutOfMemory) && node.is_some();
+    let may_help = matches!(failure.class, Crashed | NodeFailure | OutOfMemory) && node.is_some();
     may_help.then(|| CalculationHandle::Slurm(slurm::CalculationJob { node: node.clone(), ..job.clone() }))
 }
 

@@ -19,7 +19,7 @@ use store::{Store, StoreError};
 pub const GUARD: &str = "label_guard";
 
 /// Failure class of an attempt that a guard rejected.
-pub(super) const REJECTED: &str = "refused";
+pub(super) const REJECTED: &str = "rejected_by_label_guard";
 
 /// Number of structures whose features are compared: those nearest in energy.
 const MAX_COMPARED: u32 = 32;

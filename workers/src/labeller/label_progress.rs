@@ -97,7 +97,7 @@ impl LabelProgress {
         self.failed.extend(calculation);
         self.failures.push(failure.class.name().to_owned());
         let classes = failure_classes(&self.failures);
-        let lost = classes.iter().filter(|class| **class == FailureClass::LostNode).count();
+        let lost = classes.iter().filter(|class| **class == FailureClass::NodeFailure).count();
         let is_last = classes.len() - lost >= attempts as usize || lost >= MAX_LOSSES;
         if is_last || dft::adjustments(&classes).is_none() {
             self.outcome = Some(LabelOutcome::Failed(failure.to_string()));
@@ -134,13 +134,13 @@ mod tests {
         let mut progress = LabelProgress { calculation: Some("it".to_owned()), ..LabelProgress::default() };
         assert!(!failed(&mut progress, FailureClass::NotConverged));
         assert_eq!((progress.calculation.as_ref(), progress.failed.len()), (None, 1));
-        assert!(!failed(&mut progress, FailureClass::LostNode));
+        assert!(!failed(&mut progress, FailureClass::NodeFailure));
         assert!(!failed(&mut progress, FailureClass::NotConverged));
         assert!(failed(&mut progress, FailureClass::NotConverged));
         assert_eq!(progress.outcome, Some(LabelOutcome::Failed("not converged: so".to_owned())));
         assert!(failed(&mut LabelProgress::default(), FailureClass::BadInput));
         let mut lost = LabelProgress::default();
-        let losses = (0..).take_while(|_| !failed(&mut lost, FailureClass::LostNode)).count();
+        let losses = (0..).take_while(|_| !failed(&mut lost, FailureClass::NodeFailure)).count();
         assert_eq!(losses + 1, MAX_LOSSES);
     }
 

@@ -41,7 +41,7 @@ use std::time::{Duration, Instant};
 
 use dft::{CalculationResults, Failure, FailureClass};
 use store::records::{Label, LabelDetails, Lease, Protocol};
-use store::{LeaseStatus, Store, StoreError, words};
+use store::{LeaseStatus, Store, StoreError};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
@@ -234,12 +234,7 @@ async fn label_jobs(
         match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
             Err(failure) => {
-                warn!(
-                    job = lease.job,
-                    attempt = lease.attempt,
-                    class = words::shown(failure.class.name()),
-                    "{line}"
-                );
+                warn!(job = lease.job, attempt = lease.attempt, class = failure.class.name(), "{line}");
             }
         }
         on_line(&line);
@@ -433,7 +428,7 @@ async fn deliver(
     let text = text.trim_end();
     let failed = match failure.class {
         // This was no fault of the job.
-        FailureClass::LostNode => store.release_lost(lease, class, text, now).await,
+        FailureClass::NodeFailure => store.release_lost(lease, class, text, now).await,
         _ => store.fail(lease, class, text, attempts, now).await,
     };
     failed.map(DeliveryOutcome::Failed)

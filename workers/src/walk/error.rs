@@ -22,5 +22,5 @@ pub(super) enum WalkError {
     #[error("the walk's checkpoint cannot be read: {0}")]
     Checkpoint(#[from] postcard::Error),
     #[error("{0}")]
-    BlewUp(String),
+    Diverged(String),
 }

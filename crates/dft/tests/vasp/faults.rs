@@ -30,7 +30,7 @@ fn without_any_file_the_end_of_the_program_tells_the_class() {
         (Exit::Signal(11), FailureClass::Crashed),
         (Exit::TimeLimit, FailureClass::TimeLimit),
         (Exit::OutOfMemory, FailureClass::OutOfMemory),
-        (Exit::LostNode, FailureClass::LostNode),
+        (Exit::LostNode, FailureClass::NodeFailure),
     ] {
         assert_eq!(read(&[], exit).unwrap_err().class, class, "{exit:?}");
     }

@@ -23,11 +23,11 @@ fn verdict() -> impl Strategy<Value = Verdict> {
 
 fn end() -> impl Strategy<Value = WalkEnd> {
     prop_oneof![
-        Just(WalkEnd::Steps),
-        Just(WalkEnd::Collected),
+        Just(WalkEnd::Completed),
+        Just(WalkEnd::QuotaReached),
         ".{0,40}".prop_map(|guard| WalkEnd::Trapped { guard }),
-        ".{0,40}".prop_map(|reason| WalkEnd::BlewUp { reason }),
-        ".{0,40}".prop_map(|reason| WalkEnd::BadStart { reason }),
+        ".{0,40}".prop_map(|reason| WalkEnd::Diverged { reason }),
+        ".{0,40}".prop_map(|reason| WalkEnd::InvalidStart { reason }),
     ]
 }
 
