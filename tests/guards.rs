@@ -130,17 +130,23 @@ fn walks_without_rollbacks_go_on_after_refusals() {
         let text = text.replace("[campaign]", "[campaign]\ncontrol = false");
         fs::write(&config, text.replace("[guard]", &format!("[guard]\nrollback = {rollback}\n{keys}")))
             .unwrap();
-        succeed(here, ["run", "campaign.toml"]);
+        // The walk is trapped after its last rollback. A campaign without a whole walk fails.
+        let code = calmwalk(here, ["run", "campaign.toml"]).status.code();
+        assert_eq!(code, Some(i32::from(rollback)));
         let status = json(here, ["status", "campaign"]);
         let walk = &status["walks"][0];
         let number = |what: &str| walk[what].as_u64().unwrap();
         assert_eq!(status["candidates"]["rejected_by_guards"], walk["rejected"]);
         if rollback {
-            assert_eq!((number("returns"), number("segment")), (1, 1), "{walk}");
+            assert_eq!(
+                (&walk["state"], number("rollbacks"), number("segment")),
+                (&"trapped".into(), 1, 1),
+                "{walk}"
+            );
             continue;
         }
         assert!(number("rejected") > 2, "{walk}");
-        assert_eq!((number("returns"), number("segment"), number("step")), (0, 0, 260), "{walk}");
+        assert_eq!((number("rollbacks"), number("segment"), number("step")), (0, 0, 260), "{walk}");
         assert_eq!(walk["state"], "completed", "{walk}");
         assert!(succeed(here, ["replay", "campaign"]).contains("all reproduced bit by bit"));
     }

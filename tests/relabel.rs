@@ -81,7 +81,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     ] {
         assert!(planned.contains(&words), "{words} in {planned}");
     }
-    assert_eq!((place.jobs("again"), place.jobs("labelled")), (0, labels));
+    assert_eq!((place.jobs("relabelling"), place.jobs("labelled")), (0, labels));
 
     let asked = relabel(&place, &with);
     assert!(asked.contains(&format!("{labels} structures are queued again")), "{asked}");
@@ -92,7 +92,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     );
     let twice: Value = serde_json::from_str(&relabel(&place, &[&with[..], &["--json"]].concat())).unwrap();
     assert_eq!((&twice["again"], &twice["waiting_already"]), (&0.into(), &labels.into()));
-    assert_eq!((place.jobs("again"), place.jobs("queued")), (labels, labels));
+    assert_eq!((place.jobs("relabelling"), place.jobs("queued")), (labels, labels));
     let before = exported(&place);
     // Two candidates with the same structure share one label.
     assert!(before.len() as u64 >= labels && before.iter().all(|(protocol, _)| protocol == "potential"));
@@ -104,7 +104,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     assert!(after.iter().all(|(protocol, _)| protocol == "fine"), "{after:?}");
     let names = |rows: &[(String, String)]| rows.iter().map(|row| row.1.clone()).collect::<Vec<_>>();
     assert_eq!(names(&after), names(&before));
-    assert_eq!((place.jobs("labelled"), place.jobs("again"), place.jobs("queued")), (labels, 0, 0));
+    assert_eq!((place.jobs("labelled"), place.jobs("relabelling"), place.jobs("queued")), (labels, 0, 0));
     assert_eq!(place.jobs("superseded"), labels);
     assert!(succeed(here, ["status", campaign]).contains(&format!(", {labels} superseded; ")));
     succeed(here, ["report", campaign, "-o", "report"]);
@@ -138,7 +138,7 @@ fn a_protocol_needs_its_own_name_and_a_campaign_that_is_not_running() {
         assert!(!output.status.success() && stderr(&output).contains("somebody"), "{}", stderr(&output));
     }
     drop(lock);
-    assert_eq!(place.jobs("again"), 0);
+    assert_eq!(place.jobs("relabelling"), 0);
     check(&place);
 }
 
@@ -180,10 +180,10 @@ fn killed_at_any_instant_all_or_nothing_is_asked_for() {
         std::thread::sleep(Duration::from_millis(random(kill) % 60));
         signal(running.0.id(), "KILL");
         running.0.wait().unwrap();
-        assert!([0, labels].contains(&place.jobs("again")), "{}", place.status());
+        assert!([0, labels].contains(&place.jobs("relabelling")), "{}", place.status());
     }
     relabel(&place, &["--all", "--include-current"]);
-    assert_eq!(place.jobs("again"), labels);
+    assert_eq!(place.jobs("relabelling"), labels);
     // Kills of labellers do not lose jobs either.
     for kill in 0..4 {
         let mut running = place.label(&["--until-empty"]);
@@ -192,7 +192,7 @@ fn killed_at_any_instant_all_or_nothing_is_asked_for() {
         running.0.wait().unwrap();
     }
     assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
-    assert_eq!((place.jobs("labelled"), place.jobs("again")), (labels, 0));
+    assert_eq!((place.jobs("labelled"), place.jobs("relabelling")), (labels, 0));
     assert_eq!(exported(&place), before);
     check(&place);
 }
@@ -210,6 +210,6 @@ fn labellers_continue_with_the_new_protocol() {
     assert!(place.said().contains("the campaign replaced label protocol 'potential'"), "{}", place.said());
     let job = place.job(&name).job;
     assert_eq!((job.protocol.as_str(), job.state), ("fine", JobState::Labelled));
-    assert_eq!((place.jobs("labelled"), place.jobs("again")), (labels + 1, 0));
+    assert_eq!((place.jobs("labelled"), place.jobs("relabelling")), (labels + 1, 0));
     assert!(exported(&place).iter().all(|(protocol, _)| protocol == "fine"));
 }

@@ -167,7 +167,7 @@ fn walks_of_one_seed_structure_share_a_limit() {
 fn atoms_too_close_are_declined() {
     let mut selector = begin(&live(), 1);
     let least = 0.75 * SHORTEST;
-    for (number, distance, kind) in [(1, least - 1e-6, "declined guard"), (2, least + 1e-6, "accepted")] {
+    for (number, distance, kind) in [(1, least - 1e-6, "declined too_close"), (2, least + 1e-6, "accepted")] {
         let assignment = next_assignment(&mut selector);
         let report = offer(&selector, &assignment, number, structure(number, distance), NEW);
         assert_eq!(kinds(&decided(&mut selector, report)), [kind]);
@@ -190,7 +190,7 @@ fn check_limit_of_2_5(min_distances: MinDistanceRule) {
     let mut selector = begin(&SelectorSettings { min_distances, ..live() }, 1);
     let assignment = next_assignment(&mut selector);
     let report = offer(&selector, &assignment, 1, structure(1, 2.45), NEW);
-    assert_eq!(kinds(&decided(&mut selector, report)), ["declined guard"]);
+    assert_eq!(kinds(&decided(&mut selector, report)), ["declined too_close"]);
 }
 
 #[test]
@@ -337,7 +337,7 @@ fn the_first_reason_applies() {
         kinds(&decided(&mut selector, report))
     });
     let reasons: Vec<_> = reasons.filter(|kind| kind != "ended").collect();
-    assert_eq!(reasons, ["declined guard", "declined duplicate", "declined budget"]);
+    assert_eq!(reasons, ["declined too_close", "declined duplicate", "declined budget"]);
 }
 
 #[test]

@@ -275,7 +275,7 @@ fn the_campaigns_cover_the_intended_cases() {
         "declined budget",
         "declined covered",
         "declined duplicate",
-        "declined guard",
+        "declined too_close",
     ] {
         assert!(seen.contains(kind), "no {kind} in {seen:?}");
     }

@@ -148,7 +148,7 @@ fn the_scripts_reach_every_kind_of_decision() {
         "declined budget",
         "declined covered",
         "declined duplicate",
-        "declined guard",
+        "declined too_close",
         "ended",
         "forgetting",
         "left_out",

@@ -237,7 +237,9 @@ fn a_trapped_walk_rolls_back_with_a_smaller_bias() {
     let last = reports.last().unwrap();
     assert!(last.progress.rollbacks >= 1, "{last:?}");
     assert_eq!(last.progress.segment, last.progress.rollbacks);
-    assert!(last.progress.last_rollback.is_some_and(|(from, to)| from > to && to >= settings.equilibration_steps));
+    assert!(
+        last.progress.last_rollback.is_some_and(|(from, to)| from > to && to >= settings.equilibration_steps)
+    );
     assert_eq!(last.progress.tau, 2.0 * 0.5_f64.powi(last.progress.rollbacks as i32));
     assert!(last.progress.rejected >= u64::from(5 * last.progress.rollbacks));
     let candidates = reports.iter().filter(|report| matches!(report.outcome, Outcome::Candidate(_))).count();

@@ -402,8 +402,9 @@ impl ElementComponents {
             return Err(invalid(file, &key, format!("shape {:?}", centroids.shape), "shape [K, D]"));
         };
         let thresholds = thresholds.filter(|row| row.len() >= slots).cloned();
-        let thresholds = thresholds
-            .ok_or_else(|| invalid(file, &key, format!("{slots} components"), "at most one for each threshold"))?;
+        let thresholds = thresholds.ok_or_else(|| {
+            invalid(file, &key, format!("{slots} components"), "at most one for each threshold")
+        })?;
         if slots == 0 || dimension == 0 {
             return Err(invalid(file, &key, format!("shape {:?}", centroids.shape), "at least one centroid"));
         }

@@ -82,7 +82,10 @@ fn a_script_makes_a_label() {
         electronic_steps: None,
     };
     assert_eq!(calculated, expected);
-    assert_eq!(std::fs::read_to_string(place.path().join("adjustments")).unwrap(), "more_steps,other_moments\n");
+    assert_eq!(
+        std::fs::read_to_string(place.path().join("adjustments")).unwrap(),
+        "more_steps,other_moments\n"
+    );
     assert_eq!(code.size(&oxide()).atoms, 3);
     assert_eq!(label("energy=2", 0).unwrap().stress, None);
 }
