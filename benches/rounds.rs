@@ -19,7 +19,7 @@ use calm::{Artifact, UpdateSettings};
 use md::{LangevinSettings, ThermostatSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    CampaignMode, OnForgetting, Scheduling, SeedPlan, Selector, SelectorSettings, SelectorSnapshot,
+    CampaignMode, OnForgetting, Scheduling, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
     UpdateProtocol,
 };
 use potentials::grace::{GraceModel, Threads};
@@ -49,7 +49,7 @@ fn main() {
     println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
     let [live, rounds] = [CampaignMode::Live, CampaignMode::Reproducible].map(|mode| {
         // One walker per walk, so that every assignment starts at once.
-        let walks = seeds(&[600.0]);
+        let walks = seed_structures(&[600.0]);
         let settings =
             SelectorSettings { mode, walks_per_round: walks.len(), steps_per_assignment, ..settings() };
         let campaign = Campaign::run(settings, walks.len(), walks);
@@ -74,7 +74,7 @@ fn compare_schedules() {
     });
     println!("{:<36} {:>8} {:>14} {:>32}", "", "seconds", "walkers busy", "begun before the first control");
     for (name, settings) in rounds.into_iter().chain(live) {
-        let campaign = Campaign::run(settings, WALKERS, seeds(&TEMPERATURES));
+        let campaign = Campaign::run(settings, WALKERS, seed_structures(&TEMPERATURES));
         let [busy, begun] = [campaign.busy, campaign.begun_before_control].map(|share| 100.0 * share);
         println!("{name:<36} {:>8.1} {busy:>12.0} % {begun:>30.0} %", campaign.time.as_secs_f64());
     }
@@ -97,7 +97,7 @@ struct Campaign {
 struct RunningAssignment(Duration, u64, AssignmentReport);
 
 impl Campaign {
-    fn run(settings: SelectorSettings, walkers: usize, seeds: Vec<SeedPlan>) -> Self {
+    fn run(settings: SelectorSettings, walkers: usize, seeds: Vec<SeedStructurePlan>) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
         let context = WalkContext {
             model: Arc::clone(&model),
@@ -168,7 +168,7 @@ fn settings() -> SelectorSettings {
     }
 }
 
-fn selector(settings: SelectorSettings, seeds: Vec<SeedPlan>, model: &GraceModel) -> Selector {
+fn selector(settings: SelectorSettings, seeds: Vec<SeedStructurePlan>, model: &GraceModel) -> Selector {
     let n = model.elements().len();
     let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
     let grader = Grader::new(model.elements().to_vec(), cutoffs);
@@ -204,7 +204,7 @@ fn walk_settings() -> WalkSettings {
 }
 
 /// The seed structures, with a walk at each of these temperatures, K.
-fn seeds(temperatures: &[f64]) -> Vec<SeedPlan> {
+fn seed_structures(temperatures: &[f64]) -> Vec<SeedStructurePlan> {
     let frames = atoms::read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
     let conditions = |temperature: &f64| WalkConditions {
         temperature: *temperature,
@@ -212,7 +212,7 @@ fn seeds(temperatures: &[f64]) -> Vec<SeedPlan> {
         volume_ramp: Some((1.0, 1.4)),
         ..WalkConditions::default()
     };
-    let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedPlan {
+    let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedStructurePlan {
         name: number.to_string(),
         structure: frame.structure,
         walks: temperatures.iter().map(conditions).collect(),

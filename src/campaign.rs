@@ -37,7 +37,7 @@ use loader::Loader;
 pub use seed_structures::{SkippedStructure, SourcedStructure};
 pub use short_range::PairRange;
 use short_range::pair_ranges;
-pub use triage::{Remark, SeedTriage, triage};
+pub use triage::{Remark, SeedStructureTriage, triage};
 pub use walk_time::{StepTimes, WalkTime};
 
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
@@ -142,7 +142,7 @@ impl LoadedCampaign {
 
     /// Size of the label of each seed structure, on which its cost depends. A program must be installed.
     pub fn label_sizes(&self) -> Result<Vec<dft::CalculationSize>, CommandError> {
-        let structures = self.seed_structures.iter().map(|seed| &seed.seed.structure);
+        let structures = self.seed_structures.iter().map(|seed| &seed.plan.structure);
         Ok(match &self.config.label.method {
             LabelMethod::Potential(_) => structures
                 .map(|structure| dft::CalculationSize { atoms: structure.len(), electrons: 0.0, k_points: 1 })
@@ -195,7 +195,7 @@ impl LoadedCampaign {
     /// Size of the largest message between walker and selector, bytes: a candidate of the largest seed structure with
     /// the checkpoints of its walk (three states with velocities and forces).
     pub fn largest_message(&self) -> usize {
-        let atoms = self.seed_structures.iter().map(|named| named.seed.structure.len()).max().unwrap_or(0);
+        let atoms = self.seed_structures.iter().map(|named| named.plan.structure.len()).max().unwrap_or(0);
         let features = self.artifact.mixture.dimension();
         8 * atoms * (9 + features) + 512 * atoms + 16_384
     }
@@ -227,7 +227,7 @@ impl LoadedCampaign {
             value["instructions"] = json!(instructions());
         }
         let seed = |named: &SourcedStructure| {
-            format!("{} {}", named.seed.name, ContentHash::from_structure(&named.seed.structure))
+            format!("{} {}", named.plan.name, ContentHash::from_structure(&named.plan.structure))
         };
         value["seed_structures"] = self.seed_structures.iter().map(seed).collect();
         value
@@ -245,8 +245,8 @@ impl LoadedCampaign {
         hasher.update(b"calmwalk campaign 1");
         hasher.update(fixed.to_string().as_bytes());
         for named in &self.seed_structures {
-            hasher.update(named.seed.name.as_bytes());
-            hasher.update(&ContentHash::from_structure(&named.seed.structure).0);
+            hasher.update(named.plan.name.as_bytes());
+            hasher.update(&ContentHash::from_structure(&named.plan.structure).0);
         }
         let mut id = [0; 16];
         id.copy_from_slice(&hasher.finalize().as_bytes()[..16]);
@@ -258,8 +258,8 @@ impl LoadedCampaign {
         let made: Vec<_> =
             self.seed_structures.iter().filter(|named| named.repetition != Repetition::ONE).collect();
         let shown =
-            made.iter().take(MAX_SHOWN_SUPERCELLS).map(|SourcedStructure { seed, repetition, .. }| {
-                format!("'{}' {repetition} ({} atoms)", seed.name, seed.structure.len())
+            made.iter().take(MAX_SHOWN_SUPERCELLS).map(|SourcedStructure { plan, repetition, .. }| {
+                format!("'{}' {repetition} ({} atoms)", plan.name, plan.structure.len())
             });
         let shown = shown.collect::<Vec<_>>().join(", ");
         let more = match made.len().saturating_sub(MAX_SHOWN_SUPERCELLS) {
@@ -274,9 +274,9 @@ impl LoadedCampaign {
     pub fn stored_seed_structures(&self) -> Vec<store::SeedStructure> {
         let stored = |(index, named): (usize, &SourcedStructure)| store::SeedStructure {
             index: index as u32,
-            name: named.seed.name.clone(),
+            name: named.plan.name.clone(),
             source: named.source.clone(),
-            structure: named.seed.structure.clone(),
+            structure: named.plan.structure.clone(),
         };
         self.seed_structures.iter().enumerate().map(stored).collect()
     }

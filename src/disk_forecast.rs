@@ -20,9 +20,9 @@ pub const WAL_BYTES: u64 = 70_000_000;
 pub fn estimate(campaign: &LoadedCampaign) -> DiskForecast {
     let config = &campaign.config;
     let features = campaign.artifact.mixture.dimension() as u64;
-    let seeds = || campaign.seed_structures.iter().map(|named| named.seed.structure.len() as u64);
+    let seeds = || campaign.seed_structures.iter().map(|named| named.plan.structure.len() as u64);
     let number = seeds().len() as u64;
-    let walks = || campaign.seed_structures.iter().map(|named| named.seed.walks.len());
+    let walks = || campaign.seed_structures.iter().map(|named| named.plan.walks.len());
     let collected = walks().map(|walks| config.max_structures_of(walks)).fold(0, u64::saturating_add);
     let collected =
         config.collect.max_structures.map_or(collected, |total| collected.min(total.get().into()));

@@ -177,8 +177,8 @@ fn newest_or_zero(here: &Path) -> u64 {
 /// Declined candidates do not change the mixture.
 #[test]
 fn no_version_needs_features_of_declined_candidates() {
-    let seeds = &["fcc-100", "fcc-097", "fcc-103", "vacancy"];
-    let small = Small { walks_per_round: 4, seeds, ..Small::default() };
+    let seed_structures = &["fcc-100", "fcc-097", "fcc-103", "vacancy"];
+    let small = Small { walks_per_round: 4, seed_structures, ..Small::default() };
     let directory = finished(&small, "[run]", "[run]");
     let here = directory.path();
     let versions = [1, newest(here) - 1];

@@ -17,7 +17,7 @@ fn campaign(changes: &[(&str, &str)]) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     let small = Small {
         walks_per_round: 4,
-        seeds: &["fcc-100", "fcc-097", "fcc-103", "vacancy"],
+        seed_structures: &["fcc-100", "fcc-097", "fcc-103", "vacancy"],
         ..Small::default()
     };
     let path = small.write(directory.path());

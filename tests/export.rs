@@ -18,8 +18,8 @@ use crate::common::{calmwalk, deviation, refuse, stderr, succeed};
 
 fn campaign() -> TempDir {
     let directory = tempfile::tempdir().unwrap();
-    let seeds = &["fcc-100", "fcc-097", "fcc-103", "vacancy", "slab-111"];
-    let path = Small { seeds, ..Small::default() }.write(directory.path());
+    let seed_structures = &["fcc-100", "fcc-097", "fcc-103", "vacancy", "slab-111"];
+    let path = Small { seed_structures, ..Small::default() }.write(directory.path());
     succeed(directory.path(), ["run", path.to_str().unwrap(), "--directory", "here"]);
     directory
 }

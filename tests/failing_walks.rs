@@ -10,11 +10,11 @@ use crate::common;
 use crate::common::campaign::Small;
 use crate::common::{calmwalk, stderr, succeed};
 
-const SEEDS: &[&str] = &["fcc-100", "vacancy", "fcc-097", "fcc-103"];
+const SEED_STRUCTURES: &[&str] = &["fcc-100", "vacancy", "fcc-097", "fcc-103"];
 
 /// Writes a campaign in which all walks soon exceed the maximum temperature, or none.
 fn write(here: &Path, all_fail: bool) {
-    let small = Small { steps: 40, seeds: SEEDS, walks_per_round: 4, ..Small::default() };
+    let small = Small { steps: 40, seed_structures: SEED_STRUCTURES, walks_per_round: 4, ..Small::default() };
     let path = small.write(here);
     let mut text = small.text();
     if all_fail {

@@ -199,7 +199,7 @@ fn added_seed_structures_are_walked() {
     let here = directory.path();
     let before = walks(here);
     // Append a frame to the file …
-    Small { seeds: &["fcc-100", "vacancy", "fcc-097"], ..small() }.write(here);
+    Small { seed_structures: &["fcc-100", "vacancy", "fcc-097"], ..small() }.write(here);
     let shown = resume_processes(here);
     assert!(
         shown.starts_with("configuration: seed structures added to the existing 2: 'fcc-097'"),
@@ -229,8 +229,8 @@ fn added_seed_structures_are_walked() {
 fn seed_structures_cannot_be_changed_moved_or_taken_away() {
     let directory = finished();
     let here = directory.path();
-    let moved = Small { seeds: &["vacancy", "fcc-100"], ..small() };
-    let fewer = Small { seeds: &["fcc-100"], ..small() };
+    let moved = Small { seed_structures: &["vacancy", "fcc-100"], ..small() };
+    let fewer = Small { seed_structures: &["fcc-100"], ..small() };
     for (other, words) in [
         (moved, "seed structure 0 is 'vacancy' (content "),
         (fewer, "seed structure 1 is missing, but this campaign has 'vacancy' (content "),

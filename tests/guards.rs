@@ -16,7 +16,7 @@ fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
 
 /// A small campaign with these keys in `[label]`.
 fn write(here: &Path, keys: &str) {
-    let config = Small { seeds: &["fcc-100"], max_per_walk: 2, ..Small::default() }.write(here);
+    let config = Small { seed_structures: &["fcc-100"], max_per_walk: 2, ..Small::default() }.write(here);
     let text = fs::read_to_string(&config).unwrap();
     fs::write(&config, text.replace("[label]", &format!("[label]\n{keys}"))).unwrap();
 }
@@ -125,7 +125,8 @@ fn walks_without_rollbacks_go_on_after_refusals() {
     for rollback in [true, false] {
         let directory = tempfile::tempdir().unwrap();
         let here = directory.path();
-        let config = Small { seeds: &["fcc-100"], max_per_walk: 100, ..Small::default() }.write(here);
+        let config =
+            Small { seed_structures: &["fcc-100"], max_per_walk: 100, ..Small::default() }.write(here);
         let text = fs::read_to_string(&config).unwrap();
         let text = text.replace("[campaign]", "[campaign]\ncontrol = false");
         fs::write(&config, text.replace("[guard]", &format!("[guard]\nrollback = {rollback}\n{keys}")))

@@ -18,7 +18,8 @@ fn hosts(small: &Small, others: usize) -> Hosts {
 
 #[test]
 fn a_campaign_on_three_hosts_has_the_same_outcome() {
-    let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
+    let small =
+        Small { walks_per_round: 3, seed_structures: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
     let hosts = Hosts::new(&small, 2, "");
     // An agent may start before its orchestrator.
     let mut first = hosts.agent(0);
@@ -71,7 +72,8 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
 /// With 200 ms of latency in each direction, an agent with a prefetched assignment works as usual.
 #[test]
 fn a_slow_line_changes_nothing() {
-    let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
+    let small =
+        Small { walks_per_round: 3, seed_structures: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "agent_heartbeat_timeout = \"30s\"");
     let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
     hosts.endpoints[1] = format!("tcp/{}", proxy.address);

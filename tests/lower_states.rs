@@ -27,7 +27,8 @@ mv unfinished label.extxyz
 
 /// A finished campaign whose labels all needed changed moments.
 fn campaign() -> LabelCampaign {
-    let small = Small { walkers: 1, steps: 120, seeds: &["fcc-100"], max_per_walk: 2, ..Small::default() };
+    let small =
+        Small { walkers: 1, steps: 120, seed_structures: &["fcc-100"], max_per_walk: 2, ..Small::default() };
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
     let place =
         LabelCampaign::new(&small, &[("[label]\nmethod", &format!("[label]\nmethod = {command} # "))]);

@@ -11,7 +11,7 @@ use crate::common::{calmwalk, refuse, stderr, succeed};
 /// Writes a campaign that ends quickly.
 fn write(directory: &Path) {
     fs::create_dir_all(directory).unwrap();
-    Small { steps: 30, max_per_walk: 1, seeds: &["fcc-100"], ..Small::default() }.write(directory);
+    Small { steps: 30, max_per_walk: 1, seed_structures: &["fcc-100"], ..Small::default() }.write(directory);
 }
 
 fn status(here: &Path, of: &str) -> Value {

@@ -26,7 +26,11 @@ fn finished(small: &Small, changes: &[(&str, &str)]) -> TempDir {
 
 /// Concurrent walks from similar structures: a structure found by one of them is often covered for the others.
 fn many() -> Small {
-    Small { walks_per_round: 4, seeds: &["fcc-100", "fcc-097", "fcc-103", "vacancy"], ..Small::default() }
+    Small {
+        walks_per_round: 4,
+        seed_structures: &["fcc-100", "fcc-097", "fcc-103", "vacancy"],
+        ..Small::default()
+    }
 }
 
 fn change(path: &Path, changes: &[(&str, &str)]) {

@@ -33,8 +33,9 @@ fn decisions(here: &Path) -> Vec<(LoggedDecision, bool)> {
 fn control_walks_do_not_wait_for_the_last_biased_walk() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let seeds = &["fcc-100", "vacancy", "fcc-103", "fcc-097", "bcc", "sheared"];
-    Small { mode: "live", walkers: 1, steps: 120, max_per_walk: 1, seeds, ..Small::default() }.write(here);
+    let seed_structures = &["fcc-100", "vacancy", "fcc-103", "fcc-097", "bcc", "sheared"];
+    Small { mode: "live", walkers: 1, steps: 120, max_per_walk: 1, seed_structures, ..Small::default() }
+        .write(here);
     succeed(here, ["run", "campaign.toml"]);
     let decisions = decisions(here);
     let ends: Vec<_> = decisions
@@ -55,9 +56,15 @@ fn the_share_of_control_walks_decides_when_they_walk() {
     for (share, are_last) in [("1.0", false), ("0.001", true)] {
         let directory = tempfile::tempdir().unwrap();
         let here = directory.path();
-        let seeds = &["fcc-100", "vacancy", "fcc-103", "fcc-097"];
-        let small =
-            Small { mode: "live", walkers: 1, steps: 120, max_per_walk: 1, seeds, ..Small::default() };
+        let seed_structures = &["fcc-100", "vacancy", "fcc-103", "fcc-097"];
+        let small = Small {
+            mode: "live",
+            walkers: 1,
+            steps: 120,
+            max_per_walk: 1,
+            seed_structures,
+            ..Small::default()
+        };
         let text = small.text().replace("[campaign]", &format!("[campaign]\ncontrol_share = {share}"));
         fs::write(small.write(here), text).unwrap();
         succeed(here, ["run", "campaign.toml"]);

@@ -165,8 +165,8 @@ fn wrong_selections_are_refused() {
 fn candidates_without_stored_features_are_left_out_on_request() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let seeds = &["fcc-100", "fcc-097", "fcc-103", "vacancy"];
-    let path = Small { walks_per_round: 4, seeds, ..Small::default() }.write(here);
+    let seed_structures = &["fcc-100", "fcc-097", "fcc-103", "vacancy"];
+    let path = Small { walks_per_round: 4, seed_structures, ..Small::default() }.write(here);
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text.replace("max_per_walk", "declined_features_mb = 0\nmax_per_walk")).unwrap();
     succeed(here, ["run", "campaign.toml"]);

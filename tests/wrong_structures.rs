@@ -27,13 +27,13 @@ fn good() -> String {
 }
 
 /// A tester whose demo reads its seed structures from another file.
-struct Seeds {
+struct SeedStructureFiles {
     tester: ConfigTester,
     files: String,
     at: String,
 }
 
-impl Seeds {
+impl SeedStructureFiles {
     fn new() -> Self {
         let files = config("data/aluminium_seeds.extxyz").display().to_string();
         let at = format!("c.toml:{}: seed_structures.files: ", line(&files));
@@ -49,7 +49,7 @@ impl Seeds {
 
 #[test]
 fn broken_extended_xyz_is_refused_with_its_line() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let good = good();
     let other = |from: &str, to: &str| {
         assert!(good.contains(from));
@@ -83,7 +83,7 @@ fn broken_extended_xyz_is_refused_with_its_line() {
 
 #[test]
 fn structures_that_no_walk_can_start_from_are_refused() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let good = good();
     let alone = good.replacen("27", "28", 1).replace("8.4", "40") + "Al 20 20 20\n";
     let crowded = format!("1\n{} Properties=species:S:1:pos:R:3\nAl 0 0 0\n", CELL.replace("8.4", "0.5"));
@@ -109,7 +109,7 @@ fn structures_that_no_walk_can_start_from_are_refused() {
 /// The campaign runs with the other structures, unless the configuration requires all.
 #[test]
 fn a_structure_that_no_walk_can_start_from_is_skipped_and_listed() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let crowded = good().replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0.1");
     seeds.tester.write("mixed.extxyz", good() + &crowded);
     let text = changed(&seeds.files, "mixed.extxyz");
@@ -128,7 +128,7 @@ fn a_structure_that_no_walk_can_start_from_is_skipped_and_listed() {
 
 #[test]
 fn seed_structures_need_names_of_their_own() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let named = good().replace("Properties", "name=bulk Properties");
     let words =
         ":30: a second seed structure named 'bulk', the first is two.extxyz:1; give each a unique name";
@@ -137,7 +137,7 @@ fn seed_structures_need_names_of_their_own() {
 
 #[test]
 fn other_files_are_refused() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     seeds.refused(
         "seeds.txt",
         good(),
@@ -159,7 +159,7 @@ fn other_files_are_refused() {
 
 #[test]
 fn structures_from_which_nothing_can_be_collected_are_refused() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let two =
         format!("2\n{} Properties=species:S:1:pos:R:3\nAl 0 0 0\nAl 2.8 0 0\n", CELL.replace("8.4", "5.6"));
     let words = ":1: the structure has 2 atoms, fewer than the 3 that must be new at once (collect.criterion.min_atoms)";
@@ -183,7 +183,7 @@ fn enlarged(text: &str, min_atoms: &str, min_height: &str) -> String {
 
 #[test]
 fn small_cells_become_supercells() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let primitive = "1\nLattice=\"0 2.025 2.025 2.025 0 2.025 2.025 2.025 0\" Properties=species:S:1:pos:R:3 name=fcc\nAl 0 0 0\n";
     seeds.tester.write("small.extxyz", format!("{primitive}{}", good()));
     let small = changed(&seeds.files, "small.extxyz");
@@ -252,7 +252,7 @@ fn a_campaign_keeps_its_supercells() {
 }
 
 /// Warnings of `validate` for a valid campaign with these seed structures.
-fn warnings(seeds: &Seeds, name: &str, content: impl AsRef<[u8]>) -> Vec<String> {
+fn warnings(seeds: &SeedStructureFiles, name: &str, content: impl AsRef<[u8]>) -> Vec<String> {
     seeds.tester.write(name, content);
     seeds.tester.write("c.toml", changed(&seeds.files, name));
     let output = calmwalk(seeds.tester.path(), ["validate", "c.toml"]);
@@ -262,7 +262,7 @@ fn warnings(seeds: &Seeds, name: &str, content: impl AsRef<[u8]>) -> Vec<String>
 
 #[test]
 fn the_same_structure_twice_is_warned_of() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let other = good().replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 2.81");
     // The same structure within the tolerance.
     let again = good().replace("Al 2.8 2.8 2.8", "Al 2.80000001 2.8 2.8");
@@ -274,7 +274,7 @@ fn the_same_structure_twice_is_warned_of() {
 
 #[test]
 fn lengths_in_bohr_are_warned_of() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     let scaled = |factor: f64| {
         let mut text = format!(
             "27\n{} Properties=species:S:1:pos:R:3\n",
@@ -307,7 +307,7 @@ fn lengths_in_bohr_are_warned_of() {
 
 #[test]
 fn the_good_structure_is_good() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     seeds.tester.write("good.extxyz", good());
     seeds.tester.write("c.toml", changed(&seeds.files, "good.extxyz"));
     let valid = succeed(seeds.tester.path(), ["validate", "c.toml"]);
@@ -317,7 +317,7 @@ fn the_good_structure_is_good() {
 /// The ZBL window of aluminium, 2.42 Å times the fractions, reaches into the bonds of 2.8 Å.
 #[test]
 fn a_repulsion_that_reaches_into_bonds_is_shown_and_warned_of() {
-    let seeds = Seeds::new();
+    let seeds = SeedStructureFiles::new();
     seeds.tester.write("good.extxyz", good());
     let validate = |inner: f64, outer: f64| {
         let windows = format!("zbl = {{ rule = \"per_pair\", inner = {inner}, outer = {outer} }} #");

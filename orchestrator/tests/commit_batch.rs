@@ -191,7 +191,8 @@ async fn create(directory: &Path) -> Store {
         configuration_in_force: "{}".into(),
     };
     let stored = |index| {
-        let orchestrator::selector::SeedPlan { name, structure, .. } = seed(index as usize);
+        let orchestrator::selector::SeedStructurePlan { name, structure, .. } =
+            seed_structure(index as usize);
         store::SeedStructure { index, name, source: "seeds.extxyz".into(), structure }
     };
     let seeds: Vec<_> = (0..WALKS as u32).map(stored).collect();

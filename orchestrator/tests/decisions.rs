@@ -140,7 +140,7 @@ fn walks_of_one_seed_structure_share_a_limit() {
         max_per_seed_structure: Some(2),
         ..live()
     };
-    let mut seed = common::seed(0);
+    let mut seed = common::seed_structure(0);
     seed.walks = vec![seed.walks[0].clone(); 2];
     let start = |settings: &SelectorSettings, snapshot| {
         let (grader, original) = (common::grader(), mixture());

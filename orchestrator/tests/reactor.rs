@@ -16,7 +16,7 @@ use wire::transport::{InProcess, Incoming, Transport, WorkItem};
 use wire::{ContentHash, WalkId};
 
 use crate::common::scripted::{Event, Script, advance};
-use crate::common::{CAMPAIGN, restore, seed, settings};
+use crate::common::{CAMPAIGN, restore, seed_structure, settings};
 
 const PROTOCOL: ContentHash = ContentHash([7; 32]);
 
@@ -68,9 +68,9 @@ async fn open(directory: &Path) -> Store {
     let seeds: Vec<_> = (0..3)
         .map(|index| SeedStructure {
             index,
-            name: seed(index as usize).name,
+            name: seed_structure(index as usize).name,
             source: "seeds.extxyz".into(),
-            structure: seed(index as usize).structure,
+            structure: seed_structure(index as usize).structure,
         })
         .collect();
     let store = Store::create(directory, &campaign, &seeds, 0).await.unwrap();
@@ -101,7 +101,7 @@ async fn reactor(store: &Store, stopping: &CancellationToken) -> (Reactor, mpsc:
 /// Works on an assignment like a scripted walker: interrupted after a few steps if asked to stop.
 fn work_on(work: &WorkItem, transport: &InProcess) -> AssignmentReport {
     let assignment = &work.assignment;
-    let seed = (0..3).find(|number| seed(*number).structure == assignment.seed_structure).unwrap();
+    let seed = (0..3).find(|number| seed_structure(*number).structure == assignment.seed_structure).unwrap();
     let pause = transport.stopping().then_some(2);
     let report = advance(&scripts()[seed], assignment, &work.mixture, pause);
     transport.progress(report.walk, report.progress.clone());

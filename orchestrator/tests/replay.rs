@@ -18,8 +18,8 @@ use wire::ContentHash;
 use crate::common::eventful::{Campaign, acts, any_settings, scripts};
 use crate::common::scripted::{Event, Script};
 use crate::common::{
-    SHORTEST, decided, grader, kinds, mixture, next_assignment, offer, positive, seed, settings, structure,
-    try_restore,
+    SHORTEST, decided, grader, kinds, mixture, next_assignment, offer, positive, seed_structure, settings,
+    structure, try_restore,
 };
 
 /// The decisions of a campaign as restored from a store, each with its candidate.
@@ -50,7 +50,7 @@ fn logged(commits: &[Commit]) -> Vec<(LoggedDecision, Option<&CandidateRecord>)>
 
 fn open(campaign: &Campaign<'_>, settings: &SelectorSettings, seeds: usize, set: &[&str]) -> Replay {
     let set: HashSet<String> = set.iter().map(|key| (*key).to_owned()).collect();
-    let seeds = (0..seeds).map(seed).collect();
+    let seeds = (0..seeds).map(seed_structure).collect();
     let imported = campaign.store.imported.clone();
     Replay::new(settings.clone(), set, seeds, grader(), mixture(), None, imported).unwrap()
 }
@@ -226,7 +226,7 @@ fn updates_that_were_left_out_are_left_out_in_a_replay() {
         commits.push(decided(&mut selector, report));
     }
     assert_eq!(commits.iter().flat_map(kinds).collect::<Vec<_>>(), ["begun", "left_out", "accepted"]);
-    let (none, seeds) = (HashSet::new(), vec![seed(0)]);
+    let (none, seeds) = (HashSet::new(), vec![seed_structure(0)]);
     let mut replay = Replay::new(live, none, seeds, grader(), mixture(), Some(training), Vec::new()).unwrap();
     let log = logged(&commits);
     for ((recorded, _), now) in log.iter().zip(follow(&mut replay, &log)) {

@@ -39,7 +39,7 @@ fn every_seed_structure_gets_one_walk() {
     );
     let assignments = [(); 3].map(|()| next_assignment(&mut selector));
     for (seed, assignment) in assignments.iter().enumerate() {
-        assert_eq!(assignment.seed_structure, common::seed(seed).structure);
+        assert_eq!(assignment.seed_structure, common::seed_structure(seed).structure);
         assert_eq!((assignment.campaign, assignment.random_walk), (common::CAMPAIGN, assignment.walk));
         assert_eq!((assignment.number, assignment.last_step, assignment.checkpoint.is_none()), (0, 10, true));
     }
@@ -317,7 +317,7 @@ fn control_walks_provide_frames_at_the_steps_of_the_biased_walk() {
             (WalkId(1), Origin::Control, WalkId(0))
         );
         assert_eq!((assignment.frame_steps.clone(), assignment.last_step), (wanted, until));
-        assert_eq!(assignment.seed_structure, common::seed(0).structure);
+        assert_eq!(assignment.seed_structure, common::seed_structure(0).structure);
         // An unremarkable structure: a control frame is recorded whatever its grade.
         let report = offer(&selector, &assignment, step, structure(100 + step, SHORTEST), [0.1; 3]);
         let commit = decided(&mut selector, report);
@@ -419,7 +419,7 @@ fn a_mismatched_database_is_rejected() {
 
 #[test]
 fn a_seed_structure_that_cannot_be_graded_is_named() {
-    let mut seed = common::seed(0);
+    let mut seed = common::seed_structure(0);
     seed.structure.species[1] = "Cu".parse().unwrap();
     let found = Selector::restore(
         settings(CampaignMode::Live),

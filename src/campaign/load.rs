@@ -83,7 +83,7 @@ impl Loader<'_> {
     /// same structure again and again.
     pub fn check_update_target(&self, seeds: &[SourcedStructure]) -> Result<(), ConfigError> {
         let (rule, criterion) = (&self.config.collect.update_target, &self.config.collect.criterion);
-        let mut sizes = seeds.iter().map(|named| named.seed.structure.len());
+        let mut sizes = seeds.iter().map(|named| named.plan.structure.len());
         let Some(atoms) = sizes.find(|atoms| !rule.ends_candidacy(criterion, *atoms)) else { return Ok(()) };
         if self.config.calm.update == UpdateProtocol::Never {
             return Ok(());
@@ -177,8 +177,8 @@ impl Loader<'_> {
         let wrong = |message: String| self.file_error(key, file, message);
         let (mut features, mut grades) = (Features::new(model), Grades::default());
         let (mut gamma, mut first_error) = (Vec::new(), None);
-        for SourcedStructure { seed, source, .. } in seeds {
-            let graded = features.compute(&seed.structure).and_then(|elements| {
+        for SourcedStructure { plan, source, .. } in seeds {
+            let graded = features.compute(&plan.structure).and_then(|elements| {
                 let values = features.grace.features();
                 let graded = grades.evaluate(&artifact.mixture, &elements, values, None);
                 graded.map_err(|error| error.to_string())
@@ -187,8 +187,9 @@ impl Loader<'_> {
                 Ok(()) => gamma.extend_from_slice(&grades.gamma),
                 // Triage lists those that cannot be graded.
                 Err(error) => {
-                    let of_seed = || wrong(format!("seed structure '{}' ({source}): {error}", seed.name));
-                    first_error.get_or_insert_with(of_seed);
+                    let of_seed_structure =
+                        || wrong(format!("seed structure '{}' ({source}): {error}", plan.name));
+                    first_error.get_or_insert_with(of_seed_structure);
                 }
             }
             if gamma.len() >= MAX_GRADED_ATOMS {
@@ -236,7 +237,7 @@ impl Loader<'_> {
             let species = structure.species.iter().find(|species| !potential.species().contains(species));
             species.map(|species| format!("{knows}, but the structure has {species}"))
         };
-        let reasons = seeds.valid.iter().map(|named| unknown(&named.seed.structure)).collect();
+        let reasons = seeds.valid.iter().map(|named| unknown(&named.plan.structure)).collect();
         self.skip_unlabelled(seeds, reasons)
             .map_err(|message| wrong(format!("{}: {message}", file.display())))?;
         let hash = self.hash(REFERENCE_FILE, &reference.file)?;
@@ -252,11 +253,11 @@ impl Loader<'_> {
         let code = code.map_err(|error| wrong(error.to_string()))?;
         // A setting is wrong for any structure, files may be missing for an element.
         let unsupported = |named: &SourcedStructure| {
-            let species = named.seed.structure.species.iter().copied().collect();
+            let species = named.plan.structure.species.iter().copied().collect();
             match code.supports(&species) {
                 Ok(()) => Ok(None),
                 Err(error @ SetupError::Pseudopotential { .. }) => Ok(Some(error.to_string())),
-                Err(error) => Err(wrong(with_seed(&error.to_string(), named))),
+                Err(error) => Err(wrong(with_seed_structure(&error.to_string(), named))),
             }
         };
         let reasons = seeds.valid.iter().map(unsupported).collect::<Result<_, _>>()?;
@@ -276,7 +277,7 @@ impl Loader<'_> {
         let first =
             seeds.valid.iter().zip(&reasons).find_map(|(named, reason)| Some((named, reason.as_ref()?)));
         if let Some((named, reason)) = first.filter(|_| is_refused) {
-            return Err(with_seed(reason, named));
+            return Err(with_seed_structure(reason, named));
         }
         let mut reasons = reasons.into_iter();
         seeds.skip(|_| reasons.next().flatten());
@@ -293,8 +294,8 @@ impl Loader<'_> {
 }
 
 /// A message about a seed structure.
-fn with_seed(message: &str, SourcedStructure { seed, source, .. }: &SourcedStructure) -> String {
-    format!("{message} (seed structure '{}', {source})", seed.name)
+fn with_seed_structure(message: &str, SourcedStructure { plan, source, .. }: &SourcedStructure) -> String {
+    format!("{message} (seed structure '{}', {source})", plan.name)
 }
 
 /// Computes features of structures one after another.

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use atoms::{CloseContact, Repetition, Structure, extxyz, read_structures};
 use calm::rules::Positive;
-use orchestrator::selector::SeedPlan;
+use orchestrator::selector::SeedStructurePlan;
 use potentials::grace::GraceModel;
 use toml::Spanned;
 use wire::ContentHash;
@@ -31,8 +31,8 @@ const MAX_SUPERCELL_ATOMS: u64 = 100_000;
 
 /// A seed structure and its source.
 pub struct SourcedStructure {
-    /// Name and structure.
-    pub seed: SeedPlan,
+    /// Its name, structure and walks.
+    pub plan: SeedStructurePlan,
     /// `file:line`, and the repetition of a supercell.
     pub source: String,
     /// Repetition of the cell in the file.
@@ -52,8 +52,8 @@ pub struct SeedStructures {
 
 /// A seed structure that is left out.
 pub struct SkippedStructure {
-    /// Name and structure.
-    pub seed: SeedPlan,
+    /// Its name and structure; no walks.
+    pub plan: SeedStructurePlan,
     /// `file:line`
     pub source: String,
     /// Why no walk can start from it.
@@ -67,8 +67,8 @@ impl SeedStructures {
             match reason(&named) {
                 None => self.valid.push(named),
                 Some(reason) => {
-                    let SourcedStructure { seed, source, .. } = named;
-                    self.skipped.push(SkippedStructure { seed, source, reason });
+                    let SourcedStructure { plan, source, .. } = named;
+                    self.skipped.push(SkippedStructure { plan, source, reason });
                 }
             }
         }
@@ -77,14 +77,14 @@ impl SeedStructures {
 
 impl SkippedStructure {
     fn message(&self) -> String {
-        let Self { seed, source, reason } = self;
-        format!("seed structure '{}' ({source}) is skipped: {reason}", seed.name)
+        let Self { plan, source, reason } = self;
+        format!("seed structure '{}' ({source}) is skipped: {reason}", plan.name)
     }
 }
 
 /// A frame of a file.
 struct SourcedFrame<'a> {
-    seed: SeedPlan,
+    plan: SeedStructurePlan,
     /// `file:line`, and the repetition of a supercell.
     source: String,
     repetition: Repetition,
@@ -103,15 +103,15 @@ impl Loader<'_> {
             |(), mut frame| {
                 let geometry = self
                     .make_supercell(&mut frame)
-                    .and_then(|()| self.check_seed_structure(&frame.seed.structure, model));
+                    .and_then(|()| self.check_seed_structure(&frame.plan.structure, model));
                 (frame, geometry)
             },
         );
         let (mut seeds, mut first_error) = (SeedStructures::default(), None);
-        for (SourcedFrame { seed, source, repetition, file }, geometry) in examined {
+        for (SourcedFrame { plan, source, repetition, file }, geometry) in examined {
             let reason = match geometry {
                 Ok(geometry) => {
-                    seeds.valid.push(SourcedStructure { seed, source, repetition, geometry });
+                    seeds.valid.push(SourcedStructure { plan, source, repetition, geometry });
                     continue;
                 }
                 Err(reason) => reason,
@@ -121,7 +121,7 @@ impl Loader<'_> {
                 return Err(error());
             }
             first_error.get_or_insert_with(error);
-            seeds.skipped.push(SkippedStructure { seed, source, reason });
+            seeds.skipped.push(SkippedStructure { plan, source, reason });
         }
         match first_error.filter(|_| seeds.valid.is_empty()) {
             Some(error) => Err(error),
@@ -148,8 +148,8 @@ impl Loader<'_> {
                          (name=… in its comment line)",
                     )));
                 }
-                let seed = SeedPlan { name, structure: frame.structure, walks: Vec::new() };
-                all.push(SourcedFrame { seed, source, repetition: Repetition::ONE, file });
+                let plan = SeedStructurePlan { name, structure: frame.structure, walks: Vec::new() };
+                all.push(SourcedFrame { plan, source, repetition: Repetition::ONE, file });
             }
         }
         Ok(all)
@@ -158,7 +158,7 @@ impl Loader<'_> {
     /// Repeats a cell that is smaller than `min_atoms` or `min_height`.
     fn make_supercell(&self, frame: &mut SourcedFrame<'_>) -> Result<(), String> {
         let section = &self.config.seed_structures;
-        let structure = &frame.seed.structure;
+        let structure = &frame.plan.structure;
         structure.validate().map_err(|error| error.to_string())?;
         let min_atoms = section.min_atoms.map_or(1, NonZeroUsize::get);
         let min_height = section.min_height.map_or(0.0, Positive::get);
@@ -173,7 +173,7 @@ impl Loader<'_> {
                  than {MAX_SUPERCELL_ATOMS}"
             ));
         }
-        frame.seed.structure = structure.repeated(repetition);
+        frame.plan.structure = structure.repeated(repetition);
         frame.source = format!("{}, {repetition} supercell", frame.source);
         frame.repetition = repetition;
         Ok(())
@@ -233,11 +233,13 @@ impl Loader<'_> {
         let warning = |message| Warning { at: at.clone(), key: FILES.to_owned(), message };
         let (mut same, mut strange, mut first) = (Vec::new(), Vec::new(), HashMap::new());
         for named in &seeds.valid {
-            let SourcedStructure { seed: SeedPlan { name, structure, .. }, source, geometry, .. } = named;
+            let SourcedStructure {
+                plan: SeedStructurePlan { name, structure, .. }, source, geometry, ..
+            } = named;
             if let Some(other) = first.insert(ContentHash::from_structure(&rounded(structure)), named) {
                 same.push(format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",
-                    other.seed.name, other.source
+                    other.plan.name, other.source
                 ));
             }
             if let Some(distances) = suspicious_distances(structure, geometry) {

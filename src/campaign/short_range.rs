@@ -31,7 +31,7 @@ pub struct PairRange {
 /// start farther apart than the cutoff may meet in a walk.
 pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure]) -> Vec<PairRange> {
     let mut ranges: BTreeMap<ElementPair, PairRange> = BTreeMap::new();
-    for SourcedStructure { seed, geometry, .. } in seeds {
+    for SourcedStructure { plan, geometry, .. } in seeds {
         let limits: BTreeMap<_, _> = config.guard.min_distances.limits(&geometry.shortest).iter().collect();
         for (pair, distance) in geometry.shortest.iter() {
             let range = ranges.entry(pair).or_insert_with(|| PairRange {
@@ -44,7 +44,7 @@ pub fn pair_ranges(config: &Config, seeds: &[SourcedStructure]) -> Vec<PairRange
             range.limit = limits.get(&pair).map_or(range.limit, |limit| limit.min(range.limit));
             if distance < range.shortest {
                 range.shortest = distance;
-                range.seed_structure.clone_from(&seed.name);
+                range.seed_structure.clone_from(&plan.name);
             }
         }
     }

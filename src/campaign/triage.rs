@@ -36,9 +36,9 @@ pub struct ShortestPairDistance {
 }
 
 /// A seed structure under the original mixture.
-pub struct SeedTriage<'a> {
+pub struct SeedStructureTriage<'a> {
     /// The structure.
-    pub seed: &'a SourcedStructure,
+    pub seed_structure: &'a SourcedStructure,
     /// All pairs of its elements with neighbours, those closest to their limits first.
     pub pairs: Vec<ShortestPairDistance>,
     /// Its largest grade; `None` if it cannot be graded.
@@ -53,14 +53,14 @@ pub struct SeedTriage<'a> {
 
 /// Grades every seed structure of a campaign, on all cores. The worst structures come first: by their remark, then by
 /// γ_max. Calls `on_graded` after each.
-pub fn triage(campaign: &LoadedCampaign, on_graded: impl Fn() + Sync) -> Vec<SeedTriage<'_>> {
+pub fn triage(campaign: &LoadedCampaign, on_graded: impl Fn() + Sync) -> Vec<SeedStructureTriage<'_>> {
     let examiner = || Examiner::new(campaign);
-    let mut all = all_cores::map(campaign.seed_structures.iter(), examiner, |examiner, seed| {
-        let found = examiner.examine(seed);
+    let mut all = all_cores::map(campaign.seed_structures.iter(), examiner, |examiner, seed_structure| {
+        let found = examiner.examine(seed_structure);
         on_graded();
         found
     });
-    let grade = |found: &SeedTriage<'_>| found.gamma_max.unwrap_or(f64::INFINITY);
+    let grade = |found: &SeedStructureTriage<'_>| found.gamma_max.unwrap_or(f64::INFINITY);
     all.sort_by(|a, b| a.remark.cmp(&b.remark).then_with(|| grade(b).total_cmp(&grade(a))));
     all
 }
@@ -80,9 +80,9 @@ impl<'a> Examiner<'a> {
         Self { campaign, grace: Grace::new(model), neighbours, grades: Grades::default() }
     }
 
-    fn examine(&mut self, seed: &'a SourcedStructure) -> SeedTriage<'a> {
+    fn examine(&mut self, seed_structure: &'a SourcedStructure) -> SeedStructureTriage<'a> {
         let rule = &self.campaign.config.collect.criterion;
-        let structure = &seed.seed.structure;
+        let structure = &seed_structure.plan.structure;
         let graded = self.grade(structure);
         let gamma = self.grades.gamma.as_slice();
         let missing = not_in_mixture(self.campaign, structure);
@@ -92,9 +92,9 @@ impl<'a> Examiner<'a> {
             Ok(()) if rule.is_met(gamma) => Remark::Candidate,
             Ok(()) => Remark::Nothing,
         };
-        SeedTriage {
-            seed,
-            pairs: self.pairs(seed),
+        SeedStructureTriage {
+            seed_structure,
+            pairs: self.pairs(seed_structure),
             gamma_max: graded.is_ok().then(|| self.grades.maximum()),
             atoms_above: if graded.is_ok() { count_above(gamma, rule.threshold()) } else { 0 },
             needed_atoms: rule.needed_atoms(structure.len()),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use atoms::Structure;
-use orchestrator::selector::SeedPlan;
+use orchestrator::selector::SeedStructurePlan;
 use wire::WalkConditions;
 
 use super::loader::Loader;
@@ -26,14 +26,14 @@ impl Loader<'_> {
         let groups = &self.config.walks;
         if groups.is_empty() {
             let conditions = combinations(&self.config.walk, &WalkGroupSection::default());
-            seeds.valid.iter_mut().for_each(|named| named.seed.walks.clone_from(&conditions));
+            seeds.valid.iter_mut().for_each(|named| named.plan.walks.clone_from(&conditions));
             return Ok(Vec::new());
         }
         let (mut without_volume, mut messages) = (BTreeMap::new(), Vec::new());
         for (number, group) in groups.iter().enumerate() {
             messages.extend(self.add_group(number, group, seeds, &mut without_volume)?);
         }
-        match seeds.valid.iter().map(|named| named.seed.walks.len()).sum::<usize>() {
+        match seeds.valid.iter().map(|named| named.plan.walks.len()).sum::<usize>() {
             1..=MAX_WALKS => {}
             0 => {
                 let reason = without_volume.values().chain(&messages).next().map_or("", String::as_str);
@@ -44,11 +44,11 @@ impl Loader<'_> {
                 return Err(self.walks_error("walks", message));
             }
         }
-        seeds.skip(|SourcedStructure { seed, .. }| {
-            without_volume.get(&seed.name).filter(|_| seed.walks.is_empty()).cloned()
+        seeds.skip(|SourcedStructure { plan, .. }| {
+            without_volume.get(&plan.name).filter(|_| plan.walks.is_empty()).cloned()
         });
         let (mut fewer, mut no_group) = (Vec::new(), Vec::new());
-        for SourcedStructure { seed: SeedPlan { name, walks, .. }, source, .. } in &seeds.valid {
+        for SourcedStructure { plan: SeedStructurePlan { name, walks, .. }, source, .. } in &seeds.valid {
             if let Some(reason) = without_volume.get(name) {
                 let message =
                     format!("seed structure '{name}' ({source}) walks at its own volume only: {reason}");
@@ -77,20 +77,20 @@ impl Loader<'_> {
         without_volume: &mut BTreeMap<String, String>,
     ) -> Result<Option<String>, ConfigError> {
         let filter = match &group.seed_structures {
-            Some(text) => Some(self.seed_filter(number, text)?),
+            Some(text) => Some(self.seed_structure_filter(number, text)?),
             None => None,
         };
-        let selects = |SeedPlan { name, structure, .. }: &SeedPlan| {
+        let selects = |SeedStructurePlan { name, structure, .. }: &SeedStructurePlan| {
             filter.as_ref().is_none_or(|filter| is_selected(filter, name, structure))
         };
         let conditions = combinations(&self.config.walk, group);
-        let (mut selected, mut walks) = (seeds.skipped.iter().any(|skipped| selects(&skipped.seed)), 0);
-        for SourcedStructure { seed, source, .. } in &mut seeds.valid {
-            if !selects(seed) {
+        let (mut selected, mut walks) = (seeds.skipped.iter().any(|skipped| selects(&skipped.plan)), 0);
+        for SourcedStructure { plan, source, .. } in &mut seeds.valid {
+            if !selects(plan) {
                 continue;
             }
             selected = true;
-            let (name, has_volume) = (&seed.name, seed.structure.periodic != [false; 3]);
+            let (name, has_volume) = (&plan.name, plan.structure.periodic != [false; 3]);
             if !has_volume && conditions.iter().any(WalkConditions::changes_volume) {
                 let reason = format!(
                     "group '{}' changes the volume, but the structure has no periodic direction; leave it out \
@@ -104,9 +104,9 @@ impl Loader<'_> {
                 without_volume.entry(name.clone()).or_insert(reason);
             }
             let possible = |conditions: &&WalkConditions| has_volume || !conditions.changes_volume();
-            let before = seed.walks.len();
-            seed.walks.extend(conditions.iter().filter(possible).cloned());
-            walks += seed.walks.len() - before;
+            let before = plan.walks.len();
+            plan.walks.extend(conditions.iter().filter(possible).cloned());
+            walks += plan.walks.len() - before;
         }
         match &group.seed_structures {
             Some(text) if !selected => {
@@ -122,7 +122,7 @@ impl Loader<'_> {
         }
     }
 
-    fn seed_filter(&self, number: usize, text: &str) -> Result<StructureFilter, ConfigError> {
+    fn seed_structure_filter(&self, number: usize, text: &str) -> Result<StructureFilter, ConfigError> {
         let key = format!("walks.{number}.seed_structures");
         let filter: StructureFilter =
             text.parse().map_err(|error| self.walks_error(&key, format!("'{text}': {error}")))?;

@@ -80,16 +80,16 @@ impl StepTimes {
     pub fn total<'a>(&self, seeds: impl IntoIterator<Item = &'a SourcedStructure>) -> Option<WalkTime> {
         seeds
             .into_iter()
-            .map(|seed| self.for_seed(seed))
+            .map(|seed| self.for_seed_structure(seed))
             .try_fold(WalkTime::default(), |sum, of| Some(sum.plus(of?)))
     }
 
     /// The time of all walks from a seed structure. `None` if no step could be measured.
-    pub fn for_seed(&self, seed: &SourcedStructure) -> Option<WalkTime> {
+    pub fn for_seed_structure(&self, seed: &SourcedStructure) -> Option<WalkTime> {
         let class = class(seed);
         let (_, rate) = self.classes.iter().min_by_key(|(measured, _)| measured.abs_diff(class))?;
         let time = |[biased, unbiased]: [f64; 2]| work(seed) * (biased * rate[0] + unbiased * rate[1]);
-        let walks = seed.seed.walks.iter().map(|conditions| {
+        let walks = seed.plan.walks.iter().map(|conditions| {
             let [biased, control] = self.steps(conditions).map(time);
             WalkTime { biased, control }
         });
@@ -115,12 +115,12 @@ impl WalkTime {
 
 /// Structures of a class differ in their number of atoms by less than a factor of two.
 fn class(seed: &SourcedStructure) -> u32 {
-    seed.seed.structure.len().max(1).ilog2()
+    seed.plan.structure.len().max(1).ilog2()
 }
 
 /// What the time of a step scales with: atoms and their neighbours.
 fn work(seed: &SourcedStructure) -> f64 {
-    (seed.seed.structure.len() + seed.geometry.bonds) as f64
+    (seed.plan.structure.len() + seed.geometry.bonds) as f64
 }
 
 /// The mean of V₀/V while V/V₀ changes linearly.
@@ -136,14 +136,14 @@ fn step_time(
     mixture: &Arc<Mixture>,
 ) -> Option<f64> {
     // At the volume of the seed structure.
-    let conditions = WalkConditions { volume_ramp: None, ..seed.seed.walks.first()?.clone() };
+    let conditions = WalkConditions { volume_ramp: None, ..seed.plan.walks.first()?.clone() };
     let assignment = Assignment {
         campaign: CampaignId([0; 16]),
         walk: WalkId(0),
         number: 0,
         origin,
         random_walk: WalkId(0),
-        seed_structure: seed.seed.structure.clone(),
+        seed_structure: seed.plan.structure.clone(),
         conditions,
         checkpoint: None,
         verdict: None,

@@ -10,7 +10,7 @@ use monitor::label_cost::{CoreHours, CostEstimator};
 use serde_json::json;
 use store::{Location, Store};
 
-use super::seed_table::SeedTable;
+use super::seed_structure_table::SeedStructureTable;
 use super::{CommandError, ExitStatus, block_on, campaign_location};
 use crate::campaign::{LoadedCampaign, SkippedStructure, WalkTime};
 use crate::disk_forecast;
@@ -57,7 +57,7 @@ fn core_seconds(text: &str) -> Result<f64, String> {
 }
 
 /// The labels of one seed structure.
-struct SeedEstimate {
+struct SeedStructureEstimate {
     name: String,
     size: CostPredictors,
     /// Upper limit.
@@ -71,9 +71,9 @@ struct SeedEstimate {
 /// The estimate for the campaign.
 struct CampaignEstimate<'a> {
     /// What is known of the seed structures before their walks start.
-    table: SeedTable<'a>,
+    table: SeedStructureTable<'a>,
     skipped: &'a [SkippedStructure],
-    seed_structures: Vec<SeedEstimate>,
+    seed_structures: Vec<SeedStructureEstimate>,
     /// Upper limit. Smaller than the sum over the seed structures if a key of the configuration limits the total.
     labels: u64,
     limited_by: Option<String>,
@@ -101,17 +101,17 @@ impl EstimateArgs {
     fn estimate<'a>(&self, campaign: &'a LoadedCampaign) -> Result<CampaignEstimate<'a>, CommandError> {
         let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
-        let table = SeedTable::examine(campaign, self.csv.as_deref())?;
+        let table = SeedStructureTable::examine(campaign, self.csv.as_deref())?;
         let config = &campaign.config;
         let copies = config.labels_of_each();
         let seed_structures: Vec<_> = campaign
             .seed_structures
             .iter()
             .zip(sizes)
-            .map(|(seed, size)| SeedEstimate {
-                name: seed.seed.name.clone(),
+            .map(|(seed, size)| SeedStructureEstimate {
+                name: seed.plan.name.clone(),
                 size,
-                labels: u64::from(copies) * config.max_structures_of(seed.seed.walks.len()),
+                labels: u64::from(copies) * config.max_structures_of(seed.plan.walks.len()),
                 cost_per_label: costs.as_ref().and_then(|costs| costs.predict([(size, 1)])),
                 walks: table.walk_time(seed),
             })
@@ -205,7 +205,11 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate<'_>, all:
 }
 
 /// The labels of the first `shown` seed structures.
-fn write_labels(out: &mut dyn Write, seed_structures: &[SeedEstimate], shown: usize) -> io::Result<()> {
+fn write_labels(
+    out: &mut dyn Write,
+    seed_structures: &[SeedStructureEstimate],
+    shown: usize,
+) -> io::Result<()> {
     let mut table = TextTable::new(&[
         "seed structure",
         ">labels",
@@ -216,7 +220,7 @@ fn write_labels(out: &mut dyn Write, seed_structures: &[SeedEstimate], shown: us
         ">walk",
     ]);
     let shown = shown.min(seed_structures.len());
-    for SeedEstimate { name, size, labels, cost_per_label, walks } in &seed_structures[..shown] {
+    for SeedStructureEstimate { name, size, labels, cost_per_label, walks } in &seed_structures[..shown] {
         table.push(vec![
             name.clone(),
             labels.to_string(),
@@ -239,7 +243,7 @@ fn as_json(estimate: &CampaignEstimate<'_>) -> serde_json::Value {
     let hours = |walks: Option<WalkTime>| {
         walks.map(|time| json!({ "biased": time.biased / 3600.0, "control": time.control / 3600.0 }))
     };
-    let of_seed = |seed: &SeedEstimate| {
+    let of_seed = |seed: &SeedStructureEstimate| {
         let CostPredictors { atoms, electrons, k_points } = seed.size;
         json!({
             "seed_structure": seed.name, "labels": seed.labels, "atoms": atoms, "electrons": electrons,
@@ -248,8 +252,8 @@ fn as_json(estimate: &CampaignEstimate<'_>) -> serde_json::Value {
         })
     };
     let skipped = |of: &SkippedStructure| {
-        let SkippedStructure { seed, source, reason } = of;
-        json!({ "seed_structure": seed.name, "source": source, "reason": reason })
+        let SkippedStructure { plan, source, reason } = of;
+        json!({ "seed_structure": plan.name, "source": source, "reason": reason })
     };
     json!({
         "labels": estimate.labels, "limited_by": estimate.limited_by, "core_hours": estimate.cost,

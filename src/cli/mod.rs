@@ -25,7 +25,7 @@ mod replay;
 mod report;
 mod run;
 mod schema;
-mod seed_table;
+mod seed_structure_table;
 mod select;
 pub mod status;
 mod store;

@@ -378,7 +378,7 @@ async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Result<Se
     let mut selector = Selector::restore(
         campaign.selector_settings(),
         store.campaign().await?.id,
-        campaign.seed_structures.iter().map(|named| named.seed.clone()).collect(),
+        campaign.seed_structures.iter().map(|named| named.plan.clone()).collect(),
         campaign.grader(),
         Arc::new(campaign.artifact.mixture.clone()),
         campaign.training.clone(),

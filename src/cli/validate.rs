@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use calm::Artifact;
 
-use super::seed_table::SeedTable;
+use super::seed_structure_table::SeedStructureTable;
 use super::{CommandError, ExitStatus};
 use crate::campaign::{LoadedCampaign, PairRange};
 use crate::disk_forecast;
@@ -39,11 +39,11 @@ impl ValidateArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let campaign = LoadedCampaign::load(&self.config)?;
         campaign.print_warnings();
-        let seeds = SeedTable::examine(&campaign, self.csv.as_deref())?;
+        let seeds = SeedStructureTable::examine(&campaign, self.csv.as_deref())?;
         let shown = if self.all { usize::MAX } else { SHOWN };
         print(|out| {
             write(out, &self.config, &campaign)?;
-            write_seeds(out, &campaign, &seeds)?;
+            write_seed_structures(out, &campaign, &seeds)?;
             write_short_range(out, &campaign.pair_ranges, shown)?;
             writeln!(out)?;
             seeds.write(out, shown)
@@ -53,7 +53,11 @@ impl ValidateArgs {
 }
 
 /// How many seed structures are noteworthy, how long walks take, and whether walkers wait.
-fn write_seeds(out: &mut dyn Write, campaign: &LoadedCampaign, seeds: &SeedTable<'_>) -> io::Result<()> {
+fn write_seed_structures(
+    out: &mut dyn Write,
+    campaign: &LoadedCampaign,
+    seeds: &SeedStructureTable<'_>,
+) -> io::Result<()> {
     for remark in seeds.remarks() {
         writeln!(out, "  at the start     {remark}")?;
     }
@@ -70,7 +74,7 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &LoadedCampaign) -> io::Res
     let LoadedCampaign { model, artifact: Artifact { mixture, .. }, seed_structures, .. } = campaign;
     let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
     let architecture = model.description().architecture;
-    let atoms = || seed_structures.iter().map(|named| named.seed.structure.len());
+    let atoms = || seed_structures.iter().map(|named| named.plan.structure.len());
     let (min, max) = (atoms().min().unwrap_or(0), atoms().max().unwrap_or(0));
     writeln!(out, "{} is a valid campaign", path.display())?;
     writeln!(out, "  potential        {architecture}, {}, cutoff {} Å", elements.join(" "), model.cutoff())?;

@@ -31,12 +31,12 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_queue(config),
         check_budget(config),
         check_notify(&config.notify),
-        check_seeds(config),
+        check_seed_structures(config),
     ];
     checks.into_iter().filter_map(Result::err).chain(check_label(&config.label)).collect()
 }
 
-fn check_seeds(config: &Config) -> Result<(), InvalidValue> {
+fn check_seed_structures(config: &Config) -> Result<(), InvalidValue> {
     if config.seed_structures.files.is_empty() {
         return wrong("seed_structures.files", "an empty list", "at least one file with seed structures");
     }

@@ -11,7 +11,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-use orchestrator::selector::{Replay, ReplayError, SeedPlan};
+use orchestrator::selector::{Replay, ReplayError, SeedStructurePlan};
 use serde_json::Value;
 use store::Store;
 
@@ -59,7 +59,8 @@ async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Resu
     let (model, artifact, training) = campaign::load_for_grades(config, Path::new("(the campaign)"))?;
     let seeds = store.seed_structures().await?.into_iter();
     // The log has the conditions of walks.
-    let seeds = seeds.map(|seed| SeedPlan { name: seed.name, structure: seed.structure, walks: Vec::new() });
+    let seeds =
+        seeds.map(|seed| SeedStructurePlan { name: seed.name, structure: seed.structure, walks: Vec::new() });
     let seeds = seeds.collect();
     let set = settings.iter().map(|setting| setting.rule().to_owned()).collect();
     let replay = Replay::new(

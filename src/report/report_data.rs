@@ -27,11 +27,11 @@ pub struct ReportData {
     /// Values that the selector stores about its mixture, by name.
     pub values: BTreeMap<String, Value>,
     /// Seed structures.
-    pub seeds: Vec<SeedStructure>,
+    pub seed_structures: Vec<SeedStructure>,
     /// Fates of candidates along the decision log.
     pub fates: Vec<FateCount>,
     /// Fates by seed structure.
-    pub fates_by_seed: Vec<FateCount>,
+    pub fates_by_seed_structure: Vec<FateCount>,
     /// The collected structures.
     pub collections: Collections,
     /// `None` without a label protocol.
@@ -58,14 +58,15 @@ impl ReportData {
     /// Reads the data page by page.
     pub async fn read(store: &Store) -> Result<Self, StoreError> {
         let campaign = store.campaign().await?;
-        let seeds = store.seed_structures().await?;
+        let seed_structures = store.seed_structures().await?;
         let protocol = store.protocol_in_force().await?;
         let decisions = store.newest_mixture().await?.decision;
         let part = u32::try_from(decisions.max(1).unsigned_abs().div_ceil(MAX_PARTS)).unwrap_or(u32::MAX);
         let values = store.values().await?.into_iter();
         let values = values.filter_map(|(name, text)| Some((name, serde_json::from_str(&text).ok()?)));
         let collections =
-            Collections::read(store, protocol.as_ref().map(|protocol| protocol.hash), &seeds).await?;
+            Collections::read(store, protocol.as_ref().map(|protocol| protocol.hash), &seed_structures)
+                .await?;
         let labels = match protocol {
             Some(protocol) => Some(ProtocolLabels::read(store, protocol).await?),
             None => None,
@@ -76,10 +77,10 @@ impl ReportData {
             configuration: serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default(),
             values: values.collect(),
             fates: store.fates_by_decision(part).await?,
-            fates_by_seed: store.fates_by_seed_structure().await?,
+            fates_by_seed_structure: store.fates_by_seed_structure().await?,
             started: first.first().map(|operation| operation.time),
             campaign,
-            seeds,
+            seed_structures,
             collections,
             labels,
         })

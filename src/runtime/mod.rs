@@ -139,7 +139,7 @@ fn wanted_walkers(campaign: &LoadedCampaign) -> u32 {
 pub fn idle_walkers(campaign: &LoadedCampaign) -> Option<String> {
     let Config { campaign: section, run, .. } = &campaign.config;
     let walkers = wanted_walkers(campaign) as usize;
-    let biased: usize = campaign.seed_structures.iter().map(|named| named.seed.walks.len()).sum();
+    let biased: usize = campaign.seed_structures.iter().map(|named| named.plan.walks.len()).sum();
     let of_round = match section.mode {
         CampaignMode::Reproducible => {
             run.walks_per_round.get().saturating_mul(1 + usize::from(section.control))

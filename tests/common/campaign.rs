@@ -16,13 +16,20 @@ pub struct Small {
     pub walks_per_round: usize,
     pub steps: u64,
     pub max_per_walk: u32,
-    pub seeds: &'static [&'static str],
+    pub seed_structures: &'static [&'static str],
 }
 
 impl Default for Small {
     fn default() -> Self {
-        let seeds = &["fcc-100", "vacancy"];
-        Self { mode: "reproducible", walkers: 2, walks_per_round: 2, steps: 240, max_per_walk: 4, seeds }
+        let seed_structures = &["fcc-100", "vacancy"];
+        Self {
+            mode: "reproducible",
+            walkers: 2,
+            walks_per_round: 2,
+            steps: 240,
+            max_per_walk: 4,
+            seed_structures,
+        }
     }
 }
 
@@ -76,7 +83,7 @@ steps_per_assignment = 40
         let frames =
             atoms::read_extxyz(&config("data/aluminium_seeds.extxyz")).expect("the demo's seed structures");
         let mut seeds = Vec::new();
-        for name in self.seeds {
+        for name in self.seed_structures {
             let named = |frame: &&atoms::extxyz::Frame| frame.info["name"].text() == Some(name);
             let frame = frames.iter().find(named).expect("a seed structure of that name");
             atoms::extxyz::write_frame(&mut seeds, frame).expect("memory");

@@ -40,7 +40,7 @@ fn long() -> Small {
         walkers: 1,
         walks_per_round: 3,
         steps: 600,
-        seeds: &["fcc-100", "vacancy", "fcc-097"],
+        seed_structures: &["fcc-100", "vacancy", "fcc-097"],
         ..Small::default()
     }
 }

@@ -134,7 +134,7 @@ async fn recover(model: &Model, location: Location) {
         imported: store.status().await.unwrap().imported,
         values: store.values().await.unwrap(),
     };
-    let seeds = campaign::seeds(WALKS);
+    let seeds = campaign::seed_structures(WALKS);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
     let training = Some(model.training.clone());
     let settings = campaign::settings(1.5);

@@ -9,7 +9,8 @@ use calm::rules::{MaximumGrade, MaximumGradeUpdate, Positive};
 use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{
-    CampaignMode, OnForgetting, SeedPlan, Selector, SelectorSettings, SelectorSnapshot, UpdateProtocol,
+    CampaignMode, OnForgetting, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
+    UpdateProtocol,
 };
 use store::{CampaignRecord, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
@@ -53,7 +54,7 @@ pub fn settings(threshold: f64) -> SelectorSettings {
 
 /// A selector at the start of the campaign, with one seed structure per walk.
 pub fn selector(model: &Model, walks: usize, settings: &SelectorSettings) -> Selector {
-    let seeds = seeds(walks);
+    let seeds = seed_structures(walks);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
     let training = Some(model.training.clone());
     Selector::restore(
@@ -69,9 +70,9 @@ pub fn selector(model: &Model, walks: usize, settings: &SelectorSettings) -> Sel
 }
 
 /// The seed structures.
-pub fn seeds(walks: usize) -> Vec<SeedPlan> {
+pub fn seed_structures(walks: usize) -> Vec<SeedStructurePlan> {
     (0..walks)
-        .map(|k| SeedPlan {
+        .map(|k| SeedStructurePlan {
             name: format!("fcc-{k}"),
             structure: crystal(),
             walks: vec![WalkConditions::default()],

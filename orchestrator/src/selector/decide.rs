@@ -305,10 +305,10 @@ impl DecisionState {
         walk.record.accepted += 1;
         walk.state.accepted_steps.push(step);
         let seed_structure = walk.record.seed_structure;
-        let of_seed = self.accepted_by_seed.entry(seed_structure).or_default();
-        *of_seed += 1;
-        if self.settings.max_per_seed_structure.is_some_and(|most| *of_seed >= most) {
-            self.full_seeds.insert(seed_structure);
+        let of_seed_structure = self.accepted_by_seed_structure.entry(seed_structure).or_default();
+        *of_seed_structure += 1;
+        if self.settings.max_per_seed_structure.is_some_and(|most| *of_seed_structure >= most) {
+            self.full_seed_structures.insert(seed_structure);
         }
     }
 
@@ -362,11 +362,15 @@ impl DecisionState {
         let (end, over): (_, BTreeSet<_>) = if self.is_budget_exhausted() {
             (WalkEnd::Budget, self.walks.unfinished(true).filter(is_idle).collect())
         } else {
-            let of_full_seeds = self.full_seeds.iter().flat_map(|seed| self.walks.unfinished_of_seed(*seed));
-            (WalkEnd::QuotaReached, of_full_seeds.filter(is_idle).collect())
+            let of_full_seed_structures = self
+                .full_seed_structures
+                .iter()
+                .flat_map(|seed| self.walks.unfinished_of_seed_structure(*seed));
+            (WalkEnd::QuotaReached, of_full_seed_structures.filter(is_idle).collect())
         };
         over.iter().for_each(|id| self.end_walk(*id, &end, commit));
-        self.full_seeds.retain(|seed| self.walks.unfinished_of_seed(*seed).next().is_some());
+        self.full_seed_structures
+            .retain(|seed| self.walks.unfinished_of_seed_structure(*seed).next().is_some());
         over
     }
 

@@ -15,7 +15,7 @@ use super::error::SelectorError;
 use super::forgetting::Forgetting;
 use super::regrade::Regrader;
 use super::rules::{ChangeableRules, RULES};
-use super::settings::{SeedPlan, SelectorSettings, SelectorSnapshot};
+use super::settings::{SeedStructurePlan, SelectorSettings, SelectorSnapshot};
 use super::training_frames::TrainingFrames;
 use super::walk::Walk;
 use super::walk_table::WalkTable;
@@ -40,9 +40,9 @@ pub(super) struct DecisionState {
     pub round: u64,
     pub accepted: u32,
     /// Number of structures accepted from the biased walks of each seed structure.
-    pub accepted_by_seed: HashMap<u32, u32>,
+    pub accepted_by_seed_structure: HashMap<u32, u32>,
     /// Seed structures that have their maximum number of structures, but walks that have not ended.
-    pub full_seeds: BTreeSet<u32>,
+    pub full_seed_structures: BTreeSet<u32>,
     pub declined_feature_bytes: u64,
     /// Number of candidates that could not be graded, and of control frames with atoms too close.
     pub left_out: u64,
@@ -60,13 +60,13 @@ impl DecisionState {
     /// Restores the state from a store.
     pub fn restore(
         settings: SelectorSettings,
-        seeds: &[SeedPlan],
+        seed_structures: &[SeedStructurePlan],
         grader: Grader,
         original: Arc<Mixture>,
         training: Option<TrainingFrames>,
         snapshot: SelectorSnapshot,
     ) -> Result<Self, SelectorError> {
-        let min_distances = min_distances(&settings, seeds, &grader)?;
+        let min_distances = min_distances(&settings, seed_structures, &grader)?;
         let value = |name: &str| -> Result<u64, SelectorError> {
             let stored = snapshot.values.iter().find(|(key, _)| key == name);
             let Some((_, text)) = stored else { return Ok(0) };
@@ -81,14 +81,14 @@ impl DecisionState {
         let changed =
             snapshot.components.iter().map(|record| (record.element as usize, record.slot as usize));
         forgetting.update(&original, &mixture, &changed.collect())?;
-        let walks = restored_walks(snapshot.walks, seeds.len())?;
-        let mut accepted_by_seed = HashMap::new();
+        let walks = restored_walks(snapshot.walks, seed_structures.len())?;
+        let mut accepted_by_seed_structure = HashMap::new();
         for Walk { record, .. } in walks.iter().filter(|walk| walk.is_biased()) {
-            *accepted_by_seed.entry(record.seed_structure).or_default() += record.accepted;
+            *accepted_by_seed_structure.entry(record.seed_structure).or_default() += record.accepted;
         }
         let is_full = |accepted: u32| settings.max_per_seed_structure.is_some_and(|most| accepted >= most);
-        let full = accepted_by_seed.iter().filter(|(_, accepted)| is_full(**accepted));
-        let full_seeds = full.map(|(seed, _)| *seed).collect();
+        let full = accepted_by_seed_structure.iter().filter(|(_, accepted)| is_full(**accepted));
+        let full_seed_structures = full.map(|(seed, _)| *seed).collect();
         Ok(Self {
             settings,
             min_distances,
@@ -99,9 +99,9 @@ impl DecisionState {
             walks,
             known: snapshot.known.into_iter().collect(),
             round,
-            accepted: accepted_by_seed.values().sum(),
-            accepted_by_seed,
-            full_seeds,
+            accepted: accepted_by_seed_structure.values().sum(),
+            accepted_by_seed_structure,
+            full_seed_structures,
             declined_feature_bytes,
             left_out,
             staleness,
@@ -146,26 +146,27 @@ impl DecisionState {
 /// How close atoms may come in walks from each seed structure.
 fn min_distances(
     settings: &SelectorSettings,
-    seeds: &[SeedPlan],
+    seed_structures: &[SeedStructurePlan],
     grader: &Grader,
 ) -> Result<Vec<MinDistances>, SelectorError> {
-    let of = |seed: &SeedPlan| match grader.bonds(&seed.structure) {
+    let of = |seed: &SeedStructurePlan| match grader.bonds(&seed.structure) {
         Ok(bonds) => Ok(settings.min_distances.limits(&bonds.shortest)),
         Err(source) => Err(SelectorError::SeedStructure { name: seed.name.clone(), source }),
     };
-    seeds.iter().map(of).collect()
+    seed_structures.iter().map(of).collect()
 }
 
 /// The stored walks, which must be numbered from 0 and start from existing seed structures.
-fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<WalkTable, SelectorError> {
+fn restored_walks(records: Vec<WalkRecord>, seed_structures: usize) -> Result<WalkTable, SelectorError> {
     let mut walks = WalkTable::default();
     for (number, record) in records.into_iter().enumerate() {
         let (id, seed) = (record.walk, record.seed_structure);
         if id.0 as usize != number {
             return Err(SelectorError::Snapshot(format!("found walk {id} in place of walk {number}")));
         }
-        if seed as usize >= seeds {
-            let problem = format!("walk {id} starts from seed structure {seed}, but there are only {seeds}");
+        if seed as usize >= seed_structures {
+            let problem =
+                format!("walk {id} starts from seed structure {seed}, but there are only {seed_structures}");
             return Err(SelectorError::Snapshot(problem));
         }
         walks.insert(Walk::restore(record)?);

@@ -43,7 +43,7 @@ pub use regrade::{RegradedCandidate, RegradedReport, Regrader};
 pub use replay::{Replay, ReplayError, ReplayedDecision};
 pub use scheduling::Scheduling;
 pub use settings::{
-    CampaignMode, OnForgetting, SeedPlan, SelectorSettings, SelectorSnapshot, UpdateProtocol,
+    CampaignMode, OnForgetting, SeedStructurePlan, SelectorSettings, SelectorSnapshot, UpdateProtocol,
 };
 pub use training_frames::TrainingFrames;
 use walk::Walk;
@@ -51,7 +51,7 @@ use walk::Walk;
 /// The selector. See the [module](self).
 pub struct Selector {
     campaign: CampaignId,
-    seeds: Vec<SeedPlan>,
+    seed_structures: Vec<SeedStructurePlan>,
     decisions: DecisionState,
     /// The walker that has each assigned walk in hand, until it reports or is lost.
     in_hand: BTreeMap<WalkId, u32>,
@@ -71,16 +71,17 @@ impl Selector {
     pub fn restore(
         settings: SelectorSettings,
         campaign: CampaignId,
-        seeds: Vec<SeedPlan>,
+        seed_structures: Vec<SeedStructurePlan>,
         grader: Grader,
         original: Arc<Mixture>,
         training: Option<TrainingFrames>,
         snapshot: SelectorSnapshot,
     ) -> Result<Self, SelectorError> {
-        let decisions = DecisionState::restore(settings, &seeds, grader, original, training, snapshot)?;
+        let decisions =
+            DecisionState::restore(settings, &seed_structures, grader, original, training, snapshot)?;
         let mut selector = Self {
             campaign,
-            seeds,
+            seed_structures,
             decisions,
             in_hand: BTreeMap::new(),
             outstanding: BTreeSet::new(),
@@ -107,7 +108,7 @@ impl Selector {
     pub fn walk_progress(&self, last: u64) -> Vec<(WalkId, String, u64)> {
         let varied = VariedConditions::among(self.decisions.walks.iter().map(|walk| &walk.record.conditions));
         let standing = |walk: &Walk| {
-            let name = &self.seeds[walk.record.seed_structure as usize].name;
+            let name = &self.seed_structures[walk.record.seed_structure as usize].name;
             let name = varied.name(name, &walk.record.conditions);
             let control = if walk.is_biased() { "" } else { " (control)" };
             let step = if walk.has_ended() { last } else { walk.record.progress.step };
@@ -126,7 +127,7 @@ impl Selector {
     /// added. Resumes walks that ended because of a limit that has been raised since. The commit is empty if nothing
     /// changes.
     pub fn start_walks(&mut self) -> Commit {
-        let commit = self.decisions.start_walks(&self.seeds);
+        let commit = self.decisions.start_walks(&self.seed_structures);
         self.update_ready(commit.walks.iter().map(|walk| walk.walk));
         commit
     }

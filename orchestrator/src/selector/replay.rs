@@ -18,7 +18,8 @@ use super::decide::{FORGETTING, LEFT_OUT};
 use super::decision_state::{DecisionState, restored_mixture};
 use super::rules::CONFIGURATION;
 use super::{
-    RegradedCandidate, Regrader, SeedPlan, SelectorError, SelectorSettings, SelectorSnapshot, TrainingFrames,
+    RegradedCandidate, Regrader, SeedStructurePlan, SelectorError, SelectorSettings, SelectorSnapshot,
+    TrainingFrames,
 };
 use crate::grader::Grader;
 
@@ -61,7 +62,7 @@ pub struct ReplayedDecision {
 pub struct Replay {
     decisions: DecisionState,
     /// Index of each seed structure by its name.
-    seeds: HashMap<String, usize>,
+    seed_structures: HashMap<String, usize>,
     /// Imported structures in order of import.
     imported: Vec<ContentHash>,
     /// Configuration keys that differ from the campaign's.
@@ -77,17 +78,24 @@ impl Replay {
     pub fn new(
         settings: SelectorSettings,
         set: HashSet<String>,
-        seeds: Vec<SeedPlan>,
+        seed_structures: Vec<SeedStructurePlan>,
         grader: Grader,
         original: Arc<Mixture>,
         training: Option<TrainingFrames>,
         imported: Vec<ContentHash>,
     ) -> Result<Self, ReplayError> {
-        let decisions =
-            DecisionState::restore(settings, &seeds, grader, original, training, SelectorSnapshot::default());
+        let decisions = DecisionState::restore(
+            settings,
+            &seed_structures,
+            grader,
+            original,
+            training,
+            SelectorSnapshot::default(),
+        );
         let decisions = decisions.map_err(|source| ReplayError::Settings(Box::new(source)))?;
-        let seeds = seeds.into_iter().enumerate().map(|(index, seed)| (seed.name, index)).collect();
-        Ok(Self { decisions, seeds, imported, set, following: VecDeque::new(), cut_short: 0 })
+        let seed_structures =
+            seed_structures.into_iter().enumerate().map(|(index, seed)| (seed.name, index)).collect();
+        Ok(Self { decisions, seed_structures, imported, set, following: VecDeque::new(), cut_short: 0 })
     }
 
     /// Whether all rules are the same. Only then are control walks and their frames replayed: they do not affect
@@ -239,7 +247,7 @@ impl Replay {
         let id = if self.is_exact() { self.decisions.next_walk_id() } else { walk(recorded)? };
         match read(recorded)? {
             Detail::Biased { seed_structure: name, conditions } => {
-                let seed = self.seeds.get(&name).copied();
+                let seed = self.seed_structures.get(&name).copied();
                 let seed =
                     seed.ok_or_else(|| damaged(recorded, &format!("there is no seed structure '{name}'")))?;
                 Ok(Some(self.decisions.start_walk(id, seed, &name, conditions)))

@@ -119,7 +119,7 @@ impl Selector {
             number: walk.record.assignments,
             origin: walk.record.origin,
             random_walk: walk.record.partner.unwrap_or(id),
-            seed_structure: self.seeds[walk.record.seed_structure as usize].structure.clone(),
+            seed_structure: self.seed_structures[walk.record.seed_structure as usize].structure.clone(),
             conditions: walk.record.conditions.clone(),
             checkpoint: walk.record.checkpoint.clone(),
             verdict: walk.state.verdict.clone(),

@@ -89,7 +89,7 @@ pub struct SelectorSettings {
 
 /// The start of walks.
 #[derive(Clone, Debug)]
-pub struct SeedPlan {
+pub struct SeedStructurePlan {
     /// Name.
     pub name: String,
     /// Structure.

@@ -4,14 +4,14 @@ use serde_json::json;
 use store::records::{Commit, Decision};
 use wire::{WalkConditions, WalkId};
 
-use super::SeedPlan;
+use super::SeedStructurePlan;
 use super::decision_state::DecisionState;
 use super::rules::{CONFIGURATION, RULES};
 use super::walk::Walk;
 
 impl DecisionState {
     /// See [`super::Selector::start_walks`].
-    pub fn start_walks(&mut self, seeds: &[SeedPlan]) -> Commit {
+    pub fn start_walks(&mut self, seed_structures: &[SeedStructurePlan]) -> Commit {
         let mut commit = Commit::default();
         if self.imported.0 != self.imported.1 {
             // From here on, candidates can be duplicates of them.
@@ -23,7 +23,7 @@ impl DecisionState {
         self.log_rule_changes(&mut commit);
         self.resume_walks(&mut commit);
         let begun = self.walks.iter().filter(|walk| walk.is_biased()).count();
-        for (seed, SeedPlan { name, .. }, conditions) in planned_walks(seeds).skip(begun) {
+        for (seed, SeedStructurePlan { name, .. }, conditions) in planned_walks(seed_structures).skip(begun) {
             let id = self.next_walk_id();
             commit.decisions.push(self.start_walk(id, seed, name, conditions.clone()));
             commit.walks.push(self.walks[id].to_record());
@@ -80,7 +80,7 @@ impl DecisionState {
 
     /// Whether a walk, or all walks of its seed structure together, have their maximum number of structures.
     pub fn has_collected_enough(&self, walk: &Walk) -> bool {
-        let of_seed = self.accepted_by_seed.get(&walk.record.seed_structure).copied().unwrap_or(0);
+        let of_seed = self.accepted_by_seed_structure.get(&walk.record.seed_structure).copied().unwrap_or(0);
         walk.record.accepted >= self.settings.max_per_walk
             || self.settings.max_per_seed_structure.is_some_and(|most| of_seed >= most)
     }
@@ -102,7 +102,12 @@ impl DecisionState {
 }
 
 /// The biased walks of a campaign, in order: those of the first seed structure, then those of the next.
-fn planned_walks(seeds: &[SeedPlan]) -> impl Iterator<Item = (usize, &SeedPlan, &WalkConditions)> {
-    let of_seed = |(index, seed)| move |conditions| (index, seed, conditions);
-    seeds.iter().enumerate().flat_map(move |(index, seed)| seed.walks.iter().map(of_seed((index, seed))))
+fn planned_walks(
+    seed_structures: &[SeedStructurePlan],
+) -> impl Iterator<Item = (usize, &SeedStructurePlan, &WalkConditions)> {
+    let with_conditions = |(index, seed)| move |conditions| (index, seed, conditions);
+    seed_structures
+        .iter()
+        .enumerate()
+        .flat_map(move |(index, seed)| seed.walks.iter().map(with_conditions((index, seed))))
 }

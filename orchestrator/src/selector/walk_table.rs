@@ -14,7 +14,7 @@ pub(super) struct WalkTable {
     unfinished_biased: BTreeSet<WalkId>,
     unfinished_controls: BTreeSet<WalkId>,
     /// Biased walks from each seed structure.
-    of_seed: BTreeMap<u32, Vec<WalkId>>,
+    of_seed_structure: BTreeMap<u32, Vec<WalkId>>,
     /// Biased walks that have ended with structures that no control walk has yet.
     without_control: BTreeSet<WalkId>,
     /// Number of assignments that were reported on.
@@ -26,7 +26,7 @@ impl WalkTable {
     pub fn insert(&mut self, walk: Walk) {
         let id = walk.record.walk;
         if walk.is_biased() {
-            self.of_seed.entry(walk.record.seed_structure).or_default().push(id);
+            self.of_seed_structure.entry(walk.record.seed_structure).or_default().push(id);
         }
         if !walk.has_ended() {
             self.unfinished_mut(walk.is_biased()).insert(id);
@@ -104,8 +104,8 @@ impl WalkTable {
     }
 
     /// The biased walks from a seed structure that have not ended, in order.
-    pub fn unfinished_of_seed(&self, seed_structure: u32) -> impl Iterator<Item = WalkId> {
-        let walks = self.of_seed.get(&seed_structure).into_iter().flatten().copied();
+    pub fn unfinished_of_seed_structure(&self, seed_structure: u32) -> impl Iterator<Item = WalkId> {
+        let walks = self.of_seed_structure.get(&seed_structure).into_iter().flatten().copied();
         walks.filter(|id| self.unfinished_biased.contains(id))
     }
 
@@ -212,9 +212,9 @@ mod tests {
                     prop_assert_eq!(table.unfinished(biased).collect::<Vec<_>>(), unfinished);
                 }
                 for seed in 0..3 {
-                    let of_seed =
+                    let expected =
                         every(&|walk| !walk.has_ended() && walk.is_biased() && walk.record.seed_structure == seed);
-                    prop_assert_eq!(table.unfinished_of_seed(seed).collect::<Vec<_>>(), of_seed);
+                    prop_assert_eq!(table.unfinished_of_seed_structure(seed).collect::<Vec<_>>(), expected);
                 }
                 prop_assert_eq!(table.without_control(), every(&Walk::needs_control));
                 prop_assert_eq!(table.have_all_ended(), table.iter().all(Walk::has_ended));

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use orchestrator::selector::{
-    CampaignMode, OnForgetting, Scheduling, SeedPlan, Selector, SelectorSettings, SelectorSnapshot,
+    CampaignMode, OnForgetting, Scheduling, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
     UpdateProtocol,
 };
 use proptest::collection::vec;
@@ -15,13 +15,15 @@ use wire::transport::WorkItem;
 
 use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
-use super::{CAMPAIGN, grader, mixture, seed, settings};
+use super::{CAMPAIGN, grader, mixture, seed_structure, settings};
 
 /// Number of label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
 
 fn open(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -> Selector {
-    let seeds = (0..seeds).map(|number| SeedPlan { walks: walks_of(number), ..seed(number) }).collect();
+    let seeds = (0..seeds)
+        .map(|number| SeedStructurePlan { walks: walks_of(number), ..seed_structure(number) })
+        .collect();
     let selector = Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), None, snapshot);
     let mut selector = selector.unwrap();
     if settings.mode == CampaignMode::Live {

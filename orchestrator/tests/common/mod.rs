@@ -13,7 +13,7 @@ use calm::{
 };
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    CampaignMode, OnForgetting, Scheduling, SeedPlan, Selector, SelectorSettings, SelectorSnapshot,
+    CampaignMode, OnForgetting, Scheduling, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
     TrainingFrames, UpdateProtocol,
 };
 use store::records::{AtomGrades, Commit};
@@ -55,8 +55,8 @@ pub fn structure(number: u64, distance: f64) -> Structure {
     }
 }
 
-pub fn seed(number: usize) -> SeedPlan {
-    SeedPlan {
+pub fn seed_structure(number: usize) -> SeedStructurePlan {
+    SeedStructurePlan {
         name: format!("seed-{number}"),
         structure: structure(1_000_000 + number as u64, SHORTEST),
         walks: vec![WalkConditions::default()],
@@ -105,7 +105,7 @@ pub fn try_restore(
     training: Option<TrainingFrames>,
     snapshot: SelectorSnapshot,
 ) -> Result<Selector, orchestrator::selector::SelectorError> {
-    let seeds = (0..seeds).map(seed).collect();
+    let seeds = (0..seeds).map(seed_structure).collect();
     Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), training, snapshot)
 }
 

@@ -119,8 +119,8 @@ pub fn provenance(data: &ReportData) -> PageTable {
             row(format!("file {key} (BLAKE3)"), hash.as_str().unwrap_or_default().to_owned());
         }
     }
-    let sources: BTreeSet<_> = data.seeds.iter().map(|seed| seed.source.as_str()).collect();
-    let seeds = data.seeds.len() as u64;
+    let sources: BTreeSet<_> = data.seed_structures.iter().map(|seed| seed.source.as_str()).collect();
+    let seeds = data.seed_structures.len() as u64;
     row(
         "seed structures".into(),
         format!("{} of {}", grouped(seeds), sources.into_iter().collect::<Vec<_>>().join(", ")),

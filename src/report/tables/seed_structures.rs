@@ -29,16 +29,17 @@ pub fn seed_structures(data: &ReportData) -> PageTable {
     ];
     let mut table = PageTable::new("seed-structures", caption, &titles);
     let mut fates: BTreeMap<u64, BTreeMap<&str, u64>> = BTreeMap::new();
-    for fate in &data.fates_by_seed {
+    for fate in &data.fates_by_seed_structure {
         fates.entry(fate.part).or_default().insert(&fate.fate, fate.number);
     }
-    let walks_by_seed = by_seed_structure(&data.status.walks);
-    for seed in &data.seeds {
+    let walks_by_seed_structure = by_seed_structure(&data.status.walks);
+    for seed in &data.seed_structures {
         let fate =
             |name: &str| fates.get(&seed.index.into()).and_then(|of| of.get(name)).copied().unwrap_or(0);
         let biased = data.collections.biased.labels.get(&seed.index).copied().unwrap_or_default();
         let control = data.collections.control.labels.get(&seed.index).copied().unwrap_or_default();
-        let (walks, ended) = states(walks_by_seed.get(seed.name.as_str()).into_iter().flatten().copied());
+        let (walks, ended) =
+            states(walks_by_seed_structure.get(seed.name.as_str()).into_iter().flatten().copied());
         let names = ["accepted", "covered", "duplicate", "too_close", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
         row.push(count(names.iter().map(|name| fate(name)).sum()));

@@ -106,7 +106,7 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
         steps: 1600,
         max_per_walk: 12,
         walks_per_round: 3,
-        seeds: &["fcc-100", "vacancy", "fcc-097"],
+        seed_structures: &["fcc-100", "vacancy", "fcc-097"],
         ..Small::default()
     };
     let mut hosts = Hosts::new(&small, 2, "agent_heartbeat_timeout = \"1m\"");

@@ -16,7 +16,7 @@ use crate::common::processes::{pause_walkers, processes_running, resume_processe
 fn small() -> Small {
     Small {
         walks_per_round: 3,
-        seeds: &["fcc-100", "vacancy", "fcc-097"],
+        seed_structures: &["fcc-100", "vacancy", "fcc-097"],
         steps: 1600,
         max_per_walk: 8,
         ..Small::default()

@@ -9,7 +9,8 @@ use serde_json::{Value, json};
 use super::CommandError;
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::campaign::{
-    LoadedCampaign, Remark, SeedTriage, SkippedStructure, SourcedStructure, StepTimes, WalkTime, triage,
+    LoadedCampaign, Remark, SeedStructureTriage, SkippedStructure, SourcedStructure, StepTimes, WalkTime,
+    triage,
 };
 use crate::csv::{Csv, number};
 use crate::output::{Bar, TextTable, count, decimals};
@@ -40,14 +41,14 @@ const COLUMNS: [&str; 16] = [
 ];
 
 /// The seed structures of a campaign under the original mixture, and the time of their walks.
-pub struct SeedTable<'a> {
+pub struct SeedStructureTable<'a> {
     campaign: &'a LoadedCampaign,
     /// The worst first.
-    seeds: Vec<SeedTriage<'a>>,
+    seed_structures: Vec<SeedStructureTriage<'a>>,
     times: StepTimes,
 }
 
-impl<'a> SeedTable<'a> {
+impl<'a> SeedStructureTable<'a> {
     /// Grades the seed structures with a progress bar and measures a few steps. Writes the CSV if there is a path for it.
     ///
     /// # Errors
@@ -56,10 +57,10 @@ impl<'a> SeedTable<'a> {
         // Fail before the long computation.
         let file = csv.map(AtomicFile::create).transpose()?;
         let (bar, done) = (Bar::new(Some(campaign.seed_structures.len() as u64), BAR), AtomicU64::new(0));
-        let seeds = triage(campaign, || {
+        let seed_structures = triage(campaign, || {
             bar.set(done.fetch_add(1, Ordering::Relaxed) + 1, || "seed structures".to_owned())
         });
-        let table = Self { campaign, seeds, times: StepTimes::measure(campaign)? };
+        let table = Self { campaign, seed_structures, times: StepTimes::measure(campaign)? };
         if let Some((mut file, path)) = file.zip(csv) {
             file.write_all(&table.csv().into_bytes()).map_err(|error| cannot_write(path, error))?;
             file.finish()?;
@@ -69,7 +70,8 @@ impl<'a> SeedTable<'a> {
 
     /// How many structures are noteworthy and why, as sentences.
     pub fn remarks(&self) -> Vec<String> {
-        let number = |is: fn(&Remark) -> bool| self.seeds.iter().filter(|found| is(&found.remark)).count();
+        let number =
+            |is: fn(&Remark) -> bool| self.seed_structures.iter().filter(|found| is(&found.remark)).count();
         let remarks = [
             (
                 number(|remark| *remark == Remark::Candidate),
@@ -81,14 +83,14 @@ impl<'a> SeedTable<'a> {
             ),
             (number(|remark| matches!(remark, Remark::Ungraded(_))), "cannot be graded"),
         ];
-        let all = count(self.seeds.len(), "seed structure");
+        let all = count(self.seed_structures.len(), "seed structure");
         let there = remarks.into_iter().filter(|(number, _)| *number > 0);
         there.map(|(number, words)| format!("{number} of {all} {words}")).collect()
     }
 
     /// The time of the walks from a seed structure. `None` if no step could be measured.
     pub fn walk_time(&self, seed: &SourcedStructure) -> Option<WalkTime> {
-        self.times.for_seed(seed)
+        self.times.for_seed_structure(seed)
     }
 
     /// The time of all walks. `None` if no step could be measured.
@@ -99,20 +101,20 @@ impl<'a> SeedTable<'a> {
     /// Each seed structure by its name, with what is noteworthy, its distances in Å and its grades. Skipped ones are not among
     /// them.
     pub fn to_json(&self) -> Vec<(&'a str, Value)> {
-        let pairs = |found: &SeedTriage<'_>| -> Value {
+        let pairs = |found: &SeedStructureTriage<'_>| -> Value {
             let pairs = found.pairs.iter();
             let pair = pairs.map(|of| json!({ "pair": of.pair, "distance": of.distance, "limit": of.limit }));
             pair.collect()
         };
-        let row = |found: &SeedTriage<'a>| {
+        let row = |found: &SeedStructureTriage<'a>| {
             let value = json!({
-                "formula": found.seed.seed.structure.formula(), "state": state(&found.remark),
+                "formula": found.seed_structure.plan.structure.formula(), "state": state(&found.remark),
                 "remark": words(&found.remark), "distances": pairs(found), "gamma_max": found.gamma_max,
                 "atoms_above": found.atoms_above, "atoms_needed": found.needed_atoms,
             });
-            (found.seed.seed.name.as_str(), value)
+            (found.seed_structure.plan.name.as_str(), value)
         };
-        self.seeds.iter().map(row).collect()
+        self.seed_structures.iter().map(row).collect()
     }
 
     /// Writes a table of the `shown` worst structures.
@@ -130,11 +132,11 @@ impl<'a> SeedTable<'a> {
             ">walk",
             "remark",
         ]);
-        for found in self.seeds.iter().take(shown) {
-            let structure = &found.seed.seed.structure;
+        for found in self.seed_structures.iter().take(shown) {
+            let structure = &found.seed_structure.plan.structure;
             let closest = found.pairs.first();
             table.push(vec![
-                found.seed.seed.name.clone(),
+                found.seed_structure.plan.name.clone(),
                 structure.len().to_string(),
                 structure.formula(),
                 closest.map_or("–".to_owned(), |closest| closest.pair.to_string()),
@@ -143,12 +145,14 @@ impl<'a> SeedTable<'a> {
                 decimals(found.gamma_max, 2),
                 found.atoms_above.to_string(),
                 found.needed_atoms.to_string(),
-                self.times.for_seed(found.seed).map_or("–".to_owned(), |time| wall_time(time.biased)),
+                self.times
+                    .for_seed_structure(found.seed_structure)
+                    .map_or("–".to_owned(), |time| wall_time(time.biased)),
                 words(&found.remark),
             ]);
         }
         table.write(out)?;
-        match self.seeds.len().saturating_sub(shown) {
+        match self.seed_structures.len().saturating_sub(shown) {
             0 => Ok(()),
             more => writeln!(out, "… and {more} more seed structures (use --all, or --csv FILE)"),
         }
@@ -158,7 +162,7 @@ impl<'a> SeedTable<'a> {
     fn csv(&self) -> Csv {
         let mut csv = Csv::new(&COLUMNS);
         self.campaign.skipped.iter().for_each(|skipped| csv.push(&skipped_row(skipped)));
-        self.seeds.iter().for_each(|found| csv.push(&row(found, &self.times)));
+        self.seed_structures.iter().for_each(|found| csv.push(&row(found, &self.times)));
         csv
     }
 }
@@ -186,24 +190,24 @@ fn state(remark: &Remark) -> &'static str {
     }
 }
 
-fn skipped_row(SkippedStructure { seed, source, reason }: &SkippedStructure) -> Vec<String> {
-    let structure = &seed.structure;
-    let mut row = vec![seed.name.clone(), source.clone(), structure.len().to_string(), structure.formula()];
+fn skipped_row(SkippedStructure { plan, source, reason }: &SkippedStructure) -> Vec<String> {
+    let structure = &plan.structure;
+    let mut row = vec![plan.name.clone(), source.clone(), structure.len().to_string(), structure.formula()];
     row.extend(["skipped".to_owned(), reason.clone()]);
     row.resize(COLUMNS.len(), String::new());
     row
 }
 
-fn row(found: &SeedTriage<'_>, times: &StepTimes) -> Vec<String> {
-    let structure = &found.seed.seed.structure;
+fn row(found: &SeedStructureTriage<'_>, times: &StepTimes) -> Vec<String> {
+    let structure = &found.seed_structure.plan.structure;
     let closest = found.pairs.first();
-    let time = times.for_seed(found.seed);
+    let time = times.for_seed_structure(found.seed_structure);
     let hours = |seconds: Option<f64>| number(seconds.map(|seconds| seconds / SECONDS_PER_HOUR));
     let distances =
         found.pairs.iter().map(|pair| format!("{} {:.4} {:.4}", pair.pair, pair.distance, pair.limit));
     vec![
-        found.seed.seed.name.clone(),
-        found.seed.source.clone(),
+        found.seed_structure.plan.name.clone(),
+        found.seed_structure.source.clone(),
         structure.len().to_string(),
         structure.formula(),
         state(&found.remark).to_owned(),
@@ -215,7 +219,7 @@ fn row(found: &SeedTriage<'_>, times: &StepTimes) -> Vec<String> {
         number(found.gamma_max),
         found.atoms_above.to_string(),
         found.needed_atoms.to_string(),
-        number(found.seed.geometry.bonds as f64 / structure.len() as f64),
+        number(found.seed_structure.geometry.bonds as f64 / structure.len() as f64),
         hours(time.map(|time| time.biased)),
         hours(time.map(|time| time.control)),
     ]
