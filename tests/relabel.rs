@@ -91,7 +91,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
         "{asked}"
     );
     let twice: Value = serde_json::from_str(&relabel(&place, &[&with[..], &["--json"]].concat())).unwrap();
-    assert_eq!((&twice["again"], &twice["waiting_already"]), (&0.into(), &labels.into()));
+    assert_eq!((&twice["relabelling"], &twice["waiting_already"]), (&0.into(), &labels.into()));
     assert_eq!((place.jobs("relabelling"), place.jobs("queued")), (labels, labels));
     let before = exported(&place);
     // Two candidates with the same structure share one label.
@@ -158,7 +158,7 @@ fn doubtful_labels_are_made_again_by_the_same_protocol() {
     );
     relabel(&place, &[doubtful, "--reason", "a faulty node"]);
     let listed = succeed(place.path(), ["queue", place.argument(), "list", "--state", "queued"]);
-    assert!(listed.contains(doubtful) && listed.contains("queued again"), "{listed}");
+    assert!(listed.contains(doubtful) && listed.contains("queued, relabelling"), "{listed}");
     let shown = succeed(place.path(), ["queue", place.argument(), "show", doubtful]);
     assert!(shown.contains("relabel   requested: a faulty node"), "{shown}");
     assert_eq!(place.export(), bytes, "the label stays");

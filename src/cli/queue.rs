@@ -163,11 +163,12 @@ pub fn message(action: &QueueCommand, job: &QueueEntry) -> String {
     }
 }
 
-/// The state of a job; "again" if it already has a label that another one will replace; "excluded" if that label is excluded.
+/// The state of a job; with "relabelling" if it already has a label that another one will replace, with "excluded" if that label
+/// is excluded.
 fn state_of(job: &QueueEntry) -> String {
     let excluded = if job.excluded.is_some() { ", excluded" } else { "" };
     match (&job.relabel, job.state) {
-        (Some(_), JobState::Queued | JobState::Leased) => format!("{} again{excluded}", job.state),
+        (Some(_), JobState::Queued | JobState::Leased) => format!("{}, relabelling{excluded}", job.state),
         _ => format!("{}{excluded}", job.state),
     }
 }

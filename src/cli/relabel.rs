@@ -112,7 +112,7 @@ impl RelabelArgs {
             if new.is_some() { store.unlabelled_under_other_protocols(protocol.hash).await? } else { 0 };
         let cost = label_cost::relabel_cost(&store, &in_force, &selection.sizes()).await?;
         let next = self.next(&store, &location).await?;
-        let mut requeued = RelabelCounts { again: selection.structures().len() as u64, moved };
+        let mut requeued = RelabelCounts { relabelling: selection.structures().len() as u64, moved };
         if !self.dry_run {
             requeued = self.apply(&store, new.as_ref(), &selection).await?;
         }
@@ -164,9 +164,14 @@ impl RelabelArgs {
             changes: &changes,
             notes: &new.notes,
         });
-        let (structures, again) = (selection.structures(), self.include_current || !self.ids.is_empty());
-        let request =
-            store::RelabelRequest { structures: &structures, again, reason: &self.reason, protocol };
+        let (structures, include_current) =
+            (selection.structures(), self.include_current || !self.ids.is_empty());
+        let request = store::RelabelRequest {
+            structures: &structures,
+            include_current,
+            reason: &self.reason,
+            protocol,
+        };
         Ok(store.relabel(&request, unix_milliseconds()).await?)
     }
 }
@@ -187,16 +192,16 @@ impl RelabelReport {
         } else if has_config {
             writeln!(out, "protocol '{name}' is already the current label protocol")?;
         }
-        let are = verb("would be", if requeued.again == 1 { "is" } else { "are" });
-        let structures = count(requeued.again, "structure");
+        let are = verb("would be", if requeued.relabelling == 1 { "is" } else { "are" });
+        let structures = count(requeued.relabelling, "structure");
         writeln!(out, "{structures} {are} queued again for protocol '{name}'{}", selection.replaced())?;
         selection.skipped(name).iter().try_for_each(|line| writeln!(out, "{line}"))?;
-        if requeued.again > 0 {
+        if requeued.relabelling > 0 {
             writeln!(out, "cost: {}", wording::cost::relabel_cost(cost))?;
         }
         match dry_run {
             true => writeln!(out, "dry run: nothing was changed"),
-            false if requeued.again + requeued.moved > 0 => writeln!(out, "{next}"),
+            false if requeued.relabelling + requeued.moved > 0 => writeln!(out, "{next}"),
             false => Ok(()),
         }
     }
@@ -205,7 +210,7 @@ impl RelabelReport {
         let Self { protocol, changes, selection, cost, requeued, .. } = self;
         json!({
             "dry_run": dry_run, "protocol": protocol.name, "protocol_hash": protocol.hash.to_string(),
-            "changes": changes, "again": requeued.again, "without_a_label": requeued.moved,
+            "changes": changes, "relabelling": requeued.relabelling, "without_a_label": requeued.moved,
             "waiting_already": selection.waiting, "labelled_already": selection.labelled, "dropped": selection.dropped,
             "core_hours": cost.hours, "measured": cost.measured,
         })

@@ -30,7 +30,7 @@ pub struct RelabelRequest<'a> {
     /// Which structures.
     pub structures: &'a [ContentHash],
     /// Also structures whose label was made under the protocol in force.
-    pub again: bool,
+    pub include_current: bool,
     /// The reason, stored with the superseded labels.
     pub reason: &'a str,
     /// A new protocol to bring into force.
@@ -53,8 +53,8 @@ pub struct NewProtocol<'a> {
 /// The effect of a request.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RelabelCounts {
-    /// Structures to be labelled again.
-    pub again: u64,
+    /// Structures that will get another label.
+    pub relabelling: u64,
     /// Structures without a label whose jobs moved to the new protocol.
     pub moved: u64,
 }

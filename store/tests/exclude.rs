@@ -159,8 +159,9 @@ async fn only_a_requested_label_replaces_an_excluded_one() {
     assert_eq!(exported(&store, &dft).await, [0.0; 0]);
     whole(&store).await;
 
-    let order = RelabelRequest { structures: &[content(1)], again: true, reason: "better", protocol: None };
-    assert_eq!(store.relabel(&order, 20_005).await.unwrap().again, 1);
+    let order =
+        RelabelRequest { structures: &[content(1)], include_current: true, reason: "better", protocol: None };
+    assert_eq!(store.relabel(&order, 20_005).await.unwrap().relabelling, 1);
     whole(&store).await;
     // The earlier label stays excluded until the new one arrives, even if it never does.
     let failing = lease(&store, 20_006).await;

@@ -44,7 +44,8 @@ async fn relabel(store: &Store, names: &[String], now: i64) {
     for name in names {
         structures.push(store.candidate(name).await.unwrap().unwrap().block.view().id().content);
     }
-    let order = RelabelRequest { structures: &structures, again: true, reason: "doubtful", protocol: None };
+    let order =
+        RelabelRequest { structures: &structures, include_current: true, reason: "doubtful", protocol: None };
     store.relabel(&order, now).await.unwrap();
 }
 
@@ -303,8 +304,12 @@ async fn a_lower_state_of_an_earlier_time_returns_with_its_protocol() {
     let (dft, fine) = (protocol("dft"), protocol("fine"));
     let change_to = async |to: &store::Protocol, now: i64| {
         let new = NewProtocol { protocol: to, configuration: "{}", changes: &[], notes: &[] };
-        let order =
-            RelabelRequest { structures: &[content], again: false, reason: "cutoff", protocol: Some(new) };
+        let order = RelabelRequest {
+            structures: &[content],
+            include_current: false,
+            reason: "cutoff",
+            protocol: Some(new),
+        };
         store.relabel(&order, now).await.unwrap();
     };
     change_to(&fine, 10).await;

@@ -106,9 +106,13 @@ async fn imported_structures_count_as_others_do() {
     let import = found.last().unwrap();
     assert_eq!((found.len(), import.content), (4, ContentHash::from_structure(&structure(50.0))));
     assert_eq!((import.seed_structure, import.formula.as_str(), import.atoms), (u32::MAX, "Si2", 2));
-    let request =
-        RelabelRequest { structures: &[import.content], again: true, reason: "doubtful", protocol: None };
-    assert_eq!(store.relabel(&request, 40_000).await.unwrap().again, 1);
+    let request = RelabelRequest {
+        structures: &[import.content],
+        include_current: true,
+        reason: "doubtful",
+        protocol: None,
+    };
+    assert_eq!(store.relabel(&request, 40_000).await.unwrap().relabelling, 1);
     store.prioritise_job("import-1", 20, 40_000).await.unwrap();
     let again = lease(&store, 40_000).await;
     assert_eq!(again.candidate, "import-1");

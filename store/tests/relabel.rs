@@ -9,7 +9,7 @@ use wire::ContentHash;
 
 use crate::common::*;
 
-const AGAIN: RelabelCounts = RelabelCounts { again: 1, moved: 0 };
+const RELABELLING: RelabelCounts = RelabelCounts { relabelling: 1, moved: 0 };
 
 async fn lease(store: &Store, protocol: &Protocol, now: i64) -> Option<Lease> {
     store.lease(protocol.hash, "host/a", now, 10).await.unwrap()
@@ -36,8 +36,8 @@ async fn campaign_with(home: &Home, candidates: u64, labelled: u64) -> (Store, V
     )
 }
 
-async fn again(store: &Store, structures: &[ContentHash], again: bool) -> RelabelCounts {
-    let order = RelabelRequest { structures, again, reason: "a sick node", protocol: None };
+async fn relabel(store: &Store, structures: &[ContentHash], include_current: bool) -> RelabelCounts {
+    let order = RelabelRequest { structures, include_current, reason: "a sick node", protocol: None };
     store.relabel(&order, 100).await.unwrap()
 }
 
@@ -45,7 +45,7 @@ async fn change_to(store: &Store, to: &Protocol, structures: &[ContentHash]) -> 
     let notes = [("label_method", format!("how {} is made", to.name))];
     let changes = [json!({ "key": "label.protocol", "before": "dft", "after": to.name })];
     let new = NewProtocol { protocol: to, configuration: "{\"new\":1}", changes: &changes, notes: &notes };
-    let order = RelabelRequest { structures, again: false, reason: "cutoff", protocol: Some(new) };
+    let order = RelabelRequest { structures, include_current: false, reason: "cutoff", protocol: Some(new) };
     store.relabel(&order, 200).await.unwrap()
 }
 
@@ -80,9 +80,9 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 2, 1).await;
     let dft = protocol("dft");
-    assert_eq!(again(&store, &structures, false).await, RelabelCounts::default(), "it has its label");
-    assert_eq!(again(&store, &structures, true).await, AGAIN);
-    assert_eq!(again(&store, &structures, true).await, RelabelCounts::default(), "it waits already");
+    assert_eq!(relabel(&store, &structures, false).await, RelabelCounts::default(), "it has its label");
+    assert_eq!(relabel(&store, &structures, true).await, RELABELLING);
+    assert_eq!(relabel(&store, &structures, true).await, RelabelCounts::default(), "it waits already");
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.queued, labels.labelled, labels.relabelling, labels.relabel_failed), (2, 0, 1, 0));
@@ -108,7 +108,7 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.queued, labels.labelled, labels.relabelling), (1, 1, 0));
     let operation = store.operations(0, 100).await.unwrap().pop().unwrap();
-    assert_eq!((operation.kind.as_str(), &operation.detail["again"]), ("relabel", &json!(1)));
+    assert_eq!((operation.kind.as_str(), &operation.detail["relabelling"]), ("relabel", &json!(1)));
     whole(&store).await;
 }
 
@@ -117,7 +117,7 @@ async fn a_label_that_cannot_be_remade_stays() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 1, 1).await;
     let dft = protocol("dft");
-    again(&store, &structures, true).await;
+    relabel(&store, &structures, true).await;
     let first = lease(&store, &dft, 300).await.unwrap();
     assert_eq!(store.fail(&first, "crashed", "", 2, 301).await.unwrap(), FailOutcome::Requeued);
     let second = lease(&store, &dft, 302).await.unwrap();
@@ -128,7 +128,7 @@ async fn a_label_that_cannot_be_remade_stays() {
     assert_eq!((labels.labelled, labels.failed, labels.relabelling, labels.relabel_failed), (1, 0, 0, 1));
     whole(&store).await;
     // It may be requested again, and a late result satisfies the request.
-    assert_eq!(again(&store, &structures, true).await, AGAIN);
+    assert_eq!(relabel(&store, &structures, true).await, RELABELLING);
     let third = lease(&store, &dft, 400).await.unwrap();
     assert!(third.failures.is_empty());
     assert_eq!(store.release_all("host", 401).await.unwrap(), 1);
@@ -145,7 +145,7 @@ async fn an_attempt_from_before_the_request_gives_a_check() {
     let dft = protocol("dft");
     let late = lease(&store, &dft, 0).await.unwrap();
     assert_eq!(label_next(&store, &dft, -1.0, 20_000).await, CompleteOutcome::Label);
-    again(&store, &structures, true).await;
+    relabel(&store, &structures, true).await;
     assert_eq!(store.complete(&late, &label(-9.0), 30_000).await.unwrap(), CompleteOutcome::KeptAsCheck);
     let frames = [(0, structure(1e-6), label(-8.0))];
     assert_eq!(store.import(dft.hash, "x", &frames, 30_001).await.unwrap().checks, 1);
@@ -172,7 +172,7 @@ async fn another_protocol_supersedes_label_by_label() {
     );
     assert_eq!(store.unlabelled_under_other_protocols(fine.hash).await.unwrap(), 3);
 
-    for expected in [RelabelCounts { again: 2, moved: 3 }, RelabelCounts::default()] {
+    for expected in [RelabelCounts { relabelling: 2, moved: 3 }, RelabelCounts::default()] {
         assert_eq!(change_to(&store, &fine, &structures).await, expected, "asking twice is asking once");
         assert_eq!(store.protocol_in_force().await.unwrap().unwrap(), fine);
         whole(&store).await;
@@ -209,7 +209,7 @@ async fn another_protocol_supersedes_label_by_label() {
     for energy in [-3.0, -4.0, -5.0] {
         assert_eq!(label_next(&store, &fine, energy, 400).await, CompleteOutcome::Label);
     }
-    assert_eq!(again(&store, &structures, false).await, AGAIN);
+    assert_eq!(relabel(&store, &structures, false).await, RELABELLING);
     assert_eq!(label_next(&store, &fine, -2.5, 500).await, CompleteOutcome::Label);
     assert_eq!(exported(&store, &dft).await, [0.0; 0]);
     assert_eq!(exported(&store, &fine).await, [-1.5, -2.5, -3.0, -4.0, -5.0]);
@@ -226,7 +226,7 @@ async fn a_campaign_may_return_to_its_first_protocol() {
     change_to(&store, &fine, &structures).await;
     assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     // The second waits for its second label, the third for its first.
-    assert_eq!(change_to(&store, &dft, &structures).await.again, 1);
+    assert_eq!(change_to(&store, &dft, &structures).await.relabelling, 1);
     whole(&store).await;
     assert_eq!(
         jobs(&store, structures[1]).await,
@@ -256,7 +256,7 @@ async fn dropped_jobs_are_not_relabelled() {
     let lease = lease(&store, &fine, 300).await.unwrap();
     let name = store.drop_job("0.0.1", 301).await.unwrap();
     assert_eq!(store.complete(&lease, &label(-1.5), 302).await.unwrap(), CompleteOutcome::KeptAsCheck);
-    assert_eq!(again(&store, &structures, true).await, RelabelCounts::default());
+    assert_eq!(relabel(&store, &structures, true).await, RelabelCounts::default());
     whole(&store).await;
     // Requested again, it waits for the new label.
     store.retry_job(&name, 303).await.unwrap();
@@ -281,7 +281,7 @@ async fn an_imported_label_may_be_superseded_or_satisfy_a_request() {
     };
     import(&dft, 1.0, -1.0).await;
     import(&dft, 2.0, -2.0).await;
-    assert_eq!(change_to(&store, &fine, &structures).await.again, 2);
+    assert_eq!(change_to(&store, &fine, &structures).await.relabelling, 2);
     assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     assert_eq!(import(&fine, 2.0, -2.5).await.labels, 1);
     assert!(lease(&store, &fine, 400).await.is_none());
@@ -299,7 +299,8 @@ async fn two_protocols_cannot_share_a_name() {
     let mut other = protocol("other");
     other.name = "dft".into();
     let new = NewProtocol { protocol: &other, configuration: "{}", changes: &[], notes: &[] };
-    let order = RelabelRequest { structures: &structures, again: false, reason: "", protocol: Some(new) };
+    let order =
+        RelabelRequest { structures: &structures, include_current: false, reason: "", protocol: Some(new) };
     assert!(matches!(store.relabel(&order, 1).await, Err(StoreError::ProtocolName(_))));
     assert_eq!(store.protocol_in_force().await.unwrap().unwrap(), protocol("dft"));
     assert_eq!(store.status().await.unwrap().labels.relabelling, 0, "all or nothing");

@@ -54,7 +54,7 @@ macro_rules! request {
     };
 }
 const REQUEST: &str = request!("'failed', 'superseded'");
-const REQUEST_AGAIN: &str = request!("'labelled', 'failed', 'superseded'");
+const REQUEST_INCLUDING_CURRENT: &str = request!("'labelled', 'failed', 'superseded'");
 
 /// Withdraws requests under protocols no longer in force: the existing labels stay.
 const WITHDRAW_REQUESTS: &str =
@@ -179,11 +179,12 @@ impl Store {
         // A statement may write a row only once.
         let mut seen = HashSet::new();
         let rows = order.structures.iter().filter(|content| seen.insert(content.0)).map(row).collect();
-        let sql = if order.again { REQUEST_AGAIN } else { REQUEST };
-        requeued.again = execute_rows(&mut transaction, sql, &["hash", "protocol", "reason"], rows).await?;
-        if order.protocol.is_some() || requeued.again > 0 {
-            let RelabelCounts { again, moved } = requeued;
-            let detail = json!({ "reason": order.reason, "again": again, "moved": moved });
+        let sql = if order.include_current { REQUEST_INCLUDING_CURRENT } else { REQUEST };
+        requeued.relabelling =
+            execute_rows(&mut transaction, sql, &["hash", "protocol", "reason"], rows).await?;
+        if order.protocol.is_some() || requeued.relabelling > 0 {
+            let RelabelCounts { relabelling, moved } = requeued;
+            let detail = json!({ "reason": order.reason, "relabelling": relabelling, "moved": moved });
             insert_operation(&mut transaction, now, "relabel", &detail).await?;
         }
         transaction.commit().await?;
