@@ -103,7 +103,7 @@ pub fn init(
     let opened = OpenOptions::new().append(true).create(true).mode(0o600).open(&setup.file);
     let file = opened.map_err(|error| cannot_write(&setup.file, &error))?;
     let name = number.map_or_else(|| process.to_owned(), |number| format!("{process} {number}"));
-    let log = Log { file, format: setup.format, process: name };
+    let log = LogFile { file, format: setup.format, process: name };
     // A process has one log, initialized by its command.
     if tracing::subscriber::set_global_default(log.with_level(setup.level)).is_ok() {
         let _ = CONFIG.set(setup);
@@ -116,14 +116,14 @@ fn cannot_write(file: &Path, error: &std::io::Error) -> CommandError {
 }
 
 /// Writes events to the file.
-struct Log {
+struct LogFile {
     file: File,
     format: LogFormat,
     /// Name of the process, such as `walker 3`.
     process: String,
 }
 
-impl Log {
+impl LogFile {
     /// The subscriber for events of this and higher severity, of libraries only for warnings and errors.
     fn with_level(self, level: LogLevel) -> impl Subscriber + Send + Sync {
         let level = LevelFilter::from(level);
@@ -133,7 +133,7 @@ impl Log {
     }
 }
 
-impl<S: Subscriber> Layer<S> for Log {
+impl<S: Subscriber> Layer<S> for LogFile {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let line = format::line(self.format, &self.process, event);
         // A log that cannot be written stops no work.

@@ -144,7 +144,7 @@ fn composition(
     let factor = relaxed.unwrap_or(1.0);
     let crystal = scaled(&crystal, factor);
     let neighbours = nearest_neighbours(&crystal, factor * expected)?;
-    let (mut sums, mut atoms) = (Sums::default(), Vec::new());
+    let (mut sums, mut atoms) = (CompositionSums::default(), Vec::new());
     for number in 0..settings.solution_structures {
         if progress.is_stopped() {
             break;
@@ -205,7 +205,7 @@ fn first_shells(elements: &[String; 2], atoms: &[SolutionAtom], shell: usize) ->
 
 /// Sums over the atoms of a composition.
 #[derive(Default)]
-struct Sums {
+struct CompositionSums {
     structures: usize,
     atoms: usize,
     scores: Vec<f64>,
@@ -213,7 +213,7 @@ struct Sums {
     above: [usize; 2],
 }
 
-impl Sums {
+impl CompositionSums {
     fn add(&mut self, scores: &[Vec<f64>], averages: &[Vec<f64>]) {
         self.structures += 1;
         self.atoms += scores[0].len();

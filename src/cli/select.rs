@@ -266,7 +266,7 @@ struct SelectionReport<'a> {
 }
 
 /// An element of the pool.
-struct Element {
+struct ElementSelection {
     symbol: String,
     selected: u64,
     pool: u64,
@@ -299,10 +299,10 @@ impl SelectionReport<'_> {
             .collect()
     }
 
-    fn elements(&self) -> Vec<Element> {
+    fn elements(&self) -> Vec<ElementSelection> {
         let symbols = self.model.elements().iter().enumerate();
         let all = 0..self.pool.structures.len();
-        let elements = symbols.map(|(index, species)| Element {
+        let elements = symbols.map(|(index, species)| ElementSelection {
             symbol: species.symbol().to_owned(),
             selected: self.picks.picks.iter().map(|pick| self.pool.atoms(pick.structure, index)).sum(),
             pool: all.clone().map(|structure| self.pool.atoms(structure, index)).sum(),
@@ -334,7 +334,7 @@ impl SelectionReport<'_> {
             ]);
         }
         let mut elements = TextTable::new(&["element", ">atoms selected", ">of the pool"]);
-        for Element { symbol, selected, pool, .. } in self.elements() {
+        for ElementSelection { symbol, selected, pool, .. } in self.elements() {
             elements.push(vec![symbol, selected.to_string(), pool.to_string()]);
         }
         let (total, evaluated) = (self.pool.structures.len() as u64, self.pool.evaluated);
@@ -396,7 +396,7 @@ impl SelectionReport<'_> {
         let strategies = self.strategies().into_iter().map(|(name, picks)| {
             json!({ "strategy": name, "structures": picks.len(), "atoms": self.atoms(&picks) })
         });
-        let elements = self.elements().into_iter().map(|Element { symbol, selected, pool, is_short }| {
+        let elements = self.elements().into_iter().map(|ElementSelection { symbol, selected, pool, is_short }| {
             json!({ "element": symbol, "selected_atoms": selected, "pool_atoms": pool, "short": is_short })
         });
         let picks = self.picks.picks.iter().zip(1..).map(|(pick, rank)| self.pick(pick, rank));

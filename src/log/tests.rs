@@ -9,7 +9,7 @@ use super::*;
 
 fn log(file: &Path, format: LogFormat, level: LogLevel) -> impl Subscriber + Send + Sync + use<> {
     let file = OpenOptions::new().append(true).create(true).open(file).unwrap();
-    Log { file, format, process: "walker 3".to_owned() }.with_level(level)
+    LogFile { file, format, process: "walker 3".to_owned() }.with_level(level)
 }
 
 #[test]

@@ -21,14 +21,15 @@ const HEADER: usize = 8 + 8 + 32 + 32;
 
 /// The clusters of all shards that are known, also of shards with contents that they no longer have.
 pub struct KnownShards {
-    logs: Vec<Log>,
+    logs: Vec<ClusterLog>,
     /// Path of the log of this process, and its number among the logs once it exists.
     own: (PathBuf, Option<usize>),
     /// The number of the log and the record's position.
     places: BTreeMap<(u64, ShardHash), (usize, u64)>,
 }
 
-struct Log {
+/// A log of one process.
+struct ClusterLog {
     path: PathBuf,
     file: File,
     /// Where the next record begins.
@@ -42,7 +43,7 @@ impl KnownShards {
         for path in logs {
             let is_own = *path == known.own.0;
             let file = File::options().read(true).write(is_own).open(path);
-            known.read_log(Log {
+            known.read_log(ClusterLog {
                 file: file.map_err(|error| unreadable(path, error))?,
                 path: path.clone(),
                 end: 0,
@@ -57,7 +58,7 @@ impl KnownShards {
     }
 
     /// Adds a log up to its first incomplete record.
-    fn read_log(&mut self, mut log: Log) -> Result<(), CommandError> {
+    fn read_log(&mut self, mut log: ClusterLog) -> Result<(), CommandError> {
         let cannot = |error| unreadable(&log.path, error);
         let length = log.file.metadata().map_err(cannot)?.len();
         let mut file = BufReader::new(&log.file);
@@ -134,7 +135,7 @@ impl KnownShards {
         }
         let file = File::options().read(true).write(true).create(true).truncate(true).open(&*path);
         let file = file.map_err(|error| cannot_create(path, error))?;
-        self.logs.push(Log { path: path.clone(), file, end: 0 });
+        self.logs.push(ClusterLog { path: path.clone(), file, end: 0 });
         *number = Some(self.logs.len() - 1);
         Ok(self.logs.len() - 1)
     }

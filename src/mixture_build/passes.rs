@@ -70,13 +70,13 @@ pub struct ShardResult<T> {
 }
 
 /// The atoms of an element that wait to be passed on.
-struct Element<P> {
+struct PendingAtoms<P> {
     pass: Option<P>,
     features: Vec<f64>,
     weights: Vec<f64>,
 }
 
-impl<P: ElementPass> Element<P> {
+impl<P: ElementPass> PendingAtoms<P> {
     fn flush(&mut self) -> Result<(), BuildError> {
         if let Some(pass) = &mut self.pass {
             pass.add(&self.features, &self.weights)?;
@@ -142,8 +142,8 @@ pub fn run_shard<P: ElementPass>(
     stop: &CancellationToken,
     each: impl Fn(),
 ) -> Result<Option<ShardResult<P::Partial>>, CommandError> {
-    let empty = |pass| Element { pass, features: Vec::new(), weights: Vec::new() };
-    let mut elements: Vec<Element<P>> = passes.into_iter().map(empty).collect();
+    let empty = |pass| PendingAtoms { pass, features: Vec::new(), weights: Vec::new() };
+    let mut elements: Vec<PendingAtoms<P>> = passes.into_iter().map(empty).collect();
     let broken = |error: BuildError| CommandError::Failed(format!("shard {}: {error}", shard.index));
     for number in shuffled(seed, shard.index, shard.structures.len()) {
         if stop.is_cancelled() {
@@ -157,7 +157,7 @@ pub fn run_shard<P: ElementPass>(
         }
         each();
     }
-    elements.iter_mut().try_for_each(Element::flush).map_err(broken)?;
+    elements.iter_mut().try_for_each(PendingAtoms::flush).map_err(broken)?;
     Ok(Some(ShardResult {
         index: shard.index,
         hash: shard.hash,
@@ -169,7 +169,7 @@ fn add<P>(
     structure: &TrainingStructure,
     indices: &[usize],
     features: &[f64],
-    elements: &mut [Element<P>],
+    elements: &mut [PendingAtoms<P>],
 ) -> Result<(), CommandError> {
     let dimension = features.len() / indices.len().max(1);
     let rows = features.chunks_exact(dimension.max(1));

@@ -145,13 +145,13 @@ async fn label_all(
 }
 
 /// The result for the structure of this number.
-type Labelled = (usize, Result<Label, String>);
+type NumberedLabel = (usize, Result<Label, String>);
 
 /// Makes labels, several at the same time; not all of them if a stop is requested.
 async fn make(
     run: RunContext<'_>,
     missing: Vec<(usize, RecordedLabel<'_>)>,
-) -> Result<Vec<Labelled>, CommandError> {
+) -> Result<Vec<NumberedLabel>, CommandError> {
     let RunContext { campaign, store, stop, .. } = run;
     let workers = campaign.config.label.concurrency.max(1).min(missing.len());
     let next = Mutex::new(missing.into_iter());

@@ -43,7 +43,7 @@ pub struct FilterStep {
 
 /// Sums over a subset.
 #[derive(Clone, Copy, Debug, Default)]
-struct Sums {
+struct SubsetSums {
     rows: u64,
     error: f64,
     predicted: u64,
@@ -61,7 +61,7 @@ pub fn filter_sweep(rows: &[GradedRow], thresholds: &[f64], draws: u32, seed: u6
     let sizes: Vec<_> = thresholds.iter().map(|threshold| kept(*threshold).count()).collect();
     let random: Vec<_> = (0..draws).map(|draw| random_subsets(rows, &sizes, Draw::new(seed, draw))).collect();
     let step = |(k, threshold): (usize, &f64)| {
-        let mut sums = Sums::default();
+        let mut sums = SubsetSums::default();
         kept(*threshold).for_each(|row| sums.add(row));
         let over = |of: fn(&Quality) -> Option<f64>, moment: fn(&[f64]) -> Option<f64>| {
             moment(&random.iter().filter_map(|draw| of(&draw[k])).collect::<Vec<_>>())
@@ -88,7 +88,7 @@ fn random_subsets(rows: &[GradedRow], sizes: &[usize], draw: Draw) -> Vec<Qualit
     let mut order: Vec<_> = (0..rows.len()).collect();
     let mut by_size: Vec<_> = (0..sizes.len()).collect();
     by_size.sort_by_key(|k| sizes[*k]);
-    let (mut found, mut sums, mut taken) = (vec![Quality::default(); sizes.len()], Sums::default(), 0);
+    let (mut found, mut sums, mut taken) = (vec![Quality::default(); sizes.len()], SubsetSums::default(), 0);
     for k in by_size {
         for place in taken..sizes[k] {
             order.swap(place, place + draw.below(place, rows.len() - place));
@@ -100,7 +100,7 @@ fn random_subsets(rows: &[GradedRow], sizes: &[usize], draw: Draw) -> Vec<Qualit
     found
 }
 
-impl Sums {
+impl SubsetSums {
     fn add(&mut self, row: &GradedRow) {
         self.rows += 1;
         self.error += row.error.abs();

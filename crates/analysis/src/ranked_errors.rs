@@ -5,11 +5,11 @@
 #[derive(Clone, Debug)]
 pub struct RankedErrors {
     /// Ascending, as are the items.
-    errors: Order,
+    errors: AscendingItems,
     sorted: Vec<f64>,
     /// The unit of each item.
     units: Vec<u32>,
-    scores: Vec<Order>,
+    scores: Vec<AscendingItems>,
 }
 
 /// How well a score ranks errors.
@@ -23,7 +23,7 @@ pub struct RankStatistics {
 
 /// Items in ascending order of a quantity.
 #[derive(Clone, Debug)]
-struct Order {
+struct AscendingItems {
     items: Vec<u32>,
     /// Ends of the runs of equal values.
     ends: Vec<u32>,
@@ -37,15 +37,15 @@ impl RankedErrors {
     pub fn new(errors: &[f64], units: &[u32], scores: &[Vec<f64>]) -> Self {
         let is_complete = scores.iter().all(|scores| scores.len() == errors.len());
         assert!(errors.len() == units.len() && is_complete, "a unit and scores for each error");
-        let ascending = Order::from_values(errors).items;
+        let ascending = AscendingItems::from_values(errors).items;
         let permuted =
             |values: &[f64]| -> Vec<f64> { ascending.iter().map(|i| values[*i as usize]).collect() };
         let sorted = permuted(errors);
         Self {
-            errors: Order::from_values(&sorted),
+            errors: AscendingItems::from_values(&sorted),
             sorted,
             units: ascending.iter().map(|i| units[*i as usize]).collect(),
-            scores: scores.iter().map(|scores| Order::from_values(&permuted(scores))).collect(),
+            scores: scores.iter().map(|scores| AscendingItems::from_values(&permuted(scores))).collect(),
         }
     }
 
@@ -70,7 +70,7 @@ impl RankedErrors {
             thresholds.iter().map(|threshold| self.sorted.partition_point(|x| x <= threshold)).collect();
         let (mut of_errors, mut of_scores) = (vec![0.0; self.len()], vec![0.0; self.len()]);
         self.errors.ranks(&weights, &mut of_errors);
-        let statistics = |order: &Order| {
+        let statistics = |order: &AscendingItems| {
             order.ranks(&weights, &mut of_scores);
             RankStatistics {
                 spearman: weighted_correlation(&weights, &of_errors, &of_scores),
@@ -81,7 +81,7 @@ impl RankedErrors {
     }
 }
 
-impl Order {
+impl AscendingItems {
     fn from_values(values: &[f64]) -> Self {
         let mut items: Vec<_> = (0..values.len() as u32).collect();
         items.sort_by(|i, j| values[*i as usize].total_cmp(&values[*j as usize]));

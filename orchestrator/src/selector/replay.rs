@@ -201,10 +201,10 @@ impl Replay {
 
     fn import(&mut self, recorded: &LoggedDecision) -> Result<Decision, ReplayError> {
         #[derive(Deserialize)]
-        struct Detail {
+        struct ImportDetail {
             structures: usize,
         }
-        let Detail { structures } = read(recorded)?;
+        let ImportDetail { structures } = read(recorded)?;
         let known = self.imported.get(..structures);
         let known = known.ok_or_else(|| {
             damaged(
@@ -232,7 +232,7 @@ impl Replay {
     fn begin(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
         #[derive(Deserialize)]
         #[serde(untagged)]
-        enum Detail {
+        enum StartDetail {
             Biased {
                 seed_structure: String,
                 /// Campaigns of early versions have the same conditions in all walks.
@@ -246,17 +246,17 @@ impl Replay {
         // With other rules there are no control walks, but walks keep their numbers from the log.
         let id = if self.is_exact() { self.decisions.next_walk_id() } else { walk(recorded)? };
         match read(recorded)? {
-            Detail::Biased { seed_structure: name, conditions } => {
+            StartDetail::Biased { seed_structure: name, conditions } => {
                 let seed = self.seed_structures.get(&name).copied();
                 let seed =
                     seed.ok_or_else(|| damaged(recorded, &format!("there is no seed structure '{name}'")))?;
                 Ok(Some(self.decisions.start_walk(id, seed, &name, conditions)))
             }
-            Detail::Control { control_of } if self.is_exact() => {
+            StartDetail::Control { control_of } if self.is_exact() => {
                 let is_there = self.decisions.walks.get(control_of).is_some();
                 Ok(is_there.then(|| self.decisions.start_control(id, control_of)))
             }
-            Detail::Control { .. } => Ok(None),
+            StartDetail::Control { .. } => Ok(None),
         }
     }
 
@@ -275,12 +275,12 @@ impl Replay {
 
     fn left_out(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
         #[derive(Deserialize)]
-        struct Detail {
+        struct LeftOutDetail {
             step: u64,
             error: String,
         }
         let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
-        let Detail { step, error } = read(recorded)?;
+        let LeftOutDetail { step, error } = read(recorded)?;
         let mut commit = Commit::default();
         self.decisions.walk_mut(id).record.progress.step = step;
         self.decisions.leave_out(id, step, &error, &mut commit);
@@ -292,13 +292,13 @@ impl Replay {
 
     fn end(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
         #[derive(Deserialize)]
-        struct Detail {
+        struct EndDetail {
             end: String,
             reason: String,
             step: u64,
         }
         let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
-        let Detail { end, reason, step } = read(recorded)?;
+        let EndDetail { end, reason, step } = read(recorded)?;
         // Other walks of its seed structure may have collected enough.
         let enough = self.decisions.has_collected_enough(&self.decisions.walks[id]);
         let collected = end == WalkEnd::QuotaReached.name() && !enough;

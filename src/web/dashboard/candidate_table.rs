@@ -23,7 +23,7 @@ const MAX_SCANNED: usize = 10_000;
 /// Parameters of a request.
 #[derive(Debug, Default)]
 struct CandidateQuery {
-    order: Order,
+    order: TableOrder,
     ascending: bool,
     fate: Option<String>,
     state: Option<JobState>,
@@ -34,7 +34,7 @@ struct CandidateQuery {
 
 /// Order of the rows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum Order {
+enum TableOrder {
     #[default]
     Decision,
     Gamma,
@@ -57,7 +57,7 @@ pub async fn page(State(dashboard): State<Dashboard>, RawQuery(query): RawQuery)
     let query = CandidateQuery::parse(query.as_deref().unwrap_or_default())?;
     let CandidatePage { rows, next, scanned } = query.page(&dashboard.store).await?;
     let next = next.map(|place| format!("{:?}:{}", place.value, place.decision));
-    let imported = match query.state.filter(|_| query.order == Order::Queue) {
+    let imported = match query.state.filter(|_| query.order == TableOrder::Queue) {
         Some(state) => Some(dashboard.store.imported_jobs(state).await?),
         None => None,
     };
@@ -90,7 +90,7 @@ impl CandidateQuery {
                 _ => return Err(ApiError::bad_request(format!("unknown parameter '{key}'"))),
             }
         }
-        if query.order == Order::Queue && query.state.is_none() {
+        if query.order == TableOrder::Queue && query.state.is_none() {
             return Err(ApiError::bad_request("the order 'queue' applies to one state: give 'state' too"));
         }
         Ok(query)
@@ -127,8 +127,8 @@ impl CandidateQuery {
 
     /// Whether rows that are read may be filtered out.
     fn filters_rows(&self) -> bool {
-        let by_fate = self.fate.is_some() && self.order != Order::Decision;
-        let by_state = self.state.is_some() && self.order != Order::Queue;
+        let by_fate = self.fate.is_some() && self.order != TableOrder::Decision;
+        let by_state = self.state.is_some() && self.order != TableOrder::Queue;
         by_fate || by_state || self.filter.is_some()
     }
 
@@ -140,11 +140,11 @@ impl CandidateQuery {
     ) -> Result<Vec<ListedCandidate>, StoreError> {
         let descending = !self.ascending;
         let order = match (self.order, self.state, self.fate.as_deref()) {
-            (Order::Queue, Some(state), _) => {
+            (TableOrder::Queue, Some(state), _) => {
                 let after = after.map(|place| (place.value as i32, place.decision));
                 return store.list_queue(state, after, limit).await;
             }
-            (Order::Decision, _, Some(fate)) => {
+            (TableOrder::Decision, _, Some(fate)) => {
                 let (origin, reason) = match fate {
                     "control" => ("control", None),
                     "accepted" => ("biased", None),
@@ -153,19 +153,19 @@ impl CandidateQuery {
                 let after = after.map(|place| place.decision);
                 return store.list_fate(origin, reason, descending, after, limit).await;
             }
-            (Order::Gamma, ..) => ListOrder::Gamma,
-            (Order::RelativeVolume, ..) => ListOrder::Volume,
-            (Order::Decision | Order::Queue, ..) => ListOrder::Decision,
+            (TableOrder::Gamma, ..) => ListOrder::Gamma,
+            (TableOrder::RelativeVolume, ..) => ListOrder::Volume,
+            (TableOrder::Decision | TableOrder::Queue, ..) => ListOrder::Decision,
         };
         store.list_candidates(order, descending, after, limit).await
     }
 
     fn cursor_of(&self, row: &ListedCandidate) -> ListCursor {
         let value = match self.order {
-            Order::Decision => None,
-            Order::Gamma => row.gamma,
-            Order::RelativeVolume => row.relative_volume,
-            Order::Queue => row.priority.map(f64::from),
+            TableOrder::Decision => None,
+            TableOrder::Gamma => row.gamma,
+            TableOrder::RelativeVolume => row.relative_volume,
+            TableOrder::Queue => row.priority.map(f64::from),
         };
         ListCursor { value: value.unwrap_or_default(), decision: row.decision }
     }
@@ -214,7 +214,7 @@ fn properties<'a>(
     }
 }
 
-impl FromStr for Order {
+impl FromStr for TableOrder {
     type Err = ApiError;
 
     fn from_str(name: &str) -> Result<Self, ApiError> {
@@ -256,7 +256,7 @@ mod tests {
     fn queries_are_parsed_or_refused_with_a_reason() {
         let query =
             CandidateQuery::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17").unwrap();
-        assert!(query.order == Order::Gamma && query.ascending && query.fate.is_none());
+        assert!(query.order == TableOrder::Gamma && query.ascending && query.fate.is_none());
         assert_eq!(query.filter.unwrap().to_string(), "gamma > 2.0");
         assert_eq!(query.after, Some(ListCursor { value: 2.5, decision: 17 }));
         for (query, why) in [

@@ -33,8 +33,9 @@ impl Store {
                        AND (outcome IS NULL OR outcome IN ('expired', 'lost', 'released')) THEN 1 ELSE 0 END AS BIGINT)
                        AS wanted
                    FROM attempt JOIN job ON job.number = attempt.job WHERE job = $1 AND attempt = $2";
-        let row: Option<Row> = query(sql).bind(job).bind(attempt).fetch_optional(&self.database).await?;
-        Ok(row.map(|Row { calculation, failed, wanted }| PastCalculation {
+        let row: Option<CalculationRow> =
+            query(sql).bind(job).bind(attempt).fetch_optional(&self.database).await?;
+        Ok(row.map(|CalculationRow { calculation, failed, wanted }| PastCalculation {
             calculation,
             failed: failed != 0,
             wanted: wanted != 0,
@@ -42,13 +43,13 @@ impl Store {
     }
 }
 
-struct Row {
+struct CalculationRow {
     calculation: Option<String>,
     failed: i64,
     wanted: i64,
 }
 
-from_columns!(Row { calculation, failed, wanted });
+from_columns!(CalculationRow { calculation, failed, wanted });
 
 impl FromRow for CalculationArchive {
     fn from_row(row: &SqlRow) -> Result<Self> {

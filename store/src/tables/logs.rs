@@ -15,7 +15,7 @@ use crate::records::{LoggedDecision, LoggedOperation};
 /// Decisions read at a time.
 const PAGE: usize = 1000;
 
-struct Row {
+struct DecisionRow {
     sequence: i64,
     round: u64,
     kind: String,
@@ -25,7 +25,7 @@ struct Row {
     detail: String,
 }
 
-impl FromRow for Row {
+impl FromRow for DecisionRow {
     fn from_row(row: &SqlRow) -> Result<Self> {
         DECISION.verify(row, Names::Plain)?;
         Ok(Self {
@@ -43,16 +43,16 @@ impl FromRow for Row {
 impl Store {
     /// Decisions with sequence numbers (from 1) in `range`, in order.
     pub async fn decisions(&self, range: RangeInclusive<i64>) -> Result<Vec<LoggedDecision>> {
-        let decision = |row: Row| {
+        let decision = |row: DecisionRow| {
             let detail = serde_json::from_str(&row.detail);
             let detail = detail.map_err(|error| StoreError::damaged("the decision log", error))?;
-            let Row { sequence, round, kind, walk, candidate, mixture_version, .. } = row;
+            let DecisionRow { sequence, round, kind, walk, candidate, mixture_version, .. } = row;
             Ok(LoggedDecision { sequence, round, kind, walk, candidate, mixture_version, detail })
         };
         self.decision_rows(range).await?.into_iter().map(decision).collect()
     }
 
-    async fn decision_rows(&self, range: RangeInclusive<i64>) -> Result<Vec<Row>> {
+    async fn decision_rows(&self, range: RangeInclusive<i64>) -> Result<Vec<DecisionRow>> {
         let sql = "SELECT * FROM decision WHERE sequence BETWEEN $1 AND $2 ORDER BY sequence";
         let query = query(sql).bind(*range.start()).bind(*range.end());
         query.fetch_all(&self.database).await
@@ -95,8 +95,8 @@ impl Store {
     }
 }
 
-fn write_line(text: &mut String, row: &Row) {
-    let Row { sequence, round, mixture_version, detail, .. } = row;
+fn write_line(text: &mut String, row: &DecisionRow) {
+    let DecisionRow { sequence, round, mixture_version, detail, .. } = row;
     let (kind, candidate) = (Value::from(row.kind.as_str()), Value::from(row.candidate.clone()));
     let walk = Value::from(row.walk);
     // Writing to a string cannot fail.

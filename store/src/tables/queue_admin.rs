@@ -91,7 +91,7 @@ pub(crate) const FIND: &str = "SELECT id, max(job.number) FROM candidate
     CROSS JOIN job ON job.structure = candidate.structure
     WHERE id >= $1 AND id < $1 || '~' GROUP BY id ORDER BY id LIMIT $2";
 
-struct Row {
+struct QueueRow {
     number: i64,
     structure: i64,
     decision: i64,
@@ -117,7 +117,7 @@ struct Row {
     relabel: Option<String>,
 }
 
-impl FromRow for Row {
+impl FromRow for QueueRow {
     fn from_row(row: &SqlRow) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         Ok(Self {
@@ -149,12 +149,12 @@ impl FromRow for Row {
 }
 
 /// A job of an imported structure.
-struct ImportRow(Row);
+struct ImportRow(QueueRow);
 
 impl FromRow for ImportRow {
     fn from_row(row: &SqlRow) -> Result<Self> {
         STRUCTURE.verify(row, Names::Joined)?;
-        Ok(Self(Row {
+        Ok(Self(QueueRow {
             number: row.get("number")?,
             structure: row.get("structure")?,
             decision: row.get("decision")?,
@@ -201,7 +201,7 @@ impl Store {
             let (room, there) = (u64::from(limit) - jobs.len() as u64, number(state));
             if room > 0 && skipped < there {
                 let page = |sql| query(sql).bind(state.name()).bind(room as i64).bind(skipped as i64);
-                let mut rows: Vec<Row> = page(LIST).fetch_all(&mut transaction).await?;
+                let mut rows: Vec<QueueRow> = page(LIST).fetch_all(&mut transaction).await?;
                 let imports: Vec<ImportRow> = page(LIST_IMPORTS).fetch_all(&mut transaction).await?;
                 rows.extend(imports.into_iter().map(|ImportRow(row)| row));
                 rows.sort_by_key(|row| (Reverse(row.priority), row.decision));
@@ -355,7 +355,7 @@ impl PendingChange {
     }
 }
 
-impl Row {
+impl QueueRow {
     fn into_job(self, excluded: &BTreeMap<i64, String>) -> Result<QueueEntry> {
         Ok(QueueEntry {
             job: self.number,

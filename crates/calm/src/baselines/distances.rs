@@ -46,12 +46,12 @@ pub struct KNearest {
     pub(super) dimension: usize,
     /// k
     pub(super) neighbours: usize,
-    pub(super) elements: Vec<Sample>,
+    pub(super) elements: Vec<ElementSample>,
 }
 
 /// Training atoms of an element.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Sample {
+pub(super) struct ElementSample {
     /// Their mean **m**, `[D]`.
     mean: Vec<f64>,
     /// **z** − **m**, `[n × D]`: products of small numbers keep the digits of distances.
@@ -60,7 +60,7 @@ pub(super) struct Sample {
     squares: Vec<f64>,
 }
 
-impl Sample {
+impl ElementSample {
     /// Of features `[n × D]`.
     pub fn new(dimension: usize, mut rows: Vec<f64>) -> Self {
         let count = rows.len() / dimension;
@@ -221,7 +221,7 @@ impl KNearestBuilder {
         if self.elements.iter().all(|reservoir| reservoir.rows.is_empty()) {
             return Err(BaselineError::NoData);
         }
-        let elements = self.elements.into_iter().map(|found| Sample::new(self.dimension, found.rows));
+        let elements = self.elements.into_iter().map(|found| ElementSample::new(self.dimension, found.rows));
         Ok(KNearest {
             dimension: self.dimension,
             neighbours: self.settings.neighbours,

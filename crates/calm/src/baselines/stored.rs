@@ -4,7 +4,7 @@ use std::io::{self, Read, Seek, Write};
 
 use npz::{Error, NpzFile, Writer};
 
-use super::distances::{Euclidean, KNearest, Sample};
+use super::distances::{ElementSample, Euclidean, KNearest};
 use super::groups::AtomGroups;
 use super::likelihood::{Gaussian, Likelihood};
 use super::max_vol::ActiveSet;
@@ -68,7 +68,7 @@ pub(super) fn write<W: Write + Seek>(
         Baseline::Euclidean(found) => out.groups(&found.groups),
         Baseline::KNearest(found) => {
             out.file.scalar(&out.key("neighbours"), found.neighbours as i64)?;
-            out.counts("counts", found.elements.iter().map(Sample::count))?;
+            out.counts("counts", found.elements.iter().map(ElementSample::count))?;
             out.rows("means", found.elements.iter().flat_map(|sample| sample.mean().iter().copied()))?;
             out.rows("features", found.elements.iter().flat_map(|sample| sample.rows().iter().copied()))
         }
@@ -219,7 +219,7 @@ impl<R: Read + Seek> Stored<'_, R> {
         let rows = self.rows("features", &counts, sum)?;
         let neighbours = self.file.count(&self.key("neighbours"), 1, usize::MAX)?;
         let samples = means.into_iter().zip(rows);
-        let elements = samples.map(|(mean, rows)| Sample::from_parts(mean, rows)).collect();
+        let elements = samples.map(|(mean, rows)| ElementSample::from_parts(mean, rows)).collect();
         Ok(KNearest { dimension: self.dimension, neighbours, elements })
     }
 

@@ -21,11 +21,11 @@ const PANEL: usize = 66;
 #[derive(Debug, Clone)]
 pub struct CalibrationPass {
     sorter: Sorter,
-    sums: Sums,
+    sums: CalibrationSums,
 }
 
 #[derive(Debug, Clone)]
-struct Sums {
+struct CalibrationSums {
     dimension: usize,
     grid: BinEdges,
     /// T of each component, `[D × D]`.
@@ -49,7 +49,7 @@ impl CalibrationPass {
             expect_length("inverse covariance", component.inverse.len(), dimension * dimension)?;
         }
         let centroids = components.iter().flat_map(|component| &component.centroid).copied().collect();
-        let sums = Sums {
+        let sums = CalibrationSums {
             dimension,
             grid: BinEdges::default(),
             triangles: components.iter().map(|component| triangle(&component.inverse, dimension)).collect(),
@@ -77,7 +77,7 @@ impl CalibrationPass {
     }
 }
 
-impl Sums {
+impl CalibrationSums {
     fn add(&mut self, slot: usize, block: &ComponentBlock) {
         let (atoms, dimension) = (block.weights.len(), self.dimension);
         let products = &mut self.products[..atoms * dimension];

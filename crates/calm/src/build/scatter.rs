@@ -17,11 +17,11 @@ use crate::linear::view;
 #[derive(Debug, Clone)]
 pub struct ScatterPass {
     sorter: Sorter,
-    sums: Sums,
+    sums: ScatterSums,
 }
 
 #[derive(Debug, Clone)]
-struct Sums {
+struct ScatterSums {
     dimension: usize,
     components: Vec<(ComponentSums, Mat<f64>)>,
 }
@@ -38,7 +38,7 @@ impl ScatterPass {
             (sums, Mat::zeros(dimension, dimension))
         };
         let components = (0..centroids.len() / dimension).map(|_| empty()).collect();
-        Ok(Self { sorter, sums: Sums { dimension, components } })
+        Ok(Self { sorter, sums: ScatterSums { dimension, components } })
     }
 
     /// Adds atoms of the element: `features` is `[atoms × D]`, `weights` has one number for each atom.
@@ -54,7 +54,7 @@ impl ScatterPass {
     pub fn finish(self) -> ElementSums {
         let Self { sorter, mut sums } = self;
         sorter.finish(|slot, block| sums.add(slot, block));
-        let Sums { dimension, components } = sums;
+        let ScatterSums { dimension, components } = sums;
         let packed = components.into_iter().map(|(mut sums, scatter)| {
             sums.scatter = (0..dimension)
                 .flat_map(|row| (0..=row).map(move |c| (row, c)))
@@ -66,7 +66,7 @@ impl ScatterPass {
     }
 }
 
-impl Sums {
+impl ScatterSums {
     fn add(&mut self, slot: usize, block: &mut ComponentBlock) {
         let (sums, scatter) = &mut self.components[slot];
         let rows = block.deltas.chunks_exact_mut(self.dimension).zip(&block.weights);

@@ -56,7 +56,7 @@ pub struct UpdatedMixture {
     slots: usize,
     projection: Projection,
     projection_seed: Option<i64>,
-    elements: Vec<Option<Element>>,
+    elements: Vec<Option<ElementArrays>>,
     /// θ that grade, `[elements × K]`.
     thresholds: Vec<f32>,
     /// θ from the raw histograms, `[elements × K]`.
@@ -66,7 +66,7 @@ pub struct UpdatedMixture {
 
 /// The arrays of an element, filled up to K slots.
 #[derive(Debug)]
-struct Element {
+struct ElementArrays {
     /// `[K × D]`.
     centroids: Vec<f32>,
     /// `[K × D × D]`.
@@ -147,8 +147,8 @@ impl UpdatedMixture {
             }
         }
         let mut arrays = match held {
-            true => Element::read(file, element, slots, dimension)?,
-            false => Element::unused(slots, dimension),
+            true => ElementArrays::read(file, element, slots, dimension)?,
+            false => ElementArrays::unused(slots, dimension),
         };
         if !changed.is_empty() {
             let mut others = match held {
@@ -217,7 +217,7 @@ impl UpdatedMixture {
         &self,
         file: &mut Writer<W>,
         index: usize,
-        element: &Element,
+        element: &ElementArrays,
         changed: &Changed,
     ) -> io::Result<()> {
         let (slots, dimension) = (self.slots, self.dimension);
@@ -279,7 +279,7 @@ const ARRAYS: [&str; 8] = [
     "n_truncated",
 ];
 
-impl Element {
+impl ElementArrays {
     fn unused(slots: usize, dimension: usize) -> Self {
         Self {
             centroids: vec![UNUSED; slots * dimension],

@@ -15,7 +15,7 @@ const DECADES: f64 = 6.0;
 /// The sample, sorted once for all resamplings.
 pub struct AtomStatistics {
     ranked: RankedErrors,
-    elements: Vec<Element>,
+    elements: Vec<RankedElement>,
     /// Of each atom: its structure, and the number of thresholds below its error.
     atoms: Vec<(u32, usize)>,
     /// Whether an atom is within the limit of each column.
@@ -25,7 +25,7 @@ pub struct AtomStatistics {
 }
 
 /// The atoms of an element.
-struct Element {
+struct RankedElement {
     species: Species,
     ranked: RankedErrors,
     /// The 90 % quantile of their errors.
@@ -44,7 +44,7 @@ impl AtomStatistics {
             let mut errors: Vec<_> = atoms.iter().map(|(atom, _)| atom.error).collect();
             errors.sort_by(f64::total_cmp);
             let threshold = quantile(&errors, 0.9).unwrap_or(f64::NAN);
-            Element { species, ranked: ranked(&atoms, columns.len()), threshold }
+            RankedElement { species, ranked: ranked(&atoms, columns.len()), threshold }
         };
         let counts = Exceedance::new(&THRESHOLDS);
         let is_kept = |(k, column): (usize, &ScoreColumn)| -> Vec<bool> {
@@ -75,7 +75,8 @@ impl AtomStatistics {
     /// the worst decile of each element.
     pub fn values(&self, multiplicities: &[u32]) -> Values {
         let whole = self.ranked.statistics(multiplicities, &THRESHOLDS);
-        let of_element = |element: &Element| element.ranked.statistics(multiplicities, &[element.threshold]);
+        let of_element =
+            |element: &RankedElement| element.ranked.statistics(multiplicities, &[element.threshold]);
         let by_element: Vec<_> = self.elements.iter().map(of_element).collect();
         let mut values = Vec::with_capacity(self.kept.len() * self.values_of_column());
         for (k, (statistics, kept)) in whole.iter().zip(&self.kept).enumerate() {

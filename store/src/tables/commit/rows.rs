@@ -14,7 +14,8 @@ use crate::error::{Result, StoreError};
 use crate::numbers::encode_numbers;
 use crate::records::{AtomGrades, CandidateRecord, Commit, Decision, Fate, WalkRecord};
 
-type Row = Vec<SqlValue>;
+/// The values of a row, in the order of the columns.
+type RowValues = Vec<SqlValue>;
 
 pub(super) const DECISION: [&str; 8] =
     ["sequence", "round", "kind", "walk", "candidate", "mixture_version", "detail", "checksum"];
@@ -81,19 +82,19 @@ pub(super) const WALK: [&str; 20] = [
 
 /// Rows of each table. Decisions are numbered from 1 until the number of earlier decisions is known.
 pub(super) struct CommitRows {
-    pub decisions: Vec<Row>,
-    pub structures: Vec<Row>,
-    pub candidates: Vec<Row>,
+    pub decisions: Vec<RowValues>,
+    pub structures: Vec<RowValues>,
+    pub candidates: Vec<RowValues>,
     /// Number of candidates of each kind.
-    pub candidate_counts: Vec<Row>,
-    pub candidate_data: Vec<Row>,
+    pub candidate_counts: Vec<RowValues>,
+    pub candidate_data: Vec<RowValues>,
     /// For every accepted candidate.
-    pub jobs: Vec<Row>,
-    pub components: Vec<Row>,
-    pub walks: Vec<Row>,
+    pub jobs: Vec<RowValues>,
+    pub components: Vec<RowValues>,
+    pub walks: Vec<RowValues>,
     /// For every walk that has no assignment behind it.
-    pub walk_conditions: Vec<Row>,
-    pub values: Vec<Row>,
+    pub walk_conditions: Vec<RowValues>,
+    pub values: Vec<RowValues>,
 }
 
 impl CommitRows {
@@ -214,7 +215,7 @@ fn long_checksum(decision: i64, column: &SqlValue) -> SqlValue {
     CheckedColumn::checksum(decision, bytes.as_deref()).into()
 }
 
-fn candidate_counts(commit: &Commit) -> Vec<Row> {
+fn candidate_counts(commit: &Commit) -> Vec<RowValues> {
     let mut counts = BTreeMap::<_, i64>::new();
     for record in &commit.candidates {
         *counts.entry((record.block.view().origin().name(), record.fate.name())).or_default() += 1;
@@ -237,7 +238,7 @@ fn decided(commit: &Commit) -> Result<HashMap<String, i64>> {
     Ok(decided)
 }
 
-fn decision((decision, number): (&Decision, i64)) -> Result<Row> {
+fn decision((decision, number): (&Decision, i64)) -> Result<RowValues> {
     Ok(vec![
         number.into(),
         integer("round", decision.round)?.into(),
@@ -256,7 +257,7 @@ fn summary(
     record: &CandidateRecord,
     view: &CandidateView<'_>,
     formula: String,
-) -> Result<Row> {
+) -> Result<RowValues> {
     let (fate, reason) = match record.fate {
         Fate::Accepted => ("accepted", None),
         Fate::Declined(reason) => ("declined", Some(reason.name())),
@@ -309,7 +310,7 @@ fn grades(id: &str, view: &CandidateView<'_>, grades: &AtomGrades) -> Result<Opt
     }
 }
 
-fn walk(walk: &WalkRecord) -> Result<Row> {
+fn walk(walk: &WalkRecord) -> Result<RowValues> {
     let WalkRecord { progress, .. } = walk;
     let row = vec![
         walk.walk.0.into(),
@@ -336,7 +337,7 @@ fn walk(walk: &WalkRecord) -> Result<Row> {
     Ok(row)
 }
 
-fn walk_conditions(walk: &WalkRecord) -> Row {
+fn walk_conditions(walk: &WalkRecord) -> RowValues {
     let conditions = serde_json::to_string(&walk.conditions).expect("plain data becomes JSON");
     CONDITIONS.with_checksum(vec![walk.walk.0.into(), conditions.into()])
 }
