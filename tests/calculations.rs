@@ -26,11 +26,11 @@ const KILLS: usize = 24;
 enum Victim {
     Label,
     Labeller,
-    Keeper,
+    CalculationRunner,
     Program,
     Child,
 }
-use Victim::{Child, Keeper, Label, Labeller, Program};
+use Victim::{CalculationRunner, Child, Label, Labeller, Program};
 
 /// A deterministic random number generator.
 struct Random(u64);
@@ -72,7 +72,7 @@ fn victims(place: &LabelCampaign, scratch: &Path, who: Victim) -> Vec<u32> {
     match who {
         Label => processes_running(place.path(), "label"),
         Labeller => processes_running(place.path(), "labeller"),
-        Keeper => processes_running(place.path(), "calculation-runner"),
+        CalculationRunner => processes_running(place.path(), "calculation-runner"),
         Program => started("sh label.sh"),
         Child => started("sleep 1000"),
     }
@@ -93,7 +93,7 @@ fn each_label_is_made_once_despite_kills() {
         if label.0.try_wait().unwrap().is_some() {
             label = place.label(&slots);
         }
-        let who = [Label, Labeller, Keeper, Program, Child][random.below(5)];
+        let who = [Label, Labeller, CalculationRunner, Program, Child][random.below(5)];
         let found = victims(&place, &scratch, who);
         let enough = killed.values().sum::<usize>() >= KILLS
             || (who == Program && killed.get(&Program).is_some_and(|times| *times >= PROGRAMS));

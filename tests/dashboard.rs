@@ -166,9 +166,9 @@ fn check_table(live: &Live) {
 }
 
 fn check_candidate(live: &Live, id: &str) {
-    let story = get(&live.address, &format!("/api/candidates/{id}")).json();
+    let details = get(&live.address, &format!("/api/candidates/{id}")).json();
     let explained = succeed(live.here(), ["explain", "campaign", id, "--json"]);
-    assert_eq!(story, serde_json::from_str::<Value>(&explained).unwrap());
+    assert_eq!(details, serde_json::from_str::<Value>(&explained).unwrap());
     let shown = get(&live.address, &format!("/api/candidates/{id}/structure")).json();
     let file = get(&live.address, &format!("/api/candidates/{id}/structure.extxyz"));
     assert!(file.head.contains(&format!("attachment; filename=\"{id}.extxyz\"")), "{}", file.head);
@@ -177,10 +177,10 @@ fn check_candidate(live: &Live, id: &str) {
     assert_eq!(shown["cell"], json!(frame.structure.cell.0));
     let gamma = frame.arrays["gamma"].reals().unwrap();
     let largest = gamma.iter().copied().fold(0.0, f64::max);
-    assert_eq!(story["grades"]["original"]["gamma_max"], largest);
+    assert_eq!(details["grades"]["original"]["gamma_max"], largest);
     let poscar = get(&live.address, &format!("/api/candidates/{id}/structure.poscar"));
     assert_eq!(read_poscar(poscar.body.as_bytes()).unwrap().structure.len(), gamma.len());
-    let walk = story["found"]["walk"].as_u64().unwrap();
+    let walk = details["found"]["walk"].as_u64().unwrap();
     let trace = get(&live.address, &format!("/api/walks/{walk}/candidates")).json();
     assert!(trace.as_array().unwrap().iter().any(|line| line["id"] == id), "{trace}");
     let unknown = get(&live.address, "/api/candidates/nobody");

@@ -176,8 +176,8 @@ fn energy_errors_are_without_the_difference_of_zeros() {
     let note =
         format!("energy errors exclude the element offsets (eV/atom, E_label − E_model): Al {offset:.4}");
     for (id, error) in &errors {
-        let story = json(here, ["explain", "here", id]);
-        let model = &story["labels"][0]["model"];
+        let details = json(here, ["explain", "here", id]);
+        let model = &details["labels"][0]["model"];
         near(&model["energy_error_per_atom"], *error);
         near(&model["energy_per_atom"], error - offset);
         let told = succeed(here, ["explain", "here", id]);

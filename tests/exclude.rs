@@ -67,11 +67,11 @@ fn a_bad_label_is_left_out_until_it_is_included_again() {
     let listed = succeed(here, ["queue", "here", "list", "--limit", "1000"]);
     let line = listed.lines().find(|line| line.starts_with(bad)).unwrap();
     assert!(line.contains("labelled, excluded") && listed.matches("excluded").count() == 1, "{listed}");
-    let story = succeed(here, ["explain", "here", bad]);
+    let details = succeed(here, ["explain", "here", bad]);
     for part in
         ["excluded from exports and statistics", "by the user: exclude (the SCF loop had two solutions)"]
     {
-        assert!(story.contains(part), "{story}");
+        assert!(details.contains(part), "{details}");
     }
     let excluded = json(here, ["exclude", "here", "--list"]);
     assert_eq!((&excluded[0]["id"], &excluded[0]["reason"]), (&bad.into(), &report.into()));
@@ -84,8 +84,11 @@ fn a_bad_label_is_left_out_until_it_is_included_again() {
     assert_eq!(said, format!("{bad}: label of 'potential' included again\n"));
     assert_eq!(exported(here).0, before);
     assert_eq!(json(here, ["force-errors", "here"]), errors);
-    let story = succeed(here, ["explain", "here", bad]);
-    assert!(story.contains("by the user: include") && !story.contains("excluded from exports"), "{story}");
+    let details = succeed(here, ["explain", "here", bad]);
+    assert!(
+        details.contains("by the user: include") && !details.contains("excluded from exports"),
+        "{details}"
+    );
     assert_eq!(succeed(here, ["exclude", "here", "--list"]), "no excluded labels\n");
     succeed(here, ["store", "check", "here"]);
 }

@@ -131,9 +131,9 @@ fn labels_say_that_their_moments_were_changed_and_lower_states_are_proposed() {
         "{said}"
     );
     assert_eq!(exported(&place, "atoms > 0"), all);
-    let story = succeed(here, ["explain", argument, name]);
+    let details = succeed(here, ["explain", argument, name]);
     for part in ["ago: a lower state: −", "eV/atom (as in the experiment)", "by the user: lower_state"] {
-        assert!(story.contains(part), "{part} in {story}");
+        assert!(details.contains(part), "{part} in {details}");
     }
     assert_eq!(succeed(here, ["lower-states", argument]), nothing);
     let again = succeed(here, ["lower-states", argument, name]);

@@ -111,9 +111,9 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     let summary = fs::read_to_string(here.join("report/tables/summary.csv")).unwrap();
     let words = format!("{labels} labelled, 0 failed, 0 dropped, {labels} superseded, 0 leased, 0 queued");
     assert!(summary.contains(&words), "{summary}");
-    let story = succeed(here, ["explain", campaign, &after[0].1]);
+    let details = succeed(here, ["explain", campaign, &after[0].1]);
     for words in ["superseded", "ago: a finer grid", "protocol 'fine'", "protocol 'potential'"] {
-        assert!(story.contains(words), "{words} in {story}");
+        assert!(details.contains(words), "{words} in {details}");
     }
     check(&place);
     let nothing = relabel(&place, &["--all"]);

@@ -67,8 +67,8 @@ fn main() {
     }
     let page = get(address, "/api/candidates?limit=1&fate=accepted").json();
     let newest = page.pointer("/candidates/0/id").and_then(serde_json::Value::as_str).expect("a candidate");
-    let story = format!("/api/candidates/{newest}");
-    row("one candidate", || fetch(&story));
+    let details = format!("/api/candidates/{newest}");
+    row("one candidate", || fetch(&details));
     println!("\nmemory of the server: {}", memory(server.0.id()));
     let begun = Instant::now();
     row("force errors, before they are there", || fetch("/api/errors"));

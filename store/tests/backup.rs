@@ -45,8 +45,8 @@ async fn back_up(store: &Store, target: &Path) -> Result<(), StoreError> {
 
 #[tokio::test]
 async fn a_backup_is_an_independent_campaign() {
-    let (home, elsewhere) = (Home::new(), tempfile::tempdir().unwrap());
-    let store = home.create().await;
+    let (database, elsewhere) = (TestDatabase::new(), tempfile::tempdir().unwrap());
+    let store = database.create().await;
     for k in 1..=200 {
         store.commit(&numbered(k)).await.unwrap();
     }
@@ -56,7 +56,7 @@ async fn a_backup_is_an_independent_campaign() {
     store.complete(&lease().await, &label(-3.0), 2).await.unwrap();
     let leased = lease().await;
     let target = elsewhere.path().join("copy");
-    back_up(&home.open_read_only().await, &target).await.unwrap();
+    back_up(&database.open_read_only().await, &target).await.unwrap();
     assert_eq!(fs::read_dir(elsewhere.path()).unwrap().count(), 1);
     let copy = Store::open(&target).await.unwrap();
     assert_eq!(contents(&copy).await, contents(&store).await);
@@ -82,8 +82,8 @@ async fn a_backup_is_an_independent_campaign() {
 
 #[tokio::test]
 async fn nothing_is_overwritten() {
-    let (home, elsewhere) = (Home::new(), tempfile::tempdir().unwrap());
-    let store = home.create().await;
+    let (database, elsewhere) = (TestDatabase::new(), tempfile::tempdir().unwrap());
+    let store = database.create().await;
     for name in ["file", "directory"] {
         let target = elsewhere.path().join(name);
         if name == "file" {
@@ -103,8 +103,8 @@ async fn nothing_is_overwritten() {
 /// A copy is complete at any time.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn backups_are_made_while_the_campaign_runs() {
-    let (home, elsewhere) = (Home::new(), tempfile::tempdir().unwrap());
-    let (store, stop) = (home.create().await, Arc::new(AtomicBool::new(false)));
+    let (database, elsewhere) = (TestDatabase::new(), tempfile::tempdir().unwrap());
+    let (store, stop) = (database.create().await, Arc::new(AtomicBool::new(false)));
     let committing = tokio::spawn({
         let (store, stop) = (store.clone(), Arc::clone(&stop));
         async move {
@@ -120,7 +120,7 @@ async fn backups_are_made_while_the_campaign_runs() {
     let mut before = 0;
     for number in 0..5 {
         let target = elsewhere.path().join(number.to_string());
-        back_up(&home.open_read_only().await, &target).await.unwrap();
+        back_up(&database.open_read_only().await, &target).await.unwrap();
         let copy = Store::open_read_only(&target).await.unwrap();
         assert_eq!(copy.check(|_, _| ()).await.unwrap(), []);
         let values = copy.values().await.unwrap();
@@ -136,8 +136,8 @@ async fn backups_are_made_while_the_campaign_runs() {
 
 #[tokio::test]
 async fn compacting_frees_space_and_changes_nothing() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let long = |k: u32, length: usize| {
         let bytes = (0..length).map(|n| (n as u32).wrapping_mul(k) as u8).collect();
         Commit { components: vec![ComponentRecord { element: 0, slot: k, bytes }], ..Commit::default() }

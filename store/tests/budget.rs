@@ -17,8 +17,8 @@ async fn limit(store: &Store, budget: Budget) {
 
 #[tokio::test]
 async fn no_more_labels_start_than_the_budget_permits() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 4).await;
     limit(&store, Budget { labels: Some(2), ..Budget::default() }).await;
     let lease = async || store.lease(protocol("dft").hash, "a", 0, 1000).await.unwrap();
@@ -42,8 +42,8 @@ async fn no_more_labels_start_than_the_budget_permits() {
 
 #[tokio::test]
 async fn hours_sum_over_all_attempts_and_runs() {
-    let home = Home::new();
-    let store = home.create().await.with_caller_clock();
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
     accept(&store, 4).await;
     let lease = async |now| store.lease(protocol("dft").hash, "a", now, 100_000).await.unwrap().unwrap();
     let failed = lease(0).await;

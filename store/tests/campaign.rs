@@ -10,14 +10,14 @@ use crate::common::*;
 
 #[tokio::test]
 async fn a_campaign_is_created_once_and_opened_often() {
-    let home = Home::new();
-    let error = Store::open(home.location()).await.unwrap_err();
+    let database = TestDatabase::new();
+    let error = Store::open(database.location()).await.unwrap_err();
     assert!(matches!(error, StoreError::Missing { .. }), "{error}");
-    home.create().await.close().await;
-    let error = Store::create(home.location(), &campaign(), &[], 0).await.unwrap_err();
+    database.create().await.close().await;
+    let error = Store::create(database.location(), &campaign(), &[], 0).await.unwrap_err();
     assert!(matches!(error, StoreError::Exists { .. } | StoreError::Occupied { .. }), "{error}");
 
-    let store = home.open().await;
+    let store = database.open().await;
     assert_eq!(store.campaign().await.unwrap(), campaign());
     let seed_structures = store.seed_structures().await.unwrap();
     assert_eq!((seed_structures.len(), seed_structures[0].name.as_str()), (1, "diamond"));
@@ -54,13 +54,13 @@ fn mixed_commit() -> Commit {
 
 #[tokio::test]
 async fn committed_data_is_read_back() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let commit = mixed_commit();
     assert_eq!(store.commit(&commit).await.unwrap(), 1..5);
     store.close().await;
 
-    let store = home.open().await;
+    let store = database.open().await;
     assert_eq!(store.load_walks().await.unwrap(), commit.walks);
     assert_eq!(store.load_components().await.unwrap(), commit.components[1..]);
     assert_eq!(store.values().await.unwrap(), commit.values);
@@ -106,8 +106,8 @@ async fn committed_data_is_read_back() {
 
 #[tokio::test]
 async fn a_contradictory_commit_leaves_nothing() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     store.commit(&mixed_commit()).await.unwrap();
     let log = store.decision_log_text().await.unwrap();
 
@@ -134,8 +134,8 @@ async fn a_contradictory_commit_leaves_nothing() {
 /// A walk interrupted during an assignment is committed without a decision.
 #[tokio::test]
 async fn a_checkpoint_is_kept_between_decisions() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     store.commit(&mixed_commit()).await.unwrap();
     let decisions = store.decision_log_text().await.unwrap();
     let mut paused = walk(0, 1);
@@ -152,8 +152,8 @@ async fn a_checkpoint_is_kept_between_decisions() {
 
 #[tokio::test]
 async fn status_counts_everything_once() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     assert!(!store.status().await.unwrap().finished);
     store.commit(&mixed_commit()).await.unwrap();
     let dft = protocol("dft").hash;
@@ -173,7 +173,7 @@ async fn status_counts_everything_once() {
     store.upsert_process(&process("a", std::process::id())).await.unwrap();
     store.upsert_process(&process("b", dead.id())).await.unwrap();
 
-    let reader = home.open_read_only().await;
+    let reader = database.open_read_only().await;
     let status = serde_json::to_value(reader.status().await.unwrap()).unwrap();
     let candidates = serde_json::json!({
         "seen": 3, "accepted": 1, "declined": { "covered": 1, "duplicate": 0, "too_close": 1, "budget": 0, "backlog": 0 },
@@ -211,8 +211,8 @@ async fn status_counts_everything_once() {
 
 #[tokio::test]
 async fn unknown_values_of_a_walk_are_not_zero() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let progress = |tau, gamma_max| WalkProgress {
         tau,
         gamma_max,
@@ -233,8 +233,8 @@ async fn unknown_values_of_a_walk_are_not_zero() {
 
 #[tokio::test]
 async fn walks_can_be_paused_and_resumed_at_any_time() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let pause = async |walks: &[u32], paused| {
         let walks: Vec<_> = walks.iter().copied().map(WalkId).collect();
         let changed = store.pause_walks(&walks, paused, 5).await?;
@@ -253,7 +253,7 @@ async fn walks_can_be_paused_and_resumed_at_any_time() {
     let error = pause(&[0, 3], true).await.unwrap_err().to_string();
     assert_eq!(error, "the campaign has no walk 3; they are 0 to 2");
 
-    let reader = home.open_read_only().await;
+    let reader = database.open_read_only().await;
     assert_eq!(reader.paused_walks().await.unwrap(), [WalkId(1)].into());
     let paused =
         |status: store::CampaignStatus| status.walks.iter().map(|walk| walk.paused).collect::<Vec<_>>();
@@ -276,8 +276,8 @@ async fn walks_can_be_paused_and_resumed_at_any_time() {
 
 #[tokio::test]
 async fn the_newest_decisions_are_summarized() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let records = vec![
         candidate(0, 1, Origin::Biased, Fate::Accepted),
         candidate(0, 2, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
@@ -323,8 +323,8 @@ async fn the_newest_decisions_are_summarized() {
 /// Walk conditions are written once, before the first assignment.
 #[tokio::test]
 async fn conditions_of_walks_are_read_back() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let conditions = WalkConditions {
         group: "hot".into(),
         temperature: 900.0,
@@ -345,8 +345,8 @@ async fn conditions_of_walks_are_read_back() {
 
 #[tokio::test]
 async fn metadata_are_found_by_the_beginning_of_their_names() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     for name in ["a_b/2", "a_b/1", "a_b", "axb/1", "other"] {
         store.set_metadata(name, &format!("value of {name}")).await.unwrap();
     }

@@ -8,8 +8,8 @@ use crate::common::*;
 
 #[tokio::test]
 async fn a_candidate_is_found_with_related_records() {
-    let home = Home::new();
-    let store = home.create().await.with_caller_clock();
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
     // Their walkers saw version 3; each decision adds a version.
     let covered = Fate::Declined(DeclineReason::Covered);
     let records = [

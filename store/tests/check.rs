@@ -7,8 +7,8 @@ use wire::messages::DeclineReason;
 use crate::common::*;
 
 /// Two walks with a structure each, one of them labelled, a declined candidate, and a decision without a candidate.
-pub async fn whole(home: &Home) -> Store {
-    let store = home.create().await;
+pub async fn whole(database: &TestDatabase) -> Store {
+    let store = database.create().await;
     let records = vec![
         candidate(0, 1, Origin::Biased, Fate::Accepted),
         candidate(0, 2, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
@@ -35,9 +35,9 @@ async fn check(store: &Store) -> Vec<Finding> {
 
 #[tokio::test]
 async fn an_intact_campaign_has_no_findings() {
-    let home = Home::new();
-    assert_eq!(check(&whole(&home).await).await, []);
-    assert_eq!(check(&home.open_read_only().await).await, []);
+    let database = TestDatabase::new();
+    assert_eq!(check(&whole(&database).await).await, []);
+    assert_eq!(check(&database.open_read_only().await).await, []);
 }
 
 #[tokio::test]
@@ -97,9 +97,9 @@ async fn each_kind_of_damage_is_found_and_described() {
             "files of job 1, attempt 1: it cannot be unpacked",
         ),
     ] {
-        let home = Home::new();
-        let store = whole(&home).await;
-        home.execute(damage).await;
+        let database = TestDatabase::new();
+        let store = whole(&database).await;
+        database.execute(damage).await;
         let findings: Vec<_> = check(&store).await.iter().map(Finding::to_string).collect();
         assert!(findings.iter().any(|finding| finding.starts_with(words)), "{damage}: {findings:#?}");
         assert!(
@@ -110,8 +110,8 @@ async fn each_kind_of_damage_is_found_and_described() {
 
 #[tokio::test]
 async fn leases_without_a_holder_are_found() {
-    let home = Home::new();
-    let store = whole(&home).await;
+    let database = TestDatabase::new();
+    let store = whole(&database).await;
     store.lease(protocol("dft").hash, "nobody", 0, 600).await.unwrap().unwrap();
     let found = check(&store).await;
     assert_eq!(found.len(), 1, "{found:?}");

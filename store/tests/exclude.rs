@@ -15,8 +15,8 @@ async fn lease(store: &Store, now: i64) -> Lease {
 }
 
 /// Labelled candidates with energies −1, −2, … Returns their names.
-async fn labelled(home: &Home, number: u64) -> (Store, Vec<String>) {
-    let store = home.create().await.with_caller_clock();
+async fn labelled(database: &TestDatabase, number: u64) -> (Store, Vec<String>) {
+    let store = database.create().await.with_caller_clock();
     let names = accept(&store, number).await;
     let walk = WalkRecord { accepted: number as u32, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -60,8 +60,8 @@ fn change(id: &str, changed: bool, excluded: Option<&str>) -> ExclusionChange {
 
 #[tokio::test]
 async fn an_excluded_label_counts_nowhere_until_it_is_included_again() {
-    let home = Home::new();
-    let (store, candidates) = labelled(&home, 3).await;
+    let database = TestDatabase::new();
+    let (store, candidates) = labelled(&database, 3).await;
     let dft = protocol("dft");
     let second = candidates[1].as_str();
     let ids = names(&["0.0.2"]);
@@ -111,8 +111,8 @@ async fn an_excluded_label_counts_nowhere_until_it_is_included_again() {
 
 #[tokio::test]
 async fn either_all_named_structures_are_excluded_or_none() {
-    let home = Home::new();
-    let (store, candidates) = labelled(&home, 2).await;
+    let database = TestDatabase::new();
+    let (store, candidates) = labelled(&database, 2).await;
     let covered = candidate(0, 7, Origin::Biased, Fate::Declined(DeclineReason::Covered));
     let waiting = candidate(0, 8, Origin::Biased, Fate::Accepted);
     store.commit(&commit_of(vec![covered.clone(), waiting.clone()])).await.unwrap();
@@ -144,8 +144,8 @@ async fn either_all_named_structures_are_excluded_or_none() {
 
 #[tokio::test]
 async fn only_a_requested_label_replaces_an_excluded_one() {
-    let home = Home::new();
-    let store = home.create().await.with_caller_clock();
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
     let (names, dft) = (accept(&store, 1).await, protocol("dft"));
     let walk = WalkRecord { accepted: 1, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -185,8 +185,8 @@ async fn only_a_requested_label_replaces_an_excluded_one() {
 
 #[tokio::test]
 async fn imported_structures_have_labels_to_exclude() {
-    let home = Home::new();
-    let (store, _) = labelled(&home, 1).await;
+    let database = TestDatabase::new();
+    let (store, _) = labelled(&database, 1).await;
     let dft = protocol("dft");
     let frames = [(0, structure(0.1), label(-5.0)), (1, structure(0.2), label(-6.0))];
     store.import(dft.hash, "known.extxyz", &frames, 10).await.unwrap();

@@ -13,8 +13,8 @@ const SUPERSEDE: LowerStateRule =
     LowerStateRule { min_difference: 0.001, on_lower_state: OnLowerState::Supersede };
 
 /// A campaign with this number of candidates that wait for labels, and their names.
-async fn campaign_with(home: &Home, candidates: u64) -> (Store, Vec<String>) {
-    let store = home.create().await.with_caller_clock();
+async fn campaign_with(database: &TestDatabase, candidates: u64) -> (Store, Vec<String>) {
+    let store = database.create().await.with_caller_clock();
     let names = accept(&store, candidates).await;
     let walk = WalkRecord { accepted: candidates as u32, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -77,8 +77,8 @@ async fn whole(store: &Store) {
 
 #[tokio::test]
 async fn a_label_says_with_what_its_calculation_ran_also_after_a_takeover() {
-    let home = Home::new();
-    let (store, names) = campaign_with(&home, 1).await;
+    let database = TestDatabase::new();
+    let (store, names) = campaign_with(&database, 1).await;
     let first = lease(&store, 0).await;
     let made = CalculationRecord {
         remedies: Some("slower_mixing,other_moments".into()),
@@ -113,8 +113,8 @@ async fn a_label_says_with_what_its_calculation_ran_also_after_a_takeover() {
 
 #[tokio::test]
 async fn the_lower_of_two_states_is_proposed_and_taken_by_hand() {
-    let home = Home::new();
-    let (store, names) = campaign_with(&home, 3).await;
+    let database = TestDatabase::new();
+    let (store, names) = campaign_with(&database, 3).await;
     for (energy, now) in [(-1.0, 0), (-2.0, 10), (-3.0, 20)] {
         label_with(&store, None, energy, now).await;
     }
@@ -186,8 +186,8 @@ async fn the_lower_of_two_states_is_proposed_and_taken_by_hand() {
 
 #[tokio::test]
 async fn excluded_and_dropped_results_are_no_states() {
-    let home = Home::new();
-    let (store, names) = campaign_with(&home, 3).await;
+    let database = TestDatabase::new();
+    let (store, names) = campaign_with(&database, 3).await;
     for (energy, now) in [(-1.0, 0), (-2.0, 10)] {
         label_with(&store, None, energy, now).await;
     }
@@ -220,8 +220,8 @@ async fn excluded_and_dropped_results_are_no_states() {
 
 #[tokio::test]
 async fn a_lower_result_supersedes_the_label_when_it_arrives() {
-    let home = Home::new();
-    let (store, names) = campaign_with(&home, 1).await;
+    let database = TestDatabase::new();
+    let (store, names) = campaign_with(&database, 1).await;
     store.set_lower_state_rule(&SUPERSEDE).await.unwrap();
     assert_eq!(store.lower_state_rule().await.unwrap(), SUPERSEDE);
     let late = lease(&store, 0).await;
@@ -266,8 +266,8 @@ async fn a_lower_result_supersedes_the_label_when_it_arrives() {
 
 #[tokio::test]
 async fn a_requested_label_of_a_higher_state_is_kept_as_a_check() {
-    let home = Home::new();
-    let (store, names) = campaign_with(&home, 2).await;
+    let database = TestDatabase::new();
+    let (store, names) = campaign_with(&database, 2).await;
     store.set_lower_state_rule(&SUPERSEDE).await.unwrap();
     for (energy, now) in [(-1.0, 0), (-2.0, 10)] {
         label_with(&store, None, energy, now).await;
@@ -296,8 +296,8 @@ async fn a_requested_label_of_a_higher_state_is_kept_as_a_check() {
 
 #[tokio::test]
 async fn a_lower_state_of_an_earlier_time_returns_with_its_protocol() {
-    let home = Home::new();
-    let (store, names) = campaign_with(&home, 1).await;
+    let database = TestDatabase::new();
+    let (store, names) = campaign_with(&database, 1).await;
     store.set_lower_state_rule(&SUPERSEDE).await.unwrap();
     label_with(&store, None, -1.0, 0).await;
     let content = store.candidate(&names[0]).await.unwrap().unwrap().block.view().id().content;

@@ -23,8 +23,8 @@ async fn accept_with(store: &Store, step: u64, gamma: f64, relative_volume: f64)
 }
 
 /// Three labels, the second of which takes two attempts; two failed jobs, and one that waits.
-async fn filled(home: &Home) -> (Store, Vec<String>) {
-    let store = home.create().await.with_caller_clock();
+async fn filled(database: &TestDatabase) -> (Store, Vec<String>) {
+    let store = database.create().await.with_caller_clock();
     let mut names = Vec::new();
     for (step, gamma, volume) in
         [(1, 1.5, 1.0), (2, 1.6, 1.1), (3, 1.7, 1.2), (4, 4.0, 1.4), (5, 3.0, 1.35), (6, 2.0, 1.3)]
@@ -48,8 +48,8 @@ async fn filled(home: &Home) -> (Store, Vec<String>) {
 
 #[tokio::test]
 async fn costs_are_those_of_successful_attempts() {
-    let home = Home::new();
-    let (store, _) = filled(&home).await;
+    let database = TestDatabase::new();
+    let (store, _) = filled(&database).await;
     let costs = store.label_costs(protocol("dft").hash, 10).await.unwrap();
     let seconds: Vec<_> = costs.iter().map(|cost| cost.core_seconds).collect();
     assert_eq!(seconds, [8.0, 4.0, 2.0], "newest first");
@@ -76,8 +76,8 @@ async fn costs_are_those_of_successful_attempts() {
 /// A structure without a seed structure counts in the cost and the failures like others, and can be relabelled.
 #[tokio::test]
 async fn imported_structures_count_as_others_do() {
-    let home = Home::new();
-    let (store, _) = filled(&home).await;
+    let database = TestDatabase::new();
+    let (store, _) = filled(&database).await;
     let dft = protocol("dft").hash;
     let files: Vec<_> = (0..2).map(|k| ("new.extxyz".to_owned(), k, structure(50.0 + k as f64))).collect();
     store.queue_imports(&files, 0, 30_000).await.unwrap();
@@ -124,8 +124,8 @@ async fn imported_structures_count_as_others_do() {
 
 #[tokio::test]
 async fn failures_are_counted_by_class_and_outcome() {
-    let home = Home::new();
-    let (store, _) = filled(&home).await;
+    let database = TestDatabase::new();
+    let (store, _) = filled(&database).await;
     let found = store.failures(protocol("dft").hash).await.unwrap();
     let count =
         |class: &str, labelled, failed| FailureCount { class: class.into(), labelled, failed, unfinished: 0 };
@@ -134,8 +134,8 @@ async fn failures_are_counted_by_class_and_outcome() {
 
 #[tokio::test]
 async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
-    let home = Home::new();
-    let (store, names) = filled(&home).await;
+    let database = TestDatabase::new();
+    let (store, names) = filled(&database).await;
     let unlabelled = store.unlabelled(protocol("dft").hash, true).await.unwrap();
     let without = |part: &Unlabelled| Unlabelled {
         gamma_labelled: ValueRange::default(),
@@ -177,8 +177,8 @@ async fn failed_labels_are_grouped_by_seed_structure_and_formula() {
 
 #[tokio::test]
 async fn near_duplicates_are_the_labelled_structures_nearest_in_energy() {
-    let home = Home::new();
-    let store = home.create().await.with_caller_clock();
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
     let mut names = Vec::new();
     for (step, energy) in [(1, -8.0), (2, -7.0), (3, -8.4), (4, -9.0)] {
         let mut record = candidate(0, step, Origin::Biased, Fate::Accepted);
@@ -208,8 +208,8 @@ async fn near_duplicates_are_the_labelled_structures_nearest_in_energy() {
 
 #[tokio::test]
 async fn collected_structures_come_with_their_labels() {
-    let home = Home::new();
-    let (store, _) = filled(&home).await;
+    let database = TestDatabase::new();
+    let (store, _) = filled(&database).await;
     store.commit(&commit_of(vec![candidate(1, 9, Origin::Control, Fate::Accepted)])).await.unwrap();
     let declined = Fate::Declined(wire::messages::DeclineReason::Covered);
     store.commit(&commit_of(vec![candidate(0, 10, Origin::Biased, declined)])).await.unwrap();

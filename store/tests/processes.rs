@@ -33,8 +33,8 @@ async fn holders(store: &Store) -> Vec<String> {
 
 #[tokio::test]
 async fn a_record_is_read_as_it_was_written() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let mut record = living("l", ProcessRecord::LABELLER, Some(7));
     assert_eq!(Some(&record.start_time), process_start_time(std::process::id()).as_ref());
     record.restarts = 2;
@@ -52,8 +52,8 @@ async fn a_record_is_read_as_it_was_written() {
 
 #[tokio::test]
 async fn a_process_replaces_its_dead_predecessor() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let walkers =
         [gone("w0", "walker", Some(0)), gone("w1", "walker", Some(1)), living("o", "orchestrator", None)];
     store.upsert_processes(&walkers).await.unwrap();
@@ -73,8 +73,8 @@ async fn a_process_replaces_its_dead_predecessor() {
 
 #[tokio::test]
 async fn leases_of_living_processes_last_and_those_of_dead_ones_are_released() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 5).await;
     let processes = [
         living("living", "labeller", Some(0)),
@@ -97,8 +97,8 @@ async fn leases_of_living_processes_last_and_those_of_dead_ones_are_released() {
 #[tokio::test]
 async fn an_expired_lease_continues_while_its_holder_may_be_at_work() {
     const HOUR: i64 = 3_600_000;
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 6).await;
     let elsewhere = |id: &str, last_seen| {
         let here = living(id, "labeller", Some(7));
@@ -128,8 +128,8 @@ async fn an_expired_lease_continues_while_its_holder_may_be_at_work() {
 
 #[tokio::test]
 async fn a_starting_run_keeps_living_labellers_and_reclaims_other_leases() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 5).await;
     let processes = [
         living("living", "labeller", Some(0)),
@@ -156,8 +156,8 @@ async fn a_starting_run_keeps_living_labellers_and_reclaims_other_leases() {
 
 #[tokio::test]
 async fn status_shows_dead_and_failed_processes() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let said = |id: &str, number, state: &str| ProcessRecord {
         state: state.into(),
         ..gone(id, "walker", Some(number))

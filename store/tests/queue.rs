@@ -23,8 +23,8 @@ async fn state(store: &Store, candidate: &str) -> JobState {
 
 #[tokio::test]
 async fn jobs_are_leased_by_priority_then_age_and_return_on_expiry() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 3).await;
     store.prioritise_job(&names[2], 20, 0).await.unwrap();
     let first = lease(&store, "host-1/a", 0).await.unwrap();
@@ -54,8 +54,8 @@ async fn jobs_are_leased_by_priority_then_age_and_return_on_expiry() {
 
 #[tokio::test]
 async fn the_first_result_becomes_the_label() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 1).await;
     let lost = lease(&store, "a", 0).await.unwrap();
     let holds = lease(&store, "b", 10_000).await.unwrap();
@@ -75,8 +75,8 @@ async fn the_first_result_becomes_the_label() {
 
 #[tokio::test]
 async fn impossible_results_are_rejected() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 1).await;
     let lease = lease(&store, "a", 0).await.unwrap();
     let mut short = label(-1.0);
@@ -92,8 +92,8 @@ async fn impossible_results_are_rejected() {
 
 #[tokio::test]
 async fn failures_count_and_releases_do_not() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 1).await;
     for (stop, holder) in [(true, "h-1/a"), (false, "h-1/b"), (true, "h-1")] {
         lease(&store, holder, 0).await.unwrap();
@@ -122,8 +122,8 @@ async fn failures_count_and_releases_do_not() {
 
 #[tokio::test]
 async fn a_job_that_crashes_its_labellers_fails() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 2).await;
     for crash in 1..=2 {
         let holder = format!("h-{crash}");
@@ -141,8 +141,8 @@ async fn a_job_that_crashes_its_labellers_fails() {
 
 #[tokio::test]
 async fn a_job_that_is_lost_repeatedly_fails() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 1).await;
     let lose = async |losses: usize| {
         for loss in 0..losses {
@@ -178,8 +178,8 @@ async fn a_job_that_is_lost_repeatedly_fails() {
 
 #[tokio::test]
 async fn jobs_are_found_by_name_or_prefix() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let error = store.drop_job("0.0.1", 0).await.unwrap_err();
     assert!(error.to_string().contains("queue is empty"), "{error}");
     let names = accept(&store, 12).await;
@@ -207,8 +207,8 @@ async fn jobs_are_found_by_name_or_prefix() {
 
 #[tokio::test]
 async fn all_jobs_are_listed_by_state_and_priority() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 6).await;
     store.drop_job(&names[0], 1).await.unwrap();
     store.prioritise_job(&names[4], 50, 1).await.unwrap();
@@ -232,8 +232,8 @@ async fn all_jobs_are_listed_by_state_and_priority() {
 
 #[tokio::test]
 async fn a_dropped_job_stays_dropped_until_it_is_requeued() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 1).await;
     let lease = lease(&store, "a", 0).await.unwrap();
     store.drop_job(&names[0], 1).await.unwrap();
@@ -248,8 +248,8 @@ async fn a_dropped_job_stays_dropped_until_it_is_requeued() {
 
 #[tokio::test]
 async fn candidates_found_before_there_is_a_protocol_get_jobs_later() {
-    let home = Home::new();
-    let store = Store::create(home.location(), &campaign(), &[], 0).await.unwrap().with_caller_clock();
+    let database = TestDatabase::new();
+    let store = Store::create(database.location(), &campaign(), &[], 0).await.unwrap().with_caller_clock();
     let names = accept(&store, 2).await;
     assert_eq!(store.unfinished_jobs().await.unwrap(), 0);
     let unknown = store.lease(protocol("dft").hash, "a", 0, 10).await;
@@ -269,8 +269,8 @@ async fn candidates_found_before_there_is_a_protocol_get_jobs_later() {
 
 #[tokio::test]
 async fn imports_label_waiting_jobs_and_can_be_repeated() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 2).await;
     let dft = protocol("dft").hash;
     let frames = [(0, structure(50.0), label(-5.0)), (1, structure(1e-6), label(-1.0))];
@@ -303,8 +303,8 @@ async fn problems(store: &Store) -> Vec<String> {
 
 #[tokio::test]
 async fn imported_structures_wait_for_their_labels_behind_candidates() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let names = accept(&store, 1).await;
     let new = |frame: u64| ("new.extxyz".to_owned(), frame, structure(50.0 + frame as f64));
     let structures = [new(0), ("new.extxyz".to_owned(), 1, structure(1e-6)), new(2)];
@@ -356,8 +356,8 @@ async fn imported_structures_wait_for_their_labels_behind_candidates() {
 
 /// A campaign whose labels arrive in the order `order`. Returns the text of its export, read in pages of `page`.
 async fn export_text(order: &[usize], page: u32, filter: &ExportFilter) -> Vec<String> {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 4).await;
     store.commit(&commit_of(vec![candidate(3, 5, Origin::Control, Fate::Accepted)])).await.unwrap();
     let imports = [(4, structure(50.0), label(-50.0)), (6, structure(40.0), label(-40.0))];
@@ -399,8 +399,8 @@ async fn exports_do_not_depend_on_the_order_of_labels() {
 
 #[tokio::test]
 async fn an_exported_row_has_all_data() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let record = candidate(0, 1, Origin::Biased, Fate::Accepted);
     store.commit(&commit_of(vec![record.clone()])).await.unwrap();
     let lease = lease(&store, "a", 0).await.unwrap();
@@ -421,13 +421,13 @@ async fn an_exported_row_has_all_data() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_connections_never_lease_the_same_job() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let records = (1..=60).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
     store.commit(&commit_of(records)).await.unwrap();
     let mut labellers = Vec::new();
     for holder in ["a", "b", "c"] {
-        let store = home.open().await;
+        let store = database.open().await;
         labellers.push(tokio::spawn(async move {
             let mut jobs = Vec::new();
             while let Some(lease) = lease(&store, holder, 0).await {
@@ -450,8 +450,8 @@ async fn two_connections_never_lease_the_same_job() {
 /// A calculation that was taken over counts once, with the attempt that delivered its result.
 #[tokio::test]
 async fn the_cost_of_a_calculation_is_counted_once() {
-    let home = Home::new();
-    let store = home.create().await.with_caller_clock();
+    let database = TestDatabase::new();
+    let store = database.create().await.with_caller_clock();
     let names = accept(&store, 2).await;
     let made = CalculationRecord {
         cores: Some(4),
@@ -516,8 +516,8 @@ async fn the_cost_of_a_calculation_is_counted_once() {
 
 #[tokio::test]
 async fn archives_are_stored_with_their_attempts() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 1).await;
     let lease = lease(&store, "a", 0).await.unwrap();
     store.record_calculation(&lease, "here", &CalculationRecord::default()).await.unwrap();
@@ -547,8 +547,8 @@ async fn archives_are_stored_with_their_attempts() {
 /// The reply to the commit of a lease was lost: its holder is alive and does not know of it.
 #[tokio::test]
 async fn leases_that_a_holder_does_not_state_are_released() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     accept(&store, 4).await;
     let lease = async |holder: &str| {
         store.lease(protocol("dft").hash, holder, 0, 600).await.unwrap().expect("a job that waits")

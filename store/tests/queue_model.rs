@@ -88,7 +88,7 @@ impl Model {
 }
 
 struct Run {
-    home: Home,
+    database: TestDatabase,
     store: Store,
     names: Vec<String>,
     model: Model,
@@ -98,8 +98,8 @@ struct Run {
 
 impl Run {
     async fn new() -> Self {
-        let home = Home::new();
-        let store = home.create().await;
+        let database = TestDatabase::new();
+        let store = database.create().await;
         let names = accept(&store, JOBS).await;
         let job = ModelJob {
             state: JobState::Queued,
@@ -111,7 +111,7 @@ impl Run {
             results: Vec::new(),
         };
         let model = Model((0..JOBS as usize).map(|place| (place, job.clone())).collect());
-        Self { home, store, names, model, leases: Vec::new(), now: 0 }
+        Self { database, store, names, model, leases: Vec::new(), now: 0 }
     }
 
     /// Any lease ever given, lost or not.
@@ -126,7 +126,7 @@ impl Run {
             Step::Wait(milliseconds) => self.now += i64::from(milliseconds),
             Step::Reopen => {
                 store.close().await;
-                self.store = self.home.open().await;
+                self.store = self.database.open().await;
             }
             Step::Lease(holder) => {
                 let holder = format!("host/{holder}");

@@ -22,8 +22,8 @@ async fn label_next(store: &Store, protocol: &Protocol, energy: f64, now: i64) -
 }
 
 /// Candidates of which the first `labelled` have labels under "dft", with energies −1, −2, …
-async fn campaign_with(home: &Home, candidates: u64, labelled: u64) -> (Store, Vec<ContentHash>) {
-    let store = home.create().await;
+async fn campaign_with(database: &TestDatabase, candidates: u64, labelled: u64) -> (Store, Vec<ContentHash>) {
+    let store = database.create().await;
     accept(&store, candidates).await;
     let walk = WalkRecord { accepted: candidates as u32, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -77,8 +77,8 @@ async fn whole(store: &Store) {
 
 #[tokio::test]
 async fn a_doubtful_label_stays_until_the_new_one_arrives() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 2, 1).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 2, 1).await;
     let dft = protocol("dft");
     assert_eq!(relabel(&store, &structures, false).await, RelabelCounts::default(), "it has its label");
     assert_eq!(relabel(&store, &structures, true).await, RELABELLING);
@@ -114,8 +114,8 @@ async fn a_doubtful_label_stays_until_the_new_one_arrives() {
 
 #[tokio::test]
 async fn a_label_that_cannot_be_remade_stays() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 1, 1).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 1, 1).await;
     let dft = protocol("dft");
     relabel(&store, &structures, true).await;
     let first = lease(&store, &dft, 300).await.unwrap();
@@ -140,8 +140,8 @@ async fn a_label_that_cannot_be_remade_stays() {
 
 #[tokio::test]
 async fn an_attempt_from_before_the_request_gives_a_check() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 1, 0).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 1, 0).await;
     let dft = protocol("dft");
     let late = lease(&store, &dft, 0).await.unwrap();
     assert_eq!(label_next(&store, &dft, -1.0, 20_000).await, CompleteOutcome::Label);
@@ -158,8 +158,8 @@ async fn an_attempt_from_before_the_request_gives_a_check() {
 
 #[tokio::test]
 async fn another_protocol_supersedes_label_by_label() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 5, 2).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 5, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
     // One is running, one failed, one waits.
     let under_way = lease(&store, &dft, 10).await.unwrap();
@@ -220,8 +220,8 @@ async fn another_protocol_supersedes_label_by_label() {
 
 #[tokio::test]
 async fn a_campaign_may_return_to_its_first_protocol() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 3, 2).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 3, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
     change_to(&store, &fine, &structures).await;
     assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
@@ -249,8 +249,8 @@ async fn a_campaign_may_return_to_its_first_protocol() {
 
 #[tokio::test]
 async fn dropped_jobs_are_not_relabelled() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 1, 1).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 1, 1).await;
     let fine = protocol("fine");
     change_to(&store, &fine, &structures).await;
     let lease = lease(&store, &fine, 300).await.unwrap();
@@ -272,8 +272,8 @@ async fn dropped_jobs_are_not_relabelled() {
 
 #[tokio::test]
 async fn an_imported_label_may_be_superseded_or_satisfy_a_request() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 2, 0).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 2, 0).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
     let import = async |protocol: &Protocol, step: f64, energy: f64| {
         let frames = [(0, structure(1e-6 * step), label(energy))];
@@ -294,8 +294,8 @@ async fn an_imported_label_may_be_superseded_or_satisfy_a_request() {
 
 #[tokio::test]
 async fn two_protocols_cannot_share_a_name() {
-    let home = Home::new();
-    let (store, structures) = campaign_with(&home, 1, 1).await;
+    let database = TestDatabase::new();
+    let (store, structures) = campaign_with(&database, 1, 1).await;
     let mut other = protocol("other");
     other.name = "dft".into();
     let new = NewProtocol { protocol: &other, configuration: "{}", changes: &[], notes: &[] };

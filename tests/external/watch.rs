@@ -249,11 +249,11 @@ fn queued_structures_are_changed_and_candidates_explained() {
     terminal.press("Enter");
     let screen = terminal.wait_for("trigger");
     let id = screen.lines().nth(1).unwrap().trim().to_owned();
-    let story = succeed(place.path(), ["explain", place.argument(), &id]);
+    let details = succeed(place.path(), ["explain", place.argument(), &id]);
     // Skip lines that change with time, and lines that are cut.
     let lasts = |line: &&str| line.chars().count() <= 100 && !line.ends_with(" ago");
-    let first: Vec<_> = story.lines().filter(lasts).take(20).collect();
-    assert_eq!(first.len(), 20, "{story}");
+    let first: Vec<_> = details.lines().filter(lasts).take(20).collect();
+    assert_eq!(first.len(), 20, "{details}");
     terminal.wait_for_all(&first.iter().map(|line| line.trim_end()).collect::<Vec<_>>());
     terminal.press("q C-c");
     terminal.is_given_back("code 130");

@@ -176,7 +176,7 @@ impl Labeller {
 
     async fn ended(self) -> Result<(), StoreError> {
         let ended = tokio::time::timeout(Duration::from_secs(60), self.task).await;
-        ended.expect("the labeller does not go home").unwrap()
+        ended.expect("the labeller does not exit").unwrap()
     }
 }
 

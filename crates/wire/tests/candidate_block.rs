@@ -191,9 +191,9 @@ fn candidates_with_a_wrong_id_are_not_encoded() {
 }
 
 /// Memory with another owner.
-struct Lent(Vec<u64>, usize);
+struct BorrowedMemory(Vec<u64>, usize);
 
-impl AsRef<[u8]> for Lent {
+impl AsRef<[u8]> for BorrowedMemory {
     fn as_ref(&self) -> &[u8] {
         &zerocopy::IntoBytes::as_bytes(self.0.as_slice())[self.1..]
     }
@@ -208,13 +208,13 @@ fn blocks_in_place_are_validated_without_copying() {
         words[7] ^= 1;
         words
     });
-    let lent = std::sync::Arc::new(Lent(whole, 8));
-    let place = lent.as_ref().as_ref().as_ptr();
-    let found = CandidateBlock::in_place(lent).unwrap();
+    let borrowed = std::sync::Arc::new(BorrowedMemory(whole, 8));
+    let place = borrowed.as_ref().as_ref().as_ptr();
+    let found = CandidateBlock::in_place(borrowed).unwrap();
     assert_eq!(found, block);
     assert_eq!(found.as_bytes().as_ptr(), place);
     assert!(matches!(
-        CandidateBlock::in_place(std::sync::Arc::new(Lent(damaged, 8))),
+        CandidateBlock::in_place(std::sync::Arc::new(BorrowedMemory(damaged, 8))),
         Err(BlockError::Checksum { .. })
     ));
 }

@@ -80,8 +80,8 @@ impl Host {
             prefetch: 0,
         };
         let address = Address::Endpoint(endpoint(plan));
-        let uplink = AgentClient::open(&address, None, agent, |why| eprintln!("waiting: {why}")).await;
-        let joined = Arc::new(uplink.unwrap()).join().await.unwrap();
+        let client = AgentClient::open(&address, None, agent, |why| eprintln!("waiting: {why}")).await;
+        let joined = Arc::new(client.unwrap()).join().await.unwrap();
         let newest = joined.newest().await;
         let shared = SharedMixture::create(&directory.join(number.to_string()), &newest, walkers).unwrap();
         Self { joined, shared: Mutex::new((shared, Vec::new())) }

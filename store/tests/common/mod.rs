@@ -2,7 +2,7 @@
 #![allow(dead_code, unused_imports, reason = "each test file uses its part")]
 
 mod former_words;
-mod home;
+mod test_database;
 
 use atoms::{Cell, Structure};
 use serde_json::json;
@@ -14,7 +14,7 @@ use wire::messages::WalkProgress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkConditions, WalkId};
 
 pub use former_words::{TO_VERSION_15, check_present_words, write_former_words};
-pub use home::{Home, server};
+pub use test_database::{TestDatabase, server};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const ATOMS: usize = 2;

@@ -12,21 +12,22 @@ use super::leading::connect;
 /// A server that refuses new connections.
 #[tokio::test]
 async fn a_server_without_free_connections_is_waited_for_and_named() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     store.close().await;
-    let role = format!("one_{}", home.schema());
-    let mut connection = connect(&home).await;
+    let role = format!("one_{}", database.schema());
+    let mut connection = connect(&database).await;
     let make = format!(
         "CREATE ROLE {role} LOGIN CONNECTION LIMIT 1; GRANT USAGE ON SCHEMA {0} TO {role};
          GRANT SELECT ON ALL TABLES IN SCHEMA {0} TO {role}",
-        home.schema()
+        database.schema()
     );
     connection.execute(AssertSqlSafe(make)).await.unwrap();
     let options: PgConnectOptions = server().parse().unwrap();
     let first = options.username(&role).connect().await.unwrap();
     let address = server().split_once('@').unwrap().1.to_owned();
-    let location: Location = format!("postgres://{role}@{address}?schema={}", home.schema()).parse().unwrap();
+    let location: Location =
+        format!("postgres://{role}@{address}?schema={}", database.schema()).parse().unwrap();
     let error = Store::open_read_only(&location).await.unwrap_err();
     assert!(error.is_transient() && error.to_string().contains("too many connections"), "{error}");
     first.close().await.unwrap();
@@ -37,9 +38,9 @@ async fn a_server_without_free_connections_is_waited_for_and_named() {
 /// All connections of a process wait for a lock.
 #[tokio::test]
 async fn waiting_for_a_lock_is_not_reported_as_an_unreachable_server() {
-    let home = Home::new();
-    let store = home.create().await;
-    let mut other = connect(&home).await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    let mut other = connect(&database).await;
     other.execute("BEGIN; UPDATE leader SET holder = 'somebody'").await.unwrap();
     let commits = (0..5).map(|_| {
         let store = store.clone();

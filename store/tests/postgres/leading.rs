@@ -10,64 +10,67 @@ use wire::{CampaignId, Origin};
 use super::common::*;
 
 /// A connection for statements that the store does not offer.
-pub async fn connect(home: &Home) -> PgConnection {
+pub async fn connect(database: &TestDatabase) -> PgConnection {
     let options: PgConnectOptions = server().parse().unwrap();
-    options.options([("search_path", home.schema())]).connect().await.unwrap()
+    options.options([("search_path", database.schema())]).connect().await.unwrap()
 }
 
 /// Ends the connection that holds the lock, like a network failure.
-async fn break_the_lock(home: &Home) {
+async fn break_the_lock(database: &TestDatabase) {
     let sql = "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity
                WHERE application_name = $1 AND pid IN (SELECT pid FROM pg_locks WHERE locktype = 'advisory')";
-    let ended: Vec<bool> =
-        sqlx::query_scalar(sql).bind(home.schema()).fetch_all(&mut connect(home).await).await.unwrap();
+    let ended: Vec<bool> = sqlx::query_scalar(sql)
+        .bind(database.schema())
+        .fetch_all(&mut connect(database).await)
+        .await
+        .unwrap();
     assert_eq!(ended, [true]);
 }
 
 #[tokio::test]
 async fn a_second_holder_learns_of_the_first_and_the_lock_is_released() {
-    let home = Home::new();
-    let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
-    let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
+    let database = TestDatabase::new();
+    let lock = CampaignLock::acquire_at(database.location(), "first").await.unwrap();
+    let error = CampaignLock::acquire_at(database.location(), "second").await.unwrap_err();
     assert!(matches!(error, StoreError::Locked { .. }), "{error}");
     let message = error.to_string();
     let first = format!("process {} (first) on {}", std::process::id(), store::this_host());
-    assert!(message.contains(&first) && message.contains(home.schema()), "{message}");
+    assert!(message.contains(&first) && message.contains(database.schema()), "{message}");
     // Another schema is another campaign.
-    let other = Home::new();
+    let other = TestDatabase::new();
     CampaignLock::acquire_at(other.location(), "other").await.unwrap();
     drop(lock);
-    CampaignLock::acquire_at(home.location(), "second").await.unwrap();
+    CampaignLock::acquire_at(database.location(), "second").await.unwrap();
 }
 
 #[tokio::test]
 async fn a_lock_whose_connection_broke_is_taken_again() {
-    let home = Home::new();
-    let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
-    let store = home.create().await.fenced_by(&lock);
-    break_the_lock(&home).await;
+    let database = TestDatabase::new();
+    let lock = CampaignLock::acquire_at(database.location(), "first").await.unwrap();
+    let store = database.create().await.fenced_by(&lock);
+    break_the_lock(&database).await;
     let lost = tokio::time::timeout(Duration::from_secs(4), lock.lost()).await;
     assert!(lost.is_err(), "no other process took it: {lost:?}");
-    let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
+    let error = CampaignLock::acquire_at(database.location(), "second").await.unwrap_err();
     assert!(matches!(error, StoreError::Locked { .. }), "{error}");
     assert_eq!(accept(&store, 1).await.len(), 1);
 }
 
 #[tokio::test]
 async fn a_process_that_lost_the_lock_stops_writing() {
-    let home = Home::new();
-    let first = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
-    let old = home.create().await.fenced_by(&first);
+    let database = TestDatabase::new();
+    let first = CampaignLock::acquire_at(database.location(), "first").await.unwrap();
+    let old = database.create().await.fenced_by(&first);
     accept(&old, 1).await;
     let second = loop {
-        break_the_lock(&home).await;
-        match CampaignLock::acquire_at(home.location(), "second").await {
+        break_the_lock(&database).await;
+        match CampaignLock::acquire_at(database.location(), "second").await {
             Ok(lock) => break lock,
             // The first process reacquired the lock earlier.
             Err(error) => assert!(matches!(error, StoreError::Locked { .. }), "{error}"),
         }
     };
-    let new = home.open().await.fenced_by(&second);
+    let new = database.open().await.fenced_by(&second);
     let fresh = |step| commit_of(vec![candidate(0, step, Origin::Biased, Fate::Accepted)]);
     // Writes fail even before the first process notices the loss of its lock.
     for error in [
@@ -89,37 +92,37 @@ async fn a_process_that_lost_the_lock_stops_writing() {
 
 #[tokio::test]
 async fn another_campaign_in_the_same_schema_is_refused_with_both_ids() {
-    let home = Home::new();
-    home.create().await;
+    let database = TestDatabase::new();
+    database.create().await;
     let other = CampaignRecord { id: CampaignId([3; 16]), ..campaign() };
-    let error = Store::create(home.location(), &other, &[], 0).await.unwrap_err();
+    let error = Store::create(database.location(), &other, &[], 0).await.unwrap_err();
     assert!(matches!(error, StoreError::Occupied { .. }), "{error}");
     let message = error.to_string();
-    for part in [other.id.to_string(), CAMPAIGN.to_string(), home.schema().to_owned()] {
+    for part in [other.id.to_string(), CAMPAIGN.to_string(), database.schema().to_owned()] {
         assert!(message.contains(&part), "{message}");
     }
 }
 
 #[tokio::test]
 async fn foreign_tables_and_newer_versions_are_refused() {
-    let home = Home::new();
-    let mut connection = connect(&home).await;
-    let schema = sqlx::AssertSqlSafe(format!("CREATE SCHEMA {}", home.schema()));
+    let database = TestDatabase::new();
+    let mut connection = connect(&database).await;
+    let schema = sqlx::AssertSqlSafe(format!("CREATE SCHEMA {}", database.schema()));
     connection.execute(schema).await.unwrap();
     connection.execute("CREATE TABLE job (title TEXT)").await.unwrap();
     for error in [
-        Store::create(home.location(), &campaign(), &[], 0).await.unwrap_err(),
-        Store::open(home.location()).await.unwrap_err(),
-        CampaignLock::acquire_at(home.location(), "first").await.unwrap_err(),
+        Store::create(database.location(), &campaign(), &[], 0).await.unwrap_err(),
+        Store::open(database.location()).await.unwrap_err(),
+        CampaignLock::acquire_at(database.location(), "first").await.unwrap_err(),
     ] {
         assert!(matches!(&error, StoreError::ForeignSchema { found, .. } if found == "job"), "{error}");
     }
     connection.execute("DROP TABLE job").await.unwrap();
-    home.create().await;
+    database.create().await;
     let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
                  VALUES (1000, 'newer', true, '', 0)";
     connection.execute(newer).await.unwrap();
-    for opened in [Store::open(home.location()).await, Store::open_read_only(home.location()).await] {
+    for opened in [Store::open(database.location()).await, Store::open_read_only(database.location()).await] {
         assert!(matches!(opened, Err(StoreError::Version { found: 1000, .. })), "{opened:?}");
     }
 }
@@ -127,9 +130,9 @@ async fn foreign_tables_and_newer_versions_are_refused() {
 /// Several at once: none finds tables that another is still creating.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn several_processes_may_create_the_tables() {
-    let home = Home::new();
+    let database = TestDatabase::new();
     let create = || {
-        let location = home.location();
+        let location = database.location();
         tokio::spawn(async move { CampaignLock::acquire_at(location, "one of them").await })
     };
     let tries = [create(), create(), create()];

@@ -17,19 +17,19 @@ async fn lease(store: &Store, holder: &str, now: i64, seconds: u32) -> Option<Le
 }
 
 /// A campaign with this many jobs that uses the server's clock.
-async fn with_jobs(home: &Home, jobs: u64) -> Store {
-    let store = home.create().await;
+async fn with_jobs(database: &TestDatabase, jobs: u64) -> Store {
+    let store = database.create().await;
     let records = (1..=jobs).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
     store.commit(&commit_of(records)).await.unwrap();
-    Store::open(home.location()).await.unwrap()
+    Store::open(database.location()).await.unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn eight_labellers_at_once_never_get_the_same_job() {
-    let home = Home::new();
-    let store = with_jobs(&home, 200).await;
+    let database = TestDatabase::new();
+    let store = with_jobs(&database, 200).await;
     let labeller = |number: usize| {
-        let location = home.location();
+        let location = database.location();
         tokio::spawn(async move {
             let store = Store::open(location).await.unwrap();
             let mut jobs = Vec::new();
@@ -61,9 +61,9 @@ async fn eight_labellers_at_once_never_get_the_same_job() {
 /// A job that is being leased does not block the next one.
 #[tokio::test]
 async fn a_job_locked_by_another_is_skipped() {
-    let home = Home::new();
-    let store = with_jobs(&home, 2).await;
-    let mut other = connect(&home).await;
+    let database = TestDatabase::new();
+    let store = with_jobs(&database, 2).await;
+    let mut other = connect(&database).await;
     other.execute("BEGIN; SELECT number FROM job ORDER BY decision LIMIT 1 FOR UPDATE").await.unwrap();
     let leased = tokio::time::timeout(Duration::from_secs(5), lease(&store, "a", 0, 600)).await;
     assert_eq!(leased.unwrap().unwrap().structure, structure(2e-6));
@@ -74,8 +74,8 @@ async fn a_job_locked_by_another_is_skipped() {
 
 #[tokio::test]
 async fn labellers_with_clocks_an_hour_apart_respect_each_others_leases() {
-    let home = Home::new();
-    let (store, now) = (with_jobs(&home, 2).await, store::unix_milliseconds());
+    let database = TestDatabase::new();
+    let (store, now) = (with_jobs(&database, 2).await, store::unix_milliseconds());
     let slow = lease(&store, "slow", now - HOUR, 600).await.unwrap();
     let fast = lease(&store, "fast", now + HOUR, 600).await.unwrap();
     assert!(lease(&store, "fast", now + HOUR, 600).await.is_none(), "the slow one's lease lasts");
@@ -110,8 +110,8 @@ async fn labellers_with_clocks_an_hour_apart_respect_each_others_leases() {
 
 #[tokio::test]
 async fn a_label_delivered_after_its_lease_was_lost_counts_once() {
-    let home = Home::new();
-    let store = with_jobs(&home, 1).await;
+    let database = TestDatabase::new();
+    let store = with_jobs(&database, 1).await;
     let late = lease(&store, "late", 0, 1).await.unwrap();
     tokio::time::sleep(Duration::from_millis(1100)).await;
     let holds = lease(&store, "holds", 0, 600).await.unwrap();
@@ -127,8 +127,8 @@ async fn a_label_delivered_after_its_lease_was_lost_counts_once() {
 
 #[tokio::test]
 async fn waiting_labellers_are_notified_of_new_jobs() {
-    let home = Home::new();
-    let store = with_jobs(&home, 1).await;
+    let database = TestDatabase::new();
+    let store = with_jobs(&database, 1).await;
     let long = Duration::from_secs(60);
     // Until it listens.
     store.wait_for_jobs(long).await;
@@ -150,8 +150,8 @@ async fn waiting_labellers_are_notified_of_new_jobs() {
 /// The output of a process may contain anything.
 #[tokio::test]
 async fn nul_characters_in_a_log_are_replaced() {
-    let home = Home::new();
-    let store = with_jobs(&home, 1).await;
+    let database = TestDatabase::new();
+    let store = with_jobs(&database, 1).await;
     let leased = lease(&store, "a", 0, 600).await.unwrap();
     store.fail(&leased, "crashed", "a\0b", 3, 0).await.unwrap();
     let details = store.queue_show(&leased.candidate).await.unwrap();

@@ -39,8 +39,8 @@ async fn exported(location: impl Into<Location>) -> Vec<String> {
 
 #[tokio::test]
 async fn tables_without_checksums_are_read_copied_and_migrated() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     let records = (1..=3).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
     let walks = vec![store::WalkRecord { accepted: 3, ..walk(0, 1) }];
     store.commit(&store::Commit { walks, ..commit_of(records) }).await.unwrap();
@@ -48,25 +48,25 @@ async fn tables_without_checksums_are_read_copied_and_migrated() {
     store.complete(&lease, &label(-1.0), 1).await.unwrap();
     store.import(protocol("dft").hash, "old.extxyz", &[(0, structure(0.5), label(-9.0))], 2).await.unwrap();
     store.close().await;
-    let expected = exported(home.location()).await;
+    let expected = exported(database.location()).await;
     assert_eq!(expected.len(), 2);
 
-    home.execute(WITHOUT_CHECKSUMS).await;
-    assert_eq!(exported(home.location()).await, expected);
+    database.execute(WITHOUT_CHECKSUMS).await;
+    assert_eq!(exported(database.location()).await, expected);
     let copies = tempfile::tempdir().unwrap();
     let copy = copies.path().join("copy");
-    let store = home.open_read_only().await;
+    let store = database.open_read_only().await;
     store.backup(&copy, 3, |_, _| {}).await.unwrap();
     store.close().await;
     assert_eq!(exported(copy.as_path()).await, expected);
     let copied = Store::open(copy.as_path()).await.unwrap();
     assert_eq!(copied.check(|_, _| {}).await.unwrap(), []);
 
-    let (one, other) = tokio::join!(Store::open(home.location()), Store::open(home.location()));
+    let (one, other) = tokio::join!(Store::open(database.location()), Store::open(database.location()));
     let store = one.unwrap();
     other.unwrap().close().await;
     assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
-    home.execute("UPDATE label SET energy = -1.5 WHERE number = 1").await;
+    database.execute("UPDATE label SET energy = -1.5 WHERE number = 1").await;
     let found = store.check(|_, _| {}).await.unwrap();
     assert!(found.len() == 1 && found[0].what.contains("label 1"), "{found:?}");
     store.close().await;
@@ -74,15 +74,15 @@ async fn tables_without_checksums_are_read_copied_and_migrated() {
 
 #[tokio::test]
 async fn words_of_version_15_are_read_copied_and_renamed() {
-    let home = Home::new();
-    let store = home.create().await;
+    let database = TestDatabase::new();
+    let store = database.create().await;
     write_former_words(&store).await;
     store.close().await;
-    home.execute(TO_VERSION_15).await;
-    home.execute("ALTER TABLE label RENAME CONSTRAINT label_status_check TO label_standing_check").await;
+    database.execute(TO_VERSION_15).await;
+    database.execute("ALTER TABLE label RENAME CONSTRAINT label_status_check TO label_standing_check").await;
     let copies = tempfile::tempdir().unwrap();
     let copy = copies.path().join("copy");
-    let store = home.open_read_only().await;
+    let store = database.open_read_only().await;
     check_present_words(&store).await;
     store.backup(&copy, 3, |_, _| {}).await.unwrap();
     store.close().await;
@@ -95,11 +95,11 @@ async fn words_of_version_15_are_read_copied_and_renamed() {
         (SELECT count(*) FROM candidate WHERE checksum = -1), (SELECT count(*) FROM walk WHERE checksum = -1)";
     let unknown: (i64, i64, i64) = sqlx::query_as(sql).fetch_one(&mut connection).await.unwrap();
     assert_eq!(unknown, (0, 0, 0), "the copy has all checksums");
-    let store = home.open().await;
+    let store = database.open().await;
     check_present_words(&store).await;
     store.close().await;
-    home.execute("UPDATE decision SET mixture_version = 77 WHERE sequence = 4").await;
-    let store = home.open().await;
+    database.execute("UPDATE decision SET mixture_version = 77 WHERE sequence = 4").await;
+    let store = database.open().await;
     let found = store.check(|_, _| {}).await.unwrap();
     assert!(found.len() == 1 && found[0].what.contains("decision 4"), "{found:?}");
     store.close().await;

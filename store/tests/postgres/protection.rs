@@ -11,45 +11,49 @@ use super::common::*;
 use super::leading::connect;
 
 /// The directory with `authority.pem`, `server` and `anna`.
-async fn certificates(home: &Home) -> PathBuf {
-    let mut connection = connect(home).await;
+async fn certificates(database: &TestDatabase) -> PathBuf {
+    let mut connection = connect(database).await;
     let file: String = sqlx::query_scalar("SHOW ssl_ca_file").fetch_one(&mut connection).await.unwrap();
     Path::new(&file).parent().unwrap().to_owned()
 }
 
 /// The location for `user` over an encrypted connection to this host name.
-fn at(home: &Home, user: &str, host: &str, parameters: &str) -> Location {
+fn at(database: &TestDatabase, user: &str, host: &str, parameters: &str) -> Location {
     let address = server().split_once('@').unwrap().1.replace("127.0.0.1", host);
-    let schema = home.schema();
+    let schema = database.schema();
     let url = format!("postgres://{user}@{address}?schema={schema}&application_name={schema}&{parameters}");
     url.parse().unwrap()
 }
 
 /// Number of connections of a test's store and lock, and of the encrypted ones among them.
-async fn connections(home: &Home) -> (i64, i64) {
+async fn connections(database: &TestDatabase) -> (i64, i64) {
     let sql = "SELECT count(*), count(*) FILTER (WHERE ssl) FROM pg_stat_activity NATURAL JOIN pg_stat_ssl
                WHERE application_name = $1";
-    sqlx::query_as(sql).bind(home.schema()).fetch_one(&mut connect(home).await).await.unwrap()
+    sqlx::query_as(sql).bind(database.schema()).fetch_one(&mut connect(database).await).await.unwrap()
 }
 
 #[tokio::test]
 async fn a_verified_server_gets_an_encrypted_connection() {
-    let home = Home::new();
-    let root = certificates(&home).await.join("authority.pem");
-    let location =
-        at(&home, "calmwalk", "localhost", &format!("sslmode=verify-full&sslrootcert={}", root.display()));
+    let database = TestDatabase::new();
+    let root = certificates(&database).await.join("authority.pem");
+    let location = at(
+        &database,
+        "calmwalk",
+        "localhost",
+        &format!("sslmode=verify-full&sslrootcert={}", root.display()),
+    );
     let lock = CampaignLock::acquire_at(&location, "protected").await.unwrap();
     let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().fenced_by(&lock);
     store.status().await.unwrap();
-    let (all, encrypted) = connections(&home).await;
+    let (all, encrypted) = connections(&database).await;
     assert!(all >= 2, "the lock has one, and the store");
     assert_eq!(all, encrypted);
 }
 
 #[tokio::test]
 async fn an_unverified_server_is_refused() {
-    let home = Home::new();
-    let own = certificates(&home).await;
+    let database = TestDatabase::new();
+    let own = certificates(&database).await;
     let others = tempfile::tempdir().unwrap();
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/certificates.sh");
     let made = Command::new(script).arg(others.path()).arg("server").output().unwrap();
@@ -63,7 +67,7 @@ async fn an_unverified_server_is_refused() {
         // Another name than in its certificate.
         ("127.0.0.1", right.as_str(), "not valid for name"),
     ] {
-        let error = Store::open(at(&home, "calmwalk", host, parameters)).await.unwrap_err();
+        let error = Store::open(at(&database, "calmwalk", host, parameters)).await.unwrap_err();
         let message = error.to_string();
         assert!(matches!(error, StoreError::Protection(_)) && !error.is_transient(), "{error:?}");
         assert!(message.contains(expected) && message.contains("sslrootcert"), "{message}");
@@ -72,20 +76,20 @@ async fn an_unverified_server_is_refused() {
 
 #[tokio::test]
 async fn a_user_may_log_in_with_a_certificate() {
-    let home = Home::new();
-    let certificates = certificates(&home).await;
+    let database = TestDatabase::new();
+    let certificates = certificates(&database).await;
     let make = "DO $$ BEGIN CREATE ROLE anna LOGIN SUPERUSER; EXCEPTION WHEN duplicate_object THEN END $$";
-    connect(&home).await.execute(make).await.unwrap();
+    connect(&database).await.execute(make).await.unwrap();
     let (root, anna) = (certificates.join("authority.pem"), certificates.join("anna"));
     let known = format!("sslmode=verify-full&sslrootcert={}", root.display());
-    let refused = Store::open(at(&home, "anna", "localhost", &known)).await.unwrap_err();
+    let refused = Store::open(at(&database, "anna", "localhost", &known)).await.unwrap_err();
     assert!(refused.to_string().contains("certificate"), "{refused}");
     let anna = anna.display();
     let own = format!("sslcert={anna}/certificate.pem&sslkey={anna}/key.pem");
-    let location = at(&home, "anna", "localhost", &format!("{known}&{own}"));
+    let location = at(&database, "anna", "localhost", &format!("{known}&{own}"));
     let store = Store::create(&location, &campaign(), &[], 0).await.unwrap();
-    assert!(connections(&home).await.1 >= 1);
+    assert!(connections(&database).await.1 >= 1);
     store.close().await;
     let leave = "REASSIGN OWNED BY anna TO CURRENT_USER; DROP ROLE anna";
-    connect(&home).await.execute(leave).await.unwrap();
+    connect(&database).await.execute(leave).await.unwrap();
 }

@@ -37,7 +37,9 @@ fn numbered(k: u64) -> Commit {
 }
 
 /// Retries until the server responds.
-async fn insist<T, F: Future<Output = Result<T, StoreError>>>(mut call: impl FnMut() -> F) -> T {
+async fn retry_until_answered<T, F: Future<Output = Result<T, StoreError>>>(
+    mut call: impl FnMut() -> F,
+) -> T {
     loop {
         match call().await {
             Err(error) if error.is_transient() => tokio::time::sleep(Duration::from_millis(20)).await,
@@ -51,17 +53,17 @@ async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -
     let (holder, mut labelled) = (format!("l{number}"), 0);
     loop {
         let last_look = no_more_jobs.load(Ordering::Relaxed);
-        let found = insist(|| store.lease(protocol("dft").hash, &holder, 0, 1)).await;
+        let found = retry_until_answered(|| store.lease(protocol("dft").hash, &holder, 0, 1)).await;
         let Some(lease) = found else {
             // A lease whose reply was lost is released when it expires.
-            if last_look && insist(|| store.unfinished_jobs()).await == 0 {
+            if last_look && retry_until_answered(|| store.unfinished_jobs()).await == 0 {
                 return labelled;
             }
             store.wait_for_jobs(Duration::from_millis(50)).await;
             continue;
         };
         let made = label(-1.0);
-        if insist(|| store.complete(&lease, &made, 0)).await == CompleteOutcome::Label {
+        if retry_until_answered(|| store.complete(&lease, &made, 0)).await == CompleteOutcome::Label {
             labelled += 1;
         }
     }
@@ -69,10 +71,10 @@ async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nothing_is_lost_or_duplicated_when_the_server_restarts() {
-    let home = Home::new();
-    let lock = CampaignLock::acquire_at(home.location(), "restart test").await.unwrap();
-    drop(home.create().await);
-    let store = Store::open(home.location()).await.unwrap().fenced_by(&lock);
+    let database = TestDatabase::new();
+    let lock = CampaignLock::acquire_at(database.location(), "restart test").await.unwrap();
+    drop(database.create().await);
+    let store = Store::open(database.location()).await.unwrap().fenced_by(&lock);
     let (done, committed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
     let no_more_jobs = Arc::new(AtomicBool::new(false));
     let labellers: Vec<_> = (0..LABELLERS)
@@ -127,6 +129,6 @@ async fn nothing_is_lost_or_duplicated_when_the_server_restarts() {
     // The store reacquired the lock, which no other process held.
     let lost = tokio::time::timeout(Duration::from_secs(3), lock.lost()).await;
     assert!(lost.is_err(), "{lost:?}");
-    let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
+    let error = CampaignLock::acquire_at(database.location(), "second").await.unwrap_err();
     assert!(matches!(error, StoreError::Locked { .. }), "{error}");
 }

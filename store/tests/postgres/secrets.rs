@@ -9,18 +9,18 @@ use super::leading::connect;
 const PASSWORD: &str = "tr0ub4dor";
 
 /// The location for a user of its own, with the password in the URL.
-async fn with_password(home: &Home) -> Location {
-    let user = home.schema();
+async fn with_password(database: &TestDatabase) -> Location {
+    let user = database.schema();
     let create = format!("CREATE ROLE {user} LOGIN SUPERUSER PASSWORD '{PASSWORD}'");
-    connect(home).await.execute(sqlx::AssertSqlSafe(create)).await.unwrap();
+    connect(database).await.execute(sqlx::AssertSqlSafe(create)).await.unwrap();
     let host = server().split_once('@').unwrap().1.to_owned();
     format!("postgres://{user}:{PASSWORD}@{host}?schema={user}&application_name={user}").parse().unwrap()
 }
 
 #[tokio::test]
 async fn a_password_is_in_no_message_and_not_in_the_database() {
-    let home = Home::new();
-    let location = with_password(&home).await;
+    let database = TestDatabase::new();
+    let location = with_password(&database).await;
     let lock = CampaignLock::acquire_at(&location, "first").await.unwrap();
     let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().fenced_by(&lock);
     let refused = CampaignLock::acquire_at(&location, "second").await.unwrap_err();
@@ -37,13 +37,13 @@ async fn a_password_is_in_no_message_and_not_in_the_database() {
     ] {
         assert!(!shown.contains(PASSWORD), "{shown}");
     }
-    let mut connection = connect(&home).await;
+    let mut connection = connect(&database).await;
     for table in ["campaign", "leader", "process", "operation", "value"] {
         let sql = sqlx::AssertSqlSafe(format!("SELECT {table}::TEXT FROM {table}"));
         let rows: Vec<String> = sqlx::query_scalar(sql).fetch_all(&mut connection).await.unwrap();
         assert!(rows.iter().all(|row| !row.contains(PASSWORD)), "{table}: {rows:?}");
     }
     drop((store, lock));
-    let drop_role = format!("REASSIGN OWNED BY {0} TO CURRENT_USER; DROP ROLE {0}", home.schema());
+    let drop_role = format!("REASSIGN OWNED BY {0} TO CURRENT_USER; DROP ROLE {0}", database.schema());
     connection.execute(sqlx::AssertSqlSafe(drop_role)).await.unwrap();
 }

@@ -33,14 +33,14 @@ struct Linked {
 
 impl Linked {
     /// Starts both hosts. The server declares an agent dead after `heartbeat_timeout` (s), and the agent gives up after
-    /// `patience` (min).
-    fn new(heartbeat_timeout: f64, patience: f64) -> Self {
-        let linked = Self::with_cable(Cable::new(), heartbeat_timeout, patience);
+    /// `wait_timeout` (min).
+    fn new(heartbeat_timeout: f64, wait_timeout: f64) -> Self {
+        let linked = Self::with_cable(Cable::new(), heartbeat_timeout, wait_timeout);
         linked.are_at_work();
         linked
     }
 
-    fn with_cable(cable: Cable, heartbeat_timeout: f64, patience: f64) -> Self {
+    fn with_cable(cable: Cable, heartbeat_timeout: f64, wait_timeout: f64) -> Self {
         let mut hosts =
             Hosts::new(&small(), 1, &format!("agent_heartbeat_timeout = \"{heartbeat_timeout}s\""));
         hosts.through = cable.through();
@@ -49,7 +49,7 @@ impl Linked {
         certify(&certificates);
         let tls = |name: &str| ["--tls".to_owned(), certificates.join(name).display().to_string()];
         let [prefetch, timeout] =
-            ["--prefetch=1".to_owned(), format!("--wait-timeout={}s", (60.0 * patience) as u64)];
+            ["--prefetch=1".to_owned(), format!("--wait-timeout={}s", (60.0 * wait_timeout) as u64)];
         hosts.options = [tls(HEAD).into(), tls(NODE).into_iter().chain([prefetch, timeout]).collect()];
         let (orchestrator, agent) = (hosts.start_orchestrator(), hosts.agent(0));
         Self { hosts, cable, orchestrator, agent }

@@ -261,7 +261,7 @@ pub struct Labeller {
 impl Labeller {
     pub async fn ended(self) -> Result<(), StoreError> {
         let ended = tokio::time::timeout(Duration::from_secs(60), self.task).await;
-        ended.expect("the labeller does not go home").unwrap()
+        ended.expect("the labeller does not exit").unwrap()
     }
 
     /// Like kill -9: it stops, and its record is removed with the next check of processes.

@@ -63,15 +63,15 @@ async fn many_walkers_are_answered_each_for_itself() {
     let mut server = TestServer::open(directory.path(), 6, 1 << 16);
     let mut walkers: Vec<_> = (0..6).map(|walker| server.start(walker, 3, Role::Walker)).collect();
     let mut assignments = [0; 6];
-    let mut home = 0;
-    while home < walkers.len() {
+    let mut finished = 0;
+    while finished < walkers.len() {
         let offer = server.offer().await;
         let number = &mut assignments[offer.walker as usize];
         if *number > 0 {
             check(&offer.report.unwrap(), offer.walker, *number, (3, 4));
         }
         *number += 1;
-        home += usize::from(*number == 40);
+        finished += usize::from(*number == 40);
         offer.reply.send((*number < 40).then(|| work(offer.walker, *number, (3, 4)))).unwrap();
     }
     assert!(walkers.iter_mut().all(|walker| walker.wait().unwrap().success()));

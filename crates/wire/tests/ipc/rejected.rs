@@ -16,14 +16,14 @@ use super::test_server::TestServer;
 type Service = ipc_threadsafe::Service;
 
 /// A process that connects and sends arbitrary messages.
-struct Stranger {
+struct ForeignSender {
     session: u64,
     port: Client<Service, [u64], (), [u64], ()>,
-    bell: Notifier<Service>,
+    wakeup_event: Notifier<Service>,
     _node: Node<Service>,
 }
 
-impl Stranger {
+impl ForeignSender {
     fn enter(server: &TestServer) -> Self {
         let door = serde_json::to_value(server.handle.connect_info(0, 0)).unwrap();
         let text = |key: &str| door.get(key).and_then(Value::as_str).unwrap().to_owned();
@@ -35,19 +35,19 @@ impl Stranger {
         let session = door["sender"]["session"].as_u64().unwrap();
         let name =
             |what: &str| -> ServiceName { format!("{session:016x}/{what}").as_str().try_into().unwrap() };
-        let bell = node.service_builder(&name("server")).event().open().unwrap();
+        let wakeup_event = node.service_builder(&name("server")).event().open().unwrap();
         let requests =
             node.service_builder(&name("requests")).request_response::<[u64], [u64]>().open().unwrap();
         let port = requests.client_builder().initial_max_slice_len(1 << 17).create().unwrap();
-        let bell = bell.notifier_builder().create().unwrap();
-        Self { session, port, bell, _node: node }
+        let wakeup_event = wakeup_event.notifier_builder().create().unwrap();
+        Self { session, port, wakeup_event, _node: node }
     }
 
     fn send(&self, bytes: &[u8]) {
         let words = words(bytes);
         let pending =
             self.port.loan_slice_uninit(words.len()).unwrap().write_from_slice(&words).send().unwrap();
-        self.bell.notify().unwrap();
+        self.wakeup_event.notify().unwrap();
         assert_eq!(pending.number_of_server_connections(), 1);
     }
 
@@ -102,44 +102,44 @@ async fn invalid_messages_are_rejected_and_counted() {
     let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     let mut walker = server.start(0, 1, Role::Walker);
     let mut last = server.offer().await;
-    let stranger = Stranger::enter(&server);
+    let sender = ForeignSender::enter(&server);
 
-    stranger.refused(&server, &[], "request too short: 0 bytes").await;
-    stranger
+    sender.refused(&server, &[], "request too short: 0 bytes").await;
+    sender
         .refused(
             &server,
             &[0xff; 304],
             "request of 304 bytes, but its control message should have 18446744073709551615",
         )
         .await;
-    stranger.refused(&server, &framed(b"", b""), "control message too short: 0 bytes").await;
+    sender.refused(&server, &framed(b"", b""), "control message too short: 0 bytes").await;
     last = server.go_on(last, 1, (3, 4)).await;
 
-    let good = sealed(&stranger.letter((7, 2), QUESTION));
+    let good = sealed(&sender.letter((7, 2), QUESTION));
     let changed = |at: usize, byte: u8| {
         let mut bytes = good.clone();
         bytes[at] = byte;
         framed(&bytes, b"")
     };
-    stranger.refused(&server, &changed(0, b'B'), "not a control message").await;
-    stranger.refused(&server, &changed(4, 1), "control message of version 1,").await;
-    stranger.refused(&server, &changed(12, 0x55), "damaged control message").await;
-    let trailing = sealed(&[stranger.letter((7, 2), QUESTION).as_slice(), &[0]].concat());
-    stranger.refused(&server, &framed(&trailing, b""), "1 extra bytes after the end").await;
-    let unknown = sealed(&stranger.letter((7, 2), &[9]));
-    stranger.refused(&server, &framed(&unknown, b""), "cannot decode control message").await;
+    sender.refused(&server, &changed(0, b'B'), "not a control message").await;
+    sender.refused(&server, &changed(4, 1), "control message of version 1,").await;
+    sender.refused(&server, &changed(12, 0x55), "damaged control message").await;
+    let trailing = sealed(&[sender.letter((7, 2), QUESTION).as_slice(), &[0]].concat());
+    sender.refused(&server, &framed(&trailing, b""), "1 extra bytes after the end").await;
+    let unknown = sealed(&sender.letter((7, 2), &[9]));
+    sender.refused(&server, &framed(&unknown, b""), "cannot decode control message").await;
     last = server.go_on(last, 2, (3, 4)).await;
 
-    let of = |caller, words: &[u8]| framed(&sealed(&stranger.letter(caller, words)), b"");
-    stranger.refused(&server, &of((7, 2), QUESTION), "message of unexpected walker 7").await;
-    stranger
+    let of = |caller, words: &[u8]| framed(&sealed(&sender.letter(caller, words)), b"");
+    sender.refused(&server, &of((7, 2), QUESTION), "message of unexpected walker 7").await;
+    sender
         .refused(
             &server,
             &of((0, 2), NOTHING),
             "message of incarnation 2 of walker 0, expected incarnation 1",
         )
         .await;
-    let other = Stranger { session: !stranger.session, ..Stranger::enter(&server) };
+    let other = ForeignSender { session: !sender.session, ..ForeignSender::enter(&server) };
     let bytes = framed(&sealed(&other.letter((0, 1), QUESTION)), b"");
     other.refused(&server, &bytes, "message of session ffffffff").await;
     last = server.go_on(last, 3, (3, 4)).await;
@@ -150,7 +150,7 @@ async fn invalid_messages_are_rejected_and_counted() {
         server.heard.lock().unwrap().iter().all(|walker| *walker == 0),
         "unexpected senders give no heartbeats"
     );
-    drop((stranger, other));
+    drop((sender, other));
     server.close().await;
 }
 
@@ -159,37 +159,37 @@ async fn offers_with_invalid_candidates_change_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     server.handle.expect(7, 2);
-    let stranger = Stranger::enter(&server);
+    let sender = ForeignSender::enter(&server);
     let candidate = candidate(&assignment(3, 1, (5, 6)));
     let block = CandidateBlock::encode(&candidate);
-    let with = |words: &[u8], behind: &[u8]| framed(&sealed(&stranger.letter((7, 2), words)), behind);
+    let with = |words: &[u8], behind: &[u8]| framed(&sealed(&sender.letter((7, 2), words)), behind);
     let one = offer(1, &candidate);
 
-    stranger
+    sender
         .refused(
             &server,
             &with(&offer(9, &candidate), block.as_bytes()),
             "offer 9 of walker 7 is out of order: the last was 0",
         )
         .await;
-    stranger.refused(&server, &with(&one, b""), "the attached block is none").await;
-    stranger
+    sender.refused(&server, &with(&one, b""), "the attached block is none").await;
+    sender
         .refused(&server, &with(&one, &block.as_bytes()[..104]), "candidate block too short: 104 bytes")
         .await;
     let mut damaged = block.as_bytes().to_vec();
     *damaged.last_mut().unwrap() ^= 1;
-    stranger.refused(&server, &with(&one, &damaged), "damaged candidate block").await;
+    sender.refused(&server, &with(&one, &damaged), "damaged candidate block").await;
     let mut other = candidate.clone();
     other.id.step += 1;
     let other = CandidateBlock::encode(&other);
-    stranger.refused(&server, &with(&one, other.as_bytes()), "the attached block is 07070707-3.0.2-").await;
+    sender.refused(&server, &with(&one, other.as_bytes()), "the attached block is 07070707-3.0.2-").await;
     let unexpected = "bytes: the message names none";
-    stranger.refused(&server, &with(NOTHING, block.as_bytes()), unexpected).await;
+    sender.refused(&server, &with(NOTHING, block.as_bytes()), unexpected).await;
     assert!(server.incoming.try_recv().is_err() && server.heard.lock().unwrap().is_empty());
 
     // The valid offer is accepted; repeated, it is not accepted again.
     for _ in 0..3 {
-        stranger.send(&with(&one, block.as_bytes()));
+        sender.send(&with(&one, block.as_bytes()));
     }
     let taken = server.offer().await;
     assert_eq!(taken.walker, 7);
@@ -197,7 +197,7 @@ async fn offers_with_invalid_candidates_change_nothing() {
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
     assert!(server.incoming.try_recv().is_err());
-    drop((stranger, taken));
+    drop((sender, taken));
     server.close().await;
 }
 
@@ -207,13 +207,13 @@ async fn a_flood_of_messages_does_not_block_walkers() {
     let directory = tempfile::tempdir().unwrap();
     let mut server = TestServer::open(directory.path(), 2, 1 << 16);
     let mut walker = server.start(0, 1, Role::Walker);
-    let stranger = Stranger::enter(&server);
+    let sender = ForeignSender::enter(&server);
     let flood = std::thread::spawn(move || {
         for k in 0..20_000_u32 {
             let words = vec![u64::from(k) << 32 | u64::from(k); k as usize % 60 + 1];
             // Full buffers drop messages.
-            let _ = stranger.port.loan_slice_uninit(words.len()).unwrap().write_from_slice(&words).send();
-            let _ = stranger.bell.notify();
+            let _ = sender.port.loan_slice_uninit(words.len()).unwrap().write_from_slice(&words).send();
+            let _ = sender.wakeup_event.notify();
         }
     });
     let mut last = server.offer().await;

@@ -136,12 +136,12 @@ async fn an_agent_finds_the_next_run_of_its_orchestrator() {
     let mut slot = membership.slots().remove(0);
     let last_report = SlotReport::Report(report(&assignment));
     let telling = async { slot.exchange(&membership, &last_report).await.unwrap().is_none() };
-    let (home, found) = tokio::join!(telling, async {
+    let (dismissed, found) = tokio::join!(telling, async {
         let offer = server.offer().await;
         offer.reply.send(None).unwrap();
         offer.report
     });
-    assert!(home);
+    assert!(dismissed);
     assert_eq!(found, Some(report(&assignment)));
     membership.leave().await;
     server.close().await;

@@ -36,9 +36,9 @@ async fn unexpected_messages_are_rejected_and_reported() {
     ] {
         config.insert_json5(key, &value).unwrap();
     }
-    let stranger = zenoh::open(config).await.unwrap();
+    let outsider = zenoh::open(config).await.unwrap();
     let ask = async |payload: Vec<u8>| {
-        let replies = stranger.get("calmwalk/orchestrator").payload(payload).await.unwrap();
+        let replies = outsider.get("calmwalk/orchestrator").payload(payload).await.unwrap();
         let reply = timeout(LIMIT, replies.recv_async()).await.expect("in time").unwrap();
         String::from_utf8_lossy(&reply.result().unwrap().payload().to_bytes()).into_owned()
     };

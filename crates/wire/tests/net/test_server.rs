@@ -61,14 +61,14 @@ impl TestServer {
     pub async fn open(wanted: ServerOptions) -> Self {
         let ServerOptions { port, session, agent_timeout, mixture, files, tls } = wanted;
         let welcome = AgentBootstrap { setup: b"the setup".to_vec(), files };
-        let hub =
+        let server =
             AgentServer::open(&endpoint(port), tls.as_ref(), session, agent_timeout, welcome).await.unwrap();
         let tokens = StopTokens::default();
         let (to_reactor, incoming) = mpsc::channel(4);
         let events = Arc::new(Mutex::new(Vec::new()));
         let note = Arc::clone(&events);
         let note = move |event| note.lock().unwrap().push(event);
-        let task = tokio::spawn(hub.run(mixture, tokens.clone(), to_reactor, note));
+        let task = tokio::spawn(server.run(mixture, tokens.clone(), to_reactor, note));
         Self { port, incoming, events, tokens, task }
     }
 

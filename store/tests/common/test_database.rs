@@ -10,7 +10,7 @@ use tempfile::TempDir;
 
 /// A directory, or a schema of its own on the server given by `CALMWALK_POSTGRES`, which the test target `postgres`
 /// uses.
-pub struct Home {
+pub struct TestDatabase {
     directory: TempDir,
     schema: Option<String>,
 }
@@ -21,7 +21,7 @@ pub fn server() -> String {
         .expect("CALMWALK_POSTGRES must be the URL of a PostgreSQL server; '.ci/postgres start' makes one")
 }
 
-impl Home {
+impl TestDatabase {
     pub fn new() -> Self {
         static NUMBER: AtomicU64 = AtomicU64::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
@@ -74,7 +74,7 @@ impl Home {
     }
 }
 
-impl Drop for Home {
+impl Drop for TestDatabase {
     fn drop(&mut self) {
         let Some(schema) = self.schema.take() else { return };
         let remove = async move {
