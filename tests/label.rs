@@ -121,7 +121,7 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_continue() {
 }
 
 #[test]
-fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
+fn a_stop_finishes_the_current_label_or_gives_it_back() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--grace-period", "0s"]);
     place.wait_for_lease();

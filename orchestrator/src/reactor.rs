@@ -239,7 +239,7 @@ impl ReactorState {
         Ok(())
     }
 
-    /// Takes back the walk that a walker has in hand.
+    /// Takes back the walk of a walker.
     fn take_back(&mut self, walker: u32) -> Option<WalkId> {
         let walk = self.selector.walk_of(walker);
         walk.inspect(|walk| self.selector.assignment_lost(*walk))

@@ -39,7 +39,7 @@ struct WalkThroughput {
     steps: u64,
 }
 
-/// Moving average of the share of walkers that have a walk in hand.
+/// Moving average of the share of walkers that are busy.
 #[derive(Debug, Default)]
 struct Busy {
     /// The share since a time, ms.

@@ -31,7 +31,7 @@ pub struct CampaignStatus {
     pub round: u64,
     /// Steps per second of all walks together; `None` without a report in the last minute.
     pub steps_per_second: Option<f64>,
-    /// Average share of the walkers that have a walk in hand; `None` without a report in the last minute.
+    /// Average share of the walkers that are busy; `None` without a report in the last minute.
     pub walkers_busy: Option<f64>,
     /// Every walk, in order.
     pub walks: Vec<WalkStatus>,

@@ -32,7 +32,7 @@ pub struct WalkProgressRecord {
 pub struct TotalThroughput {
     /// Steps per second; `None` until it can be computed.
     pub steps_per_second: Option<f64>,
-    /// Average share of the walkers that have a walk in hand; `None` without walkers.
+    /// Average share of the walkers that are busy; `None` without walkers.
     pub walkers_busy: Option<f64>,
 }
 

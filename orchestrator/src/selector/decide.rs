@@ -28,11 +28,11 @@ pub(super) const LEFT_OUT: &str = "left_out";
 pub(super) const FORGETTING: &str = "forgetting";
 
 impl DecisionState {
-    /// Decides on the reports of a round, in order. `in_hand` contains the walks that walkers work on.
+    /// Decides on the reports of a round, in order. `assigned` contains the walks that walkers work on.
     pub fn decide(
         &mut self,
         reports: Vec<RegradedReport>,
-        in_hand: &BTreeMap<WalkId, u32>,
+        assigned: &BTreeMap<WalkId, u32>,
     ) -> Result<Commit, SelectorError> {
         let mut commit = Commit::default();
         let mut touched = BTreeSet::new();
@@ -58,7 +58,7 @@ impl DecisionState {
                 Outcome::StepsDone | Outcome::Interrupted => {}
             }
         }
-        touched.extend(self.end_by_limits(in_hand, &mut commit));
+        touched.extend(self.end_by_limits(assigned, &mut commit));
         touched.extend(self.start_controls(&mut commit));
         commit.walks = touched.iter().map(|id| self.walks[*id].to_record()).collect();
         self.add_values(&mut commit);
@@ -357,8 +357,8 @@ impl DecisionState {
 
     /// Ends the unassigned biased walks once the campaign has its maximum number of structures, and those whose seed
     /// structure has.
-    fn end_by_limits(&mut self, in_hand: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> BTreeSet<WalkId> {
-        let is_idle = |id: &WalkId| !in_hand.contains_key(id);
+    fn end_by_limits(&mut self, assigned: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> BTreeSet<WalkId> {
+        let is_idle = |id: &WalkId| !assigned.contains_key(id);
         let (end, over): (_, BTreeSet<_>) = if self.is_budget_exhausted() {
             (WalkEnd::Budget, self.walks.unfinished(true).filter(is_idle).collect())
         } else {

@@ -53,8 +53,8 @@ pub struct Selector {
     campaign: CampaignId,
     seed_structures: Vec<SeedStructurePlan>,
     decisions: DecisionState,
-    /// The walker that has each assigned walk in hand, until it reports or is lost.
-    in_hand: BTreeMap<WalkId, u32>,
+    /// The walker of each assigned walk, until it reports or is lost.
+    assigned: BTreeMap<WalkId, u32>,
     /// Walks of the current round that have not reported yet (reproducible mode), …
     outstanding: BTreeSet<WalkId>,
     /// … and the reports of the others.
@@ -83,7 +83,7 @@ impl Selector {
             campaign,
             seed_structures,
             decisions,
-            in_hand: BTreeMap::new(),
+            assigned: BTreeMap::new(),
             outstanding: BTreeSet::new(),
             reports: BTreeMap::new(),
             paused: BTreeSet::new(),
@@ -194,7 +194,7 @@ impl Selector {
         if self.decisions.walks.get(id).filter(is_current).is_none() {
             return Ok(None);
         }
-        self.in_hand.remove(&id);
+        self.assigned.remove(&id);
         if matches!(report.outcome, Outcome::Interrupted) {
             let walk = self.decisions.walk_mut(id);
             walk.interrupt(report);
@@ -214,7 +214,7 @@ impl Selector {
                 std::mem::take(&mut self.reports).into_values().collect()
             }
         };
-        let commit = self.decisions.decide(reports, &self.in_hand)?;
+        let commit = self.decisions.decide(reports, &self.assigned)?;
         self.update_ready(commit.walks.iter().map(|walk| walk.walk));
         Ok(Some(commit))
     }

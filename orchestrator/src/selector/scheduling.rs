@@ -17,7 +17,7 @@ pub enum Scheduling {
 }
 
 impl Selector {
-    /// The next assignment for an idle walker, which has it in hand from then on.
+    /// The next assignment for an idle walker, which is busy from then on.
     pub fn next_assignment(&mut self, walker: u32) -> Scheduling {
         if self.decisions.settings.mode == CampaignMode::Reproducible && self.outstanding.is_empty() {
             self.start_round();
@@ -52,7 +52,7 @@ impl Selector {
                 CampaignMode::Live => !walk.has_ended(),
             };
             let ready = &mut self.ready[usize::from(!walk.is_biased())];
-            if is_due && !self.in_hand.contains_key(&id) && !self.paused.contains(&id) {
+            if is_due && !self.assigned.contains_key(&id) && !self.paused.contains(&id) {
                 ready.insert(id);
             } else {
                 ready.remove(&id);
@@ -63,7 +63,7 @@ impl Selector {
     /// Whether the next assignment is one of the share of control walks. It follows from the number of assignments so
     /// far, and is the same after a restart.
     fn is_turn_of_controls(&self) -> bool {
-        let number = (self.decisions.walks.reported() + self.in_hand.len() as u64) as f64;
+        let number = (self.decisions.walks.reported() + self.assigned.len() as u64) as f64;
         let share = self.decisions.settings.control_share;
         ((number + 1.0) * share).floor() > (number * share).floor()
     }
@@ -73,24 +73,24 @@ impl Selector {
         self.decisions.walks.have_all_ended()
     }
 
-    /// Whether a walker has this walk in hand.
+    /// Whether a walker runs this walk.
     pub fn is_assigned(&self, id: WalkId) -> bool {
-        self.in_hand.contains_key(&id)
+        self.assigned.contains_key(&id)
     }
 
-    /// Number of walks that walkers have in hand.
+    /// Number of walks that walkers run.
     pub fn assignments(&self) -> usize {
-        self.in_hand.len()
+        self.assigned.len()
     }
 
-    /// The walk that this walker has in hand.
+    /// The walk that this walker runs.
     pub fn walk_of(&self, walker: u32) -> Option<WalkId> {
-        self.in_hand.iter().find_map(|(id, holder)| (*holder == walker).then_some(*id))
+        self.assigned.iter().find_map(|(id, holder)| (*holder == walker).then_some(*id))
     }
 
     /// Takes back a walk from a walker that will not report on it; another walker gets it.
     pub fn assignment_lost(&mut self, id: WalkId) {
-        self.in_hand.remove(&id);
+        self.assigned.remove(&id);
         self.update_ready([id]);
     }
 
@@ -109,7 +109,7 @@ impl Selector {
     }
 
     fn assign(&mut self, id: WalkId, walker: u32) -> Assignment {
-        self.in_hand.insert(id, walker);
+        self.assigned.insert(id, walker);
         self.update_ready([id]);
         let walk = self.decisions.walks.get_mut(id);
         walk.record.state = "running".to_owned();

@@ -42,7 +42,7 @@ fn a_job_whose_time_is_over_gets_twice_as_much() {
     end_its_time(&jobs.jobs()[0][0]);
     wait_until("the calculation is started again", || jobs.begun().len() == 2);
     // Slurm's limit is one minute longer than the runner's.
-    let times: Vec<_> = jobs.told("%j|%l|%r").into_iter().skip(1).map(|[_, limit, _]| limit).collect();
+    let times: Vec<_> = jobs.squeue("%j|%l|%r").into_iter().skip(1).map(|[_, limit, _]| limit).collect();
     assert_eq!(times, ["21:00"]);
     jobs.go();
     let labels = jobs.finish(run, label);
@@ -77,10 +77,10 @@ fn a_job_whose_node_is_lost_goes_to_another() {
     let run = jobs.place.run();
     let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is running", || jobs.begun().len() == 1);
-    let lost = jobs.told("%i|%T|%N")[0][2].clone();
+    let lost = jobs.squeue("%i|%T|%N")[0][2].clone();
     lose_node(&lost);
     wait_until("the calculation is started again", || jobs.begun().len() == 2);
-    assert_ne!(jobs.told("%i|%T|%N")[1][2], lost);
+    assert_ne!(jobs.squeue("%i|%T|%N")[1][2], lost);
     jobs.go();
     let labels = jobs.finish(run, label);
     once_each(&jobs, labels + 1);
@@ -95,7 +95,7 @@ fn where_there_is_no_other_node_it_goes_to_the_same() {
     let run = jobs.place.run();
     let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is running", || jobs.begun().len() == 1);
-    lose_node(&jobs.told("%i|%T|%N")[0][2]);
+    lose_node(&jobs.squeue("%i|%T|%N")[0][2]);
     wait_until("the calculation is started again", || jobs.begun().len() == 2);
     jobs.go();
     let labels = jobs.finish(run, label);

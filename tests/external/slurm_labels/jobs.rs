@@ -73,11 +73,11 @@ impl Jobs {
 
     /// Id, state and name of each job that Slurm knows, oldest first.
     pub fn jobs(&self) -> Vec<[String; 3]> {
-        self.told("%i|%T|%j")
+        self.squeue("%i|%T|%j")
     }
 
     /// Three fields of each job, given in the format of `squeue --format`.
-    pub fn told(&self, format: &str) -> Vec<[String; 3]> {
+    pub fn squeue(&self, format: &str) -> Vec<[String; 3]> {
         let format = format!("--format={format}|%Z|%T%N");
         let text = slurm(&["squeue", "--noheader", "--states=all", "--sort=i", &format]);
         let scratch = self.home.path().canonicalize().unwrap();
