@@ -183,7 +183,7 @@ impl KNearest {
     }
 }
 
-/// Keeps a sample of the atoms of each element: those with the smallest keys, which are random functions of seed,
+/// Keeps a sample of the atoms of each element: those with the smallest keys, which are functions of the random seed,
 /// element and the atom's number.
 #[derive(Debug, Clone)]
 pub(super) struct KNearestBuilder {
