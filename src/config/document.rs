@@ -20,6 +20,9 @@ const MAX_ERRORS: usize = 100;
 /// Largest number of syntax errors that are shown: one missing quote or bracket makes an error of every later line.
 const MAX_SYNTAX_ERRORS: usize = 3;
 
+/// The mark of a value that only the user can give, as `calmwalk init` writes it; what is expected follows.
+pub const FILL_IN: &str = "FILL IN: ";
+
 /// A parsed file and its errors.
 pub struct Document<'a> {
     path: &'a Path,
@@ -156,6 +159,13 @@ impl<'a> Document<'a> {
         }
     }
 
+    /// Refuses every text that begins with [`FILL_IN`].
+    pub fn refuse_unfilled(&mut self) {
+        let mut found = Vec::new();
+        unfilled_in("", self.table.get_ref(), &mut found);
+        found.into_iter().for_each(|(offset, wrong)| self.push(offset, wrong));
+    }
+
     fn push(&mut self, offset: usize, (key, found, expected): InvalidValue) {
         let at = if self.table.get_ref().is_empty() {
             self.path.display().to_string()
@@ -180,6 +190,29 @@ impl<'a> Document<'a> {
     pub fn finish(mut self) -> Result<(), ConfigError> {
         self.problems.sort_by_key(|(offset, _)| *offset);
         ConfigError::all(self.path, self.problems).map_or(Ok(()), Err)
+    }
+}
+
+/// Adds the values of a table that begin with [`FILL_IN`], with their offsets. `above` is the dotted key of the table.
+fn unfilled_in(above: &str, table: &DeTable<'_>, found: &mut Vec<(usize, InvalidValue)>) {
+    for (key, value) in table.iter() {
+        let key =
+            if above.is_empty() { key.get_ref().to_string() } else { format!("{above}.{}", key.get_ref()) };
+        unfilled(&key, value, found);
+    }
+}
+
+fn unfilled(key: &str, value: &Spanned<DeValue<'_>>, found: &mut Vec<(usize, InvalidValue)>) {
+    match value.get_ref() {
+        DeValue::String(text) => {
+            if let Some(expected) = text.strip_prefix(FILL_IN) {
+                let wrong = (key.to_owned(), "not filled in yet".to_owned(), expected.to_owned());
+                found.push((value.span().start, wrong));
+            }
+        }
+        DeValue::Array(values) => values.iter().for_each(|value| unfilled(key, value, found)),
+        DeValue::Table(inner) => unfilled_in(key, inner, found),
+        _ => {}
     }
 }
 

@@ -30,13 +30,13 @@ use workers::labeller::LabelGuard;
 
 pub use changes::{ConfigChange, Refused, changed_keys, compare, without_changeable};
 pub use check::wrong_thermostat;
-pub use document::Document;
+pub use document::{Document, FILL_IN};
 pub use error::{ConfigError, location, location_of_offset, read_text, user_message};
 pub use files::{PotentialConfig, PotentialKind};
 pub use hints::KnownKeys;
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};
-pub use ranges::impossible;
+pub use ranges::{impossible, usual_range};
 pub use schema::schema_text;
 pub use sections::*;
 pub use warning::Warning;
@@ -103,11 +103,24 @@ impl Config {
     /// # Errors
     /// Everything that is wrong with it.
     pub fn load(path: &Path) -> Result<Loaded, ConfigError> {
-        let text = read_text(path)?;
+        Self::read(path, read_text(path)?, |document| document.refuse_unfilled())
+    }
+
+    /// The same for the text of a file that is not written yet. Its values may have the mark of those to fill in.
+    pub fn from_draft(path: &Path, text: String) -> Result<Loaded, ConfigError> {
+        Self::read(path, text, |_| ())
+    }
+
+    fn read(
+        path: &Path,
+        text: String,
+        last_check: impl FnOnce(&mut Document<'_>),
+    ) -> Result<Loaded, ConfigError> {
         let mut document = Document::parse(path, &text)?;
         let config: Option<Self> = document.read(PLACEHOLDERS, &Self::known_keys());
         let warnings = document.check_ranges("walk");
         document.check_rules(|| config.as_ref().map(check::check).unwrap_or_default());
+        last_check(&mut document);
         document.finish()?;
         // What could not be read was noted, and is an error.
         let mut config = config.ok_or_else(|| ConfigError::unreadable(path))?;
@@ -127,6 +140,7 @@ impl Config {
         document.check_ranges("walk");
         document
             .check_rules(|| labels.as_ref().map(|all| check::check_label(&all.label)).unwrap_or_default());
+        document.refuse_unfilled();
         document.finish()?;
         let LabelDocument { mut label } = labels.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));

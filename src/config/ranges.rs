@@ -255,6 +255,11 @@ pub fn expected_instead(key: &str, value: f64) -> Option<(String, String)> {
     (!range.is_possible(value)).then(|| (range.written(value), range.expected()))
 }
 
+/// The usual range of a key in words, with its unit. `None`: the key has none.
+pub fn usual_range(key: &str) -> Option<String> {
+    RANGES.iter().find(|range| range.key == key).map(Range::usual_in_words)
+}
+
 /// The numbers of a text that are outside their possible ranges.
 pub fn impossible(text: &str) -> Vec<InvalidValue> {
     let (table, _) = DeTable::parse_recoverable(text);
