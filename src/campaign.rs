@@ -1,5 +1,6 @@
 //! Loads and checks everything that a configuration names. `validate` stops there, and `run` starts with it.
 
+mod draft;
 mod geometry;
 mod known_structures;
 mod load;
@@ -33,6 +34,7 @@ use crate::label_method::MethodConfig;
 use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
 use crate::process_config::{HashedFile, ModelFiles};
+pub use draft::CampaignDraft;
 use loader::Loader;
 pub use seed_structures::{SkippedStructure, SourcedStructure};
 pub use short_range::PairRange;

@@ -30,6 +30,7 @@ mod guards;
 mod hostile_labels;
 mod hosts;
 mod house;
+mod init;
 mod interruption;
 mod label;
 mod labelled;

@@ -1,20 +1,37 @@
 //! `calmwalk init`
 
-use std::fs;
+mod label_section;
+mod own_campaign;
+mod questions;
+mod suggestion;
+mod text;
+
+use std::fs::{self, File};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::{CommandError, ExitStatus};
 use crate::config::schema_text;
 use crate::output::print;
+use own_campaign::OwnCampaignArgs;
 
-/// Create a small runnable example with a commented campaign.toml
+/// Create the campaign.toml of your own campaign, or a small example that runs
 ///
-/// Also writes campaign.schema.json, which lets an editor complete and check campaign.toml.
+/// With --model, --structures and --label: writes a configuration of about twenty keys for them, with units and usual ranges in
+/// comments. Temperatures, τ, supercells, ZBL windows and collection rule are suggestions from model and structures. On a
+/// terminal, calmwalk asks for options that are missing. Lines that begin with FILL IN are yours to complete, such as the version
+/// of VASP; `calmwalk validate` refuses them until then. Paths are relative to DIR for files below it, absolute for others.
+///
+/// Without these options: writes a small example with all of its files, which lists every key.
+///
+/// Also writes campaign.schema.json, which lets an editor complete and check campaign.toml. Existing files are never overwritten.
 #[derive(Debug, clap::Args)]
 pub struct InitArgs {
     /// Directory for the files; created if it does not exist
     #[arg(value_name = "DIR")]
     directory: PathBuf,
+    #[command(flatten)]
+    own: OwnCampaignArgs,
 }
 
 macro_rules! example {
@@ -33,30 +50,21 @@ const FILES: [(&str, &[u8]); 5] = [
     example!("data/Al_mm.eam.fs"),
 ];
 
+/// Name of the configuration.
+const CONFIG: &str = "campaign.toml";
+
 /// The schema of the configuration, and the line by which editors find it.
 const SCHEMA: &str = "campaign.schema.json";
 const SCHEMA_LINE: &str = "#:schema ./campaign.schema.json\n\n";
 
 impl InitArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let config = self.directory.join("campaign.toml");
+        if self.own.is_given() {
+            return own_campaign::create(&self.directory, self.own);
+        }
+        let config = self.directory.join(CONFIG);
         let written = [SCHEMA_LINE.as_bytes(), CAMPAIGN].concat();
-        let schema = schema_text();
-        let written = [("campaign.toml", &written[..]), (SCHEMA, schema.as_bytes())];
-        let files: Vec<_> = FILES
-            .into_iter()
-            .chain(written)
-            .map(|(path, content)| (self.directory.join(path), content))
-            .collect();
-        if let Some((existing, _)) = files.iter().find(|(path, _)| path.exists()) {
-            let existing = existing.display();
-            return Err(CommandError::Input(format!(
-                "{existing} already exists: choose another directory or remove the file"
-            )));
-        }
-        for (path, content) in &files {
-            write(path, content)?;
-        }
+        write_all(&self.directory, FILES.into_iter().chain([(CONFIG, &written[..])]))?;
         print(|out| {
             writeln!(out, "created {} and the files it refers to; next:", config.display())?;
             writeln!(out, "  calmwalk run {}", config.display())?;
@@ -66,9 +74,37 @@ impl InitArgs {
     }
 }
 
+/// Writes these files, and the schema, into the directory.
+///
+/// # Errors
+/// One of them exists, in which case none is written.
+fn write_all<'a>(
+    directory: &Path,
+    files: impl IntoIterator<Item = (&'a str, &'a [u8])>,
+) -> Result<(), CommandError> {
+    let schema = schema_text();
+    let mut files: Vec<(PathBuf, &[u8])> =
+        files.into_iter().map(|(path, content)| (directory.join(path), content)).collect();
+    files.push((directory.join(SCHEMA), schema.as_bytes()));
+    refuse_existing(files.iter().map(|(path, _)| path.as_path()))?;
+    files.iter().try_for_each(|(path, content)| write(path, content))
+}
+
+fn refuse_existing<'a>(mut paths: impl Iterator<Item = &'a Path>) -> Result<(), CommandError> {
+    match paths.find(|path| path.exists()) {
+        Some(existing) => {
+            let existing = existing.display();
+            Err(CommandError::Input(format!(
+                "{existing} already exists: choose another directory or remove the file"
+            )))
+        }
+        None => Ok(()),
+    }
+}
+
 fn write(path: &Path, content: &[u8]) -> Result<(), CommandError> {
     let directory = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(directory)
-        .and_then(|()| fs::write(path, content))
+        .and_then(|()| File::create_new(path)?.write_all(content))
         .map_err(|error| CommandError::Failed(format!("cannot write {}: {error}", path.display())))
 }
