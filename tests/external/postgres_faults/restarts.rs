@@ -84,7 +84,7 @@ fn a_server_that_is_away_for_a_minute_is_waited_for() {
     let expected = uninterrupted_outcome(&small);
     let campaign = Campaign::new(&small, "away", 1, "");
     let (mut orchestrator, mut agent) = (campaign.hosts.start_orchestrator(), campaign.hosts.agent(0));
-    wait_until("candidates are sent", || campaign.counters().sent > 0);
+    wait_until("labels are made", || campaign.counters().labels > 0);
     let before = campaign.counters();
     control("halt");
     let said = |words: &str| campaign.hosts.orchestrator_stderr().contains(words);
