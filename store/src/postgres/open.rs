@@ -74,7 +74,7 @@ impl PostgresServer {
     }
 
     /// Migrates the tables to the newest version, checksums and words included, in one transaction. Only one process
-    /// does so at a time.
+    /// does so at a time. Creates the tables if the schema has none.
     async fn migrate(&self, url: &ServerUrl) -> Result<()> {
         let mut transaction = Transaction::Postgres(self.begin().await?, self.clock);
         let one = "SELECT 1::BIGINT FROM pg_advisory_xact_lock(hashtext($1))";
@@ -100,7 +100,7 @@ impl PostgresServer {
     }
 }
 
-/// Creates the schema and its tables if they do not exist.
+/// Creates the schema and its tables if they do not exist. Others see no tables or all of them.
 pub(super) async fn make_tables(url: &ServerUrl, server: &PostgresServer) -> Result<()> {
     let mut connection = server.connection().await?;
     if version(url, &mut connection).await? == Some(SCHEMA) {
@@ -119,7 +119,7 @@ pub(super) async fn make_tables(url: &ServerUrl, server: &PostgresServer) -> Res
         }
     }
     drop(connection);
-    MIGRATIONS.run(&server.pool).await.map_err(schema_error)
+    server.migrate(url).await
 }
 
 /// The name of each table in the schema with each of its columns.

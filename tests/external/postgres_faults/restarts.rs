@@ -3,7 +3,7 @@
 use std::thread::sleep;
 use std::time::Duration;
 
-use super::server::{Campaign, control};
+use super::server::{Campaign, Halted, control};
 use crate::common::campaign::Small;
 use crate::common::hosts::uninterrupted_outcome;
 use crate::common::processes::{processes_running, signal, wait_for_process, wait_until};
@@ -22,7 +22,7 @@ fn restarts_change_nothing() {
     let campaign = Campaign::new(&small, "restarts", 1, "");
     let (mut orchestrator, mut agent) = (campaign.hosts.start_orchestrator(), campaign.hosts.agent(0));
     // From the first candidate on: a fast machine may end the campaign before the last restart otherwise.
-    wait_until("candidates are sent", || campaign.counters().sent > 0);
+    campaign.wait_until(&mut orchestrator, "candidates are sent", || campaign.counters().sent > 0);
     let (mut before, mut restarts) = (campaign.counters(), 0);
     while restarts < 4 {
         // Either counter: the walks may end before a labeller tries again.
@@ -59,13 +59,7 @@ fn restarts_change_nothing_in_one_process() {
     let mut orchestrator = campaign.hosts.start_orchestrator();
     for restart in 0..2 {
         let before = campaign.counters();
-        wait_until("the campaign advances", || {
-            let over = orchestrator.0.try_wait().unwrap();
-            assert!(
-                over.is_none(),
-                "it is over before restart {restart}: {}",
-                campaign.hosts.orchestrator_stderr()
-            );
+        campaign.wait_until(&mut orchestrator, "the campaign advances", || {
             let now = campaign.counters();
             now.sent > before.sent || now.labels > before.labels
         });
@@ -84,11 +78,11 @@ fn a_server_that_is_away_for_a_minute_is_waited_for() {
     let expected = uninterrupted_outcome(&small);
     let campaign = Campaign::new(&small, "away", 1, "");
     let (mut orchestrator, mut agent) = (campaign.hosts.start_orchestrator(), campaign.hosts.agent(0));
-    wait_until("labels are made", || campaign.counters().labels > 0);
+    campaign.wait_until(&mut orchestrator, "labels are made", || campaign.counters().labels > 0);
     let before = campaign.counters();
-    control("halt");
+    let halted = Halted::now();
     let said = |words: &str| campaign.hosts.orchestrator_stderr().contains(words);
-    wait_until("the orchestrator reports why it waits", || {
+    campaign.wait_until(&mut orchestrator, "the orchestrator reports why it waits", || {
         said("waiting for the database: the database server does not answer")
     });
     let labeller = wait_for_process(campaign.home(), "labeller");
@@ -99,7 +93,7 @@ fn a_server_that_is_away_for_a_minute_is_waited_for() {
     sleep(Duration::from_secs(60));
     assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.orchestrator_stderr());
     assert!(agent.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.said(0));
-    control("resume");
+    drop(halted);
     wait_until("the orchestrator reports that the database answers", || said("the database answers again"));
     let after = campaign.counters();
     assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");

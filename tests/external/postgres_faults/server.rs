@@ -4,9 +4,10 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
+use crate::common::Running;
 use crate::common::campaign::{Counters, Outcome, Small, outcome_at};
 use crate::common::hosts::Hosts;
-use crate::common::processes::assert_no_leftovers;
+use crate::common::processes::{assert_no_leftovers, wait_until};
 
 /// Controls the server: `restart` in order, `crash` and restart, `halt`, `resume`.
 pub fn control(action: &str) {
@@ -14,6 +15,22 @@ pub fn control(action: &str) {
         .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/.ci/postgres").into());
     let done = Command::new("sh").args(["-c", &format!("{command} {action}")]).status().unwrap();
     assert!(done.success(), "{command} {action}");
+}
+
+/// A server that is down, until this is dropped: the tests after one that fails need it.
+pub struct Halted(());
+
+impl Halted {
+    pub fn now() -> Self {
+        control("halt");
+        Self(())
+    }
+}
+
+impl Drop for Halted {
+    fn drop(&mut self) {
+        control("resume");
+    }
 }
 
 /// URL of a schema that no other test uses.
@@ -43,6 +60,16 @@ impl Campaign {
 
     pub fn counters(&self) -> Counters {
         Counters::read(&self.location, self.home())
+    }
+
+    /// Waits until a condition holds while the orchestrator runs.
+    pub fn wait_until(&self, orchestrator: &mut Running, what: &str, mut is_so: impl FnMut() -> bool) {
+        wait_until(what, || {
+            let is_so = is_so();
+            let ended = if is_so { None } else { orchestrator.0.try_wait().unwrap() };
+            assert!(ended.is_none(), "{ended:?} before {what}: {}", self.hosts.orchestrator_stderr());
+            is_so
+        });
     }
 
     /// Checks that nothing is lost or duplicated, and that all processes have exited.
