@@ -9,6 +9,7 @@ mod grace_features;
 mod grace_files;
 mod grace_golden;
 mod grace_mixed;
+mod grace_training;
 mod grace_variants;
 mod lammps;
 mod potential_files;

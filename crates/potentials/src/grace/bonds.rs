@@ -8,6 +8,7 @@ use atoms::{Matrix3, NeighbourList, Structure, Vec3};
 use super::batches::Batches;
 use super::chunked_slices::{ChunkedSlice, PerChunk, PlaceLayout};
 use super::layer::Layer;
+use super::radial::RadialFunctions;
 use super::radial_network::RadialWork;
 use super::tape::TapeSlot;
 use super::threads::Threads;
@@ -66,7 +67,7 @@ impl GraceBonds {
             for place in chunk.places.clone() {
                 let before = found.len();
                 let atom = batches.order[place] as usize;
-                found.extend(bonds_of(atom, layer, structure, neighbours, elements, batches));
+                found.extend(bonds_of(atom, &layer.radial, structure, neighbours, elements, batches));
                 counts.slice(&(place..place + 1))[0] = found.len() - before;
             }
         });
@@ -137,9 +138,9 @@ impl GraceBonds {
 }
 
 /// The bonds of an atom within the cutoff of their pair.
-fn bonds_of<V: Vector>(
+pub(super) fn bonds_of<V: Vector>(
     atom: usize,
-    layer: &Layer<V>,
+    radial: &RadialFunctions<V>,
     structure: &Structure,
     neighbours: &NeighbourList,
     elements: &[usize],
@@ -149,7 +150,7 @@ fn bonds_of<V: Vector>(
         let j = neighbour.atom as usize;
         let d = neighbour.displacement(structure, atom);
         let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
-        let is_within = r < layer.radial.cutoff(layer.radial.pair(elements[atom], elements[j]));
+        let is_within = r < radial.cutoff(radial.pair(elements[atom], elements[j]));
         is_within.then(|| GraceBond { neighbour: batches.places[j], element: elements[j] as u32, d, r })
     })
 }

@@ -12,6 +12,7 @@ use super::networks::readout;
 use super::projection::{FeatureMap, GraceProjection, has_projection};
 use super::shared_reader::reject_unread_arrays;
 use super::vector::Vector;
+use super::weight_arrays::WeightArrays;
 
 /// What a reader has extracted from a file.
 pub(super) struct ModelBuilder<'a, V: Vector> {
@@ -23,8 +24,8 @@ pub(super) struct ModelBuilder<'a, V: Vector> {
     pub block_order: Vec<usize>,
     /// Number of densities y.
     pub n_densities: usize,
-    /// Number of trained weights outside the graphs.
-    pub weights: usize,
+    /// The trained arrays outside the graphs.
+    pub weights: WeightArrays,
 }
 
 /// All parts of a model.
@@ -33,11 +34,12 @@ pub(super) struct ModelParts<V: Vector> {
     /// The largest r_c over all layers for centre and neighbour element, `[n_elements²]`, Å.
     pub pair_cutoffs: Vec<f64>,
     pub description: GraceDescription,
+    pub arrays: WeightArrays,
 }
 
 impl<V: Vector> ModelBuilder<'_, V> {
-    /// Reads what follows the layers. Rejects the file if an array remains unread.
-    pub fn finish(mut self) -> Result<ModelParts<V>, GraceError> {
+    /// Reads what follows the layers; `training` as in [`super::read_options::ReadOptions`]. Rejects the file if an array remains unread.
+    pub fn finish(mut self, training: bool) -> Result<ModelParts<V>, GraceError> {
         let archive = self.archive;
         let blocks = self.layers.iter().map(|layer| layer.block.clone()).collect();
         let readout = readout(archive, blocks, self.n_densities, self.elements.len(), &mut self.weights)?;
@@ -45,6 +47,9 @@ impl<V: Vector> ModelBuilder<'_, V> {
         let basis = BasisLayout::new::<V>(&sources, &self.block_order);
         let feature_map = feature_map(archive, &basis)?;
         reject_unread_arrays(archive, self.architecture.number_of_layers())?;
+        for layer in &mut self.layers {
+            self.weights.append(std::mem::take(&mut layer.graph.weights));
+        }
         let description = self.describe(basis.dimension, feature_map.as_ref())?;
         let pairs = 0..self.elements.len() * self.elements.len();
         let radial = self.layers.iter().map(|layer| &layer.radial);
@@ -53,10 +58,10 @@ impl<V: Vector> ModelBuilder<'_, V> {
         let (mut layers, mut drafts) = (Vec::new(), self.layers.into_iter().peekable());
         while let Some(draft) = drafts.next() {
             let message = drafts.peek_mut().and_then(|next| next.message.from.as_mut());
-            layers.push(draft.finish(message));
+            layers.push(draft.finish(message, training));
         }
         let network = Network { layers, readout, basis, feature_map };
-        Ok(ModelParts { network, pair_cutoffs, description })
+        Ok(ModelParts { network, pair_cutoffs, description, arrays: self.weights })
     }
 
     fn describe(
@@ -77,7 +82,7 @@ impl<V: Vector> ModelBuilder<'_, V> {
             basis_functions: self.layers.iter().flat_map(|layer| layer.graph.source_names.clone()).collect(),
             basis_dimension,
             feature_dimension: feature_map.map_or(0, |map| map.projection.feature_dimension()),
-            weights: self.weights + self.layers.iter().map(|layer| layer.graph.weights).sum::<usize>(),
+            weights: self.weights.count(),
             radial_tables: radial
                 .flat_map(|radial| radial.tables())
                 .map(|table| (table.intervals(), table.errors()))

@@ -15,7 +15,7 @@ impl<V: Vector> Evaluator<V> {
         let atoms = self.atomic_energies().len() as u64;
         let maps = network.readout.blocks.iter().map(|block| &block.weights);
         let mut of_atom = 2 * maps.map(size).sum::<u64>();
-        of_atom += 2 * network.readout.layers.iter().map(|(layer, _)| layer.size()).sum::<u64>();
+        of_atom += 2 * network.readout.layers.iter().map(|layer| layer.forward(0).size()).sum::<u64>();
         if let Some(projection) = network.projection().filter(|_| with_features) {
             of_atom += 2 * projection.matrix.len() as u64;
         }

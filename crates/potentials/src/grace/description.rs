@@ -66,7 +66,7 @@ pub struct GraceDescription {
     pub basis_dimension: usize,
     /// D, the dimension of z; 0 without a projection.
     pub feature_dimension: usize,
-    /// Number of trained weights.
+    /// Number of weights that can be trained, the elements' shifts included.
     pub weights: usize,
     /// Tables of radial functions: number of intervals, and the measured relative errors of values and
     /// derivatives; empty on the exact path.

@@ -6,7 +6,7 @@ use super::graph::Graph;
 use super::linear::{Linear, LinearPart};
 use super::tape::{TapeOperation, Tensor};
 use super::vector::{Vector, to_lanes};
-use super::weights::Weights;
+use super::weight_map::{WeightBlock, WeightMap};
 
 impl<V: Vector> Graph<'_, V> {
     /// The product of left and right after mixing their channels with the weights U and V of each component's
@@ -39,17 +39,27 @@ impl<V: Vector> Graph<'_, V> {
         let rank = archive.count(&key("rank"), 1, 4096)?;
         let n_groups = archive.count(&key(&format!("n_groups_{side}")), 1, 1 << 16)?;
         archive.expect_count(&key(&format!("n_{side}")), tensor.channels)?;
-        let weights = archive.floats(&key(matrix), &[n_groups, rank, tensor.channels])?;
+        let channels = tensor.channels;
+        self.weights.read_exactly(archive, &key(matrix), &[n_groups, rank, channels])?;
         let groups = archive.exactly_indices(&key(&format!("group_{side}")), tensor.components, n_groups)?;
         let norm = archive.scalar(&key(norm))?;
-        self.weights += weights.len();
         let out = self.push(&format!("{name} {side}"), tensor.components, rank)?;
         let mut parts = Vec::new();
         for group in 0..n_groups {
             let rows: Vec<usize> = (0..groups.len()).filter(|w| groups[*w] == group).collect();
             let rows = rows.iter().map(|w| (tensor.row(*w) as u32, out.row(*w) as u32)).unzip();
-            let element = |_, n, k| norm * weights[(group * rank + k) * tensor.channels + n];
-            parts.push(LinearPart::new(Weights::new(1, tensor.channels, rank, element), rows));
+            let block = WeightBlock {
+                array: key(matrix),
+                norm,
+                factor: 1.0,
+                first: group * rank * channels,
+                strides: [0, 1, channels],
+                inputs: [0, channels],
+                outputs: [0, rank],
+            };
+            let map =
+                WeightMap { types: 1, inputs: channels, outputs: rank, identity: 0.0, blocks: vec![block] };
+            parts.push(LinearPart::new(map, &self.weights, rows));
         }
         parts.retain(|part| !part.tape[0].is_empty());
         self.operations.push(TapeOperation::Linear(Linear { parts }));
@@ -59,7 +69,7 @@ impl<V: Vector> Graph<'_, V> {
     /// Applies the norm `name` to a tensor.
     pub fn equivariant_norm(&mut self, name: &str, from: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("{name}_{suffix}"));
-        let ([groups, channels], weights) = archive.tensor::<2>(&key("affine_weight"))?;
+        let [groups, channels] = self.weights.read(archive, &key("affine_weight"))?;
         if channels != from.channels {
             let found = format!("{channels} columns wide");
             return Err(mismatch(
@@ -84,8 +94,8 @@ impl<V: Vector> Graph<'_, V> {
             let found = format!("partly {negative}");
             return Err(mismatch(archive, &key("degree_weights"), found, "numbers not below zero"));
         }
-        self.weights += weights.len();
         let to = self.push(name, from.components, channels)?;
+        let weights = self.weights.get(&key("affine_weight"));
         self.operations.push(TapeOperation::EquivariantNorm(EquivariantNorm {
             from,
             to,

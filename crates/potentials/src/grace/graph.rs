@@ -12,7 +12,8 @@ use super::schedule::depth_first;
 use super::tape::{TapeOperation, Tensor};
 use super::tape_program::TapeProgram;
 use super::vector::{Number, Vector, lanes_for};
-use super::weights::Weights;
+use super::weight_arrays::WeightArrays;
+use super::weight_map::{WeightBlock, WeightMap};
 
 /// A longer tape indicates a corrupt file (64 MiB per atom).
 const MAX_TAPE_LANES: usize = 1 << 20;
@@ -31,8 +32,8 @@ pub(super) struct Graph<'a, V: Vector> {
     /// Components and channels of each source of the basis.
     pub(super) sources: Vec<(usize, usize)>,
     pub(super) source_names: Vec<String>,
-    /// Number of trained weights so far.
-    pub weights: usize,
+    /// The trained arrays that were read so far.
+    pub weights: WeightArrays,
 }
 
 impl<'a, V: Vector> Graph<'a, V> {
@@ -52,7 +53,7 @@ impl<'a, V: Vector> Graph<'a, V> {
             basis: Vec::new(),
             sources: Vec::new(),
             source_names: Vec::new(),
-            weights: 0,
+            weights: WeightArrays::default(),
         };
         graph.push(name, components, channels)?;
         Ok(graph)
@@ -100,10 +101,11 @@ impl<'a, V: Vector> Graph<'a, V> {
         };
 
         let left_weights = if archive.count(&key("left_coefs"), 0, 1)? == 1 {
-            let weights = self.channel_weights(&key("w_left"), channels, left.channels)?;
+            let norm = archive.scalar(&key("norm_left"))?;
+            let weights = self.channel_weights(&key("w_left"), norm, channels, left.channels)?;
             let tiles = archive.exactly_indices(&key("w_tile_left"), left.components, weights.tiles)?;
             tiles.iter().enumerate().for_each(|(w, tile)| add(false, *tile, left.row(w), w));
-            weights.scaled(archive.scalar(&key("norm_left"))?)
+            weights
         } else {
             archive.ignore(&key("w_tile_left"));
             (0..left.components).for_each(|w| add(false, 0, left.row(w), w));
@@ -113,21 +115,19 @@ impl<'a, V: Vector> Graph<'a, V> {
             }
             ChannelWeights::identity(channels)
         };
-        let right_weights = self.channel_weights(&key("w_right"), channels, right.channels)?;
+        let norm = archive.scalar(&key("norm_right"))?;
+        let right_weights = self.channel_weights(&key("w_right"), norm, channels, right.channels)?;
         let to = archive.indices(&key("collect_to"), left.components)?;
         let from = archive.exactly_indices(&key("collect_from"), to.len(), right.components)?;
         let tiles = archive.exactly_indices(&key("w_tile_right"), to.len(), right_weights.tiles)?;
         for ((to, from), tile) in to.iter().zip(&from).zip(&tiles) {
             add(true, *tile, right.row(*from), *to);
         }
-        let right_weights = right_weights.scaled(archive.scalar(&key("norm_right"))?);
 
         let part = |((is_right, tile, factor), rows): ((bool, usize, u64), Vec<(u32, u32)>)| {
             let weights = if is_right { &right_weights } else { &left_weights };
-            let factor = f64::from_bits(factor);
-            let weights =
-                Weights::new(1, weights.inputs, channels, |_, n, k| factor * weights.at(k, n, tile));
-            LinearPart::new(weights, rows.into_iter().unzip())
+            let map = weights.map(channels, tile, f64::from_bits(factor));
+            LinearPart::new(map, &self.weights, rows.into_iter().unzip())
         };
         let parts = merged(rows.into_iter().map(part).collect());
         self.operations.push(TapeOperation::Linear(Linear { parts }));
@@ -137,16 +137,16 @@ impl<'a, V: Vector> Graph<'a, V> {
     fn channel_weights(
         &mut self,
         key: &str,
+        norm: f64,
         outputs: usize,
         inputs: usize,
     ) -> Result<ChannelWeights, GraceError> {
-        let ([k, n, tiles], weights) = self.archive.tensor::<3>(key)?;
+        let [k, n, tiles] = self.weights.read(self.archive, key)?;
         if [k, n] != [outputs, inputs] {
             let found = format!("of shape {:?}", [k, n, tiles]);
             return Err(mismatch(self.archive, key, found, format!("shape [{outputs}, {inputs}, …]")));
         }
-        self.weights += weights.len();
-        Ok(ChannelWeights { inputs, tiles, weights })
+        Ok(ChannelWeights { inputs, tiles, norm, array: Some(key.to_owned()) })
     }
 
     /// The product left × right, coupled by Clebsch–Gordan coefficients per channel.
@@ -228,7 +228,7 @@ impl<'a, V: Vector> Graph<'a, V> {
 
     /// Removes operations whose results neither the basis nor `message` needs, and allocates lanes on the
     /// tapes, also for `message`.
-    pub fn finish(mut self, message: Option<&mut Tensor>) -> TapeProgram<V> {
+    pub fn finish(mut self, message: Option<&mut Tensor>, training: bool) -> TapeProgram<V> {
         let mut needed = vec![false; self.end];
         self.basis.iter().for_each(|(row, _)| needed[*row] = true);
         let mut fixed = vec![self.density()];
@@ -239,7 +239,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         for tensor in &self.tensors {
             tensor.rows().for_each(|row| widths[row] = tensor.width);
         }
-        allocate(depth_first(self.operations), &widths, fixed, &self.basis, message)
+        allocate(depth_first(self.operations), &widths, fixed, &self.basis, message, training)
     }
 }
 
@@ -248,32 +248,40 @@ fn merged<V: Vector>(parts: Vec<LinearPart<V>>) -> Vec<LinearPart<V>> {
     let mut found: Vec<LinearPart<V>> = Vec::new();
     for part in parts {
         match found.iter_mut().find(|other| other.tape == part.tape) {
-            Some(other) => other.weights.add(&part.weights),
+            Some(other) => other.add(part),
             None => found.push(part),
         }
     }
     found
 }
 
-/// Weights `[k, n, tile]` that mix channels.
+/// Weights `[k, n, tile]` that mix channels, times their norm.
 struct ChannelWeights {
     inputs: usize,
     tiles: usize,
-    weights: Vec<f64>,
+    norm: f64,
+    /// `None` for the identity.
+    array: Option<String>,
 }
 
 impl ChannelWeights {
     fn identity(channels: usize) -> Self {
-        let element = |kn: usize| f64::from(u8::from(kn / channels == kn % channels));
-        Self { inputs: channels, tiles: 1, weights: (0..channels * channels).map(element).collect() }
+        Self { inputs: channels, tiles: 1, norm: 1.0, array: None }
     }
 
-    fn at(&self, k: usize, n: usize, tile: usize) -> f64 {
-        self.weights[(k * self.inputs + n) * self.tiles + tile]
-    }
-
-    fn scaled(mut self, norm: f64) -> Self {
-        self.weights.iter_mut().for_each(|w| *w *= norm);
-        self
+    /// The matrix of one tile, times a factor.
+    fn map(&self, outputs: usize, tile: usize, factor: f64) -> WeightMap {
+        let (inputs, tiles) = (self.inputs, self.tiles);
+        let block = |array: &String| WeightBlock {
+            array: array.clone(),
+            norm: self.norm,
+            factor,
+            first: tile,
+            strides: [0, tiles, inputs * tiles],
+            inputs: [0, inputs],
+            outputs: [0, outputs],
+        };
+        let identity = if self.array.is_none() { factor } else { 0.0 };
+        WeightMap { types: 1, inputs, outputs, identity, blocks: self.array.iter().map(block).collect() }
     }
 }

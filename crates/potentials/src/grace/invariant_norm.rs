@@ -3,7 +3,7 @@
 use super::vector::Number;
 
 /// Keeps the norm differentiable where all invariants vanish.
-const SQUARE_FLOOR: f64 = 1e-10;
+pub(super) const SQUARE_FLOOR: f64 = 1e-10;
 
 /// y_k = s_k x_k / √(mean x² + 10⁻¹⁰), with the mean over the same channels; channel 0 may be excluded.
 #[derive(Clone, Debug)]
@@ -12,10 +12,13 @@ pub(super) struct InvariantNorm {
     pub linear: Option<f64>,
     /// s of the other channels.
     pub scale: Vec<f64>,
+    /// Name of s in the file.
+    pub array: String,
 }
 
 impl InvariantNorm {
-    fn first(&self) -> usize {
+    /// The first channel that is normalised.
+    pub fn first(&self) -> usize {
         usize::from(self.linear.is_some())
     }
 

@@ -1,5 +1,6 @@
 //! One message-passing layer: the sum over neighbours and the operations on it.
 
+use super::element_factors::ElementFactors;
 use super::graph::Graph;
 use super::harmonics::Harmonics;
 use super::radial::RadialFunctions;
@@ -31,6 +32,8 @@ pub(super) struct LayerMessage<V> {
     pub components: usize,
     /// c, \[element\]\[q\]\[channel\]
     pub constants: Vec<Vec<V>>,
+    /// What the file says about c: that of the last component in models of one or two layers.
+    pub factors: ElementFactors,
 }
 
 impl<V: Vector> LayerMessage<V> {
@@ -56,13 +59,13 @@ pub(super) struct LayerDraft<'a, V: Vector> {
 
 impl<V: Vector> LayerDraft<'_, V> {
     /// Completes the layer. `message` is the tensor that the next layer uses; receives its lanes.
-    pub fn finish(self, message: Option<&mut Tensor>) -> Layer<V> {
+    pub fn finish(self, message: Option<&mut Tensor>, training: bool) -> Layer<V> {
         Layer {
             radial: self.radial,
             harmonics: Harmonics::new(self.lmax),
             message: self.message,
             density: self.graph.density(),
-            steps: self.graph.finish(message),
+            steps: self.graph.finish(message, training),
         }
     }
 }

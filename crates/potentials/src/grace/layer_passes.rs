@@ -351,7 +351,12 @@ fn energy_basis_cotangent<V: Vector>(
 /// Adds the cotangents of messages, one row per atom, to the tape's cotangents in the slots from `first` of
 /// `slots`.
 #[inline(always)]
-fn add_returned<V: Vector>(tensor: &Tensor, rows: &[V], tape: &mut [V], (first, slots): (usize, usize)) {
+pub(super) fn add_returned<V: Vector>(
+    tensor: &Tensor,
+    rows: &[V],
+    tape: &mut [V],
+    (first, slots): (usize, usize),
+) {
     for (atom, row) in rows.chunks_exact(tensor.components * tensor.width).enumerate() {
         let slot = TapeSlot { slot: first + atom, slots };
         for (q, row) in row.chunks_exact(tensor.width).enumerate() {

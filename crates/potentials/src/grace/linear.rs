@@ -3,6 +3,9 @@
 use super::matrix::StridedRows;
 use super::tape::AtomBatch;
 use super::vector::Vector;
+use super::weight_arrays::WeightArrays;
+use super::weight_gradient::WeightGradient;
+use super::weight_map::WeightMap;
 use super::weights::Weights;
 
 /// out_k,w = Σ over parts of Σ_n W_kn x_n,w′.
@@ -17,6 +20,8 @@ pub(super) struct Linear<V> {
 pub(super) struct LinearPart<V> {
     /// `[n_in × n_out]`
     pub weights: Weights<V>,
+    /// Where they stand in the file.
+    pub map: WeightMap,
     /// Lanes at which each row is read and to which it is added.
     pub tape: [Vec<u32>; 2],
     /// The same on the cotangents' tape; set by [`Linear::rename`].
@@ -25,8 +30,15 @@ pub(super) struct LinearPart<V> {
 
 impl<V: Vector> LinearPart<V> {
     /// From the lanes at which each row is read and to which it is added.
-    pub fn new(weights: Weights<V>, (from, to): (Vec<u32>, Vec<u32>)) -> Self {
-        Self { weights, tape: [from, to], cotangents: Default::default() }
+    pub fn new(map: WeightMap, arrays: &WeightArrays, (from, to): (Vec<u32>, Vec<u32>)) -> Self {
+        Self { weights: map.fill(arrays), map, tape: [from, to], cotangents: Default::default() }
+    }
+
+    /// Adds the weights of a part with the same rows.
+    pub fn add(&mut self, other: Self) {
+        self.weights.add(&other.weights);
+        self.map.identity += other.map.identity;
+        self.map.blocks.extend(other.map.blocks);
     }
 
     /// Input and output rows at these lanes.
@@ -56,6 +68,26 @@ impl<V: Vector> Linear<V> {
             let (from, to) = part.rows(&part.cotangents, N * batch.atoms);
             let weights = part.weights.transposed(batch.element);
             weights.multiply_add(&mut *cotangent, to, from, batch.instructions);
+        }
+    }
+
+    /// Adds the derivatives with respect to the weights of each part, from two cotangents of the results: of their
+    /// derivative along a direction and of their values.
+    #[inline(always)]
+    pub fn add_weight_gradients(
+        &self,
+        batch: &AtomBatch,
+        tapes: [&[V]; 2],
+        cotangent: &[V],
+        of_weights: &mut [WeightGradient<V>],
+    ) {
+        for (part, of_weights) in self.parts.iter().zip(of_weights) {
+            let (from, _) = part.rows(&part.tape, batch.atoms);
+            let (_, first) = part.rows(&part.cotangents, 2 * batch.atoms);
+            let second = StridedRows { shift: batch.atoms * first.stride, ..first };
+            let [values, along] = tapes;
+            of_weights.add_outer_products(batch.element, batch.atoms, (along, from), (cotangent, first));
+            of_weights.add_outer_products(batch.element, batch.atoms, (values, from), (cotangent, second));
         }
     }
 

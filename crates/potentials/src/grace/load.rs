@@ -13,8 +13,10 @@ use super::network::{AnyNetwork, Network};
 use super::precision::Precision;
 use super::projection::has_projection;
 use super::radial::RadialPath;
+use super::read_options::ReadOptions;
 use super::symmetry::require_invariance;
 use super::vector::Vector;
+use super::weight_arrays::WeightArrays;
 use super::{one_layer, three_layers, two_layers};
 
 impl GraceModel {
@@ -40,10 +42,12 @@ impl GraceModel {
     /// As [`GraceModel::load`].
     pub fn load_in(path: &Path, precision: Precision, radial: RadialPath) -> Result<Self, GraceError> {
         let archive = NpzFile::open(path)?;
-        match precision {
-            Precision::Double => Self::read(&archive, radial, AnyNetwork::Double),
-            Precision::Mixed => Self::read(&archive, radial, AnyNetwork::Mixed),
-        }
+        let options = ReadOptions { radial, training: false };
+        let read = match precision {
+            Precision::Double => Self::read(&archive, options, AnyNetwork::Double),
+            Precision::Mixed => Self::read(&archive, options, AnyNetwork::Mixed),
+        };
+        read.map(|(model, _)| model)
     }
 
     /// Whether a file has a projection of the features.
@@ -54,22 +58,24 @@ impl GraceModel {
         Ok(has_projection(&NpzFile::open(path)?))
     }
 
-    fn read<V: Vector>(
+    /// The model and its trained arrays.
+    pub(super) fn read<V: Vector>(
         archive: &NpzFile,
-        path: RadialPath,
+        options: ReadOptions,
         any: fn(Arc<Network<V>>) -> AnyNetwork,
-    ) -> Result<Self, GraceError> {
+    ) -> Result<(Self, WeightArrays), GraceError> {
         let architecture = detect(archive);
-        let ModelParts { network, pair_cutoffs, description } = match architecture {
-            Architecture::OneLayer => one_layer::read(archive, path)?,
-            Architecture::TwoLayer => two_layers::read(archive, path)?,
-            Architecture::ThreeLayer => three_layers::read(archive, path)?,
+        let ModelParts { network, pair_cutoffs, description, arrays } = match architecture {
+            Architecture::OneLayer => one_layer::read(archive, options)?,
+            Architecture::TwoLayer => two_layers::read(archive, options)?,
+            Architecture::ThreeLayer => three_layers::read(archive, options)?,
         };
         let model = Self { network: any(Arc::new(network)), pair_cutoffs, description };
-        match architecture {
-            Architecture::OneLayer => Ok(model),
-            _ => require_invariance(archive, model),
-        }
+        let model = match architecture {
+            Architecture::OneLayer => model,
+            _ => require_invariance(archive, model)?,
+        };
+        Ok((model, arrays))
     }
 }
 

@@ -27,6 +27,12 @@ impl<V: Vector> Matrix<V> {
         Self { inputs, outputs, panels }
     }
 
+    /// The transpose.
+    pub fn transposed(&self) -> Self {
+        let at = |i: usize, o: usize| self.panels[o / V::LANES * self.inputs + i][o % V::LANES].into();
+        Self::from_fn(self.outputs, self.inputs, |o, i| at(i, o))
+    }
+
     /// Inputs times outputs.
     pub fn size(&self) -> u64 {
         self.inputs as u64 * self.outputs as u64

@@ -12,12 +12,14 @@ use super::error::GraceError;
 use super::graph::Graph;
 use super::layer::{LayerDraft, LayerMessage};
 use super::networks::radial_network;
-use super::radial::{RadialFunctions, RadialPath};
+use super::radial::RadialFunctions;
+use super::read_options::ReadOptions;
 use super::readout::ReadoutBlock;
 use super::shared_reader::{Embedding, Powers, cutoffs, elements, reject_unsupported_radial_variants};
 use super::vector::Vector;
+use super::weight_arrays::WeightArrays;
 
-pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &NpzFile, options: ReadOptions) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
     reject_unsupported_radial_variants(archive, "mlp_rad", "A")?;
     let lmax = archive.count("lmax", 0, 12)?;
@@ -26,18 +28,20 @@ pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<Mod
         archive.expect_count("nradmax", channels)?;
     }
     let cutoffs = cutoffs(archive, elements.len())?;
-    let mut weights = 0;
+    let mut weights = WeightArrays::default();
     let network = radial_network::<V>(archive, "mlp_rad", lmax, channels, &mut weights)?;
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
     let scale = archive.scalar("A_inv_avg_n_neigh")?;
-    let constants = embedding.transformed(archive, "A_lin_transform", channels, scale, &mut weights)?;
+    let factors = embedding.transformed(archive, "A_lin_transform", channels, scale, &mut weights)?;
 
     let mut graph = Graph::new(archive, "A", (lmax + 1) * (lmax + 1), channels)?;
     let a = graph.density();
     Powers { letter: "A", third_with_mixed: true, taken_by: &["rho"] }.make(&mut graph, a)?;
-    let block = ReadoutBlock { weights: graph.invariants("rho", elements.len())?, norm: None };
-    let radial = RadialFunctions::new(network, elements.len(), cutoffs, path);
-    let message = LayerMessage { from: None, components: 1, constants };
+    let (of_basis, map) = graph.invariants("rho", elements.len())?;
+    let block = ReadoutBlock { weights: of_basis, map, norm: None };
+    let radial = RadialFunctions::new(network, elements.len(), cutoffs, options.table_error::<V>());
+    let constants = factors.rows(&weights);
+    let message = LayerMessage { from: None, components: 1, constants, factors };
     let n_densities = archive.count("rho_n_out", 1, 4096)?;
     ModelBuilder {
         archive,
@@ -48,5 +52,5 @@ pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<Mod
         n_densities,
         weights,
     }
-    .finish()
+    .finish(options.training)
 }

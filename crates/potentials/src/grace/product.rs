@@ -48,11 +48,11 @@ impl<V: Vector> Product<V> {
         for output in &self.outputs {
             let out = output.row * atoms;
             for c in (0..whole).step_by(LANES_PER_PASS) {
-                let [sums] = couple::<V, 1, LANES_PER_PASS>(&output.terms, tape, 0, tape, atoms, c);
+                let [sums] = couple::<V, 1, LANES_PER_PASS>(&output.terms, (tape, atoms, 0), tape, atoms, c);
                 tape[out + c..][..LANES_PER_PASS].copy_from_slice(&sums);
             }
             for c in whole..lanes {
-                let [[sum]] = couple::<V, 1, 1>(&output.terms, tape, 0, tape, atoms, c);
+                let [[sum]] = couple::<V, 1, 1>(&output.terms, (tape, atoms, 0), tape, atoms, c);
                 tape[out + c] = sum;
             }
         }
@@ -66,12 +66,53 @@ impl<V: Vector> Product<V> {
         for input in &self.inputs {
             let out = input.row * N * atoms;
             for c in (0..whole).step_by(LANES_PER_PASS) {
-                let sums = couple::<V, N, LANES_PER_PASS>(&input.terms, cotangent, lanes, tape, atoms, c);
+                let left = (&*cotangent, N * atoms, lanes);
+                let sums = couple::<V, N, LANES_PER_PASS>(&input.terms, left, tape, atoms, c);
                 add::<V, N, LANES_PER_PASS>(&mut cotangent[out + c..], lanes, &sums);
             }
             for c in whole..lanes {
-                let sums = couple::<V, N, 1>(&input.terms, cotangent, lanes, tape, atoms, c);
+                let left = (&*cotangent, N * atoms, lanes);
+                let sums = couple::<V, N, 1>(&input.terms, left, tape, atoms, c);
                 add::<V, N, 1>(&mut cotangent[out + c..], lanes, &sums);
+            }
+        }
+    }
+
+    /// The derivative of the result along those of the factors: Σ C (left′ right + left right′).
+    #[inline(always)]
+    pub fn forward_derivative(&self, atoms: usize, tape: &[V], along: &mut [V]) {
+        let lanes = self.width * atoms;
+        let whole = lanes / LANES_PER_PASS * LANES_PER_PASS;
+        for output in &self.outputs {
+            let out = output.row * atoms;
+            for c in (0..whole).step_by(LANES_PER_PASS) {
+                let sums = couple_derivative::<V, LANES_PER_PASS>(&output.terms, tape, along, atoms, c);
+                along[out + c..][..LANES_PER_PASS].copy_from_slice(&sums);
+            }
+            for c in whole..lanes {
+                let [sum] = couple_derivative::<V, 1>(&output.terms, tape, along, atoms, c);
+                along[out + c] = sum;
+            }
+        }
+    }
+
+    /// Adds to the second of two cotangents of both factors what the first contributes by the derivative of the
+    /// other factor.
+    #[inline(always)]
+    pub fn backward_derivative(&self, atoms: usize, along: &[V], cotangent: &mut [V]) {
+        let lanes = self.width * atoms;
+        let whole = lanes / LANES_PER_PASS * LANES_PER_PASS;
+        for input in &self.inputs {
+            let out = input.row * 2 * atoms + lanes;
+            for c in (0..whole).step_by(LANES_PER_PASS) {
+                let left = (&*cotangent, 2 * atoms, 0);
+                let sums = couple::<V, 1, LANES_PER_PASS>(&input.terms, left, along, atoms, c);
+                add::<V, 1, LANES_PER_PASS>(&mut cotangent[out + c..], 0, &sums);
+            }
+            for c in whole..lanes {
+                let left = (&*cotangent, 2 * atoms, 0);
+                let sums = couple::<V, 1, 1>(&input.terms, left, along, atoms, c);
+                add::<V, 1, 1>(&mut cotangent[out + c..], 0, &sums);
             }
         }
     }
@@ -133,13 +174,12 @@ impl<V: Vector> Product<V> {
     }
 }
 
-/// Σ C left_k right over some terms, for `L` lanes from lane `c` of their rows; the `N` left factors are
-/// `apart` lanes from each other.
+/// Σ C left_k right over some terms, for `L` lanes from lane `c` of their rows; the left factors have `slots`
+/// slots, and `N` of them are `apart` lanes from each other.
 #[inline(always)]
 fn couple<V: Vector, const N: usize, const L: usize>(
     terms: &[Term<V>],
-    left: &[V],
-    apart: usize,
+    (left, slots, apart): (&[V], usize, usize),
     right: &[V],
     atoms: usize,
     c: usize,
@@ -149,10 +189,31 @@ fn couple<V: Vector, const N: usize, const L: usize>(
         let right = &right[term.right as usize * atoms + c..][..L];
         let right: [V; L] = std::array::from_fn(|l| right[l].scaled(term.coefficient));
         for (k, sums) in sums.iter_mut().enumerate() {
-            let left = &left[term.left as usize * N * atoms + k * apart + c..][..L];
+            let left = &left[term.left as usize * slots + k * apart + c..][..L];
             for l in 0..L {
                 sums[l].add_product(&left[l], &right[l]);
             }
+        }
+    }
+    sums
+}
+
+/// Σ C (left′ right + left right′) over some terms, for `L` lanes from lane `c` of their rows.
+#[inline(always)]
+fn couple_derivative<V: Vector, const L: usize>(
+    terms: &[Term<V>],
+    tape: &[V],
+    along: &[V],
+    atoms: usize,
+    c: usize,
+) -> [V; L] {
+    let mut sums = [V::ZERO; L];
+    for term in terms {
+        let (left, right) = (term.left as usize * atoms + c, term.right as usize * atoms + c);
+        for (l, sum) in sums.iter_mut().enumerate() {
+            let mut both = along[left + l].product(&tape[right + l]);
+            both.add_product(&tape[left + l], &along[right + l]);
+            sum.add_scaled(term.coefficient, &both);
         }
     }
     sums

@@ -2,7 +2,7 @@
 
 use super::radial_network::{RadialNetwork, RadialWork};
 use super::radial_table::{RadialTable, b_splines};
-use super::vector::{Double, MAX_LANES, Number, Vector, lanes_for};
+use super::vector::{Double, MAX_LANES, Number, Vector};
 
 /// Limit of the total size of tables if every pair of elements needs its own, bytes.
 const MAX_TABLE_BYTES: usize = 1 << 28;
@@ -34,16 +34,22 @@ pub(super) struct RadialFunctions<V> {
 }
 
 impl<V: Vector> RadialFunctions<V> {
-    pub fn new(network: RadialNetwork, n_elements: usize, cutoffs: Vec<f64>, path: RadialPath) -> Self {
+    /// With tables of this relative error, or without tables.
+    pub fn new(
+        network: RadialNetwork,
+        n_elements: usize,
+        cutoffs: Vec<f64>,
+        table_error: Option<f64>,
+    ) -> Self {
         let mut tables: Vec<RadialTable<V>> = Vec::new();
         let mut table_of_pair = Vec::new();
-        let exact = path == RadialPath::Exact;
-        for (pair, cutoff) in cutoffs.iter().enumerate().take_while(|_| !exact) {
+        let errors = table_error.into_iter().cycle();
+        for ((pair, cutoff), error) in cutoffs.iter().enumerate().zip(errors) {
             let same = |table: &RadialTable<V>| network.pair_biases.is_empty() && table.cutoff() == *cutoff;
             let known = tables.iter().position(same);
             table_of_pair.push(known.unwrap_or(tables.len()));
             if known.is_none() {
-                tables.push(RadialTable::new(&network, *cutoff, pair, V::Number::TABLE_ERROR).rounded());
+                tables.push(RadialTable::new(&network, *cutoff, pair, error).rounded());
             }
             if !network.pair_biases.is_empty() && tables[0].bytes() * cutoffs.len() > MAX_TABLE_BYTES {
                 tables.clear();
@@ -80,9 +86,24 @@ impl<V: Vector> RadialFunctions<V> {
         self.network.basis_size
     }
 
-    /// The tables, for a summary of the model.
+    /// The tables.
     pub fn tables(&self) -> &[RadialTable<V>] {
         &self.tables
+    }
+
+    /// The table of a pair of elements.
+    #[inline(always)]
+    pub fn table_of_pair(&self, pair: usize) -> usize {
+        self.table_of_pair[pair]
+    }
+
+    pub fn network(&self) -> &RadialNetwork {
+        &self.network
+    }
+
+    /// The network and the tables, to be changed.
+    pub fn parts_mut(&mut self) -> (&mut RadialNetwork, &mut [RadialTable<V>]) {
+        (&mut self.network, &mut self.tables)
     }
 
     /// R_nl and dR_nl/dr of at most as many bonds as a vector has lanes, each \[bond\]\[l\]\[channel\], from
@@ -135,14 +156,6 @@ fn round<V: Vector>(from: &[Double], to: &mut [V]) {
     for (to, from) in V::flat_mut(to).iter_mut().zip(Double::flat(from)) {
         *to = V::Number::round(*from);
     }
-}
-
-/// Maps the columns of the last layer, row-major `[channel, l]` in the file, to the order \[l\]\[channel\] with
-/// padded channels: the file's column for each index, if any.
-pub(super) fn column_by_order<V: Vector>(n_channels: usize, n_orders: usize, place: usize) -> Option<usize> {
-    let width = lanes_for::<V>(n_channels) * V::LANES;
-    let (l, n) = (place / width, place % width);
-    (n < n_channels).then_some(n * n_orders + l)
 }
 
 #[cfg(test)]

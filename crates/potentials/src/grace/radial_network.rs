@@ -3,6 +3,7 @@
 use super::instructions::Instructions;
 use super::matrix::{Matrix, StridedRows};
 use super::vector::{Double, Vector, lanes_for};
+use super::weight_map::WeightMap;
 
 /// x ↦ silu(W_k … silu(W_1 g + b_1) + b_k), where g_k(r) = T_k(x) f_p(u), u = r/r_c, x = 2u − 1, k = 1 …, and
 ///
@@ -19,6 +20,8 @@ pub(super) struct RadialNetwork {
     pub envelope_last: bool,
     /// The last one gives \[l\]\[channel\], its channels padded as those of the layer.
     pub layers: Vec<Matrix<Double>>,
+    /// Where the numbers of each layer stand in the file.
+    pub maps: Vec<WeightMap>,
     /// b of each layer after the first; empty if absent.
     pub biases: Vec<Vec<Double>>,
     /// b of the first layer for centre and neighbour element, `[n_elements²]`; empty if absent.
@@ -74,7 +77,7 @@ impl RadialNetwork {
     }
 
     /// g_k(r) with derivatives.
-    fn basis(&self, r: f64, cutoff: f64, out: &mut Jet) {
+    pub fn basis(&self, r: f64, cutoff: f64, out: &mut Jet) {
         for row in out.iter_mut() {
             row.clear();
             row.resize(lanes_for::<Double>(self.basis_size), Double::ZERO);
@@ -109,7 +112,14 @@ impl RadialNetwork {
     }
 }
 
-/// silu(x) = x / (1 + e^−x) on a jet.
+/// silu(x) = x / (1 + e^−x) and its derivative.
+#[inline(always)]
+pub(super) fn silu_with_slope(x: f64) -> [f64; 2] {
+    let s = 1.0 / (1.0 + (-x).exp());
+    [x * s, s * (1.0 + x * (1.0 - s))]
+}
+
+/// silu on a jet.
 fn silu([values, first, second]: &mut Jet) {
     let rows = Double::flat_mut(values).iter_mut().zip(Double::flat_mut(first)).zip(Double::flat_mut(second));
     for ((y, dy), ddy) in rows {
@@ -142,6 +152,7 @@ pub(super) mod tests {
             envelope_last,
             biases: if envelope_last { vec![vec![], vec![Double::splat(0.3)]] } else { vec![] },
             pair_biases: if envelope_last { vec![vec![Double::splat(-0.2); 2]] } else { vec![] },
+            maps: Vec::new(),
             layers: vec![
                 Matrix::from_fn(5, 12, element),
                 Matrix::from_fn(12, 12, element),

@@ -22,7 +22,7 @@ const POLES: [f64; 3] = [-0.535_280_430_796_438_2, -0.122_554_615_192_326_69, -0
 
 /// Number of samples beyond both ends, over which the effect of the unknown end conditions decays: the largest
 /// pole to this power is 10⁻¹⁷.
-const MARGIN: usize = 64;
+pub(super) const MARGIN: usize = 64;
 
 /// R_nl(r) for one cutoff as the spline Σ_k c_k β(r/h − k), where β is the cardinal B-spline of degree seven,
 /// through the exact values at the equidistant knots r = k h. It has six continuous derivatives, and forces use
@@ -55,18 +55,67 @@ impl RadialTable<Double> {
     /// The network is smooth beyond both ends, so samples are taken there too.
     fn with_intervals(network: &RadialNetwork, cutoff: f64, pair: usize, intervals: usize) -> Self {
         let mut work = RadialWork::default();
-        let (lanes, spacing) = (network.output_lanes(), cutoff / intervals as f64);
+        let (lanes, knots_per_length) = (network.output_lanes(), intervals as f64 / cutoff);
+        let coefficients = Vec::new();
+        let mut table = Self { cutoff, intervals, knots_per_length, errors: [0.0; 2], lanes, coefficients };
         let mut samples = Vec::new();
-        for k in 0..=intervals + 2 * MARGIN {
-            let r = (k as f64 - MARGIN as f64) * spacing;
+        for r in table.knots() {
             samples.extend_from_slice(&network.evaluate(r, cutoff, pair, &mut work)[0]);
         }
-        to_coefficients(&mut samples, lanes);
-        let coefficients = samples[(MARGIN - 3) * lanes..(MARGIN + intervals + 4) * lanes].to_vec();
-        let knots_per_length = intervals as f64 / cutoff;
-        let mut table = Self { cutoff, intervals, knots_per_length, errors: [0.0; 2], lanes, coefficients };
+        table.interpolate(&mut samples);
         table.errors = table.measure(network, pair);
         table
+    }
+
+    /// r of the knots, of which there are more beyond both ends, Å.
+    pub fn knots(&self) -> impl Iterator<Item = f64> + use<> {
+        let spacing = self.cutoff / self.intervals as f64;
+        (0..=self.intervals + 2 * MARGIN).map(move |k| (k as f64 - MARGIN as f64) * spacing)
+    }
+
+    /// Passes the spline through these values at the knots, `[knots, lanes]`, which it overwrites.
+    pub fn interpolate(&mut self, samples: &mut [Double]) {
+        to_coefficients(samples, self.lanes);
+        let kept = (MARGIN - 3) * self.lanes..(MARGIN + self.intervals + 4) * self.lanes;
+        self.coefficients.clear();
+        self.coefficients.extend_from_slice(&samples[kept]);
+    }
+
+    /// The derivatives with respect to the values at the knots, `[knots, lanes]`, from those with respect to the
+    /// coefficients.
+    pub fn of_samples(&self, of_coefficients: &[Double]) -> Vec<Double> {
+        let (lanes, knots) = (self.lanes, self.intervals + 1 + 2 * MARGIN);
+        let mut of_samples = vec![Double::ZERO; knots * lanes];
+        of_samples[(MARGIN - 3) * lanes..][..of_coefficients.len()].copy_from_slice(of_coefficients);
+        transposed_to_coefficients(&mut of_samples, lanes);
+        of_samples
+    }
+
+    /// Adds the contribution of one bond to the derivatives with respect to the coefficients, `[intervals + 7,
+    /// lanes]`, from those with respect to R_nl and dR_nl/dr, each a row. The bond is given as in
+    /// [`RadialTable::combine`].
+    #[inline(always)]
+    pub fn add_gradient(
+        &self,
+        interval: usize,
+        bond: usize,
+        (weights, slopes): &([Double; SUPPORT], [Double; SUPPORT]),
+        [of_values, of_derivatives]: [&[Double]; 2],
+        sums: &mut [Double],
+    ) {
+        let rows = &mut sums[interval * self.lanes..][..SUPPORT * self.lanes];
+        for (k, row) in rows.chunks_exact_mut(self.lanes).enumerate() {
+            let (weight, slope) = (weights[k][bond], slopes[k][bond] * self.knots_per_length);
+            for (sum, (v, d)) in row.iter_mut().zip(of_values.iter().zip(of_derivatives)) {
+                sum.add_scaled(weight, v);
+                sum.add_scaled(slope, d);
+            }
+        }
+    }
+
+    /// Number of vectors of coefficients.
+    pub fn size(&self) -> usize {
+        self.coefficients.len()
     }
 
     /// The largest errors of values and derivatives between knots, relative to the largest of each. They occur
@@ -231,6 +280,24 @@ pub(super) fn b_splines<V: Vector>(t: &V) -> ([V; SUPPORT], [V; SUPPORT]) {
         }
     }
     (b, slopes)
+}
+
+/// The transpose of [`to_coefficients`].
+fn transposed_to_coefficients(of_coefficients: &mut [Double], lanes: usize) {
+    let x = of_coefficients;
+    for z in POLES.into_iter().rev() {
+        for k in 0..x.len() - lanes {
+            let here = x[k];
+            x[k + lanes].add_scaled(z, &here);
+            x[k] = here.scaled(-z);
+        }
+        for k in (lanes..x.len()).rev() {
+            let here = x[k];
+            x[k - lanes].add_scaled(z, &here);
+        }
+    }
+    let gain: f64 = POLES.iter().map(|z| (1.0 - z) * (1.0 - 1.0 / z)).product();
+    Double::flat_mut(x).iter_mut().for_each(|x| *x *= gain);
 }
 
 /// Converts samples at equidistant knots, `[knots, lanes]`, to spline coefficients by the recursive filter of

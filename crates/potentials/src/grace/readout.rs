@@ -1,10 +1,14 @@
 //! From the invariant basis to atomic energies.
 
 use super::invariant_norm::InvariantNorm;
-use super::matrix::{Matrix, StridedRows};
+use super::matrix::StridedRows;
 use super::tape::AtomBatch;
 use super::vector::{Number, Vector};
+use super::weight_map::WeightMap;
 use super::weights::Weights;
+
+/// Name of the energies of the free atoms, by element, eV.
+pub(super) const SHIFTS: &str = "shift_values";
 
 /// The readout's activation function.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -18,7 +22,7 @@ pub(super) enum Activation {
 impl Activation {
     /// Value and derivative.
     #[inline(always)]
-    fn evaluate(self, x: f64) -> (f64, f64) {
+    pub fn evaluate(self, x: f64) -> (f64, f64) {
         match self {
             Self::Silu => {
                 let s = 1.0 / (1.0 + (-x).exp());
@@ -32,6 +36,23 @@ impl Activation {
     }
 }
 
+impl Activation {
+    /// The second derivative.
+    #[inline(always)]
+    pub fn curvature(self, x: f64) -> f64 {
+        match self {
+            Self::Silu => {
+                let s = 1.0 / (1.0 + (-x).exp());
+                s * (1.0 - s) * (2.0 + x * (1.0 - 2.0 * s))
+            }
+            Self::Tanh => {
+                let t = x.tanh();
+                -2.0 * t * (1.0 - t * t)
+            }
+        }
+    }
+}
+
 /// E = s (y_0 + MLP(y_1, y_2, …)) + shift of the element, with the densities y = Σ over layers of norm(W B),
 /// where B are the invariants of the layer.
 #[derive(Clone, Debug)]
@@ -40,7 +61,9 @@ pub(super) struct Readout<V> {
     pub blocks: Vec<ReadoutBlock<V>>,
     /// Layers of the perceptron with their transposes. The first also has an input for y_0 with zero weights,
     /// so that it can read y unchanged.
-    pub layers: Vec<(Matrix<V>, Matrix<V>)>,
+    pub layers: Vec<Weights<V>>,
+    /// Where the numbers of each layer stand in the file.
+    pub maps: Vec<WeightMap>,
     /// Applied after every layer but the last.
     pub activation: Activation,
     /// s
@@ -54,6 +77,8 @@ pub(super) struct Readout<V> {
 pub(super) struct ReadoutBlock<V> {
     /// W
     pub weights: Weights<V>,
+    /// Where it stands in the file.
+    pub map: WeightMap,
     /// Absent in one-layer models.
     pub norm: Option<InvariantNorm>,
 }
@@ -122,7 +147,7 @@ impl<V: Vector> Readout<V> {
     #[inline(always)]
     pub fn evaluate(&self, batch: &AtomBatch, energies: &mut [f64], work: &mut ReadoutWork<V>) {
         let atoms = batch.atoms;
-        for (k, (layer, _)) in self.layers.iter().enumerate() {
+        for (k, layer) in self.layers.iter().map(|layer| layer.forward(0)).enumerate() {
             let (before, after) = work.values.split_at_mut(k + 1);
             zeros(&mut after[0], atoms * layer.output_lanes());
             let from = StridedRows::of_atoms(atoms, layer.input_lanes());
@@ -166,7 +191,8 @@ impl<V: Vector> Readout<V> {
     #[inline(always)]
     fn reverse(&self, layers: usize, batch: &AtomBatch, work: &mut ReadoutWork<V>) {
         let atoms = batch.atoms;
-        for (k, (_, transposed)) in self.layers[..layers].iter().enumerate().rev() {
+        for (k, layer) in self.layers[..layers].iter().enumerate().rev() {
+            let transposed = layer.transposed(0);
             if k + 1 < self.layers.len() {
                 let cotangent = V::flat_mut(&mut work.cotangent).iter_mut();
                 cotangent.zip(V::flat(&work.slopes[k])).for_each(|(c, slope)| *c *= *slope);
@@ -186,7 +212,7 @@ impl<V: Vector> Readout<V> {
 
     /// D_h, the numbers in which the energy is linear: y_0 and the last hidden layer, or all of y without hidden layers.
     pub fn hidden_dimension(&self) -> usize {
-        let last = self.layers.last().map_or(1, |(last, _)| last.inputs());
+        let last = self.layers.last().map_or(1, |last| last.forward(0).inputs());
         last + usize::from(self.hidden_layers() > 0)
     }
 

@@ -7,6 +7,7 @@ use super::graph::Graph;
 use super::linear::{Linear, LinearPart};
 use super::tape::{TapeOperation, Tensor};
 use super::vector::Vector;
+use super::weight_map::{WeightBlock, WeightMap};
 use super::weights::Weights;
 
 /// The part of a reduction that reads one tensor.
@@ -21,8 +22,9 @@ struct ReductionSource {
     sums: Vec<usize>,
     /// Number of distinct weights.
     n_tiles: usize,
-    /// Weights times their norms, `[type, k, n, tile]`.
-    weights: Vec<f64>,
+    /// Name of the weights `[type, k, n, tile]`, and their norm.
+    array: String,
+    norm: f64,
 }
 
 /// The sizes of a reduction and its sources.
@@ -33,42 +35,57 @@ struct Reduction {
 }
 
 impl Reduction {
-    /// W_kn of this tile for the central atom's element `t`.
-    fn weight(&self, source: &ReductionSource, tile: usize, [t, n, k]: [usize; 3]) -> f64 {
-        source.weights[((t * self.n_out + k) * source.tensor.channels + n) * source.n_tiles + tile]
+    /// W_kn of this tile for inputs from `first_input`.
+    fn block(&self, source: &ReductionSource, tile: usize, first_input: usize) -> WeightBlock {
+        let (channels, tiles) = (source.tensor.channels, source.n_tiles);
+        WeightBlock {
+            array: source.array.clone(),
+            norm: source.norm,
+            factor: 1.0,
+            first: tile,
+            strides: [self.n_out * channels * tiles, tiles, channels * tiles],
+            inputs: [first_input, channels],
+            outputs: [0, self.n_out],
+        }
+    }
+
+    /// The matrix of these blocks.
+    fn map(&self, inputs: usize, blocks: Vec<WeightBlock>) -> WeightMap {
+        WeightMap { types: self.n_types, inputs, outputs: self.n_out, identity: 0.0, blocks }
     }
 }
 
 impl<V: Vector> Graph<'_, V> {
     /// The invariant reduction `prefix`: collects the basis B from its sources and returns the weights W of y_k
     /// = Σ_b W_kb B_b.
-    pub fn invariants(&mut self, prefix: &str, n_elements: usize) -> Result<Weights<V>, GraceError> {
+    pub fn invariants(
+        &mut self,
+        prefix: &str,
+        n_elements: usize,
+    ) -> Result<(Weights<V>, WeightMap), GraceError> {
         let key = format!("{prefix}_only_invar");
         if self.archive.contains(&key) {
             self.archive.expect_count(&key, 1)?;
             self.archive.expect_count(&format!("{prefix}_n_funcs"), 1)?;
         }
         let reduction = self.reduction(prefix, n_elements, 1)?;
-        // Source, tile and channel of each index of the padded basis; `None` for padding.
-        let mut places: Vec<Option<(&ReductionSource, usize, usize)>> = Vec::new();
+        // The basis is padded to whole lanes.
+        let (mut blocks, mut inputs) = (Vec::new(), 0);
         for source in &reduction.sources {
             for (component, tile) in source.collect.iter().zip(&source.tiles) {
                 self.basis.push((source.tensor.row(*component), source.tensor.width));
-                let channels = source.tensor.channels;
-                places.extend(
-                    (0..source.tensor.width * V::LANES).map(|n| (n < channels).then_some((source, *tile, n))),
-                );
+                blocks.push(reduction.block(source, *tile, inputs));
+                inputs += source.tensor.width * V::LANES;
             }
             self.sources.push((source.collect.len(), source.tensor.channels));
             self.source_names.push(source.name.clone());
         }
-        if places.is_empty() {
+        if blocks.is_empty() {
             let key = format!("{prefix}_instruction_names");
             return Err(mismatch(self.archive, &key, "a list of tensors without invariants", "invariants"));
         }
-        Ok(Weights::new(reduction.n_types, places.len(), reduction.n_out, |t, place, k| {
-            places[place].map_or(0.0, |(source, tile, n)| reduction.weight(source, tile, [t, n, k]))
-        }))
+        let map = reduction.map(inputs, blocks);
+        Ok((map.fill(&self.weights), map))
     }
 
     /// The reduction `prefix` to a tensor of that name: out_k,f = Σ over sources and c with sum(c) = f of Σ_n
@@ -90,10 +107,8 @@ impl<V: Vector> Graph<'_, V> {
                 to.push(out.row(*sum) as u32);
             }
             for (tile, rows) in rows {
-                let (channels, n_out) = (source.tensor.channels, reduction.n_out);
-                let element = |t, n, k| reduction.weight(source, tile, [t, n, k]);
-                let weights = Weights::new(reduction.n_types, channels, n_out, element);
-                parts.push(LinearPart::new(weights, rows));
+                let map = reduction.map(source.tensor.channels, vec![reduction.block(source, tile, 0)]);
+                parts.push(LinearPart::new(map, &self.weights, rows));
             }
         }
         self.operations.push(TapeOperation::Linear(Linear { parts }));
@@ -143,11 +158,11 @@ impl<V: Vector> Graph<'_, V> {
         let weights_key = format!("{prefix}_reduce_{name}_W");
         let tensor = self.named(name)?;
         let collect = archive.indices(&key("collect_ind"), tensor.components)?;
-        let (shape, mut weights) = if by_element == 1 {
-            archive.tensor::<4>(&weights_key)?
+        let shape = if by_element == 1 {
+            self.weights.read::<4>(archive, &weights_key)?
         } else {
-            let ([k, n, tiles], weights) = archive.tensor::<3>(&weights_key)?;
-            ([1, k, n, tiles], weights)
+            let [k, n, tiles] = self.weights.read(archive, &weights_key)?;
+            [1, k, n, tiles]
         };
         if shape[..3] != [n_types, n_out, tensor.channels] {
             let expected = format!("[{n_types}, {n_out}, {}, …]", tensor.channels);
@@ -157,9 +172,7 @@ impl<V: Vector> Graph<'_, V> {
         let sums = archive.exactly_indices(&key("total_sum_ind"), collect.len(), components)?;
         archive.expect_count(&key("n_in"), tensor.channels)?;
         archive.expect_count(&key("w_shape"), shape[3])?;
-        self.weights += weights.len();
         let norm = norm * archive.scalar(&format!("{prefix}_reduce_{name}_norm"))?;
-        weights.iter_mut().for_each(|w| *w *= norm);
         Ok(ReductionSource {
             name: name.to_owned(),
             tensor,
@@ -167,7 +180,8 @@ impl<V: Vector> Graph<'_, V> {
             tiles,
             sums,
             n_tiles: shape[3],
-            weights,
+            array: weights_key,
+            norm,
         })
     }
 }

@@ -42,18 +42,19 @@ impl Registers {
 
 /// Allocates all rows. `widths` gives the number of lanes of each row, indexed by its lane in the graph. The
 /// tensors `whole` stay contiguous, among them `message`, which receives its lanes. `basis` lists the first
-/// lanes and widths of the basis rows.
+/// lanes and widths of the basis rows. In `training`, rows that are multiplied by weights are kept too.
 pub(super) fn allocate<V: Vector>(
     operations: Vec<TapeOperation<V>>,
     widths: &[usize],
     whole: Vec<Tensor>,
     basis: &[(usize, usize)],
     message: Option<&mut Tensor>,
+    training: bool,
 ) -> TapeProgram<V> {
     let given = given(&operations, basis);
     let fixed = fixed(&operations, whole, &given, widths);
     let (fixed_lanes, mut tape, mut cotangents) = (fixed.end, fixed.clone(), fixed);
-    for row in operations.iter().flat_map(TapeOperation::factors) {
+    for row in operations.iter().flat_map(|operation| operation.factors(training)) {
         tape.take(row, widths[row]);
     }
     let kept_lanes = tape.end;
@@ -199,7 +200,7 @@ mod tests {
     fn chain() -> TapeProgram<Double> {
         let operations = vec![multiple(1, 0, 2.0), multiple(2, 1, 3.0), square(3, 2), multiple(4, 3, -1.0)];
         let density = Tensor { start: 0, components: 1, channels: 8, width: 1 };
-        allocate(operations, &[1; 5], vec![density], &[(4, 1)], None)
+        allocate(operations, &[1; 5], vec![density], &[(4, 1)], None, false)
     }
 
     #[test]

@@ -3,10 +3,12 @@
 use atoms::Species;
 use npz::NpzFile;
 
+use super::element_factors::{EMBEDDING, ElementFactors};
 use super::error::{GraceError, mismatch, unsupported};
 use super::graph::Graph;
 use super::tape::Tensor;
 use super::vector::{Double, Vector, to_lanes};
+use super::weight_arrays::WeightArrays;
 
 pub(super) fn elements(archive: &NpzFile) -> Result<Vec<Species>, GraceError> {
     let names = archive.strings("element_names")?;
@@ -95,17 +97,20 @@ pub(super) struct Embedding {
 }
 
 impl Embedding {
-    pub fn read(archive: &NpzFile, n_elements: usize, weights: &mut usize) -> Result<Self, GraceError> {
-        let ([rows, size], values) = archive.tensor::<2>("chem_embedding")?;
+    pub fn read(
+        archive: &NpzFile,
+        n_elements: usize,
+        weights: &mut WeightArrays,
+    ) -> Result<Self, GraceError> {
+        let [rows, size] = weights.read(archive, EMBEDDING)?;
         if rows != n_elements {
             let expected = format!("{n_elements} elements");
-            return Err(mismatch(archive, "chem_embedding", format!("{rows} rows"), expected));
+            return Err(mismatch(archive, EMBEDDING, format!("{rows} rows"), expected));
         }
         for key in ["embedding_size", "chem_embedding_size"].into_iter().filter(|key| archive.contains(key)) {
             archive.expect_count(key, size)?;
         }
-        *weights += values.len();
-        Ok(Self { size, values })
+        Ok(Self { size, values: weights.get(EMBEDDING).to_vec() })
     }
 
     /// Numbers per element.
@@ -129,24 +134,19 @@ impl Embedding {
         pairs.map(|pair| to_lanes(&(0..outputs).map(|o| sum(pair, o)).collect::<Vec<_>>())).collect()
     }
 
-    /// Z W for each element with the weights `{prefix}_W` `[size, channels]` times `{prefix}_norm` times
-    /// `scale`.
-    pub fn transformed<V: Vector>(
+    /// The factors Z W with the weights `{prefix}_W` `[size, channels]` times `{prefix}_norm` times `scale`.
+    pub fn transformed(
         &self,
         archive: &NpzFile,
         prefix: &str,
         channels: usize,
         scale: f64,
-        weights: &mut usize,
-    ) -> Result<Vec<Vec<V>>, GraceError> {
-        let transform = archive.floats(&format!("{prefix}_W"), &[self.size, channels])?;
+        weights: &mut WeightArrays,
+    ) -> Result<ElementFactors, GraceError> {
+        let transform = format!("{prefix}_W");
+        weights.read_exactly(archive, &transform, &[self.size, channels])?;
         let scale = archive.scalar(&format!("{prefix}_norm"))? * scale;
-        *weights += transform.len();
-        let channel = |z: &[f64], n: usize| -> f64 {
-            z.iter().enumerate().map(|(k, z)| z * transform[k * channels + n]).sum::<f64>() * scale
-        };
-        let row = |z: &[f64]| (0..channels).map(|n| channel(z, n)).collect::<Vec<_>>();
-        Ok(self.rows().map(|z| to_lanes(&row(z))).collect())
+        Ok(ElementFactors { transform, channels, scale })
     }
 }
 

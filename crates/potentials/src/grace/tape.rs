@@ -104,6 +104,27 @@ impl<V: Vector> TapeOperation<V> {
         }
     }
 
+    /// The derivative of the result along that of the inputs, on a tape of the same layout.
+    #[inline(always)]
+    pub fn forward_derivative(&self, batch: &AtomBatch, tape: &[V], along: &mut [V]) {
+        match self {
+            Self::Linear(linear) => linear.forward(batch, along),
+            Self::Product(product) => product.forward_derivative(batch.atoms, tape, along),
+            Self::Combination(combination) => combination.forward(batch.atoms, along),
+            Self::EquivariantNorm(_) => unreachable!("models of three layers are not trained"),
+        }
+    }
+
+    /// Adds to two cotangents of the inputs: the first of their derivative along a direction, the second of
+    /// their values.
+    #[inline(always)]
+    pub fn backward_derivative(&self, batch: &AtomBatch, tapes: [&[V]; 2], cotangent: &mut [V]) {
+        self.backward::<2>(batch, tapes[0], cotangent);
+        if let Self::Product(product) = self {
+            product.backward_derivative(batch.atoms, tapes[1], cotangent);
+        }
+    }
+
     /// First lanes of the rows that it reads, for one slot.
     pub fn reads(&self) -> Vec<usize> {
         match self {
@@ -122,10 +143,12 @@ impl<V: Vector> TapeOperation<V> {
         }
     }
 
-    /// Those of them that the reverse pass reads again.
-    pub fn factors(&self) -> Vec<usize> {
+    /// Those of them that the reverse pass reads again; in `training` it also computes derivatives with respect
+    /// to weights.
+    pub fn factors(&self, training: bool) -> Vec<usize> {
         match self {
             Self::Product(_) | Self::EquivariantNorm(_) => self.reads(),
+            Self::Linear(_) if training => self.reads(),
             Self::Linear(_) | Self::Combination(_) => Vec::new(),
         }
     }

@@ -2,6 +2,7 @@
 
 use super::tape::{AtomBatch, TapeOperation};
 use super::vector::Vector;
+use super::weight_gradient::WeightGradient;
 
 /// The operations of a layer in order, with the lanes of all rows on both tapes.
 ///
@@ -68,6 +69,58 @@ impl<V: Vector> TapeProgram<V> {
             step.operation.backward::<N>(batch, tape, cotangent);
         }
         self.given.backward(batch.atoms, bases, cotangent, self.basis_lanes);
+    }
+}
+
+/// The derivative of a tape along a direction beside the tape, both for the same batch.
+impl<V: Vector> TapeProgram<V> {
+    /// From the sums over neighbours to the bases, values and derivatives.
+    #[inline(always)]
+    pub fn forward_derivative(&self, batch: &AtomBatch, tapes: [&mut [V]; 2], bases: [&mut [V]; 2]) {
+        let (lanes, [tape, along], [basis, along_basis]) = (self.basis_lanes, tapes, bases);
+        self.given.forward(batch.atoms, tape, basis, lanes);
+        self.given.forward(batch.atoms, along, along_basis, lanes);
+        for step in &self.steps {
+            step.sums.clear(batch.atoms, tape);
+            step.sums.clear(batch.atoms, along);
+            step.operation.forward(batch, tape);
+            step.operation.forward_derivative(batch, tape, along);
+            step.basis.forward(batch.atoms, tape, basis, lanes);
+            step.basis.forward(batch.atoms, along, along_basis, lanes);
+        }
+    }
+
+    /// From two cotangents of the basis, of its derivative and of its values, to those of the sum over neighbours.
+    /// Adds the derivatives with respect to the weights of each step's linear parts.
+    #[inline(always)]
+    pub fn backward_derivative(
+        &self,
+        batch: &AtomBatch,
+        tapes: [&[V]; 2],
+        cotangent: &mut [V],
+        bases: [&[V]; 2],
+        of_weights: &mut [Vec<WeightGradient<V>>],
+    ) {
+        for (step, of_weights) in self.steps.iter().zip(of_weights).rev() {
+            step.fresh.clear(2 * batch.atoms, cotangent);
+            step.basis.backward(batch.atoms, bases, cotangent, self.basis_lanes);
+            if let TapeOperation::Linear(linear) = &step.operation {
+                linear.add_weight_gradients(batch, tapes, cotangent, of_weights);
+            }
+            step.operation.backward_derivative(batch, tapes, cotangent);
+        }
+        self.given.backward(batch.atoms, bases, cotangent, self.basis_lanes);
+    }
+
+    /// Zero derivatives with respect to the weights of each step's linear parts.
+    pub fn weight_gradients(&self) -> Vec<Vec<WeightGradient<V>>> {
+        let of_step = |operation: &TapeOperation<V>| match operation {
+            TapeOperation::Linear(linear) => {
+                linear.parts.iter().map(|part| WeightGradient::new(&part.map)).collect()
+            }
+            _ => Vec::new(),
+        };
+        self.operations().map(of_step).collect()
     }
 }
 

@@ -16,14 +16,16 @@ use super::error::{GraceError, mismatch};
 use super::graph::Graph;
 use super::layer::{LayerDraft, LayerMessage};
 use super::networks::enveloped_network;
-use super::radial::{RadialFunctions, RadialPath};
+use super::radial::RadialFunctions;
+use super::read_options::ReadOptions;
 use super::readout::ReadoutBlock;
 use super::shared_reader::{Embedding, elements, reject_unsupported_variants};
 use super::tape::Tensor;
 use super::two_layers::{expect_list, invariant_norm};
 use super::vector::{Number, Vector};
+use super::weight_arrays::WeightArrays;
 
-pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &NpzFile, options: ReadOptions) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
     reject_unsupported_variants(
         archive,
@@ -38,10 +40,10 @@ pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<Mod
     let n_densities = archive.count("rho1_n_out", 1, 4096)?;
     archive.expect_count("energy_mlp_origin_n_out", n_densities)?;
     archive.expect_count("energy_mlp_n_origins", 3)?;
-    let mut weights = 0;
+    let mut weights = WeightArrays::default();
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
     let mut reader =
-        ThreeLayerReader { archive, path, n_elements: elements.len(), n_densities, embedding, weights };
+        ThreeLayerReader { archive, options, n_elements: elements.len(), n_densities, embedding, weights };
     let (mut layers, mut message) = (Vec::new(), None);
     for number in 1..=3 {
         let (layer, sent) = reader.layer(number, message)?;
@@ -59,16 +61,16 @@ pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<Mod
         n_densities,
         weights: reader.weights,
     }
-    .finish()
+    .finish(options.training)
 }
 
 struct ThreeLayerReader<'a> {
     archive: &'a NpzFile,
-    path: RadialPath,
+    options: ReadOptions,
     n_elements: usize,
     n_densities: usize,
     embedding: Embedding,
-    weights: usize,
+    weights: WeightArrays,
 }
 
 impl<'a> ThreeLayerReader<'a> {
@@ -98,10 +100,11 @@ impl<'a> ThreeLayerReader<'a> {
             base = graph.reduce(&format!("{name}_red"), self.n_elements)?;
         }
         powers(&mut graph, &name, base, self.n_elements)?;
-        let norm = Some(invariant_norm(archive, &format!("rho{number}_norm"), self.n_densities)?);
+        let norm =
+            Some(invariant_norm(archive, &format!("rho{number}_norm"), self.n_densities, &mut self.weights)?);
         archive.expect_count(&format!("rho{number}_n_out"), self.n_densities)?;
-        let block =
-            ReadoutBlock { weights: graph.invariants(&format!("rho{number}"), self.n_elements)?, norm };
+        let (weights, map) = graph.invariants(&format!("rho{number}"), self.n_elements)?;
+        let block = ReadoutBlock { weights, map, norm };
         let sent = match number {
             3 => None,
             _ => {
@@ -133,7 +136,7 @@ impl<'a> ThreeLayerReader<'a> {
         let network =
             enveloped_network::<V>(archive, name, lmax, channels, &self.embedding, &mut self.weights)?;
         let cutoffs = vec![cutoff; self.n_elements * self.n_elements];
-        Ok(RadialFunctions::new(network, self.n_elements, cutoffs, self.path))
+        Ok(RadialFunctions::new(network, self.n_elements, cutoffs, self.options.table_error::<V>()))
     }
 
     fn scalar_message<V: Vector>(
@@ -143,9 +146,10 @@ impl<'a> ThreeLayerReader<'a> {
     ) -> Result<LayerMessage<V>, GraceError> {
         let scale = self.archive.scalar(&format!("{name}_inv_avg_n_neigh"))?;
         let prefix = format!("{name}_lin_transform");
-        let constants =
+        let factors =
             self.embedding.transformed(self.archive, &prefix, channels, scale, &mut self.weights)?;
-        Ok(LayerMessage { from: None, components: 1, constants })
+        let constants = factors.rows(&self.weights);
+        Ok(LayerMessage { from: None, components: 1, constants, factors })
     }
 
     /// The indicator of the preceding layer, plus the contribution of the neighbour's element to its invariant
@@ -165,7 +169,8 @@ impl<'a> ThreeLayerReader<'a> {
         archive.expect_count(&format!("{name}_n_lm_ind"), components)?;
         let mask = archive.floats(&format!("{name}_chem_l0_mask"), &[components])?;
         let prefix = format!("{name}_chem_linear");
-        let rows = self.embedding.transformed(archive, &prefix, channels, 1.0, &mut self.weights)?;
+        let factors = self.embedding.transformed(archive, &prefix, channels, 1.0, &mut self.weights)?;
+        let rows = factors.rows(&self.weights);
         let constants = |row: &Vec<V>| -> Vec<V> {
             mask.iter().flat_map(|m| row.iter().map(|x| x.scaled(V::Number::round(*m)))).collect()
         };
@@ -173,6 +178,7 @@ impl<'a> ThreeLayerReader<'a> {
             from: Some(indicator),
             components,
             constants: rows.iter().map(constants).collect(),
+            factors,
         })
     }
 

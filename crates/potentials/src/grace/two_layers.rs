@@ -10,28 +10,31 @@ use npz::NpzFile;
 use super::block_aliases::{BlockAliases, ignore_aliases};
 use super::builder::{ModelBuilder, ModelParts};
 use super::description::Architecture;
+use super::element_factors::ElementFactors;
 use super::error::{GraceError, mismatch, unsupported};
 use super::graph::Graph;
 use super::invariant_norm::InvariantNorm;
 use super::layer::{LayerDraft, LayerMessage};
 use super::networks::radial_network;
-use super::radial::{RadialFunctions, RadialPath};
+use super::radial::RadialFunctions;
+use super::read_options::ReadOptions;
 use super::readout::ReadoutBlock;
 use super::shared_reader::{Embedding, Powers, cutoffs, elements, reject_unsupported_radial_variants};
 use super::tape::Tensor;
 use super::vector::Vector;
+use super::weight_arrays::WeightArrays;
 
 const FIRST: Powers = Powers { letter: "A", third_with_mixed: false, taken_by: &["I1", "rho"] };
 const SECOND: Powers = Powers { letter: "B", third_with_mixed: false, taken_by: &["I2"] };
 
-pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &NpzFile, options: ReadOptions) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
     let names = BlockAliases::read(archive)?;
-    let mut weights = 0;
+    let mut weights = WeightArrays::default();
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
     let mut reader = TwoLayerReader {
         archive,
-        path,
+        options,
         lmax: archive.count("lmax", 0, 12)?,
         n_elements: elements.len(),
         cutoffs: cutoffs(archive, elements.len())?,
@@ -53,17 +56,17 @@ pub(super) fn read<V: Vector>(archive: &NpzFile, path: RadialPath) -> Result<Mod
         n_densities,
         weights: reader.weights,
     }
-    .finish()
+    .finish(options.training)
 }
 
 struct TwoLayerReader<'a> {
     archive: &'a NpzFile,
-    path: RadialPath,
+    options: ReadOptions,
     lmax: usize,
     n_elements: usize,
     cutoffs: Vec<f64>,
     embedding: Embedding,
-    weights: usize,
+    weights: WeightArrays,
 }
 
 impl<'a> TwoLayerReader<'a> {
@@ -74,17 +77,17 @@ impl<'a> TwoLayerReader<'a> {
     ) -> Result<(LayerDraft<'a, V>, Tensor, usize), GraceError> {
         let (archive, lmax) = (self.archive, self.lmax);
         let (channels, radial) = self.radial("R", "A")?;
-        let constants = self.scalar_message("A", channels)?;
+        let factors = self.scalar_message("A", channels)?;
         let mut graph = Graph::new(archive, "A", (lmax + 1) * (lmax + 1), channels)?;
         let a = graph.density();
         let order = FIRST.make(&mut graph, a)?;
         graph.reduce("I1", self.n_elements)?;
         let indicator = graph.reduce("I", self.n_elements)?;
-        let block = ReadoutBlock {
-            weights: graph.invariants("rho", self.n_elements)?,
-            norm: Some(invariant_norm(archive, "I_nl_LN", n_densities)?),
-        };
-        let message = LayerMessage { from: None, components: 1, constants };
+        let (weights, map) = graph.invariants("rho", self.n_elements)?;
+        let norm = Some(invariant_norm(archive, "I_nl_LN", n_densities, &mut self.weights)?);
+        let block = ReadoutBlock { weights, map, norm };
+        let constants = factors.rows(&self.weights);
+        let message = LayerMessage { from: None, components: 1, constants, factors };
         Ok((LayerDraft { graph, radial, lmax, message, block }, indicator, order))
     }
 
@@ -100,12 +103,13 @@ impl<'a> TwoLayerReader<'a> {
             return Err(mismatch(archive, "I_n_out", found, format!("{channels}, as its radial functions")));
         }
         // The last component of a message is the factor of B0.
+        let factors = self.scalar_message("B0", channels)?;
         let mut constants = vec![vec![V::ZERO; indicator.components * indicator.width]; self.n_elements];
-        for (constants, scalar) in constants.iter_mut().zip(self.scalar_message::<V>("B0", channels)?) {
+        for (constants, scalar) in constants.iter_mut().zip(factors.rows::<V>(&self.weights)) {
             constants.extend(scalar);
         }
         let components = indicator.components + 1;
-        let message = LayerMessage { from: Some(indicator), components, constants };
+        let message = LayerMessage { from: Some(indicator), components, constants, factors };
 
         let functions = (lmax + 1) * (lmax + 1);
         let mut graph = Graph::new(archive, "the messages", components * functions, channels)?;
@@ -115,10 +119,9 @@ impl<'a> TwoLayerReader<'a> {
         self.coupled_messages(&mut graph, indicator.components)?;
         let b = graph.reduce("B", self.n_elements)?;
         let order = SECOND.make(&mut graph, b)?;
-        let block = ReadoutBlock {
-            weights: graph.invariants("I2", self.n_elements)?,
-            norm: Some(invariant_norm(archive, "I_0_LN", n_densities)?),
-        };
+        let (weights, map) = graph.invariants("I2", self.n_elements)?;
+        let norm = Some(invariant_norm(archive, "I_0_LN", n_densities, &mut self.weights)?);
+        let block = ReadoutBlock { weights, map, norm };
         Ok((LayerDraft { graph, radial, lmax, message, block }, order))
     }
 
@@ -132,10 +135,18 @@ impl<'a> TwoLayerReader<'a> {
         reject_unsupported_radial_variants(archive, &prefix, density)?;
         let channels = archive.count(&format!("{prefix}_n_rad_max"), 1, 4096)?;
         let network = radial_network::<V>(archive, &prefix, self.lmax, channels, &mut self.weights)?;
-        Ok((channels, RadialFunctions::new(network, self.n_elements, self.cutoffs.clone(), self.path)))
+        Ok((
+            channels,
+            RadialFunctions::new(
+                network,
+                self.n_elements,
+                self.cutoffs.clone(),
+                self.options.table_error::<V>(),
+            ),
+        ))
     }
 
-    fn scalar_message<V: Vector>(&mut self, name: &str, channels: usize) -> Result<Vec<Vec<V>>, GraceError> {
+    fn scalar_message(&mut self, name: &str, channels: usize) -> Result<ElementFactors, GraceError> {
         let scale = self.archive.scalar(&format!("{name}_inv_avg_n_neigh"))?;
         let prefix = format!("{name}_lin_transform");
         self.embedding.transformed(self.archive, &prefix, channels, scale, &mut self.weights)
@@ -173,6 +184,7 @@ pub(super) fn invariant_norm(
     archive: &NpzFile,
     name: &str,
     n_densities: usize,
+    weights: &mut WeightArrays,
 ) -> Result<InvariantNorm, GraceError> {
     let key = |suffix: &str| format!("{name}_{suffix}");
     archive.expect_count(&key("n_out"), n_densities)?;
@@ -182,8 +194,9 @@ pub(super) fn invariant_norm(
         _ => Some(archive.scalar(&key("lin_scale"))?),
     };
     let normalised = n_densities - usize::from(linear.is_some());
-    let scale = archive.floats(&key("scale"), &[normalised])?;
-    Ok(InvariantNorm { linear, scale })
+    weights.read_exactly(archive, &key("scale"), &[normalised])?;
+    let scale = weights.get(&key("scale")).to_vec();
+    Ok(InvariantNorm { linear, scale, array: key("scale") })
 }
 
 /// Checks that the file lists exactly the operations of the graph.

@@ -1,0 +1,191 @@
+//! A model whose weights can be changed.
+
+use std::fs::File;
+use std::io::{self, BufReader, BufWriter};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use npz::{NpzFile, Writer};
+
+use super::super::description::Architecture;
+use super::super::error::{GraceError, unsupported};
+use super::super::model::GraceModel;
+use super::super::network::{AnyNetwork, Network};
+use super::super::potential::Grace;
+use super::super::radial::RadialPath;
+use super::super::read_options::ReadOptions;
+use super::super::tape::TapeOperation;
+use super::super::vector::Double;
+use super::super::weight_arrays::WeightArrays;
+use super::radial_weights::RadialWeights;
+use super::sums::WeightSums;
+use super::worker::GradientWorker;
+
+/// A GRACE model of one or two layers whose weights can be changed, in double precision.
+#[derive(Clone, Debug)]
+pub struct TrainableGrace {
+    path: PathBuf,
+    model: Arc<GraceModel>,
+    arrays: WeightArrays,
+    groups: Vec<WeightGroup>,
+    weights: Vec<f64>,
+    /// The radial network of each layer.
+    radial: Vec<RadialWeights>,
+}
+
+/// A trained array of the model file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WeightGroup {
+    /// Its name in the file.
+    pub name: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its numbers among all weights.
+    pub range: Range<usize>,
+}
+
+impl TrainableGrace {
+    /// Reads a `kokkos.npz` file.
+    ///
+    /// # Errors
+    /// As [`GraceModel::load`], and for a model of three layers.
+    pub fn load(path: &Path) -> Result<Self, GraceError> {
+        let archive = NpzFile::open(path)?;
+        let options = ReadOptions { radial: RadialPath::Table, training: true };
+        let (model, arrays) = GraceModel::read(&archive, options, AnyNetwork::Double)?;
+        if model.description.architecture == Architecture::ThreeLayer {
+            return Err(unsupported(&archive, "models of three layers cannot be trained"));
+        }
+        let (mut groups, mut weights) = (Vec::new(), Vec::new());
+        for (name, array) in arrays.iter() {
+            let range = weights.len()..weights.len() + array.values.len();
+            groups.push(WeightGroup { name: name.to_owned(), shape: array.shape.clone(), range });
+            weights.extend_from_slice(&array.values);
+        }
+        let mut trainable = Self {
+            path: path.to_owned(),
+            model: Arc::new(model),
+            arrays,
+            groups,
+            weights,
+            radial: Vec::new(),
+        };
+        let network = trainable.network();
+        trainable.radial = network.layers.iter().map(|layer| RadialWeights::new(&layer.radial)).collect();
+        let weights = trainable.weights.clone();
+        trainable.set_weights(&weights);
+        Ok(trainable)
+    }
+
+    /// The model with the present weights.
+    pub fn model(&self) -> &GraceModel {
+        &self.model
+    }
+
+    /// The trained arrays, by name.
+    pub fn groups(&self) -> &[WeightGroup] {
+        &self.groups
+    }
+
+    /// The weights of all groups, one after another.
+    pub fn weights(&self) -> &[f64] {
+        &self.weights
+    }
+
+    /// Changes all weights. Copies the model if workers still use it.
+    ///
+    /// # Panics
+    /// If there are more or fewer than [`TrainableGrace::weights`].
+    pub fn set_weights(&mut self, weights: &[f64]) {
+        assert_eq!(weights.len(), self.weights.len(), "a number for each weight");
+        self.weights.copy_from_slice(weights);
+        let mut rest = weights;
+        for values in self.arrays.values_mut() {
+            let (here, after) = rest.split_at(values.len());
+            values.copy_from_slice(here);
+            rest = after;
+        }
+        let Self { model, arrays, radial, .. } = self;
+        let AnyNetwork::Double(network) = &mut Arc::make_mut(model).network else { return };
+        update(Arc::make_mut(network), arrays, radial);
+    }
+
+    /// Zero sums for [`GradientWorker::accumulate`].
+    pub fn sums(&self) -> WeightSums {
+        WeightSums::new(&self.network())
+    }
+
+    /// A worker for one thread, with the present weights.
+    pub fn worker(&self) -> GradientWorker {
+        GradientWorker::new(Grace::new(self.model.clone()), self.network())
+    }
+
+    /// ∂L/∂w for each of [`TrainableGrace::weights`].
+    pub fn gradient(&self, sums: &WeightSums) -> Vec<f64> {
+        let mut out = self.arrays.clone();
+        out.values_mut().for_each(|values| values.fill(0.0));
+        sums.pull_back(&self.network(), &self.arrays, &self.radial, &mut out);
+        out.iter().flat_map(|(_, array)| array.values.iter().copied()).collect()
+    }
+
+    /// Writes a model file with the present weights and everything else as in the file that was read, except the mixture of
+    /// the grade, which belongs to the earlier weights. `note` goes to the array `calmwalk_note`.
+    ///
+    /// # Errors
+    /// If the file that was read has gone or changed, or the new one cannot be written.
+    pub fn write(&self, path: &Path, note: &str) -> io::Result<()> {
+        let source = BufReader::new(File::open(&self.path)?);
+        let mut writer = Writer::new(BufWriter::new(File::create(path)?));
+        let stale = |name: &str| MIXTURE.contains(&name) || name == NOTE;
+        let trained = |name: &str| self.groups.iter().any(|group| group.name == name);
+        writer.copy(source, |name| stale(name) || trained(name))?;
+        for group in &self.groups {
+            writer.array(&group.name, &group.shape, self.weights[group.range.clone()].iter().copied())?;
+        }
+        writer.strings(NOTE, &[1], &[note])?;
+        writer.finish()?.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()
+    }
+
+    fn network(&self) -> Arc<Network<Double>> {
+        match &self.model.network {
+            AnyNetwork::Double(network) => network.clone(),
+            AnyNetwork::Mixed(_) => unreachable!("it is read in double precision"),
+        }
+    }
+}
+
+/// The array with the note.
+const NOTE: &str = "calmwalk_note";
+
+/// The arrays of the mixture.
+const MIXTURE: [&str; 5] =
+    ["uq_centroids", "uq_inv_cov", "uq_n_clusters", "uq_interp_thresholds", "uq_max_clusters"];
+
+/// Fills all matrices and tables with the present weights.
+fn update(network: &mut Network<Double>, arrays: &WeightArrays, radial: &mut [RadialWeights]) {
+    for (layer, radial) in network.layers.iter_mut().zip(radial) {
+        for step in &mut layer.steps.steps {
+            if let TapeOperation::Linear(linear) = &mut step.operation {
+                linear.parts.iter_mut().for_each(|part| part.weights = part.map.fill(arrays));
+            }
+        }
+        let message = &mut layer.message;
+        for (constants, row) in message.constants.iter_mut().zip(message.factors.rows::<Double>(arrays)) {
+            let first = constants.len() - row.len();
+            constants[first..].copy_from_slice(&row);
+        }
+        radial.update(&mut layer.radial, arrays);
+    }
+    let readout = &mut network.readout;
+    for block in &mut readout.blocks {
+        block.weights = block.map.fill(arrays);
+        if let Some(norm) = &mut block.norm {
+            norm.scale.copy_from_slice(arrays.get(&norm.array));
+        }
+    }
+    readout.layers = readout.maps.iter().map(|map| map.fill(arrays)).collect();
+    for (shift, value) in readout.shifts.iter_mut().zip(arrays.get(super::super::readout::SHIFTS)) {
+        *shift = *value;
+    }
+}
