@@ -6,26 +6,19 @@ use std::time::{Duration, Instant};
 
 use store::{JobState, LabelStatus};
 
-use crate::common::campaign::{Outcome, Small, outcome, outcome_at};
+use crate::common::campaign::{Small, outcome_at};
+use crate::common::hosts::uninterrupted_outcome;
 use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::{
     assert_no_leftovers, pause_walkers, processes_in, processes_running, resume_processes, signal, wait_until,
 };
-use crate::common::{Running, calmwalk, config, program, refuse, succeed};
+use crate::common::{Running, calmwalk, config, program, refuse};
 
 /// `run` starts no labellers.
 const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nconcurrency = 0");
 
 fn ended(running: &mut Running) -> Option<i32> {
     running.0.wait().expect("a child").code()
-}
-
-/// The outcome of the campaign in a single process.
-fn expected(small: &Small) -> Outcome {
-    let directory = tempfile::tempdir().unwrap();
-    small.write(directory.path());
-    succeed(directory.path(), ["run", "campaign.toml", "--directory", ".", "--in-process"]);
-    outcome(directory.path())
 }
 
 /// A finished campaign with one queued structure whose label takes a while. Returns the structure's name as well.
@@ -62,7 +55,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     assert!(said.contains("label.concurrency = 0: start labellers with calmwalk label --store "), "{said}");
     let labels = place.jobs("labelled") as usize;
     assert!(labels > 0 && said.matches(": labelled ").count() == labels, "{labels} in {said}");
-    assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
+    assert_eq!(outcome_at(place.argument(), place.path()), uninterrupted_outcome(&small));
     assert_eq!(place.status()["processes"], serde_json::json!([]));
     assert_no_leftovers(place.path());
 }
@@ -81,7 +74,7 @@ fn everything_in_one_process_waits_for_labels_of_others() {
     assert!(run.0.try_wait().unwrap().is_none(), "{}", place.said());
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
-    assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
+    assert_eq!(outcome_at(place.argument(), place.path()), uninterrupted_outcome(&small));
 }
 
 #[test]

@@ -8,7 +8,8 @@ use serde_json::Value;
 use store::Store;
 
 use crate::common;
-use crate::common::campaign::{Outcome, Small, outcome};
+use crate::common::campaign::{Small, outcome};
+use crate::common::hosts::uninterrupted_outcome;
 use crate::common::processes::{
     assert_no_leftovers, hold, pause_walkers, processes_in, processes_running, resume_processes, signal,
     wait_for_process, wait_until,
@@ -32,14 +33,6 @@ fn said(directory: &Path) -> String {
     fs::read_to_string(directory.join("stderr")).expect("its standard error")
 }
 
-/// The outcome of the campaign in a single process.
-fn expected(small: &Small) -> Outcome {
-    let directory = tempfile::tempdir().unwrap();
-    small.write(directory.path());
-    succeed(directory.path(), RUN.into_iter().chain(["--in-process"]));
-    outcome(directory.path())
-}
-
 /// Long enough for processes to fail and be replaced.
 fn long() -> Small {
     Small { steps: 900, ..Small::default() }
@@ -54,7 +47,7 @@ fn with_keys(path: &Path, keys: &str) {
 /// Waits for the end of the campaign, and checks its exit code, outcome and that nothing remains.
 fn ends_as_undisturbed(mut running: Running, directory: &Path, small: &Small) {
     assert_eq!(wait(&mut running), Some(0), "{}", said(directory));
-    assert_eq!(outcome(directory), expected(small));
+    assert_eq!(outcome(directory), uninterrupted_outcome(small));
     assert_no_leftovers(directory);
 }
 
@@ -292,7 +285,7 @@ fn two_campaigns_on_one_host_do_not_see_each_other() {
     for (running, directory) in running.iter_mut().zip(&directories) {
         assert_eq!(wait(running), Some(0), "{}", said(directory.path()));
     }
-    let expected = expected(&small);
+    let expected = uninterrupted_outcome(&small);
     for directory in &directories {
         assert_eq!(outcome(directory.path()), expected);
         assert_no_leftovers(directory.path());
@@ -352,7 +345,7 @@ fn sixteen_megabytes_of_shared_memory_are_enough_or_the_need_is_reported() {
     let Some(mut enough) = with_shared_memory(here, 16, 0) else { return };
     let output = enough.output().unwrap();
     assert_eq!(output.status.code(), Some(0), "{}", common::stderr(&output));
-    assert_eq!(outcome(here), expected(&small));
+    assert_eq!(outcome(here), uninterrupted_outcome(&small));
 }
 
 #[test]

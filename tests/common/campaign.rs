@@ -9,7 +9,7 @@ use store::{ComponentRecord, ExportFilter, Location, Store};
 use super::config;
 
 /// Keys that tests vary.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Small {
     pub mode: &'static str,
     pub walkers: usize,

@@ -1,9 +1,11 @@
 //! A campaign on several hosts: an orchestrator and agents.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use tempfile::TempDir;
 use wire::shm_dir::ShmDir;
@@ -91,8 +93,18 @@ pub fn started(command: &mut Command, said: &Path) -> Running {
     Running(command.stdout(Stdio::null()).stderr(said).spawn().expect("the program starts"))
 }
 
-/// The outcome of the campaign in a single process.
+/// The outcome of the campaign in a single process. A reproducible campaign has one outcome, so each is run once for all tests of
+/// a test program.
 pub fn uninterrupted_outcome(small: &Small) -> Outcome {
+    static OUTCOMES: Mutex<BTreeMap<Small, Arc<OnceLock<Outcome>>>> = Mutex::new(BTreeMap::new());
+    assert_eq!(small.mode, "reproducible", "only these campaigns have one outcome");
+    // A single process starts no walkers.
+    let small = Small { walkers: 1, ..small.clone() };
+    let outcome = Arc::clone(OUTCOMES.lock().unwrap().entry(small.clone()).or_default());
+    outcome.get_or_init(|| run_in_one_process(&small)).clone()
+}
+
+fn run_in_one_process(small: &Small) -> Outcome {
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
     let mut command = program(directory.path());
