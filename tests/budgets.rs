@@ -1,15 +1,17 @@
 //! Budgets end a campaign cleanly, and a larger budget continues it; effects of a long label queue.
 
 use std::fs;
+use std::io::Read;
 use std::path::Path;
 use std::process::Stdio;
 
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::common::campaign::{Outcome, Small, outcome};
+use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::config_tester::ConfigTester;
-use crate::common::processes::{hold, processes_running, signal, wait_until};
+use crate::common::hosts::uninterrupted_outcome;
+use crate::common::processes::{hold, processes_running, resume_processes, signal, wait_until};
 use crate::common::{Running, program, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
@@ -38,13 +40,6 @@ fn walks(status: &Value) -> Vec<(String, String)> {
     let biased = status["walks"].as_array().unwrap().iter().filter(|walk| walk["origin"] == "biased");
     let text = |value: &Value| value.as_str().unwrap().to_owned();
     biased.map(|walk| (text(&walk["state"]), text(&walk["reason"]))).collect()
-}
-
-/// A campaign without budgets.
-fn uninterrupted_outcome(small: &Small) -> Outcome {
-    let directory = write(small, "");
-    succeed(directory.path(), RUN);
-    outcome(&directory.path().join("here"))
 }
 
 fn decisions(directory: &Path) -> Vec<String> {
@@ -103,25 +98,43 @@ fn as_many_structures_are_collected_as_there_may_be_labels_for() {
     succeed(here, ["replay", "here"]);
 }
 
+/// Runs a campaign until its time is used up, and pauses its walkers before they can end their walks. Returns its summary.
+fn run_until_the_time_is_used_up(here: &Path) -> String {
+    let said = || fs::read_to_string(here.join("said")).unwrap_or_default();
+    let used_up = || said().contains("budget.wall_time is used up");
+    let stderr = fs::File::create(here.join("said")).unwrap();
+    let mut run = program(here).args(RUN).stdout(Stdio::piped()).stderr(stderr).spawn().unwrap();
+    let mut summary = run.stdout.take().unwrap();
+    let mut run = Running(run);
+    wait_until("structures are found", || used_up() || Counters::read("here", here).sent > 0);
+    let held = processes_running(here, "walker");
+    held.iter().for_each(|pid| signal(*pid, "STOP"));
+    wait_until("the time is used up", used_up);
+    resume_processes(&held);
+    let mut text = String::new();
+    summary.read_to_string(&mut text).unwrap();
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", said());
+    text
+}
+
 #[test]
 fn a_limit_of_time_stops_walks_where_they_stand() {
-    // Some seconds of work, so that the campaign checks the clock before it ends.
-    let small = Small { steps: 1500, max_per_walk: 1000, ..Small::default() };
+    let small = Small::default();
     let expected = uninterrupted_outcome(&small);
-    let directory = write(&small, "[budget]\nwall_time = \"4ms\"\n");
+    let directory = write(&small, "[budget]\nwall_time = \"2s\"\n");
     let here = directory.path();
-    let summary = succeed(here, RUN);
+    let summary = run_until_the_time_is_used_up(here);
     assert!(summary.contains("walks were ended by budget.wall_time"), "{summary}");
     let stopped = status(here);
     assert_eq!(
         (&stopped["finished"], &stopped["budget"]["used_up"]),
         (&true.into(), &"budget.wall_time".into())
     );
-    // The campaign checks the clock at intervals: some walks may have completed before.
+    // The campaign checks the clock at intervals: a walk may have completed before.
     let walks = walks(&stopped);
     assert!(walks.iter().all(|(state, _)| !["waiting", "running"].contains(&state.as_str())), "{walks:?}");
     assert!(walks.contains(&("budget".into(), "budget.wall_time".into())), "{walks:?}");
-    assert!(stopped["budget"]["used"]["wall_hours"].as_f64() > Some(1e-6));
+    assert!(stopped["budget"]["used"]["wall_hours"].as_f64() >= Some(2.0 / 3600.0), "{stopped}");
     let so_far = decisions(here);
     let all: Vec<_> = expected.decisions.lines().map(str::to_owned).collect();
     assert!(
@@ -131,7 +144,7 @@ fn a_limit_of_time_stops_walks_where_they_stand() {
     // No walk starts while the budget is used up.
     succeed(here, RUN);
     assert_eq!(decisions(here), so_far);
-    change(here, "\"4ms\"", "\"10h\"");
+    change(here, "\"2s\"", "\"10h\"");
     succeed(here, RUN);
     assert_eq!(outcome(&here.join("here")), expected);
 }
