@@ -11,7 +11,7 @@ use store::Location;
 use crate::common;
 use crate::common::campaign::{Small, outcome, outcome_at};
 use crate::common::label_campaign::{LabelCampaign, on_store};
-use crate::common::processes::{processes_in, wait_until};
+use crate::common::processes::{pause_walkers, processes_in, resume_processes, wait_until};
 use crate::common::{calmwalk, kills, random, refuse, stderr, succeed};
 
 fn ended(running: &mut common::Running) -> Option<i32> {
@@ -29,7 +29,7 @@ fn visible(directory: &Path) -> Vec<String> {
 #[test]
 fn a_copy_of_a_running_campaign_can_be_run_on() {
     // Some seconds of work, so that it runs while it is copied.
-    let small = Small { steps: 1500, max_per_walk: 1000, ..Small::default() };
+    let small = Small { steps: 600, max_per_walk: 1000, ..Small::default() };
     let place = LabelCampaign::new(&small, &[]);
     let elsewhere = tempfile::tempdir().unwrap();
     let copy = elsewhere.path().join("copy").display().to_string();
@@ -39,11 +39,14 @@ fn a_copy_of_a_running_campaign_can_be_run_on() {
     });
     let said = succeed(place.path(), ["store", "backup", place.argument(), &copy]);
     assert!(said.contains("backed up to "), "{said}");
+    // The campaign must not end before the commands that its run forbids.
+    let held = pause_walkers(place.path(), small.walkers);
     assert_eq!(visible(elsewhere.path()), ["copy"]);
     let message = refuse(place.path(), ["store", "backup", place.argument(), &copy]);
     assert!(message.contains("exists already: give the backup a new directory"), "{message}");
     let message = refuse(place.path(), ["store", "compact", place.argument()]);
     assert!(message.contains("is being run by process"), "{message}");
+    resume_processes(&held);
     let said = succeed(place.path(), ["store", "check", &copy]);
     assert!(said.contains("no problems found in "), "{said}");
     let status: Value = serde_json::from_str(&succeed(place.path(), ["status", &copy, "--json"])).unwrap();
