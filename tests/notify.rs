@@ -92,13 +92,13 @@ fn a_stall_is_notified_once_across_restarts() {
     let here = directory.path();
     let small = Small { steps: 1_000_000, ..Small::default() };
     let nothing_is_new = ("threshold = 1.0", "threshold = 1e6");
-    write(here, &small, "stall_timeout = \"1200ms\"", nothing_is_new, "exit 0");
+    write(here, &small, "stall_timeout = \"600ms\"", nothing_is_new, "exit 0");
     for again in [false, true] {
         let run = program(here).args(RUN).stderr(Stdio::null()).stdout(Stdio::null()).spawn();
         let run = Running(run.unwrap());
         if again {
-            // Several times the delay of the notification.
-            std::thread::sleep(std::time::Duration::from_secs(6));
+            // Several times the delay of the notification, after the start.
+            std::thread::sleep(std::time::Duration::from_secs(3));
         } else {
             wait_until("the stall is notified", || !operations_if_any(here).is_empty());
         }
