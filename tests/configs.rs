@@ -1,8 +1,9 @@
-//! Every file of `configs/` runs unchanged, and its results can be read.
+//! Every file of `configs/` runs, and its results can be read: `aluminium.toml` as it stands, the larger campaigns with shorter
+//! walks. `CALMWALK_WHOLE_DEMOS=1 cargo test --test integration configs::` runs these as they stand, too.
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use atoms::extxyz::Frame;
@@ -10,15 +11,31 @@ use atoms::{Evaluation, NeighbourList, Potential, ShortestDistances, read_extxyz
 use potentials::{Eam, EamStyle, StillingerWeber};
 use serde_json::Value;
 
-use crate::common::{config, deviation, refuse, stderr, succeed};
+use crate::common::{config, demo, deviation, refuse, stderr, succeed};
+
+/// Writes a demo with walks of 800 instead of 2000 biased steps, over which the whole volume ramp runs, and with this key of the
+/// equilibration replaced. With `CALMWALK_WHOLE_DEMOS` the demo stays as it is. Returns the path of the configuration.
+fn shorter(directory: &Path, name: &str, equilibration: [&str; 2]) -> PathBuf {
+    if std::env::var_os("CALMWALK_WHOLE_DEMOS").is_some() {
+        return config(name);
+    }
+    let mut text = demo(name);
+    for [before, after] in [["biased_steps = 2000", "biased_steps = 800"], equilibration] {
+        let [before, after] = [before, after].map(|key| format!("\n{key} "));
+        assert!(text.contains(&before), "{name} has no {before}");
+        text = text.replacen(&before, &after, 1);
+    }
+    let path = directory.join(name);
+    fs::write(&path, text).unwrap();
+    path
+}
 
 /// Runs a demo with this number of biased walks to its end, and checks its results. Returns its labelled frames, including
 /// control frames. No two atoms may be closer than `least` Å.
-fn campaign(directory: &Path, name: &str, walks: usize, least: f64) -> Vec<Frame> {
-    let file = config(name).display().to_string();
+fn campaign(directory: &Path, file: &Path, walks: usize, least: f64) -> Vec<Frame> {
     // By default the campaign would be written beside its configuration, in the repository.
-    let here = directory.join(Path::new(name).file_stem().unwrap()).display().to_string();
-    let summary = succeed(directory, ["run", &file, "--directory", &here]);
+    let here = directory.join("campaign").display().to_string();
+    let summary = succeed(directory, ["run", &file.display().to_string(), "--directory", &here]);
     assert!(summary.contains(&format!("walks            {walks} biased")), "{summary}");
     let status: Value = serde_json::from_str(&succeed(directory, ["status", &here, "--json"])).unwrap();
     assert_eq!(status["finished"], true, "{status}");
@@ -118,24 +135,34 @@ fn read_by_ase(path: &Path, frames: &[Frame]) {
 #[test]
 fn aluminium_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), "aluminium.toml", 8, 1.2);
+    let frames = campaign(directory.path(), &config("aluminium.toml"), 8, 1.2);
     let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
     check_labels(&frames, &mut potential);
 }
 
 #[test]
-fn silicon_runs_as_it_stands() {
+fn silicon_runs() {
     let directory = tempfile::tempdir().unwrap();
-    let frames = campaign(directory.path(), "silicon.toml", 8, 1.2);
+    let file = shorter(
+        directory.path(),
+        "silicon.toml",
+        ["# equilibration_steps = 500", "equilibration_steps = 200"],
+    );
+    let frames = campaign(directory.path(), &file, 8, 1.2);
     check_labels(&frames, &mut StillingerWeber::load(config("data/Si.sw")).unwrap());
 }
 
 #[test]
-fn nickel_aluminium_hydrogen_runs_as_it_stands() {
+fn nickel_aluminium_hydrogen_runs() {
     let directory = tempfile::tempdir().unwrap();
+    let file = shorter(
+        directory.path(),
+        "nickel-aluminium-hydrogen.toml",
+        ["equilibration_steps = 200", "equilibration_steps = 80"],
+    );
     // Three temperatures for 8 seed structures, and two more for the 7 with hydrogen. The configuration limits the distance
     // of two hydrogen atoms.
-    let frames = campaign(directory.path(), "nickel-aluminium-hydrogen.toml", 38, 0.6);
+    let frames = campaign(directory.path(), &file, 38, 0.6);
     let mut potential = Eam::load_as(config("data/NiAlH_jea.eam.alloy"), EamStyle::Alloy).unwrap();
     check_labels(&frames, &mut potential);
     check_conditions(&frames);
