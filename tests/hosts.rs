@@ -69,13 +69,13 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     hosts.assert_cleaned_up();
 }
 
-/// With 200 ms of latency in each direction, an agent with a prefetched assignment works as usual.
+/// With 100 ms of latency in each direction, an agent with a prefetched assignment works as usual.
 #[test]
 fn a_slow_line_changes_nothing() {
     let small =
         Small { walks_per_round: 3, seed_structures: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "agent_heartbeat_timeout = \"30s\"");
-    let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
+    let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(100));
     hosts.endpoints[1] = format!("tcp/{}", proxy.address);
     hosts.options[1] = vec!["--prefetch=1".into()];
     let mut agent = hosts.agent(0);
