@@ -3,13 +3,15 @@
 //! double and single precision, alternating on one core to which `taskset` (util-linux) pins both.
 //!
 //! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are in `CALMWALK_PEER_DATA`. With
-//! `scale` before the models, measures time and memory of crystals from 108 to 19 652 atoms.
+//! `scale` before the models, measures time and memory of crystals from 108 to 19 652 atoms; with `training`, the cost of
+//! derivatives with respect to weights.
 
 mod case;
 mod peak;
 mod peer;
 mod scale;
 mod threads;
+mod training;
 
 use std::time::Instant;
 
@@ -30,16 +32,18 @@ const ROUNDS: usize = 9;
 fn main() {
     let mut wanted: Vec<String> =
         std::env::args().skip(1).filter(|argument| !argument.starts_with('-')).collect();
-    let grow = wanted.first().is_some_and(|first| first == "scale");
-    if grow {
+    let first = wanted.first().map_or("", String::as_str);
+    let (grow, train) = (first == "scale", first == "training");
+    if grow || train {
         wanted.remove(0);
     }
-    let peak = if grow { Peak::default() } else { peak::report() };
+    let peak = if grow || train { Peak::default() } else { peak::report() };
     for model in
         MODELS.iter().filter(|model| wanted.is_empty() || wanted.iter().any(|name| name == model.name))
     {
         match model.folder() {
             Some(folder) if folder.join("kokkos.npz").exists() && grow => scale::report(model),
+            Some(folder) if folder.join("kokkos.npz").exists() && train => training::report(model),
             Some(folder) if folder.join("kokkos.npz").exists() => report(model, peak),
             _ => println!("\n{}: not here (CALMWALK_PEER_DATA names the folder that has it)", model.name),
         }
