@@ -1,0 +1,215 @@
+//! The zero of the energies: codes count energies from different zeros, and a fit to energies far from the model's would
+//! first have to learn a constant of each element.
+
+use analysis::{EnergyOffsets, LabelledEnergy, quantile};
+use atoms::Species;
+use potentials::grace::WeightGroup;
+use serde::{Deserialize, Serialize};
+
+/// Smaller shifts are errors of the model and no other zero, eV/atom.
+const SAME_ZERO: f64 = 0.1;
+/// Differences per atom that vary by less than this are a constant, eV/atom.
+const CONSTANT: f64 = 0.1;
+/// The share of the structures of which that is asked.
+const CONSTANT_SHARE: f64 = 0.9;
+
+/// The weights that are added to the energy of each atom of an element.
+const SHIFTS: &str = "shift_values";
+
+/// How the zero of the model's energies was moved to that of the labels.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct EnergyZero {
+    /// What was added for each atom of an element; empty if the zeros were the same.
+    pub shifts: Vec<ElementShift>,
+    /// Whether the compositions did not determine the elements' own shifts, so that all are the same.
+    pub is_constant: bool,
+}
+
+/// The shift of an element.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ElementShift {
+    /// Its symbol.
+    pub element: String,
+    /// eV/atom.
+    pub shift: f64,
+}
+
+/// Why the zero cannot be moved.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum EnergyZeroFault {
+    /// Compositions that do not distinguish elements, and differences that vary.
+    #[error(
+        "the labels' energies have another zero than the model's: they differ by {median:.3} eV/atom (median), and the compositions of \
+         {structures} structures do not determine the shifts of {elements}. Subtract the energies of the atoms from the labels, or add \
+         structures of other compositions"
+    )]
+    Undetermined {
+        /// Label − model, eV/atom.
+        median: f64,
+        /// Number of structures.
+        structures: usize,
+        /// Symbols.
+        elements: String,
+    },
+    /// A model without shifts by element.
+    #[error(
+        "the labels' energies have another zero than the model's, and the model has no 'shift_values' for {expected} elements to move it; \
+         subtract the difference from the labels"
+    )]
+    NoShifts {
+        /// Number of the model's elements.
+        expected: usize,
+    },
+}
+
+impl EnergyZero {
+    /// Fits the shifts of the elements to the differences per atom. They are zero where labels and model have the same zero, up to
+    /// 0.1 eV/atom. If the compositions do not determine the shifts, a difference that is the same for all structures is taken
+    /// for each element.
+    ///
+    /// # Errors
+    /// Compositions that do not determine the shifts, and a difference that is not the same for all structures.
+    pub fn find(energies: &[LabelledEnergy]) -> Result<Self, EnergyZeroFault> {
+        if let Ok(fit) = EnergyOffsets::fit(energies)
+            && fit.elements().all(|element| element.is_separate)
+        {
+            let shifts = fit.elements().map(|element| (element.element, element.offset));
+            return Ok(Self::new(shifts.collect(), false));
+        }
+        let atoms = |label: &LabelledEnergy| -> f64 {
+            label.composition.iter().map(|(_, number)| f64::from(*number)).sum()
+        };
+        let differences = energies.iter().map(|label| (label.label - label.model) / atoms(label));
+        let (median, sizes) = (quantile_of(differences.clone(), 0.5), differences.clone().map(f64::abs));
+        let spread = quantile_of(differences.map(|difference| (difference - median).abs()), CONSTANT_SHARE);
+        if quantile_of(sizes, 0.5) <= SAME_ZERO {
+            return Ok(Self::default());
+        }
+        let mut elements: Vec<_> =
+            energies.iter().flat_map(|label| label.composition.iter().map(|(element, _)| *element)).collect();
+        elements.sort_unstable();
+        elements.dedup();
+        if spread > CONSTANT {
+            let symbols: Vec<_> = elements.into_iter().map(symbol).collect();
+            return Err(EnergyZeroFault::Undetermined {
+                median,
+                structures: energies.len(),
+                elements: symbols.join(", "),
+            });
+        }
+        Ok(Self::new(elements.into_iter().map(|element| (element, median)).collect(), true))
+    }
+
+    /// With these shifts by atomic number, unless all are small.
+    fn new(shifts: Vec<(u8, f64)>, is_constant: bool) -> Self {
+        if shifts.iter().all(|(_, shift)| shift.abs() <= SAME_ZERO) {
+            return Self::default();
+        }
+        let shift = |(element, shift)| ElementShift { element: symbol(element), shift };
+        Self { shifts: shifts.into_iter().map(shift).collect(), is_constant }
+    }
+
+    /// The shift of all atoms of a composition, eV.
+    pub(crate) fn of(&self, composition: &[(u8, u32)]) -> f64 {
+        composition
+            .iter()
+            .map(|(element, number)| f64::from(*number) * self.of_element(&symbol(*element)))
+            .sum()
+    }
+
+    /// Adds the shifts to the weights of a model with these groups and elements. Elements without structures keep theirs.
+    ///
+    /// # Errors
+    /// A model without one shift for each element.
+    pub(crate) fn apply(
+        &self,
+        weights: &mut [f64],
+        groups: &[WeightGroup],
+        elements: &[Species],
+    ) -> Result<(), EnergyZeroFault> {
+        if self.shifts.is_empty() {
+            return Ok(());
+        }
+        let group = groups.iter().find(|group| group.name == SHIFTS && group.range.len() == elements.len());
+        let group = group.ok_or(EnergyZeroFault::NoShifts { expected: elements.len() })?;
+        for (weight, element) in weights[group.range.clone()].iter_mut().zip(elements) {
+            *weight += self.of_element(element.symbol());
+        }
+        Ok(())
+    }
+
+    fn of_element(&self, symbol: &str) -> f64 {
+        self.shifts.iter().find(|shift| shift.element == symbol).map_or(0.0, |shift| shift.shift)
+    }
+}
+
+fn symbol(element: u8) -> String {
+    Species::from_atomic_number(element)
+        .map_or_else(|_| element.to_string(), |found| found.symbol().to_owned())
+}
+
+/// 0 without numbers.
+fn quantile_of(numbers: impl Iterator<Item = f64>, q: f64) -> f64 {
+    let mut ascending: Vec<_> = numbers.collect();
+    ascending.sort_by(f64::total_cmp);
+    quantile(&ascending, q).unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Structures with these numbers of Al and Ni, and differences that `shift` gives.
+    fn energies(compositions: &[(u32, u32)], shift: impl Fn(f64, f64) -> f64) -> Vec<LabelledEnergy> {
+        let energy = |(al, ni): &(u32, u32)| {
+            let composition = [(13, *al), (28, *ni)].into_iter().filter(|(_, number)| *number > 0).collect();
+            let model = -3.4 * f64::from(al + ni);
+            LabelledEnergy { composition, model, label: model + shift(f64::from(*al), f64::from(*ni)) }
+        };
+        compositions.iter().map(energy).collect()
+    }
+
+    const ALLOYS: [(u32, u32); 5] = [(4, 0), (3, 1), (1, 3), (0, 4), (2, 2)];
+    const ONE_ALLOY: [(u32, u32); 4] = [(2, 2), (4, 4), (8, 8), (1, 1)];
+
+    #[test]
+    fn each_element_has_its_shift() {
+        let zero = EnergyZero::find(&energies(&ALLOYS, |al, ni| -100.0 * al + 7.0 * ni)).unwrap();
+        assert!(!zero.is_constant && zero.shifts.len() == 2);
+        assert!((zero.of(&[(13, 2), (28, 1)]) + 193.0).abs() < 1e-9, "{zero:?}");
+
+        let groups = [WeightGroup { name: SHIFTS.into(), shape: vec![3], range: 1..4 }];
+        let elements = [28, 1, 13].map(|element| Species::from_atomic_number(element).unwrap());
+        let mut weights = [1.0; 5];
+        zero.apply(&mut weights, &groups, &elements).unwrap();
+        for (weight, expected) in weights.iter().zip([1.0, 8.0, 1.0, -99.0, 1.0]) {
+            assert!((weight - expected).abs() < 1e-9, "{weights:?}");
+        }
+        let fault = zero.apply(&mut weights, &groups, &elements[..2]).unwrap_err();
+        assert!(fault.to_string().contains("no 'shift_values' for 2 elements"), "{fault}");
+    }
+
+    #[test]
+    fn errors_of_the_model_are_no_other_zero() {
+        for compositions in [&ALLOYS[..], &ONE_ALLOY] {
+            let zero = EnergyZero::find(&energies(compositions, |al, ni| 0.05 * al - 0.02 * ni)).unwrap();
+            assert_eq!(zero, EnergyZero::default());
+        }
+        assert_eq!(EnergyZero::find(&[]).unwrap(), EnergyZero::default());
+    }
+
+    #[test]
+    fn a_constant_needs_no_compositions() {
+        for compositions in [&ONE_ALLOY[..], &ONE_ALLOY[..1]] {
+            let zero = EnergyZero::find(&energies(compositions, |al, ni| 5.0 * (al + ni))).unwrap();
+            assert!(zero.is_constant && (zero.of(&[(28, 3)]) - 15.0).abs() < 1e-9, "{zero:?}");
+        }
+    }
+
+    #[test]
+    fn shifts_that_are_not_determined_are_refused() {
+        let energies = energies(&ONE_ALLOY, |al, ni| (al + ni) * (5.0 + 0.3 * al));
+        let fault = EnergyZero::find(&energies).unwrap_err().to_string();
+        assert!(fault.contains("the compositions of 4 structures") && fault.contains("Al, Ni"), "{fault}");
+    }
+}

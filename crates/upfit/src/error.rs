@@ -1,0 +1,142 @@
+//! Why a training cannot begin or go on.
+
+use std::path::PathBuf;
+
+use crate::data::FrameFault;
+use crate::energy_zero::EnergyZeroFault;
+
+/// Why a training cannot begin or go on.
+#[derive(Debug, thiserror::Error)]
+pub enum UpfitError {
+    /// A setting out of its range.
+    #[error("{name} is {found}, expected {expected}")]
+    Setting {
+        /// The setting.
+        name: &'static str,
+        /// Its value.
+        found: String,
+        /// The valid values.
+        expected: &'static str,
+    },
+    /// A labelled structure that cannot be used.
+    #[error("{place}: {fault}")]
+    Frame {
+        /// Where the structure comes from.
+        place: String,
+        /// What is wrong.
+        fault: FrameFault,
+    },
+    /// No structures to train with.
+    #[error("there are no labelled structures to train with")]
+    NoFrames,
+    /// A validation set would be empty.
+    #[error(
+        "the validation set is empty: a share of {share} is at most {limit} of {frames} structures, and the smallest of {groups} \
+         seed structures has {smallest}; a seed structure is not divided: choose a larger share, or name a file for validation"
+    )]
+    NoValidation {
+        /// The share asked for.
+        share: f64,
+        /// The largest number of structures for validation.
+        limit: usize,
+        /// Number of structures.
+        frames: usize,
+        /// Number of seed structures.
+        groups: usize,
+        /// Structures of the smallest of them.
+        smallest: usize,
+    },
+    /// All structures would be validated with.
+    #[error(
+        "the training set is empty: a share of {share} of {frames} structures leaves none to train with; choose a smaller share, or \
+         name a file for validation"
+    )]
+    NoTraining {
+        /// The share asked for.
+        share: f64,
+        /// Number of structures.
+        frames: usize,
+    },
+    /// A group of weights to freeze that the model does not have.
+    #[error("no weights of the model have a name that begins with '{pattern}'; it has {known}")]
+    UnknownGroup {
+        /// What was asked for.
+        pattern: String,
+        /// Names of the groups.
+        known: String,
+    },
+    /// Every weight is frozen.
+    #[error("all weights of the model are frozen: nothing is left to train")]
+    AllFrozen,
+    /// The zero of the energies cannot be found.
+    #[error(transparent)]
+    EnergyZero(#[from] EnergyZeroFault),
+    /// Loss or gradient is NaN or infinite.
+    #[error(
+        "epoch {epoch}, {place}: {what} is not finite, structures {frames}; the last checkpoint is kept. A lower learning rate may \
+         help, or other labels"
+    )]
+    NotFinite {
+        /// The epoch, from 1.
+        epoch: u64,
+        /// The batch, or the validation.
+        place: String,
+        /// Loss or gradient.
+        what: &'static str,
+        /// Where the structures come from.
+        frames: String,
+    },
+    /// A checkpoint of a training with another model, data or settings.
+    #[error(
+        "{}: checkpoint of another training: its {name} is {saved}, now it is {now}; remove the file to start over, or name another \
+         one",
+        path.display()
+    )]
+    OtherTraining {
+        /// The checkpoint.
+        path: PathBuf,
+        /// What differs.
+        name: String,
+        /// In the checkpoint.
+        saved: String,
+        /// In this training.
+        now: String,
+    },
+    /// A file that is no checkpoint, or a damaged one.
+    #[error("{}: {reason}; remove the file to start over, or name another one", path.display())]
+    Damaged {
+        /// The checkpoint.
+        path: PathBuf,
+        /// What is wrong.
+        reason: &'static str,
+    },
+    /// A checkpoint that cannot be read.
+    #[error("{}: cannot be read: {source}", path.display())]
+    ReadCheckpoint {
+        /// The checkpoint.
+        path: PathBuf,
+        /// The error of the operating system.
+        source: std::io::Error,
+    },
+    /// A checkpoint that cannot be written.
+    #[error("cannot write {}: {source}", path.display())]
+    WriteCheckpoint {
+        /// The checkpoint.
+        path: PathBuf,
+        /// The error of the operating system.
+        source: std::io::Error,
+    },
+}
+
+impl UpfitError {
+    /// Whether the input is wrong, as opposed to a failure on the way.
+    pub fn is_wrong_input(&self) -> bool {
+        !matches!(
+            self,
+            Self::NotFinite { .. }
+                | Self::Damaged { .. }
+                | Self::ReadCheckpoint { .. }
+                | Self::WriteCheckpoint { .. }
+        )
+    }
+}

@@ -1,0 +1,98 @@
+//! The errors of a model on a set of frames, without derivatives.
+
+use std::sync::Arc;
+
+use atoms::{Evaluation, Potential};
+use potentials::grace::{Grace, GraceModel};
+
+use crate::data::{FrameFault, LabelledFrame};
+use crate::differences::FrameDifferences;
+use crate::error::UpfitError;
+use crate::parallel::for_each;
+use crate::prepared::PreparedFrame;
+
+/// What the model says of one frame.
+#[derive(Clone, Copy, Debug)]
+pub struct EvaluatedFrame {
+    /// Energy of the model, eV.
+    pub energy: f64,
+    /// Its differences from the labels.
+    pub differences: FrameDifferences,
+}
+
+/// Evaluates all frames, with the δ of the loss. The result does not depend on the number of threads.
+///
+/// # Errors
+/// A frame that the model cannot evaluate.
+pub fn evaluate(
+    model: &GraceModel,
+    frames: &[PreparedFrame<'_>],
+    delta: f64,
+    threads: usize,
+) -> Result<Vec<EvaluatedFrame>, UpfitError> {
+    let model = Arc::new(model.clone());
+    let mut tasks: Vec<_> = frames.iter().map(|frame| (frame, None)).collect();
+    for_each(
+        &mut tasks,
+        threads,
+        || (Grace::new(Arc::clone(&model)), Evaluation::default()),
+        |(grace, evaluation), (frame, result)| {
+            *result = Some(evaluate_frame(grace, evaluation, frame, delta));
+        },
+    );
+    let evaluated = tasks.into_iter().map(|(frame, result)| {
+        // Every task has a result: `for_each` visits each item.
+        let result = result.unwrap_or(Err(FrameFault::ModelNotFinite));
+        result.map_err(|fault| frame.frame.wrong(fault))
+    });
+    evaluated.collect()
+}
+
+/// The sums over these frames, in their order.
+pub fn sum(evaluated: &[EvaluatedFrame]) -> FrameDifferences {
+    let mut sums = FrameDifferences::default();
+    evaluated.iter().for_each(|frame| sums.merge(&frame.differences));
+    sums
+}
+
+/// The first frame whose numbers are not finite.
+pub fn first_not_finite<'a>(
+    frames: &[PreparedFrame<'a>],
+    evaluated: &[EvaluatedFrame],
+) -> Option<&'a LabelledFrame> {
+    let index = evaluated.iter().position(|frame| !frame.differences.is_finite())?;
+    Some(frames[index].frame)
+}
+
+fn evaluate_frame(
+    grace: &mut Grace,
+    evaluation: &mut Evaluation,
+    prepared: &PreparedFrame<'_>,
+    delta: f64,
+) -> Result<EvaluatedFrame, FrameFault> {
+    let neighbours = prepared.neighbours()?;
+    grace.evaluate(&prepared.frame.structure, &neighbours, evaluation)?;
+    let differences = FrameDifferences::new(prepared.frame, evaluation, delta);
+    Ok(EvaluatedFrame { energy: evaluation.energy(), differences })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::loss::LossSettings;
+    use crate::prepared::prepare;
+    use crate::test_frames::{aluminium, model};
+
+    #[test]
+    fn the_model_of_the_demonstration_fits_its_training_data() {
+        let (model, frames) = (model(), aluminium(3));
+        let prepared = prepare(model.model(), &frames, &mut { usize::MAX }).unwrap();
+        let one = sum(&evaluate(model.model(), &prepared, 0.01, 1).unwrap());
+        let two = sum(&evaluate(model.model(), &prepared, 0.01, 2).unwrap());
+        assert_eq!(one, two);
+        let errors = one.errors(&LossSettings::demo().stages[0].weights);
+        assert_eq!(errors.structures, 3);
+        assert!(errors.energy_rmse < 0.02 && errors.force_rmse < 0.1, "{errors:?}");
+        assert!(errors.force_mae <= errors.force_rmse && errors.stress_rmse.unwrap() < 0.01, "{errors:?}");
+    }
+}

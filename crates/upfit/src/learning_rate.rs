@@ -1,0 +1,35 @@
+//! The learning rate.
+
+/// A learning rate that falls by half a cosine from the first update to the last (Loshchilov & Hutter, ICLR 2017, without
+/// restarts).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CosineDecay {
+    /// At the first update.
+    pub first: f64,
+    /// At the end.
+    pub last: f64,
+}
+
+impl CosineDecay {
+    /// The rate of update number `update` (from 0) of `updates`.
+    pub fn rate(&self, update: u64, updates: u64) -> f64 {
+        let share = update as f64 / updates.max(1) as f64;
+        self.last + 0.5 * (self.first - self.last) * (1.0 + (std::f64::consts::PI * share).cos())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rate_falls_by_half_a_cosine() {
+        let decay = CosineDecay { first: 0.01, last: 0.002 };
+        for (update, expected) in
+            [(0, 0.01), (100, 0.006), (200, 0.002), (50, 0.006 + 0.004 * 0.5_f64.sqrt())]
+        {
+            assert!((decay.rate(update, 200) - expected).abs() < 1e-15, "{update}");
+        }
+        assert_eq!(decay.rate(0, 0), 0.01);
+    }
+}

@@ -1,0 +1,35 @@
+//! Fine-tunes the weights of a GRACE model on labelled structures: losses, Adam, epochs over threads, validation and
+//! checkpoints. The gradient with respect to the weights is `potentials::grace::TrainableGrace`'s.
+//!
+//! Results have the same bits for any number of threads and for any interruptions: every frame of a batch has its own
+//! sums, which are added in the order of the frames, and random numbers are a function of random seed and epoch.
+
+mod adam;
+mod checkpoint;
+mod data;
+mod differences;
+mod energy_zero;
+mod epoch;
+mod error;
+mod evaluation;
+mod frozen;
+mod learning_rate;
+mod loss;
+mod parallel;
+mod prepared;
+mod progress;
+mod settings;
+mod split;
+#[cfg(test)]
+mod test_frames;
+mod trainer;
+
+pub use data::{FrameFault, LabelledFrame, MAX_ENERGY_DIFFERENCE, MAX_FORCE, TrainingData, data_hash};
+pub use energy_zero::{ElementShift, EnergyZero, EnergyZeroFault};
+pub use error::UpfitError;
+pub use learning_rate::CosineDecay;
+pub use loss::{LossSettings, LossStage, LossWeights};
+pub use progress::{EpochRecord, ErrorsBySet, SetErrors, TrainingEvent, UpdateProgress};
+pub use settings::UpfitSettings;
+pub use split::split;
+pub use trainer::{UpfitOutcome, run};

@@ -1,0 +1,148 @@
+//! Trainings of the demonstration's model on a few frames of its training data.
+
+use super::*;
+use crate::learning_rate::CosineDecay;
+use crate::loss::LossSettings;
+use crate::split::split;
+use crate::test_frames::{aluminium, model, settings, stronger};
+
+fn data() -> TrainingData {
+    split(stronger(5), 0.2, 1).unwrap()
+}
+
+fn train(data: &TrainingData, settings: &UpfitSettings) -> UpfitOutcome {
+    run(model(), data, settings, None, |_| ControlFlow::Continue(())).unwrap().unwrap()
+}
+
+fn failure(data: &TrainingData, settings: &UpfitSettings) -> UpfitError {
+    match run(model(), data, settings, None, |_| ControlFlow::Continue(())) {
+        Err(error) => error,
+        Ok(_) => panic!("the training did not fail"),
+    }
+}
+
+#[test]
+fn the_loss_falls_and_threads_change_no_bit() {
+    let data = data();
+    let one = train(&data, &settings());
+    let two = train(&data, &UpfitSettings { threads: 2, ..settings() });
+    assert_eq!(one.model.weights(), two.model.weights());
+    assert_eq!((one.updates, one.history.len(), one.ended_early), (4, 2, false));
+    assert!(one.after.training.loss < one.before.training.loss, "{:?} {:?}", one.before, one.after);
+    let (before, after) = (one.before.validation.unwrap(), one.after.validation.unwrap());
+    assert!(after.loss < before.loss && before.structures == 1, "{before:?} {after:?}");
+    // The labels' energies are a tenth larger: −0.34 eV/atom.
+    let [shift] = &one.zero.shifts[..] else { panic!("{:?}", one.zero) };
+    assert!(shift.element == "Al" && (shift.shift + 0.34).abs() < 0.02, "{shift:?}");
+    assert!(before.energy_mae < 0.05, "{before:?}");
+    assert_ne!(one.model.weights(), train(&data, &UpfitSettings { seed: 7, ..settings() }).model.weights());
+}
+
+#[test]
+fn a_training_that_is_stopped_anywhere_goes_on_to_the_same_bits() {
+    let (data, settings) = (data(), UpfitSettings { average: Some(0.5), ..settings() });
+    let whole = train(&data, &settings);
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("run.upfit");
+    let mut stops = 0;
+    let outcome = loop {
+        // Each process makes one update.
+        let stop = |event: TrainingEvent<'_>| match event {
+            TrainingEvent::Update(_) => ControlFlow::Break(()),
+            _ => ControlFlow::Continue(()),
+        };
+        match run(model(), &data, &settings, Some(&path), stop).unwrap() {
+            None => stops += 1,
+            Some(outcome) => break outcome,
+        }
+    };
+    assert_eq!((stops, outcome.updates), (4, 4));
+    assert_eq!(outcome.model.weights(), whole.model.weights());
+    let errors = |outcome: &UpfitOutcome| -> Vec<ErrorsBySet> {
+        outcome.history.iter().map(|record| record.errors.clone()).collect()
+    };
+    assert_eq!(errors(&outcome), errors(&whole));
+
+    for (data, settings, difference) in [
+        (data.clone(), UpfitSettings { seed: 7, ..settings.clone() }, "its random seed is 42, now it is 7"),
+        (split(aluminium(5), 0.2, 1).unwrap(), settings.clone(), "its training set"),
+    ] {
+        match run(model(), &data, &settings, Some(&path), |_| ControlFlow::Continue(())) {
+            Err(error @ UpfitError::OtherTraining { .. }) => {
+                assert!(error.to_string().contains(difference), "{error}");
+            }
+            _ => panic!("a checkpoint of another training was accepted"),
+        }
+    }
+}
+
+#[test]
+fn frozen_weights_stay_and_the_others_move() {
+    let start = model();
+    let name = start.groups()[0].name.clone();
+    let frozen = UpfitSettings { frozen: vec![name.clone()], epochs: 1, ..settings() };
+    let data = TrainingData { training: aluminium(2), validation: Vec::new() };
+    let trained = train(&data, &frozen).model;
+    for group in start.groups() {
+        let same = start.weights()[group.range.clone()] == trained.weights()[group.range.clone()];
+        assert!(same || !group.name.starts_with(&name), "{}", group.name);
+    }
+    assert_ne!(start.weights(), trained.weights());
+}
+
+#[test]
+fn patience_ends_a_training_that_gets_no_better() {
+    // Steps so large that no epoch is as good as the start.
+    let rough = UpfitSettings {
+        epochs: 9,
+        learning_rate: CosineDecay { first: 0.05, last: 0.05 },
+        patience: Some(1),
+        ..settings()
+    };
+    let outcome = train(&split(aluminium(4), 0.25, 1).unwrap(), &rough);
+    assert!(outcome.ended_early && outcome.history.len() < 9, "{:?}", outcome.history);
+    assert_eq!((outcome.epoch, outcome.model.weights()), (0, model().weights()));
+}
+
+#[test]
+fn the_best_weights_are_those_of_the_last_stage() {
+    let paper = UpfitSettings { epochs: 2, loss: LossSettings::paper(), ..settings() };
+    let outcome = train(&data(), &paper);
+    let stages: Vec<_> = outcome.history.iter().map(|record| record.stage).collect();
+    assert_eq!((stages, outcome.epoch), (vec![0, 1], 2));
+}
+
+#[test]
+fn broken_labels_are_named() {
+    let mut data = TrainingData { training: aluminium(6), validation: Vec::new() };
+    data.training[3].energy = -1e6;
+    let message = failure(&data, &settings()).to_string();
+    assert!(message.contains(&data.training[3].place) && message.contains("eV/atom"), "{message}");
+
+    let empty = TrainingData::default();
+    assert!(matches!(failure(&empty, &settings()), UpfitError::NoFrames));
+}
+
+#[test]
+fn a_loss_that_is_not_finite_keeps_the_last_checkpoint() {
+    let data = TrainingData { training: aluminium(2), validation: Vec::new() };
+    let wild = UpfitSettings { learning_rate: CosineDecay { first: 1e200, last: 0.0 }, ..settings() };
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("run.upfit");
+    let error = match run(model(), &data, &wild, Some(&path), |_| ControlFlow::Continue(())) {
+        Err(error) => error,
+        Ok(_) => panic!("the training did not fail"),
+    };
+    let message = error.to_string();
+    assert!(message.contains("is not finite") && message.contains("epoch 2, batch 1 of 1"), "{message}");
+    assert!(message.contains("seed_frames.extxyz:") && !error.is_wrong_input(), "{message}");
+    let settings = UpfitSettings { threads: 2, ..wild };
+    let mut resumed = None;
+    let stopped = run(model(), &data, &settings, Some(&path), |event| {
+        if let TrainingEvent::Begun { resumed: epochs, .. } = event {
+            resumed = epochs;
+        }
+        ControlFlow::Break(())
+    });
+    assert!(matches!(stopped, Ok(None)) && resumed.is_some_and(|epochs| epochs <= 1), "{resumed:?}");
+}
