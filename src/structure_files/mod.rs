@@ -5,7 +5,7 @@ mod format;
 mod reader;
 
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
@@ -40,6 +40,24 @@ impl StructureFiles {
         StructureReader::new(self.clone(), bytes)
     }
 
+    /// Sets the weights of some of the files.
+    ///
+    /// # Errors
+    /// A file that is not one of these, or that is given twice.
+    pub fn set_weights(&mut self, weights: &[(PathBuf, f64)]) -> Result<(), CommandError> {
+        for (number, (path, weight)) in weights.iter().enumerate() {
+            if weights[..number].iter().any(|(other, _)| other == path) {
+                return Err(CommandError::Input(format!("--weight {}: given twice", path.display())));
+            }
+            let file = self.files.iter_mut().find(|file| *file.path == **path);
+            let unknown = || {
+                CommandError::Input(format!("--weight {}: expected one of the files of DATA", path.display()))
+            };
+            file.ok_or_else(unknown)?.weight = *weight;
+        }
+        Ok(())
+    }
+
     /// Total size of the files, bytes.
     pub fn total_bytes(&self) -> Result<u64, CommandError> {
         let size = |file: &StructureFile| std::fs::metadata(&file.path).map(|found| found.len());
@@ -50,4 +68,12 @@ impl StructureFiles {
     pub fn paths(&self) -> impl Iterator<Item = &Path> {
         self.files.iter().map(|file| &*file.path)
     }
+}
+
+/// Parser of an argument `FILE=W` with the weight of a file.
+pub fn file_weight(text: &str) -> Result<(PathBuf, f64), String> {
+    let expected = || "expected FILE=W with a number W, 0 or more".to_owned();
+    let (file, weight) = text.rsplit_once('=').ok_or_else(expected)?;
+    let weight = weight.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0);
+    weight.map(|weight| (file.into(), weight)).ok_or_else(expected)
 }

@@ -18,7 +18,7 @@ use crate::file_hash;
 use crate::mixture_build::{self, BuildPart, PassContext};
 use crate::output::{TextTable, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
-use crate::structure_files::{StructureArgs, StructureFiles};
+use crate::structure_files::{StructureArgs, file_weight};
 
 /// Projected features of a model without a projection, as in the paper.
 const PROJECTED: usize = 128;
@@ -53,7 +53,7 @@ pub struct CalmBuildArgs {
     #[arg(long, value_name = "VARIANT")]
     feature_variant: Option<FeatureVariant>,
     /// Weight of the atoms of a file of DATA, 0 or more [default: 1]; may be repeated
-    #[arg(long, value_name = "FILE=W", value_parser = weight)]
+    #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
     /// Candidate numbers of components per element, ascending; the build chooses one for each element
     #[arg(long, value_name = "K,…", value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
@@ -94,7 +94,8 @@ impl CalmBuildArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let outputs: Vec<&Path> =
             std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path).collect();
-        let files = self.weighted_files()?;
+        let mut files = self.data.files()?;
+        files.set_weights(&self.weight)?;
         let data = files.paths().map(|path| (path, "a file of training data"));
         let inputs: Vec<_> = std::iter::once((self.model.as_path(), "the model")).chain(data).collect();
         outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
@@ -148,22 +149,6 @@ impl CalmBuildArgs {
         build.finish()?;
         report(&mixture, &self.output)?;
         Ok(ExitStatus::Done)
-    }
-
-    /// The training data with their weights.
-    fn weighted_files(&self) -> Result<StructureFiles, CommandError> {
-        let mut data = self.data.files()?;
-        for (number, (path, weight)) in self.weight.iter().enumerate() {
-            if self.weight[..number].iter().any(|(other, _)| other == path) {
-                return Err(CommandError::Input(format!("--weight {}: given twice", path.display())));
-            }
-            let file = data.files.iter_mut().find(|file| *file.path == **path);
-            let unknown = || {
-                CommandError::Input(format!("--weight {}: expected one of the files of DATA", path.display()))
-            };
-            file.ok_or_else(unknown)?.weight = *weight;
-        }
-        Ok(data)
     }
 }
 
@@ -227,13 +212,6 @@ pub(super) fn projected(
         ));
     };
     Ok((found.model, projection, seed))
-}
-
-fn weight(text: &str) -> Result<(PathBuf, f64), String> {
-    let expected = || "expected FILE=W with a number W, 0 or more".to_owned();
-    let (file, weight) = text.rsplit_once('=').ok_or_else(expected)?;
-    let weight = weight.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0);
-    weight.map(|weight| (file.into(), weight)).ok_or_else(expected)
 }
 
 /// A table of the elements.
