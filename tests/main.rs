@@ -50,6 +50,7 @@ mod schema;
 mod select;
 mod status;
 mod triage;
+mod upfit;
 mod walk_groups;
 mod wrong_artifacts;
 mod wrong_campaign;

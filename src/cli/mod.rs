@@ -29,6 +29,7 @@ mod seed_structure_table;
 mod select;
 pub mod status;
 mod store;
+mod upfit;
 mod validate;
 mod walker;
 mod walks;
@@ -81,6 +82,7 @@ enum CliCommand {
     #[command(subcommand)]
     Calm(calm::CalmCommand),
     Select(select::SelectArgs),
+    Upfit(upfit::UpfitArgs),
     Import(import::ImportArgs),
     Store(store::StoreArgs),
     Md(md::MdArgs),
@@ -120,6 +122,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Replay(command) => command.run(),
         CliCommand::Calm(command) => command.run(),
         CliCommand::Select(command) => command.run(),
+        CliCommand::Upfit(command) => command.run(),
         CliCommand::Import(command) => command.run(),
         CliCommand::Store(command) => command.run(),
         CliCommand::Md(command) => command.run(),

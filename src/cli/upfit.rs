@@ -1,0 +1,268 @@
+//! `calmwalk upfit`
+
+mod data;
+mod display;
+mod figure;
+mod report;
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use ::upfit::{CosineDecay, LossSettings, TrainingData, UpfitError, UpfitSettings};
+use figures::to_svg;
+use potentials::grace::TrainableGrace;
+
+use self::data::{DataFile, read_frames};
+use self::display::TrainingDisplay;
+use super::{CommandError, ExitStatus};
+use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::output::{count, print, print_json, print_stderr};
+use crate::signals::stop_token;
+use crate::structure_files::{StructureReadingArgs, file_weight};
+
+/// Fine-tune a GRACE model on labelled structures
+///
+/// Trains the weights of an export (kokkos.npz, one or two layers) with Adam on energies, forces and stresses, and writes a model file
+/// with the new weights, for calmwalk and LAMMPS. Labels are read as by `calm score`: energy, forces, stress or virial, or the same
+/// with REF_. The result does not depend on the number of threads.
+///
+/// If the labels' energies have another zero than the model's, the shifts of the elements are fitted first. --validation-share holds
+/// out whole seed structures (`seed_structure` of a frame, as `calmwalk export` writes it; otherwise single frames); the weights with
+/// the smallest validation loss are written.
+///
+/// The mixture in the model file belongs to the old weights: build a new one with `calmwalk calm build`.
+///
+/// Keeps its state in NEW.npz.upfit until the model is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same command
+/// continues, to the same bytes.
+#[derive(Debug, clap::Args)]
+pub struct UpfitArgs {
+    /// GRACE model (kokkos.npz)
+    #[arg(long, value_name = "MODEL.npz")]
+    model: PathBuf,
+    /// Labelled structures: extended XYZ (.extxyz, .xyz), also with .gz or .zst
+    #[arg(value_name = "DATA", required = true)]
+    data: Vec<PathBuf>,
+    #[command(flatten)]
+    reading: StructureReadingArgs,
+    /// File for the new model; an existing file is replaced at the end
+    #[arg(long, short, value_name = "NEW.npz")]
+    output: PathBuf,
+    /// Passes over the training set
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    epochs: u64,
+    /// Validate with the structures of this file, and train with all of DATA; may be repeated
+    #[arg(long, value_name = "FILE", conflicts_with = "validation_share")]
+    validation: Vec<PathBuf>,
+    /// Share of the structures of DATA for validation, whole seed structures only; 0: none, then the last weights are written
+    #[arg(long, value_name = "X", default_value_t = 0.1, value_parser = share)]
+    validation_share: f64,
+    /// Weights of the loss. demo: energy 20, forces 5, stress 20; paper: 1, 5 and 0.1, after 5/12 of the epochs 25, 1 and 0.1
+    #[arg(long, value_name = "NAME", value_enum, default_value_t = LossName::Demo)]
+    loss: LossName,
+    /// Weight of the errors of the energy per atom, in place of that of --loss
+    #[arg(long, value_name = "W", value_parser = not_negative)]
+    energy_weight: Option<f64>,
+    /// Weight of the errors of force components, in place of that of --loss
+    #[arg(long, value_name = "W", value_parser = not_negative)]
+    force_weight: Option<f64>,
+    /// Weight of the errors of stress components, in place of that of --loss
+    #[arg(long, value_name = "W", value_parser = not_negative)]
+    stress_weight: Option<f64>,
+    /// δ of the Huber loss: larger errors count linearly, eV/atom, eV/Å and eV/Å³ [default: 0.01]
+    #[arg(long, value_name = "DELTA", value_parser = positive)]
+    huber_delta: Option<f64>,
+    /// Weight of the structures of a file of DATA, 0 or more [default: 1]; may be repeated
+    #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
+    weight: Vec<(PathBuf, f64)>,
+    /// Learning rate of the first update; it falls by half a cosine
+    #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive)]
+    learning_rate: f64,
+    /// Learning rate at the end [default: a hundredth of --learning-rate]
+    #[arg(long, value_name = "RATE", value_parser = not_negative)]
+    min_learning_rate: Option<f64>,
+    /// Structures for each update
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..))]
+    batch_size: u32,
+    /// Random seed of the validation set and of the order of the structures
+    #[arg(long, value_name = "N", default_value_t = 42)]
+    rng_seed: u64,
+    /// Do not train the weights whose names begin with NAME; an unknown name lists all. May be repeated
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    freeze: Vec<String>,
+    /// Threads; each takes whole structures of a batch [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+    /// Validate and write a moving average of the weights with this decay at each update, such as 0.99
+    #[arg(long, value_name = "X", value_parser = share)]
+    average: Option<f64>,
+    /// End when the validation loss has had no new minimum for this many epochs [default: never]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    patience: Option<u64>,
+    /// File of the state [default: NEW.npz.upfit]
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+    /// Also draw the learning curves
+    #[arg(long, value_name = "FILE.svg")]
+    figure: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// A set of weights of the loss.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum LossName {
+    Demo,
+    Paper,
+}
+
+impl UpfitArgs {
+    pub fn run(self) -> Result<ExitStatus, CommandError> {
+        let checkpoint = self.checkpoint_path();
+        self.check_outputs(&checkpoint)?;
+        let model = TrainableGrace::load(&self.model).map_err(CommandError::input)?;
+        let (data, files) = self.read_data()?;
+        let settings = self.settings();
+        let note = report::note(&self.model, &data, &files, &settings)?;
+        let stop = stop_token()?;
+        let mut display = TrainingDisplay::new(&checkpoint);
+        let trained = ::upfit::run(model, &data, &settings, Some(&checkpoint), |event| {
+            display.show(&event);
+            if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        drop(display);
+        let Some(outcome) = trained.map_err(command_error)? else {
+            print_stderr(format_args!("stopped; the same command continues from {}", checkpoint.display()));
+            return Ok(ExitStatus::Interrupted);
+        };
+        if let Some(path) = &self.figure {
+            let mut file = AtomicFile::create(path)?;
+            let text = to_svg(&figure::learning_curves(&outcome.history));
+            file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
+            file.finish()?;
+        }
+        write_model(&outcome.model, &self.output, &note.to_string())?;
+        // Without the model, the checkpoint would be needed.
+        fs::remove_file(&checkpoint).map_err(|error| cannot_write(&checkpoint, error))?;
+        if self.json {
+            print_json(&report::to_json(&outcome, &note, &self.output))?;
+        } else {
+            print(|out| report::write(out, &outcome, &self.output))?;
+        }
+        Ok(ExitStatus::Done)
+    }
+
+    fn checkpoint_path(&self) -> PathBuf {
+        self.checkpoint.clone().unwrap_or_else(|| {
+            let mut name = self.output.clone().into_os_string();
+            name.push(".upfit");
+            name.into()
+        })
+    }
+
+    /// Finds errors in paths before hours of work.
+    fn check_outputs(&self, checkpoint: &Path) -> Result<(), CommandError> {
+        let outputs = || [self.output.as_path(), checkpoint].into_iter().chain(self.figure.as_deref());
+        let data = self.data.iter().map(|path| (path.as_path(), "a file of training data"));
+        let validation = self.validation.iter().map(|path| (path.as_path(), "a file of validation data"));
+        let inputs: Vec<_> =
+            std::iter::once((self.model.as_path(), "the model")).chain(data).chain(validation).collect();
+        for (number, output) in outputs().enumerate() {
+            refuse_to_replace(output, inputs.iter().copied())?;
+            if outputs().take(number).any(|other| other == output) {
+                return Err(CommandError::Input(format!("{}: named for two outputs", output.display())));
+            }
+            AtomicFile::create(output).map(drop)?;
+        }
+        Ok(())
+    }
+
+    /// Both sets, and the files that they come from.
+    fn read_data(&self) -> Result<(TrainingData, Vec<DataFile>), CommandError> {
+        let mut files = self.reading.files(&self.data)?;
+        files.set_weights(&self.weight)?;
+        let (frames, mut sources) = read_frames(&files, false)?;
+        let data = if self.validation.is_empty() {
+            ::upfit::split(frames, self.validation_share, self.rng_seed).map_err(command_error)?
+        } else {
+            let (validation, others) = read_frames(&self.reading.files(&self.validation)?, true)?;
+            sources.extend(others);
+            TrainingData { training: frames, validation }
+        };
+        if self.patience.is_some() && data.validation.is_empty() {
+            let message = "--patience: expected a validation set, not --validation-share 0";
+            return Err(CommandError::input(message));
+        }
+        let [training, validation] = [data.training.len(), data.validation.len()];
+        print_stderr(format_args!(
+            "{} to train with, {} for validation",
+            count(training as u64, "structure"),
+            count(validation as u64, "structure")
+        ));
+        Ok((data, sources))
+    }
+
+    fn settings(&self) -> UpfitSettings {
+        let mut loss = match self.loss {
+            LossName::Demo => LossSettings::demo(),
+            LossName::Paper => LossSettings::paper(),
+        };
+        for stage in &mut loss.stages {
+            let weights = &mut stage.weights;
+            weights.energy = self.energy_weight.unwrap_or(weights.energy);
+            weights.forces = self.force_weight.unwrap_or(weights.forces);
+            weights.stress = self.stress_weight.unwrap_or(weights.stress);
+        }
+        loss.delta = self.huber_delta.unwrap_or(loss.delta);
+        let last = self.min_learning_rate.unwrap_or(0.01 * self.learning_rate);
+        let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
+        UpfitSettings {
+            epochs: self.epochs,
+            batch_size: self.batch_size as usize,
+            loss,
+            learning_rate: CosineDecay { first: self.learning_rate, last },
+            seed: self.rng_seed,
+            frozen: self.freeze.clone(),
+            average: self.average,
+            patience: self.patience,
+            threads: self.threads.map_or(cores, usize::from),
+        }
+    }
+}
+
+/// Wrong input: exit code 2; failures on the way: exit code 1.
+fn command_error(error: UpfitError) -> CommandError {
+    if error.is_wrong_input() { CommandError::input(error) } else { CommandError::failed(error) }
+}
+
+/// Writes the model to a file beside its target first, so that the target appears complete or not at all.
+fn write_model(model: &TrainableGrace, output: &Path, note: &str) -> Result<(), CommandError> {
+    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let mut builder = tempfile::Builder::new();
+    let part = builder.prefix(".upfit.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
+    let part = part.map_err(|error| cannot_write(output, error))?.into_temp_path();
+    model.write(&part, note).map_err(|error| cannot_write(output, error))?;
+    let mut file = AtomicFile::create(output)?;
+    let copied = File::open(&part).and_then(|mut written| io::copy(&mut written, &mut file));
+    copied.map_err(|error| cannot_write(output, error))?;
+    file.finish()
+}
+
+fn number(text: &str, is_valid: impl Fn(f64) -> bool, expected: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number: &f64| number.is_finite() && is_valid(*number));
+    number.ok_or_else(|| format!("expected {expected}"))
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    number(text, |x| (0.0..1.0).contains(&x), "a number from 0 up to, not including, 1")
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    number(text, |x| x > 0.0, "a positive number")
+}
+
+fn not_negative(text: &str) -> Result<f64, String> {
+    number(text, |x| x >= 0.0, "a number, 0 or more")
+}

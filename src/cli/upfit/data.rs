@@ -1,0 +1,74 @@
+//! Reads labelled structures.
+
+use std::sync::Arc;
+
+use ::upfit::LabelledFrame;
+use atoms::extxyz::Frame;
+use serde::Serialize;
+
+use super::command_error;
+use crate::cli::CommandError;
+use crate::file_hash;
+use crate::output::{count, log_and_warn};
+use crate::structure_files::{FileLine, StructureFile, StructureFiles};
+
+/// The key of a frame with the name of its seed structure, as `calmwalk export` writes it.
+const GROUP: &str = "seed_structure";
+
+/// A file of labelled structures, for the note in the model.
+#[derive(Clone, Debug, Serialize)]
+pub struct DataFile {
+    file: String,
+    /// BLAKE3.
+    hash: String,
+    /// Those used.
+    structures: u64,
+    weight: f64,
+    /// Whether it was named for validation.
+    validation: bool,
+}
+
+/// The labelled structures of all files.
+///
+/// # Errors
+/// A structure that cannot be read; labels that [`LabelledFrame::new`] refuses.
+pub fn read_frames(
+    files: &StructureFiles,
+    validation: bool,
+) -> Result<(Vec<LabelledFrame>, Vec<DataFile>), CommandError> {
+    let mut reader = files.reader(Arc::default());
+    let (mut frames, mut counts) = (Vec::new(), vec![0; files.files.len()]);
+    let mut stresses_left_out = 0_u64;
+    while let Some((frame, file)) = reader.next()? {
+        counts[reader.file_index()] += 1;
+        let (labelled, has_stress) = labelled_frame(frame, &file)?;
+        stresses_left_out += u64::from(has_stress && labelled.stress.is_none());
+        frames.push(labelled);
+    }
+    if stresses_left_out > 0 {
+        log_and_warn(format_args!(
+            "the stresses of {} are left out: not periodic in all three directions",
+            count(stresses_left_out, "structure")
+        ));
+    }
+    let file = |(file, structures): (&StructureFile, u64)| -> Result<DataFile, CommandError> {
+        let hash = file_hash::hash(&file.path).map_err(|error| {
+            CommandError::Input(format!("{}: cannot be read: {error}", file.path.display()))
+        })?;
+        let name = file.path.display().to_string();
+        Ok(DataFile { file: name, hash, structures, weight: file.weight, validation })
+    };
+    let sources = files.files.iter().zip(counts).map(file).collect::<Result<_, _>>()?;
+    Ok((frames, sources))
+}
+
+/// The frame with its labels, and whether these have a stress.
+fn labelled_frame(frame: Frame, file: &StructureFile) -> Result<(LabelledFrame, bool), CommandError> {
+    let labels =
+        frame.labels().map_err(|error| CommandError::Input(format!("{}: {error}", file.path.display())))?;
+    let has_stress = labels.stress.is_some();
+    let place = FileLine { file: Arc::clone(&file.path), line: frame.line }.to_string();
+    let group = frame.info.get(GROUP).map_or_else(|| place.clone(), ToString::to_string);
+    let labelled = LabelledFrame::new(place, group, frame.structure, labels, file.weight);
+    Ok((labelled.map_err(command_error)?, has_stress))
+}

@@ -1,0 +1,118 @@
+//! What a training says at its end: tables, JSON, and the note in the model.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use ::upfit::{EnergyZero, SetErrors, TrainingData, UpfitOutcome, UpfitSettings, data_hash};
+use serde_json::{Map, Value, json};
+
+use super::data::DataFile;
+use crate::cli::CommandError;
+use crate::file_hash;
+use crate::output::{TextTable, count, decimals};
+
+/// Where the weights come from, for the model file. It names no times and no number of threads, so that the same training gives
+/// the same bytes.
+pub fn note(
+    model: &Path,
+    data: &TrainingData,
+    files: &[DataFile],
+    settings: &UpfitSettings,
+) -> Result<Value, CommandError> {
+    let hash = file_hash::hash(model)
+        .map_err(|error| CommandError::Input(format!("{}: cannot be read: {error}", model.display())))?;
+    let set =
+        |frames: &[::upfit::LabelledFrame]| json!({ "structures": frames.len(), "hash": data_hash(frames) });
+    let settings: Map<_, _> =
+        settings.entries().into_iter().map(|(name, value)| (name, Value::from(value))).collect();
+    Ok(json!({
+        "program": concat!("calmwalk ", env!("CARGO_PKG_VERSION"), " upfit"),
+        "model": { "file": model.display().to_string(), "hash": hash },
+        "files": files,
+        "training": set(&data.training),
+        "validation": set(&data.validation),
+        "settings": settings,
+    }))
+}
+
+/// Says how the zero of the energies was moved, if it was.
+pub fn zero_text(zero: &EnergyZero) -> Option<String> {
+    if zero.shifts.is_empty() {
+        return None;
+    }
+    let shifts = zero.shifts.iter().map(|shift| format!("{} {:+.4}", shift.element, shift.shift));
+    let reason = if zero.is_constant {
+        ", the same for each element: compositions do not tell them apart"
+    } else {
+        ""
+    };
+    Some(format!(
+        "the labels' energies have another zero than the model's; shifts added to it, eV/atom: {}{reason}",
+        shifts.collect::<Vec<_>>().join(", ")
+    ))
+}
+
+/// The outcome as JSON.
+pub fn to_json(outcome: &UpfitOutcome, note: &Value, output: &Path) -> Value {
+    json!({
+        "output": output.display().to_string(),
+        "epochs": outcome.history.len(),
+        "epoch": outcome.epoch,
+        "updates": outcome.updates,
+        "ended_early": outcome.ended_early,
+        "energy_zero": outcome.zero,
+        "before": outcome.before,
+        "after": outcome.after,
+        "history": outcome.history,
+        "note": note,
+    })
+}
+
+/// Errors before and after, and what was written.
+pub fn write(out: &mut dyn Write, outcome: &UpfitOutcome, output: &Path) -> io::Result<()> {
+    let mut table = TextTable::new(&[
+        "set",
+        "model",
+        ">structures",
+        ">energy MAE",
+        ">RMSE (meV/atom)",
+        ">force MAE",
+        ">RMSE (meV/Å)",
+        ">stress MAE",
+        ">RMSE (meV/Å³)",
+    ]);
+    let mut add = |set: &str, [before, after]: [&SetErrors; 2]| {
+        table.push(row(set, "before", before));
+        table.push(row("", "after", after));
+    };
+    add("training", [&outcome.before.training, &outcome.after.training]);
+    if let (Some(before), Some(after)) = (&outcome.before.validation, &outcome.after.validation) {
+        add("validation", [before, after]);
+    }
+    table.write(out)?;
+    let epochs = count(outcome.history.len() as u64, "epoch");
+    let end = if outcome.ended_early { " (ended early)" } else { "" };
+    writeln!(out, "{} in {epochs}{end}", count(outcome.updates, "update"))?;
+    let chosen = match outcome.epoch {
+        0 => "the weights before the first update, which no epoch improved".to_owned(),
+        epoch => format!("the weights after epoch {epoch}"),
+    };
+    writeln!(out, "wrote {} with {chosen}", output.display())?;
+    writeln!(out, "a mixture of the old weights does not fit these: build a new one with calmwalk calm build")
+}
+
+fn row(set: &str, model: &str, errors: &SetErrors) -> Vec<String> {
+    let milli = |x: f64| decimals(Some(1e3 * x), 2);
+    let optional = |x: Option<f64>| decimals(x.map(|x| 1e3 * x), 3);
+    vec![
+        set.to_owned(),
+        model.to_owned(),
+        errors.structures.to_string(),
+        milli(errors.energy_mae),
+        milli(errors.energy_rmse),
+        milli(errors.force_mae),
+        milli(errors.force_rmse),
+        optional(errors.stress_mae),
+        optional(errors.stress_rmse),
+    ]
+}
