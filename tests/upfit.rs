@@ -41,7 +41,7 @@ fn change_labels(frame: &mut Frame, change: impl FnOnce(&mut FrameLabels)) {
 fn arguments(output: &str, more: &[&str]) -> Vec<String> {
     let model = config(MODEL).display().to_string();
     let first = ["upfit", "--model", &model, "data.extxyz", "--output", output];
-    let short = ["--batch-size", "2", "--learning-rate", "2e-4"];
+    let short = ["--batch-size", "2", "--learning-rate", "1e-4", "--energy-weight", "1"];
     let mut all: Vec<_> = first.iter().chain(&short).chain(more).map(|text| (*text).to_owned()).collect();
     if !more.contains(&"--epochs") {
         all.extend(["--epochs".to_owned(), "2".to_owned()]);

@@ -32,7 +32,7 @@ use crate::structure_files::{StructureReadingArgs, file_weight};
 /// out whole seed structures (`seed_structure` of a frame, as `calmwalk export` writes it; otherwise single frames); the weights with
 /// the smallest validation loss are written.
 ///
-/// The mixture in the model file belongs to the old weights: build a new one with `calmwalk calm build`.
+/// The new file has no mixture, since the old one does not fit the new weights: build one with `calmwalk calm build`.
 ///
 /// Keeps its state in NEW.npz.upfit until the model is written. After an interruption (Ctrl-C, SIGTERM, a crash), the same command
 /// continues, to the same bytes.

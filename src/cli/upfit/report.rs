@@ -98,7 +98,10 @@ pub fn write(out: &mut dyn Write, outcome: &UpfitOutcome, output: &Path) -> io::
         epoch => format!("the weights after epoch {epoch}"),
     };
     writeln!(out, "wrote {} with {chosen}", output.display())?;
-    writeln!(out, "a mixture of the old weights does not fit these: build a new one with calmwalk calm build")
+    writeln!(
+        out,
+        "it has no mixture, since the old one does not fit these weights: build one with calmwalk calm build"
+    )
 }
 
 fn row(set: &str, model: &str, errors: &SetErrors) -> Vec<String> {
