@@ -141,14 +141,9 @@ fn aluminium_runs_as_it_stands() {
 }
 
 #[test]
-fn silicon_runs() {
+fn silicon_runs_as_it_stands() {
     let directory = tempfile::tempdir().unwrap();
-    let file = shorter(
-        directory.path(),
-        "silicon.toml",
-        ["# equilibration_steps = 500", "equilibration_steps = 200"],
-    );
-    let frames = campaign(directory.path(), &file, 8, 1.2);
+    let frames = campaign(directory.path(), &config("silicon.toml"), 8, 1.2);
     check_labels(&frames, &mut StillingerWeber::load(config("data/Si.sw")).unwrap());
 }
 

@@ -9,8 +9,11 @@ const HEIGHT: f64 = 190.0;
 const TRAINING: Colour = Colour::BLUE;
 const VALIDATION: Colour = Colour::VERMILLION;
 
+/// One of the errors of a set.
+type ErrorOfSet = fn(&SetErrors) -> f64;
+
 /// Titles and values of the panels.
-const QUANTITIES: [(&str, fn(&SetErrors) -> f64); 3] = [
+const QUANTITIES: [(&str, ErrorOfSet); 3] = [
     ("loss", |errors| errors.loss),
     ("energy RMSE (meV per atom)", |errors| 1e3 * errors.energy_rmse),
     ("force RMSE (meV Å^{−1})", |errors| 1e3 * errors.force_rmse),
