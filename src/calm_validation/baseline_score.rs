@@ -5,6 +5,7 @@ use std::sync::Arc;
 use atoms::Structure;
 use calm::baselines::{Baseline, BaselineError, BaselineKind};
 
+use super::own_features::OwnFeatures;
 use super::{AtomScore, DetectionRule};
 use crate::feature_variant::FeatureModel;
 use crate::features::FeatureCalculator;
@@ -13,18 +14,14 @@ use crate::features::FeatureCalculator;
 pub struct BaselineScore {
     name: String,
     baseline: Arc<Baseline>,
-    /// The features of the baseline with their calculator, unless it scores the features that γ grades, and these alone.
-    own: Option<(FeatureModel, FeatureCalculator)>,
+    /// The features of the baseline, unless it scores the features that γ grades, and these alone.
+    own: Option<OwnFeatures>,
 }
 
 impl BaselineScore {
     /// `own` has the features of the baseline; `None` if it scores the features that γ grades, and these alone.
     pub fn new(name: String, baseline: Arc<Baseline>, own: Option<FeatureModel>) -> Self {
-        let own = own.map(|model| {
-            let calculator = model.calculator();
-            (model, calculator)
-        });
-        Self { name, baseline, own }
+        Self { name, baseline, own: own.map(OwnFeatures::new) }
     }
 }
 
@@ -38,8 +35,11 @@ impl AtomScore for BaselineScore {
     }
 
     fn for_thread(&self) -> Box<dyn AtomScore> {
-        let own = self.own.as_ref().map(|(model, _)| model.clone());
-        Box::new(Self::new(self.name.clone(), Arc::clone(&self.baseline), own))
+        Box::new(Self {
+            name: self.name.clone(),
+            baseline: Arc::clone(&self.baseline),
+            own: self.own.as_ref().map(OwnFeatures::for_thread),
+        })
     }
 
     fn score(
@@ -50,10 +50,7 @@ impl AtomScore for BaselineScore {
     ) -> Result<Vec<f64>, String> {
         let found = match &mut self.own {
             None => self.baseline.score(elements, features),
-            Some((_, calculator)) => {
-                calculator.compute(structure).map_err(|error| error.to_string())?;
-                score_own_features(&self.baseline, calculator, elements)
-            }
+            Some(own) => score_own_features(&self.baseline, own.compute(structure)?, elements),
         };
         found.map_err(|error| error.to_string())
     }

@@ -5,27 +5,23 @@ use std::sync::Arc;
 use atoms::Structure;
 use calm::{Grades, Mixture};
 
+use super::own_features::OwnFeatures;
 use super::{AtomScore, DetectionRule};
 use crate::feature_variant::FeatureModel;
-use crate::features::FeatureCalculator;
 
 /// A mixture, with a calculator if it grades other features.
 pub struct MixtureScore {
     name: String,
     mixture: Arc<Mixture>,
-    /// The features of the mixture with their calculator, unless they are those that γ grades.
-    own: Option<(FeatureModel, FeatureCalculator)>,
+    /// The features of the mixture, unless they are those that γ grades.
+    own: Option<OwnFeatures>,
     grades: Grades,
 }
 
 impl MixtureScore {
     /// `own` has the features of the mixture; `None` if they are those that γ grades.
     pub fn new(name: String, mixture: Arc<Mixture>, own: Option<FeatureModel>) -> Self {
-        let own = own.map(|model| {
-            let calculator = model.calculator();
-            (model, calculator)
-        });
-        Self { name, mixture, own, grades: Grades::default() }
+        Self { name, mixture, own: own.map(OwnFeatures::new), grades: Grades::default() }
     }
 }
 
@@ -39,8 +35,12 @@ impl AtomScore for MixtureScore {
     }
 
     fn for_thread(&self) -> Box<dyn AtomScore> {
-        let own = self.own.as_ref().map(|(model, _)| model.clone());
-        Box::new(Self::new(self.name.clone(), Arc::clone(&self.mixture), own))
+        Box::new(Self {
+            name: self.name.clone(),
+            mixture: Arc::clone(&self.mixture),
+            own: self.own.as_ref().map(OwnFeatures::for_thread),
+            grades: Grades::default(),
+        })
     }
 
     fn score(
@@ -51,10 +51,7 @@ impl AtomScore for MixtureScore {
     ) -> Result<Vec<f64>, String> {
         let features = match &mut self.own {
             None => features,
-            Some((_, calculator)) => {
-                calculator.compute(structure).map_err(|error| error.to_string())?;
-                calculator.features()
-            }
+            Some(own) => own.compute(structure)?.features(),
         };
         let graded = self.grades.evaluate(&self.mixture, elements, features, None);
         graded.map_err(|error| error.to_string())?;

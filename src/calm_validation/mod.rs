@@ -16,6 +16,7 @@ mod grader;
 pub mod labelled;
 mod minimum;
 mod mixture_score;
+mod own_features;
 mod progress;
 mod random;
 mod solutions;
