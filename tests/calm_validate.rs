@@ -142,8 +142,15 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
         "--pairs",
         "Ni-Al",
     ];
-    validate(here, "ni_al_h_eam_1l", "out", &[&only[..], &ensemble[..]].concat());
+    let labelled = read_extxyz(&config("data/ni_al_h_eam_1l/seed_frames.extxyz")).unwrap();
+    let labelled: Vec<_> = labelled.into_iter().step_by(9).collect();
+    write_frames(&here.join("labelled.extxyz"), &labelled);
+    let labels = ["--labelled", "labelled.extxyz"];
+    validate(here, "ni_al_h_eam_1l", "out", &[&only[..], &ensemble[..], &labels[..]].concat());
     let found = json(&here.join("out"));
+    errors_are_divided(&found["labelled"], &labelled);
+    let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
+    assert!(page.contains("id=\"figure-composition-errors\"") && page.contains("id=\"table-element-errors\""));
     // An ensemble of equal models has no spread anywhere.
     let spread = &found["scores"][1];
     assert_eq!(
@@ -164,6 +171,28 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let atoms: u64 =
         solution["first_shells"].as_array().unwrap().iter().map(|of| of["atoms"].as_u64().unwrap()).sum();
     assert_eq!(atoms, 11 * 128);
+}
+
+/// Labelled structures and their atoms by composition and by element.
+fn errors_are_divided(report: &Value, frames: &[Frame]) {
+    let share = |frame: &Frame| {
+        let nickel = frame.structure.species.iter().filter(|species| species.symbol() == "Ni").count();
+        (10.0 * nickel as f64 / frame.structure.len() as f64).round() / 10.0
+    };
+    let scans = report["compositions"].as_array().unwrap();
+    let scan = scans.iter().find(|scan| scan["element"] == "Ni").unwrap();
+    let groups = scan["groups"].as_array().unwrap();
+    assert!(groups.len() > 1, "{scan}");
+    for group in groups {
+        let members: Vec<_> =
+            frames.iter().filter(|frame| share(frame) == group["share"].as_f64().unwrap()).collect();
+        let atoms: usize = members.iter().map(|frame| frame.structure.len()).sum();
+        assert_eq!((&group["structures"], &group["atoms"]), (&members.len().into(), &atoms.into()));
+        assert!(group["energy"]["mean"].is_f64() && group["forces"]["mean"].is_f64(), "{group}");
+    }
+    let elements = report["elements"].as_array().unwrap();
+    let atoms: u64 = elements.iter().map(|of| of["atoms"].as_u64().unwrap()).sum();
+    assert_eq!((elements.len(), json!(atoms)), (3, report["atoms"].clone()));
 }
 
 #[test]

@@ -3,6 +3,7 @@
 //! after another, with bounded memory; [`LabelledReport`] has the numbers, of which `tables` and `figures` are drawn.
 
 mod collect;
+mod composition_tables;
 mod deviations;
 mod estimate;
 mod figures;

@@ -1,5 +1,7 @@
 //! Collects scores and errors of one labelled structure after another.
 
+use std::sync::Arc;
+
 use analysis::{Bins, Exceedance, ForceErrors, LabelledEnergy, SystematicSample};
 use atoms::Species;
 use atoms::cell::{norm, sub};
@@ -14,7 +16,7 @@ pub const LARGE_ERROR: f64 = 1.0;
 pub const THRESHOLDS: [f64; 19] =
     [0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0];
 
-/// Atoms in the sample for ranks, quantiles and intervals: about 100 bytes each for two scores.
+/// Atoms in the sample for ranks, quantiles and intervals: about 120 bytes each for two scores.
 const SAMPLED_ATOMS: usize = 200_000;
 /// Structures in the sample for energy offsets and the intervals of mean errors.
 const SAMPLED_STRUCTURES: usize = 50_000;
@@ -64,6 +66,8 @@ pub struct SampledAtom {
     /// Number of its structure.
     pub structure: u64,
     pub species: Species,
+    /// Number of atoms of each element of its structure, by ascending atomic number.
+    pub composition: Arc<[(u8, u32)]>,
     /// |F_model − F_label|, eV/Å.
     pub error: f64,
     /// One for each column.
@@ -71,8 +75,12 @@ pub struct SampledAtom {
 }
 
 /// A structure of the sample.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct SampledStructure {
+    /// Number of atoms of each element, by ascending atomic number.
+    pub composition: Arc<[(u8, u32)]>,
+    /// Mean of each score over the atoms; not a number for a structure without atoms.
+    pub scores: Box<[f64]>,
     pub energies: Option<LabelledEnergy>,
     /// Energy per atom, eV.
     pub energy: Deviations,
@@ -137,14 +145,20 @@ impl LabelledErrors {
         self.stress.merge(stress, 1);
         if let (Some(predicted), Some(labels)) = (&graded.predicted.forces, &graded.labels.forces) {
             for (atom, (a, b)) in predicted.iter().zip(labels).enumerate() {
-                self.add_atom(graded, atom, norm(sub(*a, *b)));
+                self.add_atom(graded, &structure.composition, atom, norm(sub(*a, *b)));
             }
         }
         self.sample.add(structure);
         self.structures += 1;
     }
 
-    fn add_atom(&mut self, graded: &LabelledStructure, atom: usize, error: f64) {
+    fn add_atom(
+        &mut self,
+        graded: &LabelledStructure,
+        composition: &Arc<[(u8, u32)]>,
+        atom: usize,
+        error: f64,
+    ) {
         let scores = || graded.scores.iter().map(|scores| scores[atom]);
         if !(error.is_finite() && scores().all(f64::is_finite)) {
             self.left_out += 1;
@@ -159,17 +173,31 @@ impl LabelledErrors {
         }
         let structure = self.structures;
         let species = graded.species[atom];
-        self.atoms.add_with(|| SampledAtom { structure, species, error, scores: scores().collect() });
+        self.atoms.add_with(|| SampledAtom {
+            structure,
+            species,
+            composition: Arc::clone(composition),
+            error,
+            scores: scores().collect(),
+        });
     }
 }
 
 impl SampledStructure {
     fn from_labelled(graded: &LabelledStructure) -> Self {
-        let mut found = Self::default();
+        let mean = |scores: &&[f64]| scores.iter().sum::<f64>() / scores.len() as f64;
+        let mut found = Self {
+            composition: composition(graded.species).into(),
+            scores: graded.scores.iter().map(mean).collect(),
+            energies: None,
+            energy: Deviations::default(),
+            forces: Deviations::default(),
+            stress: Deviations::default(),
+        };
         let (predicted, labels) = (graded.predicted, graded.labels);
         if let (Some(model), Some(label)) = (predicted.energy, labels.energy) {
             found.energy.add((model - label) / graded.species.len() as f64);
-            found.energies = Some(LabelledEnergy { composition: composition(graded.species), model, label });
+            found.energies = Some(LabelledEnergy { composition: found.composition.to_vec(), model, label });
         }
         if let (Some(model), Some(label)) = (&predicted.forces, &labels.forces) {
             assert!(model.len() == label.len() && model.len() == graded.species.len(), "forces of each atom");

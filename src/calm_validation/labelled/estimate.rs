@@ -2,13 +2,14 @@
 
 mod atoms;
 mod bins;
+mod compositions;
 mod structures;
 
 use analysis::Bootstrap;
 
 use self::atoms::AtomStatistics;
 use self::structures::StructureStatistics;
-use super::collect::{LabelledErrors, SampledAtom, THRESHOLDS};
+use super::collect::{LabelledErrors, SampledAtom, SampledStructure, THRESHOLDS};
 use super::report::{
     BootstrapSettings, Confident, ElementAuc, IntervalEstimate, LabelledReport, ScoreReport,
 };
@@ -26,7 +27,8 @@ impl LabelledErrors {
     /// for 200,000 atoms and two scores, and little for small sets. Those of the bins take one more pass over the sampled atoms for
     /// each draw and score with a limit.
     pub fn report(&self, bootstrap: Bootstrap) -> LabelledReport {
-        let structures = StructureStatistics::new(&self.sample.items().collect::<Vec<_>>());
+        let sampled_structures: Vec<_> = self.sample.items().collect();
+        let structures = StructureStatistics::new(&sampled_structures);
         let [energy, energy_without_offsets, forces, stress] = self.mean_errors(&structures, bootstrap);
         let sampled: Vec<_> = self.atoms.items().collect();
         let atoms = AtomStatistics::new(&sampled, &self.columns);
@@ -51,7 +53,9 @@ impl LabelledErrors {
                 .exceedance
                 .first()
                 .map_or(vec![None; THRESHOLDS.len()], |found| found.unfiltered()),
-            scores: self.scores(&sampled, &atoms, bootstrap),
+            scores: self.scores((&sampled, &sampled_structures), &atoms, bootstrap),
+            elements: compositions::by_element(&sampled, &self.columns),
+            compositions: compositions::by_composition(&sampled, &sampled_structures, &self.columns),
         }
     }
 
@@ -73,7 +77,7 @@ impl LabelledErrors {
 
     fn scores(
         &self,
-        sampled: &[&SampledAtom],
+        (sampled, structures): (&[&SampledAtom], &[&SampledStructure]),
         atoms: &AtomStatistics,
         bootstrap: Bootstrap,
     ) -> Vec<ScoreReport> {
@@ -101,6 +105,7 @@ impl LabelledErrors {
                     name: column.name.clone(),
                     limit: column.limit,
                     spearman,
+                    energy_spearman: compositions::energy_rank(structures, k),
                     auc,
                     worst_decile,
                     worst_decile_by_element: worst_decile_by_element.map(element).collect(),

@@ -1,5 +1,6 @@
 //! The figures of the report, with captions and data.
 
+mod compositions;
 mod curves;
 mod error_histograms;
 mod reliability;
@@ -23,6 +24,7 @@ pub fn all(report: &LabelledReport) -> Vec<FigureEntry> {
         figures.push(curves::contamination(report));
     }
     figures.push(curves::areas(report));
+    figures.extend(compositions::draw(report));
     figures
 }
 

@@ -35,6 +35,10 @@ pub struct LabelledReport {
     pub unfiltered: Vec<Option<f64>>,
     /// One for each score.
     pub scores: Vec<ScoreReport>,
+    /// Force errors and scores of the sampled atoms by element.
+    pub elements: Vec<ElementErrors>,
+    /// Errors and scores by the share of an element; none if all structures have one composition.
+    pub compositions: Vec<CompositionScan>,
 }
 
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -77,6 +81,8 @@ pub struct ScoreReport {
     pub limit: Option<f64>,
     /// Spearman's ρ of score and force error.
     pub spearman: IntervalEstimate,
+    /// Spearman's ρ of the mean score of a sampled structure and the absolute error of its energy per atom.
+    pub energy_spearman: Option<f64>,
     /// Area under the ROC curve for force errors above each threshold.
     pub auc: Vec<IntervalEstimate>,
     /// Area under the ROC curve for the tenth of the atoms of an element with the largest force errors: mean over elements.
@@ -154,10 +160,69 @@ pub struct ErrorPopulation {
     pub median: Option<f64>,
 }
 
+/// The sampled atoms of an element.
+#[derive(Clone, Debug, Serialize)]
+pub struct ElementErrors {
+    pub element: &'static str,
+    pub atoms: usize,
+    /// |F_model − F_label|, eV/Å.
+    pub forces: ErrorSpread,
+    /// One for each score.
+    pub scores: Vec<ScoreMean>,
+    /// Spearman's ρ of each score and force error.
+    pub spearman: Vec<Option<f64>>,
+}
+
+/// Structures by the share of an element among their atoms.
+#[derive(Clone, Debug, Serialize)]
+pub struct CompositionScan {
+    pub element: &'static str,
+    /// By ascending share.
+    pub groups: Vec<CompositionGroup>,
+}
+
+/// Sampled structures of about one share, and the sampled atoms of such structures.
+#[derive(Clone, Debug, Serialize)]
+pub struct CompositionGroup {
+    /// The nearest multiple of 10 %.
+    pub share: f64,
+    pub structures: usize,
+    /// |E_model − E_label| per atom, eV, offsets of elements included.
+    pub energy: Option<ErrorSpread>,
+    pub atoms: usize,
+    /// |F_model − F_label|, eV/Å.
+    pub forces: Option<ErrorSpread>,
+    /// One for each score; none without atoms.
+    pub scores: Vec<ScoreMean>,
+}
+
+/// Distribution of an absolute error.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ErrorSpread {
+    pub number: usize,
+    pub mean: f64,
+    /// 10, 25, 50, 75 and 90 %.
+    pub quantiles: [f64; 5],
+}
+
+/// A score of several atoms.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ScoreMean {
+    pub mean: f64,
+    /// Share of the atoms beyond the limit of the score.
+    pub beyond: Option<f64>,
+}
+
 impl LabelledReport {
     /// The index of a threshold.
     pub fn threshold(&self, threshold: f64) -> Option<usize> {
         self.thresholds.iter().position(|found| *found == threshold)
+    }
+}
+
+impl ErrorSpread {
+    pub fn median(&self) -> f64 {
+        self.quantiles[2]
     }
 }
 

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use super::collect::LARGE_ERROR;
+use super::composition_tables::{compositions, elements};
 use super::report::{Bin, IntervalEstimate, LabelledReport, MeanErrors, ScoreReport};
 use crate::output::{self, range};
 use crate::page::{PageTable, TableCell, count, percent, real, text};
@@ -18,7 +19,7 @@ pub fn all(report: &LabelledReport) -> Vec<PageTable> {
     let mut tables = vec![errors(report)];
     if report.atoms > 0 {
         tables.extend([ranks(report), confident(report), auc_thresholds(report), worst_deciles(report)]);
-        tables.push(quantiles(report));
+        tables.extend([quantiles(report), elements(report), compositions(report)]);
     }
     tables.retain(|table| !table.rows.is_empty());
     tables

@@ -195,6 +195,45 @@ fn areas_are_shown_by_element_and_by_threshold() {
 }
 
 #[test]
+fn errors_and_scores_are_divided_by_element_and_by_composition() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    // Of two elements, the heavier one is scanned. 5 of 45 structures have 2 of 8 nickel atoms, which is nearest to 30 %.
+    let [scan] = &report.compositions[..] else { panic!("{:?}", report.compositions) };
+    let shares: Vec<_> = scan.groups.iter().map(|group| (10.0 * group.share).round()).collect();
+    assert_eq!((scan.element, &shares[..]), ("Ni", &[0.0, 1.0, 3.0, 4.0, 5.0, 6.0, 8.0, 9.0, 10.0][..]));
+    let members: Vec<_> = (0..45).filter(|number| number % 9 == 2).map(sample).collect();
+    let (errors, scores) = atoms(&members);
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let group = &scan.groups[2];
+    assert_eq!((group.structures, group.atoms), (5, 40));
+    assert_near(group.forces.map(|of| of.mean), Some(mean(&errors)));
+    let mut ascending = errors.clone();
+    ascending.sort_by(f64::total_cmp);
+    assert_near(group.forces.map(|of| of.quantiles[3]), quantile(&ascending, 0.75));
+    assert_near(group.scores.first().map(|of| of.mean), Some(mean(&scores[0])));
+    let beyond = scores[0].iter().filter(|score| **score > 1.0).count() as f64 / 40.0;
+    assert_eq!((group.scores[0].beyond, group.scores[1].beyond), (Some(beyond), None));
+    let difference = |of: &Sample| (of.predicted.energy.unwrap() - of.labels.energy.unwrap()).abs() / 8.0;
+    let energies: Vec<_> = members.iter().map(difference).collect();
+    assert_near(group.energy.map(|of| of.mean), Some(mean(&energies)));
+    let structure = |of: &Sample| (mean(&of.scores[1]), difference(of));
+    let (means, differences): (Vec<_>, Vec<_>) = samples.iter().map(structure).unzip();
+    assert_near(report.scores[1].energy_spearman, spearman(&means, &differences));
+
+    let elements: Vec<_> = report.elements.iter().map(|of| (of.element, of.atoms)).collect();
+    assert_eq!(elements, [("Al", 180), ("Ni", 180)]);
+    let (errors, scores) = atoms(&samples);
+    let species: Vec<_> = samples.iter().flat_map(|sample| sample.species.clone()).collect();
+    let of_nickel = |values: &[f64]| -> Vec<f64> {
+        values.iter().zip(&species).filter(|(_, s)| s.symbol() == "Ni").map(|(x, _)| *x).collect()
+    };
+    let nickel = &report.elements[1];
+    assert_near(Some(nickel.forces.mean), Some(mean(&of_nickel(&errors))));
+    assert_near(nickel.spearman[1], spearman(&of_nickel(&scores[1]), &of_nickel(&errors)));
+}
+
+#[test]
 fn energies_are_compared_with_and_without_offsets() {
     let samples: Vec<_> = (0..45).map(sample).collect();
     let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
@@ -257,7 +296,9 @@ fn figures_and_tables_show_every_score() {
         let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
         let figures = figures(&report);
         let names: Vec<_> = figures.iter().map(|figure| figure.name).collect();
-        assert_eq!(names, ["reliability", "error-histograms", "contamination", "auc-sweep"]);
+        let all = ["reliability", "error-histograms", "contamination", "auc-sweep", "composition-errors"];
+        // A single structure has one composition.
+        assert_eq!(names, all[..if number == 1 { 4 } else { 5 }]);
         for figure in figures {
             let drawn = figure.drawn.unwrap();
             assert!(!to_svg(&drawn.figure).contains("NaN"), "{}", figure.name);
@@ -288,6 +329,9 @@ fn figures_and_tables_show_every_score() {
                 ("auc-thresholds", 2),
                 ("worst-deciles", 4),
                 ("quantiles", 7),
+                ("element-errors", 4),
+                // 0, 1, … 8 nickel atoms of eight.
+                ("composition-errors", 9),
             ],
         };
         assert_eq!(rows, expected);
