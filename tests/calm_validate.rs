@@ -150,7 +150,9 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let found = json(&here.join("out"));
     errors_are_divided(&found["labelled"], &labelled);
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
-    assert!(page.contains("id=\"figure-composition-errors\"") && page.contains("id=\"table-element-errors\""));
+    assert!(
+        page.contains("id=\"figure-composition-errors\"") && page.contains("id=\"table-element-errors\"")
+    );
     // An ensemble of equal models has no spread anywhere.
     let spread = &found["scores"][1];
     assert_eq!(
@@ -347,6 +349,39 @@ fn labelled_structures_have_a_section() {
     write_frames(&here.join("bare.extxyz"), &[Frame::from(aluminium(1).remove(0).structure)]);
     assert!(refused("new", "bare.extxyz").contains("bare.extxyz: no structure has a label"));
     assert!(refused("out", "out/structures.extxyz").contains("is the file of labelled structures"));
+}
+
+/// An artifact has the statistics of its data, from which the axes of the features follow; a mixture in a model's file has none.
+#[test]
+fn labelled_atoms_are_drawn_among_the_components() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write_frames(&here.join("labelled.extxyz"), &aluminium(3));
+    let artifact = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
+    let quick = ["--labelled", "labelled.extxyz", "--scan-steps", "2", "--no-relax"];
+    validate(here, "al_eam_1l", "out", &[&quick[..], &["--artifact", &artifact]].concat());
+    let found = json(&here.join("out"));
+    let [plane] = &found["feature_planes"].as_array().unwrap()[..] else { panic!("{found}") };
+    let shares = [0, 1].map(|k| plane["shares"][k].as_f64().unwrap());
+    assert!(shares[0] >= shares[1] && shares[1] > 0.0 && shares[0] + shares[1] <= 1.0, "{plane}");
+    let [within, beyond] = [0, 1].map(|k| plane["atoms"][k].as_u64().unwrap());
+    assert_eq!(json!(within + beyond), found["labelled"]["atoms"]);
+    let kept = found["labelled"]["scores"][0]["confident"]["retention"]["value"].as_f64().unwrap();
+    assert!((within as f64 / (within + beyond) as f64 - kept).abs() < 1e-12, "{plane}");
+    // The axes go along the covariance of the only component, and its centroid is the origin.
+    let [component] = &plane["components"].as_array().unwrap()[..] else { panic!("{plane}") };
+    let covariance = [0, 1, 2].map(|k| component["covariance"][k].as_f64().unwrap());
+    assert!(covariance[1].abs() < 1e-9 * covariance[0], "{plane}");
+    assert!((covariance[2] / covariance[0] - shares[1] / shares[0]).abs() < 1e-9, "{plane}");
+    let rows = std::fs::read_to_string(here.join("out/figures/feature-space.csv")).unwrap();
+    assert_eq!(rows.lines().filter(|row| row.starts_with("Al,γ ≤ 1,")).count() as u64, within);
+    let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
+    assert!(page.contains("id=\"table-feature-space\"") && page.contains("largest condition number"));
+
+    validate(here, "al_eam_1l", "bare", &quick[2..]);
+    assert_eq!(json(&here.join("bare"))["feature_planes"], json!([]));
+    let page = std::fs::read_to_string(here.join("bare/validation.html")).unwrap();
+    assert!(page.contains("has no statistics of its data"));
 }
 
 /// Each mixture grades the same structures; the features follow from its artifact.

@@ -11,6 +11,7 @@ mod collisions;
 mod defects;
 mod detection;
 mod ensemble;
+mod feature_plane;
 mod figures;
 mod grader;
 pub mod labelled;
@@ -40,6 +41,7 @@ pub use self::collisions::Collision;
 pub use self::defects::Defect;
 pub use self::detection::{Detection, DetectionRule};
 pub use self::ensemble::EnergySpread;
+pub use self::feature_plane::{FeaturePlane, FeaturePlanes};
 pub use self::grader::{AtomScore, ValidationGrader};
 pub use self::mixture_score::MixtureScore;
 pub use self::progress::ValidationProgress;
@@ -86,6 +88,8 @@ pub struct Validation {
     pub solutions: Vec<Solution>,
     /// Colliding environments.
     pub collisions: Vec<Collision>,
+    /// Components of the mixture and labelled atoms in the plane of the features; none without the statistics of an artifact.
+    pub feature_planes: Vec<FeaturePlane>,
     /// What labelled structures say, if there are any.
     pub labelled: Option<LabelledReport>,
     /// The same labelled structures under several mixtures, that of the scores first; empty if no other was given.
@@ -112,11 +116,21 @@ pub struct Subject {
     pub others: Arc<[Box<dyn AtomScore>]>,
 }
 
+/// What was found with labelled structures before the tests without labels.
+pub struct LabelledResults {
+    /// `None` without labelled structures.
+    pub report: Option<LabelledReport>,
+    /// The same structures under several mixtures.
+    pub mixtures: Vec<ComparedMixture>,
+    /// Components of the mixture, with labelled atoms if there are any.
+    pub planes: FeaturePlanes,
+}
+
 /// Runs all tests without labels, and adds what labelled structures say. `None` if it was stopped.
 pub fn run(
     subject: &Subject,
     settings: ValidationSettings,
-    (labelled, mixtures): (Option<LabelledReport>, Vec<ComparedMixture>),
+    labelled: LabelledResults,
     progress: &ValidationProgress,
 ) -> Result<Option<Validation>, CommandError> {
     progress.begin(
@@ -147,8 +161,9 @@ pub fn run(
         defects,
         solutions,
         collisions,
-        labelled,
-        mixtures,
+        feature_planes: labelled.planes.finish(),
+        labelled: labelled.report,
+        mixtures: labelled.mixtures,
     }))
 }
 

@@ -11,6 +11,7 @@ pub fn all(validation: &Validation) -> Vec<PageTable> {
         bond_scans(validation),
         defects(validation),
         solutions(validation),
+        feature_space(validation),
         collisions(validation),
     ];
     tables.extend(validation.labelled.iter().flat_map(labelled::tables));
@@ -193,6 +194,35 @@ fn solutions(validation: &Validation) -> PageTable {
                 percent(Some(of.averages_above_1)),
             ]);
         }
+    }
+    table
+}
+
+fn feature_space(validation: &Validation) -> PageTable {
+    let caption = "Components of the mixture by element: their number, the share of the variance of all their data along the first two principal \
+                   components, the largest condition number of a covariance; labelled atoms and the share of them with γ above 1.";
+    let titles = [
+        "element",
+        "components",
+        "PC 1 (%)",
+        "PC 2 (%)",
+        "largest condition number",
+        "labelled atoms",
+        "γ > 1 (%)",
+    ];
+    let mut table = PageTable::new("feature-space", caption, &titles);
+    for plane in &validation.feature_planes {
+        let [within, beyond] = plane.atoms;
+        let atoms = within + beyond;
+        table.rows.push(vec![
+            text(&*plane.element),
+            count(plane.components.len() as u64),
+            percent(Some(plane.shares[0])),
+            percent(Some(plane.shares[1])),
+            significant(plane.condition_number),
+            count(atoms),
+            percent((atoms > 0).then(|| beyond as f64 / atoms as f64)),
+        ]);
     }
     table
 }

@@ -59,6 +59,16 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -
         ),
         ("Composition", blocks(vec![figure("solutions"), table("solutions")])),
         (
+            "Feature space",
+            blocks(vec![
+                words(
+                    "γ is the distance to the nearest component, relative to its threshold. Labelled atoms far from all components are outside the data.",
+                ),
+                figure("feature-space"),
+                table("feature-space"),
+            ]),
+        ),
+        (
             "Colliding environments",
             blocks(vec![
                 words(

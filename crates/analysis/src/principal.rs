@@ -1,6 +1,6 @@
 //! Principal component analysis.
 
-use faer::{Mat, Side};
+use faer::{Mat, MatRef, Side};
 
 /// Relative squared deviation from the mean below which rows differ only by rounding.
 const ROUNDING: f64 = 1e-24;
@@ -30,10 +30,30 @@ impl PrincipalAxes {
         }
         let centred = Mat::from_fn(count, dimension, |row, k| rows[row * dimension + k] - mean[k]);
         let covariance = centred.transpose() * &centred;
+        let size = count as f64 * mean.iter().map(|x| x * x).sum::<f64>();
+        Self::of_covariance(mean, covariance.as_ref(), size, number)
+    }
+
+    /// The first `number` axes of data with this mean and this symmetric covariance, `[dimension × dimension]`, such as
+    /// those of a mixture. `None` if the covariance is zero or of another size, for numbers that are not finite, or eigenvalues that
+    /// do not converge.
+    pub fn from_covariance(mean: Vec<f64>, covariance: &[f64], number: usize) -> Option<Self> {
+        let dimension = mean.len();
+        let is_finite = mean.iter().chain(covariance).all(|x| x.is_finite());
+        if covariance.len() != dimension * dimension || number > dimension || !is_finite {
+            return None;
+        }
+        let covariance = MatRef::from_row_major_slice(covariance, dimension, dimension);
+        let size = mean.iter().map(|x| x * x).sum();
+        Self::of_covariance(mean, covariance, size, number)
+    }
+
+    /// `size` is the square of the mean in the unit of the covariance.
+    fn of_covariance(mean: Vec<f64>, covariance: MatRef<'_, f64>, size: f64, number: usize) -> Option<Self> {
+        let dimension = mean.len();
         let eigen = covariance.self_adjoint_eigen(Side::Lower).ok()?;
         let (values, vectors) = (eigen.S(), eigen.U());
         let trace: f64 = (0..dimension).map(|k| values[k].max(0.0)).sum();
-        let size = count as f64 * mean.iter().map(|x| x * x).sum::<f64>();
         if trace <= ROUNDING * size {
             return None;
         }
@@ -44,6 +64,21 @@ impl PrincipalAxes {
             .map(|column| with_fixed_sign((0..dimension).map(|k| vectors[(k, column)]).collect()));
         let shares = last.clone().map(|column| values[column].max(0.0) / trace);
         Some(Self { axes: axes.collect(), shares: shares.collect(), mean })
+    }
+
+    /// The covariance C in the space of the axes, `[number × number]`: aᵀCb of each two axes a, b.
+    ///
+    /// # Panics
+    /// If the covariance has another size than that of the axes.
+    pub fn project_covariance(&self, covariance: &[f64]) -> Vec<f64> {
+        let dimension = self.mean.len();
+        assert_eq!(covariance.len(), dimension * dimension, "a covariance of the same dimension");
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let times = |axis: &Vec<f64>| -> Vec<f64> {
+            covariance.chunks_exact(dimension).map(|row| dot(row, axis)).collect()
+        };
+        let products: Vec<_> = self.axes.iter().map(times).collect();
+        self.axes.iter().flat_map(|a| products.iter().map(move |product| dot(a, product))).collect()
     }
 
     /// Components of a row along the axes, relative to the mean.
@@ -84,6 +119,33 @@ mod tests {
         // The second axis points towards growing x.
         let point = axes.project(&[1.0 + 0.6 - 0.8, 2.0 + 0.8 + 0.6, 7.0]);
         assert!((point[0] - 1.0).abs() < 1e-12 && (point[1] + 1.0).abs() < 1e-12, "{point:?}");
+    }
+
+    #[test]
+    fn a_covariance_has_the_axes_of_its_rows() {
+        // Three correlated columns.
+        let rows: Vec<_> = (0..40)
+            .flat_map(|k| {
+                let t = f64::from(k);
+                [t, 0.5 * t + (0.7 * t).sin(), 3.0 * (0.3 * t).cos()]
+            })
+            .collect();
+        let mean: Vec<f64> = (0..3).map(|k| rows.iter().skip(k).step_by(3).sum::<f64>() / 40.0).collect();
+        let element = |i: usize, j: usize| {
+            rows.chunks_exact(3).map(|row| (row[i] - mean[i]) * (row[j] - mean[j])).sum::<f64>() / 40.0
+        };
+        let covariance: Vec<_> = (0..9).map(|k| element(k / 3, k % 3)).collect();
+        let expected = PrincipalAxes::fit(&rows, 3, 2).unwrap();
+        let found = PrincipalAxes::from_covariance(mean.clone(), &covariance, 2).unwrap();
+        let near = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9);
+        assert!(near(&found.shares, &expected.shares), "{found:?} {expected:?}");
+        assert!(near(&found.project(&rows[..3]), &expected.project(&rows[..3])));
+        // Along its own axes, a covariance is diagonal, with the variances.
+        let trace = covariance[0] + covariance[4] + covariance[8];
+        let diagonal = [found.shares[0] * trace, 0.0, 0.0, found.shares[1] * trace];
+        assert!(near(&found.project_covariance(&covariance), &diagonal));
+        assert_eq!(PrincipalAxes::from_covariance(mean, &[0.0; 9], 2), None, "no variance");
+        assert_eq!(PrincipalAxes::from_covariance(vec![0.0; 2], &covariance, 2), None, "another size");
     }
 
     #[test]

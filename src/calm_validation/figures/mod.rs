@@ -2,6 +2,7 @@
 
 mod bond_scans;
 mod defects;
+mod feature_space;
 mod layout;
 mod solutions;
 mod structures;
@@ -21,6 +22,7 @@ pub fn all(validation: &Validation) -> Vec<FigureEntry> {
         part("grain-boundaries", "Grain boundaries", defects("grain-boundaries", DefectKind::GrainBoundary)),
         part("structures", "Atoms at defects", structures::draw(validation)),
         part("solutions", "Solid solutions", solutions::draw(validation)),
+        part("feature-space", "Components in the feature space", feature_space::draw(validation)),
     ];
     figures.extend(validation.labelled.iter().flat_map(labelled::figures));
     let mixtures = |report| labelled::mixtures_figure(&validation.mixtures, report);

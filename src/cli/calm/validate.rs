@@ -18,8 +18,8 @@ use super::validate_labels;
 use crate::atomic_file::refuse_to_replace;
 use crate::calm_validation::labelled::ComparedMixture;
 use crate::calm_validation::{
-    self, AtomScore, EnergySpread, MixtureScore, PAGE, Subject, Validation, ValidationProgress,
-    ValidationSettings, both, labelled, verdict,
+    self, AtomScore, EnergySpread, FeaturePlanes, LabelledResults, MixtureScore, PAGE, Subject, Validation,
+    ValidationProgress, ValidationSettings, both, labelled, verdict,
 };
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureModel;
@@ -107,18 +107,20 @@ impl CalmValidateArgs {
         // Fail before the long computation.
         create_directory(&self.output)?;
         let stop = stop_token()?;
-        let labelled = match &self.labelled {
-            None => (None, Vec::new()),
-            Some(input) => {
-                let mut scorer = Scorer::new(model.clone(), mixture.clone());
-                let found = validate_labels::report(input, &mut scorer, &mut compared, &stop)?;
-                let Some(report) = found else { return Ok(stopped()) };
-                let Some(mixtures) = self.compare(input, mixtures, &stop)? else {
-                    return Ok(stopped());
-                };
-                (Some(report), mixtures)
+        let planes = FeaturePlanes::new(&mixture, model.elements(), &settings.elements);
+        let mut labelled = LabelledResults { report: None, mixtures: Vec::new(), planes };
+        if let Some(input) = &self.labelled {
+            let mut scorer = Scorer::new(model.clone(), mixture.clone());
+            let planes = Some(&mut labelled.planes);
+            labelled.report = validate_labels::report(input, &mut scorer, &mut compared, planes, &stop)?;
+            if labelled.report.is_none() {
+                return Ok(stopped());
             }
-        };
+            let Some(mixtures) = self.compare(input, mixtures, &stop)? else {
+                return Ok(stopped());
+            };
+            labelled.mixtures = mixtures;
+        }
         let progress = ValidationProgress::new(Bar::new(Some(1), BAR), stop);
         let subject = Subject { model, mixture, others };
         let Some(validation) = calm_validation::run(&subject, settings, labelled, &progress)? else {
@@ -185,7 +187,7 @@ impl CalmValidateArgs {
             let mut scorer = Scorer::new(features.model.clone(), mixture.clone());
             // Other scores could leave atoms out.
             let mut none = OtherScores::load(&self.model, &features, &[], &[])?;
-            let Some(report) = validate_labels::report(input, &mut scorer, &mut none, stop)? else {
+            let Some(report) = validate_labels::report(input, &mut scorer, &mut none, None, stop)? else {
                 return Ok(None);
             };
             compared.push(ComparedMixture::new(file.display().to_string(), &mixture, &report));

@@ -8,6 +8,7 @@ use tokio_util::sync::CancellationToken;
 use super::other_scores::OtherScores;
 use super::score_labels::ScoreLabels;
 use super::scorer::Scorer;
+use crate::calm_validation::FeaturePlanes;
 use crate::calm_validation::labelled::LabelledReport;
 use crate::cli::CommandError;
 use crate::output::{self, Bar};
@@ -15,7 +16,8 @@ use crate::xyz_reader::XyzReader;
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
-/// Grades the structures of a file and compares the scores with their labels. `None` if it was stopped.
+/// Grades the structures of a file and compares the scores with their labels. Also adds their atoms to `planes`, if they are given. `None`
+/// if it was stopped.
 ///
 /// # Errors
 /// A structure that cannot be read or graded, with its line; a file without labels.
@@ -23,6 +25,7 @@ pub fn report(
     input: &Path,
     scorer: &mut Scorer,
     others: &mut OtherScores,
+    mut planes: Option<&mut FeaturePlanes>,
     stop: &CancellationToken,
 ) -> Result<Option<LabelledReport>, CommandError> {
     let mut frames = XyzReader::open(input).map_err(CommandError::input)?;
@@ -40,6 +43,9 @@ pub fn report(
         scorer.score(&frame.structure, false).map_err(|error| at(&error))?;
         let columns = others.columns(&frame.structure, scorer).map_err(|error| at(&error))?;
         labels.add(&frame, scorer, &columns)?;
+        if let Some(planes) = planes.as_deref_mut() {
+            planes.add(&scorer.elements, scorer.features(), &scorer.grades.gamma);
+        }
         count += 1;
         bar.set(frames.position(), || output::count(count, "frame"));
     }
