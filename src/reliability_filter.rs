@@ -1,7 +1,9 @@
 //! What a threshold of a grade keeps of a table with one row for each structure (paper, 'Reliability filtering on a
 //! Materials Discovery benchmark' and Methods, 'Matbench Discovery evaluation').
 
+mod errors;
 mod figure;
+mod page;
 mod read;
 mod text;
 
@@ -9,6 +11,7 @@ use analysis::{FilterStep, GradedRow, Quality, filter_sweep};
 use serde::Serialize;
 
 pub use self::figure::draw;
+pub use self::page::{PAGE, files};
 pub use self::read::{ErrorColumns, InputColumns, read};
 pub use self::text::{csv, write};
 

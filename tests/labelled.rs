@@ -193,6 +193,24 @@ fn a_grade_that_tells_errors_keeps_better_structures_than_chance() {
     );
     let figure = fs::read_to_string(here.join("sweep.svg")).unwrap();
     assert!(figure.contains("precision") && figure.contains("gamma_max") && !figure.contains("NaN"));
+    // The page has the same sweep.
+    let page = ["--thresholds", "1,0.5,2", "--output", "page"];
+    let printed = succeed(here, filter.iter().chain(&page));
+    assert!(printed.ends_with("wrote page/filter.html and 8 files in the same directory\n"), "{printed}");
+    let written = |name: &str| fs::read_to_string(here.join("page").join(name)).unwrap();
+    assert_eq!(json(&here.join("page/filter.json")), found);
+    assert_eq!((written("figures/filter.csv"), written("figures/filter.svg")), (rows, figure));
+    let html = written("filter.html");
+    for words in ["id=\"figure-errors\"", "id=\"table-thresholds\"", "400 structures", "40 random subsets"] {
+        assert!(html.contains(words), "{words}");
+    }
+    let table = written("tables/thresholds.csv");
+    assert!(table.starts_with("threshold,kept,kept (%),MAE,random MAE,± MAE,precision,"), "{table}");
+    assert_eq!(table.lines().count(), 5);
+    fs::create_dir_all(here.join("own/tables")).unwrap();
+    fs::copy(here.join("t.csv"), here.join("own/tables/thresholds.csv")).unwrap();
+    let own = ["calm", "filter", "own/tables/thresholds.csv", "--error", "predicted", "--output", "own"];
+    assert!(refuse(here, own).contains("own/tables/thresholds.csv is the table"));
     // Without classes there are only errors.
     let printed = succeed(
         here,

@@ -12,6 +12,8 @@ pub struct QuantileBin {
     pub high: f64,
     /// Number of values in the bin.
     pub number: u64,
+    /// Mean of y; `None` in an empty bin.
+    pub mean: Option<f64>,
     /// 5, 10, 25, 50, 75, 90 and 95 % quantiles of y; `None` in an empty bin.
     pub quantiles: Option<[f64; 7]>,
 }
@@ -35,7 +37,8 @@ pub fn binned_quantiles(edges: &[f64], pairs: impl IntoIterator<Item = (f64, f64
         let known = !values.is_empty();
         let quantiles =
             known.then(|| QuantileBin::LEVELS.map(|share| quantile(&values, share).unwrap_or(f64::NAN)));
-        QuantileBin { low: edges[0], high: edges[1], number: values.len() as u64, quantiles }
+        let mean = known.then(|| values.iter().sum::<f64>() / values.len() as f64);
+        QuantileBin { low: edges[0], high: edges[1], number: values.len() as u64, mean, quantiles }
     };
     edges.windows(2).zip(bins).map(of).collect()
 }
@@ -55,6 +58,7 @@ mod tests {
             assert!((found - 20.0 * share).abs() < 1e-12);
         }
         assert_eq!((bands[1].quantiles, bands[2].quantiles), (None, Some([7.0; 7])));
+        assert_eq!([0, 1, 2].map(|k| bands[k].mean), [Some(10.0), None, Some(7.0)]);
         assert_eq!((bands[1].low, bands[1].high), (1.0, 1.5));
     }
 }

@@ -76,6 +76,24 @@ pub fn logarithmic_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
     linear_edges(low.ln(), high.ln(), bins).into_iter().map(f64::exp).collect()
 }
 
+/// Bins of a decade, and how many decades below the largest value have bins.
+const BINS_A_DECADE: f64 = 10.0;
+const DECADES: f64 = 6.0;
+
+/// Edges 10^(k/10) round all positive values up to six decades below the largest; 1 is an edge if it is in the range. None without such
+/// values.
+pub fn decade_edges(values: impl Iterator<Item = f64> + Clone) -> Vec<f64> {
+    let positive = values.filter(|x| *x > 0.0 && x.is_finite());
+    let largest = positive.clone().fold(0.0, f64::max);
+    if largest == 0.0 {
+        return Vec::new();
+    }
+    let smallest = positive.fold(largest, f64::min).max(largest * 10_f64.powf(-DECADES));
+    let last = (largest.log10() * BINS_A_DECADE).ceil() as i32;
+    let first = ((smallest.log10() * BINS_A_DECADE).floor() as i32).min(last - 1);
+    (first..=last).map(|k| 10_f64.powf(f64::from(k) / BINS_A_DECADE)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -95,5 +113,16 @@ mod tests {
         for (edge, expected) in edges.iter().zip([0.01, 0.1, 1.0, 10.0, 100.0]) {
             assert!((edge / expected - 1.0).abs() < 1e-12);
         }
+    }
+
+    #[test]
+    fn decades_have_ten_bins() {
+        let edges = decade_edges([3.0, 0.0, 0.21, -1.0, f64::NAN].into_iter());
+        let expected: Vec<_> = (-7..=5).map(|k| 10_f64.powf(f64::from(k) / 10.0)).collect();
+        assert_eq!(edges, expected);
+        assert!(edges[0] <= 0.21 && edges[12] >= 3.0 && edges.contains(&1.0));
+        assert!(decade_edges([0.0].into_iter()).is_empty());
+        // Six decades, up to rounding.
+        assert!((61..=62).contains(&decade_edges([1e-9, 1.0].into_iter()).len()));
     }
 }

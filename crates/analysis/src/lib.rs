@@ -36,7 +36,7 @@ pub use ensemble::{EnsembleError, force_deviation, standard_deviation};
 pub use errors::{ErrorBin, ForceErrors};
 pub use exceedance::Exceedance;
 pub use filtering::{FilterStep, GradedRow, Quality, filter_sweep};
-pub use histogram::{Histogram, linear_edges, logarithmic_edges};
+pub use histogram::{Histogram, decade_edges, linear_edges, logarithmic_edges};
 pub use offsets::{ElementOffset, EnergyOffsets, LabelledEnergy, TooFewLabels};
 pub use principal::PrincipalAxes;
 pub use quantiles::quantile;

@@ -3,11 +3,13 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use analysis::GradedRow;
 use figures::{to_png, to_svg};
 
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
-use crate::output::{print, print_json};
+use crate::output::{count, print, print_json};
+use crate::page::{create_directory, write_files};
 use crate::reliability_filter::{self, ErrorColumns, FilterReport, InputColumns};
 
 /// Resolution of a PNG, dots per inch.
@@ -19,6 +21,9 @@ const RESOLUTION: f64 = 300.0;
 /// recall and F1 of membership of a class, such as the stable structures of Matbench Discovery. Beside each number: mean and standard
 /// deviation over random subsets of the same size, drawn without replacement. A grade that predicts errors makes the kept structures
 /// better than these.
+///
+/// With --output, also writes a self-contained HTML page with the errors by grade and this sweep, each figure as SVG, PNG and CSV, the
+/// table as CSV, and all results as JSON.
 ///
 /// The table is a CSV file (commas, titles in the first row) with one row for each structure. Errors have the unit of the table. True and
 /// false are read as 1 and 0.
@@ -72,6 +77,9 @@ pub struct CalmFilterArgs {
     /// Also draw the sweep
     #[arg(long, value_name = "FILE.svg|.png")]
     figure: Option<PathBuf>,
+    /// Also write a page with figures and tables into this directory, created if it does not exist; files of an earlier page are replaced
+    #[arg(long, short, value_name = "DIR")]
+    output: Option<PathBuf>,
 }
 
 fn finite(text: &str) -> Result<f64, String> {
@@ -97,11 +105,34 @@ impl CalmFilterArgs {
                 false => write(path, to_svg(&figure).as_bytes())?,
             }
         }
+        let page =
+            self.output.as_deref().map(|directory| self.write_page(directory, &report, &rows)).transpose()?;
         match self.json {
             true => print_json(&report)?,
-            false => print(|out| reliability_filter::write(&report, out))?,
+            false => print(|out| {
+                reliability_filter::write(&report, out)?;
+                page.map_or(Ok(()), |page| writeln!(out, "\n{page}"))
+            })?,
         }
         Ok(ExitStatus::Done)
+    }
+
+    /// Writes the page and its files, and says so.
+    fn write_page(
+        &self,
+        directory: &Path,
+        report: &FilterReport,
+        rows: &[GradedRow],
+    ) -> Result<String, CommandError> {
+        let files = reliability_filter::files(report, rows, &self.grade)?;
+        for file in &files {
+            refuse_to_replace(&directory.join(&file.path), [(self.table.as_path(), "the table")])?;
+        }
+        create_directory(directory)?;
+        write_files(directory, &files)?;
+        let page = directory.join(reliability_filter::PAGE);
+        let others = count(files.len() - 1, "file");
+        Ok(format!("wrote {} and {others} in the same directory", page.display()))
     }
 
     fn columns(&self) -> InputColumns<'_> {

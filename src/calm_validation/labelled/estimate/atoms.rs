@@ -1,16 +1,11 @@
 //! Statistics of scores and force errors over the sampled atoms.
 
-use analysis::{Exceedance, Histogram, RankedErrors, binned_quantiles, quantile};
+use analysis::{Exceedance, Histogram, RankedErrors, binned_quantiles, decade_edges, quantile};
 use atoms::Species;
 
 use super::super::collect::{SampledAtom, ScoreColumn, THRESHOLDS};
 use super::super::report::{Band, ErrorHistograms, ErrorPopulation};
 use super::Values;
-
-/// Bins of a decade, for bands and histograms.
-const BINS_A_DECADE: f64 = 10.0;
-/// Scores below the largest by more decades have no bands.
-const DECADES: f64 = 6.0;
 
 /// The sample, sorted once for all resamplings.
 pub struct AtomStatistics {
@@ -139,17 +134,4 @@ impl ErrorHistograms {
         };
         Some(Self { populations: [true, false].map(population), edges })
     }
-}
-
-/// Edges 10^(k/10) round all positive values up to [`DECADES`] below the largest; 1 is an edge. None without such values.
-fn decade_edges(values: impl Iterator<Item = f64> + Clone) -> Vec<f64> {
-    let positive = values.filter(|x| *x > 0.0 && x.is_finite());
-    let largest = positive.clone().fold(0.0, f64::max);
-    if largest == 0.0 {
-        return Vec::new();
-    }
-    let smallest = positive.fold(largest, f64::min).max(largest * 10_f64.powf(-DECADES));
-    let last = (largest.log10() * BINS_A_DECADE).ceil() as i32;
-    let first = ((smallest.log10() * BINS_A_DECADE).floor() as i32).min(last - 1);
-    (first..=last).map(|k| 10_f64.powf(f64::from(k) / BINS_A_DECADE)).collect()
 }
