@@ -15,7 +15,7 @@ mod tests;
 
 pub use self::collect::{LabelledErrors, LabelledStructure, ScoreColumn};
 pub use self::estimate::BOOTSTRAP;
-pub use self::figures::{all as figures, mixtures as mixtures_figure};
+pub use self::figures::{all as figures, mixture_map, mixtures as mixtures_figure};
 pub use self::mixtures::{ComparedMixture, table as mixtures_table};
 pub use self::report::LabelledReport;
 pub use self::tables::{all as tables, write, write_table};

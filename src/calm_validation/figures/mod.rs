@@ -27,5 +27,7 @@ pub fn all(validation: &Validation) -> Vec<FigureEntry> {
     figures.extend(validation.labelled.iter().flat_map(labelled::figures));
     let mixtures = |report| labelled::mixtures_figure(&validation.mixtures, report);
     figures.extend(validation.labelled.iter().filter_map(mixtures));
+    let map = |report| labelled::mixture_map(&validation.mixtures, report);
+    figures.extend(validation.labelled.iter().filter_map(map));
     figures
 }

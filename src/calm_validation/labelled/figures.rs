@@ -2,12 +2,15 @@
 
 mod compositions;
 mod curves;
+mod distributions;
 mod error_histograms;
+mod mixture_map;
 mod reliability;
 
 use ::figures::{Colour, Point, Stroke};
 
 pub use self::curves::mixtures;
+pub use self::mixture_map::draw as mixture_map;
 
 use super::report::{ErrorHistograms, IntervalEstimate, LabelledReport};
 use crate::page::FigureEntry;
@@ -21,6 +24,7 @@ pub fn all(report: &LabelledReport) -> Vec<FigureEntry> {
     if report.scores.iter().any(|score| score.confident.is_some()) {
         figures.push(reliability::draw(report));
         figures.extend(error_histograms::draw(report));
+        figures.push(distributions::draw(report));
         figures.push(curves::contamination(report));
     }
     figures.push(curves::areas(report));

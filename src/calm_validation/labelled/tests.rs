@@ -296,9 +296,16 @@ fn figures_and_tables_show_every_score() {
         let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
         let figures = figures(&report);
         let names: Vec<_> = figures.iter().map(|figure| figure.name).collect();
-        let all = ["reliability", "error-histograms", "contamination", "auc-sweep", "composition-errors"];
+        let all = [
+            "reliability",
+            "error-histograms",
+            "score-distributions",
+            "contamination",
+            "auc-sweep",
+            "composition-errors",
+        ];
         // A single structure has one composition.
-        assert_eq!(names, all[..if number == 1 { 4 } else { 5 }]);
+        assert_eq!(names, all[..if number == 1 { 5 } else { 6 }]);
         for figure in figures {
             let drawn = figure.drawn.unwrap();
             assert!(!to_svg(&drawn.figure).contains("NaN"), "{}", figure.name);
@@ -336,4 +343,31 @@ fn figures_and_tables_show_every_score() {
         };
         assert_eq!(rows, expected);
     }
+}
+
+#[test]
+fn mixtures_are_mapped_by_dimension_and_components() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    let mixture = |dimension, components| ComparedMixture {
+        artifact: "a.npz".into(),
+        dimension,
+        components,
+        scores: report.scores.clone(),
+    };
+    let mixtures = [mixture(64, vec![4, 4]), mixture(128, vec![4, 4]), mixture(128, vec![1, 8])];
+    let drawn = mixture_map(&mixtures, &report).unwrap().drawn.unwrap();
+    assert!(!to_svg(&drawn.figure).contains("NaN"));
+    let rows = String::from_utf8(drawn.numbers.into_bytes()).unwrap();
+    let confident = report.scores[0].confident.as_ref().unwrap();
+    let [kept, above] = [confident.retention, confident.contamination[report.threshold(0.5).unwrap()]]
+        .map(|of| of.value.unwrap());
+    // The other score has no limit.
+    let expected =
+        [("64", "4"), ("128", "4"), ("128", "1–8")].map(|(d, k)| format!("γ,{d},{k},{above},{kept}"));
+    assert_eq!(rows.lines().skip(1).collect::<Vec<_>>(), expected);
+    // One mixture is no map, and two in one place cannot be drawn.
+    assert!(mixture_map(&mixtures[..1], &report).is_none());
+    let twice = [mixture(64, vec![4, 4]), mixture(64, vec![4, 4])];
+    assert!(mixture_map(&twice, &report).unwrap().drawn.is_err());
 }
