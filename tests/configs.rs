@@ -1,5 +1,5 @@
-//! Every file of `configs/` runs, and its results can be read: `aluminium.toml` as it stands, the larger campaigns with shorter
-//! walks. `CALMWALK_WHOLE_DEMOS=1 cargo test --test integration configs::` runs these as they stand, too.
+//! Every file of `configs/` runs, and its results can be read: all as they stand but the largest campaign, whose walks are shorter.
+//! `CALMWALK_WHOLE_DEMOS=1 cargo test --test integration configs::` runs it as it stands, too.
 
 use std::collections::BTreeSet;
 use std::fs;

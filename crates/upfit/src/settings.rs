@@ -108,10 +108,12 @@ mod tests {
     use super::*;
     use crate::test_frames::settings;
 
+    type Change = fn(&mut UpfitSettings);
+
     #[test]
     fn settings_out_of_range_are_named() {
         settings().check().unwrap();
-        let changes: [(fn(&mut UpfitSettings), &str); 8] = [
+        let changes: [(Change, &str); 8] = [
             (|settings| settings.epochs = 0, "the number of epochs is 0, expected 1 or more"),
             (|settings| settings.batch_size = 0, "the batch size is 0"),
             (|settings| settings.learning_rate.first = f64::NAN, "the learning rate is NaN"),

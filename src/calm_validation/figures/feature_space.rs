@@ -3,7 +3,7 @@
 
 use std::f64::consts::TAU;
 
-use figures::{Anchor, Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel, Rectangle};
+use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel, Rectangle};
 
 use super::super::Validation;
 use super::super::feature_plane::{FeaturePlane, ProjectedComponent};

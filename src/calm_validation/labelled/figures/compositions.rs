@@ -47,6 +47,9 @@ fn shown(report: &LabelledReport) -> impl Iterator<Item = (usize, &str)> {
     limited.map(|(k, score)| (k, score.name.as_str())).take(SHOWN)
 }
 
+/// One of the errors of a group.
+type SpreadOfGroup = fn(&CompositionGroup) -> Option<ErrorSpread>;
+
 fn draw_scan(
     figure: &mut Figure,
     report: &LabelledReport,
@@ -57,7 +60,7 @@ fn draw_scan(
     let share = || Axis::new(&format!("{} (%)", scan.element), AxisScale::Linear, 0.0, 100.0);
     let gamma = report.scores.first();
     let ranks = [gamma.and_then(|score| score.energy_spearman), gamma.and_then(|score| score.spearman.value)];
-    let errors: [(&str, f64, fn(&CompositionGroup) -> Option<ErrorSpread>); 2] = [
+    let errors: [(&str, f64, SpreadOfGroup); 2] = [
         ("energy error (meV/atom)", 1000.0, |group| group.energy),
         ("force error (eV Å^{−1})", 1.0, |group| group.forces),
     ];
