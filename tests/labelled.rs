@@ -69,7 +69,8 @@ fn labelled_structures_say_how_far_a_grade_can_be_trusted() {
     drawn.sort();
     let expected = "auc-sweep.csv auc-sweep.png auc-sweep.svg auc-thresholds.csv captions.txt confident.csv contamination.csv \
                     contamination.png contamination.svg error-histograms.csv error-histograms.png error-histograms.svg \
-                    label-errors.csv quantiles.csv ranks.csv reliability.csv reliability.png reliability.svg";
+                    label-errors.csv quantiles.csv ranks.csv reliability.csv reliability.png reliability.svg \
+         score-distributions.csv score-distributions.png score-distributions.svg";
     assert_eq!(drawn.join(" "), expected);
     for words in ["wrote 4 structures", "4 labelled structures with forces of 432 atoms", "γ_nbr", "γ ≤ 1"]
     {

@@ -60,10 +60,13 @@ pub(super) fn reject_unsupported_radial_variants(
     )
 }
 
-/// Rejects a file with unread arrays other than those of the mixture.
+/// The array in which a training says how it made the model.
+pub(super) const NOTE: &str = "calmwalk_note";
+
+/// Rejects a file with unread arrays other than those of the mixture and the note.
 pub(super) fn reject_unread_arrays(archive: &NpzFile, depth: &str) -> Result<(), GraceError> {
     let mut left_over = archive.unread();
-    left_over.retain(|name| !name.starts_with("uq_"));
+    left_over.retain(|name| !name.starts_with("uq_") && *name != NOTE);
     if left_over.is_empty() {
         return Ok(());
     }

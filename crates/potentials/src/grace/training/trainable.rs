@@ -15,6 +15,7 @@ use super::super::network::{AnyNetwork, Network};
 use super::super::potential::Grace;
 use super::super::radial::RadialPath;
 use super::super::read_options::ReadOptions;
+use super::super::shared_reader::NOTE;
 use super::super::tape::TapeOperation;
 use super::super::vector::Double;
 use super::super::weight_arrays::WeightArrays;
@@ -154,9 +155,6 @@ impl TrainableGrace {
         }
     }
 }
-
-/// The array with the note.
-const NOTE: &str = "calmwalk_note";
 
 /// The arrays of the mixture.
 const MIXTURE: [&str; 5] =
