@@ -34,6 +34,25 @@ impl Npz {
     pub fn floats(&mut self, key: &str) -> Vec<f64> {
         self.read(key).unwrap_or_else(|| panic!("no {key}"))
     }
+
+    /// Rows of three numbers.
+    pub fn rows(&mut self, key: &str) -> Vec<[f64; 3]> {
+        self.floats(key).as_chunks::<3>().0.to_vec()
+    }
+
+    /// The structure whose arrays have names that begin with `prefix`, if there is one.
+    pub fn structure(&mut self, prefix: &str) -> Option<Structure> {
+        let key = |quantity: &str| format!("{prefix}{quantity}");
+        let numbers = self.read::<i64>(&key("numbers"))?;
+        let cell: Matrix3 = self.rows(&key("cell")).try_into().unwrap();
+        let periodic: Vec<bool> = self.read(&key("pbc")).unwrap();
+        Some(Structure {
+            species: numbers.iter().map(|z| Species::from_atomic_number(*z as u8).unwrap()).collect(),
+            positions: self.rows(&key("positions")),
+            cell: if periodic == [false; 3] { Cell::orthorhombic(1.0, 1.0, 1.0) } else { Cell(cell) },
+            periodic: periodic.try_into().unwrap(),
+        })
+    }
 }
 
 /// One structure of golden.npz. The virials are xx, yy, zz, xy, xz, yz.
@@ -56,16 +75,7 @@ pub fn golden(model: &Path) -> Vec<Golden> {
     let mut all = Vec::new();
     for k in 0.. {
         let key = |quantity: &str| format!("s{k:02}_{quantity}");
-        let Some(numbers) = file.read::<i64>(&key("numbers")) else { break };
-        let positions = file.floats(&key("positions"));
-        let cell: Matrix3 = file.floats(&key("cell")).as_chunks::<3>().0.try_into().unwrap();
-        let periodic: Vec<bool> = file.read(&key("pbc")).unwrap();
-        let structure = Structure {
-            species: numbers.iter().map(|z| Species::from_atomic_number(*z as u8).unwrap()).collect(),
-            positions: positions.as_chunks::<3>().0.to_vec(),
-            cell: if periodic == [false; 3] { Cell::orthorhombic(1.0, 1.0, 1.0) } else { Cell(cell) },
-            periodic: periodic.try_into().unwrap(),
-        };
+        let Some(structure) = file.structure(&key("")) else { break };
         let virial = file.read(&key("virial")).or_else(|| {
             let s = file.read::<f64>(&key("stress"))?;
             let volume = structure.cell.volume();
