@@ -1,4 +1,4 @@
-//! Derivatives with respect to weights, against finite differences.
+//! Derivatives with respect to weights, against finite differences and TensorFlow.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -6,8 +6,8 @@ use std::sync::Arc;
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Structure};
 use potentials::grace::{Grace, LossGradient, TrainableGrace, WeightGroup};
 
-use crate::common::evaluate;
-use crate::common::golden::{committed, golden, peer};
+use crate::common::golden::{Npz, committed, golden, peer};
+use crate::common::{assert_close, evaluate};
 
 /// Reproducible numbers in [−½, ½).
 fn noise(seed: u64) -> impl FnMut() -> f64 {
@@ -32,6 +32,15 @@ impl SmoothLoss {
             energy: noise(),
             forces: (0..n).map(|_| [noise(), noise(), noise()]).collect(),
             virial: std::array::from_fn(|_| std::array::from_fn(|_| noise())),
+        }
+    }
+
+    /// The coefficients of a file.
+    fn read(file: &mut Npz) -> Self {
+        Self {
+            energy: file.floats("a")[0],
+            forces: file.rows("F_bar"),
+            virial: file.rows("W_bar").try_into().unwrap(),
         }
     }
 
@@ -134,6 +143,35 @@ fn alloy() -> Structure {
         positions,
         cell: Cell([[3.7, 0.1, 0.0], [-0.2, 3.9, 0.1], [0.3, 0.0, 3.6]]),
         periodic: [true, true, false],
+    }
+}
+
+/// `tests/data/weight_gradients.py` writes the files.
+#[test]
+fn weight_gradients_are_those_of_tensorflow() {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
+    for (name, model) in [
+        ("al_eam_1l", committed("al_eam_1l").join("kokkos.npz")),
+        ("two_layers_trained", data.join("two_layers_trained.npz")),
+    ] {
+        let model = TrainableGrace::load(&model).unwrap();
+        let mut file = Npz::open(data.join(format!("weight_gradients_{name}.npz")));
+        let structure = file.structure("").unwrap();
+        let smooth = SmoothLoss::read(&mut file);
+        // TensorFlow evaluates the radial networks themselves. In training, tables have errors of up to 10⁻⁸, which all
+        // groups but the shifts feel. TensorFlow with such tables is off by 3 · 10⁻⁹ for the two layers.
+        let tolerance = 1e-7;
+        let found = evaluate(&mut Grace::new(Arc::new(model.model().clone())), &structure);
+        assert_close(name, &[found.energy()], &file.floats("energy"), tolerance);
+        assert_close(name, found.forces.as_flattened(), &file.floats("forces"), tolerance);
+        assert_close(name, found.virial.as_flattened(), &file.floats("virial"), tolerance);
+        let (value, gradient) = loss(&model, &structure, &smooth);
+        assert_close(name, &[value], &file.floats("loss"), 1e-8);
+        for WeightGroup { name: array, range, .. } in model.groups() {
+            let expected = file.floats(&format!("gradient_{array}"));
+            let tolerance = if array == "shift_values" { 1e-10 } else { tolerance };
+            assert_close(&format!("{name}: {array}"), &gradient[range.clone()], &expected, tolerance);
+        }
     }
 }
 
