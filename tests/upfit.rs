@@ -86,6 +86,9 @@ fn the_loss_falls_and_the_number_of_threads_changes_no_byte() {
     assert!(one == two, "the models differ");
     assert!(one != train(here, "other.npz", &[&share[..], &["--rng-seed", "7"]].concat()));
 
+    let info = succeed(here, ["calm", "info", "one.npz"]);
+    assert!(info.contains("upfit, on 4 structures") && info.contains("kokkos.npz (BLAKE3 "), "{info}");
+
     // The forces of the model are nearer to the labels than before.
     let labelled = frames(5);
     assert!(force_error(&here.join("one.npz"), &labelled) < force_error(&config(MODEL), &labelled));

@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use atoms::Species;
 use calm::{Artifact, Mixture};
 use npz::NpzFile;
-use potentials::grace::GraceModel;
+use potentials::grace::{GraceModel, NOTE};
 use serde::Serialize;
+use serde_json::Value;
 
 use crate::cli::{CommandError, ExitStatus};
 use crate::output::{TextTable, decimals, print, print_json};
@@ -52,6 +53,8 @@ struct Model {
     feature_dimension: usize,
     weights: usize,
     radial_tables: Vec<RadialTableInfo>,
+    /// How a training made the model, as it says in `calmwalk_note`.
+    training: Option<Value>,
     mixture: Option<MixtureInfo>,
 }
 
@@ -138,7 +141,9 @@ fn inspect(path: &Path) -> Result<Content, CommandError> {
         }
         false => None,
     };
-    Ok(Content::Model(Box::new(Model::new(&model, mixture))))
+    let note = archive.contains(NOTE).then(|| archive.strings(NOTE)).transpose().map_err(CommandError::input)?;
+    let training = note.and_then(|texts| serde_json::from_str(texts.first()?).ok());
+    Ok(Content::Model(Box::new(Model { training, ..Model::new(&model, mixture) })))
 }
 
 impl Model {
@@ -171,6 +176,7 @@ impl Model {
                     error: error[0].max(error[1]),
                 })
                 .collect(),
+            training: None,
             mixture,
         }
     }
@@ -198,6 +204,15 @@ impl Model {
                 "radial table",
                 format!("{intervals} intervals, relative error of values and derivatives below {error:.1e}"),
             )?;
+        }
+        if let Some(training) = &self.training {
+            let text = |path: &str| training.pointer(path).map_or_else(String::new, |value| match value {
+                Value::String(text) => text.clone(),
+                value => value.to_string(),
+            });
+            let structures = text("/training/structures");
+            line(out, "trained", format!("by {}, on {structures} structures", text("/program")))?;
+            line(out, "", format!("from {} (BLAKE3 {})", text("/model/file"), text("/model/hash")))?;
         }
         match &self.mixture {
             Some(mixture) => mixture.write(out),

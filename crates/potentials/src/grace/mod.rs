@@ -90,5 +90,6 @@ pub use potential::Grace;
 pub use precision::Precision;
 pub use projection::{FeatureForm, GraceProjection};
 pub use radial::RadialPath;
+pub use shared_reader::NOTE;
 pub use threads::Threads;
 pub use training::{GradientWorker, LossGradient, TrainableGrace, WeightGroup, WeightSums};

@@ -12,7 +12,7 @@ pub(super) struct ReadOptions {
 }
 
 /// The error of tables in training, which are made anew with every update, relative to the largest value.
-const TRAINING_TABLE_ERROR: f64 = 1e-8;
+const TRAINING_TABLE_ERROR: f64 = 1e-7;
 
 impl ReadOptions {
     /// The largest error of tables of radial functions; `None` without tables.

@@ -60,8 +60,8 @@ pub(super) fn reject_unsupported_radial_variants(
     )
 }
 
-/// The array in which a training says how it made the model.
-pub(super) const NOTE: &str = "calmwalk_note";
+/// The array of a model file in which a training says how it made the model.
+pub const NOTE: &str = "calmwalk_note";
 
 /// Rejects a file with unread arrays other than those of the mixture and the note.
 pub(super) fn reject_unread_arrays(archive: &NpzFile, depth: &str) -> Result<(), GraceError> {
