@@ -134,7 +134,7 @@ fn inspect(path: &Path) -> Result<Content, CommandError> {
         )));
     }
     let model = GraceModel::load(path).map_err(CommandError::input)?;
-    let mixture = match archive.contains("uq_schema_version") {
+    let mixture = match archive.contains("uq_centroids") {
         true => {
             let artifact = Artifact::load_export(path).map_err(CommandError::input)?;
             Some(MixtureInfo::new(&artifact, "uq_schema_version", archive))

@@ -7,7 +7,8 @@
 //!
 //! where D is the derivative along the direction in which atoms move by F̄_a and the structure is strained by W̄: a bond d
 //! from a to b changes by F̄_b − F̄_a + W̄ d. The passes here carry D beside each value (forward) and the cotangents of both
-//! back (forward over reverse). Together with the evaluation that gives E, F and W they cost about five times as much as it.
+//! back (forward over reverse). Together with the evaluation that gives E, F and W they cost
+//! three to five times as much as it (`cargo bench -p potentials --bench grace -- training`).
 //!
 //! R_nl(r) depends on the coefficients of its table. The network behind them is evaluated at the knots of the table once
 //! an update, and the coefficients' derivatives are pulled back through it once.

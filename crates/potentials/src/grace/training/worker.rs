@@ -27,6 +27,9 @@ pub struct LossGradient {
     pub virial: Matrix3,
 }
 
+/// How much more tape a batch may have than in an evaluation: each batch reads and writes the sums of all matrices.
+const LARGER_BATCHES: usize = 8;
+
 /// Computes derivatives with respect to weights, on one thread.
 #[derive(Debug)]
 pub struct GradientWorker {
@@ -131,7 +134,7 @@ impl GradientWorker {
     /// Orders the atoms; collects their bonds and directions.
     fn take(&mut self, structure: &Structure, neighbours: &NeighbourList, loss: &LossGradient) {
         let Self { network, elements, batches, offsets, bonds, directions, .. } = self;
-        batches.update(elements, 2 * network.tape_bytes());
+        batches.update(elements, network.tape_bytes() / LARGER_BATCHES);
         let radial = &network.layers[0].radial;
         offsets.clear();
         offsets.push(0);
