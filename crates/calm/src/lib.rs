@@ -4,7 +4,8 @@
 //! [`Artifact`] holds a [`Mixture`]; [`Grades`] evaluates σ, γ and ∂γ/∂z; [`neighbourhood`] averages γ over
 //! pairs; [`rules`] decides when a structure is collected and when an update is sufficient; [`search::update`]
 //! finds the update; [`forgetting`] detects whether the mixture still covers its training data. [`build`] makes a
-//! mixture from training data, [`baselines`] the scores that γ is compared with.
+//! mixture from training data, [`baselines`] the scores that γ is compared with. [`weighted_sample`] draws structures that stand
+//! for a data set.
 //!
 //! Matrices are dense, row-major `f64`; batches of features are `[atoms × D]`, row-major. All sums run in a
 //! fixed order on one thread, so results are bitwise reproducible on one kind of processor (grades on every
@@ -30,6 +31,7 @@ pub mod soundness;
 pub mod staleness;
 mod storage;
 pub mod update;
+pub mod weighted_sample;
 
 pub use alpha_scan::AlphaScan;
 pub use artifact::{Artifact, ArtifactError, Projection, ProjectionMismatch};
