@@ -53,12 +53,9 @@ impl ShardReader {
                 let Some((frame, file)) = self.structures.next()? else { break };
                 self.count += 1;
                 if self.part.has(index) {
+                    let weight = file.weight_of(&frame)?;
                     let position = FileLine { file: file.path, line: frame.line };
-                    structures.push(TrainingStructure {
-                        structure: frame.structure,
-                        weight: file.weight,
-                        position,
-                    });
+                    structures.push(TrainingStructure { structure: frame.structure, weight, position });
                 }
             }
             if self.count == before {

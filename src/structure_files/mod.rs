@@ -10,11 +10,15 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
 use atoms::Species;
+use atoms::extxyz::Frame;
 
 pub use self::arguments::{StructureArgs, StructureReadingArgs};
 pub use self::reader::{FileLine, StructureReader};
 use crate::exit_status::CommandError;
 use crate::filter::StructureFilter;
+
+/// The key of a frame with the weight of its structure, as `calmwalk calm sample` writes it.
+pub const FRAME_WEIGHT: &str = "calmwalk_weight";
 
 /// Files of structures, in order.
 #[derive(Debug, Clone)]
@@ -32,6 +36,21 @@ pub struct StructureFile {
     pub path: Arc<Path>,
     /// Weight of the atoms of its structures, where a command has weights; otherwise 1.
     pub weight: f64,
+}
+
+impl StructureFile {
+    /// The weight of a structure of this file: the file's times that of the frame ([`FRAME_WEIGHT`]), which is 1 without the key.
+    ///
+    /// # Errors
+    /// A weight of the frame that is negative or not finite.
+    pub fn weight_of(&self, frame: &Frame) -> Result<f64, CommandError> {
+        let Some(value) = frame.info.get(FRAME_WEIGHT) else { return Ok(self.weight) };
+        let weight = value.number().filter(|weight| *weight >= 0.0).map(|weight| weight * self.weight);
+        weight.filter(|weight| weight.is_finite()).ok_or_else(|| {
+            FileLine { file: Arc::clone(&self.path), line: frame.line }
+                .wrong(format_args!("{FRAME_WEIGHT} is {value}; expected a number, 0 or more"))
+        })
+    }
 }
 
 impl StructureFiles {
@@ -76,4 +95,33 @@ pub fn file_weight(text: &str) -> Result<(PathBuf, f64), String> {
     let (file, weight) = text.rsplit_once('=').ok_or_else(expected)?;
     let weight = weight.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0);
     weight.map(|weight| (file.into(), weight)).ok_or_else(expected)
+}
+
+#[cfg(test)]
+mod tests {
+    use atoms::extxyz::ExtxyzValue;
+    use atoms::{Cell, Structure};
+
+    use super::*;
+
+    #[test]
+    fn the_weight_of_a_structure_is_that_of_its_file_and_frame() {
+        let file = StructureFile { path: Path::new("a.xyz").into(), weight: 0.5 };
+        let cell = Cell([[0.0; 3]; 3]);
+        let structure = Structure { species: Vec::new(), positions: Vec::new(), cell, periodic: [false; 3] };
+        let mut frame = Frame { line: 7, ..Frame::from(structure) };
+        assert_eq!(file.weight_of(&frame).unwrap(), 0.5);
+        frame.info.insert(FRAME_WEIGHT.to_owned(), ExtxyzValue::from(3.0));
+        assert_eq!(file.weight_of(&frame).unwrap(), 1.5);
+        frame.info.insert(FRAME_WEIGHT.to_owned(), ExtxyzValue::from(4_i64));
+        assert_eq!(file.weight_of(&frame).unwrap(), 2.0);
+        for wrong in [ExtxyzValue::from(-1.0), f64::INFINITY.into(), "much".into()] {
+            frame.info.insert(FRAME_WEIGHT.to_owned(), wrong);
+            let error = file.weight_of(&frame).unwrap_err().to_string();
+            assert!(
+                error.starts_with("a.xyz:7: calmwalk_weight is ") && error.contains("expected"),
+                "{error}"
+            );
+        }
+    }
 }

@@ -23,6 +23,7 @@ pub struct DataFile {
     hash: String,
     /// Those used.
     structures: u64,
+    /// Of the file; structures may have weights of their own.
     weight: f64,
     /// Whether it was named for validation.
     validation: bool,
@@ -69,6 +70,7 @@ fn labelled_frame(frame: Frame, file: &StructureFile) -> Result<(LabelledFrame, 
     let has_stress = labels.stress.is_some();
     let place = FileLine { file: Arc::clone(&file.path), line: frame.line }.to_string();
     let group = frame.info.get(GROUP).map_or_else(|| place.clone(), ToString::to_string);
-    let labelled = LabelledFrame::new(place, group, frame.structure, labels, file.weight);
+    let weight = file.weight_of(&frame)?;
+    let labelled = LabelledFrame::new(place, group, frame.structure, labels, weight);
     Ok((labelled.map_err(command_error)?, has_stress))
 }
