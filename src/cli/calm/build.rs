@@ -21,7 +21,7 @@ use crate::signals::stop_token;
 use crate::structure_files::{StructureArgs, file_weight};
 
 /// Projected features of a model without a projection, as in the paper.
-const PROJECTED: usize = 128;
+pub(super) const PROJECTED: usize = 128;
 
 /// Build a CALM mixture from the training data of a model
 ///

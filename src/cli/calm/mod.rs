@@ -9,6 +9,7 @@ mod info;
 mod merge;
 mod other_scores;
 mod recalibrate;
+mod sample;
 mod score;
 mod score_labels;
 mod score_table;
@@ -19,7 +20,8 @@ mod validate_labels;
 pub(super) use self::score::load;
 use super::{CommandError, ExitStatus};
 
-/// Build, recalibrate, compare, export, inspect and test CALM mixtures and baselines; grade structures, and judge grades by errors
+/// Build, recalibrate, compare, export, inspect and test CALM mixtures and baselines; sample data, grade structures, and judge grades by
+/// errors
 #[derive(Debug, clap::Subcommand)]
 pub enum CalmCommand {
     Baseline(baseline::CalmBaselineArgs),
@@ -30,6 +32,7 @@ pub enum CalmCommand {
     Info(info::CalmInfoArgs),
     Merge(merge::CalmMergeArgs),
     Recalibrate(recalibrate::CalmRecalibrateArgs),
+    Sample(sample::CalmSampleArgs),
     Score(score::CalmScoreArgs),
     Validate(validate::CalmValidateArgs),
 }
@@ -45,6 +48,7 @@ impl CalmCommand {
             Self::Info(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Recalibrate(command) => command.run(),
+            Self::Sample(command) => command.run(),
             Self::Score(command) => command.run(),
             Self::Validate(command) => command.run(),
         }
