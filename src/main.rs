@@ -38,6 +38,7 @@ mod selection;
 mod signals;
 mod structure_files;
 mod summary;
+mod unlabelled_updates;
 mod web;
 mod wording;
 mod xyz_reader;

@@ -11,7 +11,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-use orchestrator::selector::{Replay, ReplayError, SeedStructurePlan};
+use orchestrator::selector::{Replay, ReplayError, SeedStructurePlan, SelectorSettings};
 use serde_json::Value;
 use store::Store;
 
@@ -52,6 +52,11 @@ pub async fn replay(
 pub fn resolved(campaign: &store::CampaignRecord) -> Result<Value, CommandError> {
     serde_json::from_str(&campaign.resolved_configuration)
         .map_err(|error| CommandError::Failed(format!("damaged database: the configuration: {error}")))
+}
+
+/// The settings of the selector with which the campaign began.
+pub fn recorded_settings(campaign: &store::CampaignRecord) -> Result<SelectorSettings, CommandError> {
+    Ok(campaign::selector_settings(&overrides::configuration(&campaign.configuration, &[])?))
 }
 
 /// The selector's state before the first decision.

@@ -8,8 +8,7 @@ use serde_json::Value;
 use store::{LoggedDecision, Store};
 
 use super::report::first_difference;
-use super::{BAR, failure, follow, is_other_processor, overrides, resolved};
-use crate::campaign;
+use super::{BAR, failure, follow, is_other_processor, recorded_settings, resolved};
 use crate::exit_status::CommandError;
 use crate::output::Bar;
 
@@ -24,7 +23,7 @@ pub async fn mixture_of(
     original: &Artifact,
 ) -> Result<Arc<Mixture>, CommandError> {
     let record = store.campaign().await?;
-    let settings = campaign::selector_settings(&overrides::configuration(&record.configuration, &[])?);
+    let settings = recorded_settings(&record)?;
     let other_processor = is_other_processor(&resolved(&record)?);
     let last = store.first_decision_of(version).await?.ok_or_else(|| {
         CommandError::Failed(format!(

@@ -12,7 +12,7 @@ use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate, T
 use wire::messages::{DeclineReason, Outcome, Verdict, WalkEnd};
 use wire::{CandidateBlock, ContentHash, WalkId};
 
-use super::decision_state::DecisionState;
+use super::decision_state::{ADDITIVE, DecisionState};
 use super::error::SelectorError;
 use super::forgetting::ForgettingState;
 use super::regrade::{RegradedCandidate, RegradedReport};
@@ -409,6 +409,12 @@ fn describe_end(end: &WalkEnd) -> String {
 fn grade_summary(gamma: &[f64], mixture_version: u64) -> serde_json::Value {
     let above = gamma.iter().filter(|gamma| **gamma > 1.0).count();
     json!({ "gamma_max": maximum(gamma), "atoms_above_1": above, "mixture_version": mixture_version })
+}
+
+/// How a campaign updates its mixture now: as `configured` when it began, or additively since it forgot too much. `values` are those
+/// of its store ([`store::Store::values`]).
+pub fn update_settings_in_force(configured: &UpdateSettings, values: &[(String, String)]) -> UpdateSettings {
+    update_settings(configured, values.iter().any(|(name, value)| name == ADDITIVE && value != "0"))
 }
 
 /// How the mixture is updated, before or after updates became additive.

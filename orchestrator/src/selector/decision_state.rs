@@ -22,7 +22,7 @@ use super::walk_table::WalkTable;
 use crate::grader::Grader;
 
 /// Name of the value that tells that updates have become additive.
-const ADDITIVE: &str = "additive_updates";
+pub const ADDITIVE: &str = "additive_updates";
 
 /// Decides on candidates and walks.
 pub(super) struct DecisionState {

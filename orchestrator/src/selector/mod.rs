@@ -36,6 +36,7 @@ use wire::{CampaignId, WalkId};
 
 use crate::grader::Grader;
 use backlog::Backlog;
+pub use decide::update_settings_in_force;
 use decision_state::DecisionState;
 pub use error::SelectorError;
 pub use mixture_history::{AcceptedAtoms, MixtureHistory};

@@ -1,7 +1,5 @@
 //! `calmwalk calm build`
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -9,7 +7,10 @@ use calm::Projection;
 use calm::build::{BuildSettings, BuiltElement, BuiltMixture, random_projection};
 use npz::NpzFile;
 use potentials::grace::GraceModel;
+use tokio_util::sync::CancellationToken;
 
+use super::campaign_updates::UpdatingCampaign;
+use super::recalibrate::open;
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
@@ -55,6 +56,10 @@ pub struct CalmBuildArgs {
     /// Weight of the atoms of a file of DATA, 0 or more [default: 1]; may be repeated
     #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
+    /// Then update the mixture with the accepted candidates of this campaign that have no label (pending, failed, dropped or excluded),
+    /// so that walkers do not collect them again: its directory or the postgres:// URL of its store. With --part, give it to `calm merge`
+    #[arg(long, value_name = "DIR", conflicts_with = "pass")]
+    campaign: Option<PathBuf>,
     /// Candidate numbers of components per element, ascending; the build chooses one for each element
     #[arg(long, value_name = "K,…", value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
     candidates: Vec<usize>,
@@ -101,6 +106,7 @@ impl CalmBuildArgs {
         outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
         // Errors in paths are found before hours of work.
         outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
+        let campaign = self.campaign.as_deref().map(UpdatingCampaign::find).transpose()?;
         let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
         if let (Some(found), Some(_)) = (model.projection(), self.projection_dimension) {
             return Err(CommandError::Input(format!(
@@ -120,15 +126,16 @@ impl CalmBuildArgs {
             shard_size: self.shard_size,
         };
         let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
+        let stop = stop_token()?;
         let context = PassContext {
-            model,
+            model: Arc::clone(&model),
             files,
             shard_size: self.shard_size,
             part: self.part,
             seed: self.rng_seed,
             threads: self.threads.map_or(cores, usize::from),
             max_feature_bytes: (1e9 * self.max_feature_cache) as u64,
-            stop: stop_token()?,
+            stop: stop.clone(),
         };
         let mut build = mixture_build::MixtureBuild::open(
             context,
@@ -145,9 +152,13 @@ impl CalmBuildArgs {
             print_stderr("stopped; the same command continues");
             return Ok(ExitStatus::Interrupted);
         };
-        write_mixture(&mixture, &self.model, self.embed.as_deref(), &self.output)?;
+        let files = MixtureFiles { model: &self.model, embed: self.embed.as_deref(), output: &self.output };
+        let Some(updates) = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop)? else {
+            print_stderr("stopped; the same command continues");
+            return Ok(ExitStatus::Interrupted);
+        };
         build.finish()?;
-        report(&mixture, &self.output)?;
+        report(&mixture, &self.output, &updates)?;
         Ok(ExitStatus::Done)
     }
 }
@@ -163,24 +174,38 @@ fn end_part(pass: u8, part: BuildPart, done: bool) -> Result<ExitStatus, Command
     Ok(ExitStatus::Done)
 }
 
-/// Writes the model with the mixture, if asked for, then the artifact.
+/// Where the files of a mixture are.
+#[derive(Clone, Copy)]
+pub(super) struct MixtureFiles<'a> {
+    /// The model's export.
+    pub model: &'a Path,
+    /// The copy of it with the mixture, if asked for.
+    pub embed: Option<&'a Path>,
+    /// The artifact.
+    pub output: &'a Path,
+}
+
+/// Writes the model with the mixture, if asked for, then the artifact; after the updates by a campaign, if one is named. `model` computes
+/// the features. Returns what is said of the updates, or `None` if `stop` was cancelled before they ended.
 pub(super) fn write_mixture(
     mixture: &BuiltMixture,
-    model: &Path,
-    embed: Option<&Path>,
-    output: &Path,
-) -> Result<(), CommandError> {
-    if let Some(path) = embed {
+    files: MixtureFiles<'_>,
+    model: &Arc<GraceModel>,
+    campaign: Option<&UpdatingCampaign>,
+    stop: &CancellationToken,
+) -> Result<Option<String>, CommandError> {
+    if let Some(campaign) = campaign {
+        return campaign.write(mixture, files, model, stop);
+    }
+    if let Some(path) = files.embed {
         let mut file = AtomicFile::create(path)?;
-        let model = File::open(model).map_err(|error| {
-            CommandError::Input(format!("{}: cannot be opened: {error}", model.display()))
-        })?;
-        mixture.write_export(BufReader::new(model), &mut file).map_err(|error| cannot_write(path, error))?;
+        mixture.write_export(open(files.model)?, &mut file).map_err(|error| cannot_write(path, error))?;
         file.finish()?;
     }
-    let mut file = AtomicFile::create(output)?;
-    mixture.write(&mut file).map_err(|error| cannot_write(output, error))?;
-    file.finish()
+    let mut file = AtomicFile::create(files.output)?;
+    mixture.write(&mut file).map_err(|error| cannot_write(files.output, error))?;
+    file.finish()?;
+    Ok(Some(String::new()))
 }
 
 /// The model with the features of `variant`, their projection, and the random seed of that if it is known. A model without a
@@ -214,8 +239,8 @@ pub(super) fn projected(
     Ok((found.model, projection, seed))
 }
 
-/// A table of the elements.
-pub(super) fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), CommandError> {
+/// A table of the elements, and what is said of updates, if anything.
+pub(super) fn report(mixture: &BuiltMixture, output: &Path, updates: &str) -> Result<(), CommandError> {
     let artifact = mixture.artifact().map_err(CommandError::failed)?;
     if let Err(fault) = check_sound(&artifact, output) {
         log_and_warn(format_args!("WARNING: {fault}; campaigns and calm score refuse this artifact"));
@@ -238,6 +263,7 @@ pub(super) fn report(mixture: &BuiltMixture, output: &Path) -> Result<(), Comman
     }
     print(|out| {
         table.write(out)?;
+        out.write_all(updates.as_bytes())?;
         writeln!(out, "wrote {}", output.display())
     })
 }

@@ -1,17 +1,19 @@
 //! `calmwalk calm merge`
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use calm::build::BuildSettings;
 use potentials::grace::GraceModel;
 
-use super::build::{projected, report, write_mixture};
+use super::build::{MixtureFiles, projected, report, write_mixture};
+use super::campaign_updates::UpdatingCampaign;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
 use crate::mixture_build::{Merged, PartsMerge};
-use crate::output::print;
+use crate::output::{print, print_stderr};
+use crate::signals::stop_token;
 
 /// Merge the parts of a pass of `calmwalk calm build --part`
 ///
@@ -28,6 +30,9 @@ pub struct CalmMergeArgs {
     /// After pass 3, also write a copy of the model with the new mixture, for LAMMPS and calmwalk
     #[arg(long, value_name = "MODEL.npz", conflicts_with = "feature_variant")]
     embed: Option<PathBuf>,
+    /// After pass 3, also update the mixture with the accepted candidates of this campaign that have no label, as `calm build` does
+    #[arg(long, value_name = "DIR")]
+    campaign: Option<PathBuf>,
     /// The --feature-variant of the parts
     #[arg(long, value_name = "VARIANT")]
     feature_variant: Option<FeatureVariant>,
@@ -39,6 +44,7 @@ impl CalmMergeArgs {
             refuse_to_replace(output, [(self.model.as_path(), "the model")])?;
             AtomicFile::create(output)?;
         }
+        let campaign = self.campaign.as_deref().map(UpdatingCampaign::find).transpose()?;
         let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
         let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
         let mut merge = PartsMerge::open(&self.output, &hash)?;
@@ -54,9 +60,15 @@ impl CalmMergeArgs {
                 print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;
             }
             Merged::Mixture(mixture) => {
-                write_mixture(&mixture, &self.model, self.embed.as_deref().map(Path::new), &self.output)?;
+                let (embed, output) = (self.embed.as_deref(), self.output.as_path());
+                let files = MixtureFiles { model: &self.model, embed, output };
+                let updates = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop_token()?)?;
+                let Some(updates) = updates else {
+                    print_stderr("stopped; the same command continues");
+                    return Ok(ExitStatus::Interrupted);
+                };
                 merge.finish()?;
-                report(&mixture, &self.output)?;
+                report(&mixture, output, &updates)?;
             }
         }
         Ok(ExitStatus::Done)

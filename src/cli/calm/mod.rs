@@ -2,6 +2,7 @@
 
 mod baseline;
 mod build;
+mod campaign_updates;
 mod compare;
 mod export;
 mod filter;

@@ -1,0 +1,104 @@
+//! Files of a built mixture that the unlabelled candidates of a campaign have updated.
+
+use std::io::{BufWriter, Write};
+use std::path::Path;
+use std::sync::Arc;
+
+use calm::build::{BuiltMixture, UpdatedMixture};
+use calm::{Artifact, Mixture};
+use potentials::grace::GraceModel;
+use store::{Location, Store};
+use tempfile::TempPath;
+use tokio_util::sync::CancellationToken;
+
+use super::build::MixtureFiles;
+use super::recalibrate::open;
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::cli::{CommandError, block_on, campaign_location};
+use crate::output::count;
+use crate::unlabelled_updates::{self, UpdatedByCampaign};
+
+/// A campaign whose unlabelled candidates update a new mixture.
+pub(super) struct UpdatingCampaign(Location);
+
+impl UpdatingCampaign {
+    /// Opens the campaign of a directory or URL once, so that errors are found before hours of work.
+    ///
+    /// # Errors
+    /// There is no campaign, or it never updates its mixture.
+    pub(super) fn find(path: &Path) -> Result<Self, CommandError> {
+        let found = Self(campaign_location::parse(path)?);
+        block_on(found.check())??;
+        Ok(found)
+    }
+
+    async fn check(&self) -> Result<(), CommandError> {
+        let store = Store::open_read_only(&self.0).await?;
+        let campaign = store.campaign().await;
+        store.close().await;
+        unlabelled_updates::updating_settings(&campaign?).map(drop)
+    }
+
+    /// Writes the updated mixture as [`super::build::write_mixture`] does. Returns what is said of the updates, or `None` if `stop` was
+    /// cancelled before they ended.
+    pub(super) fn write(
+        &self,
+        mixture: &BuiltMixture,
+        MixtureFiles { model, embed, output }: MixtureFiles<'_>,
+        features: &Arc<GraceModel>,
+        stop: &CancellationToken,
+    ) -> Result<Option<String>, CommandError> {
+        let built = write_beside(mixture, output)?;
+        let original = Artifact::load(&built).map_err(CommandError::failed)?.mixture;
+        let Some(found) = block_on(self.update(features, original.clone(), stop))?? else {
+            return Ok(None);
+        };
+        let updated = UpdatedMixture::new(&built, &original, &found.mixture).map_err(CommandError::failed)?;
+        if let Some(path) = embed {
+            let mut file = AtomicFile::create(path)?;
+            updated.write_export(open(model)?, &mut file).map_err(|error| cannot_write(path, error))?;
+            file.finish()?;
+        }
+        let mut file = AtomicFile::create(output)?;
+        updated
+            .write_artifact(open(&built)?, &mut file, &found.campaign)
+            .map_err(|error| cannot_write(output, error))?;
+        file.finish()?;
+        Ok(Some(describe(&found)))
+    }
+
+    async fn update(
+        &self,
+        features: &Arc<GraceModel>,
+        original: Mixture,
+        stop: &CancellationToken,
+    ) -> Result<Option<UpdatedByCampaign>, CommandError> {
+        let store = Store::open_read_only(&self.0).await?;
+        let found = unlabelled_updates::apply(&store, features, original, stop).await;
+        store.close().await;
+        found
+    }
+}
+
+/// Writes the artifact before the updates to a temporary file beside the output.
+fn write_beside(mixture: &BuiltMixture, output: &Path) -> Result<TempPath, CommandError> {
+    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let mut builder = tempfile::Builder::new();
+    let part = builder.prefix(".built.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
+    let mut part = part.map_err(|error| cannot_write(output, error))?;
+    let mut out = BufWriter::new(&mut part);
+    let written = mixture.write(&mut out).and_then(|out| out.flush());
+    written.map_err(|error| cannot_write(output, error))?;
+    drop(out);
+    Ok(part.into_temp_path())
+}
+
+/// A line about the updates.
+fn describe(found: &UpdatedByCampaign) -> String {
+    let UpdatedByCampaign { campaign, applied, covered, .. } = found;
+    format!(
+        "campaign {campaign}: {} without a label, of which {applied} updated the mixture and {covered} {} covered already\n",
+        count(applied + covered, "accepted candidate"),
+        if *covered == 1 { "was" } else { "were" }
+    )
+}

@@ -1,0 +1,138 @@
+//! Updates a new mixture with the accepted candidates of a campaign that have no label.
+//!
+//! A mixture that is built from labelled structures knows nothing of structures whose label is pending, failed or was taken out, so
+//! that walkers would find them again.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+
+use calm::{Grades, Mixture};
+use orchestrator::selector::{SelectorSettings, UpdateProtocol, update_settings_in_force};
+use potentials::grace::GraceModel;
+use store::{CampaignRecord, ExportCursor, ExportFilter, Fate, Store, StoredCandidate};
+use tokio_util::sync::CancellationToken;
+
+use crate::exit_status::CommandError;
+use crate::features::FeatureCalculator;
+use crate::replay::recorded_settings;
+
+/// Candidates per read; their features are not needed, but are read with them.
+const CANDIDATES: u32 = 16;
+/// Labelled structures per read.
+const LABELLED: u32 = 200;
+
+/// A mixture after the updates.
+pub struct UpdatedByCampaign {
+    /// Id of the campaign.
+    pub campaign: String,
+    pub mixture: Mixture,
+    /// Candidates that updated it.
+    pub applied: u64,
+    /// Candidates that the mixture covered already, so that walkers would not collect them.
+    pub covered: u64,
+}
+
+/// The updates under way.
+struct CampaignUpdates<'a> {
+    settings: SelectorSettings,
+    search: calm::UpdateSettings,
+    calculator: FeatureCalculator,
+    grades: Grades,
+    found: UpdatedByCampaign,
+    stop: &'a CancellationToken,
+}
+
+/// The settings of a campaign's selector.
+///
+/// # Errors
+/// A campaign that never updates its mixture.
+pub fn updating_settings(campaign: &CampaignRecord) -> Result<SelectorSettings, CommandError> {
+    let settings = recorded_settings(campaign)?;
+    if settings.update == UpdateProtocol::Never {
+        return Err(CommandError::Input(format!(
+            "--campaign: campaign {} never updates its mixture (calm.update = \"never\"); expected one that does",
+            campaign.id
+        )));
+    }
+    Ok(settings)
+}
+
+/// Applies the candidates in decision order, each by the campaign's rules, as its selector did: those that meet the collection rule
+/// under the mixture so far update it. Features are those of `model`, to which `mixture` belongs. `None` after a cancellation of `stop`.
+///
+/// A candidate counts as labelled if `calmwalk export` writes it under the protocol in force.
+///
+/// # Errors
+/// A campaign that never updates its mixture, a candidate that the model cannot evaluate, a damaged database.
+pub async fn apply(
+    store: &Store,
+    model: &Arc<GraceModel>,
+    mixture: Mixture,
+    stop: &CancellationToken,
+) -> Result<Option<UpdatedByCampaign>, CommandError> {
+    let record = store.campaign().await?;
+    let settings = updating_settings(&record)?;
+    let search = update_settings_in_force(&settings.search, &store.values().await?);
+    let labelled = labelled(store).await?;
+    let found = UpdatedByCampaign { campaign: record.id.to_string(), mixture, applied: 0, covered: 0 };
+    let calculator = FeatureCalculator::new(Arc::clone(model));
+    let mut updates =
+        CampaignUpdates { settings, search, calculator, grades: Grades::default(), found, stop };
+    let mut last = 0;
+    loop {
+        let page = store.candidates(last, false, CANDIDATES).await?;
+        let Some(end) = page.last() else { return Ok(Some(updates.found)) };
+        last = end.decision;
+        let unlabelled = |candidate: &&StoredCandidate| {
+            candidate.fate == Fate::Accepted && !labelled.contains(&candidate.decision)
+        };
+        for candidate in page.iter().filter(unlabelled) {
+            if updates.stop.is_cancelled() {
+                return Ok(None);
+            }
+            updates.apply(candidate)?;
+        }
+    }
+}
+
+/// The decisions on candidates that have a label, as an export has them.
+async fn labelled(store: &Store) -> Result<HashSet<i64>, CommandError> {
+    let mut found = HashSet::new();
+    let Some(protocol) = store.protocol_in_force().await? else { return Ok(found) };
+    let filter = ExportFilter { protocol: protocol.hash, biased: true, control: false, imported: false };
+    let mut last = None;
+    loop {
+        let page = store.labelled(&filter, last, LABELLED).await?;
+        let Some(end) = page.last() else { return Ok(found) };
+        last = Some(end.cursor);
+        found.extend(page.iter().filter_map(|row| match row.cursor {
+            ExportCursor::Candidate(decision) => Some(decision),
+            ExportCursor::Import(_) => None,
+        }));
+    }
+}
+
+impl CampaignUpdates<'_> {
+    fn apply(&mut self, candidate: &StoredCandidate) -> Result<(), CommandError> {
+        let view = candidate.block.view();
+        let campaign = &self.found.campaign;
+        let place = || format!("campaign {campaign}, candidate {}", view.id());
+        let elements = self
+            .calculator
+            .compute(&view.structure())
+            .map_err(|error| CommandError::Input(format!("{}: {error}", place())))?;
+        let failed = |error: &dyn std::fmt::Display| CommandError::Failed(format!("{}: {error}", place()));
+        let (mixture, features) = (&self.found.mixture, self.calculator.features());
+        self.grades.evaluate(mixture, &elements, features, None).map_err(|error| failed(&error))?;
+        if !self.settings.collection.is_met(&self.grades.gamma) {
+            self.found.covered += 1;
+            return Ok(());
+        }
+        let outcome =
+            calm::update(mixture, &elements, features, &self.search).map_err(|error| failed(&error))?;
+        let updated = mixture.with_changes(&outcome.changed).map_err(|error| failed(&error))?;
+        self.found.mixture = updated;
+        self.found.applied += 1;
+        Ok(())
+    }
+}
