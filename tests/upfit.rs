@@ -225,6 +225,34 @@ fn wrong_labels_are_named() {
 }
 
 #[test]
+fn weights_of_frames_count_as_those_of_files() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let mut frames = frames(2);
+    let whole = ["--validation-share", "0", "--epochs", "1", "--json"];
+    let losses = |more: &[&str]| {
+        let printed = succeed(here, arguments("out.npz", &[&whole[..], more].concat()));
+        let found: Json = serde_json::from_str(&printed).unwrap();
+        ["before", "after"].map(|when| found[when]["training"]["loss"].as_f64().unwrap())
+    };
+    write_frames(&here.join("data.extxyz"), &frames);
+    let of_file = losses(&["--weight", "data.extxyz=0.5"]);
+    for frame in &mut frames {
+        frame.info.insert("calmwalk_weight".to_owned(), 0.5_f64.into());
+    }
+    write_frames(&here.join("data.extxyz"), &frames);
+    assert_eq!(losses(&[]), of_file);
+
+    frames[0].info.insert("calmwalk_weight".to_owned(), "heavy".into());
+    write_frames(&here.join("data.extxyz"), &frames);
+    let message = refuse(here, arguments("out.npz", &whole));
+    assert!(
+        message.contains("data.extxyz:1: calmwalk_weight is heavy; expected a number, 0 or more"),
+        "{message}"
+    );
+}
+
+#[test]
 fn wrong_arguments_are_refused_before_any_work() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
