@@ -289,6 +289,8 @@ mod tests {
     }
 
     /// Structures of one kind count as often as there are of them, whatever their place and size.
+    type Kind = fn(u64) -> bool;
+
     #[test]
     fn weights_depend_on_neither_place_nor_size() {
         let data: Vec<_> = (0..100).map(|number| vec![(8, if number % 2 == 0 { 10 } else { 30 })]).collect();
@@ -300,7 +302,7 @@ mod tests {
             };
             mean_and_error(&samplers.iter().map(sum).collect::<Vec<_>>())
         };
-        let kinds: [(&str, fn(u64) -> bool); 3] = [
+        let kinds: [(&str, Kind); 3] = [
             ("first half", |number| number < 50),
             ("large", |number| number % 2 == 1),
             ("small", |number| number % 2 == 0),

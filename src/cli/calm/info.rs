@@ -141,7 +141,8 @@ fn inspect(path: &Path) -> Result<Content, CommandError> {
         }
         false => None,
     };
-    let note = archive.contains(NOTE).then(|| archive.strings(NOTE)).transpose().map_err(CommandError::input)?;
+    let note =
+        archive.contains(NOTE).then(|| archive.strings(NOTE)).transpose().map_err(CommandError::input)?;
     let training = note.and_then(|texts| serde_json::from_str(texts.first()?).ok());
     Ok(Content::Model(Box::new(Model { training, ..Model::new(&model, mixture) })))
 }
@@ -206,10 +207,12 @@ impl Model {
             )?;
         }
         if let Some(training) = &self.training {
-            let text = |path: &str| training.pointer(path).map_or_else(String::new, |value| match value {
-                Value::String(text) => text.clone(),
-                value => value.to_string(),
-            });
+            let text = |path: &str| {
+                training.pointer(path).map_or_else(String::new, |value| match value {
+                    Value::String(text) => text.clone(),
+                    value => value.to_string(),
+                })
+            };
             let structures = text("/training/structures");
             line(out, "trained", format!("by {}, on {structures} structures", text("/program")))?;
             line(out, "", format!("from {} (BLAKE3 {})", text("/model/file"), text("/model/hash")))?;
