@@ -23,17 +23,18 @@ while [ $# -gt 0 ] && [ "$1" != -- ]; do
 done
 [ $# -gt 1 ] || usage
 shift
-build=("$@")
-# What `calm merge` must be told, too.
+# What `calm build` is told, and what `calm merge` must be told, too. Only the last merge updates the mixture by a campaign.
+build=()
 merge=()
 output=
 while [ $# -gt 0 ]; do
-    name=$1
+    name=$1 given=("$1")
     case $1 in
-        --model=* | --output=* | --embed=* | --feature-variant=*) name=${1%%=*} value=${1#*=} ;;
-        --model | --output | --embed | --feature-variant | -o)
+        --model=* | --output=* | --embed=* | --feature-variant=* | --campaign=*) name=${1%%=*} value=${1#*=} ;;
+        --model | --output | --embed | --feature-variant | --campaign | -o)
             [ $# -gt 1 ] || usage
             value=$2
+            given+=("$2")
             shift
             ;;
         -o?*)
@@ -42,6 +43,7 @@ while [ $# -gt 0 ]; do
             ;;
         *) name= ;;
     esac
+    [ "$name" = --campaign ] || build+=("${given[@]}")
     [ -z "$name" ] || merge+=("$name" "$value")
     case $name in --output | -o) output=$value ;; esac
     shift

@@ -73,7 +73,8 @@ pub struct UpfitArgs {
     /// δ of the Huber loss: larger errors count linearly, eV/atom, eV/Å and eV/Å³ [default: 0.01]
     #[arg(long, value_name = "DELTA", value_parser = positive)]
     huber_delta: Option<f64>,
-    /// Weight of the structures of a file of DATA, 0 or more [default: 1]; may be repeated
+    /// Weight of the structures of a file of DATA, 0 or more [default: 1], times calmwalk_weight of a frame if it has that key; may be
+    /// repeated
     #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
     /// Learning rate of the first update; it falls by half a cosine

@@ -53,7 +53,7 @@ pub struct CalmBuildArgs {
     /// Mixtures of other features serve comparisons (`calm score`, `calm baseline`), not campaigns
     #[arg(long, value_name = "VARIANT")]
     feature_variant: Option<FeatureVariant>,
-    /// Weight of the atoms of a file of DATA, 0 or more [default: 1]; may be repeated
+    /// Weight of the atoms of a file of DATA, 0 or more [default: 1], times calmwalk_weight of a frame if it has that key; may be repeated
     #[arg(long, value_name = "FILE=W", value_parser = file_weight)]
     weight: Vec<(PathBuf, f64)>,
     /// Then update the mixture with the accepted candidates of this campaign that have no label (pending, failed, dropped or excluded),
