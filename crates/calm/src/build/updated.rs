@@ -198,7 +198,7 @@ impl UpdatedMixture {
         }
         file.copy(artifact, |key| replaced.iter().any(|replaced| replaced == key))?;
         file.strings("campaign", &[], &[campaign])?;
-        file.scalar("mixture_version", self.version)?;
+        file.scalar("mixture_version", i64::try_from(self.version).unwrap_or(i64::MAX))?;
         if new {
             let held = (0..).zip(&self.elements).filter(|(_, element)| element.is_some());
             let held: Vec<i32> = held.map(|(index, _)| index).collect();
