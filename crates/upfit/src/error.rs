@@ -102,6 +102,14 @@ pub enum UpfitError {
         /// In this training.
         now: String,
     },
+    /// The system cannot create threads.
+    #[error("cannot start {threads} threads: {reason}")]
+    Threads {
+        /// Their number.
+        threads: usize,
+        /// The error of the operating system.
+        reason: String,
+    },
     /// A file that is no checkpoint, or a damaged one.
     #[error("{}: {reason}; remove the file to start over, or name another one", path.display())]
     Damaged {
@@ -134,6 +142,7 @@ impl UpfitError {
         !matches!(
             self,
             Self::NotFinite { .. }
+                | Self::Threads { .. }
                 | Self::Damaged { .. }
                 | Self::ReadCheckpoint { .. }
                 | Self::WriteCheckpoint { .. }

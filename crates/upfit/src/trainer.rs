@@ -1,12 +1,13 @@
 //! The loop of a training.
 
+use std::error::Error;
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::Instant;
 
 use analysis::LabelledEnergy;
 use calm::build::shuffled;
-use potentials::grace::TrainableGrace;
+use potentials::grace::{Threads, TrainableGrace};
 
 use crate::adam::AdamState;
 use crate::checkpoint::{BestWeights, CheckpointFile, TrainingState};
@@ -122,7 +123,7 @@ struct Trainer<'a> {
 
 impl<'a> Trainer<'a> {
     fn new(
-        model: TrainableGrace,
+        mut model: TrainableGrace,
         data: &'a TrainingData,
         settings: &'a UpfitSettings,
     ) -> Result<Self, UpfitError> {
@@ -133,6 +134,9 @@ impl<'a> Trainer<'a> {
         let mut room = NEIGHBOUR_BYTES;
         let training = prepare(model.model(), &data.training, &mut room)?;
         let validation = prepare(model.model(), &data.validation, &mut room)?;
+        let threads = settings.threads;
+        let failed = |error: Box<dyn Error>| UpfitError::Threads { threads, reason: error.to_string() };
+        model.set_threads(Threads::new(threads).map_err(|error| failed(error.into()))?);
         let begun = Instant::now();
         let (slots, checkpoint) = (Vec::new(), None);
         Ok(Self {

@@ -3,6 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use rayon::iter::{IntoParallelRefMutIterator, ParallelIterator};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
 use super::batches::Chunk;
@@ -35,6 +36,14 @@ impl Threads {
         match &self.0 {
             Some(pool) => pool.install(work),
             None => work(),
+        }
+    }
+
+    /// Calls `act` for each item.
+    pub(super) fn for_each<T: Send>(&self, items: &mut [T], act: impl Fn(&mut T) + Sync + Send) {
+        match &self.0 {
+            Some(pool) => pool.install(|| items.par_iter_mut().for_each(act)),
+            None => items.iter_mut().for_each(act),
         }
     }
 

@@ -1,6 +1,7 @@
 //! Sums of derivatives over structures.
 
 use super::super::network::Network;
+use super::super::threads::Threads;
 use super::super::vector::{Double, Vector};
 use super::super::weight_arrays::WeightArrays;
 use super::super::weight_gradient::WeightGradient;
@@ -83,7 +84,7 @@ impl WeightSums {
         &self,
         network: &Network<Double>,
         arrays: &WeightArrays,
-        radial: &[RadialWeights],
+        (radial, threads): (&[RadialWeights], &Threads),
         out: &mut WeightArrays,
     ) {
         let layers = self.layers.iter().zip(&network.layers).zip(&network.readout.blocks);
@@ -103,7 +104,7 @@ impl WeightSums {
             let rows: Vec<Vec<f64>> =
                 sums.factors.iter().map(|row| Double::flat(row)[..factors.channels].to_vec()).collect();
             factors.pull_back(arrays, &rows, out);
-            radial.pull_back(&layer.radial, &sums.tables, out);
+            radial.pull_back(&layer.radial, &sums.tables, out, threads);
         }
         for (map, sum) in network.readout.maps.iter().zip(&self.perceptron) {
             map.pull_back(&sum.numbers(map), out);

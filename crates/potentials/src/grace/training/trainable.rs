@@ -17,6 +17,7 @@ use super::super::radial::RadialPath;
 use super::super::read_options::ReadOptions;
 use super::super::shared_reader::NOTE;
 use super::super::tape::TapeOperation;
+use super::super::threads::Threads;
 use super::super::vector::Double;
 use super::super::weight_arrays::WeightArrays;
 use super::radial_weights::RadialWeights;
@@ -33,6 +34,7 @@ pub struct TrainableGrace {
     weights: Vec<f64>,
     /// The radial network of each layer.
     radial: Vec<RadialWeights>,
+    threads: Threads,
 }
 
 /// A trained array of the model file.
@@ -71,12 +73,19 @@ impl TrainableGrace {
             groups,
             weights,
             radial: Vec::new(),
+            threads: Threads::default(),
         };
         let network = trainable.network();
         trainable.radial = network.layers.iter().map(|layer| RadialWeights::new(&layer.radial)).collect();
+        drop(network);
         let weights = trainable.weights.clone();
         trainable.set_weights(&weights);
         Ok(trainable)
+    }
+
+    /// Threads for [`TrainableGrace::set_weights`] and [`TrainableGrace::gradient`]; results do not depend on them.
+    pub fn set_threads(&mut self, threads: Threads) {
+        self.threads = threads;
     }
 
     /// The model with the present weights.
@@ -107,9 +116,9 @@ impl TrainableGrace {
             values.copy_from_slice(here);
             rest = after;
         }
-        let Self { model, arrays, radial, .. } = self;
+        let Self { model, arrays, radial, threads, .. } = self;
         let AnyNetwork::Double(network) = &mut Arc::make_mut(model).network else { return };
-        update(Arc::make_mut(network), arrays, radial);
+        update(Arc::make_mut(network), arrays, radial, threads);
     }
 
     /// Zero sums for [`GradientWorker::accumulate`].
@@ -126,7 +135,7 @@ impl TrainableGrace {
     pub fn gradient(&self, sums: &WeightSums) -> Vec<f64> {
         let mut out = self.arrays.clone();
         out.values_mut().for_each(|values| values.fill(0.0));
-        sums.pull_back(&self.network(), &self.arrays, &self.radial, &mut out);
+        sums.pull_back(&self.network(), &self.arrays, (&self.radial, &self.threads), &mut out);
         out.iter().flat_map(|(_, array)| array.values.iter().copied()).collect()
     }
 
@@ -161,7 +170,12 @@ const MIXTURE: [&str; 5] =
     ["uq_centroids", "uq_inv_cov", "uq_n_clusters", "uq_interp_thresholds", "uq_max_clusters"];
 
 /// Fills all matrices and tables with the present weights.
-fn update(network: &mut Network<Double>, arrays: &WeightArrays, radial: &mut [RadialWeights]) {
+fn update(
+    network: &mut Network<Double>,
+    arrays: &WeightArrays,
+    radial: &mut [RadialWeights],
+    threads: &Threads,
+) {
     for (layer, radial) in network.layers.iter_mut().zip(radial) {
         for step in &mut layer.steps.steps {
             if let TapeOperation::Linear(linear) = &mut step.operation {
@@ -173,7 +187,7 @@ fn update(network: &mut Network<Double>, arrays: &WeightArrays, radial: &mut [Ra
             let first = constants.len() - row.len();
             constants[first..].copy_from_slice(&row);
         }
-        radial.update(&mut layer.radial, arrays);
+        radial.update(&mut layer.radial, arrays, threads);
     }
     let readout = &mut network.readout;
     for block in &mut readout.blocks {
