@@ -45,7 +45,6 @@ impl Leadership {
     pub async fn take(url: &ServerUrl, who: &str) -> Result<Self> {
         let server = PostgresServer::connect(url, true);
         make_tables(url, &server).await?;
-        server.close().await;
         let (options, started) = (options(url), Instant::now());
         let mut connection = options.connect().await?;
         while !try_lock(&mut connection, &url.schema).await? {
@@ -56,6 +55,9 @@ impl Leadership {
             }
             tokio::time::sleep(RELEASE_POLL_INTERVAL).await;
         }
+        // No process of an earlier version leads the campaign now.
+        server.migrate(url).await?;
+        server.close().await;
         let pid = std::process::id();
         let sql = "UPDATE leader SET generation = generation + 1, holder = $1, start_time = $2 RETURNING generation";
         let query = sqlx::query_scalar(sql).bind(format!("process {pid} ({who}) on {}", this_host()));

@@ -45,7 +45,10 @@ impl PostgresServer {
         let server = Self::connect(url, true);
         make_tables(url, &server).await?;
         match server.campaign().await? {
-            None => Ok(server),
+            None => {
+                server.migrate(url).await?;
+                Ok(server)
+            }
             Some(found) => {
                 Err(StoreError::Occupied { location: url.to_string(), found, wanted: campaign.to_string() })
             }
@@ -75,13 +78,16 @@ impl PostgresServer {
 
     /// Migrates the tables to the newest version, checksums and words included, in one transaction. Only one process
     /// does so at a time. Creates the tables if the schema has none.
-    async fn migrate(&self, url: &ServerUrl) -> Result<()> {
+    pub(super) async fn migrate(&self, url: &ServerUrl) -> Result<()> {
         let mut transaction = Transaction::Postgres(self.begin().await?, self.clock);
         let one = "SELECT 1::BIGINT FROM pg_advisory_xact_lock(hashtext($1))";
         let one = query(one).bind(format!("{}: new version", url.schema));
         one.rows(&mut transaction).await?;
         let Transaction::Postgres(connection, _) = &mut transaction else { return Ok(()) };
         let found = version(url, &mut *connection).await?;
+        if found == Some(SCHEMA) {
+            return Ok(());
+        }
         // The function that `run` calls. With a borrowed connection, `run` gives a future that is not `Send`.
         MIGRATIONS.run_direct(None, &mut **connection, false).await.map_err(schema_error)?;
         if found < Some(FIRST_WITH_CHECKSUMS) {
@@ -100,10 +106,11 @@ impl PostgresServer {
     }
 }
 
-/// Creates the schema and its tables if they do not exist. Others see no tables or all of them.
+/// Creates the schema and its tables if there are none. Others see no tables or all of them. Tables of an earlier version stay
+/// as they are: a process of that version may lead the campaign.
 pub(super) async fn make_tables(url: &ServerUrl, server: &PostgresServer) -> Result<()> {
     let mut connection = server.connection().await?;
-    if version(url, &mut connection).await? == Some(SCHEMA) {
+    if version(url, &mut connection).await?.is_some() {
         return Ok(());
     }
     // The name consists of letters, digits and underscores.

@@ -127,6 +127,24 @@ async fn foreign_tables_and_newer_versions_are_refused() {
     }
 }
 
+/// A process of an earlier version may lead the campaign: only the holder of the lock migrates.
+#[tokio::test]
+async fn tables_of_an_earlier_version_stay_while_another_process_leads() {
+    let database = TestDatabase::new();
+    let lock = CampaignLock::acquire_at(database.location(), "first").await.unwrap();
+    database.create().await;
+    let mut connection = connect(&database).await;
+    connection.execute("DELETE FROM _sqlx_migrations WHERE version > 15").await.unwrap();
+    let error = CampaignLock::acquire_at(database.location(), "second").await.unwrap_err();
+    assert!(matches!(error, StoreError::Locked { .. }), "{error}");
+    let version: i64 = sqlx::query_scalar("SELECT max(version) FROM _sqlx_migrations")
+        .fetch_one(&mut connection)
+        .await
+        .unwrap();
+    assert_eq!(version, 15);
+    drop(lock);
+}
+
 /// Several at once: none finds tables that another is still creating.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn several_processes_may_create_the_tables() {
