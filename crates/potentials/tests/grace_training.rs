@@ -1,10 +1,12 @@
 //! Derivatives with respect to weights, against finite differences and TensorFlow.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Structure};
-use potentials::grace::{Grace, LossGradient, TrainableGrace, WeightGroup};
+use npyz::npz::NpzArchive;
+use potentials::grace::{Grace, GraceModel, LossGradient, TrainableGrace, WeightGroup};
 
 use crate::common::golden::{Npz, committed, golden, peer};
 use crate::common::{assert_close, evaluate};
@@ -122,8 +124,8 @@ fn check(file: &Path, structure: &Structure) {
             2e-3 * scale / (range.len() as f64).sqrt(),
         );
         let error = (found - exact).abs() / largest;
-        assert!(error < 1e-7, "{}: {name}: {exact} is {found} by differences: {error:e}", file.display());
         assert!(largest > 0.0, "{name} has no effect");
+        assert!(error < 1e-7, "{}: {name}: {exact} is {found} by differences: {error:e}", file.display());
     }
 }
 
@@ -189,5 +191,49 @@ fn weight_gradients_of_peer_models_are_differences() {
         for at in at {
             check(&model.join("kokkos.npz"), &golden(&model)[*at].structure);
         }
+    }
+}
+
+/// Dtype and shape of each array of a file but those of the mixture.
+fn layout(file: &Path) -> BTreeMap<String, (String, Vec<u64>)> {
+    let mut archive = NpzArchive::open(file).unwrap();
+    let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
+    let mut layout = BTreeMap::new();
+    for name in names {
+        let array = archive.by_name(&name).unwrap().unwrap();
+        layout.insert(name, (format!("{:?}", array.header().dtype()), array.shape().to_vec()));
+    }
+    layout
+}
+
+#[test]
+fn a_trained_model_is_written_like_the_export_that_it_came_from() {
+    let directory = tempfile::tempdir().unwrap();
+    let two_layers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/two_layers_trained.npz");
+    for (file, symbol) in [(two_layers, "Ni"), (committed("al_eam_1l").join("kokkos.npz"), "Al")] {
+        let mut model = TrainableGrace::load(&file).unwrap();
+        let mut noise = noise(3);
+        let weights: Vec<f64> = model.weights().iter().map(|w| w + 0.01 * noise()).collect();
+        model.set_weights(&weights);
+        let written = directory.path().join(format!("{symbol}.npz"));
+        model.write(&written, "a note").unwrap();
+
+        let found = layout(&written);
+        for (name, of_export) in layout(&file) {
+            let is_mixture = name.starts_with("uq_") && !name.starts_with("uq_rp_");
+            let is_kept = found.get(&name).is_some_and(|written| *written == of_export);
+            assert!(is_kept || is_mixture, "{name}: {of_export:?}, {:?}", found.get(&name));
+        }
+        assert!(!found.contains_key("uq_centroids") && found.contains_key("calmwalk_note"));
+
+        let mut structure = alloy();
+        structure.species = vec![symbol.parse().unwrap(); 4];
+        let mut read = Grace::new(Arc::new(GraceModel::load(&written).unwrap()));
+        let mut trained = Grace::new(Arc::new(model.model().clone()));
+        let [read, trained] = [&mut read, &mut trained].map(|grace| evaluate(grace, &structure));
+        let difference =
+            read.atomic_energies.iter().zip(&trained.atomic_energies).map(|(a, b)| (a - b).abs());
+        assert!(difference.fold(0.0, f64::max) < 1e-6);
+        assert!(TrainableGrace::load(&written).unwrap().weights() == weights);
     }
 }

@@ -49,8 +49,13 @@ impl BlockAliases {
     }
 }
 
-/// Ignores arrays that duplicate one that was read; rejects the file if they differ.
-pub(super) fn ignore_aliases(archive: &NpzFile, names: &BlockAliases) -> Result<(), GraceError> {
+/// Ignores arrays that duplicate one that was read; rejects the file if they differ. Returns the name of each with that of
+/// the other.
+pub(super) fn ignore_aliases(
+    archive: &NpzFile,
+    names: &BlockAliases,
+) -> Result<Vec<(String, String)>, GraceError> {
+    let mut aliases = Vec::new();
     let left_over: Vec<String> = archive.unread().into_iter().map(str::to_owned).collect();
     for key in left_over {
         let of_norm = ["_scale", "_lin_scale", "_type", "_n_out"]
@@ -62,12 +67,16 @@ pub(super) fn ignore_aliases(archive: &NpzFile, names: &BlockAliases) -> Result<
         });
         let originals: Vec<String> =
             of_norm.chain(of_reduction).filter(|original| archive.contains(original)).collect();
-        if !originals.is_empty() && !originals.iter().any(|original| same(archive, &key, original)) {
-            let reason = format!("array '{key}' differs from {}", originals.join(" or "));
-            return Err(unsupported(archive, reason));
+        match originals.iter().find(|original| same(archive, &key, original)) {
+            Some(original) => aliases.push((key, original.clone())),
+            None if originals.is_empty() => {}
+            None => {
+                let reason = format!("array '{key}' differs from {}", originals.join(" or "));
+                return Err(unsupported(archive, reason));
+            }
         }
     }
-    Ok(())
+    Ok(aliases)
 }
 
 /// Whether both arrays are equal.

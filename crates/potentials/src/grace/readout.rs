@@ -7,7 +7,7 @@ use super::vector::{Number, Vector};
 use super::weight_map::WeightMap;
 use super::weights::Weights;
 
-/// Name of the energies of the free atoms, by element, eV.
+/// Name of the constants by element, eV.
 pub(super) const SHIFTS: &str = "shift_values";
 
 /// The readout's activation function.

@@ -46,7 +46,7 @@ pub(super) fn read<V: Vector>(archive: &NpzFile, options: ReadOptions) -> Result
     let (first, message, first_order) = reader.first_layer(n_densities)?;
     let (second, second_order) = reader.second_layer(message, n_densities)?;
     expect_lists(archive, [first_order, second_order])?;
-    ignore_aliases(archive, &names)?;
+    reader.weights.aliases = ignore_aliases(archive, &names)?;
     ModelBuilder {
         archive,
         architecture: Architecture::TwoLayer,

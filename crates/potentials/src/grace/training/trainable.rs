@@ -1,9 +1,10 @@
 //! A model whose weights can be changed.
 
+use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufReader, BufWriter};
+use std::io::{self, BufWriter, Cursor};
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use npz::{NpzFile, Writer};
@@ -15,6 +16,7 @@ use super::super::network::{AnyNetwork, Network};
 use super::super::potential::Grace;
 use super::super::radial::RadialPath;
 use super::super::read_options::ReadOptions;
+use super::super::readout::SHIFTS;
 use super::super::shared_reader::NOTE;
 use super::super::tape::TapeOperation;
 use super::super::threads::Threads;
@@ -27,7 +29,8 @@ use super::worker::GradientWorker;
 /// A GRACE model of one or two layers whose weights can be changed, in double precision.
 #[derive(Clone, Debug)]
 pub struct TrainableGrace {
-    path: PathBuf,
+    /// The file that was read.
+    file: Arc<[u8]>,
     model: Arc<GraceModel>,
     arrays: WeightArrays,
     groups: Vec<WeightGroup>,
@@ -55,6 +58,8 @@ impl TrainableGrace {
     /// As [`GraceModel::load`], and for a model of three layers.
     pub fn load(path: &Path) -> Result<Self, GraceError> {
         let archive = NpzFile::open(path)?;
+        let open = |source| npz::Error::Open { path: path.to_owned(), source };
+        let file = std::fs::read(path).map_err(open)?;
         let options = ReadOptions { radial: RadialPath::Table, training: true };
         let (model, arrays) = GraceModel::read(&archive, options, AnyNetwork::Double)?;
         if model.description.architecture == Architecture::ThreeLayer {
@@ -67,7 +72,7 @@ impl TrainableGrace {
             weights.extend_from_slice(&array.values);
         }
         let mut trainable = Self {
-            path: path.to_owned(),
+            file: file.into(),
             model: Arc::new(model),
             arrays,
             groups,
@@ -139,22 +144,33 @@ impl TrainableGrace {
         out.iter().flat_map(|(_, array)| array.values.iter().copied()).collect()
     }
 
+    /// The file that was read.
+    pub fn file_bytes(&self) -> &[u8] {
+        &self.file
+    }
+
     /// Writes a model file with the present weights and everything else as in the file that was read, except the mixture of
     /// the grade, which belongs to the earlier weights. `note` goes to the array `calmwalk_note`.
     ///
     /// # Errors
-    /// If the file that was read has gone or changed, or the new one cannot be written.
+    /// If the file cannot be written.
     pub fn write(&self, path: &Path, note: &str) -> io::Result<()> {
-        let source = BufReader::new(File::open(&self.path)?);
         let mut writer = Writer::new(BufWriter::new(File::create(path)?));
-        let stale = |name: &str| MIXTURE.contains(&name) || name == NOTE;
-        let trained = |name: &str| self.groups.iter().any(|group| group.name == name);
-        writer.copy(source, |name| stale(name) || trained(name))?;
-        for group in &self.groups {
-            writer.array(&group.name, &group.shape, self.weights[group.range.clone()].iter().copied())?;
+        let aliases = self.arrays.aliases.iter().map(|(alias, original)| (alias, original));
+        let names = self.groups.iter().map(|group| (&group.name, &group.name)).chain(aliases);
+        let trained: BTreeMap<&str, &WeightGroup> =
+            names.filter_map(|(name, original)| Some((name.as_str(), self.group(original)?))).collect();
+        let is_stale = |name: &str| name == NOTE || (name.starts_with("uq_") && !is_projection(name));
+        writer.copy(Cursor::new(&self.file[..]), |name| is_stale(name) || trained.contains_key(name))?;
+        for (name, group) in trained {
+            writer.array(name, &group.shape, self.weights[group.range.clone()].iter().copied())?;
         }
         writer.strings(NOTE, &[1], &[note])?;
         writer.finish()?.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()
+    }
+
+    fn group(&self, name: &str) -> Option<&WeightGroup> {
+        self.groups.iter().find(|group| group.name == name)
     }
 
     fn network(&self) -> Arc<Network<Double>> {
@@ -165,9 +181,11 @@ impl TrainableGrace {
     }
 }
 
-/// The arrays of the mixture.
-const MIXTURE: [&str; 5] =
-    ["uq_centroids", "uq_inv_cov", "uq_n_clusters", "uq_interp_thresholds", "uq_max_clusters"];
+/// Whether an array of the grade belongs to the projection of the features, not to the mixture.
+fn is_projection(name: &str) -> bool {
+    name.starts_with("uq_rp_")
+        || matches!(name, "uq_schema_version" | "uq_feature_dim" | "uq_feature_transform")
+}
 
 /// Fills all matrices and tables with the present weights.
 fn update(
@@ -197,7 +215,7 @@ fn update(
         }
     }
     readout.layers = readout.maps.iter().map(|map| map.fill(arrays)).collect();
-    for (shift, value) in readout.shifts.iter_mut().zip(arrays.get(super::super::readout::SHIFTS)) {
+    for (shift, value) in readout.shifts.iter_mut().zip(arrays.get(SHIFTS)) {
         *shift = *value;
     }
 }

@@ -8,6 +8,7 @@ use super::super::batches::{Batches, Placed};
 use super::super::bonds::{GraceBond, bonds_of};
 use super::super::instructions::{Instructions, SimdPass};
 use super::super::layer_passes::{add_returned, grow, send};
+use super::super::matrix::StridedRows;
 use super::super::network::Network;
 use super::super::potential::Grace;
 use super::super::tape::TapeSlot;
@@ -303,7 +304,7 @@ impl SimdPass for BackwardBatch<'_> {
             of_basis.resize(atoms * steps.basis_lanes, Double::ZERO);
             multiply(block.weights.transposed(batch.element), batch, of_densities, of_basis);
         }
-        let of_rows = |stride| super::super::matrix::StridedRows::of_atoms(atoms, stride);
+        let of_rows = |stride| StridedRows::of_atoms(atoms, stride);
         let (from, to) = (of_rows(steps.basis_lanes), of_rows(lanes));
         let [basis, basis_along] = &work.bases;
         let [of_along, of_values] = of_densities;
