@@ -1,8 +1,10 @@
 //! Work on a list, over threads.
 
 use std::sync::{Mutex, PoisonError};
+use std::thread::Builder;
 
-/// Calls `work` once for each item, on up to `threads` threads. Each thread has a state of its own, which it makes itself.
+/// Calls `work` once for each item, on up to `threads` threads, fewer if the system has no more. Each thread has a state of its
+/// own, which it makes itself.
 pub fn for_each<T: Send, S>(
     items: &mut [T],
     threads: usize,
@@ -20,7 +22,11 @@ pub fn for_each<T: Send, S>(
         }
     };
     std::thread::scope(|scope| {
-        (1..threads).for_each(|_| drop(scope.spawn(run)));
+        for _ in 1..threads {
+            if Builder::new().spawn_scoped(scope, run).is_err() {
+                break;
+            }
+        }
         run();
     });
 }
