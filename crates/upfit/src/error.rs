@@ -79,7 +79,7 @@ pub enum UpfitError {
     NotFinite {
         /// The epoch, from 1.
         epoch: u64,
-        /// The batch, or the validation.
+        /// The batch, the validation, or the last update.
         place: String,
         /// Loss or gradient.
         what: &'static str,

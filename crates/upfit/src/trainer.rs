@@ -371,6 +371,9 @@ impl<'a> Trainer<'a> {
     }
 
     /// Takes the best weights, or the last ones without validation, and measures their errors.
+    ///
+    /// # Errors
+    /// Errors that are not finite: nothing has checked the last update without validation.
     fn finish(mut self, state: TrainingState) -> Result<UpfitOutcome, UpfitError> {
         let updates = state.adam.steps();
         let ended_early = state.epoch < self.settings.epochs;
@@ -380,9 +383,23 @@ impl<'a> Trainer<'a> {
         };
         self.model.set_weights(&weights);
         let (_, of_last) = self.stage(self.settings.epochs);
-        let training = sum(&self.evaluate(&self.training)?).errors(&of_last);
-        let validation = self.evaluate_some(&self.validation)?.map(|found| sum(&found).errors(&of_last));
-        let after = ErrorsBySet { training, validation };
+        let training = self.evaluate(&self.training)?;
+        let validation = self.evaluate(&self.validation)?;
+        for (frames, evaluated) in [(&self.training, &training), (&self.validation, &validation)] {
+            if let Some(frame) = first_not_finite(frames, evaluated) {
+                return Err(UpfitError::NotFinite {
+                    epoch,
+                    place: "the last update".to_owned(),
+                    what: "the loss",
+                    frames: frame.place.clone(),
+                });
+            }
+        }
+        let validated = !validation.is_empty();
+        let after = ErrorsBySet {
+            training: sum(&training).errors(&of_last),
+            validation: validated.then(|| sum(&validation).errors(&of_last)),
+        };
         Ok(UpfitOutcome {
             model: self.model,
             zero: state.zero,

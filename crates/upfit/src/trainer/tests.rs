@@ -146,3 +146,13 @@ fn a_loss_that_is_not_finite_keeps_the_last_checkpoint() {
     });
     assert!(matches!(stopped, Ok(None)) && resumed.is_some_and(|epochs| epochs <= 1), "{resumed:?}");
 }
+
+#[test]
+fn a_model_that_is_not_finite_after_the_last_update_is_refused() {
+    // The only update is the last one, and nothing is validated.
+    let data = TrainingData { training: aluminium(2), validation: Vec::new() };
+    let decay = CosineDecay { first: 1e200, last: 0.0 };
+    let wild = UpfitSettings { epochs: 1, learning_rate: decay, ..settings() };
+    let message = failure(&data, &wild).to_string();
+    assert!(message.contains("epoch 1, the last update: the loss is not finite"), "{message}");
+}
