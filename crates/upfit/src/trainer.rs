@@ -300,9 +300,14 @@ impl<'a> Trainer<'a> {
         Ok(found.differences.loss(&weights))
     }
 
+    /// Number of updates of all epochs.
+    fn all_updates(&self) -> u64 {
+        self.settings.epochs.saturating_mul(self.batches())
+    }
+
     /// The learning rate of update number `update`, from 0.
     fn rate(&self, update: u64) -> f64 {
-        self.settings.learning_rate.rate(update, self.settings.epochs * self.batches())
+        self.settings.learning_rate.rate(update, self.all_updates())
     }
 
     fn check_finite(
@@ -418,7 +423,7 @@ impl<'a> Trainer<'a> {
     }
 
     fn progress(&self, state: &TrainingState, loss: f64) -> UpdateProgress {
-        let (updates, all_updates) = (state.adam.steps(), self.settings.epochs * self.batches());
+        let (updates, all_updates) = (state.adam.steps(), self.all_updates());
         let updates_per_second = self.updates_per_second(state);
         UpdateProgress {
             epoch: state.epoch + 1,

@@ -156,3 +156,19 @@ fn a_model_that_is_not_finite_after_the_last_update_is_refused() {
     let message = failure(&data, &wild).to_string();
     assert!(message.contains("epoch 1, the last update: the loss is not finite"), "{message}");
 }
+
+#[test]
+fn any_number_of_epochs_can_be_asked_for() {
+    let data = TrainingData { training: aluminium(3), validation: Vec::new() };
+    let endless = UpfitSettings { epochs: u64::MAX, ..settings() };
+    let mut all = None;
+    let stopped = run(model(), &data, &endless, None, |event| {
+        if let TrainingEvent::Update(progress) = event {
+            all = Some(progress.all_updates);
+            return ControlFlow::Break(());
+        }
+        ControlFlow::Continue(())
+    });
+    assert!(matches!(stopped, Ok(None)));
+    assert_eq!(all, Some(u64::MAX));
+}
