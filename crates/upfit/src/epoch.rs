@@ -9,11 +9,26 @@ use crate::loss::{BatchCounts, LossWeights, loss_gradient};
 use crate::parallel::for_each;
 use crate::prepared::PreparedFrame;
 
-/// The sums of one frame of a batch; the next batch uses them again.
-pub struct BatchSlot {
+/// Sums over structures, which all batches use again: a total, and those of the frames that are at work at a time.
+pub struct BatchSums {
+    total: WeightSums,
+    slots: Vec<BatchSlot>,
+}
+
+/// One frame of a batch.
+struct BatchSlot {
     frame: usize,
     sums: WeightSums,
     outcome: Result<FrameDifferences, FrameFault>,
+}
+
+impl BatchSums {
+    /// For this many threads, at least 1, each of which takes one frame at a time.
+    pub fn new(model: &TrainableGrace, threads: usize) -> Self {
+        let slot = || BatchSlot { frame: 0, sums: model.sums(), outcome: Ok(FrameDifferences::default()) };
+        let slots = std::iter::repeat_with(slot).take(threads.max(1)).collect();
+        Self { total: model.sums(), slots }
+    }
 }
 
 /// The loss of a batch: δ, and the weights of its stage.
@@ -35,8 +50,9 @@ pub struct BatchGradient {
     pub not_finite: Vec<usize>,
 }
 
-/// The gradient of the loss of `batch`, indices of `frames`. Each frame has sums of its own, which are added in the order of
-/// the batch, so that the result does not depend on the number of threads.
+/// The gradient of the loss of `batch`, indices of `frames`. As many frames as there are threads are at work at a time. Each
+/// has sums of its own, which are added to the total in the order of the batch, so that the result does not depend on the
+/// number of threads.
 ///
 /// # Errors
 /// A frame that the model cannot evaluate.
@@ -44,39 +60,39 @@ pub fn batch_gradient(
     model: &TrainableGrace,
     frames: &[PreparedFrame<'_>],
     batch: &[usize],
-    slots: &mut Vec<BatchSlot>,
+    sums: &mut BatchSums,
     loss: &BatchLoss,
-    threads: usize,
 ) -> Result<BatchGradient, UpfitError> {
     let counts = BatchCounts::new(batch.iter().map(|&index| frames[index].frame));
-    while slots.len() < batch.len() {
-        slots.push(BatchSlot { frame: 0, sums: model.sums(), outcome: Ok(FrameDifferences::default()) });
-    }
-    let slots = &mut slots[..batch.len()];
-    slots.iter_mut().zip(batch).for_each(|(slot, &index)| slot.frame = index);
-    for_each(
-        slots,
-        threads,
-        || model.worker(),
-        |worker, slot| {
-            slot.sums.clear();
-            slot.outcome = frame_gradient(worker, &frames[slot.frame], loss, &counts, &mut slot.sums);
-        },
-    );
+    let BatchSums { total, slots } = sums;
+    total.clear();
+    let mut workers: Vec<_> = batch.iter().zip(slots.iter()).map(|_| model.worker()).collect();
     let mut differences = FrameDifferences::default();
     let mut not_finite = Vec::new();
-    for slot in slots.iter() {
-        let found = slot.outcome.clone().map_err(|fault| frames[slot.frame].frame.wrong(fault))?;
-        if !found.is_finite() {
-            not_finite.push(slot.frame);
+    for wave in batch.chunks(slots.len()) {
+        let slots = &mut slots[..wave.len()];
+        slots.iter_mut().zip(wave).for_each(|(slot, &index)| slot.frame = index);
+        let mut tasks: Vec<_> = slots.iter_mut().zip(&mut workers).collect();
+        let threads = tasks.len();
+        for_each(
+            &mut tasks,
+            threads,
+            || (),
+            |(), (slot, worker)| {
+                slot.sums.clear();
+                slot.outcome = frame_gradient(worker, &frames[slot.frame], loss, &counts, &mut slot.sums);
+            },
+        );
+        for slot in slots.iter() {
+            let found = slot.outcome.clone().map_err(|fault| frames[slot.frame].frame.wrong(fault))?;
+            if !found.is_finite() {
+                not_finite.push(slot.frame);
+            }
+            differences.merge(&found);
+            total.add(&slot.sums);
         }
-        differences.merge(&found);
     }
-    let Some((first, others)) = slots.split_first_mut() else {
-        return Ok(BatchGradient { differences, gradient: vec![0.0; model.weights().len()], not_finite });
-    };
-    others.iter().for_each(|slot| first.sums.add(&slot.sums));
-    Ok(BatchGradient { differences, gradient: model.gradient(&first.sums), not_finite })
+    Ok(BatchGradient { differences, gradient: model.gradient(total), not_finite })
 }
 
 fn frame_gradient(
@@ -114,14 +130,18 @@ mod tests {
         let (mut model, frames) = (model(), stronger(3));
         let prepared = prepare(model.model(), &frames, &mut { usize::MAX }).unwrap();
         let loss = BatchLoss { delta: 0.01, weights: LossSettings::demo().stages[0].weights };
-        let mut slots = Vec::new();
-        let found = |threads, slots: &mut Vec<BatchSlot>| {
-            batch_gradient(&model, &prepared, &[2, 0, 1], slots, &loss, threads).unwrap()
-        };
-        let one = found(1, &mut slots);
-        // Sums are used again, and threads change no bit.
-        let two = found(2, &mut slots);
-        assert!(one.gradient == two.gradient && one.differences == two.differences);
+        let found =
+            |sums: &mut BatchSums| batch_gradient(&model, &prepared, &[2, 0, 1], sums, &loss).unwrap();
+        let one = found(&mut BatchSums::new(&model, 1));
+        for threads in [2, 3, 5] {
+            let mut sums = BatchSums::new(&model, threads);
+            assert_eq!(sums.slots.len(), threads);
+            // Sums are used again, and threads change no bit.
+            for _ in 0..2 {
+                let other = found(&mut sums);
+                assert!(one.gradient == other.gradient && one.differences == other.differences);
+            }
+        }
         assert!(one.not_finite.is_empty());
 
         let square: f64 = one.gradient.iter().map(|g| g * g).sum();

@@ -14,7 +14,7 @@ use crate::checkpoint::{BestWeights, CheckpointFile, TrainingState};
 use crate::data::{FrameFault, MAX_ENERGY_DIFFERENCE, TrainingData, data_hash};
 use crate::differences::FrameDifferences;
 use crate::energy_zero::EnergyZero;
-use crate::epoch::{BatchGradient, BatchLoss, BatchSlot, batch_gradient};
+use crate::epoch::{BatchGradient, BatchLoss, BatchSums, batch_gradient};
 use crate::error::UpfitError;
 use crate::evaluation::{EvaluatedFrame, evaluate, first_not_finite, sum};
 use crate::frozen::frozen_weights;
@@ -114,7 +114,7 @@ struct Trainer<'a> {
     training: Vec<PreparedFrame<'a>>,
     validation: Vec<PreparedFrame<'a>>,
     frozen: Vec<bool>,
-    slots: Vec<BatchSlot>,
+    sums: BatchSums,
     checkpoint: Option<CheckpointFile>,
     /// When this process began, and the number of updates of earlier ones.
     begun: Instant,
@@ -138,15 +138,15 @@ impl<'a> Trainer<'a> {
         let failed = |error: Box<dyn Error>| UpfitError::Threads { threads, reason: error.to_string() };
         model.set_threads(Threads::new(threads).map_err(|error| failed(error.into()))?);
         let begun = Instant::now();
-        let (slots, checkpoint) = (Vec::new(), None);
+        let sums = BatchSums::new(&model, threads.min(settings.batch_size).min(training.len()));
         Ok(Self {
             model,
             settings,
             training,
             validation,
             frozen,
-            slots,
-            checkpoint,
+            sums,
+            checkpoint: None,
             begun,
             resumed_updates: 0,
         })
@@ -284,8 +284,7 @@ impl<'a> Trainer<'a> {
     fn update(&mut self, state: &mut TrainingState, batch: &[usize]) -> Result<f64, UpfitError> {
         let (_, weights) = self.stage(state.epoch);
         let loss = BatchLoss { delta: self.settings.loss.delta, weights };
-        let threads = self.settings.threads;
-        let found = batch_gradient(&self.model, &self.training, batch, &mut self.slots, &loss, threads)?;
+        let found = batch_gradient(&self.model, &self.training, batch, &mut self.sums, &loss)?;
         self.check_finite(state, batch, &found)?;
         let rate = self.rate(state.adam.steps());
         state.adam.step(&mut state.weights, &found.gradient, rate, &self.frozen);
