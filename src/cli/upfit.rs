@@ -80,7 +80,7 @@ pub struct UpfitArgs {
     /// Learning rate of the first update; it falls by half a cosine
     #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive)]
     learning_rate: f64,
-    /// Learning rate at the end [default: a hundredth of --learning-rate]
+    /// Learning rate of the last update [default: a hundredth of --learning-rate]
     #[arg(long, value_name = "RATE", value_parser = not_negative)]
     min_learning_rate: Option<f64>,
     /// Structures for each update

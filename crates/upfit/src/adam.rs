@@ -4,11 +4,11 @@ use serde::{Deserialize, Serialize};
 
 /// Decay of the mean of the gradient and of that of its square (Kingma & Ba, ICLR 2015).
 const DECAY: [f64; 2] = [0.9, 0.999];
-/// Added to the root of the mean square.
-const EPSILON: f64 = 1e-8;
+/// Added to the root of the mean square, as in Keras.
+const EPSILON: f64 = 1e-7;
 
 /// Adam (Kingma & Ba, ICLR 2015) with the largest mean square so far in place of the present one (AMSGrad; Reddi, Kale &
-/// Kumar, ICLR 2018). Both means are corrected for their start at zero.
+/// Kumar, ICLR 2018). Both means are corrected for their start at zero; as in Keras, the largest is taken before the correction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AdamState {
     steps: u64,
@@ -42,13 +42,13 @@ impl AdamState {
         self.steps += 1;
         let power = i32::try_from(self.steps).unwrap_or(i32::MAX);
         let [mean_share, square_share] = DECAY.map(|decay| 1.0 - decay.powi(power));
+        let rate = rate * square_share.sqrt() / mean_share;
         for k in (0..n).filter(|k| !frozen[*k]) {
             let g = gradient[k];
             self.mean[k] = DECAY[0] * self.mean[k] + (1.0 - DECAY[0]) * g;
             self.square[k] = DECAY[1] * self.square[k] + (1.0 - DECAY[1]) * g * g;
             self.largest[k] = self.largest[k].max(self.square[k]);
-            let scale = (self.largest[k] / square_share).sqrt() + EPSILON;
-            weights[k] -= rate * self.mean[k] / mean_share / scale;
+            weights[k] -= rate * self.mean[k] / (self.largest[k].sqrt() + EPSILON);
         }
     }
 }
@@ -62,19 +62,24 @@ mod tests {
         let mut adam = AdamState::new(3);
         let mut weights = [1.0, 2.0, 3.0];
         let frozen = [false, false, true];
-        // The first step is the rate in the direction of each gradient.
+        // g = 0.5: m = 0.05, v = 0.00025; g = −4: m = −0.4, v = 0.016. But for the small number, the step is the rate in the
+        // direction of each gradient.
         adam.step(&mut weights, &[0.5, -4.0, 1.0], 0.1, &frozen);
-        for (weight, expected) in weights.iter().zip([0.9, 2.1, 3.0]) {
-            assert!((weight - expected).abs() < 1e-8, "{weights:?}");
+        let rate = 0.1 * 0.001_f64.sqrt() / 0.1;
+        let first = 1.0 - rate * 0.05 / (0.00025_f64.sqrt() + 1e-7);
+        let second = 2.0 + rate * 0.4 / (0.016_f64.sqrt() + 1e-7);
+        assert!((first - 0.9).abs() < 1e-6 && (second - 2.1).abs() < 1e-6, "{first} {second}");
+        for (weight, expected) in weights.iter().zip([first, second, 3.0]) {
+            assert!((weight - expected).abs() < 1e-12, "{weights:?}");
         }
-        // g = 0.5, then 0.1: m = 0.9 · 0.05 + 0.1 · 0.1 = 0.055, m̂ = 0.055 / 0.19;
-        // v = 0.999 · 0.00025 + 0.001 · 0.01 = 0.00025975, which is the largest, v̂ = 0.00025975 / 0.001999.
-        adam.step(&mut weights, &[0.1, 0.0, 1.0], 0.1, &frozen);
-        let first = 0.1 * (0.055 / 0.19) / (0.00025975_f64 / 0.001999).sqrt();
+        // g = 0.5, then 0.1: m = 0.9 · 0.05 + 0.1 · 0.1 = 0.055, v = 0.999 · 0.00025 + 0.001 · 0.01 = 0.00025975, the largest.
         // g = −4, then 0: m = −0.36, v falls from 0.016 to 0.015984, so that 0.016 remains.
-        let second = 0.1 * (-0.36 / 0.19) / (0.016_f64 / 0.001999).sqrt();
-        for (weight, expected) in weights.iter().zip([0.9 - first, 2.1 - second, 3.0]) {
-            assert!((weight - expected).abs() < 1e-7, "{weights:?} {first} {second}");
+        adam.step(&mut weights, &[0.1, 0.0, 1.0], 0.1, &frozen);
+        let rate = 0.1 * 0.001999_f64.sqrt() / 0.19;
+        let first = first - rate * 0.055 / (0.00025975_f64.sqrt() + 1e-7);
+        let second = second + rate * 0.36 / (0.016_f64.sqrt() + 1e-7);
+        for (weight, expected) in weights.iter().zip([first, second, 3.0]) {
+            assert!((weight - expected).abs() < 1e-12, "{weights:?} {first} {second}");
         }
         assert_eq!(adam.steps(), 2);
     }

@@ -6,14 +6,14 @@
 pub struct CosineDecay {
     /// At the first update.
     pub first: f64,
-    /// At the end.
+    /// At the last update.
     pub last: f64,
 }
 
 impl CosineDecay {
-    /// The rate of update number `update` (from 0) of `updates`.
+    /// The rate of update number `update` (from 0) of `updates`. A single update has the first rate.
     pub fn rate(&self, update: u64, updates: u64) -> f64 {
-        let share = update as f64 / updates.max(1) as f64;
+        let share = update as f64 / updates.saturating_sub(1).max(1) as f64;
         self.last + 0.5 * (self.first - self.last) * (1.0 + (std::f64::consts::PI * share).cos())
     }
 }
@@ -28,8 +28,10 @@ mod tests {
         for (update, expected) in
             [(0, 0.01), (100, 0.006), (200, 0.002), (50, 0.006 + 0.004 * 0.5_f64.sqrt())]
         {
-            assert!((decay.rate(update, 200) - expected).abs() < 1e-15, "{update}");
+            assert!((decay.rate(update, 201) - expected).abs() < 1e-15, "{update}");
         }
-        assert_eq!(decay.rate(0, 0), 0.01);
+        for updates in [0, 1] {
+            assert_eq!(decay.rate(0, updates), 0.01);
+        }
     }
 }
