@@ -126,7 +126,7 @@ impl UpfitArgs {
         let model = TrainableGrace::load(&self.model).map_err(CommandError::input)?;
         let (data, files) = self.read_data()?;
         let settings = self.settings();
-        let note = report::note(&self.model, &data, &files, &settings)?;
+        let note = report::note((&self.model, &model), &data, &files, &settings);
         let stop = stop_token()?;
         let mut display = TrainingDisplay::new(&checkpoint);
         let trained = ::upfit::run(model, &data, &settings, Some(&checkpoint), |event| {
@@ -245,6 +245,14 @@ fn write_model(model: &TrainableGrace, output: &Path, note: &str) -> Result<(), 
     let part = builder.prefix(".upfit.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
     let part = part.map_err(|error| cannot_write(output, error))?.into_temp_path();
     model.write(&part, note).map_err(|error| cannot_write(output, error))?;
+    // The checkpoint is removed afterwards, so the model must be readable.
+    let written = TrainableGrace::load(&part).map_err(CommandError::failed)?;
+    if written.weights() != model.weights() {
+        return Err(CommandError::Failed(format!(
+            "{}: the model was not written as it is",
+            output.display()
+        )));
+    }
     let mut file = AtomicFile::create(output)?;
     let copied = File::open(&part).and_then(|mut written| io::copy(&mut written, &mut file));
     copied.map_err(|error| cannot_write(output, error))?;

@@ -144,6 +144,12 @@ impl TrainableGrace {
         out.iter().flat_map(|(_, array)| array.values.iter().copied()).collect()
     }
 
+    /// The note in the file that was read, if a training made it.
+    pub fn note(&self) -> Option<String> {
+        let archive = NpzFile::from_bytes("the model", &self.file).ok()?;
+        archive.contains(NOTE).then(|| archive.strings(NOTE).ok()?.into_iter().next()).flatten()
+    }
+
     /// The file that was read.
     pub fn file_bytes(&self) -> &[u8] {
         &self.file
