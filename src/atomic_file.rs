@@ -41,14 +41,18 @@ impl AtomicFile {
         Ok(Self { target, file: BufWriter::new(file), temporary: Some(temporary) })
     }
 
-    /// Renames the complete file to its target.
+    /// Renames the complete file to its target, for good.
     pub fn finish(self) -> Result<(), CommandError> {
         let Self { target, file, temporary } = self;
         let cannot = |error| cannot_write(&target, error);
         let file = file.into_inner().map_err(|error| cannot(error.into_error()))?;
         let Some(temporary) = temporary else { return Ok(()) };
         file.sync_all().map_err(cannot)?;
-        temporary.persist(&target).map_err(|error| cannot(error.error))
+        temporary.persist(&target).map_err(|error| cannot(error.error))?;
+        // So that the name lasts through a power cut, too; not every file system can do this.
+        let parent = target.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let _ = File::open(parent.unwrap_or(Path::new("."))).and_then(|parent| parent.sync_all());
+        Ok(())
     }
 }
 

@@ -146,7 +146,12 @@ impl UpfitArgs {
         }
         write_model(&outcome.model, &self.output, &note.to_string())?;
         // Without the model, the checkpoint would be needed.
-        fs::remove_file(&checkpoint).map_err(|error| cannot_write(&checkpoint, error))?;
+        match fs::remove_file(&checkpoint) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                return Err(cannot_write(&checkpoint, error));
+            }
+            _ => {}
+        }
         if self.json {
             print_json(&report::to_json(&outcome, &note, &self.output))?;
         } else {

@@ -45,7 +45,7 @@ pub struct EpochRecord {
     pub learning_rate: f64,
     /// Of the training set during the epoch, each batch before its update; of validation, after the epoch.
     pub errors: ErrorsBySet,
-    /// Updates per second of wall-clock time, with validation.
+    /// Updates per second of wall-clock time since the process began, with all evaluations.
     pub updates_per_second: f64,
 }
 

@@ -35,7 +35,7 @@ pub struct UpfitOutcome {
     pub after: ErrorsBySet,
     /// The epochs.
     pub history: Vec<EpochRecord>,
-    /// Number of epochs after which the weights were those of the model.
+    /// The epoch whose weights were chosen; 0: those before the first update.
     pub epoch: u64,
     /// Updates made.
     pub updates: u64,
