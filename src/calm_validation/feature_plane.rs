@@ -12,7 +12,7 @@ use serde::Serialize;
 /// Elements with a plane.
 const MAX_ELEMENTS: usize = 6;
 /// Atoms kept on either side of γ = 1, for each element.
-const MAX_ATOMS: usize = 1024;
+pub const MAX_ATOMS: usize = 1024;
 
 /// The planes of several elements.
 pub struct FeaturePlanes {
@@ -111,6 +111,18 @@ impl FeaturePlane {
         self.atoms[side] += 1;
         self.samples[side].add_with(|| pair(&self.axes.project(features)));
     }
+
+    /// Share of the labelled atoms whose place meets a condition. Each sampled atom stands for the same number of atoms of its side.
+    /// `None` without labelled atoms.
+    pub fn share(&self, is_met: impl Fn(&[f64; 2]) -> bool) -> Option<f64> {
+        let all = self.atoms.iter().sum::<u64>();
+        let sides = self.atoms.iter().zip(&self.samples);
+        let found = sides.map(|(atoms, sample)| {
+            let met = sample.items().filter(|point| is_met(point)).count();
+            *atoms as f64 * met as f64 / sample.items().len().max(1) as f64
+        });
+        (all > 0).then(|| found.sum::<f64>() / all as f64)
+    }
 }
 
 /// Mean and covariance of the data of several components, `[D]` and `[D × D]`, with the centroids as means. `None` without statistics or
@@ -193,6 +205,21 @@ mod tests {
         let within: Vec<_> = plane.samples[0].items().copied().flatten().collect();
         let beyond: Vec<_> = plane.samples[1].items().copied().flatten().collect();
         assert!(near(&within, &[3.0, 1.0, -1.0, 0.0]) && near(&beyond, &[9.0, 0.0]), "{within:?} {beyond:?}");
+    }
+
+    /// Of 5000 atoms with γ ≤ 1, at most 1024 are in the sample; of 100 with γ > 1 all.
+    #[test]
+    fn shares_are_those_of_all_labelled_atoms() {
+        let mixture = Mixture::new(0, vec![vec![component(0.0, 5.0)]]).unwrap();
+        let mut planes = FeaturePlanes::new(&mixture, &species()[..1], &species()[..1]);
+        (0..5000).for_each(|_| planes.add(&[0], &[1.0, 0.0, 0.0], &[0.5]));
+        (0..100).for_each(|_| planes.add(&[0], &[5.0, 0.0, 0.0], &[1.5]));
+        let [plane] = &planes.finish()[..] else { panic!("one plane") };
+        assert!(plane.samples[0].items().len() <= MAX_ATOMS && plane.samples[1].items().len() == 100);
+        let share = plane.share(|[x, _]| x.abs() > 3.0).unwrap();
+        assert!((share - 100.0 / 5100.0).abs() < 1e-12, "{share}");
+        let empty = FeaturePlanes::new(&mixture, &species()[..1], &species()[..1]).finish().remove(0);
+        assert_eq!(empty.share(|_| true), None);
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::f64::consts::TAU;
 use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel, Rectangle};
 
 use super::super::Validation;
-use super::super::feature_plane::{FeaturePlane, ProjectedComponent};
+use super::super::feature_plane::{FeaturePlane, MAX_ATOMS, ProjectedComponent};
 use super::layout::{PanelGrid, legend_rows, letter, panel_name};
 use crate::csv::{self, Csv};
 use crate::output;
@@ -23,7 +23,9 @@ const OPACITY: f64 = 0.35;
 pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
     let planes = &validation.feature_planes;
     if planes.is_empty() {
-        return Err("The mixture has no statistics of its data, as one from a model’s file: give its artifact with --artifact.".into());
+        return Err("The mixture has no statistics of its data, as one from a model’s file, or none of the elements shown has data. If it is \
+                    from a model’s file, give its artifact with --artifact."
+            .into());
     }
     let grid = PanelGrid { number: planes.len(), height: 128.0, top: 36.0 };
     let description = "Components of the mixture along the first two principal components of the features";
@@ -46,7 +48,8 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
         "Features along the first two principal components of the data behind the mixture, one projection for each element, with equal scales \
          along both axes; in brackets, the share of the variance. The axes follow from the covariances and centroids of the components, so the \
          data are not read again. Ellipses, 95 % of the normal distribution of each component. The range is that of the components: labelled \
-         atoms outside it are counted and not drawn. {}.",
+         atoms outside it are counted and not drawn. Of each element, at most {MAX_ATOMS} labelled atoms with γ ≤ 1 and as many with γ > 1 \
+         are drawn, evenly from all, so that blue and red are not in proportion. {}.",
         facts.join("; ")
     );
     Ok(FigureContent { figure, caption, numbers })
@@ -64,8 +67,7 @@ fn draw_plane(
     let [x, y] = axes(plane, &outlines, place);
     let is_shown =
         |point: &[f64; 2]| (x.low..=x.high).contains(&point[0]) && (y.low..=y.high).contains(&point[1]);
-    let sampled = || plane.samples.iter().flat_map(|sample| sample.items());
-    let outside = sampled().filter(|point| !is_shown(point)).count();
+    let outside = plane.share(|point| !is_shown(point));
     let mut panel = Panel::new(place, x.clone(), y.clone());
     let colours = [("γ ≤ 1", Colour::BLUE), ("γ > 1", Colour::VERMILLION)];
     for ((what, colour), sample) in colours.into_iter().zip(&plane.samples) {
@@ -84,8 +86,8 @@ fn draw_plane(
     panel_name(figure, place, &plane.element, &components);
     let condition = plane.condition_number.map_or("beyond double precision".into(), |of| format!("{of:.1e}"));
     let mut facts = format!("{}: {components}, largest condition number {condition}", plane.element);
-    if let all @ 1.. = sampled().count() {
-        facts += &format!(", {:.1} % of the labelled atoms outside", 100.0 * outside as f64 / all as f64);
+    if let Some(share) = outside {
+        facts += &format!(", {:.1} % of the labelled atoms outside", 100.0 * share);
     }
     facts
 }
