@@ -356,7 +356,10 @@ fn labelled_structures_have_a_section() {
 fn labelled_atoms_are_drawn_among_the_components() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    write_frames(&here.join("labelled.extxyz"), &aluminium(3));
+    // The structure without a label is graded and counts nowhere.
+    let mut frames = aluminium(3);
+    frames.push(Frame::from(frames[0].structure.clone()));
+    write_frames(&here.join("labelled.extxyz"), &frames);
     let artifact = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
     let quick = ["--labelled", "labelled.extxyz", "--scan-steps", "2", "--no-relax"];
     validate(here, "al_eam_1l", "out", &[&quick[..], &["--artifact", &artifact]].concat());

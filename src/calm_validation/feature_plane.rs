@@ -60,7 +60,8 @@ impl FeaturePlanes {
         Self { planes: shown.iter().filter_map(plane).take(MAX_ELEMENTS).collect() }
     }
 
-    /// Adds labelled atoms: the element index of each, their features, `[atoms × D]`, and their γ.
+    /// Adds labelled atoms: the element index of each, their features, `[atoms × D]`, and their γ. Atoms
+    /// whose γ is not finite are left out.
     pub fn add(&mut self, elements: &[usize], features: &[f64], gamma: &[f64]) {
         let dimension = features.len().checked_div(elements.len()).unwrap_or(0);
         if dimension == 0 {
@@ -107,7 +108,10 @@ impl FeaturePlane {
     }
 
     fn add(&mut self, features: &[f64], gamma: f64) {
-        let side = usize::from(gamma.is_nan() || gamma > 1.0);
+        if !gamma.is_finite() {
+            return;
+        }
+        let side = usize::from(gamma > 1.0);
         self.atoms[side] += 1;
         self.samples[side].add_with(|| pair(&self.axes.project(features)));
     }
@@ -190,9 +194,9 @@ mod tests {
         let mut planes = FeaturePlanes::new(&mixture, &species(), &species()[..1]);
         // Another element has no plane.
         planes.add(
-            &[0, 1, 0, 0],
-            &[3.0, 1.0, 9.0, 7.0, 7.0, 7.0, -1.0, 0.0, 0.0, 9.0, 0.0, 0.0],
-            &[0.5, 0.1, 1.0, 1.5],
+            &[0, 1, 0, 0, 0],
+            &[3.0, 1.0, 9.0, 7.0, 7.0, 7.0, -1.0, 0.0, 0.0, 9.0, 0.0, 0.0, 8.0, 0.0, 0.0],
+            &[0.5, 0.1, 1.0, 1.5, f64::NAN],
         );
         let [plane] = &planes.finish()[..] else { panic!("one plane") };
         assert_eq!((plane.element.as_str(), plane.atoms), ("Mo", [2, 1]));

@@ -36,13 +36,14 @@ impl ScoreLabels {
         Ok(Self { table, errors: LabelledErrors::new(columns), unreadable: (0, None) })
     }
 
-    /// Adds the frame that was scored last, with the values of the other columns. Its labels must not have been moved yet.
+    /// Adds the frame that was scored last, with the values of the other columns. Its labels must not have been moved yet. Returns
+    /// whether it has force labels.
     pub fn add(
         &mut self,
         frame: &Frame,
         scorer: &Scorer,
         others: &[(String, Vec<f64>)],
-    ) -> Result<(), CommandError> {
+    ) -> Result<bool, CommandError> {
         let labels = frame.labels().unwrap_or_else(|error| {
             self.unreadable.0 += 1;
             self.unreadable.1.get_or_insert_with(|| error.to_string());
@@ -63,7 +64,8 @@ impl ScoreLabels {
             predicted: &predicted,
             labels: &labels,
         });
-        self.table.as_mut().map_or(Ok(()), |table| table.add(frame, scorer, &labels))
+        self.table.as_mut().map_or(Ok(()), |table| table.add(frame, scorer, &labels))?;
+        Ok(labels.forces.is_some())
     }
 
     /// Prints the tables, if any frame has labels, and writes the files.

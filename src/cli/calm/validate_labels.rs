@@ -16,8 +16,8 @@ use crate::xyz_reader::XyzReader;
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
-/// Grades the structures of a file and compares the scores with their labels. Also adds their atoms to `planes`, if they are given. `None`
-/// if it was stopped.
+/// Grades the structures of a file and compares the scores with their labels. Also adds the atoms of those with force labels to `planes`, if
+/// they are given. `None` if it was stopped.
 ///
 /// # Errors
 /// A structure that cannot be read or graded, with its line; a file without labels.
@@ -42,8 +42,8 @@ pub fn report(
         };
         scorer.score(&frame.structure, false).map_err(|error| at(&error))?;
         let columns = others.columns(&frame.structure, scorer).map_err(|error| at(&error))?;
-        labels.add(&frame, scorer, &columns)?;
-        if let Some(planes) = planes.as_deref_mut() {
+        let has_forces = labels.add(&frame, scorer, &columns)?;
+        if let Some(planes) = planes.as_deref_mut().filter(|_| has_forces) {
             planes.add(&scorer.elements, scorer.features(), &scorer.grades.gamma);
         }
         count += 1;
