@@ -14,6 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::exit_status::CommandError;
 use crate::features::FeatureCalculator;
+use crate::output::log_and_warn;
 use crate::replay::recorded_settings;
 
 /// Candidates per read; their features are not needed, but are read with them.
@@ -30,6 +31,8 @@ pub struct UpdatedByCampaign {
     pub applied: u64,
     /// Candidates that the mixture covered already, so that walkers would not collect them.
     pub covered: u64,
+    /// Candidates that the model cannot evaluate or the mixture cannot take up.
+    pub left_out: u64,
 }
 
 /// The updates under way.
@@ -60,10 +63,12 @@ pub fn updating_settings(campaign: &CampaignRecord) -> Result<SelectorSettings, 
 /// Applies the candidates in decision order, each by the campaign's rules, as its selector did: those that meet the collection rule
 /// under the mixture so far update it. Features are those of `model`, to which `mixture` belongs. `None` after a cancellation of `stop`.
 ///
+/// Warns of a candidate that the model cannot evaluate or the mixture cannot take up, and goes on.
+///
 /// A candidate counts as labelled if `calmwalk export` writes it under the protocol in force.
 ///
 /// # Errors
-/// A campaign that never updates its mixture, a candidate that the model cannot evaluate, a damaged database.
+/// A campaign that never updates its mixture, a damaged database.
 pub async fn apply(
     store: &Store,
     model: &Arc<GraceModel>,
@@ -74,7 +79,8 @@ pub async fn apply(
     let settings = updating_settings(&record)?;
     let search = update_settings_in_force(&settings.search, &store.values().await?);
     let labelled = labelled(store).await?;
-    let found = UpdatedByCampaign { campaign: record.id.to_string(), mixture, applied: 0, covered: 0 };
+    let found =
+        UpdatedByCampaign { campaign: record.id.to_string(), mixture, applied: 0, covered: 0, left_out: 0 };
     let calculator = FeatureCalculator::new(Arc::clone(model));
     let mut updates =
         CampaignUpdates { settings, search, calculator, grades: Grades::default(), found, stop };
@@ -90,7 +96,7 @@ pub async fn apply(
             if updates.stop.is_cancelled() {
                 return Ok(None);
             }
-            updates.apply(candidate)?;
+            updates.apply_or_warn(candidate);
         }
     }
 }
@@ -113,25 +119,24 @@ async fn labelled(store: &Store) -> Result<HashSet<i64>, CommandError> {
 }
 
 impl CampaignUpdates<'_> {
-    fn apply(&mut self, candidate: &StoredCandidate) -> Result<(), CommandError> {
-        let view = candidate.block.view();
-        let campaign = &self.found.campaign;
-        let place = || format!("campaign {campaign}, candidate {}", view.id());
-        let elements = self
-            .calculator
-            .compute(&view.structure())
-            .map_err(|error| CommandError::Input(format!("{}: {error}", place())))?;
-        let failed = |error: &dyn std::fmt::Display| CommandError::Failed(format!("{}: {error}", place()));
+    fn apply_or_warn(&mut self, candidate: &StoredCandidate) {
+        if let Err(error) = self.apply(candidate) {
+            let (campaign, id) = (&self.found.campaign, candidate.block.view().id());
+            log_and_warn(format_args!("campaign {campaign}, candidate {id} is left out: {error}"));
+            self.found.left_out += 1;
+        }
+    }
+
+    fn apply(&mut self, candidate: &StoredCandidate) -> Result<(), Box<dyn std::error::Error>> {
+        let elements = self.calculator.compute(&candidate.block.view().structure())?;
         let (mixture, features) = (&self.found.mixture, self.calculator.features());
-        self.grades.evaluate(mixture, &elements, features, None).map_err(|error| failed(&error))?;
+        self.grades.evaluate(mixture, &elements, features, None)?;
         if !self.settings.collection.is_met(&self.grades.gamma) {
             self.found.covered += 1;
             return Ok(());
         }
-        let outcome =
-            calm::update(mixture, &elements, features, &self.search).map_err(|error| failed(&error))?;
-        let updated = mixture.with_changes(&outcome.changed).map_err(|error| failed(&error))?;
-        self.found.mixture = updated;
+        let outcome = calm::update(mixture, &elements, features, &self.search)?;
+        self.found.mixture = mixture.with_changes(&outcome.changed)?;
         self.found.applied += 1;
         Ok(())
     }

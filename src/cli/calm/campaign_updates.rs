@@ -95,10 +95,38 @@ fn write_beside(mixture: &BuiltMixture, output: &Path) -> Result<TempPath, Comma
 
 /// A line about the updates.
 fn describe(found: &UpdatedByCampaign) -> String {
-    let UpdatedByCampaign { campaign, applied, covered, .. } = found;
-    format!(
-        "campaign {campaign}: {} without a label, of which {applied} updated the mixture and {covered} {} covered already\n",
-        count(applied + covered, "accepted candidate"),
-        if *covered == 1 { "was" } else { "were" }
-    )
+    let UpdatedByCampaign { campaign, applied, covered, left_out, .. } = found;
+    let all = count(applied + covered + left_out, "accepted candidate");
+    let were = |number: u64| if number == 1 { "was" } else { "were" };
+    let covered = format!("{covered} {} covered already", were(*covered));
+    let parts = match *left_out {
+        0 => format!("{applied} updated the mixture and {covered}"),
+        n => format!(
+            "{applied} updated the mixture, {covered} and {n} {} left out (see the warnings)",
+            were(n)
+        ),
+    };
+    format!("campaign {campaign}: {all} without a label, of which {parts}\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn candidates_that_were_left_out_are_mentioned() {
+        let mixture = Mixture::new(0, vec![vec![Arc::new(calm::Component::unknown_element(2))]]).unwrap();
+        let found = |left_out| UpdatedByCampaign {
+            campaign: "x".into(),
+            mixture: mixture.clone(),
+            applied: 3,
+            covered: 1,
+            left_out,
+        };
+        let all = "campaign x: 4 accepted candidates without a label, of which 3 updated the mixture and 1 was covered already\n";
+        assert_eq!(describe(&found(0)), all);
+        let some = "campaign x: 6 accepted candidates without a label, of which 3 updated the mixture, 1 was covered already and 2 were left \
+                    out (see the warnings)\n";
+        assert_eq!(describe(&found(2)), some);
+    }
 }
