@@ -69,6 +69,10 @@ fn elements_with_too_few_atoms_are_named() {
         "fewer than 131 atoms (D + 1) in the sample, which a component of a mixture needs: Al 108 of 5400\n";
     assert!(printed.contains(expected), "{printed}");
     assert!(!sample(here, "131", "enough.extxyz", &["--model", &model]).contains("fewer than"));
+    // Of a model with further elements, also those without data.
+    let model = config("data/ni_al_h_eam_1l/kokkos.npz").display().to_string();
+    let printed = sample(here, "5400", "all.extxyz", &["--model", &model]);
+    assert!(printed.contains("which a component of a mixture needs: H 0 of 0, Ni 0 of 0\n"), "{printed}");
 
     let words = ["calm", "sample", "data.extxyz", "--atoms-per-element", "9", "--output", "data.extxyz"];
     assert!(refuse(here, words).contains("data.extxyz is a file of the data"));

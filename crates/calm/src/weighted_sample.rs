@@ -9,7 +9,7 @@ use crate::build::random_key;
 ///
 /// Each structure has a random key, a function of the random seed and of its number in the stream. An element keeps the structures
 /// with the smallest keys, as many as have fewer than N atoms of it without the largest of them: at least N atoms, or all there are,
-/// and fewer than N more than the largest one. The sample is what at least one element keeps. Elements rank structures by the same
+/// and fewer than N plus those of its largest structure. The sample is what at least one element keeps. Elements rank structures by the same
 /// keys, so that what one of them keeps serves the others, and large structures are not preferred.
 ///
 /// With the smallest key τ that an element left out, as a share of all keys, a structure is in the sample if its key is below the
@@ -25,7 +25,7 @@ pub struct WeightedSampler {
     seed: u64,
     /// Number of the next structure.
     next: u64,
-    elements: BTreeMap<u8, ElementSample>,
+    elements: BTreeMap<u8, ElementDraw>,
     kept: BTreeMap<u64, KeptStructure>,
 }
 
@@ -52,7 +52,7 @@ struct KeptStructure {
 
 /// The structures that an element keeps.
 #[derive(Debug, Default)]
-struct ElementSample {
+struct ElementDraw {
     /// Atoms of the element in all data.
     in_data: u64,
     /// Atoms of the element in each structure.
@@ -77,8 +77,10 @@ impl WeightedSampler {
         }
     }
 
-    /// Takes the next structure. `atoms` has each of its elements, by any number of it, once, with its number of atoms.
-    pub fn add(&mut self, atoms: Vec<(u8, u64)>) -> SampleChange {
+    /// Takes the next structure. `atoms` has each of its elements, by any number of it, once, with its number of atoms. Elements
+    /// without atoms are ignored.
+    pub fn add(&mut self, mut atoms: Vec<(u8, u64)>) -> SampleChange {
+        atoms.retain(|(_, count)| *count > 0);
         let number = self.next;
         self.next += 1;
         let key = (random_key(&[self.seed, number, SAMPLE]), number);
@@ -143,10 +145,10 @@ impl WeightedSampler {
     }
 }
 
-impl ElementSample {
+impl ElementDraw {
     /// Keeps a structure with this number of atoms, unless its key is too large.
     fn insert(&mut self, key: SampleKey, atoms: u64) -> bool {
-        if atoms == 0 || self.left_out.is_some_and(|left_out| key > left_out) {
+        if self.left_out.is_some_and(|left_out| key > left_out) {
             return false;
         }
         self.structures.insert(key, atoms);
@@ -288,9 +290,9 @@ mod tests {
         }
     }
 
-    /// Structures of one kind count as often as there are of them, whatever their place and size.
     type Kind = fn(u64) -> bool;
 
+    /// Structures of one kind count as often as there are of them, whatever their place and size.
     #[test]
     fn weights_depend_on_neither_place_nor_size() {
         let data: Vec<_> = (0..100).map(|number| vec![(8, if number % 2 == 0 { 10 } else { 30 })]).collect();
@@ -321,6 +323,16 @@ mod tests {
         assert_eq!((sample, sampler.structures()), (vec![0, 2], 3));
         assert_eq!([0, 1, 2].map(|number| sampler.weight(number)), [Some(1.0), None, Some(1.0)]);
         assert!(sampler.atoms_in_data().eq([(13, 112), (28, 4)]));
+        // An element without atoms has no say in the weights.
+        let [mut plain, mut padded] = [1, 1].map(|seed| WeightedSampler::new(100, seed));
+        for _ in 0..100 {
+            plain.add(vec![(13, 10)]);
+            padded.add(vec![(13, 10), (28, 0)]);
+        }
+        let numbers = || plain.sample().map(|(number, _)| number);
+        assert!(numbers().all(|number| plain.weight(number) > Some(1.0)));
+        assert!(numbers().all(|number| plain.weight(number) == padded.weight(number)));
+        assert!(padded.atoms_in_data().eq([(13, 1000)]));
         // A structure that is larger than what is asked for is not left out.
         assert_eq!(drawn(1, 1, &data[..1]).sample().count(), 1);
     }

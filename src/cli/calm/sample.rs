@@ -22,8 +22,9 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Draw a weighted sample of structures that stands for a data set of any size
 ///
-/// Draws whole structures at random, without replacement, so that the sample has about N atoms of each element, or all there are: at
-/// least N, and fewer than N more than the largest structure. What one element draws serves the others, so frequent elements get more.
+/// Draws whole structures at random, without replacement, so that the sample has about N atoms of each element, or all there are. An
+/// element draws at least N atoms, and fewer than N plus those of its largest structure. What one element draws serves the others, so
+/// frequent elements get more.
 ///
 /// Writes each structure as it is, with its labels and with calmwalk_weight: the number of structures of the data that it stands for.
 /// `calm build` and `upfit` multiply it by --weight of the file. Weighted sums over the sample are those over the data, up to the
@@ -40,7 +41,7 @@ pub struct CalmSampleArgs {
     /// File for the sample, extended XYZ; an existing file is replaced at the end
     #[arg(long, short, value_name = "SAMPLE.extxyz")]
     output: PathBuf,
-    /// GRACE model (kokkos.npz): also name the elements with fewer than D + 1 atoms in the sample
+    /// GRACE model (kokkos.npz): also name the elements with fewer than D + 1 atoms in the sample, also elements of the model without data
     #[arg(long, value_name = "MODEL.npz")]
     model: Option<PathBuf>,
     /// Random seed
@@ -61,6 +62,14 @@ struct DrawnStructure {
     weight: f64,
 }
 
+/// The model of --model.
+struct SampledModel {
+    /// Atomic numbers of its elements.
+    elements: Vec<u8>,
+    /// D of the mixtures that `calm build` makes for it.
+    dimension: u64,
+}
+
 /// What the sample has of an element.
 #[derive(Default)]
 struct SampledElement {
@@ -79,17 +88,17 @@ impl CalmSampleArgs {
         refuse_to_replace(&self.output, data.chain(model))?;
         // Errors in paths are found before hours of work.
         AtomicFile::create(&self.output).map(drop)?;
-        let dimension = self.model.as_deref().map(feature_dimension).transpose()?;
+        let model = self.model.as_deref().map(SampledModel::load).transpose()?;
         let sampler = WeightedSampler::new(self.atoms_per_element, self.rng_seed);
         let Some(sample) = draw(&files, sampler, &stop_token()?)? else {
             print_stderr("stopped; nothing was written");
             return Ok(ExitStatus::Interrupted);
         };
-        let rows = sample.rows();
+        let rows = sample.rows(model.as_ref().map_or(&[][..], |model| &model.elements[..]));
         let weights = sample.write(&self.output)?;
         print(|out| {
             table(&rows).write(out)?;
-            if let Some(line) = dimension.and_then(|dimension| too_few(&rows, dimension)) {
+            if let Some(line) = model.as_ref().and_then(|model| too_few(&rows, model.dimension)) {
                 writeln!(out, "{line}")?;
             }
             let drawn = count(weights.len() as u64, "structure");
@@ -102,11 +111,13 @@ impl CalmSampleArgs {
     }
 }
 
-/// D of the mixtures that `calm build` makes for a model.
-fn feature_dimension(path: &Path) -> Result<u64, CommandError> {
-    let model = GraceModel::load(path).map_err(CommandError::input)?;
-    let (_, projection, _) = projected(path, model, None, 0, PROJECTED)?;
-    Ok(projection.feature_dimension as u64)
+impl SampledModel {
+    fn load(path: &Path) -> Result<Self, CommandError> {
+        let model = GraceModel::load(path).map_err(CommandError::input)?;
+        let elements = model.elements().iter().map(|species| species.atomic_number()).collect();
+        let (_, projection, _) = projected(path, model, None, 0, PROJECTED)?;
+        Ok(Self { elements, dimension: projection.feature_dimension as u64 })
+    }
 }
 
 /// Reads all structures; `None` after a cancellation.
@@ -151,10 +162,13 @@ impl DrawnSample {
         before * self.sampler.weight(number).unwrap_or(1.0)
     }
 
-    /// Each element by its atomic number.
-    fn rows(&self) -> BTreeMap<u8, SampledElement> {
-        let row = |(element, in_data)| (element, SampledElement { in_data, ..SampledElement::default() });
-        let mut rows: BTreeMap<u8, SampledElement> = self.sampler.atoms_in_data().map(row).collect();
+    /// Each element of the data, and each of `others`, by its atomic number.
+    fn rows(&self, others: &[u8]) -> BTreeMap<u8, SampledElement> {
+        let mut rows: BTreeMap<u8, SampledElement> =
+            others.iter().map(|element| (*element, SampledElement::default())).collect();
+        for (element, in_data) in self.sampler.atoms_in_data() {
+            rows.entry(element).or_default().in_data = in_data;
+        }
         for (number, atoms) in self.sampler.sample() {
             let weight = self.weight(number);
             for (element, count) in atoms {
