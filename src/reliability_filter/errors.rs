@@ -19,6 +19,8 @@ const COLOURS: [Colour; 2] = [Colour::BLUE, Colour::VERMILLION];
 
 /// The errors of the structures on one side of the limit.
 struct Side {
+    /// Structures, those outside the bins included.
+    all: usize,
     counts: Vec<u64>,
     mean: Option<f64>,
     median: Option<f64>,
@@ -40,7 +42,8 @@ pub fn draw(rows: &[GradedRow], grade: &str) -> Result<FigureContent, String> {
     let caption = format!(
         "Absolute errors, in the unit of the table. a, against the grade {grade}: dashed, median; grey, mean; bands, P_{{25}}–P_{{75}} and \
          P_{{10}}–P_{{90}}, in ten bins a decade with at least {MIN_STRUCTURES} structures each. b, distribution for the grades up to 1 (blue) \
-         and above (red), each by itself; errors of zero are not drawn."
+         and above (red), as shares of all its structures; errors of zero or more than six \
+         decades below the largest are not drawn."
     );
     Ok(FigureContent { figure, caption, numbers: numbers(&bins, &sides, &edges) })
 }
@@ -52,6 +55,7 @@ impl Side {
         errors.sort_by(f64::total_cmp);
         let sum = errors.iter().sum::<f64>();
         Self {
+            all: errors.len(),
             mean: (!errors.is_empty()).then(|| sum / errors.len() as f64),
             median: quantile(&errors, 0.5),
             counts: Histogram::from_values(edges.to_vec(), errors).counts().to_vec(),
@@ -60,7 +64,7 @@ impl Side {
 
     /// Outline of the histogram of shares, from zero to zero.
     fn outline(&self, edges: &[f64]) -> Vec<Point> {
-        let all = self.counts.iter().sum::<u64>().max(1) as f64;
+        let all = self.all.max(1) as f64;
         let steps = edges.windows(2).zip(&self.counts);
         let steps = steps.flat_map(|(edges, count)| [edges[0], edges[1]].map(|x| [x, *count as f64 / all]));
         let (first, last) = ([edges[0], 0.0], [edges[edges.len() - 1], 0.0]);
@@ -156,6 +160,10 @@ mod tests {
         assert!((within.mean.unwrap() - 1.05).abs() < 1e-12 && (beyond.mean.unwrap() - 3.05).abs() < 1e-12);
         let outline = within.outline(&edges);
         assert_eq!((outline.len(), outline[0][1]), (2 * edges.len(), 0.0));
+        // Shares are of all structures, also of those outside the bins.
+        let with_zero: Vec<_> = [row(0.1, 0.0), row(0.1, 1.0)].into();
+        let outline = Side::new(&with_zero, &edges, true).outline(&edges);
+        assert_eq!(outline.iter().map(|[_, share]| *share).fold(0.0, f64::max), 0.5);
         let drawn = draw(&rows, "gamma_max").unwrap();
         assert!(!to_svg(&drawn.figure).contains("NaN"));
         let text = String::from_utf8(drawn.numbers.into_bytes()).unwrap();
