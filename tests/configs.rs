@@ -1,5 +1,6 @@
-//! Every file of `configs/` runs, and its results can be read: all as they stand but the largest campaign, whose walks are shorter.
-//! `CALMWALK_WHOLE_DEMOS=1 cargo test --test integration configs::` runs it as it stands, too.
+//! Every file of `configs/` but `silicon-dft.toml` runs here, and its results can be read. The demos of aluminium and silicon run as they
+//! stand, the largest demo with shorter walks, those for foundation models with a small model, three seed structures and short walks.
+//! `CALMWALK_WHOLE_DEMOS=1 cargo test --test integration configs::` runs the largest demo as it stands instead.
 
 use std::collections::BTreeSet;
 use std::fs;

@@ -36,7 +36,7 @@ fn lead(report: &FilterReport) -> String {
         n => format!(", {n} left out without a number"),
     };
     format!(
-        "{}{left_out}. What is better than {} of the same size is due to the grade.",
+        "{}{left_out}, compared with {} of the same size. What exceeds them by several standard deviations is due to the grade.",
         output::count(report.rows as u64, "structure"),
         output::count(u64::from(report.draws), "random subset")
     )
@@ -118,7 +118,7 @@ mod tests {
             let table = text(files.len() - 1);
             assert_eq!(table.lines().count(), 4, "{table}");
             assert_eq!(table.contains("precision"), class.is_some());
-            // The number of structures below 1, of 0.1 to 3; 0.1 · 10 is 1.
+            // The number of structures up to 1, of 0.1 to 3; 0.1 · 10 is 1.
             assert!(table.lines().nth(2).unwrap().starts_with("1,10,"), "{table}");
         }
     }

@@ -27,8 +27,8 @@ pub(super) const PROJECTED: usize = 128;
 /// Build a CALM mixture from the training data of a model
 ///
 /// Goes through all structures three times: pass 1 finds clusters of environments for each element, pass 2 their covariances,
-/// pass 3 the thresholds. The artifact depends on model, data, --candidates, --rng-seed and --shard-size, but not on the number of
-/// threads.
+/// pass 3 the thresholds. The artifact depends on model, data, weights, --where, --candidates, --projection-dimension, --feature-variant,
+/// --rng-seed, --shard-size and --campaign, but not on the number of threads.
 ///
 /// A model without a projection of its features (uq_rp_matrix) gets a random one, which the artifact stores.
 ///

@@ -143,7 +143,7 @@ async fn version(url: &ServerUrl, connection: &mut PgConnection) -> Result<Optio
     let tables: Vec<String> = sqlx::query_scalar(sql).bind(&url.schema).fetch_all(&mut *connection).await?;
     match tables.first() {
         None => return Ok(None),
-        // This may be left by a process that was killed while it created the tables.
+        // Earlier versions of the program left this when they were killed while they created the tables.
         Some(first) if first == "_sqlx_migrations" && tables.len() == 1 => return Ok(None),
         Some(first) if first != "leader" => {
             return Err(StoreError::ForeignSchema { location: url.to_string(), found: first.clone() });
