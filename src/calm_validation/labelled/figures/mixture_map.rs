@@ -14,10 +14,38 @@ use crate::page::{FigureContent, FigureEntry};
 /// Height of the panels, points.
 const HEIGHT: f64 = 150.0;
 
-/// Labels of the columns (K) and the rows (D).
+/// The columns (K of each element) and the rows (D), and their labels.
 struct Places {
+    columns: Vec<Vec<usize>>,
     components: Vec<String>,
+    rows: Vec<usize>,
     dimensions: Vec<String>,
+}
+
+impl Places {
+    /// Of all mixtures. Columns ascend by the largest K, then by the smallest.
+    fn new(mixtures: &[ComparedMixture]) -> Self {
+        let key = |mixture: &ComparedMixture| {
+            let components = &mixture.components;
+            (components.iter().max().copied(), components.iter().min().copied(), components.clone())
+        };
+        let mut found: Vec<_> = mixtures.iter().map(|mixture| (key(mixture), mixture.range())).collect();
+        found.sort();
+        found.dedup();
+        let (columns, components) =
+            found.into_iter().map(|((_, _, components), range)| (components, range)).unzip();
+        let mut rows: Vec<_> = mixtures.iter().map(|mixture| mixture.dimension).collect();
+        rows.sort_unstable();
+        rows.dedup();
+        let dimensions = rows.iter().map(ToString::to_string).collect();
+        Self { columns, components, rows, dimensions }
+    }
+
+    /// Column and row of a mixture.
+    fn of(&self, mixture: &ComparedMixture) -> Option<(usize, usize)> {
+        let column = self.columns.iter().position(|components| *components == mixture.components)?;
+        Some((column, self.rows.iter().position(|dimension| *dimension == mixture.dimension)?))
+    }
 }
 
 /// `report` is that of any of the mixtures. `None` with fewer than two mixtures, or without force labels.
@@ -30,23 +58,15 @@ pub fn draw(mixtures: &[ComparedMixture], report: &LabelledReport) -> Option<Fig
 }
 
 fn draw_map(mixtures: &[ComparedMixture], report: &LabelledReport) -> Result<FigureContent, String> {
-    let mut cells: Vec<_> = mixtures.iter().map(|mixture| (mixture.dimension, mixture.range())).collect();
+    let mut cells: Vec<_> = mixtures.iter().map(|mixture| (mixture.dimension, &mixture.components)).collect();
     cells.sort();
     cells.dedup();
     if cells.len() < mixtures.len() {
-        return Err("Two mixtures have the same dimension and the same number of components.".into());
+        return Err(
+            "Two mixtures have the same dimension and the same number of components of each element.".into(),
+        );
     }
-    let mut components: Vec<_> =
-        mixtures.iter().map(|mixture| (mixture.components.iter().max().copied(), mixture.range())).collect();
-    components.sort();
-    components.dedup();
-    let mut dimensions: Vec<_> = mixtures.iter().map(|mixture| mixture.dimension).collect();
-    dimensions.sort_unstable();
-    dimensions.dedup();
-    let places = Places {
-        components: components.into_iter().map(|(_, range)| range).collect(),
-        dimensions: dimensions.iter().map(ToString::to_string).collect(),
-    };
+    let places = Places::new(mixtures);
     let description = "Contamination of the confident set by dimension and components of the mixture";
     let mut figure = Figure::new("mixture-map", description, WIDTH, HEIGHT + 64.0);
     let mut numbers = Csv::new(&["score", "dimension", "components", "contamination", "retention"]);
@@ -91,10 +111,7 @@ fn draw_cell(
     [contamination, retention]: [Option<f64>; 2],
     unfiltered: Option<f64>,
 ) {
-    let find = |labels: &[String], label: &str| labels.iter().position(|other| other == label);
-    let column = find(&places.components, &mixture.range());
-    let row = find(&places.dimensions, &mixture.dimension.to_string());
-    let Some((x, y)) = column.zip(row).map(|(x, y)| (x as f64, y as f64)) else { return };
+    let Some((x, y)) = places.of(mixture).map(|(x, y)| (x as f64, y as f64)) else { return };
     let share = contamination.zip(unfiltered.filter(|all| *all > 0.0)).map_or(0.0, |(of, all)| of / all);
     let paint: Paint = Colour::VERMILLION.faint(0.8 * share.clamp(0.0, 1.0));
     panel.bar([x, y], [x + 1.0, y + 1.0], paint);
@@ -102,4 +119,25 @@ fn draw_cell(
     let middle = [x + 0.5, y + 0.5];
     panel.text(middle, [0.0, 0.0], &percent(contamination, 2), Anchor::Middle).bold = true;
     panel.text(middle, [0.0, 10.0], &percent(retention, 1), Anchor::Middle);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The range of K does not tell mixtures apart.
+    #[test]
+    fn columns_are_the_components_of_each_element() {
+        let mixture = |dimension, components: &[usize]| ComparedMixture {
+            artifact: "a.npz".into(),
+            dimension,
+            components: components.to_vec(),
+            scores: Vec::new(),
+        };
+        let mixtures = [mixture(8, &[8, 4]), mixture(4, &[8, 2]), mixture(8, &[4, 8]), mixture(8, &[16, 1])];
+        let places = Places::new(&mixtures);
+        assert_eq!(places.components, ["2–8", "4–8", "4–8", "1–16"]);
+        let found = mixtures.each_ref().map(|mixture| places.of(mixture));
+        assert_eq!(found, [Some((2, 1)), Some((0, 0)), Some((1, 1)), Some((3, 1))]);
+    }
 }
