@@ -34,9 +34,7 @@ impl Activation {
             }
         }
     }
-}
 
-impl Activation {
     /// The second derivative.
     #[inline(always)]
     pub fn curvature(self, x: f64) -> f64 {
@@ -271,8 +269,9 @@ fn row<V: Vector>(lanes: &[V], atoms: usize, atom: usize) -> &[V::Number] {
     V::flat(&lanes[atom * of_atom..][..of_atom])
 }
 
+/// Zeros for this many lanes.
 #[inline(always)]
-fn zeros<V: Vector>(lanes: &mut Vec<V>, n: usize) {
+pub(super) fn zeros<V: Vector>(lanes: &mut Vec<V>, n: usize) {
     lanes.clear();
     lanes.resize(n, V::ZERO);
 }

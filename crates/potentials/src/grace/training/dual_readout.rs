@@ -2,7 +2,7 @@
 
 use super::super::invariant_norm::{InvariantNorm, SQUARE_FLOOR};
 use super::super::matrix::{Matrix, StridedRows};
-use super::super::readout::Readout;
+use super::super::readout::{Readout, zeros};
 use super::super::tape::AtomBatch;
 use super::super::vector::{Double, Vector};
 use super::sums::WeightSums;
@@ -236,10 +236,4 @@ pub(super) fn multiply(matrix: &Matrix<Double>, batch: &AtomBatch, from: &[Doubl
     let rows = |stride| StridedRows::of_atoms(batch.atoms, stride);
     let (x, y) = (rows(matrix.input_lanes()), rows(matrix.output_lanes()));
     matrix.multiply_add((from, to), x, y, batch.instructions);
-}
-
-#[inline(always)]
-fn zeros(lanes: &mut Vec<Double>, n: usize) {
-    lanes.clear();
-    lanes.resize(n, Double::ZERO);
 }
