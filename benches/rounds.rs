@@ -165,6 +165,8 @@ fn settings() -> SelectorSettings {
         control_share: 0.5,
         min_distances: MinDistanceRule::default(),
         declined_feature_bytes: 0,
+        version: Default::default(),
+        refit_at: None,
     }
 }
 

@@ -21,7 +21,7 @@ use calm::Artifact;
 use calm::forgetting::ForgettingAlarm;
 use monitor::reference_check::{self, KnownStructure};
 use orchestrator::grader::Grader;
-use orchestrator::selector::{CampaignMode, SelectorSettings, TrainingFrames};
+use orchestrator::selector::{CampaignMode, PotentialVersion, SelectorSettings, TrainingFrames};
 use potentials::grace::{GraceModel, Precision};
 use serde_json::{Value, json};
 use store::Protocol;
@@ -376,6 +376,8 @@ pub fn selector_settings(config: &Config) -> SelectorSettings {
         control_share: campaign.control_share.get(),
         min_distances: guard.min_distances.clone(),
         declined_feature_bytes: collect.declined_features_mb * 1_000_000,
+        version: PotentialVersion::default(),
+        refit_at: None,
     }
 }
 

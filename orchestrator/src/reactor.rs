@@ -82,6 +82,8 @@ pub struct Reactor {
     pub incoming: mpsc::Receiver<Incoming>,
     /// Cancelled to stop, for example by Ctrl-C: walkers are shut down and their walks can be continued later.
     pub stopping: CancellationToken,
+    /// Cancelled when a newer version of the potential is there: the biased walks make room for it.
+    pub superseded: CancellationToken,
     /// Walkers wait while more label jobs than this are unfinished, unless the selector raises its threshold first.
     pub queue_limit: u64,
 }
@@ -123,6 +125,8 @@ impl Reactor {
             EventStream::new(self.incoming, self.selector.regrader().clone(), self.selector.mixture());
         let stopping = self.stopping.clone();
         let mut stop = pin!(stopping.cancelled().fuse());
+        let superseded = self.superseded;
+        let mut newer_version = pin!(superseded.cancelled().fuse());
         let mut state = ReactorState::new(self.selector, self.store, self.stopping, self.queue_limit);
         // An interval, not a timeout since the last message: busy walkers may report progress continuously.
         let mut poll = tokio::time::interval(POLL_INTERVAL);
@@ -150,6 +154,10 @@ impl Reactor {
                 }
                 _ = poll.tick(), if !state.waiting.is_empty() => {}
                 () = &mut stop => {}
+                () = &mut newer_version => {
+                    let ended = state.selector.supersede_walks();
+                    commit_batch::append(state.decided.get_or_insert_default(), ended);
+                }
             }
             if !writing.is_empty() {
                 continue;

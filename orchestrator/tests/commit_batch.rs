@@ -214,7 +214,8 @@ impl Arrived {
 }
 
 fn reactor(store: &Store, selector: Selector, incoming: mpsc::Receiver<Incoming>) -> Reactor {
-    Reactor { selector, store: store.clone(), incoming, stopping: CancellationToken::new(), queue_limit: 100 }
+    let [stopping, superseded] = [(); 2].map(|()| CancellationToken::new());
+    Reactor { selector, store: store.clone(), incoming, stopping, superseded, queue_limit: 100 }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

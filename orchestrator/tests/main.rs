@@ -9,4 +9,5 @@ mod replay;
 mod reproducible;
 mod slurm_plan;
 mod supervisor;
+mod versions;
 mod walks;

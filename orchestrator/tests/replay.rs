@@ -1,13 +1,14 @@
 //! Replaying a campaign's log gives exactly the same decisions with the same rules, and different ones with others.
 
 use std::collections::{BTreeMap, HashSet};
+use std::sync::Arc;
 
 use atoms::{MinDistanceRule, Uniform};
-use calm::CollectionRule;
+use calm::{CollectionRule, Mixture};
 use calm::rules::MaximumGrade;
 use orchestrator::selector::{
     AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings,
-    SelectorSnapshot, TrainingFrames, UpdateProtocol,
+    SelectorSnapshot, TrainingFrames, UpdateProtocol, VERSION,
 };
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
@@ -18,8 +19,8 @@ use wire::ContentHash;
 use crate::common::eventful::{Campaign, acts, any_settings, scripts};
 use crate::common::scripted::{Event, Script};
 use crate::common::{
-    SHORTEST, decided, grader, kinds, mixture, next_assignment, offer, positive, seed_structure, settings,
-    structure, try_restore,
+    SHORTEST, decided, grader, kinds, mixture, mixture_of, next_assignment, offer, positive, seed_structure,
+    settings, structure, try_restore, with_version,
 };
 
 /// The decisions of a campaign as restored from a store, each with its candidate.
@@ -55,6 +56,11 @@ fn open(campaign: &Campaign<'_>, settings: &SelectorSettings, seeds: usize, set:
     Replay::new(settings.clone(), set, seeds, grader(), mixture(), None, imported).unwrap()
 }
 
+/// The original mixture of the version that a decision takes up.
+fn original_of(decision: &LoggedDecision) -> Arc<Mixture> {
+    mixture_of(decision.detail["version"].as_u64().unwrap() as u32)
+}
+
 /// Replays each decision of the log.
 fn follow(
     replay: &mut Replay,
@@ -65,6 +71,9 @@ fn follow(
             replay.regrader().regrade_block(record.block.clone(), replay.mixture()).unwrap()
         };
         let examined = candidate.as_ref().map(examine);
+        if decision.kind == VERSION {
+            return replay.take_up_version(decision, grader(), original_of(decision), None).unwrap();
+        }
         replay.apply(decision, examined).unwrap()
     };
     log.iter().map(next).collect()
@@ -114,6 +123,10 @@ fn check_history(
                 let atoms = AcceptedAtoms { elements: &elements, features: view.features };
                 history.apply(recorded, Some(atoms)).unwrap()
             }
+            None if recorded.kind == VERSION => {
+                history.take_up_version(recorded, original_of(recorded)).unwrap();
+                None
+            }
             None => history.apply(recorded, None).unwrap(),
         };
         let expected = recorded.detail.get("update").map(|update| update.to_string());
@@ -152,6 +165,26 @@ proptest! {
         first.into_iter().for_each(|act| campaign.act(act));
         let hash = |number| ContentHash::from_structure(&structure(number, SHORTEST));
         campaign.store.imported = imports.into_iter().map(hash).collect();
+        campaign.go_on(&second);
+        middle.into_iter().for_each(|act| campaign.act(act));
+        campaign.go_on(&third);
+        last.into_iter().for_each(|act| campaign.act(act));
+        check_exact(&campaign.finish(false), &settings, scripts.len());
+    }
+
+    /// Two versions of the potential are taken up, the second after walks made room for it; or it was refused.
+    #[test]
+    fn replays_include_versions_of_the_potential(
+        settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize,
+        parts in prop::array::uniform3(acts()), refit_at in 1..6_u32, refused in any::<bool>(),
+    ) {
+        let mode = if live { CampaignMode::Live } else { CampaignMode::Reproducible };
+        let settings = SelectorSettings { mode, ..settings };
+        let second = SelectorSettings { refit_at: Some(refit_at), ..with_version(&settings, 1) };
+        let third = if refused { with_version(&settings, 1) } else { with_version(&settings, 3) };
+        let [first, middle, last] = parts;
+        let mut campaign = Campaign::begin(&settings, &scripts, walkers);
+        first.into_iter().for_each(|act| campaign.act(act));
         campaign.go_on(&second);
         middle.into_iter().for_each(|act| campaign.act(act));
         campaign.go_on(&third);

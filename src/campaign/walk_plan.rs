@@ -166,6 +166,7 @@ fn combinations(walk: &WalkSection, group: &WalkGroupSection) -> Vec<WalkConditi
                     tau: tau.get(),
                     volume_ramp: ramp.map(|VolumeRampSection { from, to }| (from.get(), to.get())),
                     repeat,
+                    version: 0,
                 };
                 walks.extend((0..group.repeats.get()).map(conditions));
             }

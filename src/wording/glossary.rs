@@ -30,6 +30,7 @@ fn every_status_word_is_explained() {
         WalkEnd::Completed,
         WalkEnd::QuotaReached,
         WalkEnd::Budget,
+        WalkEnd::Superseded,
         WalkEnd::Trapped { guard: none() },
         WalkEnd::Diverged { reason: none() },
         WalkEnd::InvalidStart { reason: none() },
@@ -51,6 +52,7 @@ fn every_status_word_is_explained() {
         "forgetting",
         "imported",
         "configuration",
+        "version",
     ];
     let reasons = DeclineReason::ALL.into_iter().filter(|reason| *reason != DeclineReason::LeftOut);
     let classes = FailureClass::ALL

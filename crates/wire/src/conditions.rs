@@ -15,6 +15,9 @@ pub struct WalkConditions {
     pub volume_ramp: Option<(f64, f64)>,
     /// Number of the walk among those under the same conditions, from 0. They differ in their random numbers.
     pub repeat: u32,
+    /// Version of the potential that drives it: 0 is that of the configuration.
+    #[serde(default)]
+    pub version: u32,
 }
 
 /// Which conditions differ between the walks of a campaign.
@@ -25,6 +28,7 @@ pub struct VariedConditions {
     tau: bool,
     volume_ramp: bool,
     repeat: bool,
+    version: bool,
 }
 
 impl VariedConditions {
@@ -38,10 +42,11 @@ impl VariedConditions {
             tau: varied.tau || other.tau != first.tau,
             volume_ramp: varied.volume_ramp || other.volume_ramp != first.volume_ramp,
             repeat: varied.repeat || other.repeat != first.repeat,
+            version: varied.version || other.version != first.version,
         })
     }
 
-    /// What distinguishes a walk, as text: `hot, 600 K, V 1 to 1.4, τ 0.15, #2`. Empty if nothing varies.
+    /// What distinguishes a walk, as text: `hot, 600 K, V 1 to 1.4, τ 0.15, #2, version 1`. Empty if nothing varies.
     pub fn describe(&self, walk: &WalkConditions) -> String {
         let ramp = match walk.volume_ramp {
             Some((from, to)) => format!("V {from} to {to}"),
@@ -53,6 +58,7 @@ impl VariedConditions {
             (self.volume_ramp, ramp),
             (self.tau, format!("τ {}", walk.tau)),
             (self.repeat, format!("#{}", walk.repeat + 1)),
+            (self.version, format!("version {}", walk.version)),
         ];
         let parts: Vec<_> = parts.into_iter().filter_map(|(varies, text)| varies.then_some(text)).collect();
         parts.join(", ")
@@ -85,6 +91,7 @@ mod tests {
             tau: 0.15,
             volume_ramp: Some((1.0, 1.4)),
             repeat,
+            version: 0,
         }
     }
 
@@ -101,5 +108,7 @@ mod tests {
         let varied = VariedConditions::among([&walks[0], &other]);
         assert_eq!(varied.name("fcc", &walks[0]), "fcc (hot, V 1 to 1.4, τ 0.15)");
         assert_eq!(varied.name("fcc", &other), "fcc (cold, fixed cell, τ 0.3)");
+        let later = WalkConditions { version: 2, ..walks[0].clone() };
+        assert_eq!(VariedConditions::among([&walks[0], &later]).describe(&later), "version 2");
     }
 }

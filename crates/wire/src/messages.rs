@@ -109,6 +109,8 @@ pub enum WalkEnd {
     QuotaReached,
     /// The campaign has reached its maximum number of structures.
     Budget,
+    /// It made room for a new version of the potential.
+    Superseded,
     /// A guard rejected it too often, after the allowed number of rollbacks.
     Trapped {
         /// Name of the guard.
@@ -127,13 +129,14 @@ pub enum WalkEnd {
 }
 
 impl WalkEnd {
-    /// The serialized name: `"completed"`, `"quota_reached"`, `"budget"`, `"trapped"`, `"diverged"` or
-    /// `"invalid_start"`.
+    /// The serialized name: `"completed"`, `"quota_reached"`, `"budget"`, `"superseded"`, `"trapped"`,
+    /// `"diverged"` or `"invalid_start"`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Completed => "completed",
             Self::QuotaReached => "quota_reached",
             Self::Budget => "budget",
+            Self::Superseded => "superseded",
             Self::Trapped { .. } => "trapped",
             Self::Diverged { .. } => "diverged",
             Self::InvalidStart { .. } => "invalid_start",

@@ -55,7 +55,9 @@ pub async fn lead(plan: Plan) {
         stop.cancel();
     });
     let stopping = tokens.stopping;
-    let reactor = Reactor { selector, store: store.clone(), incoming, stopping, queue_limit: u64::MAX };
+    let superseded = CancellationToken::new();
+    let reactor =
+        Reactor { selector, store: store.clone(), incoming, stopping, superseded, queue_limit: u64::MAX };
     let writing = Arc::clone(&log);
     reactor.run(move |notice| writing.lock().unwrap().record(&notice, plan)).await.unwrap();
     tokens.closing.cancel();

@@ -49,6 +49,8 @@ pub fn settings(threshold: f64) -> SelectorSettings {
         control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),
         declined_feature_bytes: 1_000_000_000,
+        version: Default::default(),
+        refit_at: None,
     }
 }
 
@@ -146,6 +148,7 @@ pub async fn run(
         store: store.clone(),
         incoming,
         stopping: CancellationToken::new(),
+        superseded: CancellationToken::new(),
         queue_limit: u64::MAX,
     };
     let offers: Arc<Vec<_>> =

@@ -26,6 +26,8 @@ const CONTROL_PRIORITY: i32 = 0;
 pub(super) const LEFT_OUT: &str = "left_out";
 /// Kind of the decision that makes updates additive.
 pub(super) const FORGETTING: &str = "forgetting";
+/// Kind of the decision that takes up a version of the potential, and the value with its number.
+pub const VERSION: &str = "version";
 
 impl DecisionState {
     /// Decides on the reports of a round, in order. `assigned` contains the walks that walkers work on.
@@ -58,11 +60,28 @@ impl DecisionState {
                 Outcome::StepsDone | Outcome::Interrupted => {}
             }
         }
-        touched.extend(self.end_by_limits(assigned, &mut commit));
-        touched.extend(self.start_controls(&mut commit));
-        commit.walks = touched.iter().map(|id| self.walks[*id].to_record()).collect();
-        self.add_values(&mut commit);
+        self.finish_commit(assigned, touched, &mut commit);
         Ok(commit)
+    }
+
+    /// Ends what a limit ends, without any report.
+    pub fn end_walks_by_limits(&mut self, assigned: &BTreeMap<WalkId, u32>) -> Commit {
+        let mut commit = Commit::default();
+        self.finish_commit(assigned, BTreeSet::new(), &mut commit);
+        commit
+    }
+
+    /// Adds to a commit what follows from its decisions: ends by limits, control walks, and the records of all `touched` walks.
+    fn finish_commit(
+        &mut self,
+        assigned: &BTreeMap<WalkId, u32>,
+        mut touched: BTreeSet<WalkId>,
+        commit: &mut Commit,
+    ) {
+        touched.extend(self.end_by_limits(assigned, commit));
+        touched.extend(self.start_controls(commit));
+        commit.walks = touched.iter().map(|id| self.walks[*id].to_record()).collect();
+        self.add_values(commit);
     }
 
     /// Updates the walk from the report, and logs rollbacks.
@@ -325,7 +344,7 @@ impl DecisionState {
         keeps
     }
 
-    fn end_walk(&mut self, id: WalkId, end: &WalkEnd, commit: &mut Commit) {
+    pub fn end_walk(&mut self, id: WalkId, end: &WalkEnd, commit: &mut Commit) {
         self.end_walk_as(id, end.name(), describe_end(end), commit);
     }
 
@@ -355,12 +374,14 @@ impl DecisionState {
         self.settings.update == UpdateProtocol::PerSeedStructure && next != Some(seed_structure)
     }
 
-    /// Ends the unassigned biased walks once the campaign has its maximum number of structures, and those whose seed
-    /// structure has.
+    /// Ends the unassigned biased walks once the campaign has its maximum number of structures or a refit of the potential is
+    /// due, and those whose seed structure has its maximum.
     fn end_by_limits(&mut self, assigned: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> BTreeSet<WalkId> {
         let is_idle = |id: &WalkId| !assigned.contains_key(id);
         let (end, over): (_, BTreeSet<_>) = if self.is_budget_exhausted() {
             (WalkEnd::Budget, self.walks.unfinished(true).filter(is_idle).collect())
+        } else if self.is_refit_due() {
+            (WalkEnd::Superseded, self.walks.unfinished(true).filter(is_idle).collect())
         } else {
             let of_full_seed_structures = self
                 .full_seed_structures
@@ -374,13 +395,16 @@ impl DecisionState {
         over
     }
 
-    /// Creates the control walks of biased walks that have ended. Returns all changed walks.
+    /// Creates the control walks of biased walks of the version in force that have ended. Returns all changed walks.
     fn start_controls(&mut self, commit: &mut Commit) -> Vec<WalkId> {
         let mut touched = Vec::new();
         if !self.settings.control {
             return touched;
         }
         for id in self.walks.without_control() {
+            if self.walks[id].record.conditions.version != self.version {
+                continue;
+            }
             let control_id = self.next_walk_id();
             commit.decisions.push(self.start_control(control_id, id));
             touched.extend([id, control_id]);
@@ -400,7 +424,7 @@ impl DecisionState {
 /// Why a walk ended, as text, if the name of the end is not sufficient.
 fn describe_end(end: &WalkEnd) -> String {
     match end {
-        WalkEnd::Completed | WalkEnd::QuotaReached | WalkEnd::Budget => String::new(),
+        WalkEnd::Completed | WalkEnd::QuotaReached | WalkEnd::Budget | WalkEnd::Superseded => String::new(),
         WalkEnd::Trapped { guard } => format!("rejected by the {guard} guard again and again"),
         WalkEnd::Diverged { reason } | WalkEnd::InvalidStart { reason } => reason.clone(),
     }

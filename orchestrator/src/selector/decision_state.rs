@@ -11,6 +11,7 @@ use store::records::{Commit, ComponentRecord, Decision, STALENESS, WalkRecord};
 use wire::{ContentHash, WalkId};
 
 use super::backlog::Backlog;
+use super::decide::VERSION;
 use super::error::SelectorError;
 use super::forgetting::Forgetting;
 use super::regrade::Regrader;
@@ -31,6 +32,8 @@ pub(super) struct DecisionState {
     pub min_distances: Vec<MinDistances>,
     pub regrader: Regrader,
     pub mixture: Arc<Mixture>,
+    /// Number of the version of the potential that the log has taken up.
+    pub version: u32,
     pub forgetting: Forgetting,
     /// Updates are additive from here on: the mixture had forgotten too much.
     pub switched_to_additive: bool,
@@ -39,7 +42,7 @@ pub(super) struct DecisionState {
     /// Number of started rounds; always 0 in live mode.
     pub round: u64,
     pub accepted: u32,
-    /// Number of structures accepted from the biased walks of each seed structure.
+    /// Number of structures accepted from the biased walks of each seed structure with the version in force.
     pub accepted_by_seed_structure: HashMap<u32, u32>,
     /// Seed structures that have their maximum number of structures, but walks that have not ended.
     pub full_seed_structures: BTreeSet<u32>,
@@ -76,15 +79,25 @@ impl DecisionState {
         let (declined_feature_bytes, imported) = (value("declined_feature_bytes")?, value("imported")?);
         let left_out = value(store::records::LEFT_OUT)?;
         let staleness = restored(STALENESS, &snapshot.values)?.unwrap_or_default();
-        let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
+        let taken_up = u32::try_from(value(VERSION)?).unwrap_or(u32::MAX);
+        let in_force = settings.version.version;
+        if taken_up > in_force {
+            let problem = format!("version {taken_up} of the potential, expected at most version {in_force}");
+            return Err(SelectorError::Snapshot(problem));
+        }
+        // Components of another version do not fit the mixture of this one.
+        let stored = if taken_up == in_force { &snapshot.components[..] } else { &[] };
+        let mixture = Arc::new(restored_mixture(&original, version, stored)?);
         let mut forgetting = Forgetting::new(grader.symbols(), training);
-        let changed =
-            snapshot.components.iter().map(|record| (record.element as usize, record.slot as usize));
+        let changed = stored.iter().map(|record| (record.element as usize, record.slot as usize));
         forgetting.update(&original, &mixture, &changed.collect())?;
         let walks = restored_walks(snapshot.walks, seed_structures.len())?;
-        let mut accepted_by_seed_structure = HashMap::new();
+        let (mut accepted, mut accepted_by_seed_structure) = (0, HashMap::new());
         for Walk { record, .. } in walks.iter().filter(|walk| walk.is_biased()) {
-            *accepted_by_seed_structure.entry(record.seed_structure).or_default() += record.accepted;
+            accepted += record.accepted;
+            if record.conditions.version == taken_up {
+                *accepted_by_seed_structure.entry(record.seed_structure).or_default() += record.accepted;
+            }
         }
         let is_full = |accepted: u32| settings.max_per_seed_structure.is_some_and(|most| accepted >= most);
         let full = accepted_by_seed_structure.iter().filter(|(_, accepted)| is_full(**accepted));
@@ -94,12 +107,13 @@ impl DecisionState {
             min_distances,
             regrader: Regrader { grader: Arc::new(grader), original },
             mixture,
+            version: taken_up,
             forgetting,
             switched_to_additive: value(ADDITIVE)? > 0,
             walks,
             known: snapshot.known.into_iter().collect(),
             round,
-            accepted: accepted_by_seed_structure.values().sum(),
+            accepted,
             accepted_by_seed_structure,
             full_seed_structures,
             declined_feature_bytes,
@@ -131,6 +145,9 @@ impl DecisionState {
         }
         if self.switched_to_additive {
             commit.values.push((ADDITIVE.to_owned(), "1".to_owned()));
+        }
+        if self.version > 0 {
+            commit.values.push((VERSION.to_owned(), self.version.to_string()));
         }
         if self.left_out > 0 {
             commit.values.push((store::records::LEFT_OUT.to_owned(), self.left_out.to_string()));

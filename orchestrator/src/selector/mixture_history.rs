@@ -1,7 +1,7 @@
 //! Follows the mixture through the decision log of a campaign.
 //!
-//! Only three kinds of decisions matter: an accepted candidate updates the mixture, a decision on forgetting makes later
-//! updates additive, and the end of a walk may restart the original mixture. Declined candidates do not matter, so their
+//! Only four kinds of decisions matter: an accepted candidate updates the mixture, a decision on forgetting makes later
+//! updates additive, the end of a walk may restart the original mixture, and a new version of the potential has a mixture of its own. Declined candidates do not matter, so their
 //! features are not needed.
 
 use std::sync::Arc;
@@ -42,6 +42,20 @@ impl MixtureHistory {
         &self.mixture
     }
 
+    /// Takes the decision of the log on a new version of the potential, whose mixture is `original`.
+    ///
+    /// # Errors
+    /// A damaged log: another version of the mixture after the decision than expected.
+    pub fn take_up_version(
+        &mut self,
+        next: &LoggedDecision,
+        original: Arc<Mixture>,
+    ) -> Result<(), ReplayError> {
+        self.mixture = Arc::new(original.at_version(self.mixture.version() + 1));
+        (self.original, self.switched_to_additive) = (original, false);
+        self.check_version(next)
+    }
+
     /// Whether the next decision of the log updated the mixture with its candidate.
     pub fn is_update(&self, next: &LoggedDecision) -> bool {
         next.kind == "accepted" && next.mixture_version > self.mixture.version()
@@ -67,11 +81,15 @@ impl MixtureHistory {
         } else if next.kind == FORGETTING {
             self.switched_to_additive = true;
         }
-        let version = self.mixture.version();
-        if version == next.mixture_version {
-            return Ok(update);
+        self.check_version(next)?;
+        Ok(update)
+    }
+
+    fn check_version(&self, next: &LoggedDecision) -> Result<(), ReplayError> {
+        let (version, recorded) = (self.mixture.version(), next.mixture_version);
+        if version == recorded {
+            return Ok(());
         }
-        let recorded = next.mixture_version;
         Err(damaged(next, &format!("mixture version {recorded} after it, expected version {version}")))
     }
 

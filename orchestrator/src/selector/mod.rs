@@ -36,7 +36,7 @@ use wire::{CampaignId, WalkId};
 
 use crate::grader::Grader;
 use backlog::Backlog;
-pub use decide::update_settings_in_force;
+pub use decide::{VERSION, update_settings_in_force};
 use decision_state::DecisionState;
 pub use error::SelectorError;
 pub use mixture_history::{AcceptedAtoms, MixtureHistory};
@@ -44,7 +44,8 @@ pub use regrade::{RegradedCandidate, RegradedReport, Regrader};
 pub use replay::{Replay, ReplayError, ReplayedDecision};
 pub use scheduling::Scheduling;
 pub use settings::{
-    CampaignMode, OnForgetting, SeedStructurePlan, SelectorSettings, SelectorSnapshot, UpdateProtocol,
+    CampaignMode, OnForgetting, PotentialVersion, SeedStructurePlan, SelectorSettings, SelectorSnapshot,
+    UpdateProtocol,
 };
 pub use training_frames::TrainingFrames;
 use walk::Walk;
@@ -124,11 +125,20 @@ impl Selector {
         walks.map(|Walk { record, .. }| (record.walk, record.state.as_str(), record.reason.as_str()))
     }
 
-    /// Creates a walk for each seed structure without one: at the start of a campaign, or when seed structures were
-    /// added. Resumes walks that ended because of a limit that has been raised since. The commit is empty if nothing
-    /// changes.
+    /// Creates a walk for each seed structure without one: at the start of a campaign, with a new version of the potential, or
+    /// when seed structures were added. Resumes walks that ended because of a limit that has been raised since, or for a
+    /// version that was refused. The commit is empty if nothing changes.
     pub fn start_walks(&mut self) -> Commit {
         let commit = self.decisions.start_walks(&self.seed_structures);
+        self.update_ready(commit.walks.iter().map(|walk| walk.walk));
+        commit
+    }
+
+    /// Ends the biased walks that no walker works on as superseded, and others when they report: a new version of the
+    /// potential is there. Their control walks run to their end.
+    pub fn supersede_walks(&mut self) -> Commit {
+        self.decisions.settings.refit_at = Some(0);
+        let commit = self.decisions.end_walks_by_limits(&self.assigned);
         self.update_ready(commit.walks.iter().map(|walk| walk.walk));
         commit
     }

@@ -16,6 +16,7 @@ use wire::{ContentHash, WalkConditions, WalkId};
 
 use super::decide::{FORGETTING, LEFT_OUT};
 use super::decision_state::{DecisionState, restored_mixture};
+use super::forgetting::Forgetting;
 use super::rules::CONFIGURATION;
 use super::{
     RegradedCandidate, Regrader, SeedStructurePlan, SelectorError, SelectorSettings, SelectorSnapshot,
@@ -197,6 +198,27 @@ impl Replay {
         self.following = decisions.collect();
         let candidate = commit.candidates.pop();
         Ok(decision.map(|decision| ReplayedDecision { decision, candidate }))
+    }
+
+    /// Replays the decision to take up a version of the potential, with what grades depend on: the model's `grader`, its `original`
+    /// mixture and, if they are monitored, the features of the `training` frames by that model. The decision is of kind
+    /// [`super::VERSION`].
+    pub fn take_up_version(
+        &mut self,
+        recorded: &LoggedDecision,
+        grader: Grader,
+        original: Arc<Mixture>,
+        training: Option<TrainingFrames>,
+    ) -> Result<Option<ReplayedDecision>, ReplayError> {
+        let decisions = &mut self.decisions;
+        decisions.round = recorded.round;
+        decisions.settings.version = read(recorded)?;
+        decisions.forgetting = Forgetting::new(grader.symbols(), training);
+        decisions.regrader = Regrader { grader: Arc::new(grader), original };
+        let mut commit = Commit::default();
+        decisions.take_up_version(&mut commit);
+        let decision = commit.decisions.pop();
+        Ok(decision.map(|decision| ReplayedDecision { decision, candidate: None }))
     }
 
     fn import(&mut self, recorded: &LoggedDecision) -> Result<Decision, ReplayError> {

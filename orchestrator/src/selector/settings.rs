@@ -52,6 +52,19 @@ pub enum OnForgetting {
     Additive,
 }
 
+/// A version of the potential: model, mixture and thresholds together.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PotentialVersion {
+    /// Its number; 0 is that of the configuration.
+    pub version: u32,
+    /// The version from which it was trained.
+    pub parent: u32,
+    /// BLAKE3 hash of the model's file, hexadecimal; empty for version 0.
+    pub model: String,
+    /// The same of the mixture's file.
+    pub mixture: String,
+}
+
 /// The settings of the selector.
 #[derive(Clone, Debug)]
 pub struct SelectorSettings {
@@ -73,7 +86,7 @@ pub struct SelectorSettings {
     pub collection: calm::CollectionRule,
     /// Maximum number of structures accepted from one walk.
     pub max_per_walk: u32,
-    /// Maximum number of structures accepted from all walks of one seed structure.
+    /// Maximum number of structures accepted from all walks of one seed structure, with each version of the potential.
     pub max_per_seed_structure: Option<u32>,
     /// Maximum number of structures accepted in the campaign.
     pub max_structures: Option<u32>,
@@ -85,6 +98,10 @@ pub struct SelectorSettings {
     pub min_distances: MinDistanceRule,
     /// Maximum size of the stored feature vectors of declined candidates, bytes.
     pub declined_feature_bytes: u64,
+    /// The version of the potential in force. Every walk of the plan starts anew with each version.
+    pub version: PotentialVersion,
+    /// Number of structures, accepted in the whole campaign, at which biased walks make room for a new version.
+    pub refit_at: Option<u32>,
 }
 
 /// The start of walks.

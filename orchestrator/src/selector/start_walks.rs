@@ -1,11 +1,15 @@
 //! What the selector records at the start of each run: changes since the last run, and new walks.
 
+use std::sync::Arc;
+
 use serde_json::json;
-use store::records::{Commit, Decision};
+use store::records::{Commit, Decision, TRAINING_FRAMES};
+use wire::messages::WalkEnd;
 use wire::{WalkConditions, WalkId};
 
 use super::SeedStructurePlan;
-use super::decision_state::DecisionState;
+use super::decide::VERSION;
+use super::decision_state::{ADDITIVE, DecisionState};
 use super::rules::{CONFIGURATION, RULES};
 use super::walk::Walk;
 
@@ -21,15 +25,45 @@ impl DecisionState {
             self.imported.1 = self.imported.0;
         }
         self.log_rule_changes(&mut commit);
+        self.take_up_version(&mut commit);
         self.resume_walks(&mut commit);
-        let begun = self.walks.iter().filter(|walk| walk.is_biased()).count();
+        let version = self.version;
+        let is_of_version = |walk: &&Walk| walk.is_biased() && walk.record.conditions.version == version;
+        let begun = self.walks.iter().filter(is_of_version).count();
         for (seed, SeedStructurePlan { name, .. }, conditions) in planned_walks(seed_structures).skip(begun) {
             let id = self.next_walk_id();
-            commit.decisions.push(self.start_walk(id, seed, name, conditions.clone()));
+            let conditions = WalkConditions { version, ..conditions.clone() };
+            commit.decisions.push(self.start_walk(id, seed, name, conditions));
             commit.walks.push(self.walks[id].to_record());
         }
         self.add_values(&mut commit);
         commit
+    }
+
+    /// Takes up the version of the potential in force, unless the log has it already: walks of earlier versions end, and the
+    /// mixture is that of the version.
+    pub fn take_up_version(&mut self, commit: &mut Commit) {
+        let next = self.settings.version.clone();
+        if self.version == next.version {
+            return;
+        }
+        let left: Vec<_> = [true, false].into_iter().flat_map(|biased| self.walks.unfinished(biased)).collect();
+        for id in left {
+            self.end_walk(id, &WalkEnd::Superseded, commit);
+            commit.walks.push(self.walks[id].to_record());
+        }
+        self.version = next.version;
+        self.mixture = Arc::new(self.regrader.original.at_version(self.mixture.version() + 1));
+        commit.components.clear();
+        commit.restart_mixture = true;
+        self.forgetting.restart();
+        self.accepted_by_seed_structure.clear();
+        self.full_seed_structures.clear();
+        if std::mem::take(&mut self.switched_to_additive) {
+            commit.values.push((ADDITIVE.to_owned(), "0".to_owned()));
+        }
+        commit.values.push((TRAINING_FRAMES.to_owned(), self.forgetting_state().to_json().to_string()));
+        commit.decisions.push(self.campaign_decision(VERSION, json!(next)));
     }
 
     /// Records the rules if they differ from those in the log. A campaign starts with the rules of its configuration.
@@ -72,10 +106,21 @@ impl DecisionState {
         }
     }
 
-    /// Whether a walk ended only because of a limit that is no longer reached.
+    /// Whether a walk of the version in force ended only because of a limit that is no longer reached, or for a new version that
+    /// was refused.
     pub fn can_resume(&self, id: WalkId) -> bool {
         let walk = &self.walks[id];
-        !self.is_budget_exhausted() && walk.ended_by_budget() && !self.has_collected_enough(walk)
+        let may_go_on = match walk.was_superseded() {
+            true => !self.is_refit_due(),
+            false => walk.ended_by_budget(),
+        };
+        let is_in_force = walk.record.conditions.version == self.version;
+        may_go_on && is_in_force && !self.is_budget_exhausted() && !self.has_collected_enough(walk)
+    }
+
+    /// Whether biased walks make room for a new version of the potential.
+    pub fn is_refit_due(&self) -> bool {
+        self.settings.refit_at.is_some_and(|structures| self.accepted >= structures)
     }
 
     /// Whether a walk, or all walks of its seed structure together, have their maximum number of structures.

@@ -113,4 +113,9 @@ impl Walk {
         self.is_biased()
             && [WalkEnd::QuotaReached, WalkEnd::Budget].iter().any(|end| self.record.state == end.name())
     }
+
+    /// Whether it made room for a new version of the potential.
+    pub fn was_superseded(&self) -> bool {
+        self.is_biased() && self.record.state == WalkEnd::Superseded.name()
+    }
 }

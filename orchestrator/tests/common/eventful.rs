@@ -15,7 +15,7 @@ use wire::transport::WorkItem;
 
 use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
-use super::{CAMPAIGN, grader, mixture, seed_structure, settings};
+use super::{CAMPAIGN, grader, mixture_of, seed_structure, settings};
 
 /// Number of label jobs above which a live campaign raises its threshold.
 const QUEUE_LIMIT: u64 = 5;
@@ -24,7 +24,8 @@ fn open(settings: &SelectorSettings, seeds: usize, snapshot: SelectorSnapshot) -
     let seeds = (0..seeds)
         .map(|number| SeedStructurePlan { walks: walks_of(number), ..seed_structure(number) })
         .collect();
-    let selector = Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), None, snapshot);
+    let original = mixture_of(settings.version.version);
+    let selector = Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), original, None, snapshot);
     let mut selector = selector.unwrap();
     if settings.mode == CampaignMode::Live {
         selector.raise_threshold_above(QUEUE_LIMIT);

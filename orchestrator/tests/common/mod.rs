@@ -13,7 +13,7 @@ use calm::{
 };
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    CampaignMode, OnForgetting, Scheduling, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
+    CampaignMode, OnForgetting, PotentialVersion, Scheduling, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
     TrainingFrames, UpdateProtocol,
 };
 use store::records::{AtomGrades, Commit};
@@ -35,12 +35,18 @@ pub fn aluminium() -> Species {
 
 /// Two components with unit covariance and θ = 1: γ is the distance of **z** from the nearer centroid.
 pub fn mixture() -> Arc<Mixture> {
+    mixture_of(0)
+}
+
+/// The original mixture of a version of the potential: later ones have a larger θ, 1 + version / 4.
+pub fn mixture_of(version: u32) -> Arc<Mixture> {
+    let theta = 1.0 + 0.25 * f64::from(version);
     let identity: Vec<f64> =
         (0..DIMENSION * DIMENSION).map(|k| f64::from(k % (DIMENSION + 1) == 0)).collect();
     let component = |centroid: [f64; DIMENSION]| {
         let scatter = identity.iter().map(|value| 100.0 * value).collect();
         let statistics = Statistics { scatter, count: 100.0, effective_count: 100.0 };
-        Arc::new(Component::new(centroid.to_vec(), identity.clone(), 1.0, Some(statistics)).unwrap())
+        Arc::new(Component::new(centroid.to_vec(), identity.clone(), theta, Some(statistics)).unwrap())
     };
     Arc::new(Mixture::new(0, vec![CENTROIDS.map(component).to_vec()]).unwrap())
 }
@@ -92,6 +98,8 @@ pub fn settings(mode: CampaignMode) -> SelectorSettings {
         control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),
         declined_feature_bytes: 1 << 20,
+        version: Default::default(),
+        refit_at: None,
     }
 }
 
@@ -106,7 +114,8 @@ pub fn try_restore(
     snapshot: SelectorSnapshot,
 ) -> Result<Selector, orchestrator::selector::SelectorError> {
     let seeds = (0..seeds).map(seed_structure).collect();
-    Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), training, snapshot)
+    let original = mixture_of(settings.version.version);
+    Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), original, training, snapshot)
 }
 
 /// A selector at the start of a campaign, with its walks.
@@ -199,6 +208,18 @@ pub fn offer(
 
 pub fn ended(assignment: &Assignment, step: u64, end: WalkEnd) -> AssignmentReport {
     report(assignment, Outcome::Ended(end), at(step))
+}
+
+/// The settings with this version of the potential, trained from the one before.
+pub fn with_version(settings: &SelectorSettings, version: u32) -> SelectorSettings {
+    let file = |name| format!("{name} {version}");
+    let version = PotentialVersion {
+        version,
+        parent: version.saturating_sub(1),
+        model: file("model"),
+        mixture: file("mixture"),
+    };
+    SelectorSettings { version, refit_at: None, ..settings.clone() }
 }
 
 /// The selector's decision on a report that completes its round.

@@ -53,16 +53,14 @@ fn by_conditions(walks: &[WalkStatus]) -> Vec<(WalkConditions, Vec<&WalkStatus>)
     let mut all: Vec<(WalkConditions, Vec<&WalkStatus>)> = Vec::new();
     let mut places = HashMap::new();
     for walk in walks.iter().filter(|walk| walk.origin == "biased") {
-        let Some(WalkConditions { group, temperature, tau, volume_ramp, repeat: _ }) = &walk.conditions
-        else {
-            continue;
-        };
+        let Some(conditions) = &walk.conditions else { continue };
+        let WalkConditions { group, temperature, tau, volume_ramp, repeat: _, version } = conditions;
         // Numbers have no hash, their bits have.
         let ramp = volume_ramp.map(|(from, to)| (from.to_bits(), to.to_bits()));
-        let place = *places.entry((group, temperature.to_bits(), tau.to_bits(), ramp)).or_insert(all.len());
+        let key = (group, temperature.to_bits(), tau.to_bits(), ramp, version);
+        let place = *places.entry(key).or_insert(all.len());
         if place == all.len() {
-            let (group, temperature, tau, volume_ramp) = (group.clone(), *temperature, *tau, *volume_ramp);
-            all.push((WalkConditions { group, temperature, tau, volume_ramp, repeat: 0 }, Vec::new()));
+            all.push((WalkConditions { repeat: 0, ..conditions.clone() }, Vec::new()));
         }
         all[place].1.push(walk);
     }

@@ -25,6 +25,7 @@ fn end() -> impl Strategy<Value = WalkEnd> {
     prop_oneof![
         Just(WalkEnd::Completed),
         Just(WalkEnd::QuotaReached),
+        Just(WalkEnd::Superseded),
         ".{0,40}".prop_map(|guard| WalkEnd::Trapped { guard }),
         ".{0,40}".prop_map(|reason| WalkEnd::Diverged { reason }),
         ".{0,40}".prop_map(|reason| WalkEnd::InvalidStart { reason }),
@@ -91,13 +92,14 @@ pub fn assignment() -> impl Strategy<Value = Assignment> {
 
 fn conditions() -> impl Strategy<Value = WalkConditions> {
     let ramp = option::of((0.1..9.0, 0.1..9.0));
-    ("[a-z]{0,9}", 1.0..9000.0, 0.0..9.0, ramp, any::<u32>()).prop_map(
-        |(group, temperature, tau, volume_ramp, repeat)| WalkConditions {
+    ("[a-z]{0,9}", 1.0..9000.0, 0.0..9.0, ramp, any::<u32>(), any::<u32>()).prop_map(
+        |(group, temperature, tau, volume_ramp, repeat, version)| WalkConditions {
             group,
             temperature,
             tau,
             volume_ramp,
             repeat,
+            version,
         },
     )
 }
