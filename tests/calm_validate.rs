@@ -94,8 +94,17 @@ fn a_model_of_one_element_is_tested_completely() {
     assert_eq!((&detection["compression"], &detection["stretching"]), (&true.into(), &true.into()));
     let defects = found["defects"].as_array().unwrap();
     let names: Vec<_> = defects.iter().map(|defect| defect["name"].as_str().unwrap()).collect();
-    assert_eq!(names, ["vacancy", "(111)", "(100)", "(110)", "Σ5 (310)"]);
-    for defect in defects {
+    assert_eq!(names, ["vacancy", "(111)", "(100)", "(110)", "Σ5 (310)", "vacancy", "(111)"]);
+    let (own, others) = defects.split_at(5);
+    assert!(own.iter().all(|defect| defect["prototype"] == "fcc" && defect["is_ground_state"] == true));
+    for defect in others {
+        // The bond scan of bcc aluminium has the distance of these crystals, and the grade of the perfect one.
+        assert!(defect["prototype"] == "bcc" && defect["relaxation"].is_null(), "{defect}");
+        let perfect = &found["bond_scans"][1]["detection"][0]["at_equilibrium"];
+        let [crystal, perfect] = [&defect["crystal"][0], perfect].map(|gamma| gamma.as_f64().unwrap());
+        assert!((crystal / perfect - 1.0).abs() < 1e-9, "{crystal} {perfect}");
+    }
+    for defect in own {
         let shells = defect["shells"].as_array().unwrap();
         let grade = |shell: &Value| shell["scores"][0].as_f64().unwrap();
         let (near, far) = (grade(&shells[0]), grade(&shells[shells.len() - 1]));
@@ -121,6 +130,13 @@ fn a_model_of_one_element_is_tested_completely() {
     assert!(
         page.contains("Table 1.") && page.contains("no two elements") && page.matches("<svg").count() == 5
     );
+    // Both crystals share a panel, the second one dashed.
+    for figure in ["bond-scans", "vacancies", "surfaces"] {
+        let svg = std::fs::read_to_string(here.join(format!("first/figures/{figure}.svg"))).unwrap();
+        assert!(svg.contains(">Al, fcc; dashed, bcc<") && svg.contains("does not form"), "{figure}");
+        let dashed = |line: &str| line.contains("#d55e00") && line.contains("stroke-dasharray");
+        assert!(svg.lines().any(dashed), "{figure}");
+    }
     validate(here, "al_eam_1l", "second", &quick);
     assert!(files == contents(&here.join("second")), "the same bytes");
 }

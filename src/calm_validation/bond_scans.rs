@@ -60,9 +60,13 @@ pub struct ScanPoint {
 /// The ground state of an element, and fcc or bcc as one that it does not form.
 fn prototypes(species: Species) -> Vec<(Species, GroundState, bool)> {
     let ground = species.ground_state();
-    let prototype = if ground.prototype == Prototype::Bcc { Prototype::Fcc } else { Prototype::Bcc };
-    let other = GroundState { prototype, is_own: false, ..ground };
+    let other = GroundState { prototype: other_prototype(species), is_own: false, ..ground };
     vec![(species, ground, true), (species, other, false)]
+}
+
+/// Bcc, or fcc for an element whose ground state is bcc.
+pub fn other_prototype(species: Species) -> Prototype {
+    if species.ground_state().prototype == Prototype::Bcc { Prototype::Fcc } else { Prototype::Bcc }
 }
 
 /// Number of scans.
@@ -84,10 +88,10 @@ pub fn run(subject: &Subject, settings: &ValidationSettings, progress: &Validati
     )
 }
 
-/// The equilibrium distance of each element's ground state, Å.
-pub fn distances(scans: &[BondScan]) -> BTreeMap<String, f64> {
-    let ground_states = scans.iter().filter(|scan| scan.is_ground_state);
-    ground_states.map(|scan| (scan.element.clone(), scan.equilibrium)).collect()
+/// The equilibrium distance of each element's ground state, or of the crystal that it does not form, Å.
+pub fn distances(scans: &[BondScan], of_ground_states: bool) -> BTreeMap<String, f64> {
+    let scans = scans.iter().filter(|scan| scan.is_ground_state == of_ground_states);
+    scans.map(|scan| (scan.element.clone(), scan.equilibrium)).collect()
 }
 
 fn scan(

@@ -5,8 +5,10 @@ use std::collections::BTreeMap;
 use atoms::cell::{norm, sub};
 use atoms::prototypes::{Facet, Prototype, grain_boundary, slab, vacancy};
 use atoms::{Species, Structure, Vec3};
+use md::Fire;
 use serde::Serialize;
 
+use super::bond_scans::other_prototype;
 use super::grader::Graded;
 use super::{Subject, ValidationGrader, ValidationProgress, ValidationSettings};
 use crate::all_cores;
@@ -21,11 +23,14 @@ pub struct Defect {
     pub element: String,
     /// The crystal.
     pub prototype: String,
+    /// Whether this is the element's ground state. Others show the grade at defects of a crystal that the element does not form.
+    pub is_ground_state: bool,
     /// What it is.
     pub kind: DefectKind,
     /// Its name: the facet of a surface.
     pub name: &'static str,
-    /// The relaxation of its positions; `None` if positions are ideal, because nothing else was asked for or atoms collapse.
+    /// The relaxation of its positions; `None` if positions are ideal, because nothing else was asked for, atoms collapse or the
+    /// element does not form the crystal.
     pub relaxation: Option<Relaxation>,
     /// Scores of the perfect crystal, as [`Shell::scores`].
     pub crystal: Vec<f64>,
@@ -76,36 +81,60 @@ pub struct Shell {
 }
 
 /// A defect to be built.
-type Task = (Species, Prototype, f64, DefectKind, Option<Facet>);
+#[derive(Clone, Copy, Debug)]
+struct DefectTask {
+    species: Species,
+    prototype: Prototype,
+    is_ground_state: bool,
+    /// Å.
+    distance: f64,
+    kind: DefectKind,
+    facet: Option<Facet>,
+}
 
-/// The defects of the crystals that elements really form.
-fn tasks(settings: &ValidationSettings, distance: impl Fn(Species) -> f64) -> Vec<Task> {
-    let of = |species: &Species| {
-        let (species, prototype) = (*species, species.ground_state().prototype);
-        let d = distance(species);
-        let facets =
-            Facet::for_prototype(prototype).iter().map(move |facet| (DefectKind::Surface, Some(*facet)));
-        let has_boundary = matches!(prototype, Prototype::Fcc | Prototype::Bcc);
+/// The defects of the crystals that elements really form, and after those of each element a vacancy and the (111) surface of a crystal
+/// that it does not form (paper, 'Controlled structural and chemical extrapolation'). `distance` has the equilibrium distance of an
+/// element, by whether the crystal is its ground state.
+fn tasks(settings: &ValidationSettings, distance: impl Fn(Species, bool) -> f64) -> Vec<DefectTask> {
+    let of = |species: Species| {
+        let ground = species.ground_state().prototype;
+        let facets = Facet::for_prototype(ground).iter().map(|facet| (DefectKind::Surface, Some(*facet)));
+        let has_boundary = matches!(ground, Prototype::Fcc | Prototype::Bcc);
         let boundary = has_boundary.then_some((DefectKind::GrainBoundary, None));
-        let all = [(DefectKind::Vacancy, None)].into_iter().chain(facets).chain(boundary);
-        all.map(move |(kind, facet)| (species, prototype, d, kind, facet))
+        let own = [(DefectKind::Vacancy, None)].into_iter().chain(facets).chain(boundary);
+        let own = own.map(|defect| (ground, true, defect));
+        let others = [(DefectKind::Vacancy, None), (DefectKind::Surface, Some(Facet::F111))];
+        let others = others.map(|defect| (other_prototype(species), false, defect));
+        let task = |(prototype, is_ground_state, (kind, facet))| DefectTask {
+            species,
+            prototype,
+            is_ground_state,
+            distance: distance(species, is_ground_state),
+            kind,
+            facet,
+        };
+        own.chain(others).map(task).collect::<Vec<_>>()
     };
-    settings.elements.iter().filter(|species| species.ground_state().is_own).flat_map(of).collect()
+    settings.elements.iter().copied().filter(|species| species.ground_state().is_own).flat_map(of).collect()
 }
 
 /// Number of defects.
 pub fn count(settings: &ValidationSettings) -> usize {
-    tasks(settings, |species| species.ground_state().distance).len()
+    tasks(settings, |species, _| species.ground_state().distance).len()
 }
 
-/// Relaxes and grades the defects of all elements, with these equilibrium distances, Å.
+/// Relaxes and grades the defects of all elements, with the equilibrium distances of their ground states and of the crystals that they
+/// do not form, Å.
 pub fn run(
     subject: &Subject,
     settings: &ValidationSettings,
-    distances: &BTreeMap<String, f64>,
+    [of_ground_states, of_others]: [&BTreeMap<String, f64>; 2],
     progress: &ValidationProgress,
 ) -> Vec<Defect> {
-    let tasks = tasks(settings, |species| distances[species.symbol()]);
+    let tasks = tasks(settings, |species, is_ground_state| {
+        let distances = if is_ground_state { of_ground_states } else { of_others };
+        distances[species.symbol()]
+    });
     all_cores::map(
         tasks.into_iter(),
         || ValidationGrader::new(subject),
@@ -122,10 +151,11 @@ impl Defect {
         grader: &mut ValidationGrader,
         settings: &ValidationSettings,
         progress: &ValidationProgress,
-        (species, prototype, distance, kind, facet): Task,
+        task: DefectTask,
     ) -> Self {
-        let (ideal, distances, centre) = ideal(species, prototype, distance, kind, facet);
-        let (mut structure, mut relaxation) = relaxed(grader, settings, progress, &ideal);
+        let DefectTask { species, prototype, is_ground_state, distance, kind, facet } = task;
+        let (ideal, distances, centre) = ideal(&task);
+        let (mut structure, mut relaxation) = relaxed(grader, task.relaxation(settings), progress, &ideal);
         let mut graded = grader.grade(&structure);
         if graded.is_err() && relaxation.is_some() {
             // The model lets atoms collapse.
@@ -136,6 +166,7 @@ impl Defect {
         let mut defect = Self {
             element: species.to_string(),
             prototype: prototype.to_string(),
+            is_ground_state,
             kind,
             name: facet.map_or(kind.name(), Facet::name),
             relaxation,
@@ -157,6 +188,13 @@ impl Defect {
     }
 }
 
+impl DefectTask {
+    /// How positions are relaxed. A crystal that the element does not form would turn into another one, and keeps ideal positions.
+    fn relaxation(&self, settings: &ValidationSettings) -> Option<Fire> {
+        settings.relaxation.filter(|_| self.is_ground_state)
+    }
+}
+
 impl DefectKind {
     /// Its name.
     pub fn name(self) -> &'static str {
@@ -169,13 +207,8 @@ impl DefectKind {
 }
 
 /// The unrelaxed structure, the distance of its atoms to the defect and the centre of a vacancy, Å.
-fn ideal(
-    species: Species,
-    prototype: Prototype,
-    distance: f64,
-    kind: DefectKind,
-    facet: Option<Facet>,
-) -> (Structure, Vec<f64>, Option<Vec3>) {
+fn ideal(task: &DefectTask) -> (Structure, Vec<f64>, Option<Vec3>) {
+    let DefectTask { species, prototype, distance, kind, facet, .. } = *task;
     if let Some(facet) = facet {
         let slab = slab(prototype, species, distance, facet);
         let depths = slab.depths();
@@ -195,14 +228,14 @@ fn ideal(
     }
 }
 
-/// The structure with relaxed positions, if that was asked for and is possible.
+/// The structure with relaxed positions, if `fire` says how and it is possible.
 fn relaxed(
     grader: &mut ValidationGrader,
-    settings: &ValidationSettings,
+    fire: Option<Fire>,
     progress: &ValidationProgress,
     ideal: &Structure,
 ) -> (Structure, Option<Relaxation>) {
-    let Some(fire) = settings.relaxation else { return (ideal.clone(), None) };
+    let Some(fire) = fire else { return (ideal.clone(), None) };
     let stop = || progress.is_stopped();
     match fire.relax(ideal.clone(), &mut grader.features.grace, &stop) {
         Ok(found) => {
@@ -256,17 +289,25 @@ mod tests {
             elements,
             pairs: Vec::new(),
             scan_steps: 2,
-            relaxation: None,
+            relaxation: Some(Fire::default()),
             solution_structures: 1,
             seed: 0,
         };
-        assert_eq!(count(&settings), 5 + 5 + 4 + 2);
-        for (species, prototype, distance, kind, facet) in tasks(&settings, |_| 2.5) {
-            let (structure, distances, _) = ideal(species, prototype, distance, kind, facet);
+        // Two more of each element, of another crystal.
+        assert_eq!(count(&settings), 5 + 5 + 4 + 2 + 4 * 2);
+        let tasks = tasks(&settings, |_, is_ground_state| if is_ground_state { 2.5 } else { 2.7 });
+        for task in &tasks {
+            let (structure, distances, _) = ideal(task);
             assert_eq!(structure.len(), distances.len());
             let nearest = distances.iter().copied().fold(f64::INFINITY, f64::min);
-            let expected = if kind == DefectKind::Vacancy { 2.5 } else { 0.0 };
-            assert!((nearest - expected).abs() < 1e-9, "{species} {kind:?} {facet:?}: {nearest}");
+            let expected = if task.kind == DefectKind::Vacancy { task.distance } else { 0.0 };
+            assert!((nearest - expected).abs() < 1e-9, "{task:?}: {nearest}");
+            assert_eq!(task.relaxation(&settings).is_some(), task.is_ground_state);
         }
+        let others = tasks.iter().filter(|task| !task.is_ground_state);
+        let others: Vec<_> =
+            others.map(|task| (task.species.symbol(), task.prototype, task.facet, task.distance)).collect();
+        assert_eq!(others[0], ("Al", Prototype::Bcc, None, 2.7));
+        assert_eq!(others[3], ("W", Prototype::Fcc, Some(Facet::F111), 2.7));
     }
 }

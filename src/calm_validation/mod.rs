@@ -140,8 +140,8 @@ pub fn run(
             + collisions::count(&settings),
     );
     let bond_scans = bond_scans::run(subject, &settings, progress);
-    let distances = bond_scans::distances(&bond_scans);
-    let defects = defects::run(subject, &settings, &distances, progress);
+    let [distances, of_others] = [true, false].map(|own| bond_scans::distances(&bond_scans, own));
+    let defects = defects::run(subject, &settings, [&distances, &of_others], progress);
     let solutions = solutions::run(subject, &settings, &distances, progress)?;
     let collisions = collisions::run(subject, &settings, &distances, progress);
     if progress.is_stopped() {

@@ -122,7 +122,7 @@ fn bond_scans(validation: &Validation) -> PageTable {
 
 fn defects(validation: &Validation) -> PageTable {
     let caption = "Grades at defects: of the perfect crystal, next to the defect and farthest from it. The longest displacement is that of the \
-                   relaxation.";
+                   relaxation; crystals that the element does not form keep ideal positions.";
     let titles = [
         "element",
         "crystal",

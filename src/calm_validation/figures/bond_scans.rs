@@ -1,10 +1,13 @@
 //! Energy and scores along bond scans (the paper's Figs. 3a, S1 and S10).
 
-use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Panel, Rectangle};
+use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Panel, Point, Rectangle};
 
 use super::super::detection::{COMPRESSION, DetectionRule, LONGEST, STRETCHING};
 use super::super::{BondScan, Validation};
-use super::layout::{PanelGrid, axis, legend_height, legend_rows, letter, line, panel_name};
+use super::layout::{
+    OTHER_CRYSTAL, PanelGrid, axis, crystal_names, legend_height, legend_rows, letter, line, other_line,
+    panel_name,
+};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
 use crate::page::style::WIDTH;
@@ -31,7 +34,7 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
         let others: Vec<_> =
             validation.bond_scans.iter().filter(|other| is_other_crystal(scan, other)).collect();
         let above = Rectangle { height: ENERGIES, ..place };
-        draw_energies(&mut figure, scan, above, letter(k));
+        draw_energies(&mut figure, scan, &others, above, letter(k));
         let height = place.height - ENERGIES - GAP;
         let below = Rectangle { y: place.y + ENERGIES + GAP, height, ..place };
         draw_scores(&mut figure, validation, scan, &others, below);
@@ -46,8 +49,7 @@ fn is_other_crystal(scan: &BondScan, other: &BondScan) -> bool {
 fn keys(validation: &Validation) -> Vec<(LegendKey, String)> {
     let drawn = validation.scores.iter().enumerate().filter(|(_, score)| score.rule.is_some());
     let mut keys: Vec<_> = drawn.map(|(k, score)| (LegendKey::Line(line(k)), score.name.clone())).collect();
-    let grey = Colour::GREY.dashed(1.2);
-    keys.push((LegendKey::Line(grey), "γ, crystal that the element does not form".into()));
+    keys.push((LegendKey::Line(other_line()), format!("γ, {OTHER_CRYSTAL}")));
     keys
 }
 
@@ -56,18 +58,25 @@ fn distances(title: &str, scan: &BondScan) -> Axis {
     Axis::new(title, AxisScale::Linear, first, LONGEST)
 }
 
-fn draw_energies(figure: &mut Figure, scan: &BondScan, place: Rectangle, letter: char) {
-    let energies: Vec<_> = scan.points.iter().filter_map(|p| Some([p.distance, p.energy?])).collect();
+/// Energies per atom along a scan, relative to `zero`, eV.
+fn energies(scan: &BondScan, zero: f64) -> Vec<Point> {
+    scan.points.iter().filter_map(|point| Some([point.distance, point.energy? - zero])).collect()
+}
+
+fn draw_energies(figure: &mut Figure, scan: &BondScan, others: &[&BondScan], place: Rectangle, letter: char) {
     let lowest = scan.energy.unwrap_or(0.0);
-    let stretched = energies.iter().filter(|[d, _]| *d > scan.equilibrium).map(|[_, energy]| energy - lowest);
+    let own = energies(scan, lowest);
+    let stretched = own.iter().filter(|[d, _]| *d > scan.equilibrium).map(|[_, energy]| *energy);
     let depth = stretched.fold(0.1, f64::max).min(MAX_ENERGY);
     let y = Axis::new("ΔE (eV)", AxisScale::Linear, -0.15 * depth, 1.25 * depth).with_ticks(3);
     let mut panel = Panel::new(place, distances("", scan).without_ticks(), y);
     panel.vertical_line(scan.equilibrium);
-    panel.line(energies.iter().map(|[d, energy]| [*d, energy - lowest]), Colour::INK.line(1.0));
+    others.iter().for_each(|other| panel.line(energies(other, lowest), Colour::INK.dashed(0.8)));
+    panel.line(own, Colour::INK.line(1.0));
     panel.panel_letter(letter);
     panel.draw(figure);
-    panel_name(figure, place, &scan.element, &scan.prototype);
+    let dashed = others.first().map(|other| other.prototype.as_str());
+    panel_name(figure, place, &scan.element, &crystal_names(&scan.prototype, dashed));
 }
 
 /// What the scores of a scan are divided by, so that 1 is the limit of detection.
@@ -97,8 +106,7 @@ fn draw_scores(
 ) {
     let drawn = (0..validation.scores.len())
         .filter_map(|k| Some((line(k), points(scan, k, limit(validation, scan, k)?))));
-    let mut lines: Vec<_> =
-        others.iter().map(|other| (Colour::GREY.dashed(1.2), points(other, 0, 1.0))).collect();
+    let mut lines: Vec<_> = others.iter().map(|other| (other_line(), points(other, 0, 1.0))).collect();
     let own: Vec<_> = drawn.collect();
     lines.extend(own.into_iter().rev());
     let values = lines.iter().flat_map(|(_, points)| points.iter().map(|[_, y]| *y));
@@ -163,7 +171,8 @@ fn caption(validation: &Validation) -> String {
     };
     format!(
         "Energy per atom relative to that at equilibrium (above) and largest score of an atom (below) of the elements’ ground-state crystals, scaled \
-         over {} distances of nearest neighbours. Dashed, the distance with the lowest energy and the limit 1. Shaded, compression \
+         over {} distances of nearest neighbours; dashed, energy and γ of a crystal that the element does not form. Dashed grey, the distance with \
+         the lowest energy and the limit 1. Shaded, compression \
          (d < {COMPRESSION} d_{{eq}}) and stretching ({STRETCHING} d_{{eq}} < d < {LONGEST} Å), which a grade should flag.{relative}{without}{guessed}{stand_in}",
         validation.settings.scan_steps
     )

@@ -4,10 +4,16 @@ use figures::{Axis, AxisScale, Colour, Figure, LegendKey, Marker, Panel, Rectang
 
 use super::super::defects::{DefectKind, Shell};
 use super::super::{Defect, Validation};
-use super::layout::{PanelGrid, axis, legend_height, legend_rows, letter, line, panel_name};
+use super::layout::{
+    OTHER_CRYSTAL, PanelGrid, axis, crystal_names, legend_height, legend_rows, letter, line, other_line,
+    panel_name,
+};
 use crate::csv::{self, Csv};
 use crate::page::FigureContent;
 use crate::page::style::WIDTH;
+
+/// Opacity of γ_nbr.
+const PALE: f64 = 0.4;
 
 pub fn draw(validation: &Validation, name: &'static str, kind: DefectKind) -> Result<FigureContent, String> {
     let all: Vec<_> = validation.defects.iter().filter(|defect| defect.kind == kind).collect();
@@ -18,7 +24,7 @@ pub fn draw(validation: &Validation, name: &'static str, kind: DefectKind) -> Re
             None => "No element has a crystal with this defect.".into(),
         });
     }
-    // One panel for each element; the facets of a surface share it.
+    // One panel for each element; the facets of a surface share it, and two crystals do.
     let panels: Vec<_> = graded.chunk_by(|a, b| a.element == b.element).collect();
     let keys = keys(kind, &panels);
     let grid = PanelGrid { number: panels.len(), height: 140.0, top: 20.0 + legend_height(&keys) };
@@ -31,29 +37,37 @@ pub fn draw(validation: &Validation, name: &'static str, kind: DefectKind) -> Re
     Ok(FigureContent { figure, caption: caption(kind, &graded), numbers: numbers(validation, &all) })
 }
 
-/// The lines of γ and γ_nbr of defect `k` of a panel.
-fn strokes(k: usize) -> [Stroke; 2] {
-    let solid = Stroke { dashes: &[], ..line(k) };
-    [solid, Stroke { dashes: &[3.0, 2.0], ..solid }]
+/// The lines of γ and γ_nbr of a defect: dashed in a crystal that the element does not form.
+fn strokes(defect: &Defect) -> [Stroke; 2] {
+    let k = if defect.kind == DefectKind::Surface { colour_index(defect.name) } else { 0 };
+    let dashes: &'static [f64] = if defect.is_ground_state { &[] } else { other_line().dashes };
+    let gamma = Stroke { dashes, ..line(k) };
+    [gamma, pale(gamma)]
+}
+
+fn pale(stroke: Stroke) -> Stroke {
+    Stroke { paint: stroke.paint.colour.faint(PALE), ..stroke }
 }
 
 fn keys(kind: DefectKind, panels: &[&[&Defect]]) -> Vec<(LegendKey, String)> {
-    if kind != DefectKind::Surface {
-        let [gamma, average] = [LegendKey::Line(strokes(0)[0]), LegendKey::Line(strokes(0)[1])];
-        return vec![(gamma, "γ".into()), (average, "γ_{nbr}".into())];
-    }
-    let mut names: Vec<&str> = Vec::new();
-    for defect in panels.iter().copied().flatten() {
-        if !names.contains(&defect.name) {
-            names.push(defect.name);
+    let defects = || panels.iter().copied().flatten();
+    let mut keys = Vec::new();
+    let gamma = if kind == DefectKind::Surface { Colour::INK.line(1.0) } else { line(0) };
+    if kind == DefectKind::Surface {
+        let mut names: Vec<&str> = Vec::new();
+        for defect in defects() {
+            if !names.contains(&defect.name) {
+                names.push(defect.name);
+            }
         }
+        let key = |name: &&str| (LegendKey::Line(line(colour_index(name))), (*name).to_owned());
+        keys.extend(names.iter().map(key));
     }
-    let mut keys: Vec<_> = names
-        .iter()
-        .map(|name| (LegendKey::Line(strokes(colour_index(name))[0]), (*name).to_owned()))
-        .collect();
-    keys.push((LegendKey::Line(Colour::INK.line(1.0)), "γ".into()));
-    keys.push((LegendKey::Line(Colour::INK.dashed(1.0)), "γ_{nbr}".into()));
+    keys.push((LegendKey::Line(gamma), "γ".into()));
+    keys.push((LegendKey::Line(pale(gamma)), "γ_{nbr}".into()));
+    if defects().any(|defect| !defect.is_ground_state) {
+        keys.push((LegendKey::Line(Colour::INK.dashed(1.0)), OTHER_CRYSTAL.into()));
+    }
     keys
 }
 
@@ -79,17 +93,19 @@ fn draw_panel(figure: &mut Figure, kind: DefectKind, defects: &[&Defect], place:
         panel.line([[low, *crystal], [high, *crystal]], Colour::GREY.line(0.5));
     }
     for defect in defects {
-        let k = if kind == DefectKind::Surface { colour_index(defect.name) } else { 0 };
-        let [solid, dashed] = strokes(k);
+        let [gamma, average] = strokes(defect);
         let points =
             |of: fn(&Shell) -> f64| defect.shells.iter().map(move |shell| [shell.distance, of(shell)]);
-        panel.line(points(|shell| shell.averages[0]), dashed);
-        panel.line(points(|shell| shell.scores[0]), solid);
-        panel.dots(points(|shell| shell.scores[0]), Marker::Disc, 1.6, solid.paint, None);
+        panel.line(points(|shell| shell.averages[0]), average);
+        panel.line(points(|shell| shell.scores[0]), gamma);
+        panel.dots(points(|shell| shell.scores[0]), Marker::Disc, 1.6, gamma.paint, None);
     }
     panel.panel_letter(letter);
     panel.draw(figure);
-    panel_name(figure, place, &defects[0].element, &defects[0].prototype);
+    let first = defects[0];
+    let other = defects.iter().find(|defect| first.is_ground_state && !defect.is_ground_state);
+    let dashed = other.map(|defect| defect.prototype.as_str());
+    panel_name(figure, place, &first.element, &crystal_names(&first.prototype, dashed));
 }
 
 fn caption(kind: DefectKind, defects: &[&Defect]) -> String {
@@ -122,7 +138,15 @@ fn caption(kind: DefectKind, defects: &[&Defect]) -> String {
             unconverged.join(", ")
         ),
     };
-    format!("{what} {relaxation} Dashed grey, the limit 1; thin grey, the perfect crystal.")
+    let others = match defects.iter().any(|defect| !defect.is_ground_state) {
+        true => {
+            " Dashed, a crystal that the element does not form, at ideal positions: bcc, or fcc for bcc elements."
+        }
+        false => "",
+    };
+    format!(
+        "{what} {relaxation} γ_{{nbr}} is pale.{others} Dashed grey, the limit 1; thin grey, the perfect crystal of the ground state."
+    )
 }
 
 fn numbers(validation: &Validation, defects: &[&Defect]) -> Csv {

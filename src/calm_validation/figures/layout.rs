@@ -61,6 +61,19 @@ pub fn letter(k: usize) -> char {
     u8::try_from(k).ok().filter(|k| *k < 26).map_or(' ', |k| char::from(b'a' + k))
 }
 
+/// Line of γ in a crystal that the element does not form: that of γ, dashed.
+pub fn other_line() -> Stroke {
+    Stroke { dashes: &[3.0, 2.0], ..line(0) }
+}
+
+/// What the dashed lines are, for legends.
+pub const OTHER_CRYSTAL: &str = "crystal that the element does not form";
+
+/// The names of the crystal with solid lines and of the one with dashed lines in a panel.
+pub fn crystal_names(solid: &str, dashed: Option<&str>) -> String {
+    dashed.map_or(solid.to_owned(), |dashed| format!("{solid}; dashed, {dashed}"))
+}
+
 /// Writes element and crystal above a panel, behind its letter.
 pub fn panel_name(figure: &mut Figure, place: Rectangle, element: &str, prototype: &str) {
     figure.text([place.x - 8.0, place.y - 6.0], &format!("{element}, {prototype}"), Anchor::Start);

@@ -54,13 +54,13 @@ pub fn draw(validation: &Validation) -> Result<FigureContent, String> {
     Ok(FigureContent { figure, caption: caption.into(), numbers })
 }
 
-/// A vacancy, one surface and a boundary of each element.
+/// A vacancy, one surface and a boundary of each element's ground state.
 fn is_shown(defect: &Defect) -> bool {
     let is_first = match defect.kind {
         DefectKind::Surface => ["(111)", "(0001)"].contains(&defect.name),
         _ => true,
     };
-    is_first && defect.graded.is_some()
+    is_first && defect.is_ground_state && defect.graded.is_some()
 }
 
 /// Positions on the page (Å, to the right and up) of the atoms that are drawn, from the farthest to the nearest. A vacancy is in
