@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use analysis::{Bins, Exceedance, ForceErrors, LabelledEnergy, SystematicSample};
-use atoms::Species;
 use atoms::cell::{norm, sub};
 use atoms::extxyz::FrameLabels;
+use atoms::{Species, Vec3};
 
 use super::deviations::Deviations;
 
@@ -16,7 +16,7 @@ pub const LARGE_ERROR: f64 = 1.0;
 pub const THRESHOLDS: [f64; 19] =
     [0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0];
 
-/// Atoms in the sample for ranks, quantiles and intervals: about 120 bytes each for two scores.
+/// Atoms in the sample for ranks, quantiles and intervals: about 150 bytes each for two scores.
 const SAMPLED_ATOMS: usize = 200_000;
 /// Structures in the sample for energy offsets and the intervals of mean errors.
 const SAMPLED_STRUCTURES: usize = 50_000;
@@ -70,6 +70,8 @@ pub struct SampledAtom {
     pub composition: Arc<[(u8, u32)]>,
     /// |F_model − F_label|, eV/Å.
     pub error: f64,
+    /// F_model − F_label, eV/Å.
+    pub difference: Vec3,
     /// One for each column.
     pub scores: Box<[f64]>,
 }
@@ -145,7 +147,7 @@ impl LabelledErrors {
         self.stress.merge(stress, 1);
         if let (Some(predicted), Some(labels)) = (&graded.predicted.forces, &graded.labels.forces) {
             for (atom, (a, b)) in predicted.iter().zip(labels).enumerate() {
-                self.add_atom(graded, &structure.composition, atom, norm(sub(*a, *b)));
+                self.add_atom(graded, &structure.composition, atom, sub(*a, *b));
             }
         }
         self.sample.add(structure);
@@ -157,8 +159,9 @@ impl LabelledErrors {
         graded: &LabelledStructure,
         composition: &Arc<[(u8, u32)]>,
         atom: usize,
-        error: f64,
+        difference: Vec3,
     ) {
+        let error = norm(difference);
         let scores = || graded.scores.iter().map(|scores| scores[atom]);
         if !(error.is_finite() && scores().all(f64::is_finite)) {
             self.left_out += 1;
@@ -178,6 +181,7 @@ impl LabelledErrors {
             species,
             composition: Arc::clone(composition),
             error,
+            difference,
             scores: scores().collect(),
         });
     }

@@ -114,7 +114,12 @@ impl LabelledErrors {
                         .as_ref()
                         .map_or(Vec::new(), |errors| bins::with_intervals(errors, sampled, k, bootstrap)),
                     bands: atoms::bands(sampled, k),
-                    error_histograms: column.limit.and_then(|limit| ErrorHistograms::new(sampled, k, limit)),
+                    error_histograms: column
+                        .limit
+                        .and_then(|limit| ErrorHistograms::of_atoms(sampled, k, limit)),
+                    component_histograms: column
+                        .limit
+                        .and_then(|limit| ErrorHistograms::of_components(sampled, k, limit)),
                 }
             })
             .collect()

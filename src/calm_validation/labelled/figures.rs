@@ -32,7 +32,7 @@ pub fn all(report: &LabelledReport) -> Vec<FigureEntry> {
     figures
 }
 
-/// Outlines of the histograms of the atoms within and beyond the limit: (error, share of these atoms), from zero to zero.
+/// Outlines of the histograms within and beyond the limit: (error, share of these errors), from zero to zero.
 fn outlines(histograms: &ErrorHistograms) -> [Vec<Point>; 2] {
     let edges = &histograms.edges;
     histograms.populations.each_ref().map(|population| {

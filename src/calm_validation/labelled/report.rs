@@ -97,6 +97,8 @@ pub struct ScoreReport {
     pub bands: Vec<Band>,
     /// Sampled atoms by force error: within and beyond the limit.
     pub error_histograms: Option<ErrorHistograms>,
+    /// The same of the absolute errors of the components of their forces, three for each atom.
+    pub component_histograms: Option<ErrorHistograms>,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -147,14 +149,14 @@ pub struct Band {
 pub struct ErrorHistograms {
     /// Edges of the bins, eV/Å.
     pub edges: Vec<f64>,
-    /// Atoms with a score up to the limit, and those with a larger one.
+    /// Of atoms with a score up to the limit, and of those with a larger one.
     pub populations: [ErrorPopulation; 2],
 }
 
-/// Force errors of sampled atoms, eV/Å.
+/// Force errors of sampled atoms, or their components, eV/Å.
 #[derive(Clone, Debug, Serialize)]
 pub struct ErrorPopulation {
-    /// Atoms by bin.
+    /// Errors by bin.
     pub counts: Vec<u64>,
     pub mean: Option<f64>,
     pub median: Option<f64>,

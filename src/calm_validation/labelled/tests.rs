@@ -107,6 +107,19 @@ fn a_report_has_the_statistics_of_its_atoms() {
     assert_near(within.mean, Some(kept.iter().sum::<f64>() / kept.len() as f64));
     assert!(beyond.mean > within.mean && beyond.median > within.median, "{histograms:?}");
     assert_eq!(beyond.counts.iter().sum::<u64>(), 360 - kept.len() as u64);
+    let components = report.scores[0].component_histograms.as_ref().unwrap();
+    let of_sample = |sample: &Sample| {
+        let (a, b) = (sample.predicted.forces.clone().unwrap(), sample.labels.forces.clone().unwrap());
+        let atoms = a.into_iter().zip(b).zip(sample.scores[0].clone());
+        atoms.flat_map(|((a, b), score)| sub(a, b).map(|x| (score, x.abs()))).collect::<Vec<_>>()
+    };
+    let of_beyond: Vec<_> = samples.iter().flat_map(of_sample).filter(|(score, _)| *score > 1.0).collect();
+    let number = of_beyond.len() as f64;
+    assert_near(
+        components.populations[1].mean,
+        Some(of_beyond.iter().map(|(_, error)| error).sum::<f64>() / number),
+    );
+    assert_eq!(number, 3.0 * (360 - kept.len()) as f64);
     let confident = report.scores[0].confident.as_ref().unwrap();
     assert_near(confident.retention.value, share(&|score| score <= 1.0, &scores[0]));
     for (k, threshold) in report.thresholds.iter().enumerate() {
@@ -308,7 +321,12 @@ fn figures_and_tables_show_every_score() {
         assert_eq!(names, all[..if number == 1 { 5 } else { 6 }]);
         for figure in figures {
             let drawn = figure.drawn.unwrap();
-            assert!(!to_svg(&drawn.figure).contains("NaN"), "{}", figure.name);
+            let svg = to_svg(&drawn.figure);
+            assert!(!svg.contains("NaN"), "{}", figure.name);
+            // An inset has the rank of the only score with a limit, and needs a bin with enough atoms.
+            if figure.name == "error-histograms" {
+                assert_eq!(svg.matches(">ρ = ").count(), usize::from(number > 1), "{svg}");
+            }
             assert!(to_png(&drawn.figure, 40.0).is_ok());
             let rows = String::from_utf8(drawn.numbers.into_bytes()).unwrap();
             assert!(rows.lines().count() > 5 && rows.contains('γ'), "{rows}");

@@ -116,14 +116,27 @@ pub fn bands(sampled: &[&SampledAtom], column: usize) -> Vec<Band> {
 
 impl ErrorHistograms {
     /// `None` without an error above zero.
-    pub fn new(sampled: &[&SampledAtom], column: usize, limit: f64) -> Option<Self> {
-        let edges = decade_edges(sampled.iter().map(|atom| atom.error));
+    pub fn of_atoms(sampled: &[&SampledAtom], column: usize, limit: f64) -> Option<Self> {
+        Self::new(sampled.iter().map(|atom| (atom.scores[column] <= limit, atom.error)))
+    }
+
+    /// `None` without an error above zero.
+    pub fn of_components(sampled: &[&SampledAtom], column: usize, limit: f64) -> Option<Self> {
+        Self::new(sampled.iter().flat_map(|atom| {
+            let is_within = atom.scores[column] <= limit;
+            atom.difference.map(|component| (is_within, component.abs()))
+        }))
+    }
+
+    /// Of errors, each with whether it is of an atom within the limit.
+    fn new(errors: impl Iterator<Item = (bool, f64)>) -> Option<Self> {
+        let mut sides = [Vec::new(), Vec::new()];
+        errors.for_each(|(is_within, error)| sides[usize::from(!is_within)].push(error));
+        let edges = decade_edges(sides.iter().flatten().copied());
         if edges.len() < 2 {
             return None;
         }
-        let population = |is_within: bool| {
-            let atoms = sampled.iter().filter(|atom| (atom.scores[column] <= limit) == is_within);
-            let mut errors: Vec<_> = atoms.map(|atom| atom.error).collect();
+        let population = |mut errors: Vec<f64>| {
             errors.sort_by(f64::total_cmp);
             let sum = errors.iter().sum::<f64>();
             ErrorPopulation {
@@ -132,6 +145,6 @@ impl ErrorHistograms {
                 median: quantile(&errors, 0.5),
             }
         };
-        Some(Self { populations: [true, false].map(population), edges })
+        Some(Self { populations: sides.map(population), edges })
     }
 }

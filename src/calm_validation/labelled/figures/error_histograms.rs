@@ -1,16 +1,19 @@
-//! Force errors of the atoms within and beyond the limit of a score (the paper's Fig. 5).
+//! Errors of the force components of the atoms within and beyond the limit of a score (the paper's Figs. 5 and S7).
 
 use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, Panel, Rectangle};
 
 use super::super::report::{ErrorHistograms, LabelledReport, ScoreReport};
-use super::outlines;
+use super::{outlines, reliability};
 use crate::csv::{Csv, number};
 use crate::output::decimals;
 use crate::page::style::WIDTH;
 use crate::page::{FigureContent, FigureEntry};
 
-/// Height of a row of two panels, points.
-const ROW: f64 = 190.0;
+/// Height of a row of two panels, and of a panel, points.
+const ROW: f64 = 240.0;
+const PANEL: f64 = 180.0;
+/// Height of the axis, in heights of the histograms, with room for words and inset.
+const ROOM: f64 = 2.2;
 /// Colours of the atoms within and beyond the limit.
 const COLOURS: [Colour; 2] = [Colour::BLUE, Colour::VERMILLION];
 
@@ -22,19 +25,21 @@ pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
     let shown = report
         .scores
         .iter()
-        .filter_map(|score| Some((score, score.limit?, score.error_histograms.as_ref()?)));
+        .filter_map(|score| Some((score, score.limit?, score.component_histograms.as_ref()?)));
     let shown: Vec<Split> = shown.collect();
     if shown.is_empty() {
         return None;
     }
-    let description = "Force errors of the atoms within and beyond the limit of a score";
+    let description = "Errors of the force components of the atoms within and beyond the limit of a score";
     let height = ROW * shown.len().div_ceil(2) as f64 + 4.0;
     let mut figure = Figure::new("error-histograms", description, WIDTH, height);
     let mut numbers = Csv::new(&["score", "low", "high", "within", "beyond"]);
     for (k, split) in shown.iter().enumerate() {
         let (x, y) = ([46.0, 302.0][k % 2], 24.0 + ROW * (k / 2) as f64);
-        let place = Rectangle { x, y, width: 192.0, height: 130.0 };
+        let place = Rectangle { x, y, width: 192.0, height: PANEL };
         draw_panel(&mut figure, split, place, char::from(b'a' + k as u8));
+        let inset = Rectangle { x: place.right() - 92.0, y: y + 30.0, width: 84.0, height: 44.0 };
+        reliability::draw_inset(&mut figure, split.0, inset);
         push(&mut numbers, split);
     }
     let names = shown.iter().map(|split| {
@@ -42,8 +47,10 @@ pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
         format!("{} {within}; {beyond}", split.0.name)
     });
     let caption = format!(
-        "Force errors |F_{{model}} − F_{{label}}| of the {} sampled atoms up to the limit of a score (blue) and beyond it (red), each by \
-         themselves, in ten bins a decade. Means and medians (eV Å^{{−1}}) and, in parentheses, the share of the atoms beyond the limit: {}.",
+        "Absolute errors of the force components of the {} sampled atoms up to the limit of a score (blue) and beyond it (red), each by \
+         themselves, in ten bins a decade. Means and medians (eV Å^{{−1}}) and, in parentheses, the share of the atoms beyond the limit: {}. \
+         Insets, force error |F_{{model}} − F_{{label}}| of an atom against its score, as in the figure of the reliability of the threshold; ρ, \
+         Spearman’s.",
         report.sampled_atoms,
         names.collect::<Vec<_>>().join(". ")
     );
@@ -68,9 +75,8 @@ fn draw_panel(figure: &mut Figure, split: &Split, place: Rectangle, letter: char
     let outlines = outlines(histograms);
     let most = outlines.iter().flatten().map(|[_, share]| *share).fold(0.0, f64::max);
     let (low, high) = (histograms.edges[0], histograms.edges[histograms.edges.len() - 1]);
-    let x = Axis::new("force error (eV Å^{−1})", AxisScale::Logarithmic, low, high);
-    // Room for the words.
-    let y = Axis::new("share of the atoms", AxisScale::Linear, 0.0, 1.35 * most);
+    let x = Axis::new("error of a force component (eV Å^{−1})", AxisScale::Logarithmic, low, high);
+    let y = Axis::new("share of the components", AxisScale::Linear, 0.0, ROOM * most);
     let mut panel = Panel::new(place, x, y);
     let top = [panel.x.low, panel.y.high];
     for (k, (outline, colour)) in outlines.into_iter().zip(COLOURS).enumerate() {

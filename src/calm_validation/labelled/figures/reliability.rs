@@ -56,11 +56,45 @@ fn facts(score: &ScoreReport) -> String {
 fn draw_panel(figure: &mut Figure, score: &ScoreReport, place: Rectangle, letter: char) {
     let (x, y) = (score_axis(score), error_axis(score));
     let mut panel = Panel::new(place, x.clone(), y.clone());
-    let limit = score.limit.unwrap_or(f64::INFINITY);
-    let is_within = |band: &Band| band.high <= limit * (1.0 + 1e-9);
+    draw_bands(&mut panel, score);
+    if score.bands.iter().all(|band| band.atoms < MIN_ATOMS) {
+        panel.placeholder("too few atoms");
+    }
+    panel.panel_letter(letter);
+    draw_rank(&mut panel, score);
+    panel.draw(figure);
+    draw_scores(figure, score, place, &x);
+    if let Some(histograms) = &score.error_histograms {
+        draw_errors(figure, histograms, place, &y);
+    }
+}
+
+/// The bands of a panel without its margins, small; nothing with too few atoms.
+pub fn draw_inset(figure: &mut Figure, score: &ScoreReport, place: Rectangle) {
+    if score.bands.iter().all(|band| band.atoms < MIN_ATOMS) {
+        return;
+    }
+    let mut panel =
+        Panel::new(place, score_axis(score).with_ticks(3), error_axis(score).with_title("").with_ticks(3));
+    draw_bands(&mut panel, score);
+    draw_rank(&mut panel, score);
+    panel.draw(figure);
+}
+
+/// Whether all atoms of a bin are within the limit.
+fn is_within(score: &ScoreReport, band: &Band) -> bool {
+    band.high <= score.limit.unwrap_or(f64::INFINITY) * (1.0 + 1e-9)
+}
+
+fn colour(score: &ScoreReport, band: &Band) -> Colour {
+    if is_within(score, band) { Colour::BLUE } else { Colour::VERMILLION }
+}
+
+/// Bands, medians and the limit.
+fn draw_bands(panel: &mut Panel, score: &ScoreReport) {
     for run in score.bands.split(|band| band.atoms < MIN_ATOMS) {
-        for part in run.chunk_by(|a, b| is_within(a) == is_within(b)) {
-            let colour = if is_within(&part[0]) { Colour::BLUE } else { Colour::VERMILLION };
+        for part in run.chunk_by(|a, b| is_within(score, a) == is_within(score, b)) {
+            let colour = colour(score, &part[0]);
             for (low, high, opacity) in BANDS {
                 let point = |band: &Band| band.quantiles.map(|q| (middle(band), q[low], q[high]));
                 panel.band(&part.iter().filter_map(point).collect::<Vec<_>>(), colour.faint(opacity));
@@ -69,36 +103,25 @@ fn draw_panel(figure: &mut Figure, score: &ScoreReport, place: Rectangle, letter
         let median = |band: &Band| band.quantiles.map(|q| [middle(band), q[MEDIAN]]);
         panel.line(run.iter().filter_map(median), Colour::INK.dashed(1.1));
     }
-    if score.bands.iter().all(|band| band.atoms < MIN_ATOMS) {
-        panel.placeholder("too few atoms");
-    }
-    panel.vertical_line(limit);
-    panel.panel_letter(letter);
+    panel.vertical_line(score.limit.unwrap_or(f64::INFINITY));
+}
+
+/// Spearman's ρ, in the lower right corner.
+fn draw_rank(panel: &mut Panel, score: &ScoreReport) {
+    let corner = [panel.x.high, panel.y.low];
     if let Some(rho) = score.spearman.value {
-        panel.text([x.high, y.low], [-4.0, -5.0], &format!("ρ = {rho:.3}"), Anchor::End);
-    }
-    panel.draw(figure);
-    draw_scores(figure, score, place, &x, is_within);
-    if let Some(histograms) = &score.error_histograms {
-        draw_errors(figure, histograms, place, &y);
+        panel.text(corner, [-4.0, -5.0], &format!("ρ = {rho:.3}"), Anchor::End);
     }
 }
 
 /// Distribution of the score, above the panel.
-fn draw_scores(
-    figure: &mut Figure,
-    score: &ScoreReport,
-    place: Rectangle,
-    x: &Axis,
-    is_within: impl Fn(&Band) -> bool,
-) {
+fn draw_scores(figure: &mut Figure, score: &ScoreReport, place: Rectangle, x: &Axis) {
     let above = Rectangle { y: place.y - 31.0, height: 28.0, ..place };
     let most = score.bands.iter().map(|band| band.atoms).max().unwrap_or(0) as f64;
     let count = Axis::new("", AxisScale::Linear, 0.0, 1.05 * most).without_ticks();
     let mut panel = Panel::new(above, x.clone().with_title("").without_ticks(), count);
     for band in score.bands.iter().filter(|band| band.atoms > 0) {
-        let colour = if is_within(band) { Colour::BLUE } else { Colour::VERMILLION };
-        panel.bar([band.low, 0.0], [band.high, band.atoms as f64], colour.faint(0.3));
+        panel.bar([band.low, 0.0], [band.high, band.atoms as f64], colour(score, band).faint(0.3));
     }
     panel.draw_as_margin(figure, MarginalSide::Below);
 }
