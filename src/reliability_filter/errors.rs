@@ -1,7 +1,7 @@
 //! Error of a structure against its grade, and errors on either side of grade 1 (the paper's figure of the benchmark, panels a and b).
 
 use analysis::{GradedRow, Histogram, QuantileBin, binned_quantiles, decade_edges, quantile};
-use figures::{Anchor, Axis, AxisScale, Colour, Figure, Panel, Point, Rectangle};
+use figures::{Anchor, Axis, AxisScale, Colour, Figure, MarginalSide, Panel, Point, Rectangle};
 
 use crate::csv::{Csv, number};
 use crate::output::decimals;
@@ -35,13 +35,16 @@ pub fn draw(rows: &[GradedRow], grade: &str) -> Result<FigureContent, String> {
     }
     let bins = binned_quantiles(&grades, rows.iter().map(|row| (row.grade, row.error.abs())));
     let sides = [true, false].map(|within| Side::new(rows, &edges, within));
-    let mut figure = Figure::new("errors", "Errors of structures against their grade", WIDTH, 214.0);
-    let place = |k: usize| Rectangle { x: 46.0 + 258.0 * k as f64, y: 24.0, width: 192.0, height: 146.0 };
-    draw_bins(&mut figure, &bins, grade, place(0));
-    draw_sides(&mut figure, &sides, &edges, place(1));
+    let mut figure = Figure::new("errors", "Errors of structures against their grade", WIDTH, 246.0);
+    let place = |x, width| Rectangle { x, y: 56.0, width, height: 146.0 };
+    let [x, y] = draw_bins(&mut figure, &bins, grade, place(46.0, 162.0));
+    draw_grades(&mut figure, &bins, x, place(46.0, 162.0));
+    draw_errors(&mut figure, &sides, &edges, y, place(46.0, 162.0));
+    draw_sides(&mut figure, &sides, &edges, place(304.0, 192.0));
     let caption = format!(
         "Absolute errors, in the unit of the table. a, against the grade {grade}: dashed, median; grey, mean; bands, P_{{25}}–P_{{75}} and \
-         P_{{10}}–P_{{90}}, in ten bins a decade with at least {MIN_STRUCTURES} structures each. b, distribution for the grades up to 1 (blue) \
+         P_{{10}}–P_{{90}}, in ten bins a decade with at least {MIN_STRUCTURES} structures each; margins, distribution of the grade, and of the \
+         errors on either side of grade 1 by themselves. b, distribution for the grades up to 1 (blue) \
          and above (red), as shares of all its structures; errors of zero or more than six \
          decades below the largest are not drawn."
     );
@@ -72,18 +75,28 @@ impl Side {
     }
 }
 
-fn draw_bins(figure: &mut Figure, bins: &[QuantileBin], grade: &str, place: Rectangle) {
+/// Whether all structures of a bin have a grade up to the limit.
+fn is_within(bin: &QuantileBin) -> bool {
+    bin.high <= LIMIT * (1.0 + 1e-9)
+}
+
+fn colour(bin: &QuantileBin) -> Colour {
+    COLOURS[usize::from(!is_within(bin))]
+}
+
+/// Draws panel a, and returns its axes.
+fn draw_bins(figure: &mut Figure, bins: &[QuantileBin], grade: &str, place: Rectangle) -> [Axis; 2] {
     let is_shown = |bin: &&QuantileBin| bin.number >= MIN_STRUCTURES;
     let shown = || bins.iter().filter(is_shown);
     let values: Vec<_> = shown().filter_map(|bin| bin.quantiles).flat_map(|q| [q[1], q[5]]).collect();
     let ends: Vec<_> = shown().flat_map(|bin| [bin.low, bin.high]).collect();
     let x = axis(grade, AxisScale::Logarithmic, &ends, Some(LIMIT));
-    let mut panel = Panel::new(place, x, axis("absolute error", AxisScale::Logarithmic, &values, None));
+    let y = axis("absolute error", AxisScale::Logarithmic, &values, None);
+    let mut panel = Panel::new(place, x.clone(), y.clone());
     let middle = |bin: &QuantileBin| (bin.low * bin.high).sqrt();
-    let is_within = |bin: &QuantileBin| bin.high <= LIMIT * (1.0 + 1e-9);
     for run in bins.split(|bin| bin.number < MIN_STRUCTURES) {
         for part in run.chunk_by(|a, b| is_within(a) == is_within(b)) {
-            let colour = COLOURS[usize::from(!is_within(&part[0]))];
+            let colour = colour(&part[0]);
             for (low, high, opacity) in BANDS {
                 let point = |bin: &QuantileBin| bin.quantiles.map(|q| (middle(bin), q[low], q[high]));
                 panel.band(&part.iter().filter_map(point).collect::<Vec<_>>(), colour.faint(opacity));
@@ -100,6 +113,34 @@ fn draw_bins(figure: &mut Figure, bins: &[QuantileBin], grade: &str, place: Rect
     panel.vertical_line(LIMIT);
     panel.panel_letter('a');
     panel.draw(figure);
+    [x, y]
+}
+
+/// Distribution of the grade, above panel a.
+fn draw_grades(figure: &mut Figure, bins: &[QuantileBin], x: Axis, place: Rectangle) {
+    let above = Rectangle { y: place.y - 31.0, height: 28.0, ..place };
+    let most = bins.iter().map(|bin| bin.number).max().unwrap_or(0) as f64;
+    let count = Axis::new("", AxisScale::Linear, 0.0, 1.05 * most).without_ticks();
+    let mut panel = Panel::new(above, x.with_title("").without_ticks(), count);
+    for bin in bins.iter().filter(|bin| bin.number > 0) {
+        panel.bar([bin.low, 0.0], [bin.high, bin.number as f64], colour(bin).faint(0.3));
+    }
+    panel.draw_as_margin(figure, MarginalSide::Below);
+}
+
+/// Distributions of the errors of either side, to the right of panel a.
+fn draw_errors(figure: &mut Figure, sides: &[Side; 2], edges: &[f64], y: Axis, place: Rectangle) {
+    let right = Rectangle { x: place.right() + 3.0, width: 30.0, ..place };
+    let outlines = sides.each_ref().map(|side| side.outline(edges));
+    let most = outlines.iter().flatten().map(|[_, share]| *share).fold(0.0, f64::max);
+    let share = Axis::new("", AxisScale::Linear, 0.0, 1.05 * most).without_ticks();
+    let mut panel = Panel::new(right, share, y.with_title("").without_ticks());
+    for (outline, colour) in outlines.into_iter().zip(COLOURS) {
+        let outline: Vec<_> = outline.into_iter().map(|[error, share]| [share, error]).collect();
+        panel.polygons([outline.clone()], Some(colour.faint(0.18)), None);
+        panel.line(outline, colour.line(0.9));
+    }
+    panel.draw_as_margin(figure, MarginalSide::Left);
 }
 
 fn draw_sides(figure: &mut Figure, sides: &[Side; 2], edges: &[f64], place: Rectangle) {
@@ -165,7 +206,21 @@ mod tests {
         let outline = Side::new(&with_zero, &edges, true).outline(&edges);
         assert_eq!(outline.iter().map(|[_, share]| *share).fold(0.0, f64::max), 0.5);
         let drawn = draw(&rows, "gamma_max").unwrap();
-        assert!(!to_svg(&drawn.figure).contains("NaN"));
+        let svg = to_svg(&drawn.figure);
+        assert!(!svg.contains("NaN"));
+        // Two panels and two margins have places of their own.
+        assert_eq!(svg.matches("<clipPath").count(), 4, "{svg}");
+        // The margin of the grade has a bar for each bin with structures, blue up to 1.
+        let margin = svg.split("<clipPath").nth(2).and_then(|rest| rest.split('"').nth(1)).unwrap();
+        let bars = |colour: &str| {
+            let is_bar = |line: &&str| line.contains(margin) && line.contains(colour);
+            svg.lines().filter(|line| line.starts_with("<path")).filter(is_bar).count()
+        };
+        let grades = decade_edges(rows.iter().map(|row| row.grade));
+        let bins = Histogram::from_values(grades.clone(), rows.iter().map(|row| row.grade));
+        let filled = grades.windows(2).zip(bins.counts()).filter(|(_, count)| **count > 0);
+        let (within, beyond): (Vec<_>, Vec<_>) = filled.partition(|(edges, _)| edges[1] < 1.01);
+        assert_eq!([bars("#0072b2"), bars("#d55e00")], [within.len(), beyond.len()]);
         let text = String::from_utf8(drawn.numbers.into_bytes()).unwrap();
         let counted = |what: &str| -> u64 {
             let rows = text.lines().filter(|line| line.starts_with(what));
