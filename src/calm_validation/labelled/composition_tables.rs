@@ -40,8 +40,8 @@ pub fn elements(report: &LabelledReport) -> PageTable {
 
 /// By the share of an element in a structure.
 pub fn compositions(report: &LabelledReport) -> PageTable {
-    let caption = "Errors and γ of structures by the share of an element among their atoms, to the nearest 10 %. Offsets of \
-                   the elements are not removed from energies";
+    let caption = "Errors and γ of structures by the share of an element among their atoms, to the nearest 10 %. Energies \
+                   are compared without the offsets of the elements";
     let titles = [
         "element",
         "share (%)",

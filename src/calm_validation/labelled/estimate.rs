@@ -22,6 +22,9 @@ pub const BOOTSTRAP: Bootstrap = Bootstrap { draws: 1000, level: 0.95, seed: 1 }
 /// One value of each statistic, `None` where it is not defined.
 type Values = Vec<Option<f64>>;
 
+/// A structure with the absolute error of its energy per atom without the offsets of elements, eV; `None` where that is not known.
+type StructureEnergyError<'a> = (&'a SampledStructure, Option<f64>);
+
 impl LabelledErrors {
     /// The report. The intervals cost about 40 ns for each draw, sampled atom and score, on all cores: some 15 seconds of one core
     /// for 200,000 atoms and two scores, and little for small sets. Those of the bins take one more pass over the sampled atoms for
@@ -30,6 +33,8 @@ impl LabelledErrors {
         let sampled_structures: Vec<_> = self.sample.items().collect();
         let structures = StructureStatistics::new(&sampled_structures);
         let [energy, energy_without_offsets, forces, stress] = self.mean_errors(&structures, bootstrap);
+        let energies = structures.energy_errors();
+        let of_structures: Vec<_> = sampled_structures.iter().copied().zip(energies).collect();
         let sampled: Vec<_> = self.atoms.items().collect();
         let atoms = AtomStatistics::new(&sampled, &self.columns);
         LabelledReport {
@@ -53,9 +58,9 @@ impl LabelledErrors {
                 .exceedance
                 .first()
                 .map_or(vec![None; THRESHOLDS.len()], |found| found.unfiltered()),
-            scores: self.scores((&sampled, &sampled_structures), &atoms, bootstrap),
+            scores: self.scores((&sampled, &of_structures), &atoms, bootstrap),
             elements: compositions::by_element(&sampled, &self.columns),
-            compositions: compositions::by_composition(&sampled, &sampled_structures, &self.columns),
+            compositions: compositions::by_composition(&sampled, &of_structures, &self.columns),
         }
     }
 
@@ -77,7 +82,7 @@ impl LabelledErrors {
 
     fn scores(
         &self,
-        (sampled, structures): (&[&SampledAtom], &[&SampledStructure]),
+        (sampled, structures): (&[&SampledAtom], &[StructureEnergyError]),
         atoms: &AtomStatistics,
         bootstrap: Bootstrap,
     ) -> Vec<ScoreReport> {

@@ -81,7 +81,8 @@ pub struct ScoreReport {
     pub limit: Option<f64>,
     /// Spearman's ρ of score and force error.
     pub spearman: IntervalEstimate,
-    /// Spearman's ρ of the mean score of a sampled structure and the absolute error of its energy per atom.
+    /// Spearman's ρ of the mean score of a sampled structure and the absolute error of its energy per atom, without the offsets of
+    /// elements.
     pub energy_spearman: Option<f64>,
     /// Area under the ROC curve for force errors above each threshold.
     pub auc: Vec<IntervalEstimate>,
@@ -189,7 +190,8 @@ pub struct CompositionGroup {
     /// The nearest multiple of 10 %.
     pub share: f64,
     pub structures: usize,
-    /// |E_model − E_label| per atom, eV, offsets of elements included.
+    /// |E_model − E_label| per atom without the offsets of elements, eV. Structures without an energy, or with a composition whose
+    /// offset too few structures support, do not count.
     pub energy: Option<ErrorSpread>,
     pub atoms: usize,
     /// |F_model − F_label|, eV/Å.

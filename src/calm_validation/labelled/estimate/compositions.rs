@@ -6,8 +6,9 @@ use std::collections::BTreeMap;
 use analysis::{quantile, spearman};
 use atoms::Species;
 
-use super::super::collect::{SampledAtom, SampledStructure, ScoreColumn};
+use super::super::collect::{SampledAtom, ScoreColumn};
 use super::super::report::{CompositionGroup, CompositionScan, ElementErrors, ErrorSpread, ScoreMean};
+use super::StructureEnergyError;
 
 /// Groups are one of this number of equal steps of the share apart.
 const STEPS: usize = 10;
@@ -39,15 +40,15 @@ pub fn by_element(atoms: &[&SampledAtom], columns: &[ScoreColumn]) -> Vec<Elemen
 /// By the share of each of the elements with the most atoms in a structure. Of two elements, the heavier one is enough.
 pub fn by_composition(
     atoms: &[&SampledAtom],
-    structures: &[&SampledStructure],
+    structures: &[StructureEnergyError],
     columns: &[ScoreColumn],
 ) -> Vec<CompositionScan> {
     let scan = |element: u8| {
         let mut groups = vec![GroupMembers::default(); STEPS + 1];
-        for structure in structures {
+        for (structure, energy) in structures {
             let group = &mut groups[step(&structure.composition, element)];
             group.structures += 1;
-            group.energies.extend(structure.energy.mean_absolute());
+            group.energies.extend(*energy);
         }
         for atom in atoms {
             groups[step(&atom.composition, element)].atoms.push(atom);
@@ -59,27 +60,27 @@ pub fn by_composition(
     scanned(structures).into_iter().map(scan).collect()
 }
 
-/// Spearman's ρ of the mean score of a structure and the absolute error of its energy per atom.
-pub fn energy_rank(structures: &[&SampledStructure], column: usize) -> Option<f64> {
-    let pairs = structures.iter().filter_map(|structure| {
+/// Spearman's ρ of the mean score of a structure and the absolute error of its energy.
+pub fn energy_rank(structures: &[StructureEnergyError], column: usize) -> Option<f64> {
+    let pairs = structures.iter().filter_map(|(structure, energy)| {
         let score = structure.scores.get(column).copied().filter(|score| score.is_finite())?;
-        Some((score, structure.energy.mean_absolute().filter(|error| error.is_finite())?))
+        Some((score, energy.filter(|error| error.is_finite())?))
     });
     let (scores, errors): (Vec<_>, Vec<_>) = pairs.unzip();
     spearman(&scores, &errors)
 }
 
 /// Elements whose share differs between structures, those with the most atoms first.
-fn scanned(structures: &[&SampledStructure]) -> Vec<u8> {
+fn scanned(structures: &[StructureEnergyError]) -> Vec<u8> {
     let mut totals: BTreeMap<u8, u64> = BTreeMap::new();
-    for (element, atoms) in structures.iter().flat_map(|structure| structure.composition.iter()) {
+    for (element, atoms) in structures.iter().flat_map(|(structure, _)| structure.composition.iter()) {
         *totals.entry(*element).or_default() += u64::from(*atoms);
     }
     if totals.len() == 2 {
         totals.pop_first();
     }
     let differs = |element: &u8| {
-        let mut steps = structures.iter().map(|structure| step(&structure.composition, *element));
+        let mut steps = structures.iter().map(|(structure, _)| step(&structure.composition, *element));
         let first = steps.next();
         steps.any(|step| Some(step) != first)
     };
@@ -99,7 +100,7 @@ fn step(composition: &[(u8, u32)], element: u8) -> usize {
 #[derive(Clone, Default)]
 struct GroupMembers<'a> {
     structures: usize,
-    /// Absolute errors per atom, eV.
+    /// Absolute errors per atom without the offsets of elements, eV.
     energies: Vec<f64>,
     atoms: Vec<&'a SampledAtom>,
 }

@@ -33,6 +33,12 @@ impl StructureStatistics {
         self.deviations.len()
     }
 
+    /// Absolute error of the energy per atom without the offsets of elements, eV, of each structure. `None` without an energy, or if too
+    /// few structures support the offset of its composition.
+    pub fn energy_errors(&self) -> Vec<Option<f64>> {
+        self.deviations.iter().map(|[_, energy, ..]| energy.mean_absolute()).collect()
+    }
+
     pub fn offsets(&self) -> Vec<Offset> {
         self.offsets.iter().flat_map(EnergyOffsets::elements).map(Into::into).collect()
     }

@@ -34,7 +34,7 @@ pub fn draw(report: &LabelledReport) -> Option<FigureEntry> {
         scan.groups.iter().for_each(|group| push(&mut numbers, report, scan, group));
     }
     let caption = "Errors of labelled structures by the share of an element among their atoms, to the nearest 10 %. Left, error of the \
-                   energy per atom, offsets of the elements included; middle, force error |F_{model} − F_{label}| of an atom. Line, mean; \
+                   energy per atom without the offsets of the elements; middle, force error |F_{model} − F_{label}| of an atom. Line, mean; \
                    bands, P_{25}–P_{75} and P_{10}–P_{90}; ρ, Spearman’s ρ of the energy error and the mean γ of a structure, and of the \
                    force error and γ of an atom, over all compositions. Right, mean grade of the atoms; dashed, its limit.";
     let drawn = Ok(FigureContent { figure, caption: caption.into(), numbers });
@@ -82,7 +82,7 @@ fn draw_scan(
         panel.line(means.clone(), Colour::BLUE.line(1.2));
         panel.dots(means, Marker::Disc, 1.8, Colour::BLUE, None);
         if points.is_empty() {
-            panel.placeholder("no labels");
+            panel.placeholder("too few labels");
         }
         if let Some(rho) = rho {
             let corner = [panel.x.low, panel.y.high];
