@@ -28,8 +28,8 @@ struct Side {
 
 /// The figure. `grade` is the title of the grade's column.
 pub fn draw(rows: &[GradedRow], grade: &str) -> Result<FigureContent, String> {
-    let grades = decade_edges(rows.iter().map(|row| row.grade));
-    let edges = decade_edges(rows.iter().map(|row| row.error.abs()));
+    let grades = decade_edges(rows.iter().map(|row| row.grade), Some(0.1 * LIMIT));
+    let edges = decade_edges(rows.iter().map(|row| row.error.abs()), None);
     if grades.is_empty() || edges.is_empty() {
         return Err("No structure has a grade above zero, or none has an error.".into());
     }
@@ -45,8 +45,8 @@ pub fn draw(rows: &[GradedRow], grade: &str) -> Result<FigureContent, String> {
         "Absolute errors, in the unit of the table. a, against the grade {grade}: dashed, median; grey, mean; bands, P_{{25}}–P_{{75}} and \
          P_{{10}}–P_{{90}}, in ten bins a decade with at least {MIN_STRUCTURES} structures each; margins, distribution of the grade, and of the \
          errors on either side of grade 1 by themselves. b, distribution for the grades up to 1 (blue) \
-         and above (red), as shares of all its structures; errors of zero or more than six \
-         decades below the largest are not drawn."
+         and above (red), as shares of all its structures. Not drawn are errors of zero, and those \
+         that are both six decades below the largest and three below the median."
     );
     Ok(FigureContent { figure, caption, numbers: numbers(&bins, &sides, &edges) })
 }
@@ -195,7 +195,7 @@ mod tests {
     #[test]
     fn structures_are_divided_at_grade_1() {
         let rows: Vec<_> = (1..=40).map(|k| row(0.05 * f64::from(k), -0.1 * f64::from(k))).collect();
-        let edges = decade_edges(rows.iter().map(|row| row.error.abs()));
+        let edges = decade_edges(rows.iter().map(|row| row.error.abs()), None);
         let [within, beyond] = [true, false].map(|is_within| Side::new(&rows, &edges, is_within));
         assert_eq!([&within, &beyond].map(|side| side.counts.iter().sum::<u64>()), [20, 20]);
         assert!((within.mean.unwrap() - 1.05).abs() < 1e-12 && (beyond.mean.unwrap() - 3.05).abs() < 1e-12);
@@ -216,7 +216,7 @@ mod tests {
             let is_bar = |line: &&str| line.contains(margin) && line.contains(colour);
             svg.lines().filter(|line| line.starts_with("<path")).filter(is_bar).count()
         };
-        let grades = decade_edges(rows.iter().map(|row| row.grade));
+        let grades = decade_edges(rows.iter().map(|row| row.grade), Some(0.1));
         let bins = Histogram::from_values(grades.clone(), rows.iter().map(|row| row.grade));
         let filled = grades.windows(2).zip(bins.counts()).filter(|(_, count)| **count > 0);
         let (within, beyond): (Vec<_>, Vec<_>) = filled.partition(|(edges, _)| edges[1] < 1.01);
@@ -227,6 +227,17 @@ mod tests {
             rows.map(|line| line.split(',').nth(3).unwrap().parse::<u64>().unwrap()).sum()
         };
         assert_eq!(["error by grade", "errors up to", "errors above"].map(counted), [40, 20, 20]);
+    }
+
+    #[test]
+    fn one_failed_structure_leaves_the_others_in_their_bins() {
+        let rows: Vec<_> = (1..=40).map(|k| row(0.05 * f64::from(k), 0.1 * f64::from(k))).collect();
+        let failed = [row(1e9, 1e12)];
+        let drawn = draw(&[&rows[..], &failed].concat(), "gamma_max").unwrap();
+        let text = String::from_utf8(drawn.numbers.into_bytes()).unwrap();
+        let counts = text.lines().skip(1).map(|line| line.split(',').nth(3).unwrap().parse::<u64>().unwrap());
+        // By grade, and by error on either side.
+        assert_eq!(counts.sum::<u64>(), 2 * 41);
     }
 
     #[test]

@@ -1,5 +1,9 @@
 //! Histograms.
 
+use std::ops::RangeInclusive;
+
+use crate::quantiles::quantile;
+
 /// Counts values between ascending edges. A bin includes its lower edge; the last bin also includes its upper
 /// edge.
 #[derive(Clone, Debug, PartialEq)]
@@ -76,19 +80,26 @@ pub fn logarithmic_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
     linear_edges(low.ln(), high.ln(), bins).into_iter().map(f64::exp).collect()
 }
 
-/// Bins of a decade, and how many decades below the largest value have bins.
+/// Bins of a decade.
 const BINS_A_DECADE: f64 = 10.0;
-const DECADES: f64 = 6.0;
+/// Shares of the largest value and of the median down to which values have bins: six and three decades below them.
+const OF_LARGEST: f64 = 1e-6;
+const OF_MEDIAN: f64 = 1e-3;
+/// Values that can have bins: near the ends of double precision, edges would coincide or be infinite.
+const BINNED: RangeInclusive<f64> = 1e-300..=1e300;
 
-/// Edges 10^(k/10) round all positive values up to six decades below the largest; 1 is an edge if it is in the range. None without such
-/// values.
-pub fn decade_edges(values: impl Iterator<Item = f64> + Clone) -> Vec<f64> {
-    let positive = values.filter(|x| *x > 0.0 && x.is_finite());
-    let largest = positive.clone().fold(0.0, f64::max);
-    if largest == 0.0 {
+/// Edges 10^(k/10) round all positive values; 1 is an edge if it is in the range. Values are left out if they are six decades below the
+/// largest, three decades below the median, and below `reached`: a few large values do not leave out the others, and what is zero up to
+/// rounding does not stretch the range. None without positive values.
+pub fn decade_edges(values: impl Iterator<Item = f64>, reached: Option<f64>) -> Vec<f64> {
+    let mut positive: Vec<_> = values.filter(|x| BINNED.contains(x)).collect();
+    positive.sort_by(f64::total_cmp);
+    let (Some(&smallest), Some(&largest)) = (positive.first(), positive.last()) else {
         return Vec::new();
-    }
-    let smallest = positive.fold(largest, f64::min).max(largest * 10_f64.powf(-DECADES));
+    };
+    let median = quantile(&positive, 0.5).unwrap_or(largest);
+    let lowest = (OF_LARGEST * largest).min(OF_MEDIAN * median).min(reached.unwrap_or(f64::INFINITY));
+    let smallest = smallest.max(lowest);
     let last = (largest.log10() * BINS_A_DECADE).ceil() as i32;
     let first = ((smallest.log10() * BINS_A_DECADE).floor() as i32).min(last - 1);
     (first..=last).map(|k| 10_f64.powf(f64::from(k) / BINS_A_DECADE)).collect()
@@ -117,12 +128,26 @@ mod tests {
 
     #[test]
     fn decades_have_ten_bins() {
-        let edges = decade_edges([3.0, 0.0, 0.21, -1.0, f64::NAN].into_iter());
+        let edges = decade_edges([3.0, 0.0, 0.21, -1.0, f64::NAN].into_iter(), None);
         let expected: Vec<_> = (-7..=5).map(|k| 10_f64.powf(f64::from(k) / 10.0)).collect();
         assert_eq!(edges, expected);
         assert!(edges[0] <= 0.21 && edges[12] >= 3.0 && edges.contains(&1.0));
-        assert!(decade_edges([0.0].into_iter()).is_empty());
+        assert!(decade_edges([0.0].into_iter(), None).is_empty());
         // Six decades, up to rounding.
-        assert!((61..=62).contains(&decade_edges([1e-9, 1.0].into_iter()).len()));
+        assert!((61..=62).contains(&decade_edges([1e-9, 1.0].into_iter(), None).len()));
+    }
+
+    #[test]
+    fn decades_of_a_heavy_tail_reach_the_others() {
+        let lowest = |values: &[f64], reached| decade_edges(values.iter().copied(), reached)[0];
+        // Three decades below the median of 0.3.
+        assert!(lowest(&[0.2, 0.3, 1e9], None) <= 0.2);
+        assert!((lowest(&[1e-17, 0.3, 1e9], None) / 2.512e-4 - 1.0).abs() < 1e-3);
+        let tail = [0.05, 1e8, 1e9, 1e9];
+        assert!((790.0..1001.0).contains(&lowest(&tail, None)));
+        assert!((0.079..0.1001).contains(&lowest(&tail, Some(0.1))));
+        // All edges can be told apart, and are finite.
+        let edges = decade_edges([5e-324, 1e-300, f64::MAX, 1e299].into_iter(), Some(0.0));
+        assert!(edges.is_sorted_by(|a, b| a < b) && edges.iter().all(|edge| edge.is_finite()));
     }
 }

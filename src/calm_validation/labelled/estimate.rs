@@ -118,7 +118,7 @@ impl LabelledErrors {
                     bins: self.bins[k]
                         .as_ref()
                         .map_or(Vec::new(), |errors| bins::with_intervals(errors, sampled, k, bootstrap)),
-                    bands: atoms::bands(sampled, k),
+                    bands: atoms::bands(sampled, k, column.limit),
                     error_histograms: column
                         .limit
                         .and_then(|limit| ErrorHistograms::of_atoms(sampled, k, limit)),

@@ -180,6 +180,22 @@ fn bins_have_intervals() {
 }
 
 #[test]
+fn a_heavy_tail_leaves_the_atoms_within_the_limit_in_their_bins() {
+    let mut samples: Vec<_> = (0..45).map(sample).collect();
+    for score in samples.iter_mut().flat_map(|sample| &mut sample.scores[0]).filter(|score| **score > 1.0) {
+        *score *= 1e9;
+    }
+    let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);
+    let (_, scores) = atoms(&samples);
+    let bands = &report.scores[0].bands;
+    let low = bands[0].low;
+    assert!(low < 0.1, "{low}");
+    let expected = scores[0].iter().filter(|score| (low..=1.0).contains(*score)).count();
+    let within = bands.iter().filter(|band| band.high < 1.01).map(|band| band.atoms).sum::<u64>();
+    assert_eq!(within, expected as u64);
+}
+
+#[test]
 fn areas_are_shown_by_element_and_by_threshold() {
     let samples: Vec<_> = (0..45).map(sample).collect();
     let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);

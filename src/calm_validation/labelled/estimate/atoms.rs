@@ -107,9 +107,10 @@ fn mean(values: &[Option<f64>]) -> Option<f64> {
     (!known.is_empty()).then(|| known.iter().copied().sum::<f64>() / known.len() as f64)
 }
 
-/// Quantiles of the force error in bins of a score, ten a decade.
-pub fn bands(sampled: &[&SampledAtom], column: usize) -> Vec<Band> {
-    let edges = decade_edges(sampled.iter().map(|atom| atom.scores[column]));
+/// Quantiles of the force error in bins of a score, ten a decade, down to a tenth of its limit at least.
+pub fn bands(sampled: &[&SampledAtom], column: usize, limit: Option<f64>) -> Vec<Band> {
+    let scores = sampled.iter().map(|atom| atom.scores[column]);
+    let edges = decade_edges(scores, limit.map(|limit| 0.1 * limit));
     let pairs = sampled.iter().map(|atom| (atom.scores[column], atom.error));
     binned_quantiles(&edges, pairs).into_iter().map(Into::into).collect()
 }
@@ -132,7 +133,7 @@ impl ErrorHistograms {
     fn new(errors: impl Iterator<Item = (bool, f64)>) -> Option<Self> {
         let mut sides = [Vec::new(), Vec::new()];
         errors.for_each(|(is_within, error)| sides[usize::from(!is_within)].push(error));
-        let edges = decade_edges(sides.iter().flatten().copied());
+        let edges = decade_edges(sides.iter().flatten().copied(), None);
         if edges.len() < 2 {
             return None;
         }

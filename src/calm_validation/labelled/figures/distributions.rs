@@ -40,7 +40,8 @@ pub fn draw(report: &LabelledReport) -> FigureEntry {
     panel.draw(&mut figure);
     let caption = format!(
         "Distribution of each score with a limit over the {} sampled atoms, in ten bins a decade; dashed, 1. Shares are of \
-         all sampled atoms; bins reach six decades below the largest value, and lower values are not drawn.",
+         all sampled atoms. Not drawn are values of zero, and those that are at once below a tenth of the limit, six decades \
+         below the largest value and three below the median.",
         report.sampled_atoms
     );
     let drawn = Ok(FigureContent { figure, caption, numbers });
