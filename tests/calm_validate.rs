@@ -432,12 +432,12 @@ fn mixtures_of_several_dimensions_are_compared() {
     assert!(table.lines().next().unwrap().ends_with(",AUC > 1 eV/Å,interval"), "{table}");
     let page = std::fs::read_to_string(here.join("out/validation.html")).unwrap();
     assert!(page.contains("id=\"table-mixtures\"") && page.contains("id=\"figure-mixture-contamination\""));
-    // One curve for each mixture, and one of all atoms.
+    // Two curves for each mixture, and one of all atoms.
     let curves = std::fs::read_to_string(here.join("out/figures/mixture-contamination.csv")).unwrap();
     let kept = &mixtures[2]["scores"][1]["confident"]["contamination"];
-    assert_eq!(curves.lines().count(), 1 + 4 * kept.as_array().unwrap().len());
-    let linear = curves.lines().find(|line| line.starts_with("\"3: D = 128, K = 1 (")).unwrap();
-    let (_, numbers) = linear.split_once(" % kept)\",").unwrap();
+    assert_eq!(curves.lines().count(), 1 + 7 * kept.as_array().unwrap().len());
+    let linear = curves.lines().find(|line| line.starts_with("γ_nbr,3,128,1,")).unwrap();
+    let numbers = linear.strip_prefix("γ_nbr,3,128,1,").unwrap();
     let numbers: Vec<f64> = numbers.split(',').take(2).map(|number| number.parse().unwrap()).collect();
     assert!(deviation(&numbers, &[0.01, kept[0]["value"].as_f64().unwrap()]) < 1e-12, "{linear}");
 

@@ -4,12 +4,13 @@ mod compositions;
 mod curves;
 mod distributions;
 mod error_histograms;
+mod mixture_curves;
 mod mixture_map;
 mod reliability;
 
 use ::figures::{Colour, Point, Stroke};
 
-pub use self::curves::mixtures;
+pub use self::mixture_curves::draw as mixtures;
 pub use self::mixture_map::draw as mixture_map;
 
 use super::report::{ErrorHistograms, IntervalEstimate, LabelledReport};

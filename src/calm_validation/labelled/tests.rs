@@ -388,6 +388,38 @@ fn figures_and_tables_show_every_score() {
 }
 
 #[test]
+fn contamination_has_a_row_for_each_grade_and_a_panel_for_each_dimension() {
+    let samples: Vec<_> = (0..45).map(sample).collect();
+    let grades = ["γ", "γ_{nbr}"].map(ScoreColumn::grade).to_vec();
+    let report = collected(LabelledErrors::new(grades), &samples).report(BOOTSTRAP);
+    let mixture = |dimension, components: usize| ComparedMixture {
+        artifact: format!("{dimension}-{components}.npz"),
+        dimension,
+        components: vec![components; 2],
+        scores: report.scores.clone(),
+    };
+    let mixtures = [mixture(128, 8), mixture(64, 4), mixture(128, 4)];
+    let drawn = mixtures_figure(&mixtures, &report).unwrap().drawn.unwrap();
+    let svg = to_svg(&drawn.figure);
+    assert!(!svg.contains("NaN"));
+    assert_eq!(svg.matches("<clipPath").count(), 4, "{svg}");
+    for dimension in [64, 128] {
+        assert_eq!(svg.matches(&format!(" ≤ 1, D = {dimension}<")).count(), 2, "{svg}");
+    }
+    // Each panel has the mixtures of its dimension.
+    let entries = |number| svg.matches(&format!(">{number}: K = ")).count();
+    assert_eq!([1, 2, 3].map(entries), [2; 3]);
+    let rows = String::from_utf8(drawn.numbers.into_bytes()).unwrap();
+    // The curve of all atoms, and two for each mixture.
+    assert_eq!(rows.lines().count(), 1 + report.thresholds.len() * (1 + 2 * 3));
+    for (name, score) in ["γ", "γ_nbr"].iter().zip(&report.scores) {
+        let first = score.confident.as_ref().unwrap().contamination[0].value.unwrap();
+        assert!(rows.contains(&format!("\n{name},2,64,4,0.01,{first},")), "{rows}");
+    }
+    assert!(mixtures_figure(&[], &report).is_none());
+}
+
+#[test]
 fn mixtures_are_mapped_by_dimension_and_components() {
     let samples: Vec<_> = (0..45).map(sample).collect();
     let report = collected(LabelledErrors::new(columns()), &samples).report(BOOTSTRAP);

@@ -2,7 +2,6 @@
 
 use ::figures::{Anchor, Axis, AxisScale, Colour, Figure, Panel, Rectangle, Stroke};
 
-use super::super::ComparedMixture;
 use super::super::report::{Confident, IntervalEstimate, LabelledReport};
 use super::{runs, stroke};
 use crate::csv::{Csv, number};
@@ -20,7 +19,7 @@ const ERROR: &str = "threshold of the force error (eV Å^{−1})";
 
 pub fn contamination(report: &LabelledReport) -> FigureEntry {
     const TITLE: &str = "Contamination of the confident set";
-    let mut chart = unfiltered("contamination", TITLE, report);
+    let mut chart = unfiltered(TITLE, report);
     for (k, score) in report.scores.iter().enumerate() {
         let (Some(limit), Some(confident)) = (score.limit, &score.confident) else { continue };
         let name = format!("{} ≤ {limit}{}", score.name, kept(confident));
@@ -35,37 +34,12 @@ pub fn contamination(report: &LabelledReport) -> FigureEntry {
     chart.finish(TITLE, caption)
 }
 
-/// The same for γ_nbr up to 1 under several mixtures. `report` is that of any of them. `None` without mixtures or force labels.
-pub fn mixtures(mixtures: &[ComparedMixture], report: &LabelledReport) -> Option<FigureEntry> {
-    const TITLE: &str = "Contamination under several mixtures";
-    if mixtures.is_empty() || report.atoms == 0 {
-        return None;
-    }
-    let mut chart = unfiltered("mixture-contamination", TITLE, report);
-    for (k, mixture) in mixtures.iter().enumerate() {
-        let Some(confident) = mixture.scores.get(1).and_then(|average| average.confident.as_ref()) else {
-            continue;
-        };
-        let (dimension, components) = (mixture.dimension, mixture.range());
-        let name = format!("{}: D = {dimension}, K = {components}{}", k + 1, kept(confident));
-        chart.curve(&name, stroke(k), &report.thresholds, &confident.contamination);
-    }
-    let files = mixtures.iter().enumerate().map(|(k, mixture)| format!("{}, {}", k + 1, mixture.artifact));
-    let caption = format!(
-        "Probability that an atom with γ_{{nbr}} up to 1 has a force error above a threshold, under mixtures of dimension D with K components \
-         of each element, with {} intervals; dashed, all atoms; vertical line, 0.5 eV Å^{{−1}}. Mixtures: {}.",
-        level(report),
-        files.collect::<Vec<_>>().join("; ")
-    );
-    Some(chart.finish(TITLE, caption))
-}
-
 /// A chart of contamination with the curve of all atoms.
-fn unfiltered(name: &'static str, title: &str, report: &LabelledReport) -> Chart {
+fn unfiltered(title: &str, report: &LabelledReport) -> Chart {
     let (low, high) = (report.thresholds[0], report.thresholds[report.thresholds.len() - 1]);
     let x = Axis::new(ERROR, AxisScale::Logarithmic, low, high);
     let y = Axis::new("probability of a larger error", AxisScale::Linear, 0.0, 1.0);
-    let mut chart = Chart::new(name, title, x, y);
+    let mut chart = Chart::new("contamination", title, x, y);
     chart.panel.vertical_line(0.5);
     let all = report.unfiltered.iter().map(|value| IntervalEstimate { value: *value, interval: None });
     chart.curve("no filter", Colour::INK.dashed(1.1), &report.thresholds, &all.collect::<Vec<_>>());
@@ -98,8 +72,20 @@ pub fn areas(report: &LabelledReport) -> FigureEntry {
     chart.finish("Detection of large force errors", caption)
 }
 
-fn level(report: &LabelledReport) -> String {
+/// The kind of the intervals.
+pub fn level(report: &LabelledReport) -> String {
     format!("{:.0} % bootstrap", 100.0 * report.bootstrap.level)
+}
+
+/// Draws a curve over thresholds with its interval.
+pub fn draw_curve(panel: &mut Panel, stroke: Stroke, thresholds: &[f64], estimates: &[IntervalEstimate]) {
+    for run in runs(thresholds, estimates) {
+        let band: Vec<_> = run.iter().map(|(x, low, _, high)| (*x, *low, *high)).collect();
+        if run.iter().any(|(_, low, _, high)| low < high) {
+            panel.band(&band, stroke.paint.colour.faint(0.15));
+        }
+        panel.line(run.iter().map(|(x, _, value, _)| [*x, *value]), stroke);
+    }
 }
 
 /// A panel with a legend beside it.
@@ -124,13 +110,7 @@ impl Chart {
 
     /// Draws a curve with its interval, and its entry of the legend.
     fn curve(&mut self, name: &str, stroke: Stroke, thresholds: &[f64], estimates: &[IntervalEstimate]) {
-        for run in runs(thresholds, estimates) {
-            let band: Vec<_> = run.iter().map(|(x, low, _, high)| (*x, *low, *high)).collect();
-            if run.iter().any(|(_, low, _, high)| low < high) {
-                self.panel.band(&band, stroke.paint.colour.faint(0.15));
-            }
-            self.panel.line(run.iter().map(|(x, _, value, _)| [*x, *value]), stroke);
-        }
+        draw_curve(&mut self.panel, stroke, thresholds, estimates);
         for (x, estimate) in thresholds.iter().zip(estimates) {
             let (low, high) = estimate.interval.unzip();
             let numbers = [Some(*x), estimate.value, low, high].map(number);

@@ -15,16 +15,17 @@ use crate::page::{FigureContent, FigureEntry};
 const HEIGHT: f64 = 150.0;
 
 /// The columns (K of each element) and the rows (D), and their labels.
-struct Places {
+pub struct MixturePlaces {
     columns: Vec<Vec<usize>>,
     components: Vec<String>,
-    rows: Vec<usize>,
+    /// Ascending.
+    pub rows: Vec<usize>,
     dimensions: Vec<String>,
 }
 
-impl Places {
+impl MixturePlaces {
     /// Of all mixtures. Columns ascend by the largest K, then by the smallest.
-    fn new(mixtures: &[ComparedMixture]) -> Self {
+    pub fn new(mixtures: &[ComparedMixture]) -> Self {
         let key = |mixture: &ComparedMixture| {
             let components = &mixture.components;
             (components.iter().max().copied(), components.iter().min().copied(), components.clone())
@@ -42,7 +43,7 @@ impl Places {
     }
 
     /// Column and row of a mixture.
-    fn of(&self, mixture: &ComparedMixture) -> Option<(usize, usize)> {
+    pub fn of(&self, mixture: &ComparedMixture) -> Option<(usize, usize)> {
         let column = self.columns.iter().position(|components| *components == mixture.components)?;
         Some((column, self.rows.iter().position(|dimension| *dimension == mixture.dimension)?))
     }
@@ -66,7 +67,7 @@ fn draw_map(mixtures: &[ComparedMixture], report: &LabelledReport) -> Result<Fig
             "Two mixtures have the same dimension and the same number of components of each element.".into(),
         );
     }
-    let places = Places::new(mixtures);
+    let places = MixturePlaces::new(mixtures);
     let description = "Contamination of the confident set by dimension and components of the mixture";
     let mut figure = Figure::new("mixture-map", description, WIDTH, HEIGHT + 64.0);
     let mut numbers = Csv::new(&["score", "dimension", "components", "contamination", "retention"]);
@@ -106,7 +107,7 @@ fn values(score: &ScoreReport, report: &LabelledReport) -> [Option<f64>; 2] {
 
 fn draw_cell(
     panel: &mut Panel,
-    places: &Places,
+    places: &MixturePlaces,
     mixture: &ComparedMixture,
     [contamination, retention]: [Option<f64>; 2],
     unfiltered: Option<f64>,
@@ -135,7 +136,7 @@ mod tests {
             scores: Vec::new(),
         };
         let mixtures = [mixture(8, &[8, 4]), mixture(4, &[8, 2]), mixture(8, &[4, 8]), mixture(8, &[16, 1])];
-        let places = Places::new(&mixtures);
+        let places = MixturePlaces::new(&mixtures);
         assert_eq!(places.components, ["2–8", "4–8", "4–8", "1–16"]);
         let found = mixtures.each_ref().map(|mixture| places.of(mixture));
         assert_eq!(found, [Some((2, 1)), Some((0, 0)), Some((1, 1)), Some((3, 1))]);
