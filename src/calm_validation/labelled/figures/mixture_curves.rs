@@ -87,9 +87,9 @@ impl<'a> MixtureCurves<'a> {
         let all =
             self.report.unfiltered.iter().map(|value| IntervalEstimate { value: *value, interval: None });
         draw_curve(&mut panel, Colour::INK.dashed(1.1), thresholds, &all.collect::<Vec<_>>());
-        let shown = || self.mixtures.iter().enumerate().filter(|(_, mixture)| mixture.dimension == dimension);
+        let shown = self.mixtures.iter().enumerate().filter(|(_, mixture)| mixture.dimension == dimension);
         let mut legend = Vec::new();
-        for (k, mixture) in shown() {
+        for (k, mixture) in shown {
             let Some(confident) = confident(mixture, score) else { continue };
             let stroke = stroke(self.stroke_number(k, mixture));
             draw_curve(&mut panel, stroke, thresholds, &confident.contamination);
