@@ -80,6 +80,7 @@ fn a_campaign_of_ones_own_is_valid_as_it_stands() {
             let listed = keys(&text);
             let left_out: Vec<_> = keys(&demo).into_iter().filter(|key| !listed.contains(key)).collect();
             assert!(left_out.is_empty(), "{left_out:?}");
+            assert!(text.contains("\n#   replay = [\"training_frames.extxyz\"] "), "{text}");
         }
         for name in ["campaign.toml", "campaign.schema.json"] {
             fs::remove_file(here.join("own").join(name)).unwrap();

@@ -39,6 +39,7 @@ fn faults(schema: &Value, value: &Value, at: &str) -> Vec<String> {
             "minimum" => expect(number >= below(rule), rule),
             "exclusiveMinimum" => expect(number > below(rule), rule),
             "maximum" => expect(number <= below(rule), rule),
+            "exclusiveMaximum" => expect(number < below(rule), rule),
             "pattern" => expect(Regex::new(rule.as_str().unwrap()).unwrap().is_match(text), rule),
             "minItems" => expect(as_list(value).count() as u64 >= rule.as_u64().unwrap(), rule),
             "required" => {
@@ -137,6 +138,7 @@ fn the_schema_takes_and_refuses_what_the_program_does() {
     let schema: Value = serde_json::from_str(&published()).unwrap();
     let vasp =
         json!({ "vasp": { "version": "5.4.4", "pseudopotentials": "/", "pseudopotential_variants": {} } });
+    let replay = json!([config("data/al_eam_1l/seed_frames.extxyz").display().to_string()]);
     for (key, value, takes) in [
         ("walk.time_step", json!(0.5), true),
         ("walk.time_step", json!(50), false),
@@ -176,6 +178,29 @@ fn the_schema_takes_and_refuses_what_the_program_does() {
         ("notify.on", json!(["end"]), true),
         ("notify.on", json!(["begin"]), false),
         ("notify.command", json!([]), false),
+        (
+            "refit",
+            json!({ "replay": replay, "method": { "native": { "epochs": 2, "loss": "paper" } } }),
+            true,
+        ),
+        (
+            "refit",
+            json!({ "replay": replay, "held_out": 0, "method": { "command": { "program": ["p"] } } }),
+            true,
+        ),
+        ("refit", json!({ "replay": replay, "test_sets": [{ "name": "t", "file": replay[0] }] }), true),
+        ("refit", json!({ "replay": replay, "test_sets": [{ "name": "a b", "file": replay[0] }] }), false),
+        ("refit", json!({ "replay": replay, "held_out": 1 }), false),
+        ("refit", json!({ "replay": replay, "threads": 5000 }), false),
+        ("refit", json!({ "replay": replay, "method": { "command": { "program": [] } } }), false),
+        ("refit", json!({ "replay": replay, "method": { "native": { "average": 1.0 } } }), false),
+        (
+            "refit",
+            json!({ "replay": replay, "method": { "native": {}, "command": { "program": ["p"] } } }),
+            false,
+        ),
+        ("refit", json!({ "replay": [] }), false),
+        ("refit", json!({}), false),
     ] {
         let mut campaign = parsed(&demo("aluminium.toml"));
         set(&mut campaign, key, value.clone());

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 55] = [
+pub(super) const CHANGEABLE: [&str; 61] = [
     "campaign.control_share",
     "seed_structures",
     "collect.max_per_walk",
@@ -61,6 +61,12 @@ pub(super) const CHANGEABLE: [&str; 55] = [
     "notify.failed_labels",
     "notify.time_limit",
     "guard.max_temperature",
+    "refit.after_time",
+    "refit.max_versions",
+    "refit.max_attempts",
+    "refit.threads",
+    "refit.test_sets",
+    "refit.method.command.time_limit",
 ];
 
 const BONDS: &str = "label.guard.min_bond_lengths";
@@ -145,6 +151,9 @@ fn reason(key: &str) -> &'static str {
              mode = \"reproducible\" excludes"
         }
         key if is_label(key) => "one data set must not mix labels of two protocols",
+        key if key.starts_with("refit") => {
+            "a campaign keeps the refit with which it started, so that its versions can be compared"
+        }
         _ => OTHER_PHYSICS,
     }
 }
@@ -166,7 +175,8 @@ impl Refused {
     /// The key of the configuration that must be restored.
     pub fn key(&self) -> &str {
         match self {
-            Self::Key { key, .. } | Self::File { key, .. } => key,
+            // Files of a list have numbers: `refit.replay[0]`.
+            Self::Key { key, .. } | Self::File { key, .. } => key.split('[').next().unwrap_or(key),
             Self::SeedStructure { .. } => "seed_structures.files",
         }
     }
@@ -332,6 +342,57 @@ mod tests {
             json!({ "key": "seed_structures", "before": 1, "after": 2, "added": ["b 2"] })
         );
         assert_eq!(compare(&after, &after), Ok(Vec::new()));
+    }
+
+    #[test]
+    fn a_campaign_keeps_its_refit_but_for_its_limits() {
+        let before = json!({
+            "files": { "refit.replay[0]": "ab" },
+            "refit": {
+                "replay": null, "held_out": 0.1, "max_versions": 3, "after_time": null, "max_attempts": 3, "threads": 0,
+                "method": { "command": { "program": ["train"], "time_limit": null } },
+                "test_sets": [],
+            },
+        });
+        let changed = |pointer: &str, value: Value| {
+            let mut after = before.clone();
+            *after.pointer_mut(pointer).unwrap() = value;
+            assert_eq!(
+                without_changeable(&before) == without_changeable(&after),
+                compare(&before, &after).is_ok(),
+                "{pointer}"
+            );
+            compare(&before, &after)
+        };
+        for (pointer, value) in [
+            ("/refit/max_versions", json!(5)),
+            ("/refit/after_time", json!("2h")),
+            ("/refit/max_attempts", json!(5)),
+            ("/refit/threads", json!(2)),
+            ("/refit/test_sets", json!([{ "name": "liquid", "file": "" }])),
+            ("/refit/method/command/time_limit", json!("1day")),
+        ] {
+            assert_eq!(changed(pointer, value).unwrap().len(), 1, "{pointer}");
+        }
+        for (pointer, value, expected) in [
+            (
+                "/refit/held_out",
+                json!(0.2),
+                "refit.held_out is 0.2, but this campaign started with 0.1: a campaign keeps",
+            ),
+            ("/refit/method", json!({ "native": {} }), "refit.method.command.program is left out, but"),
+            ("/files/refit.replay[0]", json!("cd"), "refit.replay[0]: the contents of the file changed"),
+        ] {
+            let message = changed(pointer, value).unwrap_err().to_string();
+            assert!(message.starts_with(expected), "{message}");
+        }
+        let refused = changed("/files/refit.replay[0]", json!("cd")).unwrap_err();
+        assert_eq!(refused.key(), "refit.replay");
+        let without = json!({ "files": {} });
+        let message = compare(&without, &before).unwrap_err().to_string();
+        let expected = "refit.replay[0] is \"ab\", but this campaign started without it: a campaign keeps";
+        assert!(message.starts_with(expected), "{message}");
+        assert!(compare(&before, &without).is_err());
     }
 
     #[test]

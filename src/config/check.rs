@@ -1,5 +1,7 @@
 //! Rules between keys, which the types and ranges of single keys cannot express.
 
+mod refit;
+
 use std::collections::HashSet;
 
 use atoms::MinDistanceRule;
@@ -8,6 +10,7 @@ use orchestrator::selector::{CampaignMode, UpdateProtocol};
 use potentials::{RadiiWindows, ZblWindow, ZblWindows};
 use store::ServerUrl;
 
+use self::refit::check_refit;
 use super::error::InvalidValue;
 use super::ranges;
 use super::{Config, LabelSection, NotifySection, QueueFull};
@@ -33,7 +36,8 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_notify(&config.notify),
         check_seed_structures(config),
     ];
-    checks.into_iter().filter_map(Result::err).chain(check_label(&config.label)).collect()
+    let of_sections = check_label(&config.label).into_iter().chain(check_refit(config));
+    checks.into_iter().filter_map(Result::err).chain(of_sections).collect()
 }
 
 fn check_seed_structures(config: &Config) -> Result<(), InvalidValue> {

@@ -114,3 +114,27 @@ pub fn min_state_difference() -> Positive {
 pub fn queue_limit() -> NonZeroU32 {
     nonzero(1000)
 }
+
+pub fn replay_weight() -> Positive {
+    positive(1.0)
+}
+
+pub fn max_versions() -> NonZeroU32 {
+    nonzero(3)
+}
+
+pub fn held_out() -> f64 {
+    0.1
+}
+
+pub fn max_seed_error_ratio() -> Positive {
+    positive(3.0)
+}
+
+pub fn max_held_out_error_ratio() -> Positive {
+    positive(1.0)
+}
+
+pub fn refit_attempts() -> NonZeroU32 {
+    nonzero(3)
+}

@@ -14,6 +14,7 @@ mod method;
 mod mutated;
 mod notify;
 mod ranges;
+mod refit;
 mod schema;
 mod sections;
 mod warning;
@@ -37,6 +38,7 @@ pub use hints::KnownKeys;
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};
 pub use ranges::{impossible, usual_range};
+pub use refit::*;
 pub use schema::schema_text;
 pub use sections::*;
 pub use warning::Warning;
@@ -66,6 +68,9 @@ pub struct Config {
     pub guard: GuardSection,
     /// How collected structures are labelled.
     pub label: LabelSection,
+    /// How the potential is trained anew while the campaign runs. Without it, the campaign keeps its potential.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refit: Option<RefitSection>,
     /// What the campaign may use up.
     #[serde(default)]
     pub budget: BudgetSection,
@@ -85,6 +90,7 @@ seed_structures = { files = ["-"] }
 walk = { temperature = 300.0, biased_steps = 1, tau = 1.0 }
 collect = { criterion = { rule = "maximum_grade" }, update_target = { rule = "maximum_grade" } }
 label = { method = { potential = { kind = "grace", file = "-" } } }
+refit = { replay = ["-"], method = { command = { program = ["-"] } } }
 "#;
 
 /// A configuration as it was read.
@@ -165,6 +171,10 @@ impl Config {
             .with::<BudgetSection>("budget")
             .with::<RunSection>("run")
             .with::<NotifySection>("notify")
+            .with::<RefitSection>("refit")
+            .with::<NativeRefit>("refit.method.native")
+            .with::<CommandRefit>("refit.method.command")
+            .with::<TestSetSection>("refit.test_sets")
     }
 
     /// Where the campaign is kept, if `directory` is its directory.
@@ -186,18 +196,23 @@ impl Config {
         let optional = optional.chain(&mut self.label.reference_check.structures);
         let others =
             [&mut self.potential.model].into_iter().chain(optional).chain(&mut self.seed_structures.files);
-        others.map(Spanned::get_mut).chain(self.label.method.paths())
+        let of_refit = self.refit.iter_mut().flat_map(RefitSection::files);
+        others.map(Spanned::get_mut).chain(self.label.method.paths()).chain(of_refit)
     }
 
     fn resolve_paths(&mut self, directory: &Path) {
         self.paths().for_each(|path| *path = directory.join(&*path));
         self.notify.resolve_paths(directory);
+        if let Some(program) = self.refit.as_mut().and_then(RefitSection::program_path) {
+            *program = directory.join(&*program).to_string_lossy().into_owned();
+        }
     }
 
     /// The same without any path: a campaign depends on what is in files, not on where they are.
     pub fn without_paths(&self) -> Self {
         let mut config = self.clone();
         config.paths().for_each(PathBuf::clear);
+        config.refit.as_mut().and_then(RefitSection::program_path).into_iter().for_each(String::clear);
         config
     }
 

@@ -67,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 91] = [
+pub static RANGES: [Range; 104] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -156,6 +156,19 @@ pub static RANGES: [Range; 91] = [
     range("label.method.cp2k.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
     range("label.method.cp2k.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
     range("label.method.cp2k.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("refit.replay_weight", "", [0.0, 1e6], [1e-4, 100.0], ""),
+    range("refit.after_structures", "", [0.0, 1e9], [1.0, 1e5], ""),
+    range("refit.after_time", TIME, [0.1, YEAR], [60.0, 30.0 * DAY], ""),
+    range("refit.max_versions", "", [0.0, 1e4], [1.0, 100.0], ""),
+    range("refit.max_seed_error_ratio", "", [0.0, 1e6], [0.5, 20.0], ""),
+    range("refit.max_held_out_error_ratio", "", [0.0, 1e6], [0.5, 5.0], ""),
+    range("refit.max_attempts", "", [0.0, 1e9], [1.0, 20.0], ""),
+    range("refit.threads", "", [0.0, 1024.0], [0.0, 512.0], ""),
+    range("refit.method.native.epochs", "", [0.0, 1e9], [1.0, 1e4], ""),
+    range("refit.method.native.batch_size", "", [0.0, 1e6], [1.0, 256.0], ""),
+    range("refit.method.native.learning_rate", "", [0.0, 1.0], [1e-6, 0.05], ""),
+    range("refit.method.native.patience", "", [0.0, 1e9], [1.0, 1e3], ""),
+    range("refit.method.command.time_limit", TIME, [1.0, YEAR], [60.0, 30.0 * DAY], ""),
     range("budget.wall_time", TIME, [0.001, 10.0 * YEAR], [60.0, YEAR], ""),
     range("run.walkers", "", [0.0, 1024.0], [0.0, 512.0], ""),
     range("run.threads_per_walker", "", [0.0, 256.0], [1.0, 128.0], ""),

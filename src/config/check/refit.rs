@@ -1,0 +1,287 @@
+//! The rules of `[refit]`.
+
+use std::collections::HashSet;
+
+use orchestrator::selector::{CampaignMode, UpdateProtocol};
+
+use super::wrong;
+use crate::config::error::InvalidValue;
+use crate::config::{CommandRefit, Config, NativeRefit, RefitMethod, RefitSection};
+
+/// Names of the data sets that every version is judged by; no test set may have them.
+const OWN_SETS: [&str; 3] = ["held_out", "seed", "since"];
+
+/// Everything that is wrong with `[refit]`, and with other sections because of it.
+pub fn check_refit(config: &Config) -> Vec<InvalidValue> {
+    let Some(refit) = &config.refit else { return Vec::new() };
+    let mut checks = vec![
+        check_update(config),
+        check_artifact(config),
+        check_replay(refit),
+        check_after_time(config, refit),
+        check_share("refit.held_out", refit.held_out),
+        check_test_sets(refit),
+    ];
+    match &refit.method {
+        RefitMethod::Native(native) => checks.extend(check_native(native)),
+        RefitMethod::Command(command) => checks.push(check_program(command)),
+    }
+    checks.into_iter().filter_map(Result::err).collect()
+}
+
+/// The mixture of each version learns what walks have found.
+fn check_update(config: &Config) -> Result<(), InvalidValue> {
+    if config.calm.update == UpdateProtocol::Never {
+        let expected = "another value: with [refit], the mixture of each version is updated by the structures that walks find";
+        return wrong("calm.update", "\"never\"", expected);
+    }
+    Ok(())
+}
+
+/// With other values of `calm.update`, `calm.artifact` is required without `[refit]` too.
+fn check_artifact(config: &Config) -> Result<(), InvalidValue> {
+    if config.calm.update == UpdateProtocol::Never && config.calm.artifact.is_none() {
+        let expected = "the gmm_artifacts.npz of the model: [refit] needs a mixture that can be updated";
+        return wrong("calm.artifact", "left out", expected);
+    }
+    Ok(())
+}
+
+fn check_replay(refit: &RefitSection) -> Result<(), InvalidValue> {
+    if refit.replay.is_empty() {
+        let expected = "at least one file with labelled structures that the potential knows";
+        return wrong("refit.replay", "an empty list", expected);
+    }
+    Ok(())
+}
+
+fn check_after_time(config: &Config, refit: &RefitSection) -> Result<(), InvalidValue> {
+    match refit.after_time {
+        Some(time) if config.campaign.mode == CampaignMode::Reproducible => {
+            let expected = "mode = \"live\", or refit.after_structures in its place: what depends on time is not reproducible";
+            wrong("refit.after_time", time, expected)
+        }
+        _ => Ok(()),
+    }
+}
+
+fn check_share(key: &str, share: f64) -> Result<(), InvalidValue> {
+    if !(0.0..1.0).contains(&share) {
+        return wrong(key, share, "a number from 0 up to, not including, 1");
+    }
+    Ok(())
+}
+
+fn check_test_sets(refit: &RefitSection) -> Result<(), InvalidValue> {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || ['_', '-'].contains(&letter);
+    let mut names = HashSet::from(OWN_SETS);
+    for (number, set) in refit.test_sets.iter().enumerate() {
+        let name = set.name.as_str();
+        if name.is_empty() || !name.chars().all(is_plain) || !names.insert(name) {
+            let expected = "a name of letters, digits, _ and - that no other set has; calmwalk itself makes sets with the names \
+                            held_out, seed and since";
+            return wrong(&format!("refit.test_sets.{number}.name"), format!("{name:?}"), expected);
+        }
+    }
+    Ok(())
+}
+
+fn check_native(native: &NativeRefit) -> Vec<Result<(), InvalidValue>> {
+    let average = native.average.map(|average| check_share("refit.method.native.average", average));
+    let mut checks = vec![
+        check_share("refit.method.native.validation_share", native.validation_share),
+        check_last_learning_rate(native),
+        check_patience(native),
+    ];
+    checks.extend(average);
+    checks
+}
+
+fn check_last_learning_rate(native: &NativeRefit) -> Result<(), InvalidValue> {
+    let first = native.learning_rate.get();
+    match native.min_learning_rate {
+        Some(last) if !(0.0..=first).contains(&last) => {
+            let expected = format!("0 to refit.method.native.learning_rate = {first}");
+            wrong("refit.method.native.min_learning_rate", last, expected)
+        }
+        _ => Ok(()),
+    }
+}
+
+fn check_patience(native: &NativeRefit) -> Result<(), InvalidValue> {
+    match native.patience {
+        Some(patience) if native.validation_share == 0.0 => {
+            let expected =
+                "refit.method.native.validation_share above 0: without validation there is no loss to watch";
+            wrong("refit.method.native.patience", patience, expected)
+        }
+        _ => Ok(()),
+    }
+}
+
+fn check_program(command: &CommandRefit) -> Result<(), InvalidValue> {
+    if command.program.first().is_none_or(String::is_empty) {
+        return wrong("refit.method.command.program", "an empty command", "a program, and its arguments");
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    const DEMO: &str = include_str!("../../../configs/aluminium.toml");
+    const REPLAY: &str = "replay = [\"r.extxyz\"]";
+
+    /// What is wrong with a configuration; empty if nothing is.
+    fn errors(text: &str) -> String {
+        let loaded = Config::from_draft(Path::new("c.toml"), text.to_owned());
+        loaded.err().map(|error| error.to_string()).unwrap_or_default()
+    }
+
+    /// The demo with these lines in `[refit]`.
+    fn with(lines: &str) -> String {
+        format!("{DEMO}\n[refit]\n{lines}\n")
+    }
+
+    /// `file:line` of the first line that begins with this.
+    fn at(text: &str, beginning: &str) -> String {
+        let number = text.lines().position(|line| line.starts_with(beginning));
+        format!("c.toml:{}:", 1 + number.unwrap_or_else(|| panic!("no line {beginning}")))
+    }
+
+    /// Each line is refused at its place with these words.
+    fn refused(lines: &[(&str, &str)]) {
+        for (line, expected) in lines {
+            let replay = if line.starts_with("replay = ") { "" } else { REPLAY };
+            let text = with(&format!("{replay}\n{line}"));
+            let found = errors(&text);
+            assert!(found.starts_with(&at(&text, line)), "{line}: {found}");
+            assert!(found.contains(expected), "{found}\nexpected {expected}");
+        }
+    }
+
+    #[test]
+    fn a_refit_with_all_its_keys_is_accepted() {
+        assert_eq!(errors(&with(REPLAY)), "");
+        let native = "epochs = 5, batch_size = 4, learning_rate = 1e-4, min_learning_rate = 1e-4, loss = \"paper\", \
+                      freeze = [\"shift\"], patience = 2, average = 0.99, validation_share = 0.2";
+        let sets = "[[refit.test_sets]]\nname = \"liquid-1\"\nfile = \"l.extxyz\"\n[[refit.test_sets]]\nname = \"seeds\"\n\
+                    file = \"s.extxyz\"";
+        let all = format!(
+            "{REPLAY}\nreplay_weight = 0.02\nafter_structures = 50\nafter_time = \"24h\"\nmax_versions = 2\nheld_out = 0\n\
+             max_seed_error_ratio = 2\nmax_held_out_error_ratio = 1.1\nmax_attempts = 2\nthreads = 2\n\
+             method = {{ native = {{ {native} }} }}\n{sets}"
+        );
+        let live = with(&all).replacen("# mode = \"reproducible\"", "mode = \"live\"", 1);
+        assert_eq!(errors(&live), "");
+        let command = "method = { command = { program = [\"./train.sh\"], time_limit = \"1day\" } }";
+        assert_eq!(errors(&with(&format!("{REPLAY}\n{command}"))), "");
+    }
+
+    #[test]
+    fn each_key_has_its_rule() {
+        refused(&[
+            ("replay = []", "refit.replay is an empty list; expected at least one file"),
+            (
+                "after_time = \"2h\"",
+                "refit.after_time is 2h; expected mode = \"live\", or refit.after_structures in its place",
+            ),
+            ("held_out = 1.0", "refit.held_out is 1; expected a number from 0 up to, not including, 1"),
+            ("held_out = -0.1", "refit.held_out is -0.1; expected a number from 0"),
+            ("max_versions = 0", "refit.max_versions: "),
+            ("max_versions = 20000", "refit.max_versions is 20000; expected at most 10000"),
+            ("replay_weight = -1.0", "found -1, expected a finite number above 0"),
+            ("max_seed_error_ratio = 0", "found 0, expected a finite number above 0"),
+            ("threads = 5000", "refit.threads is 5000; expected at most 1024"),
+        ]);
+    }
+
+    #[test]
+    fn each_key_of_a_method_has_its_rule() {
+        refused(&[
+            (
+                "method = { native = { validation_share = 1.5 } }",
+                "refit.method.native.validation_share is 1.5; expected a number from 0 up to",
+            ),
+            (
+                "method = { native = { average = 1.0 } }",
+                "refit.method.native.average is 1; expected a number from 0 up to",
+            ),
+            (
+                "method = { native = { min_learning_rate = 0.1 } }",
+                "refit.method.native.min_learning_rate is 0.1; expected 0 to refit.method.native.learning_rate = 0.001",
+            ),
+            (
+                "method = { native = { min_learning_rate = -1.0 } }",
+                "refit.method.native.min_learning_rate is -1; expected 0 to",
+            ),
+            (
+                "method = { native = { patience = 5, validation_share = 0.0 } }",
+                "refit.method.native.patience is 5; expected refit.method.native.validation_share above 0",
+            ),
+            (
+                "method = { native = { learning_rate = 2.0 } }",
+                "refit.method.native.learning_rate is 2; expected at most 1",
+            ),
+            (
+                "method = { command = { program = [] } }",
+                "refit.method.command.program is an empty command; expected a program",
+            ),
+            (
+                "method = { command = { program = [\"\"] } }",
+                "refit.method.command.program is an empty command",
+            ),
+            (
+                "method = { command = { program = [\"p\"], time_limit = \"10ms\" } }",
+                "refit.method.command.time_limit is 10ms; expected 1s to 1year",
+            ),
+        ]);
+    }
+
+    #[test]
+    fn test_sets_have_names_of_their_own() {
+        for name in ["", "a b", "a/b", "é", "held_out", "seed", "since"] {
+            let line = format!("test_sets = [{{ name = \"{name}\", file = \"t\" }}]");
+            let expected = format!("refit.test_sets.0.name is \"{name}\"; expected a name of letters");
+            refused(&[(line.as_str(), expected.as_str())]);
+        }
+        let twice = "[[refit.test_sets]]\nname = \"a\"\nfile = \"t\"\n";
+        let text = with(&format!("{REPLAY}\n{twice}{twice}"));
+        let found = errors(&text);
+        let second = text.lines().count();
+        let expected = format!("c.toml:{}: refit.test_sets.1.name is \"a\"; expected", second - 2);
+        assert!(found.starts_with(&expected), "{found}\nexpected {expected}");
+    }
+
+    #[test]
+    fn names_that_are_nearly_right_get_a_hint() {
+        refused(&[
+            ("thread = 2", "did you mean `threads`?"),
+            ("epochs = 5", "it belongs in [refit.method.native]"),
+            ("method = { nativ = {} }", "did you mean `native`?"),
+            ("method = { native = { epoch = 5 } }", "did you mean `epochs`?"),
+            ("method = { native = { loss = \"dmo\" } }", "did you mean `demo`?"),
+        ]);
+        let found = errors(&with("after_structures = 5"));
+        assert!(found.contains("missing key `replay`"), "{found}");
+    }
+
+    #[test]
+    fn the_mixture_must_be_one_that_is_updated() {
+        let text = with(REPLAY).replacen("# update = \"cumulative\"", "update = \"never\"", 1);
+        let found = errors(&text);
+        assert!(found.starts_with(&at(&text, "update = ")), "{found}");
+        assert!(found.contains("calm.update is \"never\"; expected another value: with [refit]"), "{found}");
+        let text = text.replacen("\nartifact = ", "\n# artifact = ", 1);
+        let found = errors(&text);
+        let expected =
+            format!("{} calm.artifact is left out; expected the gmm_artifacts", at(&text, "[calm]"));
+        assert!(found.contains(&expected) && found.contains("calm.update is \"never\""), "{found}");
+        // Without a refit, both are allowed.
+        let without = text.split("\n[refit]").next().unwrap();
+        assert_eq!(errors(without), "");
+    }
+}

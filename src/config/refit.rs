@@ -1,0 +1,219 @@
+//! `[refit]`
+
+use std::num::{NonZeroU32, NonZeroU64};
+use std::path::PathBuf;
+
+use calm::rules::Positive;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use toml::Spanned;
+
+use super::defaults;
+use crate::duration::Duration;
+
+/// How the potential is trained anew while the campaign runs.
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RefitSection {
+    /// Extended XYZ files of labelled structures that the potential knows: its training data, or a sample of them.
+    #[schemars(with = "Vec<PathBuf>", length(min = 1))]
+    pub replay: Vec<Spanned<PathBuf>>,
+    /// Weight of each structure of `replay` in the training, times its `calmwalk_weight`. A label of the campaign has the weight 1.
+    #[serde(default = "defaults::replay_weight")]
+    pub replay_weight: Positive,
+    /// Number of structures accepted since the last attempt after which a refit begins. Default: when all walks have ended.
+    #[serde(default)]
+    pub after_structures: Option<NonZeroU32>,
+    /// Time since the last attempt after which a refit begins if there is anything new, in live mode. Default: none.
+    #[serde(default)]
+    pub after_time: Option<Duration>,
+    /// Number of versions to train. Refused ones do not count.
+    #[serde(default = "defaults::max_versions")]
+    pub max_versions: NonZeroU32,
+    /// Share of the seed structures whose labels are never trained on, from 0 up to, not including, 1.
+    #[serde(default = "defaults::held_out")]
+    #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
+    pub held_out: f64,
+    /// Largest mean absolute error of the forces on `replay`, relative to that of version 0. A version with more is refused.
+    #[serde(default = "defaults::max_seed_error_ratio")]
+    pub max_seed_error_ratio: Positive,
+    /// Largest mean absolute error of the forces on the held-out labels, relative to that of the parent. A version with more is
+    /// refused.
+    #[serde(default = "defaults::max_held_out_error_ratio")]
+    pub max_held_out_error_ratio: Positive,
+    /// Number of attempts after which a training that crashes is refused.
+    #[serde(default = "defaults::refit_attempts")]
+    pub max_attempts: NonZeroU32,
+    /// Number of threads of a refit. 0: all cores.
+    #[serde(default)]
+    pub threads: usize,
+    /// What trains the model.
+    #[serde(default)]
+    pub method: RefitMethod,
+    /// Further labelled structures. The errors of each version on them are shown, and decide nothing.
+    #[serde(default)]
+    pub test_sets: Vec<TestSetSection>,
+}
+
+/// What trains the model: a table with one key.
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum RefitMethod {
+    /// calmwalk itself, as `calmwalk upfit`.
+    Native(NativeRefit),
+    /// A program of the user.
+    Command(CommandRefit),
+}
+
+/// Settings of the training by calmwalk.
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct NativeRefit {
+    /// Number of passes over the training set.
+    pub epochs: NonZeroU64,
+    /// Number of structures for each update.
+    pub batch_size: NonZeroU32,
+    /// Learning rate of the first update; it falls by half a cosine.
+    pub learning_rate: Positive,
+    /// Learning rate of the last update, at most `learning_rate`. Default: a hundredth of it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("minimum" = 0))]
+    pub min_learning_rate: Option<f64>,
+    /// Weights of the errors of energies, forces and stresses.
+    pub loss: RefitLoss,
+    /// Beginnings of the names of weights that are not trained.
+    pub freeze: Vec<String>,
+    /// Number of epochs without a new minimum of the validation loss after which the training ends. Default: never.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub patience: Option<NonZeroU64>,
+    /// Decay, at each update, of a moving average of the weights, which is validated and written in their place; from 0 up to, not
+    /// including, 1. Default: no average.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
+    pub average: Option<f64>,
+    /// Share of the training structures for validation, whole seed structures only; from 0 up to, not including, 1. 0: none, then
+    /// the last weights are written.
+    #[schemars(extend("minimum" = 0, "exclusiveMaximum" = 1))]
+    pub validation_share: f64,
+}
+
+/// Weights of the errors in the loss, as `calmwalk upfit --loss`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RefitLoss {
+    /// Energy 20, forces 5, stress 20.
+    #[default]
+    Demo,
+    /// Energy 1, forces 5, stress 0.1; after 5/12 of the epochs 25, 1 and 0.1.
+    Paper,
+}
+
+/// Settings of the training by a program.
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CommandRefit {
+    /// The program and its arguments.
+    #[schemars(length(min = 1))]
+    pub program: Vec<String>,
+    /// Time after which the program is killed. Default: no limit.
+    #[serde(default)]
+    pub time_limit: Option<Duration>,
+}
+
+/// `[[refit.test_sets]]`
+#[derive(Clone, Debug, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TestSetSection {
+    /// Name, of letters, digits, `_` and `-`.
+    #[schemars(extend("pattern" = "^[A-Za-z0-9_-]+$"))]
+    pub name: String,
+    /// Extended XYZ file of labelled structures.
+    #[schemars(with = "PathBuf")]
+    pub file: Spanned<PathBuf>,
+}
+
+impl RefitSection {
+    /// Every file that it names.
+    pub(super) fn files(&mut self) -> impl Iterator<Item = &mut PathBuf> {
+        let of_test_sets = self.test_sets.iter_mut().map(|set| &mut set.file);
+        self.replay.iter_mut().chain(of_test_sets).map(Spanned::get_mut)
+    }
+
+    /// The program that trains the model, if it is a path.
+    pub(super) fn program_path(&mut self) -> Option<&mut String> {
+        match &mut self.method {
+            RefitMethod::Command(command) => command.program.first_mut().filter(|name| name.contains('/')),
+            RefitMethod::Native(_) => None,
+        }
+    }
+}
+
+impl Default for RefitMethod {
+    fn default() -> Self {
+        Self::Native(NativeRefit::default())
+    }
+}
+
+impl Default for NativeRefit {
+    fn default() -> Self {
+        Self {
+            epochs: defaults::nonzero(100).into(),
+            batch_size: defaults::nonzero(8),
+            learning_rate: defaults::positive(1e-3),
+            min_learning_rate: None,
+            loss: RefitLoss::default(),
+            freeze: Vec::new(),
+            patience: None,
+            average: None,
+            validation_share: 0.1,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::config::Config;
+
+    const DEMO: &str = include_str!("../../configs/aluminium.toml");
+
+    /// The demo in `directory` with these lines behind it.
+    fn config(directory: &str, lines: &str) -> Config {
+        let path = Path::new(directory).join("c.toml");
+        Config::from_draft(&path, format!("{DEMO}\n{lines}")).unwrap().config
+    }
+
+    #[test]
+    fn paths_are_relative_to_the_configuration_and_not_part_of_what_a_campaign_is() {
+        let lines = "[refit]\nreplay = [\"r.extxyz\", \"/s.extxyz\"]\n\
+                     method = { command = { program = [\"./train.sh\", \"a/b\"] } }\n\
+                     test_sets = [{ name = \"liquid\", file = \"liquid.extxyz\" }]\n";
+        let [here, there] = ["/a", "/b"].map(|directory| config(directory, lines));
+        let refit = here.refit.as_ref().unwrap();
+        let replay: Vec<_> = refit.replay.iter().map(|path| path.get_ref().as_path()).collect();
+        assert_eq!(replay, [Path::new("/a/r.extxyz"), Path::new("/s.extxyz")]);
+        assert_eq!(refit.test_sets[0].file.get_ref(), Path::new("/a/liquid.extxyz"));
+        let RefitMethod::Command(command) = &refit.method else { panic!("a command") };
+        assert_eq!(command.program, ["/a/./train.sh", "a/b"]);
+        let identity = |config: &Config| serde_json::to_value(config.without_paths()).unwrap();
+        assert_eq!(identity(&here), identity(&there));
+        let RefitMethod::Command(command) = here.without_paths().refit.unwrap().method else {
+            panic!("a command")
+        };
+        assert_eq!(command.program, ["", "a/b"]);
+        // A program that is no path is looked for in PATH.
+        let lines = "[refit]\nreplay = [\"r\"]\nmethod = { command = { program = [\"train\"] } }\n";
+        let mut refit = config("/a", lines).refit.unwrap();
+        assert_eq!(refit.program_path(), None);
+    }
+
+    #[test]
+    fn campaigns_without_a_refit_are_what_they_were() {
+        let value = serde_json::to_value(config("/a", "")).unwrap();
+        assert_eq!(value.get("refit"), None);
+        let with = serde_json::to_value(config("/a", "[refit]\nreplay = [\"r\"]\n")).unwrap();
+        assert_eq!(with["refit"]["method"]["native"]["epochs"], 100);
+    }
+}
