@@ -5,6 +5,7 @@ mod geometry;
 mod known_structures;
 mod load;
 mod loader;
+mod refit_files;
 mod seed_structures;
 mod short_range;
 mod training_sample;
@@ -43,8 +44,13 @@ pub use triage::{Remark, SeedStructureTriage, triage};
 pub use walk_time::{StepTimes, WalkTime};
 
 /// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
-const FILE_KEYS: [&str; 4] =
-    ["/potential/model", "/calm/artifact", "/calm/training_frames", "/label/method/potential/file"];
+const FILE_KEYS: [&str; 5] = [
+    "/potential/model",
+    "/calm/artifact",
+    "/calm/training_frames",
+    "/label/method/potential/file",
+    "/refit/replay",
+];
 
 /// Number of supercells that are named.
 const MAX_SHOWN_SUPERCELLS: usize = 5;
@@ -114,6 +120,7 @@ impl LoadedCampaign {
         for (key, file) in others {
             file_hashes.extend(file.as_ref().map(|file| loader.hash(key, file)).transpose()?);
         }
+        file_hashes.extend(loader.refit_files()?);
         let path = path.to_owned();
         Ok(Self {
             config,
