@@ -11,7 +11,7 @@ use store::Location;
 use crate::common;
 use crate::common::campaign::{Small, outcome, outcome_at};
 use crate::common::label_campaign::{LabelCampaign, on_store};
-use crate::common::processes::{pause_walkers, processes_in, resume_processes, wait_until};
+use crate::common::processes::{pause_walkers, processes_in, wait_until};
 use crate::common::{calmwalk, kills, random, refuse, stderr, succeed};
 
 fn ended(running: &mut common::Running) -> Option<i32> {
@@ -37,16 +37,16 @@ fn a_copy_of_a_running_campaign_can_be_run_on() {
     wait_until("the campaign advances", || {
         place.status()["mixture_version"].as_u64().is_some_and(|version| version > 0)
     });
+    // The campaign must not end before it is copied, nor before the commands that its run forbids.
+    let held = pause_walkers(place.path(), small.walkers);
     let said = succeed(place.path(), ["store", "backup", place.argument(), &copy]);
     assert!(said.contains("backed up to "), "{said}");
-    // The campaign must not end before the commands that its run forbids.
-    let held = pause_walkers(place.path(), small.walkers);
     assert_eq!(visible(elsewhere.path()), ["copy"]);
     let message = refuse(place.path(), ["store", "backup", place.argument(), &copy]);
     assert!(message.contains("exists already: give the backup a new directory"), "{message}");
     let message = refuse(place.path(), ["store", "compact", place.argument()]);
     assert!(message.contains("is being run by process"), "{message}");
-    resume_processes(&held);
+    held.resume();
     let said = succeed(place.path(), ["store", "check", &copy]);
     assert!(said.contains("no problems found in "), "{said}");
     let status: Value = serde_json::from_str(&succeed(place.path(), ["status", &copy, "--json"])).unwrap();

@@ -11,7 +11,7 @@ use tempfile::TempDir;
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::config_tester::ConfigTester;
 use crate::common::hosts::uninterrupted_outcome;
-use crate::common::processes::{hold, processes_running, resume_processes, signal, wait_until};
+use crate::common::processes::{PausedProcesses, processes_running, wait_until};
 use crate::common::{Running, program, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
@@ -107,10 +107,9 @@ fn run_until_the_time_is_used_up(here: &Path) -> String {
     let mut summary = run.stdout.take().unwrap();
     let mut run = Running(run);
     wait_until("structures are found", || used_up() || Counters::read("here", here).sent > 0);
-    let held = processes_running(here, "walker");
-    held.iter().for_each(|pid| signal(*pid, "STOP"));
+    let held = PausedProcesses::new(processes_running(here, "walker"));
     wait_until("the time is used up", used_up);
-    resume_processes(&held);
+    held.resume();
     let mut text = String::new();
     summary.read_to_string(&mut text).unwrap();
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", said());
@@ -178,10 +177,10 @@ fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
     // The queue only grows while the labellers are paused.
     wait_until("a labeller is running", || !processes_running(here, "labeller").is_empty());
     let labellers = processes_running(here, "labeller");
-    labellers.iter().for_each(|pid| hold(*pid, here.join("here").to_str().unwrap()));
+    let held = PausedProcesses::outside_transactions(labellers, here.join("here").to_str().unwrap());
     let raised = || decisions(here).into_iter().filter(|line| line.contains("\"raised_by\"")).count();
     wait_until("the threshold is raised", || here.join("here/campaign.sqlite").exists() && raised() > 0);
-    labellers.iter().for_each(|pid| signal(*pid, "CONT"));
+    held.resume();
     assert!(run.0.wait().unwrap().success());
     outcome(&here.join("here"));
     let report: Value = serde_json::from_str(&succeed(here, ["replay", "here", "--json"])).unwrap();

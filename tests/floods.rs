@@ -18,9 +18,7 @@ use crate::common::Running;
 use crate::common::campaign::{Small, outcome};
 use crate::common::hosts::uninterrupted_outcome;
 use crate::common::http::{first_event, request, said};
-use crate::common::processes::{
-    assert_no_leftovers, pause_walkers, processes_running, resume_processes, signal, wait_until,
-};
+use crate::common::processes::{assert_no_leftovers, pause_walkers, processes_running, signal, wait_until};
 
 /// Limit of file descriptors of the campaign's process.
 const LIMIT: usize = 256;
@@ -106,9 +104,9 @@ fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
 
     let flood = Flood::begin(address);
     wait_until("the flood has opened its connections", || flood.opened() >= connections());
-    signal(held[0], "KILL");
+    signal(held.pids()[0], "KILL");
     wait_until("the walker is replaced", || {
-        processes_running(here, "walker").iter().any(|pid| !held.contains(pid))
+        processes_running(here, "walker").iter().any(|pid| !held.pids().contains(pid))
     });
     let allowed =
         request(address, "GET", "/api/actions", &[("x-calmwalk-token", token), ("Connection", "close")], "");
@@ -118,7 +116,7 @@ fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
     assert!(taken < LIMIT * 7 / 8, "{taken} descriptors");
     drop(flood);
 
-    resume_processes(&held);
+    held.resume();
     assert_eq!(run.0.wait().unwrap().code(), Some(0));
     assert_eq!(outcome(here), uninterrupted_outcome(&small));
     assert_no_leftovers(here);

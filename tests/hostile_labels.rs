@@ -13,7 +13,7 @@ use store::JobState;
 use crate::common;
 use crate::common::campaign::Small;
 use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, on_store, queue};
-use crate::common::processes::{calculation_processes, pause_walkers, resume_processes, wait_until};
+use crate::common::processes::{calculation_processes, pause_walkers, wait_until};
 use crate::common::{program, stderr};
 
 /// Name, shell command, and expected message of each kind of output.
@@ -100,7 +100,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     LEFT.iter().for_each(|(kind, ..)| fs::create_dir(home.join("kinds").join(kind)).unwrap());
     let mut label = place.label(&["--wait-timeout", "2m"]);
     wait_until("every kind has been left once", || fs::read_dir(home.join("kinds")).unwrap().count() == 0);
-    resume_processes(&walkers);
+    walkers.resume();
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
 
@@ -230,13 +230,11 @@ fn walkers_have_no_password() {
     Small { walkers: 1, ..Small::default() }.write(directory.path());
     let mut command = program(directory.path());
     command.args(["run", "campaign.toml", "--directory", "."]).env("PGPASSWORD", "hunter2").env("KEPT", "1");
-    let mut run = common::Running(command.stderr(std::process::Stdio::null()).spawn().unwrap());
+    let _run = common::Running(command.stderr(std::process::Stdio::null()).spawn().unwrap());
     let walkers = pause_walkers(directory.path(), 1);
-    let environment = fs::read(format!("/proc/{}/environ", walkers[0])).unwrap();
+    let environment = fs::read(format!("/proc/{}/environ", walkers.pids()[0])).unwrap();
     let environment = String::from_utf8_lossy(&environment).replace('\0', "\n");
     assert!(environment.contains("KEPT=1\n") && !environment.contains("hunter2"), "{environment}");
-    run.0.kill().unwrap();
-    resume_processes(&walkers);
 }
 
 /// A daemon with its own session, no parent and an empty environment.

@@ -8,7 +8,7 @@ use std::time::Duration;
 use crate::common::campaign::{Small, outcome};
 use crate::common::delay_proxy::DelayProxy;
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
-use crate::common::processes::{pause_walkers, processes_running, resume_processes, signal, wait_until};
+use crate::common::processes::{pause_walkers, processes_running, signal, wait_until};
 use crate::common::{Running, kills, random};
 
 /// The server soon declares a silent agent dead.
@@ -31,7 +31,7 @@ fn a_campaign_on_three_hosts_has_the_same_outcome() {
     for host in 0..2 {
         wait_until("the agent has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
-    resume_processes(&held);
+    held.resume();
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!((first.0.wait().unwrap().code(), second.0.wait().unwrap().code()), (Some(0), Some(0)));
     for host in 0..2 {
@@ -53,7 +53,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     signal(agents[0].0.id(), "TERM");
     assert_eq!(agents[0].0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     signal(orchestrator.0.id(), "TERM");
-    resume_processes(&held);
+    held.resume();
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(130));
     assert_eq!(agents[1].0.wait().unwrap().code(), Some(130), "{}", hosts.said(1));
     hosts.assert_cleaned_up();
@@ -62,7 +62,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     let joined = hosts.said(0).matches("joined: 1 walker,").count();
     let mut agent = hosts.agent(0);
     wait_until("the agent has joined", || hosts.said(0).matches("joined: 1 walker,").count() > joined);
-    resume_processes(&held);
+    held.resume();
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
@@ -83,7 +83,7 @@ fn a_slow_line_changes_nothing() {
     // On an idle machine, the orchestrator's own walker would finish before the agent has joined.
     let held = pause_walkers(hosts.home.path(), 1);
     wait_until("the agent has joined", || hosts.said(0).contains("joined: 1 walker,"));
-    resume_processes(&held);
+    held.resume();
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert!(!hosts.orchestrator_stderr().contains("sends no heartbeat"), "{}", hosts.orchestrator_stderr());

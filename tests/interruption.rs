@@ -11,8 +11,8 @@ use crate::common;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
 use crate::common::label_campaign::WRITE_FIXED_LABEL;
 use crate::common::processes::{
-    assert_no_leftovers, calculation_processes, pause_walkers, processes_in, processes_running,
-    resume_processes, signal, wait_until,
+    assert_no_leftovers, calculation_processes, pause_walkers, processes_in, processes_running, signal,
+    wait_until,
 };
 use crate::common::{Running, kills, program, random};
 
@@ -147,7 +147,7 @@ fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
         // The campaign must not end before the signal.
         let held = pause_walkers(directory.path(), 2);
         signal(running.0.id(), name);
-        resume_processes(&held);
+        held.resume();
         assert_eq!(running.0.wait().unwrap().code(), Some(130), "{name}");
         assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
         assert_eq!(outcome(directory.path()), expected, "{name}");

@@ -10,7 +10,7 @@ use crate::common::campaign::{Small, outcome_at};
 use crate::common::hosts::uninterrupted_outcome;
 use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::{
-    assert_no_leftovers, pause_walkers, processes_in, processes_running, resume_processes, signal, wait_until,
+    assert_no_leftovers, pause_walkers, processes_in, processes_running, signal, wait_until,
 };
 use crate::common::{Running, calmwalk, config, program, refuse};
 
@@ -48,7 +48,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
             processes.iter().filter(|process| process["kind"] == "labeller" && process["state"] == "running");
         slots.count() == 2
     });
-    resume_processes(&held);
+    held.resume();
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     let said = place.said();
@@ -82,10 +82,11 @@ fn the_job_of_a_killed_labeller_is_labelled_by_the_next() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--until-empty"]);
     // Pause its slot, so that the label is not made before the kill.
-    place.pause_labeller();
+    let slot = place.pause_labeller();
     label.0.kill().unwrap();
     label.0.wait().unwrap();
     wait_until("its label worker has exited", || processes_in(place.path()).is_empty());
+    drop(slot);
     assert_ne!(place.job(&name).job.state, JobState::Labelled);
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
     let job = place.job(&name);
@@ -101,12 +102,12 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_continue() {
     place.wait_for_lease();
     let slots = processes_running(place.path(), "labeller");
     // Pause all slots, so that the label is not made before its slot is found.
-    slots.iter().for_each(|slot| place.hold(*slot));
+    let held = place.pause(&slots);
     let holder = place.job(&name).job.holder.unwrap();
     let pid: u32 = holder.rsplit('-').nth(1).unwrap().parse().unwrap();
     assert!(slots.len() == 2 && slots.contains(&pid), "{slots:?} {holder}");
     signal(pid, "KILL");
-    resume_processes(&slots);
+    held.resume();
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     assert!(place.said().contains("killed by signal 9 (SIGKILL); backing off"), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Labelled);
@@ -224,7 +225,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
     assert!(begun.elapsed() > Duration::from_secs(1), "the lease had not expired");
     let exported = place.export();
-    signal(slot, "CONT");
+    slot.resume();
     assert_eq!(ended(&mut late), Some(0), "{}", place.said());
     assert!(place.said().contains("has a label already; this result is kept as a check"), "{}", place.said());
     let job = place.job(&name);
@@ -252,7 +253,7 @@ fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
     std::thread::sleep(Duration::from_secs(6));
     assert_eq!(place.job(&name).job.attempts, 1, "{}", place.said());
     assert!(run.0.try_wait().unwrap().is_none(), "{}", place.said());
-    signal(slot, "CONT");
+    slot.resume();
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
     let job = place.job(&name);

@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::common::campaign::Small;
 use crate::common::hosts::Hosts;
 use crate::common::http::{Answer, get, request, said};
-use crate::common::processes::{signal, wait_for_process, wait_until};
+use crate::common::processes::{PausedProcesses, signal, wait_for_process, wait_until};
 use crate::common::{Running, program, refuse, succeed};
 
 /// Type and samples of each metric; samples by their labels as text.
@@ -158,10 +158,10 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
         value("calmwalk_agent_walker_restarts_total", "") == Some(1.0)
             && value("calmwalk_agent_walkers", "state=\"running\"") == Some(1.0)
     });
-    signal(orchestrator.0.id(), "STOP");
+    let held = PausedProcesses::new([orchestrator.0.id()]);
     wait_until("the link is down", || value("calmwalk_agent_link_up", "") == Some(0.0));
     assert!(value("calmwalk_agent_link_silence_seconds", "") > Some(1.0));
-    signal(orchestrator.0.id(), "CONT");
+    held.resume();
     wait_until("the link is up again", || value("calmwalk_agent_link_up", "") == Some(1.0));
     signal(agent.0.id(), "TERM");
     assert_eq!(agent.0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));

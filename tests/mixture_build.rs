@@ -18,7 +18,7 @@ use atoms::read_extxyz;
 use calm::Artifact;
 use npyz::zip::ZipArchive;
 
-use crate::common::processes::{signal, wait_until};
+use crate::common::processes::{PausedProcesses, signal, wait_until};
 use crate::common::{Running, calmwalk, config, program, refuse, stderr, succeed, write_frames};
 
 const MODEL: &str = "data/al_eam_1l/kokkos.npz";
@@ -117,10 +117,10 @@ fn an_interrupted_build_continues_and_another_is_refused() {
     let child = command.args(&started).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let state = here.join("out.npz.build");
     wait_until("a shard is finished", || state.join("pass-1").exists());
-    signal(child.id(), "STOP");
+    let held = PausedProcesses::new([child.id()]);
     assert!(fail(here, &started).contains("another process builds out.npz"));
     signal(child.id(), "INT");
-    signal(child.id(), "CONT");
+    held.resume();
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
     assert!(stderr(&output).contains("the same command continues"));

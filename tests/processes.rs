@@ -11,7 +11,7 @@ use crate::common;
 use crate::common::campaign::{Small, outcome};
 use crate::common::hosts::uninterrupted_outcome;
 use crate::common::processes::{
-    assert_no_leftovers, hold, pause_walkers, processes_in, processes_running, resume_processes, signal,
+    PausedProcesses, assert_no_leftovers, pause_walkers, processes_in, processes_running, signal,
     wait_for_process, wait_until,
 };
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
@@ -146,7 +146,7 @@ fn a_terminated_labeller_is_replaced() {
         wait_until("another labeller is running", || {
             processes_running(here, "labeller").first().is_some_and(|other| *other != labeller)
         });
-        resume_processes(&held);
+        held.resume();
     });
 }
 
@@ -163,7 +163,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_continue() {
     let held = pause_walkers(here, 2);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
-    signal(held[0], "KILL");
+    signal(held.pids()[0], "KILL");
     let failed = |process: &Value| {
         let remark = process["remark"].as_str().unwrap_or_default();
         process["kind"] == "walker" && process["state"] == "failed" && remark.contains("another content")
@@ -173,7 +173,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_continue() {
     let failed = |line: &str| line.starts_with("walker") && line.contains("  failed  ");
     assert!(table.lines().any(failed) && table.contains("another content"), "{table}");
     fs::write(here.join("model.npz"), model).unwrap();
-    resume_processes(&held);
+    held.resume();
     ends_as_undisturbed(running, here, &small);
 }
 
@@ -196,10 +196,10 @@ fn a_run_may_have_more_descriptors_than_its_walkers() {
     let mut running = Running(command.spawn().unwrap());
     let held = pause_walkers(here, 2);
     assert_eq!(descriptors(running.0.id()), ["600", "600"]);
-    for child in held.iter().chain(&processes_running(here, "labeller")) {
+    for child in held.pids().iter().chain(&processes_running(here, "labeller")) {
         assert_eq!(descriptors(*child), ["300", "600"]);
     }
-    resume_processes(&held);
+    held.resume();
     assert_eq!(wait(&mut running), Some(0));
     assert_no_leftovers(here);
 }
@@ -216,7 +216,8 @@ fn without_any_walker_the_campaign_fails_and_can_continue() {
     let held = pause_walkers(here, 2);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
-    held.into_iter().for_each(|walker| signal(walker, "KILL"));
+    // This kills the walkers.
+    drop(held);
     assert_eq!(wait(&mut running), Some(1), "{}", said(here));
     let message = said(here);
     assert!(message.contains("no walker is left") && message.contains("another content"), "{message}");
@@ -237,7 +238,7 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     let labellers = processes_running(here, "labeller");
     assert_eq!(labellers.len(), 1);
     // Pause it, so that it does not look for an orchestrator and exit.
-    hold(labellers[0], here.to_str().unwrap());
+    let held = PausedProcesses::outside_transactions(&*labellers, here.to_str().unwrap());
     running.0.kill().unwrap();
     running.0.wait().unwrap();
     wait_until("the walkers have exited", || processes_running(here, "walker").is_empty());
@@ -248,7 +249,7 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     // The campaign cannot end while a labeller is paused.
     let second = refuse(here, RUN);
     assert!(second.contains(&format!("process {}", running.0.id())), "{second}");
-    signal(labellers[0], "CONT");
+    held.resume();
     assert_eq!(processes_running(here, "labeller"), labellers);
     ends_as_undisturbed(running, here, &small);
 }
@@ -370,7 +371,7 @@ fn shared_memory_is_the_users_alone() {
     }
     assert!(segments > 0);
     signal(running.0.id(), "TERM");
-    resume_processes(&held);
+    held.resume();
     assert_eq!(wait(&mut running), Some(130));
     assert_no_leftovers(here);
 }

@@ -205,7 +205,7 @@ fn labellers_continue_with_the_new_protocol() {
     let mut label = place.label(&[]);
     let slot = place.pause_labeller();
     relabel(&place, &["--config", "fine.toml", "--all"]);
-    signal(slot, "CONT");
+    slot.resume();
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert!(place.said().contains("the campaign replaced label protocol 'potential'"), "{}", place.said());
     let job = place.job(&name).job;

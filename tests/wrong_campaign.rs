@@ -11,6 +11,7 @@ use tempfile::TempDir;
 
 use crate::common::campaign::{Small, outcome};
 use crate::common::hosts::uninterrupted_outcome;
+use crate::common::processes::PausedProcesses;
 use crate::common::{Running, calmwalk, program, refuse, stderr, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
@@ -216,18 +217,15 @@ fn a_second_run_of_a_campaign_names_the_first() {
     let mut first = program(directory.path());
     let first = first.args(RUN).stdout(Stdio::null()).stderr(Stdio::null());
     let mut first = Running(first.spawn().unwrap());
-    let signal = |name: &str, pid: u32| {
-        assert!(Command::new("kill").args([name, &pid.to_string()]).status().unwrap().success());
-    };
     let lock = directory.path().join("here/campaign.lock");
     while !fs::read_to_string(&lock).is_ok_and(|text| text.contains("process")) {
         assert!(first.0.try_wait().unwrap().is_none(), "the first run ended too early to be met");
         std::thread::yield_now();
     }
     // Pause the first run, so that it cannot end before the second starts.
-    signal("-STOP", first.0.id());
+    let held = PausedProcesses::new([first.0.id()]);
     let second = calmwalk(directory.path(), RUN);
-    signal("-CONT", first.0.id());
+    held.resume();
     let message = assert_plain(&second, 2);
     assert!(message.contains(&format!("being run by process {} (calmwalk run)", first.0.id())), "{message}");
     assert_eq!(first.0.wait().unwrap().code(), Some(0));

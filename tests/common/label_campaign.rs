@@ -16,7 +16,7 @@ use tempfile::TempDir;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 use super::campaign::Small;
-use super::processes::{hold, wait_for_process, wait_until};
+use super::processes::{PausedProcesses, wait_for_process, wait_until};
 use super::{Running, calmwalk, program, succeed};
 
 /// A directory with `campaign.toml`, and the URL of the store if it is on a server.
@@ -120,17 +120,17 @@ impl LabelCampaign {
         wait_until("a structure is leased", || on_store(self.location(), leased) == 1);
     }
 
-    /// Stops a process with SIGSTOP while it holds no database lock.
-    pub fn hold(&self, pid: u32) {
-        hold(pid, self.url.as_deref().unwrap_or_else(|| self.path().to_str().unwrap()));
+    /// Stops processes while they hold no database lock.
+    pub fn pause(&self, pids: &[u32]) -> PausedProcesses {
+        let store = self.url.as_deref().unwrap_or_else(|| self.path().to_str().unwrap());
+        PausedProcesses::outside_transactions(pids, store)
     }
 
-    /// Stops the only labeller while it makes a label. Returns its pid.
-    pub fn pause_labeller(&self) -> u32 {
+    /// Stops the only labeller while it makes a label.
+    pub fn pause_labeller(&self) -> PausedProcesses {
         let labeller = wait_for_process(self.path(), "labeller");
         self.wait_for_lease();
-        self.hold(labeller);
-        labeller
+        self.pause(&[labeller])
     }
 
     /// Queues a structure whose label takes a second or more. Returns the name of its candidate.

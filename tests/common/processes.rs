@@ -61,21 +61,63 @@ pub fn calculation_processes(scratch: &Path) -> Vec<(u32, String)> {
 
 /// Sends a signal. Ignores a process that has ended.
 pub fn signal(pid: u32, name: &str) {
-    let sent = Command::new("kill").args([format!("-{name}"), pid.to_string()]).output();
-    sent.expect("kill runs");
+    kill_command(pid, name).output().expect("kill runs");
 }
 
-/// Stops a process with SIGSTOP, but not within a transaction, which would block other writers. `store` is the
-/// campaign's directory or URL.
-pub fn hold(pid: u32, store: &str) {
-    wait_until("it is held outside of a transaction", || {
-        signal(pid, "STOP");
-        let others_can_write = can_write(store);
-        if !others_can_write {
-            signal(pid, "CONT");
+fn kill_command(pid: u32, signal: &str) -> Command {
+    let mut command = Command::new("kill");
+    command.args([format!("-{signal}"), pid.to_string()]);
+    command
+}
+
+/// Processes that SIGSTOP has stopped, until [`Self::resume`]. Dropping this kills them, so that a test that fails leaves no
+/// stopped process behind.
+#[must_use = "dropping it kills the processes"]
+pub struct PausedProcesses(Vec<u32>);
+
+impl PausedProcesses {
+    /// Stops these processes.
+    pub fn new(pids: impl Into<Vec<u32>>) -> Self {
+        let paused = Self(pids.into());
+        paused.0.iter().for_each(|pid| signal(*pid, "STOP"));
+        paused
+    }
+
+    /// Stops these processes, but none within a transaction, which would block other writers. `store` is the campaign's
+    /// directory or URL.
+    pub fn outside_transactions(pids: impl Into<Vec<u32>>, store: &str) -> Self {
+        let paused = Self(pids.into());
+        for pid in &paused.0 {
+            wait_until("it is stopped outside of a transaction", || {
+                signal(*pid, "STOP");
+                let others_can_write = can_write(store);
+                if !others_can_write {
+                    signal(*pid, "CONT");
+                }
+                others_can_write
+            });
         }
-        others_can_write
-    });
+        paused
+    }
+
+    pub fn pids(&self) -> &[u32] {
+        &self.0
+    }
+
+    /// Lets the processes continue.
+    pub fn resume(mut self) {
+        self.0.iter().for_each(|pid| signal(*pid, "CONT"));
+        self.0.clear();
+    }
+}
+
+impl Drop for PausedProcesses {
+    fn drop(&mut self) {
+        for pid in &self.0 {
+            // SIGKILL also ends a stopped process. The test may be failing already.
+            let _ = kill_command(*pid, "KILL").output();
+        }
+    }
 }
 
 /// Whether the job table can be locked within a second.
@@ -93,20 +135,14 @@ fn can_write(store: &str) -> bool {
     })
 }
 
-/// Stops all walkers as soon as there are `number` of them. The campaign cannot end until [`resume_processes`].
-pub fn pause_walkers(directory: &Path, number: usize) -> Vec<u32> {
+/// Stops all walkers as soon as there are `number` of them. The campaign cannot end until they are resumed.
+pub fn pause_walkers(directory: &Path, number: usize) -> PausedProcesses {
     let mut walkers = Vec::new();
     wait_until(&format!("there are {number} walkers"), || {
         walkers = processes_running(directory, "walker");
         walkers.len() == number
     });
-    walkers.iter().for_each(|pid| signal(*pid, "STOP"));
-    walkers
-}
-
-/// Resumes stopped processes.
-pub fn resume_processes(held: &[u32]) {
-    held.iter().for_each(|pid| signal(*pid, "CONT"));
+    PausedProcesses::new(walkers)
 }
 
 /// Waits until a condition holds.

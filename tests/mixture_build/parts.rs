@@ -78,12 +78,13 @@ fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
     let mut running = Running(child.unwrap());
     let state = here.join("out.npz.build");
     wait_until("a shard is finished", || state.join("pass-1-1of2").exists());
-    signal(running.0.id(), "STOP");
+    let held = PausedProcesses::new([running.0.id()]);
     let message = fail(here, &part("out.npz", 1, 1, 2));
     assert!(message.contains("another process builds out.npz"), "{message}");
     assert!(fail(here, &arguments("out.npz", &["data.extxyz"], &[])).contains("another process builds"));
     succeed(here, part("out.npz", 1, 2, 2));
-    signal(running.0.id(), "KILL");
+    // This kills the part.
+    drop(held);
     running.0.wait().unwrap();
     let message = fail(here, &merge("out.npz"));
     assert!(message.contains("pass 1 is not done: missing are the parts 1/2"), "{message}");

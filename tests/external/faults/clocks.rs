@@ -13,9 +13,7 @@ use serde_json::Value;
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::clock::Clock;
 use crate::common::hosts::{Hosts, started, uninterrupted_outcome};
-use crate::common::processes::{
-    assert_no_leftovers, pause_walkers, processes_running, resume_processes, signal, wait_until,
-};
+use crate::common::processes::{assert_no_leftovers, pause_walkers, processes_running, signal, wait_until};
 use crate::common::{calmwalk, random, through};
 
 #[test]
@@ -126,7 +124,7 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
     for host in 0..2 {
         wait_until("the agent has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
-    resume_processes(&held);
+    held.resume();
     for jump in 0.. {
         set[jump % 2].set(["-1h", "+1h", "+0"][jump % 3]);
         sleep(Duration::from_millis(300));

@@ -10,9 +10,7 @@ use tempfile::TempDir;
 use super::must;
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::hosts::{started, uninterrupted_outcome};
-use crate::common::processes::{
-    assert_no_leftovers, pause_walkers, processes_in, resume_processes, signal, wait_until,
-};
+use crate::common::processes::{assert_no_leftovers, pause_walkers, processes_in, signal, wait_until};
 use crate::common::{Running, program, random, through};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
@@ -83,7 +81,7 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
         let held = pause_walkers(&disk.at, 2);
         before = Counters::read(".", &disk.at);
         disk.fill();
-        resume_processes(&held);
+        held.resume();
         assert_eq!(run.0.wait().unwrap().code(), Some(1));
         let said = disk.said();
         let words =
@@ -124,8 +122,8 @@ fn shared_memory_that_others_fill_does_no_harm() {
     let held = pause_walkers(here, 2);
     must(&format!("{inside} sh -c '! dd if=/dev/zero of=/dev/shm/filler bs=64k'"));
     // Walkers started from now on find it full.
-    signal(held[0], "KILL");
-    resume_processes(&held);
+    signal(held.pids()[0], "KILL");
+    held.resume();
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
     wait_until("all processes have exited", || processes_in(here).is_empty());
     must(&format!("{inside} sh -c 'rm /dev/shm/filler && ! ls /dev/shm | grep ^cw-'"));

@@ -10,7 +10,7 @@ use super::must;
 use crate::common::Running;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
-use crate::common::processes::{pause_walkers, processes_running, resume_processes, wait_until};
+use crate::common::processes::{pause_walkers, processes_running, wait_until};
 
 /// Three concurrent walks: one for the orchestrator's own walker, two for the agent.
 fn small() -> Small {
@@ -61,7 +61,7 @@ impl Linked {
         wait_until("the other host is running", || {
             !processes_running(self.hosts.others[0].path(), "walker").is_empty()
         });
-        resume_processes(&held);
+        held.resume();
         wait_until("structures are found", || self.counters().accepted > 0);
     }
 
@@ -138,7 +138,7 @@ fn cut_for_a_minute() {
     wait_until("the agent joins again", || {
         linked.hosts.orchestrator_stderr().matches("): joined").count() >= 2
     });
-    resume_processes(&held);
+    held.resume();
     let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
 }

@@ -7,7 +7,7 @@ use crate::common::campaign::{Small, outcome};
 use crate::common::config;
 use crate::common::delay_proxy::DelayProxy;
 use crate::common::hosts::{Hosts, uninterrupted_outcome};
-use crate::common::processes::{pause_walkers, processes_running, resume_processes, signal, wait_until};
+use crate::common::processes::{pause_walkers, processes_running, signal, wait_until};
 
 /// Long enough to kill the orchestrator while a request is in transit.
 const DELAY: Duration = Duration::from_secs(1);
@@ -31,18 +31,19 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     hosts.endpoints[1] = format!("tcp/{}", proxy.address);
 
     // Keep work for the agent until it has joined, and joined again.
-    let hold = || pause_walkers(hosts.home.path(), 1);
+    let pause = || pause_walkers(hosts.home.path(), 1);
     let mut orchestrator = hosts.start_orchestrator();
-    hold();
+    let held = pause();
     let mut agent = hosts.agent(0);
     wait_until("the agent asks for the model", || hosts.said(0).contains("downloading the model"));
     signal(orchestrator.0.id(), "KILL");
     orchestrator.0.wait().unwrap();
     wait_until("its walker has exited", || processes_running(hosts.home.path(), "walker").is_empty());
+    drop(held);
     let mut orchestrator = hosts.start_orchestrator();
-    let held = hold();
+    let held = pause();
     wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walker,"));
-    resume_processes(&held);
+    held.resume();
     assert!(hosts.said(0).contains("joining again"), "{}", hosts.said(0));
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));

@@ -9,7 +9,7 @@ use crate::common::campaign::{Small, outcome_at};
 use crate::common::clock::Clock;
 use crate::common::hosts::uninterrupted_outcome;
 use crate::common::label_campaign::LabelCampaign;
-use crate::common::processes::{processes_running, signal, wait_until};
+use crate::common::processes::{processes_running, wait_until};
 use crate::common::{random, through};
 
 /// `calmwalk label` with this clock on a simulated other host, which has its own process ids and its own boot id.
@@ -77,7 +77,7 @@ fn a_lease_lasts_however_late_others_think_it_is() {
     wait_until("another labeller is running", || processes_running(place.path(), "labeller").len() == 2);
     // Long enough for the second labeller to poll the queue several times.
     sleep(Duration::from_secs(8));
-    signal(slot, "CONT");
+    slot.resume();
     for label in [&mut first, &mut second] {
         assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
     }
