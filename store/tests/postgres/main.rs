@@ -6,6 +6,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod connections;
+mod creation;
 mod leading;
 mod leases;
 mod old_schema;
