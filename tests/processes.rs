@@ -119,14 +119,14 @@ fn wait_for_work(directory: &Path) {
 #[test]
 fn a_hung_walker_is_killed_and_replaced() {
     let mut hung = 0;
-    let directory = disturbed("heartbeat_timeout = \"10s\"", |here| {
+    let directory = disturbed("heartbeat_timeout = \"5s\"", |here| {
         hung = wait_for_process(here, "walker");
         signal(hung, "STOP");
     });
     assert!(!processes_in(directory.path()).iter().any(|process| process.pid == hung));
     let endings = endings(directory.path());
     let hung =
-        |ending: &String| ending.contains("silent for 10 s, killed") && ending.contains(r#""kind":"walker""#);
+        |ending: &String| ending.contains("silent for 5 s, killed") && ending.contains(r#""kind":"walker""#);
     assert_eq!(endings.iter().filter(|ending| hung(ending)).count(), 1, "{endings:?}");
 }
 

@@ -118,10 +118,10 @@ fn cut_for_five_seconds() {
     );
 }
 
-/// Longer than the heartbeat timeout: the server reassigns the walks to the orchestrator's own walker. The host joins again
+/// Twice the heartbeat timeout: the server reassigns the walks to the orchestrator's own walker. The host joins again
 /// after the cut; the server discards its results for walks that were reassigned or finished.
 #[test]
-fn cut_for_a_minute() {
+fn cut_for_half_a_minute() {
     let linked = Linked::new(15.0, 60.0);
     let before = linked.counters();
     linked.cable.cut();
@@ -132,7 +132,7 @@ fn cut_for_a_minute() {
     wait_until("another walker continues the walks", || linked.counters().sent > handed_on.sent);
     // Keep work for the host until it is back.
     let held = pause_walkers(linked.hosts.home.path(), 1);
-    sleep(Duration::from_secs(60).saturating_sub(begun.elapsed()));
+    sleep(Duration::from_secs(30).saturating_sub(begun.elapsed()));
     linked.cable.mend();
     wait_until("the agent is back", || linked.agent_says("the orchestrator answers again"));
     wait_until("the agent joins again", || {

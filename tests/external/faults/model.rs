@@ -10,7 +10,7 @@ use crate::common::hosts::{Hosts, uninterrupted_outcome};
 use crate::common::processes::{pause_walkers, processes_running, signal, wait_until};
 
 /// Long enough to kill the orchestrator while a request is in transit.
-const DELAY: Duration = Duration::from_secs(1);
+const DELAY: Duration = Duration::from_millis(500);
 
 #[test]
 fn an_orchestrator_is_killed_while_its_model_is_fetched() {
