@@ -27,7 +27,7 @@ fn visible(directory: &Path) -> Vec<String> {
 
 /// A copy made during a campaign continues to the same outcome as the campaign.
 #[test]
-fn a_copy_of_a_running_campaign_can_be_run_on() {
+fn a_copy_of_a_running_campaign_can_be_continued() {
     // Some seconds of work, so that it runs while it is copied.
     let small = Small { steps: 600, max_per_walk: 1000, ..Small::default() };
     let place = LabelCampaign::new(&small, &[]);
@@ -37,7 +37,7 @@ fn a_copy_of_a_running_campaign_can_be_run_on() {
     wait_until("the campaign advances", || {
         place.status()["mixture_version"].as_u64().is_some_and(|version| version > 0)
     });
-    // The campaign must not end before it is copied, nor before the commands that its run forbids.
+    // The campaign must not end before it is copied, nor before the commands that are refused while it runs.
     let held = pause_walkers(place.path(), small.walkers);
     let said = succeed(place.path(), ["store", "backup", place.argument(), &copy]);
     assert!(said.contains("backed up to "), "{said}");
@@ -100,7 +100,7 @@ fn a_killed_backup_leaves_nothing_that_looks_like_one() {
             assert_eq!(visible(elsewhere.path()), [""; 0]);
         }
     }
-    assert!(unfinished > 0, "none of {} was killed at work, {whole} were whole", kills());
+    assert!(unfinished > 0, "none of {} was killed while it copied, {whole} were complete", kills());
     succeed(place.path(), ["store", "backup", place.argument(), &copy]);
     assert_eq!(fs::read_dir(elsewhere.path()).unwrap().count(), 1, "the unfinished backups are removed");
     succeed(place.path(), ["export", &copy, "--control", "--output", "copy.extxyz"]);

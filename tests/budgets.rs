@@ -65,7 +65,7 @@ fn costly_labels(directory: &Path) -> usize {
 }
 
 #[test]
-fn as_many_structures_are_collected_as_there_may_be_labels_for() {
+fn the_budget_of_labels_limits_how_many_structures_are_collected() {
     // A structure takes two labels: its own and its control frame's.
     let small = Small { walks_per_round: 1, ..Small::default() };
     let directory = write(&small, "[budget]\nlabels = 5\n");
@@ -117,7 +117,7 @@ fn run_until_the_time_is_used_up(here: &Path) -> String {
 }
 
 #[test]
-fn a_limit_of_time_stops_walks_where_they_stand() {
+fn a_time_limit_stops_walks_at_their_current_step() {
     let small = Small::default();
     let expected = uninterrupted_outcome(&small);
     let directory = write(&small, "[budget]\nwall_time = \"2s\"\n");
@@ -149,7 +149,7 @@ fn a_limit_of_time_stops_walks_where_they_stand() {
 }
 
 #[test]
-fn labels_beyond_the_core_hours_are_not_begun() {
+fn labels_beyond_the_core_hours_are_not_started() {
     for in_process in [false, true] {
         let directory = write(&Small { mode: "live", ..Small::default() }, "[budget]\ncore_hours = 1e-9\n");
         let here = directory.path();

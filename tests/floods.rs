@@ -83,7 +83,7 @@ impl Drop for Flood {
 }
 
 #[test]
-fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
+fn a_flood_of_connections_disturbs_neither_the_campaign_nor_its_user() {
     // A walker may be restarted only once.
     let small = Small::default();
     let directory = tempfile::tempdir().unwrap();

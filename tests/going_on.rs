@@ -34,7 +34,7 @@ fn replace(directory: &Path, from: &str, to: &str) {
 }
 
 /// Continues the campaign. Returns the lines about changes of the configuration.
-fn resume_processes(directory: &Path) -> String {
+fn run_again(directory: &Path) -> String {
     let output = calmwalk(directory, RUN);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let shown = stderr(&output);
@@ -121,7 +121,7 @@ fn other_physics_is_refused_with_old_and_new_value() {
         fs::write(here.join("campaign.toml"), &original).unwrap();
     }
     assert_eq!(fs::read(here.join("here/campaign.sqlite")).unwrap(), database);
-    assert_eq!(resume_processes(here), "");
+    assert_eq!(run_again(here), "");
     assert_eq!(logged(here), Vec::<Value>::new());
 }
 
@@ -133,7 +133,7 @@ fn files_may_move_but_not_change() {
     let content = fs::read_to_string(&label).unwrap();
     fs::write(here.join("label.eam.fs"), &content).unwrap();
     replace(here, &label, "label.eam.fs");
-    assert_eq!(resume_processes(here), "");
+    assert_eq!(run_again(here), "");
     fs::write(here.join("label.eam.fs"), format!("another comment{content}")).unwrap();
     let message = refuse(here, RUN);
     assert!(
@@ -156,7 +156,7 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
                  configuration: collect.max_structures is now 20 (was left out)\n\
                  configuration: label.concurrency is now 2 (was 1)\n\
                  configuration: run.walkers is now 1 (was 2)";
-    assert_eq!(resume_processes(here), shown);
+    assert_eq!(run_again(here), shown);
     let change =
         |key: &str, before: Value, after: Value| json!({ "key": key, "before": before, "after": after });
     let expected = [
@@ -166,7 +166,7 @@ fn budgets_walkers_and_slots_are_applied_printed_and_logged() {
         change("run.walkers", 2.into(), 1.into()),
     ];
     assert_eq!(logged(here), expected);
-    assert_eq!(resume_processes(here), "", "the new values are those of the campaign now");
+    assert_eq!(run_again(here), "", "the new values are those of the campaign now");
     assert_eq!(walks(here), before, "walks that have made all their steps stay ended");
 }
 
@@ -185,11 +185,11 @@ fn a_larger_budget_lets_walks_continue() {
         |accepted: u32| ["fcc-100", "vacancy"].map(|n| (n.to_owned(), "quota_reached".to_owned(), accepted));
     assert_eq!(accepted(), collected(1));
     replace(here, "max_per_walk = 1", "max_per_walk = 2");
-    assert_eq!(resume_processes(here), "configuration: collect.max_per_walk is now 2 (was 1)");
+    assert_eq!(run_again(here), "configuration: collect.max_per_walk is now 2 (was 1)");
     assert_eq!(accepted(), collected(2));
     // One more structure in total: the first walk that finds one collects it.
     replace(here, "max_per_walk = 2", "max_per_walk = 4\nmax_structures = 5");
-    resume_processes(here);
+    run_again(here);
     assert_eq!(accepted().iter().map(|walk| walk.2).sum::<u32>(), 5);
 }
 
@@ -200,7 +200,7 @@ fn added_seed_structures_are_walked() {
     let before = walks(here);
     // Append a frame to the file …
     Small { seed_structures: &["fcc-100", "vacancy", "fcc-097"], ..small() }.write(here);
-    let shown = resume_processes(here);
+    let shown = run_again(here);
     assert!(
         shown.starts_with("configuration: seed structures added to the existing 2: 'fcc-097'"),
         "{shown}"
@@ -216,7 +216,7 @@ fn added_seed_structures_are_walked() {
     let frame = frames.into_iter().find(|frame| frame.info["name"].text() == Some("fcc-103")).unwrap();
     common::write_frames(&here.join("more.extxyz"), &[frame]);
     replace(here, "[\"seeds.extxyz\"]", "[\"seeds.extxyz\", \"more.extxyz\"]");
-    assert!(resume_processes(here).contains("'fcc-103'"));
+    assert!(run_again(here).contains("'fcc-103'"));
     let walked = walks(here);
     assert!(walked.iter().all(|walk| !["waiting", "running"].contains(&walk.2.as_str())), "{walked:?}");
     assert!(walked.iter().any(|walk| walk.0 == "biased" && walk.1 == "fcc-103"), "{walked:?}");
@@ -248,7 +248,7 @@ fn seed_structures_cannot_be_changed_moved_or_taken_away() {
     let message = refuse(here, RUN);
     assert!(message.contains("seed structure 1 is 'vacancy' (content "), "{message}");
     small().write(here);
-    assert_eq!(resume_processes(here), "");
+    assert_eq!(run_again(here), "");
 }
 
 #[test]
@@ -257,7 +257,7 @@ fn precision_is_part_of_what_a_campaign_is() {
     let here = directory.path();
     let before = look(here, async |store| store.decision_log_text().await.unwrap());
     replace(here, "[potential]\n", "[potential]\nprecision = \"double\"\n");
-    assert_eq!(resume_processes(here), "");
+    assert_eq!(run_again(here), "");
     replace(here, "\"double\"", "\"mixed\"");
     let message = refuse(here, RUN);
     assert!(

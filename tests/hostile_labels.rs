@@ -71,7 +71,7 @@ fn pair(number: usize) -> Structure {
 }
 
 #[test]
-fn whatever_a_program_leaves_costs_one_attempt() {
+fn arbitrary_output_of_a_program_costs_one_attempt() {
     let home = tempfile::tempdir().unwrap();
     let home = home.path().canonicalize().unwrap();
     let scratch = home.join("scratch");

@@ -42,7 +42,7 @@ fn a_campaign_on_three_hosts_has_the_same_outcome() {
 }
 
 #[test]
-fn agents_leave_in_order_and_a_campaign_stops_in_order() {
+fn agents_leave_cleanly_and_a_campaign_stops_cleanly() {
     let small = Small::default();
     let hosts = Hosts::new(&small, 2, "");
     let mut orchestrator = hosts.start_orchestrator();
@@ -71,7 +71,7 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
 
 /// With 100 ms of latency in each direction, an agent with a prefetched assignment works as usual.
 #[test]
-fn a_slow_line_changes_nothing() {
+fn a_slow_connection_changes_nothing() {
     let small =
         Small { walks_per_round: 3, seed_structures: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "agent_heartbeat_timeout = \"30s\"");

@@ -121,12 +121,12 @@ fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
 }
 
 #[test]
-fn kills_at_random_instants_change_nothing() {
+fn kills_at_random_times_change_nothing() {
     disturbed(&Small::default(), plain, &[], kills());
 }
 
 #[test]
-fn kills_of_the_one_process_change_nothing() {
+fn kills_of_a_run_in_one_process_change_nothing() {
     disturbed(&Small::default(), plain, &["--in-process"], kills().div_ceil(4));
 }
 
@@ -136,7 +136,7 @@ fn kills_of_a_campaign_whose_labels_a_program_makes_change_nothing() {
 }
 
 #[test]
-fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
+fn ctrl_c_and_sigterm_stop_cleanly_and_lose_nothing() {
     let small = Small::default();
     let (expected, _) = uninterrupted_outcome(&small, plain);
     for name in ["INT", "TERM"] {
@@ -156,7 +156,7 @@ fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
 }
 
 #[test]
-fn live_mode_loses_and_doubles_nothing() {
+fn live_mode_loses_and_duplicates_nothing() {
     let small = Small { mode: "live", ..Small::default() };
     let (_, takes) = uninterrupted_outcome(&small, plain);
     let directory = tempfile::tempdir().unwrap();
@@ -174,7 +174,7 @@ fn live_mode_loses_and_doubles_nothing() {
 
 /// All walks have ended, but another labeller still makes a label: a stop now must not report a finished campaign.
 #[test]
-fn a_stop_while_labels_are_still_made_is_no_end() {
+fn a_stop_while_labels_are_still_made_does_not_end_the_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let text = Small::default().text().replace("[label]", "[label]\nmax_force = 1e-6\nmax_attempts = 1");

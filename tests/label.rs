@@ -219,7 +219,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     assert_eq!(
         (first.state, first.attempts),
         (JobState::Leased, 1),
-        "it was stopped too late: {}",
+        "it was paused too late: {}",
         place.said()
     );
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
@@ -238,7 +238,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
 
 /// A process that this host cannot see does not count as dead: neither `run` nor another labeller takes its job.
 #[test]
-fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
+fn a_labeller_on_another_host_keeps_its_job_when_a_run_starts() {
     let (place, name) = with_large_structure(&[("[label]", "[label]\nlease_timeout = \"1m\"")]);
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];

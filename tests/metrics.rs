@@ -104,7 +104,7 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
 }
 
 #[test]
-fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
+fn an_agent_is_scraped_before_it_has_joined_and_after_failures() {
     // The campaign does not end without a signal.
     let small = Small { mode: "live", steps: 1_000_000, max_per_walk: 1_000_000, ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "");

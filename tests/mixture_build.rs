@@ -163,7 +163,7 @@ fn fail(here: &Path, arguments: &[String]) -> String {
 }
 
 #[test]
-fn packed_files_and_several_files_are_the_same_stream() {
+fn compressed_files_and_several_files_give_the_same_mixture() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let frames = frames();
@@ -281,7 +281,7 @@ fn wrong_arguments_are_refused_before_any_work() {
 }
 
 #[test]
-fn thresholds_are_set_anew_from_the_histograms() {
+fn thresholds_are_computed_again_from_the_histograms() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     write_frames(&here.join("data.extxyz"), &frames());

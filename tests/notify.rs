@@ -70,7 +70,7 @@ fn the_end_is_notified_once_with_the_state_of_the_campaign() {
 }
 
 #[test]
-fn a_command_that_fails_or_hangs_is_a_line_in_the_log() {
+fn a_command_that_fails_or_hangs_is_recorded_in_the_log() {
     for (last, limit, words) in
         [("echo no network >&2; exit 3", 60, "no network"), ("exec sleep 1000", 3, "killed after 3 s")]
     {
@@ -145,20 +145,20 @@ fn forgetting_is_reported_once_per_run_and_notified_once() {
         let said = fs::File::create(&said).unwrap();
         Running(program(here).args(RUN).stderr(said).stdout(Stdio::null()).spawn().unwrap())
     };
-    let spoken_of = || fs::read_to_string(&said).unwrap().matches("forgets its training data").count();
+    let reports = || fs::read_to_string(&said).unwrap().matches("forgets its training data").count();
     let mut run = start();
     wait_until("there are several alarms", || alarms(here) >= 3);
     wait_until("the command has been called", || !events(here).is_empty());
     signal(run.0.id(), "TERM");
     run.0.wait().unwrap();
     let text = fs::read_to_string(&said).unwrap();
-    assert_eq!(spoken_of(), 1, "{text}");
+    assert_eq!(reports(), 1, "{text}");
     assert!(text.contains("ALARM: ") && text.contains("covariance_update = \"additive\""), "{text}");
     let before = alarms(here);
     assert_eq!(start().0.wait().unwrap().code(), Some(0));
     // How many decisions the second run makes depends on when the first was stopped: maybe none.
     let text = fs::read_to_string(&said).unwrap();
-    assert_eq!(spoken_of(), usize::from(alarms(here) > before), "{text}");
+    assert_eq!(reports(), usize::from(alarms(here) > before), "{text}");
     let told = fs::read_to_string(here.join("events")).unwrap();
     assert_eq!(told.matches("forgetting argument the mixture forgets").count(), 1, "{told}");
 }

@@ -58,7 +58,7 @@ fn check(place: &LabelCampaign) {
 }
 
 #[test]
-fn a_campaign_goes_over_to_another_protocol_label_by_label() {
+fn a_campaign_changes_to_another_protocol_label_by_label() {
     let (place, labels) = labelled();
     another_protocol(&place, "fine");
     let (here, campaign) = (place.path(), place.argument());
@@ -172,7 +172,7 @@ fn doubtful_labels_are_made_again_by_the_same_protocol() {
 }
 
 #[test]
-fn killed_at_any_instant_all_or_nothing_is_asked_for() {
+fn a_killed_relabel_requests_all_structures_or_none() {
     let (place, labels) = labelled();
     let before = exported(&place);
     for kill in 0..8 {

@@ -105,7 +105,7 @@ fn a_path_that_is_not_a_directory_is_reported() {
 }
 
 #[test]
-fn names_need_not_be_text_but_for_sqlite() {
+fn names_need_not_be_utf_8_except_for_sqlite() {
     let above = tempfile::tempdir().unwrap();
     let directory = above.path().join(OsStr::from_bytes(b"no \xff text"));
     fs::create_dir(&directory).unwrap();
@@ -219,7 +219,7 @@ fn a_second_run_of_a_campaign_names_the_first() {
     let mut first = Running(first.spawn().unwrap());
     let lock = directory.path().join("here/campaign.lock");
     while !fs::read_to_string(&lock).is_ok_and(|text| text.contains("process")) {
-        assert!(first.0.try_wait().unwrap().is_none(), "the first run ended too early to be met");
+        assert!(first.0.try_wait().unwrap().is_none(), "the first run ended before the second began");
         std::thread::yield_now();
     }
     // Pause the first run, so that it cannot end before the second starts.

@@ -39,11 +39,11 @@ pub fn processes_running(directory: &Path, command: &str) -> Vec<u32> {
 /// Waits for a process that runs `command`.
 pub fn wait_for_process(directory: &Path, command: &str) -> u32 {
     let mut found = None;
-    wait_until(&format!("a {command} is at work"), || {
+    wait_until(&format!("a {command} is running"), || {
         found = processes_running(directory, command).first().copied();
         found.is_some()
     });
-    found.expect("it was waited for")
+    found.expect("a process")
 }
 
 /// Processes that calculations in directories below `scratch` have started: pids with their command lines.
@@ -149,7 +149,7 @@ pub fn pause_walkers(directory: &Path, number: usize) -> PausedProcesses {
 pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !is_so() {
-        assert!(begun.elapsed() < Duration::from_secs(300), "waited in vain until {what}");
+        assert!(begun.elapsed() < Duration::from_secs(300), "timed out waiting until {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }

@@ -85,7 +85,7 @@ impl Terminal {
     }
 
     /// Checks that the program has exited with this code, and that the terminal is restored: screen, cursor and echo.
-    fn is_given_back(&self, code: &str) {
+    fn is_restored(&self, code: &str) {
         let screen = self.wait_for(code);
         assert!(!screen.contains("1 walks"), "{screen}");
         let flags = self.tmux(&["display-message", "-p", "#{alternate_on} #{cursor_flag}"]);
@@ -199,7 +199,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     terminal.press("End");
     terminal.wait_for("orchestrator");
     terminal.press("q q");
-    terminal.is_given_back("code 0");
+    terminal.is_restored("code 0");
 }
 
 #[test]
@@ -257,11 +257,11 @@ fn queued_structures_are_changed_and_candidates_explained() {
     assert_eq!(first.len(), 20, "{details}");
     terminal.wait_for_all(&first.iter().map(|line| line.trim_end()).collect::<Vec<_>>());
     terminal.press("q C-c");
-    terminal.is_given_back("code 130");
+    terminal.is_restored("code 130");
 }
 
 #[test]
-fn the_terminal_is_given_back_however_it_ends() {
+fn the_terminal_is_restored_however_watch_ends() {
     let place = waiting();
     let here = place.path();
     let watching = || processes_running(here, "watch");
@@ -271,7 +271,7 @@ fn the_terminal_is_given_back_however_it_ends() {
         // Charts are coloured.
         terminal.wait_for_sequence("[38;5;6m");
         signal(watching()[0], how);
-        terminal.is_given_back("code 130");
+        terminal.is_restored("code 130");
     }
     let terminal = Terminal::open(&place, "closed", (80, 24), "");
     terminal.wait_for("1 walks: 4");
@@ -280,7 +280,7 @@ fn the_terminal_is_given_back_however_it_ends() {
 }
 
 #[test]
-fn a_copy_is_watched_through_its_absence() {
+fn a_copy_that_is_missing_for_a_while_is_still_watched() {
     let place = waiting();
     let here = place.path();
     succeed(here, ["store", "backup", place.argument(), "copy"]);
@@ -294,10 +294,10 @@ fn a_copy_is_watched_through_its_absence() {
         !terminal.screen().contains("outdated, cannot read the campaign")
     });
     terminal.press("q");
-    terminal.is_given_back("code 0");
+    terminal.is_restored("code 0");
     // An error at startup is printed on the normal screen.
     fs::remove_dir_all(here.join("copy")).unwrap();
     let terminal = Terminal::watch(here, "copy", "nothing", (80, 24), "");
     terminal.wait_for("calmwalk: ");
-    terminal.is_given_back("code 2");
+    terminal.is_restored("code 2");
 }

@@ -64,7 +64,7 @@ fn any_number_of_parts_gives_the_same_bytes() {
 }
 
 #[test]
-fn parts_that_are_missing_killed_or_another_builds_are_noticed() {
+fn parts_that_are_missing_killed_or_of_another_build_are_noticed() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     write_frames(&here.join("data.extxyz"), &frames());

@@ -82,7 +82,7 @@ fn a_clock_that_jumps_changes_nothing_and_restarts_no_process() {
 
 /// The leases of a killed labeller return to the queue, whatever its clock showed.
 #[test]
-fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
+fn labellers_that_are_killed_while_the_clock_jumps_lose_and_duplicate_nothing() {
     let small = Small { steps: 1600, max_per_walk: 16, ..Small::default() };
     let killed = Cell::new(0);
     jumping(&small, |here, jump| {

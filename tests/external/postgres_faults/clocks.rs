@@ -64,7 +64,7 @@ fn labellers_with_wrong_clocks_label_everything_once() {
 /// A labeller whose clock is an hour behind holds a lease and is paused for some seconds; one whose clock is an hour ahead
 /// looks for jobs.
 #[test]
-fn a_lease_lasts_however_late_others_think_it_is() {
+fn a_lease_does_not_depend_on_the_clocks_of_other_labellers() {
     let small = Small { steps: 60, ..Small::default() };
     let place = LabelCampaign::on_server(&small, &[("[label]", "[label]\nlease_timeout = \"1m\"")]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
