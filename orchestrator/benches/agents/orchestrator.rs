@@ -9,6 +9,7 @@ use orchestrator::selector::SelectorSettings;
 use store::Fate;
 use tokio::sync::mpsc;
 use tokio::time::{interval, sleep};
+use tokio_util::sync::CancellationToken;
 use wire::net::{AgentBootstrap, AgentServer, StopTokens};
 
 use crate::database::Database;
