@@ -22,8 +22,8 @@ const CANDIDATES: u32 = 16;
 /// Labelled structures per read.
 const LABELLED: u32 = 200;
 
-/// A mixture after the updates.
-pub struct UpdatedByCampaign {
+/// A mixture after the updates, and what the candidates did to it.
+pub struct MixtureAfterUpdates {
     /// Id of the campaign.
     pub campaign: String,
     pub mixture: Mixture,
@@ -35,13 +35,13 @@ pub struct UpdatedByCampaign {
     pub left_out: u64,
 }
 
-/// The updates under way.
-struct CampaignUpdates<'a> {
+/// Applies candidates to a mixture, one after another.
+struct CandidateUpdater<'a> {
     settings: SelectorSettings,
     search: calm::UpdateSettings,
     calculator: FeatureCalculator,
     grades: Grades,
-    found: UpdatedByCampaign,
+    found: MixtureAfterUpdates,
     stop: &'a CancellationToken,
 }
 
@@ -74,29 +74,29 @@ pub async fn apply(
     model: &Arc<GraceModel>,
     mixture: Mixture,
     stop: &CancellationToken,
-) -> Result<Option<UpdatedByCampaign>, CommandError> {
+) -> Result<Option<MixtureAfterUpdates>, CommandError> {
     let record = store.campaign().await?;
     let settings = updating_settings(&record)?;
     let search = update_settings_in_force(&settings.search, &store.values().await?);
     let labelled = labelled(store).await?;
-    let found =
-        UpdatedByCampaign { campaign: record.id.to_string(), mixture, applied: 0, covered: 0, left_out: 0 };
+    let campaign = record.id.to_string();
+    let found = MixtureAfterUpdates { campaign, mixture, applied: 0, covered: 0, left_out: 0 };
     let calculator = FeatureCalculator::new(Arc::clone(model));
-    let mut updates =
-        CampaignUpdates { settings, search, calculator, grades: Grades::default(), found, stop };
+    let mut updater =
+        CandidateUpdater { settings, search, calculator, grades: Grades::default(), found, stop };
     let mut last = 0;
     loop {
         let page = store.candidates(last, false, CANDIDATES).await?;
-        let Some(end) = page.last() else { return Ok(Some(updates.found)) };
+        let Some(end) = page.last() else { return Ok(Some(updater.found)) };
         last = end.decision;
         let unlabelled = |candidate: &&StoredCandidate| {
             candidate.fate == Fate::Accepted && !labelled.contains(&candidate.decision)
         };
         for candidate in page.iter().filter(unlabelled) {
-            if updates.stop.is_cancelled() {
+            if updater.stop.is_cancelled() {
                 return Ok(None);
             }
-            updates.apply_or_warn(candidate);
+            updater.apply_or_warn(candidate);
         }
     }
 }
@@ -118,7 +118,7 @@ async fn labelled(store: &Store) -> Result<HashSet<i64>, CommandError> {
     }
 }
 
-impl CampaignUpdates<'_> {
+impl CandidateUpdater<'_> {
     fn apply_or_warn(&mut self, candidate: &StoredCandidate) {
         if let Err(error) = self.apply(candidate) {
             let (campaign, id) = (&self.found.campaign, candidate.block.view().id());

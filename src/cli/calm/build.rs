@@ -9,10 +9,10 @@ use npz::NpzFile;
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
-use super::campaign_updates::UpdatingCampaign;
-use super::recalibrate::open;
+use super::campaign_updates::UpdateSource;
+use super::mixture_files::MixtureFiles;
 use crate::artifact_checks::check_sound;
-use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 use crate::file_hash;
@@ -106,7 +106,7 @@ impl CalmBuildArgs {
         outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
         // Errors in paths are found before hours of work.
         outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
-        let campaign = self.campaign.as_deref().map(UpdatingCampaign::find).transpose()?;
+        let campaign = self.campaign.as_deref().map(UpdateSource::find).transpose()?;
         let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
         if let (Some(found), Some(_)) = (model.projection(), self.projection_dimension) {
             return Err(CommandError::Input(format!(
@@ -152,7 +152,8 @@ impl CalmBuildArgs {
             print_stderr("stopped; the same command continues");
             return Ok(ExitStatus::Interrupted);
         };
-        let files = MixtureFiles { model: &self.model, embed: self.embed.as_deref(), output: &self.output };
+        let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
+        let files = MixtureFiles { embed, output: &self.output };
         let Some(updates) = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop)? else {
             print_stderr("stopped; the same command continues");
             return Ok(ExitStatus::Interrupted);
@@ -174,38 +175,19 @@ fn end_part(pass: u8, part: BuildPart, done: bool) -> Result<ExitStatus, Command
     Ok(ExitStatus::Done)
 }
 
-/// Where the files of a mixture are.
-#[derive(Clone, Copy)]
-pub(super) struct MixtureFiles<'a> {
-    /// The model's export.
-    pub model: &'a Path,
-    /// The copy of it with the mixture, if asked for.
-    pub embed: Option<&'a Path>,
-    /// The artifact.
-    pub output: &'a Path,
-}
-
-/// Writes the model with the mixture, if asked for, then the artifact; after the updates by a campaign, if one is named. `model` computes
-/// the features. Returns what is said of the updates, or `None` if `stop` was cancelled before they ended.
+/// Writes the files of a mixture, after the updates by a campaign, if one is named. `model` computes the features. Returns what is said of
+/// the updates, or `None` if `stop` was cancelled before they ended.
 pub(super) fn write_mixture(
     mixture: &BuiltMixture,
     files: MixtureFiles<'_>,
     model: &Arc<GraceModel>,
-    campaign: Option<&UpdatingCampaign>,
+    campaign: Option<&UpdateSource>,
     stop: &CancellationToken,
 ) -> Result<Option<String>, CommandError> {
-    if let Some(campaign) = campaign {
-        return campaign.write(mixture, files, model, stop);
+    match campaign {
+        Some(campaign) => campaign.write(mixture, files, model, stop),
+        None => files.write_built(mixture).map(|()| Some(String::new())),
     }
-    if let Some(path) = files.embed {
-        let mut file = AtomicFile::create(path)?;
-        mixture.write_export(open(files.model)?, &mut file).map_err(|error| cannot_write(path, error))?;
-        file.finish()?;
-    }
-    let mut file = AtomicFile::create(files.output)?;
-    mixture.write(&mut file).map_err(|error| cannot_write(files.output, error))?;
-    file.finish()?;
-    Ok(Some(String::new()))
 }
 
 /// The model with the features of `variant`, their projection, and the random seed of that if it is known. A model without a

@@ -1,27 +1,26 @@
-//! Files of a built mixture that the unlabelled candidates of a campaign have updated.
+//! Updates of a built mixture by the unlabelled candidates of a campaign (`--campaign`).
 
 use std::io::{BufWriter, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-use calm::build::{BuiltMixture, UpdatedMixture};
+use calm::build::{ArtifactVersion, BuiltMixture};
 use calm::{Artifact, Mixture};
 use potentials::grace::GraceModel;
 use store::{Location, Store};
 use tempfile::TempPath;
 use tokio_util::sync::CancellationToken;
 
-use super::build::MixtureFiles;
-use super::recalibrate::open;
-use crate::atomic_file::{AtomicFile, cannot_write};
+use super::mixture_files::MixtureFiles;
+use crate::atomic_file::cannot_write;
 use crate::cli::{CommandError, block_on, campaign_location};
 use crate::output::count;
-use crate::unlabelled_updates::{self, UpdatedByCampaign};
+use crate::unlabelled_updates::{self, MixtureAfterUpdates};
 
-/// A campaign whose unlabelled candidates update a new mixture.
-pub(super) struct UpdatingCampaign(Location);
+/// The campaign from which the updates of a new mixture come.
+pub(super) struct UpdateSource(Location);
 
-impl UpdatingCampaign {
+impl UpdateSource {
     /// Opens the campaign of a directory or URL once, so that errors are found before hours of work.
     ///
     /// # Errors
@@ -39,42 +38,34 @@ impl UpdatingCampaign {
         unlabelled_updates::updating_settings(&campaign?).map(drop)
     }
 
-    /// Writes the updated mixture as [`super::build::write_mixture`] does. Returns what is said of the updates, or `None` if `stop` was
-    /// cancelled before they ended.
+    /// Updates the mixture and writes its files. `model` computes the features. Returns what is said of the updates, or `None` if
+    /// `stop` was cancelled before they ended.
     pub(super) fn write(
         &self,
         mixture: &BuiltMixture,
-        MixtureFiles { model, embed, output }: MixtureFiles<'_>,
-        features: &Arc<GraceModel>,
+        files: MixtureFiles<'_>,
+        model: &Arc<GraceModel>,
         stop: &CancellationToken,
     ) -> Result<Option<String>, CommandError> {
-        let built = write_beside(mixture, output)?;
+        let built = write_beside(mixture, files.output)?;
         let original = Artifact::load(&built).map_err(CommandError::failed)?.mixture;
-        let Some(found) = block_on(self.update(features, original.clone(), stop))?? else {
+        let Some(found) = block_on(self.update(model, original.clone(), stop))?? else {
             return Ok(None);
         };
-        let updated = UpdatedMixture::new(&built, &original, &found.mixture).map_err(CommandError::failed)?;
-        if let Some(path) = embed {
-            let mut file = AtomicFile::create(path)?;
-            updated.write_export(open(model)?, &mut file).map_err(|error| cannot_write(path, error))?;
-            file.finish()?;
-        }
-        let mut file = AtomicFile::create(output)?;
-        updated
-            .write_artifact(open(&built)?, &mut file, &found.campaign)
-            .map_err(|error| cannot_write(output, error))?;
-        file.finish()?;
+        let version =
+            ArtifactVersion::new(&built, &original, &found.mixture).map_err(CommandError::failed)?;
+        files.write_version(&version, &built, &found.campaign)?;
         Ok(Some(describe(&found)))
     }
 
     async fn update(
         &self,
-        features: &Arc<GraceModel>,
+        model: &Arc<GraceModel>,
         original: Mixture,
         stop: &CancellationToken,
-    ) -> Result<Option<UpdatedByCampaign>, CommandError> {
+    ) -> Result<Option<MixtureAfterUpdates>, CommandError> {
         let store = Store::open_read_only(&self.0).await?;
-        let found = unlabelled_updates::apply(&store, features, original, stop).await;
+        let found = unlabelled_updates::apply(&store, model, original, stop).await;
         store.close().await;
         found
     }
@@ -94,8 +85,8 @@ fn write_beside(mixture: &BuiltMixture, output: &Path) -> Result<TempPath, Comma
 }
 
 /// A line about the updates.
-fn describe(found: &UpdatedByCampaign) -> String {
-    let UpdatedByCampaign { campaign, applied, covered, left_out, .. } = found;
+fn describe(found: &MixtureAfterUpdates) -> String {
+    let MixtureAfterUpdates { campaign, applied, covered, left_out, .. } = found;
     let all = count(applied + covered + left_out, "accepted candidate");
     let were = |number: u64| if number == 1 { "was" } else { "were" };
     let covered = format!("{covered} {} covered already", were(*covered));
@@ -116,7 +107,7 @@ mod tests {
     #[test]
     fn candidates_that_were_left_out_are_mentioned() {
         let mixture = Mixture::new(0, vec![vec![Arc::new(calm::Component::unknown_element(2))]]).unwrap();
-        let found = |left_out| UpdatedByCampaign {
+        let found = |left_out| MixtureAfterUpdates {
             campaign: "x".into(),
             mixture: mixture.clone(),
             applied: 3,

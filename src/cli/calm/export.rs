@@ -3,13 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use calm::build::UpdatedMixture;
+use calm::build::ArtifactVersion;
 use calm::{Artifact, Mixture};
 use serde_json::Value;
 use store::Store;
 
-use super::recalibrate::open;
-use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use super::mixture_files::MixtureFiles;
+use crate::atomic_file::refuse_to_replace;
 use crate::cli::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, print};
 use crate::replay::{self, RelocatedFilesArgs};
@@ -53,18 +53,11 @@ struct Version {
 impl CalmExportArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
         let found = block_on(self.read())??;
-        let updated = UpdatedMixture::new(&found.artifact, &found.original.mixture, &found.mixture);
-        let updated = updated.map_err(CommandError::input)?;
-        if let (Some(model), Some(path)) = (&found.model, &self.embed) {
-            let mut file = AtomicFile::create(path)?;
-            updated.write_export(open(model)?, &mut file).map_err(|error| cannot_write(path, error))?;
-            file.finish()?;
-        }
-        let mut file = AtomicFile::create(&self.output)?;
-        updated
-            .write_artifact(open(&found.artifact)?, &mut file, &found.campaign)
-            .map_err(|error| cannot_write(&self.output, error))?;
-        file.finish()?;
+        let version = ArtifactVersion::new(&found.artifact, &found.original.mixture, &found.mixture);
+        let version = version.map_err(CommandError::input)?;
+        let files =
+            MixtureFiles { embed: found.model.as_deref().zip(self.embed.as_deref()), output: &self.output };
+        files.write_version(&version, &found.artifact, &found.campaign)?;
         self.report(&found)?;
         Ok(ExitStatus::Done)
     }

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use calm::build::BuildSettings;
 use potentials::grace::GraceModel;
 
-use super::build::{MixtureFiles, projected, report, write_mixture};
-use super::campaign_updates::UpdatingCampaign;
+use super::build::{projected, report, write_mixture};
+use super::campaign_updates::UpdateSource;
+use super::mixture_files::MixtureFiles;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
@@ -44,7 +45,7 @@ impl CalmMergeArgs {
             refuse_to_replace(output, [(self.model.as_path(), "the model")])?;
             AtomicFile::create(output)?;
         }
-        let campaign = self.campaign.as_deref().map(UpdatingCampaign::find).transpose()?;
+        let campaign = self.campaign.as_deref().map(UpdateSource::find).transpose()?;
         let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
         let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
         let mut merge = PartsMerge::open(&self.output, &hash)?;
@@ -60,15 +61,15 @@ impl CalmMergeArgs {
                 print(|out| writeln!(out, "pass {pass} of 3 is merged; continue with --pass {}", pass + 1))?;
             }
             Merged::Mixture(mixture) => {
-                let (embed, output) = (self.embed.as_deref(), self.output.as_path());
-                let files = MixtureFiles { model: &self.model, embed, output };
+                let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
+                let files = MixtureFiles { embed, output: &self.output };
                 let updates = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop_token()?)?;
                 let Some(updates) = updates else {
                     print_stderr("stopped; the same command continues");
                     return Ok(ExitStatus::Interrupted);
                 };
                 merge.finish()?;
-                report(&mixture, output, &updates)?;
+                report(&mixture, &self.output, &updates)?;
             }
         }
         Ok(ExitStatus::Done)

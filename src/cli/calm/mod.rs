@@ -8,6 +8,7 @@ mod export;
 mod filter;
 mod info;
 mod merge;
+mod mixture_files;
 mod other_scores;
 mod recalibrate;
 mod sample;

@@ -1,12 +1,11 @@
 //! `calmwalk calm recalibrate`
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use calm::Artifact;
 use calm::build::{ElementHistograms, Recalibration, ThresholdRule, read_histograms};
 
+use super::mixture_files::open;
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
@@ -69,12 +68,6 @@ impl CalmRecalibrateArgs {
 fn percentage(text: &str) -> Result<f64, String> {
     let found = text.parse().ok().filter(|value| *value > 0.0 && *value <= 100.0);
     found.ok_or_else(|| "expected a percentage, above 0 and at most 100".to_owned())
-}
-
-pub(super) fn open(path: &Path) -> Result<BufReader<File>, CommandError> {
-    let file = File::open(path);
-    file.map(BufReader::new)
-        .map_err(|error| CommandError::Input(format!("{}: cannot be opened: {error}", path.display())))
 }
 
 /// The mixture of the model's export is that of the artifact, but for thresholds.

@@ -22,6 +22,7 @@
 //! [`Component::unknown_element`](crate::Component::unknown_element).
 
 mod artifact;
+mod artifact_version;
 mod calibration;
 mod components;
 mod distances;
@@ -42,9 +43,9 @@ mod scatter;
 mod settings;
 mod sorter;
 mod thresholds;
-mod updated;
 
 pub use artifact::{BuiltElement, BuiltMixture, read_histograms};
+pub use artifact_version::{ArtifactVersion, ArtifactVersionError};
 pub use calibration::CalibrationPass;
 pub use components::{BuiltComponent, components};
 pub use elbow::elbow;
@@ -61,7 +62,6 @@ pub use recalibrate::Recalibration;
 pub use scatter::ScatterPass;
 pub use settings::BuildSettings;
 pub use thresholds::{ThresholdRule, Thresholds};
-pub use updated::{UpdatedMixture, UpdatedMixtureError};
 
 #[cfg(test)]
 mod tests {

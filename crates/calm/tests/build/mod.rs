@@ -1,10 +1,10 @@
 //! The build of a mixture from training data.
 
+mod artifact_version;
 mod clustering;
 mod golden;
 mod passes;
 mod stored;
-mod updated;
 
 use calm::Projection;
 use calm::build::{

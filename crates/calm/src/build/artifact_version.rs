@@ -1,4 +1,4 @@
-//! A mixture that was updated after its build, as files: copies of the artifact and of the model's export in which the
+//! A later version of an artifact's mixture as files: copies of the artifact and of the model's export in which the
 //! components that changed are replaced.
 
 use std::io::{self, Read, Seek, Write};
@@ -20,9 +20,9 @@ const WEIGHTED_THRESHOLDS: &str = "eff_interp_thresholds";
 const SEED: &str = "uq_rp_seed";
 const EDGES: &str = "hist_bin_edges";
 
-/// Why an updated mixture has no files.
+/// Why a later version of a mixture has no files.
 #[derive(Debug, thiserror::Error)]
-pub enum UpdatedMixtureError {
+pub enum ArtifactVersionError {
     /// The artifact cannot be read.
     #[error(transparent)]
     Artifact(#[from] ArtifactError),
@@ -38,18 +38,18 @@ pub enum UpdatedMixtureError {
     },
 }
 
-impl From<npz::Error> for UpdatedMixtureError {
+impl From<npz::Error> for ArtifactVersionError {
     fn from(error: npz::Error) -> Self {
         Self::Artifact(error.into())
     }
 }
 
-/// A later version of the mixture of an artifact, with all numbers rounded to single precision as in its files.
+/// A later version of the mixture of an artifact, as its files have it: all numbers are rounded to single precision.
 ///
 /// Inverse covariances are those of the version, rounded, not inverses of the rounded scatter. Centroids and thresholds never
 /// change, and the histograms of σ remain those of the build.
 #[derive(Debug)]
-pub struct UpdatedMixture {
+pub struct ArtifactVersion {
     version: u64,
     dimension: usize,
     /// Slots of each element, K.
@@ -88,12 +88,12 @@ struct Changed {
     truncated: Vec<i32>,
 }
 
-impl UpdatedMixture {
+impl ArtifactVersion {
     /// `original` is the mixture of the artifact, as loaded, and `mixture` a later version of it.
     ///
     /// # Errors
     /// As [`Artifact::load`](crate::Artifact::load); covariances whose eigenvalues do not converge.
-    pub fn new(artifact: &Path, original: &Mixture, mixture: &Mixture) -> Result<Self, UpdatedMixtureError> {
+    pub fn new(artifact: &Path, original: &Mixture, mixture: &Mixture) -> Result<Self, ArtifactVersionError> {
         let file = &NpzFile::open(artifact)?;
         let weighted = file.contains(WEIGHTED_THRESHOLDS);
         let key = if weighted { WEIGHTED_THRESHOLDS } else { RAW_THRESHOLDS };
@@ -102,7 +102,7 @@ impl UpdatedMixture {
             true => file.numbers(RAW_THRESHOLDS)?.with_shape(&[count, slots])?,
             false => thresholds.clone(),
         };
-        let mut updated = Self {
+        let mut found = Self {
             version: mixture.version(),
             dimension: mixture.dimension(),
             slots,
@@ -119,9 +119,9 @@ impl UpdatedMixture {
         };
         let held = file.indices("elements", count)?;
         for element in 0..count {
-            updated.add(file, element, held.contains(&element), original, mixture)?;
+            found.add(file, element, held.contains(&element), original, mixture)?;
         }
-        Ok(updated)
+        Ok(found)
     }
 
     fn add(
@@ -131,7 +131,7 @@ impl UpdatedMixture {
         held: bool,
         original: &Mixture,
         mixture: &Mixture,
-    ) -> Result<(), UpdatedMixtureError> {
+    ) -> Result<(), ArtifactVersionError> {
         let components = mixture.components(element).unwrap_or_default();
         let before = original.components(element).unwrap_or_default();
         let changed: Vec<usize> =
@@ -158,7 +158,7 @@ impl UpdatedMixture {
             for slot in changed {
                 let component = &components[slot];
                 arrays.replace(slot, component);
-                others.replace(slot, component).map_err(|source| UpdatedMixtureError::Linear {
+                others.replace(slot, component).map_err(|source| ArtifactVersionError::Linear {
                     element,
                     slot,
                     source,
@@ -294,7 +294,7 @@ impl ElementArrays {
         element: usize,
         slots: usize,
         dimension: usize,
-    ) -> Result<Self, UpdatedMixtureError> {
+    ) -> Result<Self, ArtifactVersionError> {
         let mut arrays = Self { new: false, ..Self::unused(slots, dimension) };
         overwrite(&mut arrays.centroids, &numbers(file, "centroids", element)?);
         overwrite(&mut arrays.inverses, &numbers(file, "inv_cov", element)?);
@@ -325,7 +325,7 @@ impl Changed {
         element: usize,
         slots: usize,
         dimension: usize,
-    ) -> Result<Self, UpdatedMixtureError> {
+    ) -> Result<Self, ArtifactVersionError> {
         let mut arrays = Self::unused(slots, dimension);
         overwrite(&mut arrays.scatters, &numbers(file, "scatter", element)?);
         arrays.counts.splice(.., filled(numbers(file, "counts", element)?, slots));
@@ -356,7 +356,7 @@ impl Changed {
     }
 }
 
-fn numbers(file: &NpzFile, name: &str, element: usize) -> Result<Vec<f64>, UpdatedMixtureError> {
+fn numbers(file: &NpzFile, name: &str, element: usize) -> Result<Vec<f64>, ArtifactVersionError> {
     Ok(file.numbers(&format!("{name}_{element}"))?.data)
 }
 

@@ -3,7 +3,7 @@
 use std::io::{Cursor, Read};
 use std::path::Path;
 
-use calm::build::{UpdatedMixture, read_histograms};
+use calm::build::{ArtifactVersion, read_histograms};
 use calm::{Artifact, Batch, CovarianceUpdate, Mixture};
 use npyz::npz::NpzArchive;
 
@@ -26,7 +26,7 @@ fn updated(mixture: &Mixture, element: usize, slot: usize) -> Mixture {
 }
 
 fn write(path: &Path, original: &Mixture, mixture: &Mixture, to: &Path) -> Artifact {
-    let updated = UpdatedMixture::new(path, original, mixture).unwrap();
+    let updated = ArtifactVersion::new(path, original, mixture).unwrap();
     let source = Cursor::new(std::fs::read(path).unwrap());
     let written = updated.write_artifact(source, Cursor::new(Vec::new()), "c-1").unwrap();
     std::fs::write(to, written.into_inner()).unwrap();
@@ -95,7 +95,7 @@ fn an_updated_mixture_is_read_back() {
     }
 
     // In the model, the same numbers.
-    let files = UpdatedMixture::new(&path, &original, &twice).unwrap();
+    let files = ArtifactVersion::new(&path, &original, &twice).unwrap();
     let written = files.write_export(export(), Cursor::new(Vec::new())).unwrap();
     std::fs::write(&model, written.into_inner()).unwrap();
     let embedded = Artifact::load_export(&model).unwrap().mixture;
@@ -131,7 +131,7 @@ fn an_element_that_only_updates_know_is_added() {
     let histograms = read_histograms(&later).unwrap();
     assert_eq!(histograms[1].as_ref().unwrap().components.iter().map(|one| one.count()).sum::<u64>(), 0);
 
-    let files = UpdatedMixture::new(&path, &original, &mixture).unwrap();
+    let files = ArtifactVersion::new(&path, &original, &mixture).unwrap();
     let written = files.write_export(export(), Cursor::new(Vec::new())).unwrap();
     std::fs::write(&model, written.into_inner()).unwrap();
     let embedded = Artifact::load_export(&model).unwrap().mixture;
