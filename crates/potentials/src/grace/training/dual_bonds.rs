@@ -3,30 +3,14 @@
 //! T_q,lm,n = Σ_j R_nl(r) Y_lm(v) m_q,n(j), and with ′ for the derivative along the direction u of each bond,
 //! T′ = Σ_j (R_r r′ Y + R Y′) m + R Y m′, where r′ = v·u, v′ = (u − r′ v)/r and R_r = dR/dr.
 
-use atoms::Vec3;
-
 use super::super::bonds::{GraceBond, directions, distances};
 use super::super::layer::Layer;
 use super::super::radial_network::RadialWork;
 use super::super::radial_table::b_splines;
 use super::super::tape::TapeSlot;
 use super::super::vector::{Double, MAX_LANES, Vector};
+use super::moving_bonds::MovingBonds;
 use super::sums::LayerSums;
-
-/// The bonds of an atom with the directions along which they change.
-#[derive(Clone, Copy)]
-pub(super) struct MovingBonds<'a> {
-    pub bonds: &'a [GraceBond],
-    /// u, Å
-    pub directions: &'a [Vec3],
-}
-
-impl<'a> MovingBonds<'a> {
-    fn blocks(self) -> impl Iterator<Item = MovingBonds<'a>> {
-        let blocks = self.bonds.chunks(Double::LANES).zip(self.directions.chunks(Double::LANES));
-        blocks.map(|(bonds, directions)| Self { bonds, directions })
-    }
-}
 
 /// Scratch arrays for one block of bonds.
 #[derive(Clone, Debug, Default)]

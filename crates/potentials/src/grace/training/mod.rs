@@ -14,12 +14,15 @@
 //! an update, and the coefficients' derivatives are pulled back through it once.
 
 mod dual_bonds;
+mod dual_passes;
 mod dual_readout;
-mod radial_weights;
+mod knot_traces;
+mod moving_bonds;
 mod sums;
 mod trainable;
 mod worker;
 
+pub use moving_bonds::LossGradient;
 pub use sums::WeightSums;
 pub use trainable::{TrainableGrace, WeightGroup};
-pub use worker::{GradientWorker, LossGradient};
+pub use worker::GradientWorker;

@@ -6,7 +6,7 @@ use super::super::vector::{Double, Vector};
 use super::super::weight_arrays::WeightArrays;
 use super::super::weight_gradient::WeightGradient;
 use super::super::{readout::SHIFTS, tape::TapeOperation};
-use super::radial_weights::RadialWeights;
+use super::knot_traces::KnotTraces;
 
 /// The derivatives of a loss with respect to the matrices and tables of a model, summed over structures.
 #[derive(Clone, Debug)]
@@ -84,11 +84,11 @@ impl WeightSums {
         &self,
         network: &Network<Double>,
         arrays: &WeightArrays,
-        (radial, threads): (&[RadialWeights], &Threads),
+        (traces, threads): (&[KnotTraces], &Threads),
         out: &mut WeightArrays,
     ) {
         let layers = self.layers.iter().zip(&network.layers).zip(&network.readout.blocks);
-        for (((sums, layer), block), radial) in layers.zip(radial) {
+        for (((sums, layer), block), traces) in layers.zip(traces) {
             for (operation, of_parts) in layer.steps.operations().zip(&sums.steps) {
                 let TapeOperation::Linear(linear) = operation else { continue };
                 for (part, sum) in linear.parts.iter().zip(of_parts) {
@@ -104,7 +104,7 @@ impl WeightSums {
             let rows: Vec<Vec<f64>> =
                 sums.factors.iter().map(|row| Double::flat(row)[..factors.channels].to_vec()).collect();
             factors.pull_back(arrays, &rows, out);
-            radial.pull_back(&layer.radial, &sums.tables, out, threads);
+            traces.pull_back(&layer.radial, &sums.tables, out, threads);
         }
         for (map, sum) in network.readout.maps.iter().zip(&self.perceptron) {
             map.pull_back(&sum.numbers(map), out);

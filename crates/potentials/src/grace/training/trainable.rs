@@ -22,7 +22,7 @@ use super::super::tape::TapeOperation;
 use super::super::threads::Threads;
 use super::super::vector::Double;
 use super::super::weight_arrays::WeightArrays;
-use super::radial_weights::RadialWeights;
+use super::knot_traces::KnotTraces;
 use super::sums::WeightSums;
 use super::worker::GradientWorker;
 
@@ -35,8 +35,8 @@ pub struct TrainableGrace {
     arrays: WeightArrays,
     groups: Vec<WeightGroup>,
     weights: Vec<f64>,
-    /// The radial network of each layer.
-    radial: Vec<RadialWeights>,
+    /// Of the radial network of each layer.
+    traces: Vec<KnotTraces>,
     threads: Threads,
 }
 
@@ -77,11 +77,11 @@ impl TrainableGrace {
             arrays,
             groups,
             weights,
-            radial: Vec::new(),
+            traces: Vec::new(),
             threads: Threads::default(),
         };
         let network = trainable.network();
-        trainable.radial = network.layers.iter().map(|layer| RadialWeights::new(&layer.radial)).collect();
+        trainable.traces = network.layers.iter().map(|layer| KnotTraces::new(&layer.radial)).collect();
         drop(network);
         let weights = trainable.weights.clone();
         trainable.set_weights(&weights);
@@ -121,9 +121,9 @@ impl TrainableGrace {
             values.copy_from_slice(here);
             rest = after;
         }
-        let Self { model, arrays, radial, threads, .. } = self;
+        let Self { model, arrays, traces, threads, .. } = self;
         let AnyNetwork::Double(network) = &mut Arc::make_mut(model).network else { return };
-        update(Arc::make_mut(network), arrays, radial, threads);
+        update(Arc::make_mut(network), arrays, traces, threads);
     }
 
     /// Zero sums for [`GradientWorker::accumulate`].
@@ -140,7 +140,7 @@ impl TrainableGrace {
     pub fn gradient(&self, sums: &WeightSums) -> Vec<f64> {
         let mut out = self.arrays.clone();
         out.values_mut().for_each(|values| values.fill(0.0));
-        sums.pull_back(&self.network(), &self.arrays, (&self.radial, &self.threads), &mut out);
+        sums.pull_back(&self.network(), &self.arrays, (&self.traces, &self.threads), &mut out);
         out.iter().flat_map(|(_, array)| array.values.iter().copied()).collect()
     }
 
@@ -197,10 +197,10 @@ fn is_projection(name: &str) -> bool {
 fn update(
     network: &mut Network<Double>,
     arrays: &WeightArrays,
-    radial: &mut [RadialWeights],
+    traces: &mut [KnotTraces],
     threads: &Threads,
 ) {
-    for (layer, radial) in network.layers.iter_mut().zip(radial) {
+    for (layer, traces) in network.layers.iter_mut().zip(traces) {
         for step in &mut layer.steps.steps {
             if let TapeOperation::Linear(linear) = &mut step.operation {
                 linear.parts.iter_mut().for_each(|part| part.weights = part.map.fill(arrays));
@@ -211,7 +211,7 @@ fn update(
             let first = constants.len() - row.len();
             constants[first..].copy_from_slice(&row);
         }
-        radial.update(&mut layer.radial, arrays, threads);
+        traces.update(&mut layer.radial, arrays, threads);
     }
     let readout = &mut network.readout;
     for block in &mut readout.blocks {

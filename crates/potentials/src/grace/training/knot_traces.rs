@@ -17,9 +17,9 @@ use super::super::weight_gradient::WeightGradient;
 /// threads.
 const PARTS: usize = 4;
 
-/// What the network computes at the knots of each table, in parts of consecutive knots.
+/// What the radial network of a layer computes at the knots of each table, in parts of consecutive knots.
 #[derive(Clone, Debug)]
-pub(super) struct RadialWeights {
+pub(super) struct KnotTraces {
     parts: Vec<KnotTrace>,
 }
 
@@ -36,7 +36,7 @@ struct KnotTrace {
     values: Vec<Double>,
 }
 
-impl RadialWeights {
+impl KnotTraces {
     /// The polynomials at the knots of these tables.
     pub fn new(radial: &RadialFunctions<Double>) -> Self {
         let (network, mut jet, mut parts) = (radial.network(), Default::default(), Vec::new());
