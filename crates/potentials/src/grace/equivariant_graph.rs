@@ -69,7 +69,7 @@ impl<V: Vector> Graph<'_, V> {
     /// Applies the norm `name` to a tensor.
     pub fn equivariant_norm(&mut self, name: &str, from: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("{name}_{suffix}"));
-        let [groups, channels] = self.weights.read(archive, &key("affine_weight"))?;
+        let ([groups, channels], weights) = self.weights.read(archive, &key("affine_weight"))?;
         if channels != from.channels {
             let found = format!("{channels} columns wide");
             return Err(mismatch(
@@ -80,6 +80,8 @@ impl<V: Vector> Graph<'_, V> {
             ));
         }
         let expand = archive.exactly_indices(&key("expand_index"), from.components, groups)?;
+        let affine =
+            expand.iter().flat_map(|g| to_lanes(&weights[g * channels..(g + 1) * channels])).collect();
         let invariant = archive.floats(&key("l0_mask"), &[from.components])?;
         if invariant.iter().any(|x| *x != 0.0 && *x != 1.0) {
             return Err(mismatch(archive, &key("l0_mask"), format!("{invariant:?}"), "zeros and ones"));
@@ -95,16 +97,12 @@ impl<V: Vector> Graph<'_, V> {
             return Err(mismatch(archive, &key("degree_weights"), found, "numbers not below zero"));
         }
         let to = self.push(name, from.components, channels)?;
-        let weights = self.weights.get(&key("affine_weight"));
         self.operations.push(TapeOperation::EquivariantNorm(EquivariantNorm {
             from,
             to,
             centred: invariant.iter().map(|x| x * centring).collect(),
             degree_weights,
-            affine: expand
-                .iter()
-                .flat_map(|g| to_lanes(&weights[g * channels..(g + 1) * channels]))
-                .collect(),
+            affine,
             floor,
         }));
         Ok(to)

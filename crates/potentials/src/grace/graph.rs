@@ -141,7 +141,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         outputs: usize,
         inputs: usize,
     ) -> Result<ChannelWeights, GraceError> {
-        let [k, n, tiles] = self.weights.read(self.archive, key)?;
+        let ([k, n, tiles], _) = self.weights.read(self.archive, key)?;
         if [k, n] != [outputs, inputs] {
             let found = format!("of shape {:?}", [k, n, tiles]);
             return Err(mismatch(self.archive, key, found, format!("shape [{outputs}, {inputs}, …]")));

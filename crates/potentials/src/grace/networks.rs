@@ -67,8 +67,8 @@ pub(super) fn enveloped_network<V: Vector>(
             break;
         }
         let key = format!("{prefix}_b{k}");
-        weights.read_exactly(archive, &key, &[1, layer.outputs])?;
-        let bias: Vec<f64> = weights.get(&key).iter().map(|b| b * layer.norm).collect();
+        let bias = weights.read_exactly(archive, &key, &[1, layer.outputs])?;
+        let bias: Vec<f64> = bias.iter().map(|b| b * layer.norm).collect();
         let mut map = layer.map();
         if k == 0 {
             pair_biases = embedding.pair_biases(&map.numbers(weights)[basis_size * layer.outputs..], &bias);
@@ -140,7 +140,7 @@ fn dense(
     weights: &mut WeightArrays,
 ) -> Result<Dense, GraceError> {
     let key = format!("{prefix}_W{k}");
-    let [rows, outputs] = weights.read(archive, &key)?;
+    let ([rows, outputs], _) = weights.read(archive, &key)?;
     if rows != inputs {
         return Err(mismatch(archive, &key, format!("{rows} rows high"), format!("{inputs} rows")));
     }
@@ -182,10 +182,7 @@ pub(super) fn readout<V: Vector>(
         _ => Activation::Silu,
     };
     let shifts = match archive.contains(SHIFTS) {
-        true => {
-            weights.read_exactly(archive, SHIFTS, &[n_elements])?;
-            weights.get(SHIFTS).to_vec()
-        }
+        true => weights.read_exactly(archive, SHIFTS, &[n_elements])?.to_vec(),
         false => vec![0.0; n_elements],
     };
     let scale = archive.scalar_or("output_scale", 1.0)?;

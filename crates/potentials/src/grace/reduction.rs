@@ -159,9 +159,9 @@ impl<V: Vector> Graph<'_, V> {
         let tensor = self.named(name)?;
         let collect = archive.indices(&key("collect_ind"), tensor.components)?;
         let shape = if by_element == 1 {
-            self.weights.read::<4>(archive, &weights_key)?
+            self.weights.read::<4>(archive, &weights_key)?.0
         } else {
-            let [k, n, tiles] = self.weights.read(archive, &weights_key)?;
+            let ([k, n, tiles], _) = self.weights.read(archive, &weights_key)?;
             [1, k, n, tiles]
         };
         if shape[..3] != [n_types, n_out, tensor.channels] {

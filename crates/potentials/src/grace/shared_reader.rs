@@ -105,7 +105,7 @@ impl Embedding {
         n_elements: usize,
         weights: &mut WeightArrays,
     ) -> Result<Self, GraceError> {
-        let [rows, size] = weights.read(archive, EMBEDDING)?;
+        let ([rows, size], values) = weights.read(archive, EMBEDDING)?;
         if rows != n_elements {
             let expected = format!("{n_elements} elements");
             return Err(mismatch(archive, EMBEDDING, format!("{rows} rows"), expected));
@@ -113,7 +113,7 @@ impl Embedding {
         for key in ["embedding_size", "chem_embedding_size"].into_iter().filter(|key| archive.contains(key)) {
             archive.expect_count(key, size)?;
         }
-        Ok(Self { size, values: weights.get(EMBEDDING).to_vec() })
+        Ok(Self { size, values: values.to_vec() })
     }
 
     /// Numbers per element.

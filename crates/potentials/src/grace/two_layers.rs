@@ -194,8 +194,7 @@ pub(super) fn invariant_norm(
         _ => Some(archive.scalar(&key("lin_scale"))?),
     };
     let normalised = n_densities - usize::from(linear.is_some());
-    weights.read_exactly(archive, &key("scale"), &[normalised])?;
-    let scale = weights.get(&key("scale")).to_vec();
+    let scale = weights.read_exactly(archive, &key("scale"), &[normalised])?.to_vec();
     Ok(InvariantNorm { linear, scale, array: key("scale") })
 }
 

@@ -79,7 +79,7 @@ impl WeightMap {
             diagonal.take(self.inputs.min(self.outputs)).for_each(|x| *x = self.identity);
         }
         for block in &self.blocks {
-            let weights = arrays.get(&block.array);
+            let weights = &arrays[block.array.as_str()];
             self.entries(block).for_each(|(matrix, index)| {
                 dense[matrix] += block.factor * (weights[index] * block.norm);
             });
@@ -91,7 +91,7 @@ impl WeightMap {
     /// output]`.
     pub fn pull_back(&self, of_matrix: &[f64], of_arrays: &mut WeightArrays) {
         for block in &self.blocks {
-            let weights = of_arrays.get_mut(&block.array);
+            let weights = &mut of_arrays[block.array.as_str()];
             self.entries(block).for_each(|(matrix, index)| {
                 weights[index] += block.factor * block.norm * of_matrix[matrix];
             });

@@ -97,7 +97,7 @@ impl WeightSums {
             }
             block.map.pull_back(&sums.block.numbers(&block.map), out);
             if let Some(norm) = &block.norm {
-                let scale = out.get_mut(&norm.array).iter_mut();
+                let scale = out[norm.array.as_str()].iter_mut();
                 scale.zip(&sums.norm).for_each(|(x, sum)| *x += sum);
             }
             let factors = &layer.message.factors;
@@ -109,6 +109,8 @@ impl WeightSums {
         for (map, sum) in network.readout.maps.iter().zip(&self.perceptron) {
             map.pull_back(&sum.numbers(map), out);
         }
-        out.get_mut(SHIFTS).iter_mut().zip(&self.shifts).for_each(|(x, sum)| *x += sum);
+        if let Some(shifts) = out.get_mut(SHIFTS) {
+            shifts.iter_mut().zip(&self.shifts).for_each(|(x, sum)| *x += sum);
+        }
     }
 }

@@ -217,11 +217,12 @@ fn update(
     for block in &mut readout.blocks {
         block.weights = block.map.fill(arrays);
         if let Some(norm) = &mut block.norm {
-            norm.scale.copy_from_slice(arrays.get(&norm.array));
+            norm.scale.copy_from_slice(&arrays[norm.array.as_str()]);
         }
     }
     readout.layers = readout.maps.iter().map(|map| map.fill(arrays)).collect();
-    for (shift, value) in readout.shifts.iter_mut().zip(arrays.get(SHIFTS)) {
-        *shift = *value;
+    // Not every file has them.
+    if let Some(shifts) = arrays.get(SHIFTS) {
+        readout.shifts.copy_from_slice(shifts);
     }
 }
