@@ -16,10 +16,10 @@ use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
 use crate::file_hash;
-use crate::mixture_build::{self, BuildPart, PassContext};
+use crate::mixture_build::{BuildPart, MixtureBuild, PassContext};
 use crate::output::{TextTable, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
-use crate::structure_files::{StructureArgs, file_weight};
+use crate::structure_files::{StructureArgs, StructureFiles, file_weight};
 
 /// Projected features of a model without a projection, as in the paper.
 pub(super) const PROJECTED: usize = 128;
@@ -97,16 +97,39 @@ fn gigabytes(text: &str) -> Result<f64, String> {
 
 impl CalmBuildArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let outputs: Vec<&Path> =
-            std::iter::once(&self.output).chain(&self.embed).map(PathBuf::as_path).collect();
+        let files = self.files()?;
+        let campaign = self.campaign.as_deref().map(UpdateSource::find).transpose()?;
+        let (model, projection, seed) = self.projected_model()?;
+        let stop = stop_token()?;
+        let mut build = self.open(files, &model, &projection, &stop)?;
+        if let (Some(pass), Some(part)) = (self.pass, self.part) {
+            return end_part(pass, part, build.run_part(pass)?);
+        }
+        let Some(mixture) = build.run(projection, seed)? else { return Ok(stopped()) };
+        let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
+        let files = MixtureFiles { embed, output: &self.output };
+        let Some(updates) = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop)? else {
+            return Ok(stopped());
+        };
+        build.finish()?;
+        report(&mixture, &self.output, &updates)?;
+        Ok(ExitStatus::Done)
+    }
+
+    /// The training data with their weights. Checks the paths of all files, so that errors are found before hours of work.
+    fn files(&self) -> Result<StructureFiles, CommandError> {
         let mut files = self.data.files()?;
         files.set_weights(&self.weight)?;
         let data = files.paths().map(|path| (path, "a file of training data"));
         let inputs: Vec<_> = std::iter::once((self.model.as_path(), "the model")).chain(data).collect();
-        outputs.iter().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
-        // Errors in paths are found before hours of work.
-        outputs.iter().try_for_each(|output| AtomicFile::create(output).map(drop))?;
-        let campaign = self.campaign.as_deref().map(UpdateSource::find).transpose()?;
+        let outputs = || std::iter::once(&self.output).chain(&self.embed);
+        outputs().try_for_each(|output| refuse_to_replace(output, inputs.iter().copied()))?;
+        outputs().try_for_each(|output| AtomicFile::create(output).map(drop))?;
+        Ok(files)
+    }
+
+    /// As [`projected`], with what the command line says about the projection.
+    fn projected_model(&self) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
         let model = GraceModel::load(&self.model).map_err(CommandError::input)?;
         if let (Some(found), Some(_)) = (model.projection(), self.projection_dimension) {
             return Err(CommandError::Input(format!(
@@ -116,8 +139,17 @@ impl CalmBuildArgs {
             )));
         }
         let dimension = self.projection_dimension.map_or(PROJECTED, |dimension| dimension as usize);
-        let (model, projection, seed) =
-            projected(&self.model, model, self.feature_variant, self.rng_seed, dimension)?;
+        projected(&self.model, model, self.feature_variant, self.rng_seed, dimension)
+    }
+
+    /// Begins the build, or continues it.
+    fn open(
+        &self,
+        files: StructureFiles,
+        model: &Arc<GraceModel>,
+        projection: &Projection,
+        stop: &CancellationToken,
+    ) -> Result<MixtureBuild, CommandError> {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let settings = BuildSettings {
             dimension: projection.feature_dimension,
@@ -126,9 +158,8 @@ impl CalmBuildArgs {
             shard_size: self.shard_size,
         };
         let hash = file_hash::hash(&self.model).map_err(CommandError::input)?;
-        let stop = stop_token()?;
         let context = PassContext {
-            model: Arc::clone(&model),
+            model: Arc::clone(model),
             files,
             shard_size: self.shard_size,
             part: self.part,
@@ -137,42 +168,24 @@ impl CalmBuildArgs {
             max_feature_bytes: (1e9 * self.max_feature_cache) as u64,
             stop: stop.clone(),
         };
-        let mut build = mixture_build::MixtureBuild::open(
-            context,
-            settings,
-            hash,
-            &projection,
-            &self.output,
-            self.restart,
-        )?;
-        if let (Some(pass), Some(part)) = (self.pass, self.part) {
-            return end_part(pass, part, build.run_part(pass)?);
-        }
-        let Some(mixture) = build.run(projection, seed)? else {
-            print_stderr("stopped; the same command continues");
-            return Ok(ExitStatus::Interrupted);
-        };
-        let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
-        let files = MixtureFiles { embed, output: &self.output };
-        let Some(updates) = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop)? else {
-            print_stderr("stopped; the same command continues");
-            return Ok(ExitStatus::Interrupted);
-        };
-        build.finish()?;
-        report(&mixture, &self.output, &updates)?;
-        Ok(ExitStatus::Done)
+        MixtureBuild::open(context, settings, hash, projection, &self.output, self.restart)
     }
 }
 
 fn end_part(pass: u8, part: BuildPart, done: bool) -> Result<ExitStatus, CommandError> {
     if !done {
-        print_stderr("stopped; the same command continues");
-        return Ok(ExitStatus::Interrupted);
+        return Ok(stopped());
     }
     print(|out| {
         writeln!(out, "part {part} of pass {pass} is done; when all parts are, run calmwalk calm merge")
     })?;
     Ok(ExitStatus::Done)
+}
+
+/// Says that the build goes on later.
+pub(super) fn stopped() -> ExitStatus {
+    print_stderr("stopped; the same command continues");
+    ExitStatus::Interrupted
 }
 
 /// Writes the files of a mixture, after the updates by a campaign, if one is named. `model` computes the features. Returns what is said of

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use calm::build::BuildSettings;
 use potentials::grace::GraceModel;
 
-use super::build::{projected, report, write_mixture};
+use super::build::{projected, report, stopped, write_mixture};
 use super::campaign_updates::UpdateSource;
 use super::mixture_files::MixtureFiles;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
@@ -13,7 +13,7 @@ use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
 use crate::mixture_build::{Merged, PartsMerge};
-use crate::output::{print, print_stderr};
+use crate::output::print;
 use crate::signals::stop_token;
 
 /// Merge the parts of a pass of `calmwalk calm build --part`
@@ -64,10 +64,7 @@ impl CalmMergeArgs {
                 let embed = self.embed.as_deref().map(|copy| (self.model.as_path(), copy));
                 let files = MixtureFiles { embed, output: &self.output };
                 let updates = write_mixture(&mixture, files, &model, campaign.as_ref(), &stop_token()?)?;
-                let Some(updates) = updates else {
-                    print_stderr("stopped; the same command continues");
-                    return Ok(ExitStatus::Interrupted);
-                };
+                let Some(updates) = updates else { return Ok(stopped()) };
                 merge.finish()?;
                 report(&mixture, &self.output, &updates)?;
             }

@@ -94,44 +94,62 @@ impl<'a, V: Vector> Graph<'a, V> {
             let found = format!("a list of {}", factors.len());
             return Err(mismatch(archive, &key("norm_out_factor"), found, out.components.to_string()));
         }
-        let mut rows: BTreeMap<(bool, usize, u64), Vec<(u32, u32)>> = BTreeMap::new();
-        let mut add = |is_right: bool, tile: usize, from: usize, component: usize| {
-            let group = rows.entry((is_right, tile, factors[component].to_bits())).or_default();
-            group.push((from as u32, out.row(component) as u32));
-        };
-
-        let left_weights = if archive.count(&key("left_coefs"), 0, 1)? == 1 {
-            let norm = archive.scalar(&key("norm_left"))?;
-            let weights = self.channel_weights(&key("w_left"), norm, channels, left.channels)?;
-            let tiles = archive.exactly_indices(&key("w_tile_left"), left.components, weights.tiles)?;
-            tiles.iter().enumerate().for_each(|(w, tile)| add(false, *tile, left.row(w), w));
-            weights
-        } else {
-            archive.ignore(&key("w_tile_left"));
-            (0..left.components).for_each(|w| add(false, 0, left.row(w), w));
-            if left.channels != channels {
-                let found = format!("{channels} but its left input keeps {} channels", left.channels);
-                return Err(mismatch(archive, &key("n_out"), found, left.channels.to_string()));
-            }
-            ChannelWeights::identity(channels)
-        };
-        let norm = archive.scalar(&key("norm_right"))?;
-        let right_weights = self.channel_weights(&key("w_right"), norm, channels, right.channels)?;
-        let to = archive.indices(&key("collect_to"), left.components)?;
-        let from = archive.exactly_indices(&key("collect_from"), to.len(), right.components)?;
-        let tiles = archive.exactly_indices(&key("w_tile_right"), to.len(), right_weights.tiles)?;
-        for ((to, from), tile) in to.iter().zip(&from).zip(&tiles) {
-            add(true, *tile, right.row(*from), *to);
-        }
-
+        let mut rows = LinearRows { out, factors, groups: BTreeMap::new() };
+        let left_weights = self.left_weights(name, left, channels, &mut rows)?;
+        let right_weights = self.right_weights(name, [left, right], channels, &mut rows)?;
         let part = |((is_right, tile, factor), rows): ((bool, usize, u64), Vec<(u32, u32)>)| {
             let weights = if is_right { &right_weights } else { &left_weights };
             let map = weights.map(channels, tile, f64::from_bits(factor));
             LinearPart::new(map, &self.weights, rows.into_iter().unzip())
         };
-        let parts = merged(rows.into_iter().map(part).collect());
+        let parts = merged(rows.groups.into_iter().map(part).collect());
         self.operations.push(TapeOperation::Linear(Linear { parts }));
         Ok(out)
+    }
+
+    /// W^left, the identity if the file has none, and the rows of the left input.
+    fn left_weights(
+        &mut self,
+        name: &str,
+        left: Tensor,
+        channels: usize,
+        rows: &mut LinearRows,
+    ) -> Result<ChannelWeights, GraceError> {
+        let (archive, key) = (self.archive, |suffix: &str| format!("fc_{name}_{suffix}"));
+        if archive.count(&key("left_coefs"), 0, 1)? == 1 {
+            let norm = archive.scalar(&key("norm_left"))?;
+            let weights = self.channel_weights(&key("w_left"), norm, channels, left.channels)?;
+            let tiles = archive.exactly_indices(&key("w_tile_left"), left.components, weights.tiles)?;
+            tiles.iter().enumerate().for_each(|(w, tile)| rows.add(false, *tile, left.row(w), w));
+            return Ok(weights);
+        }
+        archive.ignore(&key("w_tile_left"));
+        (0..left.components).for_each(|w| rows.add(false, 0, left.row(w), w));
+        if left.channels != channels {
+            let found = format!("{channels} but its left input keeps {} channels", left.channels);
+            return Err(mismatch(archive, &key("n_out"), found, left.channels.to_string()));
+        }
+        Ok(ChannelWeights::identity(channels))
+    }
+
+    /// W^right, and the rows of the right input.
+    fn right_weights(
+        &mut self,
+        name: &str,
+        [left, right]: [Tensor; 2],
+        channels: usize,
+        rows: &mut LinearRows,
+    ) -> Result<ChannelWeights, GraceError> {
+        let (archive, key) = (self.archive, |suffix: &str| format!("fc_{name}_{suffix}"));
+        let norm = archive.scalar(&key("norm_right"))?;
+        let weights = self.channel_weights(&key("w_right"), norm, channels, right.channels)?;
+        let to = archive.indices(&key("collect_to"), left.components)?;
+        let from = archive.exactly_indices(&key("collect_from"), to.len(), right.components)?;
+        let tiles = archive.exactly_indices(&key("w_tile_right"), to.len(), weights.tiles)?;
+        for ((to, from), tile) in to.iter().zip(&from).zip(&tiles) {
+            rows.add(true, *tile, right.row(*from), *to);
+        }
+        Ok(weights)
     }
 
     fn channel_weights(
@@ -240,6 +258,22 @@ impl<'a, V: Vector> Graph<'a, V> {
             tensor.rows().for_each(|row| widths[row] = tensor.width);
         }
         allocate(depth_first(self.operations), &widths, fixed, &self.basis, message, training)
+    }
+}
+
+/// The rows of a linear operation, grouped by what multiplies them.
+struct LinearRows {
+    out: Tensor,
+    /// f of each component of the result.
+    factors: Vec<f64>,
+    /// Lanes at which rows are read and to which they are added; by side (whether right), tile and bits of f.
+    groups: BTreeMap<(bool, usize, u64), Vec<(u32, u32)>>,
+}
+
+impl LinearRows {
+    fn add(&mut self, is_right: bool, tile: usize, from: usize, component: usize) {
+        let group = self.groups.entry((is_right, tile, self.factors[component].to_bits())).or_default();
+        group.push((from as u32, self.out.row(component) as u32));
     }
 }
 

@@ -153,12 +153,12 @@ fn reverse_bond(
     layer: &Layer<Double>,
     (b, bond): (usize, &GraceBond),
     [messages, messages_along]: [&[Double]; 2],
-    (cotangent, [slot_along, slot]): (&[Double], [TapeSlot; 2]),
+    cotangent: (&[Double], [TapeSlot; 2]),
     work: &mut BlockWork,
     ([returned_along, returned], sums): ([&mut [Double]; 2], &mut LayerSums),
 ) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
-    let (functions, passed) = (layer.harmonics.len(), layer.message.passed());
+    let passed = layer.message.passed();
     let first = bond.neighbour as usize * layer.message.lanes();
     let rate = work.rates[b];
     work.of_radial.iter_mut().for_each(|row| row.fill(Double::ZERO));
@@ -168,14 +168,7 @@ fn reverse_bond(
             let m_along = if q < passed { messages_along[first + q * width + c] } else { Double::ZERO };
             let (mut of_message, mut of_message_along) = (Double::ZERO, Double::ZERO);
             for l in 0..=layer.harmonics.lmax() {
-                let (mut p, mut p_along) = (Double::ZERO, Double::ZERO);
-                for lm in l * l..(l + 1) * (l + 1) {
-                    let (y, y_along) = (work.harmonics[0][lm][b], work.harmonics[1][lm][b]);
-                    let of_along = cotangent[slot_along.row(&layer.density, q * functions + lm) + c];
-                    p.add_scaled(y, &cotangent[slot.row(&layer.density, q * functions + lm) + c]);
-                    p.add_scaled(y_along, &of_along);
-                    p_along.add_scaled(y, &of_along);
-                }
+                let [p, p_along] = harmonic_sums(layer, (b, &*work), cotangent, [q, l, c]);
                 let at = l * width + c;
                 let (value, derivative) = (work.radial[0][b * lanes + at], work.radial[1][b * lanes + at]);
                 of_message.add_product(&value, &p);
@@ -197,4 +190,25 @@ fn reverse_bond(
             }
         }
     }
+}
+
+/// P and P′ of bond `b` for the component q of its message, the order l and the channel c.
+#[inline(always)]
+fn harmonic_sums(
+    layer: &Layer<Double>,
+    (b, work): (usize, &BlockWork),
+    (cotangent, [slot_along, slot]): (&[Double], [TapeSlot; 2]),
+    [q, l, c]: [usize; 3],
+) -> [Double; 2] {
+    let functions = layer.harmonics.len();
+    let (mut p, mut p_along) = (Double::ZERO, Double::ZERO);
+    for lm in l * l..(l + 1) * (l + 1) {
+        let (y, y_along) = (work.harmonics[0][lm][b], work.harmonics[1][lm][b]);
+        let component = q * functions + lm;
+        let of_along = cotangent[slot_along.row(&layer.density, component) + c];
+        p.add_scaled(y, &cotangent[slot.row(&layer.density, component) + c]);
+        p.add_scaled(y_along, &of_along);
+        p_along.add_scaled(y, &of_along);
+    }
+    [p, p_along]
 }
