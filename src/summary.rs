@@ -38,16 +38,29 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, Store
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            status: CampaignStatus { candidates, labels, walks, mixture_version, .. },
-            statistics,
-            ..
-        } = self;
+        self.write_walks(f)?;
+        self.write_candidates(f)?;
+        self.write_labels(f)?;
+        if let Some(budget) = budget::describe(&self.status.budget) {
+            writeln!(f, "budget           {budget}")?;
+        }
+        self.write_mixture(f)?;
+        self.write_errors(f)
+    }
+}
+
+impl Summary {
+    fn write_walks(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let walks = &self.status.walks;
         let of = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
         writeln!(f, "walks            {} biased, {} control", of("biased"), of("control"))?;
         let ends = WalkEnds::from_walks(walks);
         writeln!(f, "                 ended: {}", walk_ends::all(&ends))?;
-        walk_ends::early_ends(&ends).iter().try_for_each(|line| writeln!(f, "                 {line}"))?;
+        walk_ends::early_ends(&ends).iter().try_for_each(|line| writeln!(f, "                 {line}"))
+    }
+
+    fn write_candidates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let candidates = &self.status.candidates;
         let declined = &candidates.declined;
         let all =
             declined.covered + declined.duplicate + declined.too_close + declined.budget + declined.backlog;
@@ -62,7 +75,11 @@ impl fmt::Display for Summary {
             declined.budget,
             declined.backlog
         )?;
-        writeln!(f, "                 {} rejected by guards", candidates.rejected_by_guards)?;
+        writeln!(f, "                 {} rejected by guards", candidates.rejected_by_guards)
+    }
+
+    fn write_labels(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (labels, statistics) = (&self.status.labels, &self.statistics);
         let superseded = match labels.superseded {
             0 => String::new(),
             jobs => format!(", {jobs} superseded"),
@@ -80,11 +97,11 @@ impl fmt::Display for Summary {
             labels.failed,
             labels.dropped
         )?;
-        write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, MAX_SHOWN))?;
-        if let Some(budget) = budget::describe(&self.status.budget) {
-            writeln!(f, "budget           {budget}")?;
-        }
-        writeln!(f, "mixture          version {mixture_version}")?;
+        write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, MAX_SHOWN))
+    }
+
+    fn write_mixture(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "mixture          version {}", self.status.mixture_version)?;
         if let Some(training) = &self.training {
             let (share, median) = (100.0 * training.share_above_one, training.median);
             writeln!(
@@ -92,6 +109,10 @@ impl fmt::Display for Summary {
                 "                 training atoms under it: median γ {median:.2}, {share:.1} % above 1"
             )?;
         }
+        Ok(())
+    }
+
+    fn write_errors(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "force error of the potential against the grade of the original mixture:")?;
         writeln!(
             f,

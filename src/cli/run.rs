@@ -192,15 +192,7 @@ async fn run(
         return Err(paused_by_alarm(campaign, &store).await?);
     }
     let process = registration::register(&store).await?;
-    if let Some(idle) = runtime::idle_walkers(campaign) {
-        log_and_warn(format_args!("WARNING: {idle}"));
-    }
-    if campaign.config.label.concurrency == 0 {
-        let store = shell_argument(location);
-        log_and_print(format_args!(
-            "label.concurrency = 0: start labellers with calmwalk label --store {store}"
-        ));
-    }
+    say_what_is_idle(campaign, location);
     let stop = CancellationToken::new();
     let run =
         runtime::RunContext { campaign, store: &store, process: &process, directory, listen, stop: &stop };
@@ -216,7 +208,31 @@ async fn run(
         store.close().await;
         return Ok(ExitStatus::Interrupted);
     }
-    let summary = summary::read(&store, campaign.protocol.hash).await?;
+    let ended = print_end(campaign, location, &store).await;
+    store.close().await;
+    ended
+}
+
+/// Says which walkers will idle, and that labellers must be started.
+fn say_what_is_idle(campaign: &LoadedCampaign, location: &Location) {
+    if let Some(idle) = runtime::idle_walkers(campaign) {
+        log_and_warn(format_args!("WARNING: {idle}"));
+    }
+    if campaign.config.label.concurrency == 0 {
+        let store = shell_argument(location);
+        log_and_print(format_args!(
+            "label.concurrency = 0: start labellers with calmwalk label --store {store}"
+        ));
+    }
+}
+
+/// Prints the summary of a finished campaign and what to do next.
+async fn print_end(
+    campaign: &LoadedCampaign,
+    location: &Location,
+    store: &Store,
+) -> Result<ExitStatus, CommandError> {
+    let summary = summary::read(store, campaign.protocol.hash).await?;
     let status = store.status().await?;
     let (failed, ends) = (status.labels.failed, WalkEnds::from_walks(&status.walks));
     let argument = shell_argument(location);
@@ -234,7 +250,6 @@ async fn run(
         }
         writeln!(out, "  calmwalk export {argument} --output dataset.extxyz")
     })?;
-    store.close().await;
     if ends.all_early() {
         log_and_warn(format_args!("calmwalk: the campaign has failed: {}", walk_ends::warning(&ends)));
         return Ok(ExitStatus::NoWalkCompleted);

@@ -1,5 +1,6 @@
 //! `calmwalk select`
 
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -320,12 +321,11 @@ impl SelectionReport<'_> {
         picks.into_iter().map(|pick| self.pool.total_atoms(pick.structure)).sum()
     }
 
-    fn print_tables(&self) -> Result<(), CommandError> {
-        let mut strategies =
-            TextTable::new(&["strategy", ">structures", ">atoms", ">largest γ", ">smallest γ"]);
+    fn strategy_table(&self) -> TextTable {
+        let mut table = TextTable::new(&["strategy", ">structures", ">atoms", ">largest γ", ">smallest γ"]);
         for (name, picks) in self.strategies() {
             let gamma = || picks.iter().map(|pick| pick.gamma_max);
-            strategies.push(vec![
+            table.push(vec![
                 name.to_owned(),
                 picks.len().to_string(),
                 self.atoms(&picks).to_string(),
@@ -333,6 +333,10 @@ impl SelectionReport<'_> {
                 decimals(gamma().reduce(f64::min), 2),
             ]);
         }
+        table
+    }
+
+    fn print_tables(&self) -> Result<(), CommandError> {
         let mut elements = TextTable::new(&["element", ">atoms selected", ">of the pool"]);
         for ElementSelection { symbol, selected, pool, .. } in self.elements() {
             elements.push(vec![symbol, selected.to_string(), pool.to_string()]);
@@ -340,33 +344,11 @@ impl SelectionReport<'_> {
         let (total, evaluated) = (self.pool.structures.len() as u64, self.pool.evaluated);
         let stored = total - evaluated;
         print(|out| {
-            strategies.write(out)?;
+            self.strategy_table().write(out)?;
             writeln!(out)?;
             elements.write(out)?;
             writeln!(out)?;
-            let window = self.pool.pool.window();
-            match self.picks.gamma_left {
-                Some(left) if left > window.above => {
-                    writeln!(
-                        out,
-                        "largest γ left: {left:.3}, under the mixture updated with what was selected"
-                    )?;
-                }
-                Some(_) => writeln!(
-                    out,
-                    "no γ above {} is left, under the mixture updated with what was selected",
-                    window.above
-                )?,
-                None => (),
-            }
-            for element in self.elements().iter().filter(|element| element.is_short) {
-                let floor = self.rules.floor.unwrap_or_default();
-                writeln!(
-                    out,
-                    "{}: only {} atoms; {floor} do not fit this number of structures",
-                    element.symbol, element.selected
-                )?;
-            }
+            self.write_what_is_left(out)?;
             if stored > 0 {
                 writeln!(
                     out,
@@ -387,6 +369,26 @@ impl SelectionReport<'_> {
                 self.command.output.display()
             )
         })
+    }
+
+    /// The grades that are left, and the elements with too few atoms.
+    fn write_what_is_left(&self, out: &mut dyn Write) -> io::Result<()> {
+        let window = self.pool.pool.window();
+        let learnt = "under the mixture updated with what was selected";
+        match self.picks.gamma_left {
+            Some(left) if left > window.above => writeln!(out, "largest γ left: {left:.3}, {learnt}")?,
+            Some(_) => writeln!(out, "no γ above {} is left, {learnt}", window.above)?,
+            None => (),
+        }
+        for element in self.elements().iter().filter(|element| element.is_short) {
+            let floor = self.rules.floor.unwrap_or_default();
+            writeln!(
+                out,
+                "{}: only {} atoms; {floor} do not fit this number of structures",
+                element.symbol, element.selected
+            )?;
+        }
+        Ok(())
     }
 
     fn json(&self) -> Value {

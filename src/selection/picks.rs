@@ -2,7 +2,9 @@
 
 use calm::Mixture;
 use calm::rules::{Positive, UpdateSettings};
-use calm::selection::{DOptimal, FarthestPoints, Greedy, Metric, floors, random_structures, update_settings};
+use calm::selection::{
+    DOptimal, FarthestPoints, Greedy, Metric, SelectionError, floors, random_structures, update_settings,
+};
 use tokio_util::sync::CancellationToken;
 
 use super::GradedPool;
@@ -54,68 +56,29 @@ pub fn pick(
     let settings = update_settings(rules.update_target);
     let mut picks: Vec<Pick> = Vec::new();
     let mut left = None;
-    for (number, part) in rules.parts.iter().enumerate() {
-        let before = picks.len();
-        let wanted = part.number.unwrap_or(usize::MAX);
-        let bar = Bar::new(Some(wanted.min(pool.structures.len()) as u64), BAR);
-        let shown = |picked: usize| bar.set(picked as u64, || part.strategy.name().to_owned());
-        let picked: Vec<usize> = picks.iter().map(|pick| pick.structure).collect();
-        let is_complete = |picks: &[Pick]| picks.len() - before >= wanted || stop.is_cancelled();
-        left = None;
-        match part.strategy {
-            Strategy::Greedy => {
-                let mut greedy = Greedy::new(&pool.pool, mixture, settings.clone(), picked)
-                    .map_err(CommandError::failed)?;
-                while !is_complete(&picks)
-                    && let Some(found) = greedy.pick().map_err(CommandError::failed)?
-                {
-                    picks.push(Pick {
-                        structure: found.structure,
-                        strategy: part.strategy.name(),
-                        gamma_max: found.gamma_max,
-                    });
-                    shown(picks.len() - before);
-                }
-                left = Some(greedy.gamma_left().map_err(CommandError::failed)?.unwrap_or_default());
-            }
-            Strategy::FarthestPoints | Strategy::FarthestPointsAll => {
-                let metric = match part.strategy {
-                    Strategy::FarthestPoints => Metric::Whitened(mixture),
-                    _ => Metric::Plain,
-                };
-                let mut points =
-                    FarthestPoints::new(&pool.pool, metric, picked).map_err(CommandError::failed)?;
-                while !is_complete(&picks)
-                    && let Some(found) = points.pick().map_err(CommandError::failed)?
-                {
-                    picks.push(pool.pick(found.structure, part.strategy.name()));
-                    shown(picks.len() - before);
-                }
-            }
-            Strategy::DOptimal => {
-                let mut design = DOptimal::new(&pool.pool, mixture, picked).map_err(CommandError::failed)?;
-                while !is_complete(&picks)
-                    && let Some(found) = design.pick().map_err(CommandError::failed)?
-                {
-                    picks.push(pool.pick(found.structure, part.strategy.name()));
-                    shown(picks.len() - before);
-                }
-            }
-            Strategy::Random | Strategy::RandomExtrapolating => {
-                let extrapolating = part.strategy == Strategy::RandomExtrapolating;
-                let mut free = vec![true; pool.structures.len()];
-                picked.into_iter().for_each(|structure| free[structure] = false);
-                let may = |s: &usize| {
-                    free[*s] && (!extrapolating || pool.pool.window_atoms_of(*s).next().is_some())
-                };
-                let structures: Vec<usize> = (0..free.len()).filter(may).collect();
-                let drawn = random_structures(&structures, wanted, rules.seed, number as u64);
-                picks.extend(drawn.into_iter().map(|s| pool.pick(s, part.strategy.name())));
-            }
-        }
+    for (part, quota) in (0..).zip(&rules.parts) {
+        let strategy = quota.strategy;
+        let run = StrategyRun {
+            pool,
+            mixture,
+            strategy: strategy.name(),
+            wanted: quota.number.unwrap_or(usize::MAX),
+            picked: picks.iter().map(|pick| pick.structure).collect(),
+            stop,
+        };
+        let (found, largest_left) = match strategy {
+            Strategy::Greedy => run.greedy(settings.clone())?,
+            Strategy::FarthestPoints => (run.farthest_points(Metric::Whitened(mixture))?, None),
+            Strategy::FarthestPointsAll => (run.farthest_points(Metric::Plain)?, None),
+            Strategy::DOptimal => (run.d_optimal()?, None),
+            Strategy::Random => (run.random(false, rules.seed, part), None),
+            Strategy::RandomExtrapolating => (run.random(true, rules.seed, part), None),
+        };
         if stop.is_cancelled() {
             return Ok(None);
         }
+        picks.extend(found);
+        left = largest_left;
     }
     let short = match rules.floor {
         Some(floor) => meet_floors(pool, &mut picks, floor, &mut left),
@@ -126,6 +89,79 @@ pub fn pick(
         None => gamma_left(pool, mixture, settings, &picks)?,
     };
     Ok(Some(Picks { picks, short, gamma_left }))
+}
+
+/// A strategy at work.
+struct StrategyRun<'a> {
+    pool: &'a GradedPool,
+    mixture: &'a Mixture,
+    /// Its name.
+    strategy: &'static str,
+    /// How many structures it picks, if there are as many.
+    wanted: usize,
+    /// Structures that earlier strategies picked.
+    picked: Vec<usize>,
+    stop: &'a CancellationToken,
+}
+
+impl StrategyRun<'_> {
+    /// The picks, and the largest γ that is left (0: none is above the lower limit).
+    fn greedy(&self, settings: UpdateSettings) -> Result<(Vec<Pick>, Option<f64>), CommandError> {
+        let mut greedy = Greedy::new(&self.pool.pool, self.mixture, settings, self.picked.iter().copied())
+            .map_err(CommandError::failed)?;
+        let picks = self.collect(|| {
+            let found = greedy.pick()?;
+            Ok(found.map(|found| Pick {
+                structure: found.structure,
+                strategy: self.strategy,
+                gamma_max: found.gamma_max,
+            }))
+        })?;
+        let left = greedy.gamma_left().map_err(CommandError::failed)?;
+        Ok((picks, Some(left.unwrap_or_default())))
+    }
+
+    fn farthest_points(&self, metric: Metric<'_>) -> Result<Vec<Pick>, CommandError> {
+        let picked = self.picked.iter().copied();
+        let mut points =
+            FarthestPoints::new(&self.pool.pool, metric, picked).map_err(CommandError::failed)?;
+        self.collect(|| Ok(points.pick()?.map(|found| self.pool.pick(found.structure, self.strategy))))
+    }
+
+    fn d_optimal(&self) -> Result<Vec<Pick>, CommandError> {
+        let picked = self.picked.iter().copied();
+        let mut design =
+            DOptimal::new(&self.pool.pool, self.mixture, picked).map_err(CommandError::failed)?;
+        self.collect(|| Ok(design.pick()?.map(|found| self.pool.pick(found.structure, self.strategy))))
+    }
+
+    /// Structures at random, or those among them with an atom within the window; `part` is the number of the strategy.
+    fn random(&self, extrapolating: bool, seed: u64, part: u64) -> Vec<Pick> {
+        let mut free = vec![true; self.pool.structures.len()];
+        self.picked.iter().for_each(|structure| free[*structure] = false);
+        let may =
+            |s: &usize| free[*s] && (!extrapolating || self.pool.pool.window_atoms_of(*s).next().is_some());
+        let structures: Vec<usize> = (0..free.len()).filter(may).collect();
+        let drawn = random_structures(&structures, self.wanted, seed, part);
+        drawn.into_iter().map(|structure| self.pool.pick(structure, self.strategy)).collect()
+    }
+
+    /// Picks until there are enough, no more is found or the selection is stopped.
+    fn collect(
+        &self,
+        mut next: impl FnMut() -> Result<Option<Pick>, SelectionError>,
+    ) -> Result<Vec<Pick>, CommandError> {
+        let bar = Bar::new(Some(self.wanted.min(self.pool.structures.len()) as u64), BAR);
+        let mut picks = Vec::new();
+        while picks.len() < self.wanted
+            && !self.stop.is_cancelled()
+            && let Some(found) = next().map_err(CommandError::failed)?
+        {
+            picks.push(found);
+            bar.set(picks.len() as u64, || self.strategy.to_owned());
+        }
+        Ok(picks)
+    }
 }
 
 impl GradedPool {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use atoms::extxyz::{Column, ColumnData, ExtxyzValue, Frame, FrameLabels, LabelKeys};
 use dft::RetryAdjustment;
+use store::records::Label;
 use store::{ExportRow, ExportSource};
 use wire::{WalkConditions, WalkId};
 
@@ -61,10 +62,18 @@ pub fn frame(
     conditions: &BTreeMap<WalkId, WalkConditions>,
 ) -> Frame {
     let mut frame = Frame::from(row.structure);
-    let label = row.label;
+    add_label(&mut frame, row.label, keys);
+    let mut info = |key: &str, value: ExtxyzValue| frame.info.insert(key.to_owned(), value);
+    info("campaign", campaign.into());
+    info("protocol", row.protocol_name.into());
+    info("protocol_hash", row.protocol.to_string().chars().take(16).collect::<String>().into());
+    add_source(&mut frame, row.source, conditions);
+    frame
+}
+
+fn add_label(frame: &mut Frame, label: Label, keys: LabelKeys) {
     let labels = FrameLabels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
     frame.set_labels(&labels, keys);
-    let scalars = |values| Column { width: 1, entries: ColumnData::Real(values) };
     let details = label.details;
     if let Some(moments) = details.magnetic_moments {
         frame.arrays.insert("magmoms".to_owned(), scalars(moments));
@@ -81,10 +90,12 @@ pub fn frame(
     if !adjustments.is_empty() {
         info("retry_adjustments", adjustments.join(",").into());
     }
-    info("campaign", campaign.into());
-    info("protocol", row.protocol_name.into());
-    info("protocol_hash", row.protocol.to_string().chars().take(16).collect::<String>().into());
-    match row.source {
+}
+
+/// Adds what is known of the origin of a structure.
+fn add_source(frame: &mut Frame, source: ExportSource, conditions: &BTreeMap<WalkId, WalkConditions>) {
+    let mut info = |key: &str, value: ExtxyzValue| frame.info.insert(key.to_owned(), value);
+    match source {
         ExportSource::Candidate {
             id,
             seed_structure_name,
@@ -120,7 +131,11 @@ pub fn frame(
             info("source_frame", integer(frame));
         }
     }
-    frame
+}
+
+/// A number for each atom.
+fn scalars(values: Vec<f64>) -> Column {
+    Column { width: 1, entries: ColumnData::Real(values) }
 }
 
 fn integer(number: u64) -> ExtxyzValue {

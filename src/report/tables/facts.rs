@@ -6,6 +6,7 @@ use calm::CollectionRule;
 use calm::forgetting::{ComponentForgetting, ElementForgetting};
 use monitor::mixture_values::forgetting_by_element;
 use serde_json::Value;
+use store::LabelJobCounts;
 use store::records::{LEFT_OUT, TRAINING_FRAMES};
 
 use super::super::report_data::ReportData;
@@ -36,20 +37,7 @@ pub fn summary(data: &ReportData) -> PageTable {
     if let Some(left_out) = data.values.get(LEFT_OUT).and_then(Value::as_u64) {
         row("left out (not gradable, or control frames with atoms too close)", grouped(left_out));
     }
-    let labels = &status.labels;
-    row(
-        "label jobs",
-        format!(
-            "{} labelled, {} failed, {} dropped, {} superseded, {} leased, {} queued; {} labels excluded by hand",
-            grouped(labels.labelled),
-            grouped(labels.failed),
-            grouped(labels.dropped),
-            grouped(labels.superseded),
-            grouped(labels.leased),
-            grouped(labels.queued),
-            grouped(labels.excluded)
-        ),
-    );
+    row("label jobs", label_jobs(&status.labels));
     if let Some(found) = &data.labels {
         let energies = found.statistics.energies.summary();
         row(
@@ -60,32 +48,53 @@ pub fn summary(data: &ReportData) -> PageTable {
     }
     row("imported structures", grouped(status.imported));
     row("cost of labels", format!("{:.4} core-hours", status.budget.used.core_hours));
-    let mut mixture = format!("version {}", status.mixture_version);
     let training = data.values.get(TRAINING_FRAMES);
-    let number = |key: &str| training.and_then(|training| training[key].as_f64());
-    if let Some((median, share)) = number("median").zip(number("share_above_one")) {
-        mixture +=
-            &format!("; training atoms under it: median γ {median:.2}, {:.1} % above 1", 100.0 * share);
-    }
-    row("mixture", mixture);
+    row("mixture", mixture(status.mixture_version, training));
     let forgotten = training.map(forgetting_by_element).unwrap_or_default();
     if !forgotten.is_empty() {
-        let element = |of: &ElementForgetting| {
-            let share = of.share_above_one.map(|share| format!("{:.1} % above 1", 100.0 * share));
-            let worst = of.worst_component().map(|ComponentForgetting { component, mean_square_growth }| {
-                format!("component {component} × {mean_square_growth:.2}")
-            });
-            let more: Vec<_> = share.into_iter().chain(worst).collect();
-            let more = if more.is_empty() { String::new() } else { format!(" ({})", more.join(", ")) };
-            format!("{} × {:.2}{more}", of.element, of.mean_square_growth)
-        };
-        let shown: Vec<_> = forgotten.iter().take(MAX_ELEMENTS).map(element).collect();
+        let shown: Vec<_> = forgotten.iter().take(MAX_ELEMENTS).map(element_forgetting).collect();
         row("mean σ² of training atoms, relative to the start", shown.join(", "));
     }
     if let Some(key) = &status.budget.used_up {
         row("ended by", format!("the budget {key}"));
     }
     table
+}
+
+fn label_jobs(labels: &LabelJobCounts) -> String {
+    format!(
+        "{} labelled, {} failed, {} dropped, {} superseded, {} leased, {} queued; {} labels excluded by hand",
+        grouped(labels.labelled),
+        grouped(labels.failed),
+        grouped(labels.dropped),
+        grouped(labels.superseded),
+        grouped(labels.leased),
+        grouped(labels.queued),
+        grouped(labels.excluded)
+    )
+}
+
+/// The version of the mixture, with the grades of the training frames under it if they are monitored.
+fn mixture(version: u64, training: Option<&Value>) -> String {
+    let number = |key: &str| training.and_then(|training| training[key].as_f64());
+    let grades = match number("median").zip(number("share_above_one")) {
+        Some((median, share)) => {
+            format!("; training atoms under it: median γ {median:.2}, {:.1} % above 1", 100.0 * share)
+        }
+        None => String::new(),
+    };
+    format!("version {version}{grades}")
+}
+
+/// How much the training data of an element are forgotten.
+fn element_forgetting(of: &ElementForgetting) -> String {
+    let share = of.share_above_one.map(|share| format!("{:.1} % above 1", 100.0 * share));
+    let worst = of.worst_component().map(|ComponentForgetting { component, mean_square_growth }| {
+        format!("component {component} × {mean_square_growth:.2}")
+    });
+    let more: Vec<_> = share.into_iter().chain(worst).collect();
+    let more = if more.is_empty() { String::new() } else { format!(" ({})", more.join(", ")) };
+    format!("{} × {:.2}{more}", of.element, of.mean_square_growth)
 }
 
 /// The collection rule as text. `None` if the configuration has none.
