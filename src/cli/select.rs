@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::extxyz::write_frame;
+use calm::Projection;
 use calm::rules::Positive;
 use calm::selection::Window;
 use potentials::grace::GraceModel;
@@ -13,11 +14,10 @@ use serde_json::{Value, json};
 use super::calm::load;
 use super::{CommandError, ExitStatus, campaign_location};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::file_hash;
 use crate::output::{TextTable, count, decimals, print, print_json, print_stderr};
 use crate::selection::{
-    CampaignCandidates, CandidateChoice, GradedPool, Pick, Picks, PoolFiles, PoolGrading, Rules, Strategy,
-    StrategyQuota, StructureSource, frames, pick,
+    CampaignCandidates, CandidateChoice, FeatureIdentity, GradedPool, Pick, Picks, PoolFiles, PoolGrading,
+    Rules, Strategy, StrategyQuota, StructureSource, frames, pick,
 };
 use crate::signals::stop_token;
 use crate::structure_files::StructureReadingArgs;
@@ -62,8 +62,8 @@ pub struct SelectArgs {
     /// Of campaigns, only declined candidates
     #[arg(long, requires = "campaign")]
     declined: bool,
-    /// Of campaigns, leave out candidates whose features are not stored or belong to another model; otherwise the model is evaluated on
-    /// them
+    /// Of campaigns, leave out candidates whose features are not stored or belong to another model or projection; otherwise the model is
+    /// evaluated on them
     #[arg(long, requires = "campaign")]
     no_evaluation: bool,
     /// Strategies in order, each with its number of structures: greedy, fps, fps-all, d-optimal, random, random-extrap
@@ -117,6 +117,7 @@ impl SelectArgs {
         // Errors in paths are found before hours of work.
         AtomicFile::create(&self.output).map(drop)?;
         let (features, artifact) = load(&self.model, self.artifact.as_deref())?;
+        let projection = features.projection().unwrap_or(artifact.projection);
         let (model, mixture) = (features.model, Arc::new(artifact.mixture));
 
         let needed = parts
@@ -131,7 +132,7 @@ impl SelectArgs {
                 strategy.name()
             )));
         }
-        let mut pool = PoolFiles { files, campaigns: self.campaigns(mixture.dimension())? };
+        let mut pool = PoolFiles { files, campaigns: self.campaigns(projection)? };
         let grading = PoolGrading {
             model: Arc::clone(&model),
             mixture: Arc::clone(&mixture),
@@ -225,14 +226,14 @@ impl SelectArgs {
         }
     }
 
-    /// `dimension` is that of the features.
-    fn campaigns(&self, dimension: usize) -> Result<Vec<CampaignCandidates>, CommandError> {
+    /// `projection` is that of the features.
+    fn campaigns(&self, projection: Projection) -> Result<Vec<CampaignCandidates>, CommandError> {
         if self.campaign.is_empty() {
             return Ok(Vec::new());
         }
         let choice = CandidateChoice {
-            model_hash: file_hash::hash(&self.model).map_err(CommandError::input)?,
-            dimension,
+            dimension: projection.feature_dimension,
+            features: FeatureIdentity::new(&self.model, self.artifact.as_deref(), projection)?,
             declined_only: self.declined,
             no_evaluation: self.no_evaluation,
         };

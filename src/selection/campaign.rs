@@ -1,11 +1,12 @@
 //! The candidates of a campaign as a pool.
 
-use serde_json::Value;
 use store::records::{Fate, StoredCandidate};
 use store::{Location, Store};
 
-use super::{ItemPlace, PoolItem, StructureSource};
+use super::{FeatureIdentity, ItemPlace, PoolItem, StructureSource};
 use crate::exit_status::CommandError;
+use crate::output::log_and_warn;
+use crate::replay;
 
 /// Candidates per read; each has up to megabytes of features.
 const PAGE: u32 = 16;
@@ -13,8 +14,8 @@ const PAGE: u32 = 16;
 /// Which candidates of campaigns are part of a pool, and which of their stored features are used.
 #[derive(Clone, Debug)]
 pub struct CandidateChoice {
-    /// BLAKE3 hash of the model. Features that a campaign with another model has stored are not used.
-    pub model_hash: String,
+    /// The features of the selection. Others that a campaign has stored are not used.
+    pub features: FeatureIdentity,
     /// Dimension D of the features.
     pub dimension: usize,
     /// Leave out accepted candidates.
@@ -31,10 +32,10 @@ pub struct CampaignCandidates {
     /// Id of the campaign.
     pub id: String,
     choice: CandidateChoice,
-    /// The stored features are those of the model.
-    same_model: bool,
+    /// The stored features are those of the selection.
+    same_features: bool,
     last: i64,
-    /// Candidates that were left out because the store has no features of them for the model.
+    /// Candidates that were left out because the store has no features of them for the selection.
     pub left_out: u64,
     /// Every candidate was read.
     pub(super) is_read: bool,
@@ -46,16 +47,20 @@ impl CampaignCandidates {
     pub fn open(location: &Location, number: u32, choice: CandidateChoice) -> Result<Self, CommandError> {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(CommandError::failed)?;
-        let (store, campaign) = runtime.block_on(async {
+        let (store, campaign, files) = runtime.block_on(async {
             let store = Store::open_read_only(location).await?;
-            let campaign = store.campaign().await?;
-            Ok::<_, CommandError>((store, campaign))
+            let (campaign, files) = (store.campaign().await?, store.grade_files().await?);
+            Ok::<_, CommandError>((store, campaign, files))
         })?;
-        let configuration: Value =
-            serde_json::from_str(&campaign.resolved_configuration).map_err(CommandError::failed)?;
-        let same_model = configuration["files"]["potential.model"] == choice.model_hash;
         let id = campaign.id.to_string();
-        Ok(Self { store, number, id, choice, same_model, last: 0, left_out: 0, is_read: false, runtime })
+        let stored = choice.features.is_stored_by(&replay::resolved(&campaign)?, &files);
+        let same_features = stored.unwrap_or_else(|error| {
+            log_and_warn(format_args!(
+                "campaign {id}: the features that it has stored are not used, because their projection is unknown: {error}"
+            ));
+            false
+        });
+        Ok(Self { store, number, id, choice, same_features, last: 0, left_out: 0, is_read: false, runtime })
     }
 
     /// The next candidates; none at the end.
@@ -85,7 +90,7 @@ impl CampaignCandidates {
         PoolItem {
             structure,
             source: StructureSource::Candidate { campaign: self.number, decision: found.decision },
-            features: found.features.filter(|features| self.same_model && features.len() == size),
+            features: found.features.filter(|features| self.same_features && features.len() == size),
             place: ItemPlace::Candidate(view.id().to_string()),
         }
     }

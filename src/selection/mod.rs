@@ -5,6 +5,7 @@ mod compositions;
 mod grading;
 mod output;
 mod picks;
+mod stored_features;
 mod strategy;
 
 use std::path::Path;
@@ -17,6 +18,7 @@ use self::compositions::Compositions;
 pub use self::grading::{PoolFiles, PoolGrading};
 pub use self::output::frames;
 pub use self::picks::{Pick, Picks, Rules, pick};
+pub use self::stored_features::FeatureIdentity;
 pub use self::strategy::{Strategy, StrategyQuota};
 
 /// Structures of a pool with the grades of their atoms.
