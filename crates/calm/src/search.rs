@@ -111,7 +111,8 @@ pub fn update(
 /// The bounded inflation: at most three rounds of scatter ← min(4, (γ_max / 0.95 target)²) · scatter on every
 /// component that the structure touches, while γ_max ≥ target.
 ///
-/// `changed` are the components after the last trial. Returns the inflated components and the factors.
+/// `changed` are the components after the last trial. Returns the inflated components and the factors. It is public
+/// because tests compare it alone with the reference.
 ///
 /// # Errors
 /// Those of [`Batch::inflated`].

@@ -35,7 +35,9 @@ impl DOptimality {
         self.sets.iter().map(ActiveSet::rank).collect()
     }
 
-    /// The active rows of a group, `[r × D]`, centred where the construction is; `None` beyond the last group.
+    /// The active rows of a group, `[r × D]`, centred where the construction is; `None` beyond the last group. Tests and benchmarks
+    /// check with them that no training atom has a coefficient above 1.
+    #[doc(hidden)]
     pub fn active_rows(&self, group: usize) -> Option<&[f64]> {
         self.sets.get(group).map(ActiveSet::rows)
     }

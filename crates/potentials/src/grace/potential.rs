@@ -132,7 +132,8 @@ impl Grace {
 
     /// Number of multiply-adds for the last structure: energies and forces, optionally with features and the
     /// pull-back of their cotangents. Counts sums of products over channels, bonds and couplings without
-    /// padding, with tables of radial functions; excludes spherical harmonics, norms and activations.
+    /// padding, with tables of radial functions; excludes spherical harmonics, norms and activations. Benchmarks
+    /// compare it with the time.
     pub fn multiply_adds(&self, with_features: bool) -> u64 {
         either!(&self.0, evaluator => evaluator.multiply_adds(with_features))
     }
