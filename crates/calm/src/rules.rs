@@ -7,7 +7,7 @@ mod numbers;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use self::atom_count::{AtomCount, AtomCountUpdate, atom_limit};
+pub use self::atom_count::{AtomCount, AtomCountUpdate};
 pub use self::maximum_grade::{MaximumGrade, MaximumGradeUpdate};
 pub use self::numbers::{AlphaValues, Fraction, Positive, RuleError};
 use crate::update::CovarianceUpdate;

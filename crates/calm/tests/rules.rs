@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use calm::rules::{AlphaValues, AtomCount, AtomCountUpdate, Fraction, MaximumGrade, Positive, atom_limit};
+use calm::rules::{AlphaValues, AtomCount, AtomCountUpdate, Fraction, MaximumGrade, Positive};
 use calm::{
     CollectionRule, Component, CovarianceUpdateKind, Mixture, Statistics, UpdateEnd, UpdateRule,
     UpdateSettings, update,
@@ -112,21 +112,6 @@ fn rules_describe_themselves() {
         update("rule = 'atom_count'"),
         "atom_count: fewer than 17 atoms with γ > 1.3, else γ_max below 1.25"
     );
-}
-
-#[test]
-fn a_whole_share_is_not_rounded_up() {
-    for percent in 1..=100_usize {
-        let fraction = Fraction::try_from(percent as f64 / 100.0).unwrap();
-        for atoms in 1..400 {
-            let exact = (percent * atoms).div_ceil(100);
-            assert_eq!(
-                atom_limit(atoms, fraction, NonZeroUsize::MIN),
-                exact.max(1),
-                "{percent} % of {atoms}"
-            );
-        }
-    }
 }
 
 /// D = 2, unit covariance, θ = 1: an atom at distance r has γ = r before.

@@ -28,7 +28,7 @@ impl Panel {
     }
 
     /// Converts data coordinates to sheet coordinates.
-    pub fn to_sheet(&self, [x, y]: Point) -> Point {
+    fn to_sheet(&self, [x, y]: Point) -> Point {
         let Rectangle { x: left, width, height, .. } = self.area;
         [left + width * self.x.position(x), self.area.bottom() - height * self.y.position(y)]
     }

@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
-use potentials::grace::{Architecture, Grace, GraceModel, Instructions, PullBack, RadialPath, Threads};
+use potentials::grace::{
+    Architecture, Grace, GraceModel, Instructions, Precision, PullBack, RadialPath, Threads,
+};
 
 use crate::common;
 use crate::common::golden::committed;
@@ -18,7 +20,7 @@ fn model(name: &str, path: RadialPath) -> Arc<GraceModel> {
         }
         _ => committed(name).join("kokkos.npz"),
     };
-    Arc::new(GraceModel::load_with(&file, path).unwrap())
+    Arc::new(GraceModel::load_in(&file, Precision::Double, path).unwrap())
 }
 
 /// Reproducible numbers in [−½, ½).

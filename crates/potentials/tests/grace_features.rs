@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Species, Structure};
-use potentials::grace::{FeatureForm, Grace, GraceModel, PullBack, RadialPath, Threads};
+use potentials::grace::{FeatureForm, Grace, GraceModel, Precision, PullBack, RadialPath, Threads};
 
 use crate::common::golden::committed;
 use crate::common::model_file::{array, changed, deep, floats, floats_of};
@@ -17,7 +17,7 @@ fn model(name: &str) -> GraceModel {
         "al_eam_1l" => committed(name).join("kokkos.npz"),
         _ => Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/{name}.npz")),
     };
-    GraceModel::load_with(&file, RadialPath::Table).unwrap()
+    GraceModel::load_in(&file, Precision::Double, RadialPath::Table).unwrap()
 }
 
 /// Four atoms in a skewed cell, of all elements of the model that has at most two.

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList};
-use potentials::grace::{Grace, GraceModel, PullBack, RadialPath};
+use potentials::grace::{Grace, GraceModel, Precision, PullBack, RadialPath};
 
 use crate::common::golden::{Golden, Mixture, committed, golden, peer, six};
 
@@ -43,7 +43,7 @@ fn raise(worst: &mut f64, deviation: f64) {
 fn compare(model: &Path, path: RadialPath) -> Deviations {
     let mixture = Mixture::read(model);
     let model_file = model.join("kokkos.npz");
-    let mut grace = Grace::new(Arc::new(GraceModel::load_with(&model_file, path).unwrap()));
+    let mut grace = Grace::new(Arc::new(GraceModel::load_in(&model_file, Precision::Double, path).unwrap()));
     assert_eq!(grace.model().feature_dimension(), mixture.dimension);
     let mut worst = Deviations::default();
     let structures = golden(model);

@@ -87,7 +87,7 @@ impl AtomCountUpdate {
 }
 
 /// max[min_atoms, ⌈fraction · atoms⌉]; products that are integers up to rounding count as integers.
-pub fn atom_limit(atoms: usize, fraction: Fraction, min_atoms: NonZeroUsize) -> usize {
+fn atom_limit(atoms: usize, fraction: Fraction, min_atoms: NonZeroUsize) -> usize {
     let share = (fraction.0 * atoms as f64 * (1.0 - 1e-12)).ceil() as usize;
     share.max(min_atoms.get())
 }
@@ -102,4 +102,21 @@ fn fraction() -> Fraction {
 
 fn min_atoms() -> NonZeroUsize {
     NonZeroUsize::MIN.saturating_add(2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_whole_share_is_not_rounded_up() {
+        for percent in 1..=100_usize {
+            let fraction = Fraction::try_from(percent as f64 / 100.0).unwrap();
+            for atoms in 1..400 {
+                let exact = (percent * atoms).div_ceil(100);
+                let found = atom_limit(atoms, fraction, NonZeroUsize::MIN);
+                assert_eq!(found, exact.max(1), "{percent} % of {atoms}");
+            }
+        }
+    }
 }

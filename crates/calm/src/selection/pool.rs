@@ -109,7 +109,7 @@ impl Pool {
     }
 
     /// The atoms of a structure that were kept.
-    pub fn atoms_of(&self, structure: usize) -> Range<usize> {
+    fn atoms_of(&self, structure: usize) -> Range<usize> {
         self.first[structure]..self.first[structure + 1]
     }
 

@@ -25,18 +25,10 @@ impl GraceModel {
     /// # Errors
     /// With file, array, what was found and what was expected.
     pub fn load(path: &Path) -> Result<Self, GraceError> {
-        Self::load_with(path, RadialPath::default())
+        Self::load_in(path, Precision::Double, RadialPath::default())
     }
 
-    /// Reads a model with this evaluation of radial functions.
-    ///
-    /// # Errors
-    /// As [`GraceModel::load`].
-    pub fn load_with(path: &Path, radial: RadialPath) -> Result<Self, GraceError> {
-        Self::load_in(path, Precision::Double, radial)
-    }
-
-    /// Reads a model for this precision.
+    /// Reads a model for this precision, with this evaluation of radial functions.
     ///
     /// # Errors
     /// As [`GraceModel::load`].

@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 
 use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
 use npyz::{NpyFile, WriterBuilder};
-use potentials::grace::{GraceError, GraceModel, RadialPath};
+use potentials::grace::{GraceError, GraceModel, Precision, RadialPath};
 
 /// The aluminium model.
 pub static BYTES: LazyLock<Vec<u8>> = LazyLock::new(|| {
@@ -18,7 +18,7 @@ pub static BYTES: LazyLock<Vec<u8>> = LazyLock::new(|| {
 pub fn load(bytes: &[u8]) -> Result<GraceModel, GraceError> {
     let mut file = tempfile::NamedTempFile::new().unwrap();
     file.write_all(bytes).unwrap();
-    GraceModel::load_with(file.path(), RadialPath::Exact)
+    GraceModel::load_in(file.path(), Precision::Double, RadialPath::Exact)
 }
 
 /// A multi-layer test model.
