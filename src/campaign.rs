@@ -10,6 +10,7 @@ mod seed_structures;
 mod short_range;
 mod training_sample;
 mod triage;
+mod version;
 mod walk_plan;
 mod walk_time;
 
@@ -34,7 +35,7 @@ use crate::exit_status::CommandError;
 use crate::label_method::MethodConfig;
 use crate::label_method::resolved_method;
 use crate::output::log_and_warn;
-use crate::process_config::{HashedFile, ModelFiles};
+use crate::versions::VersionOnDisk;
 pub use draft::CampaignDraft;
 use loader::Loader;
 pub use seed_structures::{SkippedStructure, SourcedStructure};
@@ -56,6 +57,7 @@ const FILE_KEYS: [&str; 5] = [
 const MAX_SHOWN_SUPERCELLS: usize = 5;
 
 /// A campaign that is ready to run.
+#[derive(Clone)]
 pub struct LoadedCampaign {
     /// The configuration.
     pub config: Config,
@@ -83,6 +85,8 @@ pub struct LoadedCampaign {
     pub file_hashes: Vec<(String, String)>,
     /// Settings that are valid but likely mistakes.
     pub warnings: Vec<Warning>,
+    /// The version of the potential, if it is not that of the configuration. Model, mixture and training frames are its own.
+    pub version: Option<VersionOnDisk>,
 }
 
 impl LoadedCampaign {
@@ -136,6 +140,7 @@ impl LoadedCampaign {
             known,
             file_hashes,
             warnings,
+            version: None,
         })
     }
 
@@ -175,24 +180,6 @@ impl LoadedCampaign {
         let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
         let files = files.into_iter().filter_map(|(key, file)| Some((key, absolute(file?.get_ref()))));
         files.map(|(key, path)| (key.to_owned(), json!(path.to_string_lossy()))).collect()
-    }
-
-    /// The files that walkers load the model from.
-    pub fn model_files(&self) -> Result<ModelFiles, CommandError> {
-        let Config { potential, calm, .. } = &self.config;
-        let file = |key: &str, path: &Path| -> Result<HashedFile, CommandError> {
-            let path = std::path::absolute(path).map_err(CommandError::failed)?;
-            Ok(HashedFile { path, hash: self.hash_of(key) })
-        };
-        let export = potential.model.get_ref();
-        // The campaign's own model has the projection already.
-        let projected = GraceModel::has_projection(export).map_err(CommandError::input)?;
-        let artifact = calm.artifact.as_ref().filter(|_| !projected);
-        Ok(ModelFiles {
-            export: file("potential.model", export)?,
-            artifact: artifact.map(|path| file("calm.artifact", path.get_ref())).transpose()?,
-            precision: potential.precision,
-        })
     }
 
     /// Hash of the file that the configuration names under this key.
@@ -324,7 +311,8 @@ impl LoadedCampaign {
 
     /// The part of the configuration that the selector needs.
     pub fn selector_settings(&self) -> SelectorSettings {
-        selector_settings(&self.config)
+        let version = self.version.as_ref().map(|found| found.version.clone()).unwrap_or_default();
+        SelectorSettings { version, ..selector_settings(&self.config) }
     }
 }
 

@@ -8,7 +8,6 @@ use std::fs::DirBuilder;
 use std::io::ErrorKind;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use monitor::candidate_details;
 use monitor::disk;
@@ -17,7 +16,7 @@ use monitor::provenance::Provenance;
 use monitor::walk_ends::WalkEnds;
 use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
-use orchestrator::selector::{OnForgetting, Selector, SelectorSnapshot};
+use orchestrator::selector::{OnForgetting, Selector};
 use serde::Deserialize;
 use store::{CampaignLock, DATABASE, Location, Store, StoreError, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
@@ -34,7 +33,7 @@ use crate::label_setup::LABEL_METHOD_KEY;
 use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
 use crate::runtime::notify::{self, Notifier};
 use crate::runtime::reference_check::{self, ANY_CHECK};
-use crate::runtime::{self, time_budget};
+use crate::runtime::{self, time_budget, version_loop};
 use crate::wording::disk::megabytes;
 use crate::wording::{self, walk_ends};
 use crate::{log, summary, web};
@@ -186,22 +185,35 @@ async fn run(
     if let Location::Directory(directory) = &location {
         warn_if_disk_is_too_small(campaign, directory, &store).await?;
     }
-    let selector = restore_selector(campaign, &store).await?;
+    // Everything but the identity of the campaign follows the version of its potential.
+    let versioned = version_loop::in_force(campaign, &store, directory).await?;
+    let campaign = &versioned;
+    let selector = version_loop::restore_selector(campaign, &store).await?;
     let pauses = campaign.config.calm.on_forgetting == OnForgetting::Pause;
     if pauses && selector.forgetting_level() > 1.0 && !selector.is_done() {
         return Err(paused_by_alarm(campaign, &store).await?);
     }
     let process = registration::register(&store).await?;
     say_what_is_idle(campaign, location);
-    let stop = CancellationToken::new();
-    let run =
-        runtime::RunContext { campaign, store: &store, process: &process, directory, listen, stop: &stop };
+    let (stop, superseded) = (CancellationToken::new(), CancellationToken::new());
+    let run = runtime::RunContext {
+        campaign,
+        store: &store,
+        process: &process,
+        directory,
+        listen,
+        stop: &stop,
+        superseded: &superseded,
+    };
+    let mode = runtime::RunMode { in_process, accepted_check: accept_reference_check };
     let surroundings = Surroundings { location, lock: lock.as_ref(), web };
-    let worked = work(run, surroundings, selector, in_process, accept_reference_check).await;
+    let worked = work(run, surroundings, selector, mode).await;
     let store = registration::unregister(store, &process, worked.as_ref()).await;
-    worked?;
+    let outcome = worked?;
     let store = store?;
-    if !store.status().await?.finished {
+    // A refit may be left although every walk has ended.
+    let may_refit = campaign.config.refit.is_some() && outcome == reactor::RunOutcome::Stopped;
+    if may_refit || !store.status().await?.finished {
         if pauses && MixtureValues(store.values().await?).training_frames()["alarm"] == true {
             return Err(paused_by_alarm(campaign, &store).await?);
         }
@@ -270,8 +282,7 @@ async fn work(
     run: runtime::RunContext<'_>,
     surroundings: Surroundings<'_>,
     selector: Selector,
-    in_process: bool,
-    accept_reference_check: Option<&str>,
+    mode: runtime::RunMode<'_>,
 ) -> Result<reactor::RunOutcome, CommandError> {
     let runtime::RunContext { campaign, store, stop, .. } = run;
     let Surroundings { location, lock, web } = surroundings;
@@ -281,7 +292,7 @@ async fn work(
             // The budget allows no further work.
             return Ok(reactor::RunOutcome::Stopped);
         }
-        runtime::run(run, selector, in_process, accept_reference_check).await
+        version_loop::run(run, selector, mode).await
     };
     let serving = web.serve(location, store, &campaign.artifact).await?;
     let mut notifier = Notifier::new(&campaign.config, store, location).await?;
@@ -380,29 +391,4 @@ async fn paused_by_alarm(campaign: &LoadedCampaign, store: &Store) -> Result<Com
         "the campaign is paused: {}, then run it again",
         ForgettingRule::new(&campaign.config.calm).raised_message(&measured)
     )))
-}
-
-async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Result<Selector, CommandError> {
-    let snapshot = SelectorSnapshot {
-        walks: store.load_walks().await?,
-        components: store.load_components().await?,
-        known: store.known_hashes().await?,
-        imported: store.status().await?.imported,
-        values: store.values().await?,
-    };
-    let mut selector = Selector::restore(
-        campaign.selector_settings(),
-        store.campaign().await?.id,
-        campaign.seed_structures.iter().map(|named| named.plan.clone()).collect(),
-        campaign.grader(),
-        Arc::new(campaign.artifact.mixture.clone()),
-        campaign.training.clone(),
-        snapshot,
-    )
-    .map_err(CommandError::failed)?;
-    let started = selector.start_walks();
-    if !started.decisions.is_empty() {
-        store.commit(&started).await?;
-    }
-    Ok(selector)
 }

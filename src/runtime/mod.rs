@@ -11,11 +11,13 @@ pub mod notify;
 mod process_manager;
 mod process_records;
 pub mod reference_check;
+mod refit_process;
 pub mod scratch_dir;
 mod single_process;
 mod spawn;
 mod throughput;
 pub mod time_budget;
+pub mod version_loop;
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -36,7 +38,6 @@ use crate::exit_status::CommandError;
 use crate::forgetting::ForgettingRule;
 use crate::output::count;
 use crate::progress::RunDisplay;
-use crate::signals::cancel_on_signal;
 pub use listen::Listen;
 
 /// Capacity of the channel of reports from walkers to the reactor.
@@ -57,27 +58,36 @@ pub struct RunContext<'a> {
     pub listen: Option<&'a Listen>,
     /// Cancelled to stop the run: by a signal, or when a time limit is reached.
     pub stop: &'a CancellationToken,
+    /// Cancelled when walks make room for a newer version of the potential.
+    pub superseded: &'a CancellationToken,
+}
+
+/// How a campaign is run, besides its [`RunContext`].
+#[derive(Clone, Copy, Debug)]
+pub struct RunMode<'a> {
+    /// Everything in one process.
+    pub in_process: bool,
+    /// The reference check whose differences from the reference the user accepts.
+    pub accepted_check: Option<&'a str>,
 }
 
 /// Printed when a campaign is asked to stop.
 const STOP_MESSAGE: &str = "stopping: walks are checkpointed …";
 
-/// Checks the reference, and runs the campaign until it is finished or stopped. `accept`: the check whose differences from
-/// the reference the user accepts.
+/// Checks the reference, and runs the walks with one version of the potential until all have ended, each structure has its label,
+/// or a stop is requested.
 ///
 /// Await this on the main thread: the walkers end with the thread that starts them.
-pub async fn run(
+async fn run_walks(
     run: RunContext<'_>,
     selector: Selector,
-    in_process: bool,
-    accept: Option<&str>,
+    mode: RunMode<'_>,
 ) -> Result<reactor::RunOutcome, CommandError> {
-    cancel_on_signal(run.stop.clone(), STOP_MESSAGE)?;
     let go_on = tokio::select! {
-        go_on = reference_check::run(run, accept) => go_on?,
+        go_on = reference_check::run(run, mode.accepted_check) => go_on?,
         never = single_process::write_heartbeats(run.store.clone(), run.process.clone()) => match never {},
     };
-    match (go_on, in_process) {
+    match (go_on, mode.in_process) {
         (false, _) => Ok(reactor::RunOutcome::Stopped),
         (true, true) => single_process::run(run, selector).await,
         (true, false) => multi_process::run(run, selector).await,
@@ -109,6 +119,7 @@ fn start_reactor(
         store: run.store.clone().with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT),
         incoming,
         stopping,
+        superseded: run.superseded.clone(),
         queue_limit,
     };
     let (store, throughput) = (run.store.clone(), Mutex::new(Throughput::default()));

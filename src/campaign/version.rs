@@ -1,0 +1,100 @@
+//! A campaign with a version of the potential other than that of its configuration.
+
+use std::path::{Path, PathBuf};
+
+use potentials::grace::GraceModel;
+use toml::Spanned;
+
+use super::LoadedCampaign;
+use super::loader::Loader;
+use crate::config::{ConfigError, RefitSection};
+use crate::exit_status::CommandError;
+use crate::file_hash;
+use crate::process_config::{HashedFile, ModelFiles};
+use crate::refit::settings::{RefitSettings, TestSet};
+use crate::versions::VersionOnDisk;
+
+impl LoadedCampaign {
+    /// The campaign with this version. Its configuration and identity remain.
+    ///
+    /// # Errors
+    /// Files of the version that do not belong together, or training frames that its model cannot evaluate.
+    pub fn with_version(&self, found: VersionOnDisk) -> Result<Self, ConfigError> {
+        let mut config = self.config.clone();
+        let mixture = config.calm.artifact.as_ref().map_or(0..0, Spanned::span);
+        config.potential.model = Spanned::new(config.potential.model.span(), found.model.path.clone());
+        config.calm.artifact = Some(Spanned::new(mixture, found.mixture.path.clone()));
+        let loader = Loader { path: &self.path, text: &self.text, config: &config };
+        let model = loader.model()?;
+        let artifact = loader.artifact(&model)?;
+        let training = loader.training_frames(&model, &artifact.mixture)?;
+        Ok(Self { model, artifact, training, version: Some(found), ..self.clone() })
+    }
+
+    /// Number of the version of the potential; 0 is that of the configuration.
+    pub fn version_number(&self) -> u32 {
+        self.version.as_ref().map_or(0, |found| found.version.version)
+    }
+
+    /// The model of version 0.
+    pub fn first_model(&self) -> Result<HashedFile, CommandError> {
+        self.configured_file("potential.model", self.config.potential.model.get_ref())
+    }
+
+    /// The artifact of the mixture.
+    ///
+    /// # Errors
+    /// The campaign has none: its mixture is that of the model's export.
+    pub fn mixture_file(&self) -> Result<HashedFile, CommandError> {
+        match (&self.version, &self.config.calm.artifact) {
+            (Some(found), _) => Ok(found.mixture.clone()),
+            (None, Some(path)) => self.configured_file("calm.artifact", path.get_ref()),
+            (None, None) => Err(CommandError::input("[refit] needs calm.artifact")),
+        }
+    }
+
+    /// The files that walkers load the model from.
+    pub fn model_files(&self) -> Result<ModelFiles, CommandError> {
+        let export = match &self.version {
+            Some(found) => found.model.clone(),
+            None => self.first_model()?,
+        };
+        // A model with a mixture of its own has the projection already.
+        let projected = GraceModel::has_projection(&export.path).map_err(CommandError::input)?;
+        let has_artifact = self.version.is_some() || self.config.calm.artifact.is_some();
+        let artifact = (has_artifact && !projected).then(|| self.mixture_file()).transpose()?;
+        Ok(ModelFiles { export, artifact, precision: self.config.potential.precision })
+    }
+
+    /// The section `[refit]` with absolute paths and hashes.
+    pub fn refit_settings(&self, refit: &RefitSection) -> Result<RefitSettings, CommandError> {
+        let replay = refit.replay.iter().enumerate().map(|(number, path)| {
+            self.configured_file(&format!("refit.replay[{number}]"), path.get_ref())
+        });
+        let test_sets = refit.test_sets.iter().map(|set| {
+            let path = absolute(set.file.get_ref())?;
+            let hash = file_hash::hash(&path).map_err(|error| {
+                CommandError::Input(format!("refit.test_sets: cannot read {}: {error}", path.display()))
+            })?;
+            Ok(TestSet { name: set.name.clone(), file: HashedFile { path, hash } })
+        });
+        Ok(RefitSettings {
+            replay: replay.collect::<Result<_, _>>()?,
+            replay_weight: refit.replay_weight.get(),
+            method: refit.method.clone(),
+            held_out: refit.held_out,
+            max_seed_error_ratio: refit.max_seed_error_ratio.get(),
+            max_held_out_error_ratio: refit.max_held_out_error_ratio.get(),
+            threads: refit.threads,
+            test_sets: test_sets.collect::<Result<_, CommandError>>()?,
+        })
+    }
+
+    fn configured_file(&self, key: &str, path: &Path) -> Result<HashedFile, CommandError> {
+        Ok(HashedFile { path: absolute(path)?, hash: self.hash_of(key) })
+    }
+}
+
+fn absolute(path: &Path) -> Result<PathBuf, CommandError> {
+    std::path::absolute(path).map_err(CommandError::failed)
+}

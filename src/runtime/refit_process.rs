@@ -1,0 +1,176 @@
+//! The process that trains a new version of the potential: starts it, and starts it again when it is killed.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use orchestrator::launcher::{ChildEvent, Children, Launch};
+use orchestrator::selector::CampaignMode;
+use orchestrator::supervisor::{ChildState, Limits};
+use store::{ProcessRecord, Store, StoreError};
+use tokio::time::{MissedTickBehavior, interval};
+
+use super::RunContext;
+use super::process_manager::all_failed_message;
+use crate::campaign::LoadedCampaign;
+use crate::config::RefitSection;
+use crate::exit_status::CommandError;
+use crate::log;
+use crate::output::{log_and_print, log_and_warn};
+use crate::process_config;
+use crate::refit::schedule::RefitSchedule;
+use crate::refit::settings::RefitterConfig;
+
+/// Interval between checks for a due refit and for newer versions of a live campaign.
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
+/// A refit writes its own heartbeats, and a training takes as long as it takes: it is never considered hung.
+const NO_TIMEOUT: Duration = Duration::from_secs(1 << 32);
+
+/// The refit of a run.
+pub struct RefitProcess<'a> {
+    run: RunContext<'a>,
+    refit: &'a RefitSection,
+    /// While one is running.
+    children: Option<Children>,
+}
+
+impl<'a> RefitProcess<'a> {
+    /// None is running yet.
+    pub fn new(run: RunContext<'a>, refit: &'a RefitSection) -> Self {
+        Self { run, refit, children: None }
+    }
+
+    /// Starts a refit, unless one is running. [`Self::finish`] drives it.
+    fn start(&mut self) -> Result<(), CommandError> {
+        if self.children.is_some() {
+            return Ok(());
+        }
+        log_and_print("training a new version of the potential …");
+        let config = configuration(self.run.campaign, self.refit, self.run.directory)?;
+        let config = RefitterConfig { parent: Some(std::process::id()), ..config };
+        let limits = Limits {
+            heartbeat_timeout: NO_TIMEOUT,
+            max_restarts: self.refit.max_attempts.get(),
+            ..Limits::default()
+        };
+        self.children = Some(Children::new(1, limits, move |_, _| {
+            Launch::this_program(["refitter"], process_config::to_bytes(&config))
+        }));
+        Ok(())
+    }
+
+    /// Runs the refit that is due to its end. Await it on the main thread, see [`orchestrator::launcher`].
+    ///
+    /// # Errors
+    /// A refit that fails again and again. The same run continues it.
+    pub async fn run_to_end(&mut self) -> Result<(), CommandError> {
+        self.start()?;
+        let stop = self.run.stop.clone();
+        tokio::select! {
+            ended = self.finish() => return ended,
+            () = stop.cancelled() => {}
+        }
+        if let Some(children) = &mut self.children {
+            children.stop();
+        }
+        self.finish().await
+    }
+
+    /// Beside the walks of a live campaign: starts refits that are due, and cancels [`RunContext::superseded`] when a version is
+    /// registered that is newer than that of the walks. Never ends without an error. Cancel-safe.
+    pub async fn watch(&mut self) -> CommandError {
+        if self.run.campaign.config.campaign.mode != CampaignMode::Live {
+            return std::future::pending().await;
+        }
+        let mut ticks = interval(CHECK_INTERVAL);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                ended = self.finish(), if self.children.is_some() => {
+                    if let Err(error) = ended {
+                        return error;
+                    }
+                }
+                _ = ticks.tick() => {}
+            }
+            match self.check().await {
+                Err(CommandError::Failed(error)) => log_and_warn(format_args!("cannot look for refits: {error}")),
+                Err(error) => return error,
+                Ok(()) => {}
+            }
+        }
+    }
+
+    async fn check(&mut self) -> Result<(), CommandError> {
+        let RunContext { store, campaign, process, superseded, .. } = self.run;
+        let schedule = RefitSchedule::read(store).await?;
+        let newest = schedule.in_force().map_or(0, |version| version.number);
+        if newest > campaign.version_number() {
+            superseded.cancel();
+        } else if schedule.is_due_beside_walks(self.refit, process.started, store::unix_milliseconds()) {
+            self.start()?;
+        }
+        Ok(())
+    }
+
+    /// Drives the running refit, if there is one, to its end. Cancel-safe.
+    async fn finish(&mut self) -> Result<(), CommandError> {
+        let Some(children) = &mut self.children else { return Ok(()) };
+        loop {
+            match children.next().await {
+                ChildEvent::Started { .. } => {}
+                ChildEvent::Stderr { line, .. } => log_and_print(line),
+                ChildEvent::Ended { ended, .. } => {
+                    if ended.then != ChildState::Exited {
+                        log_and_warn(format_args!("refit: {}; {}", ended.reason, ended.then));
+                    }
+                    remove_dead(self.run.store).await?;
+                }
+                ChildEvent::AllExited => {
+                    let failed = all_failed_message(children);
+                    self.children = None;
+                    return failed.map_or(Ok(()), |how| {
+                        Err(CommandError::Failed(format!("the refit failed: {how}; the same command continues it")))
+                    });
+                }
+            }
+        }
+    }
+}
+
+/// Removes the records of refits that have ended without doing so.
+async fn remove_dead(store: &Store) -> Result<(), StoreError> {
+    for found in store.processes(Some(ProcessRecord::REFITTER)).await? {
+        if found.is_local() && found.is_dead() {
+            store.remove_process(&found.id).await?;
+        }
+    }
+    Ok(())
+}
+
+/// What a refit of this campaign needs to know.
+///
+/// # Errors
+/// A campaign without a file that a refit needs.
+pub fn configuration(
+    campaign: &LoadedCampaign,
+    refit: &RefitSection,
+    directory: &Path,
+) -> Result<RefitterConfig, CommandError> {
+    let absolute = |path: &Path| std::path::absolute(path).map_err(CommandError::failed);
+    let directory = absolute(directory)?;
+    let location = campaign.config.run.store.as_ref().map_or_else(|| directory.clone(), PathBuf::from);
+    let first_model = campaign.first_model()?;
+    Ok(RefitterConfig {
+        parent: None,
+        location,
+        directory,
+        parent_version: campaign.version_number(),
+        parent_model: campaign.model_files()?.export,
+        first_model,
+        parent_mixture: campaign.mixture_file()?,
+        precision: campaign.config.potential.precision,
+        rng_seed: campaign.config.campaign.rng_seed,
+        settings: campaign.refit_settings(refit)?,
+        log: log::child_config(),
+    })
+}

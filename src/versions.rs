@@ -1,0 +1,64 @@
+//! The version of the potential in force, with its files on this host.
+
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+
+use orchestrator::selector::PotentialVersion;
+use store::{Store, VersionRecord};
+
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::exit_status::CommandError;
+use crate::file_hash::verify_hash;
+use crate::process_config::HashedFile;
+
+/// Folder of the campaign's directory with the files of versions. The store has them too: what is missing here is written again.
+const FOLDER: &str = "versions";
+/// Names of the files of a version.
+pub const MODEL_FILE: &str = "kokkos.npz";
+pub const MIXTURE_FILE: &str = "gmm_artifacts.npz";
+
+/// A registered version and its files.
+#[derive(Clone, Debug)]
+pub struct VersionOnDisk {
+    /// The version, as the decision log has it.
+    pub version: PotentialVersion,
+    /// The model's export.
+    pub model: HashedFile,
+    /// The artifact of its mixture.
+    pub mixture: HashedFile,
+}
+
+impl VersionOnDisk {
+    /// A registered version, whose files are written to `directory` unless they are there.
+    ///
+    /// # Errors
+    /// A damaged database, a full disk.
+    pub async fn find(store: &Store, record: &VersionRecord, directory: &Path) -> Result<Self, CommandError> {
+        let folder = directory.join(FOLDER).join(record.number.to_string());
+        let file = |name: &str, hash: &String| HashedFile { path: folder.join(name), hash: hash.clone() };
+        let model = file(MODEL_FILE, &record.model_hash);
+        let mixture = file(MIXTURE_FILE, &record.mixture_hash);
+        if [&model, &mixture].into_iter().any(|file| verify_hash(&file.path, &file.hash).is_err()) {
+            let files = store.version_files(record.number).await?.ok_or_else(|| {
+                CommandError::Failed(format!(
+                    "version {} has no files: the database is damaged; restore the campaign from a backup",
+                    record.number
+                ))
+            })?;
+            fs::create_dir_all(&folder).map_err(|error| cannot_write(&folder, error))?;
+            for (file, bytes) in [(&model, &files.model), (&mixture, &files.mixture)] {
+                let mut out = AtomicFile::create(&file.path)?;
+                out.write_all(bytes).map_err(|error| cannot_write(&file.path, error))?;
+                out.finish()?;
+            }
+        }
+        let version = PotentialVersion {
+            version: record.number,
+            parent: record.parent,
+            model: record.model_hash.clone(),
+            mixture: record.mixture_hash.clone(),
+        };
+        Ok(Self { version, model, mixture })
+    }
+}
