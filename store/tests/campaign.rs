@@ -344,6 +344,21 @@ async fn conditions_of_walks_are_read_back() {
 }
 
 #[tokio::test]
+async fn accepted_structures_are_those_of_biased_walks() {
+    let database = TestDatabase::new();
+    let store = database.create().await;
+    assert_eq!(store.accepted_structures().await.unwrap(), 0);
+    let records = vec![
+        candidate(0, 1, Origin::Biased, Fate::Accepted),
+        candidate(0, 2, Origin::Biased, Fate::Declined(DeclineReason::Covered)),
+        candidate(1, 3, Origin::Control, Fate::Accepted),
+        candidate(2, 4, Origin::Biased, Fate::Accepted),
+    ];
+    store.commit(&commit_of(records)).await.unwrap();
+    assert_eq!(store.accepted_structures().await.unwrap(), 2);
+}
+
+#[tokio::test]
 async fn metadata_are_found_by_the_beginning_of_their_names() {
     let database = TestDatabase::new();
     let store = database.create().await;

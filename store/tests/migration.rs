@@ -104,7 +104,7 @@ async fn a_campaign_of_version_1_opens_read_only_without_migration() {
     let before = fs::read(directory.path().join(DATABASE)).unwrap();
     let store = Store::open_read_only(directory.path()).await.unwrap();
     let status = store.status().await.unwrap();
-    assert_eq!(status.candidates.accepted, 2);
+    assert_eq!((status.candidates.accepted, store.accepted_structures().await.unwrap()), (2, 2));
     assert_eq!((status.labels.leased, status.processes), (1, vec![old_process()]));
     assert_eq!(store.processes(Some("orchestrator")).await.unwrap(), [old_process()]);
     assert_eq!(store.decision_log_text().await.unwrap(), log);

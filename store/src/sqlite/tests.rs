@@ -79,6 +79,7 @@ async fn frequent_queries_use_indexes() {
         outcomes::CORES_IN_USE,
         outcomes::FINISHED,
         recent::NEWEST,
+        status::ACCEPTED,
     ] {
         // A page is a result of an index and has a bounded length.
         let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "").replace("SCAN page", "");

@@ -23,6 +23,13 @@ const FATES: &str = "SELECT origin, fate, number FROM candidate_count";
 pub(crate) const COUNTED_FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
+/// Accepted candidates of biased walks.
+pub(crate) const ACCEPTED: &str = "SELECT CAST(coalesce(sum(number), 0) AS BIGINT) FROM candidate_count
+    WHERE origin = 'biased' AND fate = 'accepted'";
+
+/// The same, counted, for tables of an earlier version.
+const COUNTED_ACCEPTED: &str = "SELECT count(*) FROM candidate WHERE origin = 'biased' AND fate = 'accepted'";
+
 /// The query for [`WalkStatus`]; its end selects the walks. The table has zeros before a walk starts and where it
 /// is not graded.
 macro_rules! walks {
@@ -104,6 +111,16 @@ impl Store {
             walks,
             processes: with_visible_state(processes),
         })
+    }
+
+    /// Number of accepted candidates of biased walks.
+    pub async fn accepted_structures(&self) -> Result<u64> {
+        let mut transaction = self.database.begin_read().await?;
+        let are_counted = transaction.has_table("candidate_count").await?;
+        let accepted = query(if are_counted { ACCEPTED } else { COUNTED_ACCEPTED });
+        let accepted = accepted.fetch_one(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(accepted)
     }
 }
 
