@@ -111,6 +111,13 @@ pub static WALK: CheckedTable = checked!("walk" by walk Integer {
 pub static WALK_CONDITIONS: CheckedTable =
     checked!("walk_conditions" by walk Integer { walk: Integer, conditions: Text });
 
+/// Versions of the potential, which have never been without checksums. Their hashes cover their files.
+pub static VERSION: CheckedTable = checked!("version" by number Integer {
+    number: Integer, parent: Integer, state: Text, reason: Text, method: Text, structures: Integer,
+    last_decision: Integer, labels: Integer, model_hash: Text, mixture_hash: Text, figures: Text, seconds: Real,
+    core_hours: Real, time: Integer,
+});
+
 /// Labels, without their status and why it changed.
 pub static LABEL: CheckedTable = checked!("label" by number Integer {
     structure: Integer, protocol: Integer, energy: Real, forces: Bytes, stress: Bytes, job: Integer,

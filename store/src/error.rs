@@ -200,6 +200,14 @@ pub enum StoreError {
     /// The candidate exists already: a programming error of the caller, who must check before.
     #[error("candidate {0} is committed already")]
     DuplicateCandidate(String),
+    /// The number of a new version of the potential is not the next one: another process may have added a version.
+    #[error("version {number} of the potential was not stored: the next number is {next}")]
+    VersionNumber {
+        /// The given number.
+        number: u32,
+        /// The number that the next version must have.
+        next: u32,
+    },
     /// No such job.
     #[error("no label job belongs to '{id}'; {}", neighbours(near))]
     UnknownJob {

@@ -1,4 +1,5 @@
-//! The database of a campaign: decisions, candidates, the mixture, the label queue and labels.
+//! The database of a campaign: decisions, candidates, the mixture, the label queue, labels and versions of the
+//! potential.
 //!
 //! A campaign is kept in one directory or in one schema of a server ([`Location`]). The process that runs it holds
 //! the [`CampaignLock`]; any other process may open the [`Store`] at the same time. Every writing function is one
@@ -38,6 +39,7 @@ mod sqlite;
 mod status;
 mod store;
 mod tables;
+mod versions;
 mod walk_progress;
 
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -75,6 +77,7 @@ pub use relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 pub use report::{CollectedStructure, FateCount};
 pub use status::{CampaignStatus, Candidates, Declined, LabelJobCounts, WalkStatus};
 pub use store::Store;
+pub use versions::{VersionFiles, VersionRecord, VersionState};
 pub use walk_progress::{TotalThroughput, WalkProgressRecord};
 
 /// The current time, ms since 1970.

@@ -18,3 +18,5 @@ mod processes;
 mod queue;
 mod queue_model;
 mod relabel;
+mod version_records;
+mod versions;

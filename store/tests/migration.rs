@@ -6,9 +6,10 @@ use std::path::Path;
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
-use store::{Commit, DATABASE, JobState, ProcessRecord, Store, WalkRecord};
+use store::{Commit, DATABASE, JobState, ProcessRecord, Store, VersionState, WalkRecord};
 
 use crate::common::*;
+use crate::version_records::{version_files, version_record};
 
 const FIRST: &str = "0001_campaign.sql";
 
@@ -117,7 +118,7 @@ async fn a_campaign_of_version_1_continues() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 16);
+    assert_eq!(version(directory.path()).await, 17);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
@@ -145,14 +146,15 @@ async fn columns_of_version_13_are_read_under_their_former_names_and_renamed() {
     store.upsert_process(&process).await.unwrap();
     store.close().await;
     let mut connection = connect(&directory.path().join(DATABASE)).await;
-    let sql = "ALTER TABLE process RENAME COLUMN start_time TO birth;
+    let sql = "DROP TABLE version_file; DROP TABLE version;
+        ALTER TABLE process RENAME COLUMN start_time TO birth;
         ALTER TABLE walk RENAME COLUMN assignments TO turn; ALTER TABLE walk RENAME COLUMN rejected TO refused;
         ALTER TABLE walk RENAME COLUMN rollbacks TO returns; ALTER TABLE walk_progress RENAME TO pace;
         ALTER TABLE label RENAME COLUMN status TO standing; PRAGMA user_version = 13;
         DELETE FROM _sqlx_migrations WHERE version > 13;";
     sqlx::raw_sql(sql).execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    for (writes, expected) in [(false, 13), (true, 16)] {
+    for (writes, expected) in [(false, 13), (true, 17)] {
         let path = directory.path();
         let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
         assert_eq!(store.load_walks().await.unwrap(), walks);
@@ -191,6 +193,30 @@ async fn words_of_version_15_are_read_and_renamed() {
         (SELECT count(*) FROM candidate WHERE reason = 'too_close'), (SELECT class FROM attempt)";
     let found: (i64, i64, String) = sqlx::query_as(sql).fetch_one(&mut connection).await.unwrap();
     assert_eq!(found, (0, 1, "node_failure".to_owned()));
+}
+
+#[tokio::test]
+async fn a_campaign_of_version_16_has_no_versions_of_the_potential() {
+    let directory = tempfile::tempdir().unwrap();
+    create(directory.path()).await.close().await;
+    let mut connection = connect(&directory.path().join(DATABASE)).await;
+    sqlx::raw_sql(TO_VERSION_16).execute(&mut connection).await.unwrap();
+    sqlx::raw_sql("PRAGMA user_version = 16").execute(&mut connection).await.unwrap();
+    connection.close().await.unwrap();
+    for (writes, expected) in [(false, 16), (true, 17)] {
+        let path = directory.path();
+        let store = if writes { Store::open(path).await } else { Store::open_read_only(path).await }.unwrap();
+        assert_eq!(store.versions().await.unwrap(), []);
+        assert_eq!(store.version_files(1).await.unwrap(), None);
+        assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+        if writes {
+            let record = version_record(1, 0, VersionState::Registered);
+            store.add_version(&record, Some(&version_files(1))).await.unwrap();
+            assert_eq!(store.version_files(1).await.unwrap(), Some(version_files(1)));
+        }
+        store.close().await;
+        assert_eq!(version(path).await, expected);
+    }
 }
 
 #[tokio::test]

@@ -44,7 +44,7 @@ macro_rules! table {
 
 /// All tables except those of the leader, of processes and their progress, and of job counts, which triggers count
 /// again. Each table comes after those that it references. A new database already has some rows of `campaign`.
-const TABLES: [CopiedTable; 17] = [
+const TABLES: [CopiedTable; 19] = [
     table!("campaign" { key: T, value: T, checksum: I }),
     table!("value" { name: T, value: T, checksum: I }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B, checksum: I }),
@@ -85,6 +85,11 @@ const TABLES: [CopiedTable; 17] = [
     }),
     table!("import" { number: I, structure: I, file: T, frame: I, checksum: I }),
     table!("archive" 1 { job: I, attempt: I, bytes: B, left_out: T, checksum: I }),
+    table!("version" {
+        number: I, parent: I, state: T, reason: T, method: T, structures: I, last_decision: I, labels: I,
+        model_hash: T, mixture_hash: T, figures: T, seconds: R, core_hours: R, time: I, checksum: I,
+    }),
+    table!("version_file" 1 { version: I, name: T, data: B }),
 ];
 const OPERATIONS: CopiedTable = table!("operation" { number: I, time: I, kind: T, detail: T });
 

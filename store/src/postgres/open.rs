@@ -16,10 +16,10 @@ use crate::old_schema::{self, FIRST_WITH_CHECKSUMS, FIRST_WITH_PRESENT_WORDS};
 use crate::tables::{checksums, renamed_words};
 
 /// The newest migration.
-const SCHEMA: i64 = 16;
+const SCHEMA: i64 = 17;
 
 /// The migrations in order.
-pub(crate) static STEPS: [MigrationSource; 15] = [
+pub(crate) static STEPS: [MigrationSource; 16] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -35,6 +35,7 @@ pub(crate) static STEPS: [MigrationSource; 15] = [
     (14, "start time", include_str!("../../migrations/postgres/0014_start_time.sql")),
     (15, "assignments", include_str!("../../migrations/postgres/0015_assignments.sql")),
     (16, "words", include_str!("../../migrations/postgres/0016_words.sql")),
+    (17, "versions", include_str!("../../migrations/postgres/0017_versions.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

@@ -32,5 +32,6 @@ pub mod report;
 mod restore;
 pub mod status;
 pub mod structures;
+pub mod versions;
 mod walk_conditions;
 mod walk_progress;

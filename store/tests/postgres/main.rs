@@ -13,3 +13,5 @@ mod old_schema;
 mod protection;
 mod restart;
 mod secrets;
+#[path = "../version_records.rs"]
+mod version_records;

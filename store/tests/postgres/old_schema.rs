@@ -2,10 +2,11 @@
 
 use sqlx::ConnectOptions;
 use sqlx::sqlite::SqliteConnectOptions;
-use store::{ExportFilter, Fate, Location, Store};
+use store::{ExportFilter, Fate, Location, Store, VersionState};
 use wire::Origin;
 
 use super::common::*;
+use super::version_records::{version_files, version_record};
 
 /// Turns them into tables of version 8 by undoing what later versions add and rename.
 const WITHOUT_CHECKSUMS: &str = "
@@ -19,7 +20,7 @@ const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE label DROP COLUMN checksum, DROP COLUMN excluded, DROP COLUMN exclusion;
     ALTER TABLE walk DROP COLUMN checksum, DROP COLUMN checkpoint_checksum;
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
-    DROP TABLE walk_conditions;
+    DROP TABLE walk_conditions; DROP TABLE version_file; DROP TABLE version;
     ALTER TABLE process RENAME COLUMN start_time TO birth; ALTER TABLE leader RENAME COLUMN start_time TO birth;
     ALTER TABLE walk RENAME COLUMN assignments TO turn; ALTER TABLE walk RENAME COLUMN rejected TO refused;
     ALTER TABLE walk RENAME COLUMN rollbacks TO returns; ALTER TABLE walk_progress RENAME TO pace;
@@ -70,6 +71,29 @@ async fn tables_without_checksums_are_read_copied_and_migrated() {
     let found = store.check(|_, _| {}).await.unwrap();
     assert!(found.len() == 1 && found[0].what.contains("label 1"), "{found:?}");
     store.close().await;
+}
+
+#[tokio::test]
+async fn tables_of_version_16_have_no_versions_of_the_potential() {
+    let database = TestDatabase::new();
+    database.create().await.close().await;
+    database.execute(TO_VERSION_16).await;
+    let copies = tempfile::tempdir().unwrap();
+    let copy = copies.path().join("copy");
+    let store = database.open_read_only().await;
+    assert_eq!(store.versions().await.unwrap(), []);
+    assert_eq!(store.version_files(1).await.unwrap(), None);
+    assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+    store.backup(&copy, 3, |_, _| {}).await.unwrap();
+    store.close().await;
+    for store in [Store::open(copy.as_path()).await.unwrap(), database.open().await] {
+        assert_eq!(store.versions().await.unwrap(), []);
+        let record = version_record(1, 0, VersionState::Registered);
+        store.add_version(&record, Some(&version_files(1))).await.unwrap();
+        assert_eq!(store.versions().await.unwrap(), [record]);
+        assert_eq!(store.check(|_, _| {}).await.unwrap(), []);
+        store.close().await;
+    }
 }
 
 #[tokio::test]
