@@ -1,12 +1,14 @@
 //! Findings of `Store::check`, each in a campaign with one kind of damage.
 
-use store::{Commit, Decision, Fate, Finding, Store};
+use store::{Commit, Decision, Fate, Finding, Store, VersionState};
 use wire::Origin;
 use wire::messages::DeclineReason;
 
 use crate::common::*;
+use crate::version_records::{version_files, version_record};
 
-/// Two walks with a structure each, one of them labelled, a declined candidate, and a decision without a candidate.
+/// Two walks with a structure each, one of them labelled, a declined candidate, a decision without a candidate, a
+/// registered version of the potential and a refused one.
 pub async fn whole(database: &TestDatabase) -> Store {
     let store = database.create().await;
     let records = vec![
@@ -23,6 +25,9 @@ pub async fn whole(database: &TestDatabase) -> Store {
     // An empty compressed tar file.
     let packed = zstd::encode_all(&[0; 1024][..], 3).unwrap();
     store.keep_archive(lease.job, lease.attempt, &packed, "").await.unwrap();
+    let version = version_record(1, 0, VersionState::Registered);
+    store.add_version(&version, Some(&version_files(1))).await.unwrap();
+    store.add_version(&version_record(2, 1, VersionState::Refused), None).await.unwrap();
     store
 }
 
@@ -96,6 +101,21 @@ async fn each_kind_of_damage_is_found_and_described() {
             "UPDATE archive SET bytes = substr(bytes, 1, 8)",
             "files of job 1, attempt 1: it cannot be unpacked",
         ),
+        (
+            "UPDATE version SET number = 5 WHERE number = 2",
+            "1 versions of the potential with a number below 1 or after a gap (such as 5)",
+        ),
+        (
+            "UPDATE version SET parent = 2 WHERE number = 2",
+            "1 versions of the potential without a registered parent (such as 2)",
+        ),
+        (
+            "INSERT INTO version_file SELECT 2, name, data FROM version_file WHERE name = 'model'",
+            "1 files of versions of the potential that are not registered (such as 2)",
+        ),
+        ("DELETE FROM version_file WHERE name = 'mixture'", "the mixture of version 1: it is missing"),
+        ("UPDATE version_file SET data = substr(data, 1, 3)", "the model of version 1: its BLAKE3 hash is "),
+        ("UPDATE version SET labels = 7 WHERE number = 2", "version 2: its content has the checksum "),
     ] {
         let database = TestDatabase::new();
         let store = whole(&database).await;

@@ -8,15 +8,17 @@ use std::path::Path;
 
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection, Row};
-use store::{Commit, ComponentRecord, DATABASE, ExportFilter, Fate, Store, StoreError};
+use store::{Commit, ComponentRecord, DATABASE, ExportFilter, Fate, Store, StoreError, VersionState};
 use wire::Origin;
 use wire::messages::DeclineReason;
 
 use crate::common::*;
+use crate::version_records::{version_files, version_record};
 
 /// Columns whose bits are flipped: numbers of labels, structures, features, grades, decisions, the mixture, walks,
-/// archives, seed structures and imports. Keys are left out: foreign keys and other rows check them.
-const COLUMNS: [(&str, &[&str]); 12] = [
+/// archives, seed structures, imports and versions of the potential. Keys are left out: foreign keys and other rows
+/// check them.
+const COLUMNS: [(&str, &[&str]); 14] = [
     ("structure", &["hash", "atoms", "data", "checksum"]),
     ("seed_structure", &["structure", "checksum"]),
     ("protocol", &["hash", "checksum"]),
@@ -73,6 +75,25 @@ const COLUMNS: [(&str, &[&str]); 12] = [
     ("import", &["frame", "checksum"]),
     ("archive", &["bytes", "left_out", "checksum"]),
     ("value", &["value", "checksum"]),
+    (
+        "version",
+        &[
+            "parent",
+            "state",
+            "method",
+            "structures",
+            "last_decision",
+            "labels",
+            "model_hash",
+            "mixture_hash",
+            "figures",
+            "seconds",
+            "core_hours",
+            "time",
+            "checksum",
+        ],
+    ),
+    ("version_file", &["data"]),
 ];
 
 fn wanted(variable: &str, by_default: u64) -> u64 {
@@ -124,6 +145,8 @@ async fn full(directory: &Path, accepted: u64) -> Store {
     }
     let frames: Vec<_> = (0..accepted / 4).map(|k| (k, structure(0.5 + k as f64), label(-9.0))).collect();
     store.import(protocol("dft").hash, "old.extxyz", &frames, 2).await.unwrap();
+    let version = version_record(1, 0, VersionState::Registered);
+    store.add_version(&version, Some(&version_files(1))).await.unwrap();
     store
 }
 

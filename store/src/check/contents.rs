@@ -1,9 +1,11 @@
-//! Checks the content of long columns: structures, candidates, labels, JSON texts, packed directories.
+//! Checks the content of long columns: structures, candidates, labels, JSON texts, packed directories, versions of the
+//! potential.
 
 use wire::{CandidateBlock, ContentHash};
 
 use super::archives::ArchiveRow;
 use super::finding::Finding;
+use super::versions;
 use crate::checksum::{
     CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG_COLUMNS, Names, PROTOCOL, STRUCTURE,
 };
@@ -13,6 +15,7 @@ use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
 use crate::tables::checksums;
 use crate::tables::label_row::decode_label;
+use crate::tables::versions::expected_files;
 
 /// Rows read at a time: a row of a large structure has megabytes.
 const PAGE: u32 = 16;
@@ -110,7 +113,8 @@ impl<'a> Contents<'a> {
         transaction: &'a mut Transaction,
         on_progress: &'a mut dyn FnMut(u64, u64),
     ) -> Result<Vec<Finding>> {
-        let all = query(ROWS).fetch_one(&mut *transaction).await?;
+        let rows: u64 = query(ROWS).fetch_one(&mut *transaction).await?;
+        let all = rows + versions::count_files(transaction).await?;
         let mut contents = Self { transaction, on_progress, read: 0, all, findings: Vec::new() };
         contents.table::<StructureContent>((&STRUCTURE, &[]), STRUCTURES).await?;
         contents.table::<CandidateContent>((&CANDIDATE, &LONG_COLUMNS), CANDIDATES).await?;
@@ -118,6 +122,7 @@ impl<'a> Contents<'a> {
         contents.table::<TextContent>((&DECISION, &[]), DECISIONS).await?;
         contents.table::<TextContent>((&PROTOCOL, &[]), PROTOCOLS).await?;
         contents.archives().await?;
+        contents.versions().await?;
         let others = checksums::verify_others(contents.transaction).await?;
         contents.found(others);
         Ok(contents.findings)
@@ -148,6 +153,19 @@ impl<'a> Contents<'a> {
             self.have_read(1);
             let fault = packed.fault();
             faults.extend(fault.map(|fault| format!("files of job {}, attempt {}: {fault}", last.0, last.1)));
+        }
+        self.found(faults);
+        Ok(())
+    }
+
+    /// Versions of the potential and their files, one file at a time.
+    async fn versions(&mut self) -> Result<()> {
+        let mut faults = Vec::new();
+        for version in versions::registered(self.transaction, &mut faults).await? {
+            for file in expected_files(&version) {
+                faults.extend(versions::file_fault(self.transaction, version.number, file).await?);
+                self.have_read(1);
+            }
         }
         self.found(faults);
         Ok(())

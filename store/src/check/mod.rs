@@ -7,6 +7,7 @@ mod contents;
 pub(crate) mod export;
 mod finding;
 mod rules;
+mod versions;
 
 use self::contents::Contents;
 use crate::Store;
@@ -57,6 +58,7 @@ async fn ours(
     findings.extend(rules::job_counts(transaction).await?);
     findings.extend(rules::leases(transaction).await?);
     findings.extend(rules::sums(transaction).await?);
+    findings.extend(versions::rules(transaction).await?);
     findings.extend(Contents::check(transaction, on_progress).await?);
     Ok(())
 }

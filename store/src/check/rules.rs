@@ -24,7 +24,7 @@ impl ConsistencyRule {
     }
 }
 
-const LOST: &str = "something was lost or changed by hand; restore the campaign from a backup";
+pub(super) const LOST: &str = "something was lost or changed by hand; restore the campaign from a backup";
 const QUEUE: &str =
     "the label queue was changed by hand; calmwalk queue shows the jobs; a backup has the original ones";
 
