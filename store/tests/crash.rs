@@ -1,5 +1,5 @@
-//! Kills a process that commits and labels in a loop, at random times: everything that it reported as committed is stored,
-//! and everything else is stored completely or not at all.
+//! Kills a process that commits, labels and registers versions of the potential in a loop, at random times: everything
+//! that it reported as committed is stored, and everything else is stored completely or not at all.
 
 use std::env;
 use std::io::{BufRead, BufReader, Write};
@@ -10,11 +10,13 @@ use std::time::Duration;
 
 use store::{
     CampaignLock, Commit, CompleteOutcome, ComponentRecord, ExportFilter, Fate, JobState, Store, StoreError,
+    VersionState,
 };
 use wire::Origin;
 use wire::messages::DeclineReason;
 
 use crate::common::*;
+use crate::version_records::{version_files, version_record};
 
 const KILLS: u64 = 20;
 const DIRECTORY: &str = "STORE_CRASH_TEST_DIRECTORY";
@@ -48,9 +50,14 @@ async fn work(directory: &Path) {
     store.add_protocol(&protocol("dft"), 0).await.unwrap();
     store.release_leases_of_dead_processes(0).await.unwrap();
     let mut next = commits(&store).await + 1;
+    let mut version = store.versions().await.unwrap().len() as u32 + 1;
     loop {
         store.commit(&numbered_commit(next)).await.unwrap();
         tell("committed", next);
+        let record = version_record(version, version - 1, VersionState::Registered);
+        store.add_version(&record, Some(&version_files(version))).await.unwrap();
+        tell("registered", u64::from(version));
+        version += 1;
         for _ in 0..2 {
             let lease = store.lease(protocol("dft").hash, "host/a", 0, 10).await.unwrap().unwrap();
             if lease.job % 5 == 0 {
@@ -80,16 +87,24 @@ fn start(directory: &Path) -> Child {
         .unwrap()
 }
 
-/// Kills the process `delay` after its start, or after its first commit. Returns the last numbers that it reported.
-fn kill(mut child: Child, after_first_commit: bool, delay: Duration) -> (u64, Vec<u64>) {
+/// What a killed process reported: its last commit, the jobs that it labelled, and the last version that it registered.
+struct Reported {
+    committed: u64,
+    labelled: Vec<u64>,
+    registered: u64,
+}
+
+/// Kills the process `delay` after its start, or after its first commit.
+fn kill(mut child: Child, after_first_commit: bool, delay: Duration) -> Reported {
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
-    let (mut committed, mut labelled) = (0, Vec::new());
+    let mut reported = Reported { committed: 0, labelled: Vec::new(), registered: 0 };
     let mut hear = |line: String| {
         // The test harness writes to the same stream, without a newline before our output.
         let number = |word: &str| line.rsplit_once(word).and_then(|(_, number)| number.trim().parse().ok());
-        committed = number("committed ").unwrap_or(committed);
-        labelled.extend(number("labelled "));
-        committed > 0
+        reported.committed = number("committed ").unwrap_or(reported.committed);
+        reported.labelled.extend(number("labelled "));
+        reported.registered = number("registered ").unwrap_or(reported.registered);
+        reported.committed > 0
     };
     if after_first_commit {
         while !hear(lines.next().expect("it commits")) {}
@@ -100,12 +115,13 @@ fn kill(mut child: Child, after_first_commit: bool, delay: Duration) -> (u64, Ve
     for line in lines {
         hear(line);
     }
-    (committed, labelled)
+    reported
 }
 
-async fn check(store: &Store, committed: u64, labelled: &[u64]) -> u64 {
+async fn check(store: &Store, reported: &Reported) -> u64 {
+    let Reported { committed, labelled, registered } = reported;
     let k = commits(store).await;
-    assert!(k >= committed, "commit {committed} was safe, {k} is the last");
+    assert!(k >= *committed, "commit {committed} was safe, {k} is the last");
     // Every commit is complete.
     let text = store.decision_log_text().await.unwrap();
     let mut expected = String::new();
@@ -147,6 +163,12 @@ async fn check(store: &Store, committed: u64, labelled: &[u64]) -> u64 {
     }
     let is_labelled = |job: &u64| jobs[*job as usize - 1].state == JobState::Labelled;
     assert!(labelled.iter().all(is_labelled));
+    let versions = store.versions().await.unwrap();
+    assert!(versions.len() as u64 >= *registered);
+    for (record, number) in versions.iter().zip(1..) {
+        assert_eq!(*record, version_record(number, number - 1, VersionState::Registered));
+        assert_eq!(store.version_files(number).await.unwrap(), Some(version_files(number)));
+    }
     let filter = ExportFilter { protocol: protocol("dft").hash, biased: true, control: true, imported: true };
     assert_eq!(store.labelled(&filter, None, u32::MAX).await.unwrap().len(), done);
     k
@@ -163,16 +185,16 @@ fn a_killed_process_leaves_complete_commits() {
     for kill_number in 0..KILLS {
         // While it creates or opens the campaign and while it works, at times spread over 60 ms.
         let delay = Duration::from_millis(kill_number * 37 % 60);
-        let (committed, labelled) = kill(start(directory.path()), kill_number % 2 == 1, delay);
+        let reported = kill(start(directory.path()), kill_number % 2 == 1, delay);
         drop(CampaignLock::acquire(directory.path(), "check").expect("free, for its holder is dead"));
         let store = match runtime.block_on(Store::open(directory.path())) {
-            Err(StoreError::Missing { .. }) if last == 0 && committed == 0 => continue,
+            Err(StoreError::Missing { .. }) if last == 0 && reported.committed == 0 => continue,
             opened => opened.unwrap(),
         };
         if runtime.block_on(store.protocols()).unwrap().is_empty() {
             continue;
         }
-        let now = runtime.block_on(check(&store, committed, &labelled));
+        let now = runtime.block_on(check(&store, &reported));
         assert!(now >= last);
         last = now;
         runtime.block_on(store.close());
