@@ -22,6 +22,7 @@
 //! # }
 //! ```
 
+mod activation;
 mod basis;
 mod batch_passes;
 mod batches;

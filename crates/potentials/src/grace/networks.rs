@@ -2,10 +2,11 @@
 
 use npz::NpzFile;
 
+use super::activation::Activation;
 use super::error::{GraceError, mismatch};
 use super::matrix::Matrix;
 use super::radial_network::RadialNetwork;
-use super::readout::{Activation, Readout, ReadoutBlock, SHIFTS};
+use super::readout::{Readout, ReadoutBlock, SHIFTS};
 use super::shared_reader::Embedding;
 use super::vector::{Double, Vector, to_lanes};
 use super::weight_arrays::WeightArrays;

@@ -1,5 +1,6 @@
 //! The network on a Chebyshev basis that gives the radial functions, with two derivatives, in double precision.
 
+use super::activation::Activation;
 use super::instructions::Instructions;
 use super::matrix::{Matrix, StridedRows};
 use super::vector::{Double, Vector, lanes_for};
@@ -112,24 +113,14 @@ impl RadialNetwork {
     }
 }
 
-/// silu(x) = x / (1 + e^−x) and its derivative.
-#[inline(always)]
-pub(super) fn silu_with_slope(x: f64) -> [f64; 2] {
-    let s = 1.0 / (1.0 + (-x).exp());
-    [x * s, s * (1.0 + x * (1.0 - s))]
-}
-
-/// silu on a jet.
+/// [`Activation::Silu`] on a jet.
 fn silu([values, first, second]: &mut Jet) {
     let rows = Double::flat_mut(values).iter_mut().zip(Double::flat_mut(first)).zip(Double::flat_mut(second));
     for ((y, dy), ddy) in rows {
-        let x = *y;
-        let s = 1.0 / (1.0 + (-x).exp());
-        let slope = s * (1.0 + x * (1.0 - s));
-        let curvature = s * (1.0 - s) * (2.0 + x * (1.0 - 2.0 * s));
+        let ((value, slope), curvature) = (Activation::Silu.evaluate(*y), Activation::Silu.curvature(*y));
         *ddy = curvature * *dy * *dy + slope * *ddy;
         *dy *= slope;
-        *y = x * s;
+        *y = value;
     }
 }
 

@@ -1,5 +1,6 @@
 //! From the invariant basis to atomic energies.
 
+use super::activation::Activation;
 use super::invariant_norm::InvariantNorm;
 use super::matrix::StridedRows;
 use super::tape::AtomBatch;
@@ -9,47 +10,6 @@ use super::weights::Weights;
 
 /// Name of the constants by element, eV.
 pub(super) const SHIFTS: &str = "shift_values";
-
-/// The readout's activation function.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Activation {
-    /// x / (1 + e^−x)
-    Silu,
-    /// tanh x
-    Tanh,
-}
-
-impl Activation {
-    /// Value and derivative.
-    #[inline(always)]
-    pub fn evaluate(self, x: f64) -> (f64, f64) {
-        match self {
-            Self::Silu => {
-                let s = 1.0 / (1.0 + (-x).exp());
-                (x * s, s * (1.0 + x * (1.0 - s)))
-            }
-            Self::Tanh => {
-                let t = x.tanh();
-                (t, 1.0 - t * t)
-            }
-        }
-    }
-
-    /// The second derivative.
-    #[inline(always)]
-    pub fn curvature(self, x: f64) -> f64 {
-        match self {
-            Self::Silu => {
-                let s = 1.0 / (1.0 + (-x).exp());
-                s * (1.0 - s) * (2.0 + x * (1.0 - 2.0 * s))
-            }
-            Self::Tanh => {
-                let t = x.tanh();
-                -2.0 * t * (1.0 - t * t)
-            }
-        }
-    }
-}
 
 /// E = s (y_0 + MLP(y_1, y_2, …)) + shift of the element, with the densities y = Σ over layers of norm(W B),
 /// where B are the invariants of the layer.

@@ -3,11 +3,12 @@
 
 use std::ops::Range;
 
+use super::super::activation::Activation;
 use super::super::instructions::Instructions;
 use super::super::matrix::{Matrix, StridedRows};
 use super::super::networks::matrix;
 use super::super::radial::RadialFunctions;
-use super::super::radial_network::{RadialNetwork, silu_with_slope};
+use super::super::radial_network::RadialNetwork;
 use super::super::threads::Threads;
 use super::super::vector::{Double, Vector};
 use super::super::weight_arrays::WeightArrays;
@@ -110,7 +111,7 @@ impl KnotTrace {
             }
             let mut slopes = out.clone();
             for (x, slope) in Double::flat_mut(&mut out).iter_mut().zip(Double::flat_mut(&mut slopes)) {
-                [*x, *slope] = silu_with_slope(*x);
+                (*x, *slope) = Activation::Silu.evaluate(*x);
             }
             self.inputs.push(out);
             self.slopes.push(slopes);
