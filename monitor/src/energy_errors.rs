@@ -1,7 +1,7 @@
 //! Errors of the potential's energies against labels, after removing element offsets.
 
 use analysis::{EnergyOffsets, SystematicSample, TooFewLabels, quantile};
-use atoms::{Species, Structure};
+use atoms::{Structure, element_symbol};
 use serde::Serialize;
 use store::{Store, StoreError};
 use wire::ContentHash;
@@ -97,7 +97,7 @@ impl ProtocolEnergyOffsets {
             }
         };
         let elements = fit.elements().map(|found| OffsetEntry {
-            element: Species::from_atomic_number(found.element).map_or("?", Species::symbol),
+            element: element_symbol(found.element),
             offset: found.offset,
             separate: found.is_separate,
         });

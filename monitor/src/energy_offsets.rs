@@ -1,9 +1,7 @@
 //! Offsets of the elements between the energies of labels and those of the potential, fitted to the newest labels.
 
-use std::collections::BTreeMap;
-
 use analysis::{EnergyOffsets, LabelledEnergy, TooFewLabels};
-use atoms::Structure;
+use atoms::{Structure, composition};
 use store::{Store, StoreError};
 use wire::ContentHash;
 
@@ -29,9 +27,5 @@ pub async fn energy_offsets(
 
 /// A structure's energies by the potential and by its label, eV, for the fit.
 pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> LabelledEnergy {
-    let mut counts = BTreeMap::new();
-    for species in &structure.species {
-        *counts.entry(species.atomic_number()).or_default() += 1;
-    }
-    LabelledEnergy { composition: counts.into_iter().collect(), model, label }
+    LabelledEnergy { composition: composition(&structure.species), model, label }
 }

@@ -24,6 +24,6 @@ pub use min_distances::{CloseContact, MinDistanceRule, MinDistances, PerPair, Un
 pub use neighbours::{Bond, Neighbour, NeighbourList, shortest_distance};
 pub use potential::{Evaluation, Potential, PotentialError};
 pub use read::{FileError, open_extxyz, read_extxyz, read_poscar, read_structures};
-pub use species::{Species, UnknownSpecies};
+pub use species::{Species, UnknownSpecies, composition, element_symbol};
 pub use structure::{Structure, StructureError};
 pub use supercell::Repetition;

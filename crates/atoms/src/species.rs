@@ -53,6 +53,18 @@ impl Species {
     }
 }
 
+/// Atomic number and number of atoms of each element, by ascending atomic number.
+pub fn composition(species: &[Species]) -> Vec<(u8, u32)> {
+    let mut numbers: Vec<_> = species.iter().map(|species| species.atomic_number()).collect();
+    numbers.sort_unstable();
+    numbers.chunk_by(|a, b| a == b).map(|run| (run[0], run.len() as u32)).collect()
+}
+
+/// Symbol of an atomic number; `"?"` where there is no element.
+pub fn element_symbol(atomic_number: u8) -> &'static str {
+    Species::from_atomic_number(atomic_number).map_or("?", Species::symbol)
+}
+
 impl FromStr for Species {
     type Err = UnknownSpecies;
 
@@ -113,6 +125,14 @@ mod tests {
         assert_eq!("Al".parse::<Species>().unwrap().atomic_number(), 13);
         assert!("al".parse::<Species>().is_err());
         assert!(Species::from_atomic_number(0).is_err());
+    }
+
+    #[test]
+    fn atoms_are_counted_by_atomic_number() {
+        let species = ["Ni", "H", "Ni", "Al"].map(|symbol| symbol.parse().unwrap());
+        assert_eq!(composition(&species), [(1, 1), (13, 1), (28, 2)]);
+        assert!(composition(&[]).is_empty());
+        assert_eq!([28, 118, 0, 119].map(element_symbol), ["Ni", "Og", "?", "?"]);
     }
 
     #[test]

@@ -110,14 +110,6 @@ impl LabelledFrame {
         }
     }
 
-    /// Number of atoms of each element, by ascending atomic number.
-    pub(crate) fn composition(&self) -> Vec<(u8, u32)> {
-        let mut numbers: Vec<_> =
-            self.structure.species.iter().map(|species| species.atomic_number()).collect();
-        numbers.sort_unstable();
-        numbers.chunk_by(|a, b| a == b).map(|run| (run[0], run.len() as u32)).collect()
-    }
-
     /// The error that names this structure.
     pub(crate) fn wrong(&self, fault: FrameFault) -> UpfitError {
         UpfitError::Frame { place: self.place.clone(), fault }
@@ -227,7 +219,7 @@ mod tests {
         let mut slab = frame.structure.clone();
         slab.periodic = [true, true, false];
         let made = LabelledFrame::new("x".into(), "a".into(), slab, labels(&frame), 1.0).unwrap();
-        assert_eq!((made.stress, made.composition()), (None, vec![(13, 108)]));
+        assert_eq!((made.stress, atoms::composition(&made.structure.species)), (None, vec![(13, 108)]));
     }
 
     #[test]

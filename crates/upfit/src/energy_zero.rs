@@ -2,7 +2,7 @@
 //! first have to learn a constant of each element.
 
 use analysis::{EnergyOffsets, LabelledEnergy, quantile};
-use atoms::Species;
+use atoms::{Species, element_symbol};
 use potentials::grace::WeightGroup;
 use serde::{Deserialize, Serialize};
 
@@ -90,7 +90,7 @@ impl EnergyZero {
         elements.sort_unstable();
         elements.dedup();
         if spread > CONSTANT {
-            let symbols: Vec<_> = elements.into_iter().map(symbol).collect();
+            let symbols: Vec<_> = elements.into_iter().map(element_symbol).collect();
             return Err(EnergyZeroFault::Undetermined {
                 median,
                 structures: energies.len(),
@@ -105,7 +105,7 @@ impl EnergyZero {
         if shifts.iter().all(|(_, shift)| shift.abs() <= SAME_ZERO) {
             return Self::default();
         }
-        let shift = |(element, shift)| ElementShift { element: symbol(element), shift };
+        let shift = |(element, shift)| ElementShift { element: element_symbol(element).to_owned(), shift };
         Self { shifts: shifts.into_iter().map(shift).collect(), is_constant }
     }
 
@@ -113,7 +113,7 @@ impl EnergyZero {
     pub(crate) fn of(&self, composition: &[(u8, u32)]) -> f64 {
         composition
             .iter()
-            .map(|(element, number)| f64::from(*number) * self.of_element(&symbol(*element)))
+            .map(|(element, number)| f64::from(*number) * self.of_element(element_symbol(*element)))
             .sum()
     }
 
@@ -141,11 +141,6 @@ impl EnergyZero {
     fn of_element(&self, symbol: &str) -> f64 {
         self.shifts.iter().find(|shift| shift.element == symbol).map_or(0.0, |shift| shift.shift)
     }
-}
-
-fn symbol(element: u8) -> String {
-    Species::from_atomic_number(element)
-        .map_or_else(|_| element.to_string(), |found| found.symbol().to_owned())
 }
 
 /// 0 without numbers.

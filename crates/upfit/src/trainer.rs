@@ -6,6 +6,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use analysis::LabelledEnergy;
+use atoms::composition;
 use calm::build::shuffled;
 use potentials::grace::{Threads, TrainableGrace};
 
@@ -230,7 +231,7 @@ impl<'a> Trainer<'a> {
         validation: &[EvaluatedFrame],
     ) -> Result<EnergyZero, UpfitError> {
         let labelled = |(prepared, evaluated): (&PreparedFrame<'a>, &EvaluatedFrame)| LabelledEnergy {
-            composition: prepared.frame.composition(),
+            composition: composition(&prepared.frame.structure.species),
             model: evaluated.energy,
             label: prepared.frame.energy,
         };

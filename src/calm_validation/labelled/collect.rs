@@ -5,7 +5,7 @@ use std::sync::Arc;
 use analysis::{Bins, Exceedance, ForceErrors, LabelledEnergy, SystematicSample};
 use atoms::cell::{norm, sub};
 use atoms::extxyz::FrameLabels;
-use atoms::{Species, Vec3};
+use atoms::{Species, Vec3, composition};
 
 use super::deviations::Deviations;
 
@@ -216,11 +216,4 @@ impl SampledStructure {
         }
         found
     }
-}
-
-/// Number of atoms of each element, by ascending atomic number.
-fn composition(species: &[Species]) -> Vec<(u8, u32)> {
-    let mut numbers: Vec<_> = species.iter().map(|species| species.atomic_number()).collect();
-    numbers.sort_unstable();
-    numbers.chunk_by(|a, b| a == b).map(|run| (run[0], run.len() as u32)).collect()
 }

@@ -1,7 +1,7 @@
 //! What is said of labelled structures.
 
 use analysis::{ElementOffset, ErrorBin, QuantileBin};
-use atoms::Species;
+use atoms::element_symbol;
 use serde::Serialize;
 
 /// Errors of a model, and what scores of atoms say about them. JSON has these names; quantities that are not defined are
@@ -255,7 +255,6 @@ impl From<QuantileBin> for Band {
 
 impl From<ElementOffset> for Offset {
     fn from(of: ElementOffset) -> Self {
-        let element = Species::from_atomic_number(of.element).map_or("?", Species::symbol);
-        Self { element, offset: of.offset, is_separate: of.is_separate }
+        Self { element: element_symbol(of.element), offset: of.offset, is_separate: of.is_separate }
     }
 }

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use atoms::Species;
 use atoms::extxyz::{Frame, write_frame};
+use atoms::{composition, element_symbol};
 use calm::weighted_sample::WeightedSampler;
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
@@ -134,7 +134,8 @@ fn draw(
             return Ok(None);
         }
         let weight = file.weight_of(&frame)?;
-        let change = sampler.add(composition(&frame.structure.species));
+        let atoms = composition(&frame.structure.species).into_iter();
+        let change = sampler.add(atoms.map(|(element, count)| (element, u64::from(count))).collect());
         frames.insert(change.number, DrawnStructure { frame, file: file.path, weight });
         change.dropped.iter().for_each(|number| drop(frames.remove(number)));
         let read = sampler.structures();
@@ -146,13 +147,6 @@ fn draw(
         ));
     }
     Ok(Some(DrawnSample { sampler, frames }))
-}
-
-/// Atomic number and number of atoms of each element.
-fn composition(species: &[Species]) -> Vec<(u8, u64)> {
-    let mut numbers: Vec<_> = species.iter().map(|species| species.atomic_number()).collect();
-    numbers.sort_unstable();
-    numbers.chunk_by(|a, b| a == b).map(|run| (run[0], run.len() as u64)).collect()
 }
 
 impl DrawnSample {
@@ -211,7 +205,7 @@ fn table(rows: &BTreeMap<u8, SampledElement>) -> TextTable {
                 (low, high) => format!("{low}–{high}"),
             });
         table.push(vec![
-            symbol(*element),
+            element_symbol(*element).to_owned(),
             row.in_data.to_string(),
             row.atoms.to_string(),
             row.structures.to_string(),
@@ -225,19 +219,15 @@ fn table(rows: &BTreeMap<u8, SampledElement>) -> TextTable {
 fn too_few(rows: &BTreeMap<u8, SampledElement>, dimension: u64) -> Option<String> {
     let needed = dimension + 1;
     let few = rows.iter().filter(|(_, row)| row.atoms < needed);
-    let named: Vec<_> =
-        few.map(|(element, row)| format!("{} {} of {}", symbol(*element), row.atoms, row.in_data)).collect();
+    let named: Vec<_> = few
+        .map(|(element, row)| format!("{} {} of {}", element_symbol(*element), row.atoms, row.in_data))
+        .collect();
     (!named.is_empty()).then(|| {
         format!(
             "fewer than {needed} atoms (D + 1) in the sample, which a component of a mixture needs: {}",
             named.join(", ")
         )
     })
-}
-
-fn symbol(element: u8) -> String {
-    Species::from_atomic_number(element)
-        .map_or_else(|_| element.to_string(), |found| found.symbol().to_owned())
 }
 
 /// With three significant digits, or as a whole number.

@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use analysis::{quantile, spearman};
-use atoms::Species;
+use atoms::element_symbol;
 
 use super::super::collect::{SampledAtom, ScoreColumn};
 use super::super::report::{CompositionGroup, CompositionScan, ElementErrors, ErrorSpread, ScoreMean};
@@ -27,7 +27,7 @@ pub fn by_element(atoms: &[&SampledAtom], columns: &[ScoreColumn]) -> Vec<Elemen
         let errors: Vec<_> = atoms.iter().map(|atom| atom.error).collect();
         let rank = |k| spearman(&atoms.iter().map(|atom| atom.scores[k]).collect::<Vec<_>>(), &errors);
         Some(ElementErrors {
-            element: symbol(number),
+            element: element_symbol(number),
             atoms: atoms.len(),
             scores: score_means(&atoms, columns),
             spearman: (0..columns.len()).map(rank).collect(),
@@ -55,7 +55,7 @@ pub fn by_composition(
         }
         let groups = groups.into_iter().enumerate().filter(|(_, group)| group.structures > 0);
         let group = |(step, members): (usize, GroupMembers)| members.group(step, columns);
-        CompositionScan { element: symbol(element), groups: groups.map(group).collect() }
+        CompositionScan { element: element_symbol(element), groups: groups.map(group).collect() }
     };
     scanned(structures).into_iter().map(scan).collect()
 }
@@ -145,8 +145,4 @@ impl ErrorSpread {
             quantiles: LEVELS.map(|level| quantile(&errors, level).unwrap_or(median)),
         })
     }
-}
-
-fn symbol(element: u8) -> &'static str {
-    Species::from_atomic_number(element).map_or("?", Species::symbol)
 }
