@@ -69,6 +69,12 @@ impl GraceModel {
         self.network.projection()
     }
 
+    /// D_ρ, the number of densities that the readout reads, the one that counts linearly included: the hidden layer and the energy of an
+    /// atom are functions of them.
+    pub fn density_dimension(&self) -> usize {
+        self.network.density_dimension()
+    }
+
     /// D_h, the number of features of [`super::Grace::hidden_layer`].
     pub fn hidden_dimension(&self) -> usize {
         self.network.hidden_dimension()

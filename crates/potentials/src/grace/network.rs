@@ -73,6 +73,14 @@ impl AnyNetwork {
         }
     }
 
+    /// As [`super::GraceModel::density_dimension`].
+    pub fn density_dimension(&self) -> usize {
+        match self {
+            Self::Double(network) => network.readout.density_dimension(),
+            Self::Mixed(network) => network.readout.density_dimension(),
+        }
+    }
+
     /// As [`super::GraceModel::hidden_dimension`].
     pub fn hidden_dimension(&self) -> usize {
         match self {

@@ -168,6 +168,11 @@ impl<V: Vector> Readout<V> {
         self.layers.len().saturating_sub(1)
     }
 
+    /// D_ρ, the numbers y from which the energy follows.
+    pub fn density_dimension(&self) -> usize {
+        self.layers.first().map_or(1, |first| first.forward(0).inputs())
+    }
+
     /// D_h, the numbers in which the energy is linear: y_0 and the last hidden layer, or all of y without hidden layers.
     pub fn hidden_dimension(&self) -> usize {
         let last = self.layers.last().map_or(1, |last| last.forward(0).inputs());
