@@ -15,6 +15,8 @@ pub struct FeatureCalculator {
     pub neighbours: NeighbourList,
     /// The hidden layer of the readout, if it is the feature.
     hidden: Option<Vec<f64>>,
+    /// Derivatives of the energy, which come with those of the features.
+    of_energy: Evaluation,
 }
 
 /// Why a structure has no features.
@@ -39,7 +41,12 @@ pub enum FeatureError {
 impl FeatureCalculator {
     /// Computes on the calling thread.
     pub fn new(model: Arc<GraceModel>) -> Self {
-        Self { neighbours: NeighbourList::new(model.cutoff(), 0.0), grace: Grace::new(model), hidden: None }
+        Self {
+            neighbours: NeighbourList::new(model.cutoff(), 0.0),
+            grace: Grace::new(model),
+            hidden: None,
+            of_energy: Evaluation::default(),
+        }
     }
 
     /// The same with the hidden layer of the readout as features.
@@ -77,19 +84,23 @@ impl FeatureCalculator {
         Ok(elements)
     }
 
+    /// The derivatives of a function of the last structure's features, from its cotangent, the derivatives with respect to them, [n × D].
+    pub fn pull_back(&mut self, cotangent: &[f64], out: &mut PullBack) {
+        match self.hidden {
+            Some(_) => self.grace.pull_back_hidden_layer(cotangent, out),
+            None => self.grace.backward(Some(cotangent), &mut self.of_energy, out),
+        }
+    }
+
     /// Gradient of the sum of the last structure's features with respect to the coordinates of its atoms, [3n × D], 1/Å. Takes D
     /// reverse sweeps.
     pub fn force_rows(&mut self) -> Vec<f64> {
         let (dimension, numbers) = (self.dimension(), self.features().len());
-        let mut rows = vec![0.0; 3 * numbers];
-        let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+        let (mut rows, mut pull_back) = (vec![0.0; 3 * numbers], PullBack::default());
         for feature in 0..dimension {
             let mut cotangent = vec![0.0; numbers];
             cotangent.iter_mut().skip(feature).step_by(dimension).for_each(|c| *c = 1.0);
-            match self.hidden {
-                Some(_) => self.grace.pull_back_hidden_layer(&cotangent, &mut pull_back),
-                None => self.grace.backward(Some(&cotangent), &mut energy, &mut pull_back),
-            }
+            self.pull_back(&cotangent, &mut pull_back);
             let column = rows.iter_mut().skip(feature).step_by(dimension);
             column.zip(pull_back.gradient.as_flattened()).for_each(|(row, gradient)| *row = *gradient);
         }
