@@ -73,7 +73,7 @@ fn contents(directory: &Path) -> Vec<(String, Vec<u8>)> {
 fn a_model_of_one_element_is_tested_completely() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    let quick = ["--scan-steps", "16", "--no-relax"];
+    let quick = ["--scan-steps", "16", "--no-relax", "--collision-evaluations", "20"];
     let text = validate(here, "al_eam_1l", "first", &quick);
     assert!(text.contains("Al") && text.contains("yes/yes") && text.contains("fcc (111)"), "{text}");
     let found = json(&here.join("first"));
@@ -113,6 +113,7 @@ fn a_model_of_one_element_is_tested_completely() {
     assert!(found["solutions"].as_array().unwrap().is_empty());
     let pair = &found["collisions"][0]["features"][0];
     assert!(pair["distance"].as_f64().unwrap() > 1e3 * pair["rounding"].as_f64().unwrap(), "{pair}");
+    searches_come_closer(&here.join("first"), &found["matched_pairs"]);
 
     let files = contents(&here.join("first"));
     let names: Vec<_> = files.iter().map(|(name, _)| name.as_str()).collect();
@@ -141,6 +142,24 @@ fn a_model_of_one_element_is_tested_completely() {
     assert!(files == contents(&here.join("second")), "the same bytes");
 }
 
+/// Each search from an allowed start brings the features of both environments closer, and its pair is in the file.
+fn searches_come_closer(output: &Path, pairs: &Value) {
+    let described: Vec<_> = pairs.as_array().unwrap().iter().map(|pair| &pair["neighbours"]).collect();
+    // Nine densities can tell environments of three neighbours apart.
+    assert_eq!(described, [50, 50, 3, 50, 50]);
+    for pair in pairs.as_array().unwrap() {
+        let number = |key: &str| pair[key].as_f64().unwrap();
+        let is_closer = number("distance") < number("start_distance");
+        assert!(is_closer || pair["start"] != "unrelated", "{pair}");
+        assert!(pair["evaluations"].as_u64().unwrap() <= 20 && pair["is_different"].is_boolean(), "{pair}");
+    }
+    let frames = read_extxyz(&output.join("collisions.extxyz")).unwrap();
+    let atoms: Vec<_> = frames.iter().map(|frame| frame.structure.len()).collect();
+    assert_eq!(atoms, [51, 51, 51, 51, 4, 4, 51, 51, 51, 51]);
+    let table = std::fs::read_to_string(output.join("tables/collision-search.csv")).unwrap();
+    assert_eq!(table.lines().count(), 6, "{table}");
+}
+
 #[test]
 fn solid_solutions_are_scanned_for_models_of_several_elements() {
     let directory = tempfile::tempdir().unwrap();
@@ -153,6 +172,8 @@ fn solid_solutions_are_scanned_for_models_of_several_elements() {
         "--scan-steps",
         "4",
         "--no-relax",
+        "--collision-evaluations",
+        "0",
         "--solution-structures",
         "1",
         "--pairs",
@@ -223,7 +244,7 @@ fn baselines_are_scanned_beside_the_grade() {
     let linear = ["--feature-variant", "linear", "--kind", "llpr", "--regularisation", "1e-6"];
     baselines(here, &[&["l.npz"], &linear[..]].concat());
     let files = ["--baseline", "b.npz", "--baseline", "l.npz"];
-    let quick = ["--scan-steps", "11", "--no-relax"];
+    let quick = ["--scan-steps", "11", "--no-relax", "--collision-evaluations", "0"];
     let text = validate(here, "al_eam_1l", "out", &[&quick[..], &files[..]].concat());
     let found = json(&here.join("out"));
     let scores = found["scores"].as_array().unwrap();
@@ -285,7 +306,7 @@ fn further_mixtures_are_scanned_beside_the_grade() {
     linear_mixture(here, "linear.npz");
     let own = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
     let others = ["--compare-artifact", "linear.npz", "--compare-artifact", &own];
-    let quick = ["--scan-steps", "4", "--no-relax"];
+    let quick = ["--scan-steps", "4", "--no-relax", "--collision-evaluations", "0"];
     let text = validate(here, "al_eam_1l", "out", &[&quick[..], &others[..]].concat());
     assert!(text.contains("γ (linear)"), "{text}");
     let found = json(&here.join("out"));
@@ -315,8 +336,8 @@ fn further_mixtures_are_scanned_beside_the_grade() {
     std::fs::create_dir(here.join("copy")).unwrap();
     std::fs::copy(here.join("linear.npz"), here.join("copy/linear.npz")).unwrap();
     let others = ["--compare-artifact", "linear.npz", "--compare-artifact", "copy/linear.npz"];
-    let text =
-        validate(here, "al_eam_1l", "out", &[&["--scan-steps", "2", "--no-relax"][..], &others].concat());
+    let quick = ["--scan-steps", "2", "--no-relax", "--collision-evaluations", "0"];
+    let text = validate(here, "al_eam_1l", "out", &[&quick[..], &others].concat());
     assert!(text.contains("γ (linear.npz)") && text.contains("γ (copy/linear.npz)"), "{text}");
 }
 
@@ -328,7 +349,8 @@ fn labelled_structures_have_a_section() {
     write_frames(&here.join("labelled.extxyz"), &aluminium(3));
     let printed =
         score(here, "labelled.extxyz", &["--baseline", "b.npz", "--json", "l.json", "--figures", "drawn"]);
-    let more = ["--labelled", "labelled.extxyz", "--baseline", "b.npz", "--scan-steps", "2", "--no-relax"];
+    let quick = ["--scan-steps", "2", "--no-relax", "--collision-evaluations", "0"];
+    let more = [&["--labelled", "labelled.extxyz", "--baseline", "b.npz"][..], &quick].concat();
     let text = validate(here, "al_eam_1l", "out", &more);
     // The section equals the output of `calm score`.
     let (_, tables) = printed.split_once("\n\n").unwrap();
@@ -377,7 +399,8 @@ fn labelled_atoms_are_drawn_among_the_components() {
     frames.push(Frame::from(frames[0].structure.clone()));
     write_frames(&here.join("labelled.extxyz"), &frames);
     let artifact = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
-    let quick = ["--labelled", "labelled.extxyz", "--scan-steps", "2", "--no-relax"];
+    let labels = ["--labelled", "labelled.extxyz"];
+    let quick = [&labels[..], &["--scan-steps", "2", "--no-relax", "--collision-evaluations", "0"]].concat();
     validate(here, "al_eam_1l", "out", &[&quick[..], &["--artifact", &artifact]].concat());
     let found = json(&here.join("out"));
     let [plane] = &found["feature_planes"].as_array().unwrap()[..] else { panic!("{found}") };
@@ -413,7 +436,8 @@ fn mixtures_of_several_dimensions_are_compared() {
     write_frames(&here.join("labelled.extxyz"), &aluminium(4));
     let own = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
     let others = ["--compare-artifact", &own, "--compare-artifact", "linear.npz"];
-    let quick = ["--labelled", "labelled.extxyz", "--scan-steps", "2", "--no-relax"];
+    let labels = ["--labelled", "labelled.extxyz"];
+    let quick = [&labels[..], &["--scan-steps", "2", "--no-relax", "--collision-evaluations", "0"]].concat();
     let printed = validate(here, "al_eam_1l", "out", &[&quick[..], &others[..]].concat());
     assert!(printed.contains("under several mixtures") && printed.contains("linear.npz"), "{printed}");
     let found = json(&here.join("out"));

@@ -291,6 +291,7 @@ mod tests {
             scan_steps: 2,
             relaxation: Some(Fire::default()),
             solution_structures: 1,
+            collision_evaluations: 0,
             seed: 0,
         };
         // Two more of each element, of another crystal.

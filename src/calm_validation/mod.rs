@@ -37,7 +37,8 @@ use crate::exit_status::CommandError;
 
 pub use self::baseline_score::{BaselineScore, score_own_features};
 pub use self::bond_scans::BondScan;
-pub use self::collisions::Collision;
+pub use self::collisions::octagon::Collision;
+pub use self::collisions::search::MatchedPair;
 pub use self::defects::Defect;
 pub use self::detection::{Detection, DetectionRule};
 pub use self::ensemble::EnergySpread;
@@ -65,7 +66,9 @@ pub struct ValidationSettings {
     pub relaxation: Option<Fire>,
     /// Random structures of each composition of a solid solution.
     pub solution_structures: usize,
-    /// Random seed of the solid solutions.
+    /// Evaluations of each minimisation that searches colliding environments; 0 searches none.
+    pub collision_evaluations: usize,
+    /// Random seed of the solid solutions and the searched environments.
     pub seed: u64,
 }
 
@@ -88,6 +91,8 @@ pub struct Validation {
     pub solutions: Vec<Solution>,
     /// Colliding environments.
     pub collisions: Vec<Collision>,
+    /// Pairs of environments found by minimisation.
+    pub matched_pairs: Vec<MatchedPair>,
     /// Components of the mixture and labelled atoms in the plane of the features; none without the statistics of an artifact.
     pub feature_planes: Vec<FeaturePlane>,
     /// What labelled structures say, if there are any.
@@ -137,13 +142,15 @@ pub fn run(
         bond_scans::count(&settings)
             + defects::count(&settings)
             + solutions::count(&settings)
-            + collisions::count(&settings),
+            + collisions::octagon::count(&settings)
+            + collisions::search::count(&settings),
     );
     let bond_scans = bond_scans::run(subject, &settings, progress);
     let [distances, of_others] = [true, false].map(|own| bond_scans::distances(&bond_scans, own));
     let defects = defects::run(subject, &settings, [&distances, &of_others], progress);
     let solutions = solutions::run(subject, &settings, &distances, progress)?;
-    let collisions = collisions::run(subject, &settings, &distances, progress);
+    let collisions = collisions::octagon::run(subject, &settings, &distances, progress);
+    let matched_pairs = collisions::search::run(subject, &settings, &distances, progress);
     if progress.is_stopped() {
         return Ok(None);
     }
@@ -161,6 +168,7 @@ pub fn run(
         defects,
         solutions,
         collisions,
+        matched_pairs,
         feature_planes: labelled.planes.finish(),
         labelled: labelled.report,
         mixtures: labelled.mixtures,

@@ -16,7 +16,7 @@ impl RandomSequence {
     }
 
     /// Uniform in (0, 1).
-    fn uniform(&mut self) -> f64 {
+    pub fn uniform(&mut self) -> f64 {
         let [a, b] = halves(self.position);
         self.position += 1;
         let [high, low, ..] = philox([a, b, self.sequence[0], self.sequence[1]], self.key);

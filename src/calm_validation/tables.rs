@@ -13,6 +13,7 @@ pub fn all(validation: &Validation) -> Vec<PageTable> {
         solutions(validation),
         feature_space(validation),
         collisions(validation),
+        matched_pairs(validation),
     ];
     tables.extend(validation.labelled.iter().flat_map(labelled::tables));
     tables.extend(
@@ -255,6 +256,52 @@ fn collisions(validation: &Validation) -> PageTable {
                 b,
             ]);
         }
+    }
+    table
+}
+
+fn matched_pairs(validation: &Validation) -> PageTable {
+    let caption = "Environments A and B of an atom with M neighbours, after the features of B were brought as close to those of A as a minimisation \
+                   over its positions could. They are other environments if no rotation, reflection and order of the atoms makes them equal: \
+                   the sorted distances between all atoms, or the mean ones of each atom, differ. The readout’s densities can tell apart \
+                   environments of the smallest M. Energies and forces are those of the atom.";
+    let titles = [
+        "element",
+        "features",
+        "start of B",
+        "M",
+        "|z_{A} − z_{B}| / |z_{A}| at the start",
+        "found",
+        "other environment",
+        "distances differ by (Å)",
+        "superposed (Å)",
+        "E_{A} − E_{B} (eV)",
+        "|F_{A}| (eV/Å)",
+        "|F_{B}| (eV/Å)",
+        "γ_{A}",
+        "γ_{B}",
+        "evaluations",
+    ];
+    let mut table = PageTable::new("collision-search", caption, &titles);
+    for pair in &validation.matched_pairs {
+        let [a, b] = [&pair.scores[0], &pair.scores[1]].map(|of| significant(of.first().copied()));
+        table.rows.push(vec![
+            text(&*pair.element),
+            text(pair.features.name()),
+            text(pair.start.name()),
+            count(pair.neighbours as u64),
+            significant(Some(pair.start_distance)),
+            significant(Some(pair.distance)),
+            text(verdict(Some(pair.is_different))),
+            significant(Some(pair.distances.max(pair.spreads))),
+            significant(Some(pair.superposed)),
+            significant(Some(pair.energies[0] - pair.energies[1])),
+            significant(Some(pair.forces[0])),
+            significant(Some(pair.forces[1])),
+            a,
+            b,
+            count(pair.evaluations as u64),
+        ]);
     }
     table
 }

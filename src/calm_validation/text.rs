@@ -4,7 +4,7 @@ use atoms::extxyz::{Column, ColumnData, Frame, write_frame};
 
 use super::labelled::LabelledReport;
 use super::tables::both;
-use super::{Defect, Validation, figures, tables};
+use super::{Defect, MatchedPair, Validation, figures, tables};
 use crate::exit_status::CommandError;
 use crate::page::{self, PageBlock, PageFile, Section};
 
@@ -21,6 +21,7 @@ pub fn files(validation: &Validation) -> Result<Vec<PageFile>, CommandError> {
         PageFile { path: PAGE.to_owned(), bytes: text.into_bytes() },
         PageFile { path: "validation.json".into(), bytes: json },
         PageFile { path: "structures.extxyz".into(), bytes: structures(&validation.defects)? },
+        PageFile { path: "collisions.extxyz".into(), bytes: pairs(&validation.matched_pairs)? },
     ];
     files.extend(page::files(parts, &tables)?);
     Ok(files)
@@ -75,6 +76,12 @@ fn sections<'a>(parts: &'a [page::FigureEntry], tables: &'a [page::PageTable]) -
                     "Environments that differ should have features that differ: otherwise no score can tell them apart.",
                 ),
                 table("collisions"),
+                table("collision-search").and(words(
+                    "Pairs can also be searched. A pair of other environments with the same hidden layer, to 10⁻⁹ in the paper, also has the same \
+                     energy of the atom, and shows that scores of that layer must be blind somewhere. The features that γ grades should keep \
+                     such a pair apart. A search that ends far away proves nothing. The file collisions.extxyz has the pairs.",
+                )),
+                table("collision-search"),
             ]),
         ),
         (
@@ -141,6 +148,21 @@ fn structures(defects: &[Defect]) -> Result<Vec<u8>, CommandError> {
             frame.arrays.insert(name.to_owned(), column);
         }
         write_frame(&mut bytes, &frame).map_err(CommandError::failed)?;
+    }
+    Ok(bytes)
+}
+
+/// The environments of all pairs, A before B, extended XYZ.
+fn pairs(pairs: &[MatchedPair]) -> Result<Vec<u8>, CommandError> {
+    let mut bytes = Vec::new();
+    for pair in pairs {
+        let (features, start) = (pair.features.name(), pair.start.name());
+        for (structure, which) in pair.structures.iter().zip(["A", "B"]) {
+            let mut frame = Frame::from(structure.clone());
+            let name = format!("{} {features}, {start}, M = {}: {which}", pair.element, pair.neighbours);
+            frame.info.insert("name".into(), name.into());
+            write_frame(&mut bytes, &frame).map_err(CommandError::failed)?;
+        }
     }
     Ok(bytes)
 }

@@ -1,4 +1,4 @@
-//! Colliding environments: explicit pairs which features of too low a body order cannot distinguish (paper, SI1).
+//! An explicit pair which features of too low a body order cannot distinguish.
 
 use std::collections::BTreeMap;
 
@@ -6,8 +6,8 @@ use atoms::{Cell, Species, Structure};
 use potentials::grace::GraceProjection;
 use serde::Serialize;
 
-use super::{Subject, ValidationGrader, ValidationProgress, ValidationSettings};
 use crate::all_cores;
+use crate::calm_validation::{Subject, ValidationGrader, ValidationProgress, ValidationSettings};
 
 /// Two sets of places on an octagon with the same distances between their members, which neither rotation nor reflection turns into each
 /// other: A. L. Patterson, Phys. Rev. 65, 195 (1944). An atom in the middle has the same distances and angles to both, so features of

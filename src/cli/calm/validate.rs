@@ -38,8 +38,9 @@ const MIXED: usize = 4;
 /// Test whether the extrapolation grade of a model can be trusted, with and without labels
 ///
 /// Bond scans of the elements' crystals from compression to stretching, as the paper's minimal test; grades at vacancies, surfaces and
-/// grain boundaries; grades of random solid solutions against composition. With --labelled, also how well the grade ranks the force
-/// errors of labelled structures, as calm score says. Run it after calm build, and before a campaign trusts γ.
+/// grain boundaries; grades of random solid solutions against composition; searches for different environments with the same features.
+/// With --labelled, also how well the grade ranks the force errors of labelled structures, as calm score says. Run it after calm build,
+/// and before a campaign trusts γ.
 /// Writes a self-contained HTML page, each figure as SVG, PNG and CSV, each table as CSV, all results as JSON, and the graded
 /// structures. The same input gives the same bytes. docs/calm-validation.md explains the tests.
 ///
@@ -89,7 +90,11 @@ pub struct CalmValidateArgs {
     /// Keep the ideal positions at defects instead of relaxing them at fixed cell (FIRE, to 0.01 eV/Å)
     #[arg(long)]
     no_relax: bool,
-    /// Random seed of the solid solutions
+    /// Evaluations of the features in each search for two environments with the same features, for up to six elements; 0 leaves these
+    /// searches out
+    #[arg(long, value_name = "N", default_value = "1000")]
+    collision_evaluations: usize,
+    /// Random seed of the solid solutions and of the searched environments
     #[arg(long, value_name = "N", default_value = "42")]
     rng_seed: u64,
 }
@@ -236,6 +241,7 @@ impl CalmValidateArgs {
             scan_steps: self.scan_steps.get(),
             relaxation: (!self.no_relax).then(Fire::default),
             solution_structures: self.solution_structures.get(),
+            collision_evaluations: self.collision_evaluations,
             seed: self.rng_seed,
         })
     }

@@ -1,0 +1,9 @@
+//! Colliding environments (paper, SI1): different ones with the same features, explicit and found by minimisation.
+
+mod environments;
+mod feature_match;
+mod lbfgs;
+pub mod octagon;
+pub mod search;
+#[cfg(test)]
+mod tests;
