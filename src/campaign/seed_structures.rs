@@ -30,6 +30,7 @@ const MAX_LISTED: usize = 20;
 const MAX_SUPERCELL_ATOMS: u64 = 100_000;
 
 /// A seed structure and its source.
+#[derive(Clone)]
 pub struct SourcedStructure {
     /// Its name, structure and walks.
     pub plan: SeedStructurePlan,
@@ -51,6 +52,7 @@ pub struct SeedStructures {
 }
 
 /// A seed structure that is left out.
+#[derive(Clone)]
 pub struct SkippedStructure {
     /// Its name and structure; no walks.
     pub plan: SeedStructurePlan,

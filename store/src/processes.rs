@@ -20,7 +20,7 @@ const UNRESPONSIVE_AFTER: i64 = 60 * 1000;
 pub struct ProcessRecord {
     /// Unique name, never reused and without `/`.
     pub id: String,
-    /// [`Self::ORCHESTRATOR`], [`Self::WALKER`], [`Self::AGENT`] or [`Self::LABELLER`].
+    /// [`Self::ORCHESTRATOR`], [`Self::WALKER`], [`Self::AGENT`], [`Self::LABELLER`] or [`Self::REFITTER`].
     pub kind: String,
     /// Index of the walker or labeller; `None` for an orchestrator.
     pub number: Option<u32>,
@@ -77,6 +77,8 @@ impl ProcessRecord {
     pub const AGENT: &str = "agent";
     /// A process that makes labels. It outlives its orchestrator and writes its own record.
     pub const LABELLER: &str = "labeller";
+    /// A process that trains a new version of the potential. It ends with its orchestrator, and writes its own record.
+    pub const REFITTER: &str = "refitter";
 
     /// A record for the process `pid` in this process's PID namespace, `running` since `now`.
     pub fn new(kind: &str, number: Option<u32>, pid: u32, now: i64) -> Self {

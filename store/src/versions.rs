@@ -68,3 +68,8 @@ pub struct VersionFiles {
     /// The bytes of the mixture with its thresholds, `gmm_artifacts.npz`.
     pub mixture: Vec<u8>,
 }
+
+impl VersionRecord {
+    /// [`Self::method`] of a version that is an earlier one again.
+    pub const ROLLBACK: &str = "rollback";
+}

@@ -331,6 +331,7 @@ async fn conditions_of_walks_are_read_back() {
         tau: 0.15,
         volume_ramp: Some((1.0, 0.85)),
         repeat: 2,
+        version: 2,
     };
     let begun = WalkRecord { conditions: conditions.clone(), ..walk(0, 0) };
     store.commit(&Commit { walks: vec![begun.clone()], ..Commit::default() }).await.unwrap();
