@@ -76,6 +76,8 @@ pub struct AgentConfig {
     pub heartbeat_timeout: f64,
     /// Largest number of restarts.
     pub max_restarts: u32,
+    /// Whether the campaign trains new versions of its potential: the agent joins again for the next one.
+    pub has_versions: bool,
 }
 
 /// Configuration of a labeller process.

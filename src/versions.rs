@@ -4,10 +4,13 @@ use std::fs;
 use std::io::Write;
 use std::path::Path;
 
-use orchestrator::selector::PotentialVersion;
-use store::{Store, VersionRecord};
+use orchestrator::selector::{PotentialVersion, VERSION};
+use serde::Deserialize;
+use store::{LoggedDecision, Store, StoreError, VersionRecord};
+use toml::Spanned;
 
 use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::config::Config;
 use crate::exit_status::CommandError;
 use crate::file_hash::verify_hash;
 use crate::process_config::HashedFile;
@@ -61,4 +64,50 @@ impl VersionOnDisk {
         };
         Ok(Self { version, model, mixture })
     }
+
+    /// The version that a decision of the log takes up, with its files in `directory`.
+    ///
+    /// # Errors
+    /// A damaged database, a full disk.
+    pub async fn taken_up_by(
+        store: &Store,
+        decision: &LoggedDecision,
+        directory: &Path,
+    ) -> Result<Self, CommandError> {
+        let damaged = |problem: &str| {
+            CommandError::Failed(format!(
+                "decision {}: {problem}: the database is damaged; restore the campaign from a backup",
+                decision.sequence
+            ))
+        };
+        let logged = PotentialVersion::deserialize(&decision.detail);
+        let logged = logged.map_err(|error| damaged(&error.to_string()))?;
+        let records = store.versions().await?;
+        let record = records.iter().find(|record| record.number == logged.version);
+        let record = record.ok_or_else(|| damaged(&format!("there is no version {}", logged.version)))?;
+        let found = Self::find(store, record, directory).await?;
+        if found.version != logged {
+            return Err(damaged(&format!("version {} has other files than recorded", logged.version)));
+        }
+        Ok(found)
+    }
+
+    /// A configuration with the files of this version in place of its own.
+    pub fn applied_to(&self, config: &Config) -> Config {
+        let mut config = config.clone();
+        let mixture = config.calm.artifact.as_ref().map_or(0..0, Spanned::span);
+        config.potential.model = Spanned::new(config.potential.model.span(), self.model.path.clone());
+        config.calm.artifact = Some(Spanned::new(mixture, self.mixture.path.clone()));
+        config
+    }
+}
+
+/// The decision that took up the version of the potential to which this version of the mixture belongs; `None` for that of the
+/// configuration.
+pub async fn taken_up_before(
+    store: &Store,
+    mixture_version: u64,
+) -> Result<Option<LoggedDecision>, StoreError> {
+    let decisions = store.decisions_of_kind(VERSION).await?;
+    Ok(decisions.into_iter().rfind(|decision| decision.mixture_version <= mixture_version))
 }

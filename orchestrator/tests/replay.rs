@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
 use atoms::{MinDistanceRule, Uniform};
-use calm::{CollectionRule, Mixture};
 use calm::rules::MaximumGrade;
+use calm::{CollectionRule, Mixture};
 use orchestrator::selector::{
     AcceptedAtoms, CampaignMode, MixtureHistory, Replay, ReplayedDecision, SelectorSettings,
     SelectorSnapshot, TrainingFrames, UpdateProtocol, VERSION,
@@ -124,7 +124,8 @@ fn check_history(
                 history.apply(recorded, Some(atoms)).unwrap()
             }
             None if recorded.kind == VERSION => {
-                history.take_up_version(recorded, original_of(recorded)).unwrap();
+                let original = original_of(recorded).at_version(recorded.mixture_version);
+                history = MixtureHistory::new(settings.search.clone(), Arc::new(original));
                 None
             }
             None => history.apply(recorded, None).unwrap(),

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use potentials::grace::GraceModel;
-use toml::Spanned;
 
 use super::LoadedCampaign;
 use super::loader::Loader;
@@ -20,10 +19,7 @@ impl LoadedCampaign {
     /// # Errors
     /// Files of the version that do not belong together, or training frames that its model cannot evaluate.
     pub fn with_version(&self, found: VersionOnDisk) -> Result<Self, ConfigError> {
-        let mut config = self.config.clone();
-        let mixture = config.calm.artifact.as_ref().map_or(0..0, Spanned::span);
-        config.potential.model = Spanned::new(config.potential.model.span(), found.model.path.clone());
-        config.calm.artifact = Some(Spanned::new(mixture, found.mixture.path.clone()));
+        let config = found.applied_to(&self.config);
         let loader = Loader { path: &self.path, text: &self.text, config: &config };
         let model = loader.model()?;
         let artifact = loader.artifact(&model)?;
@@ -68,9 +64,10 @@ impl LoadedCampaign {
 
     /// The section `[refit]` with absolute paths and hashes.
     pub fn refit_settings(&self, refit: &RefitSection) -> Result<RefitSettings, CommandError> {
-        let replay = refit.replay.iter().enumerate().map(|(number, path)| {
-            self.configured_file(&format!("refit.replay[{number}]"), path.get_ref())
-        });
+        let replay =
+            refit.replay.iter().enumerate().map(|(number, path)| {
+                self.configured_file(&format!("refit.replay[{number}]"), path.get_ref())
+            });
         let test_sets = refit.test_sets.iter().map(|set| {
             let path = absolute(set.file.get_ref())?;
             let hash = file_hash::hash(&path).map_err(|error| {

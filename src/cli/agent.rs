@@ -84,8 +84,15 @@ impl AgentArgs {
             if let Some(address) = self.metrics {
                 web::serve_metrics(web::listen(address).await?, web::agent_metrics::router(watched.clone()))?;
             }
-            let (tls, threads, timeout) = (tls.as_ref(), self.threads as usize, self.wait_timeout.get());
-            agent_host::run(&self.join, tls, agent, threads, timeout, scratch.path(), &watched).await
+            let settings = agent_host::AgentSettings {
+                address: &self.join,
+                tls: tls.as_ref(),
+                agent,
+                threads: self.threads as usize,
+                timeout: self.wait_timeout.get(),
+                directory: scratch.path(),
+            };
+            agent_host::run(&settings, &watched).await
         })?
     }
 }

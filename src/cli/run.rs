@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use monitor::candidate_details;
 use monitor::disk;
+use monitor::mixture_status::InitialMixture;
 use monitor::mixture_values::MixtureValues;
 use monitor::provenance::Provenance;
 use monitor::walk_ends::WalkEnds;
@@ -294,7 +295,12 @@ async fn work(
         }
         version_loop::run(run, selector, mode).await
     };
-    let serving = web.serve(location, store, &campaign.artifact).await?;
+    let artifact = Some(&campaign.artifact).filter(|_| campaign.config.refit.is_none());
+    let initial = artifact.map(|artifact| InitialMixture {
+        symbols: artifact.symbols.clone(),
+        mixture: artifact.mixture.clone(),
+    });
+    let serving = web.serve(location, store, initial).await?;
     let mut notifier = Notifier::new(&campaign.config, store, location).await?;
     let worked = tokio::select! {
         ended = work => ended,

@@ -100,7 +100,10 @@ mod tests {
         assert_eq!((schedule.refit_at(&refit), schedule.in_force().unwrap().number), (Some(14), 1));
         assert!(!schedule.is_due_after_walks(&refit));
         schedule.accepted = 20;
-        let rollback = VersionRecord { method: VersionRecord::ROLLBACK.into(), ..version(3, VersionState::Registered, 9) };
+        let rollback = VersionRecord {
+            method: VersionRecord::ROLLBACK.into(),
+            ..version(3, VersionState::Registered, 9)
+        };
         schedule.versions.push(rollback);
         assert!(schedule.is_due_after_walks(&refit), "a rollback is no training");
         schedule.versions.push(version(4, VersionState::Registered, 14));

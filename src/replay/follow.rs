@@ -1,18 +1,22 @@
 //! Feeds decisions and candidates from the store to the replay.
 
 use std::collections::VecDeque;
+use std::path::Path;
 use std::sync::Arc;
 
 use calm::Mixture;
-use orchestrator::selector::{RegradedCandidate, Regrader, Replay, SelectorError};
+use orchestrator::selector::{RegradedCandidate, Regrader, Replay, ReplayedDecision, SelectorError, VERSION};
 use store::{LoggedDecision, Store, StoredCandidate};
 
 use super::failure;
 use super::report::{LogEntry, ReplayReport};
 use crate::all_cores;
+use crate::campaign::{self, grader};
+use crate::config::Config;
 use crate::exit_status::CommandError;
 use crate::output::Bar;
 use crate::runtime::cores;
+use crate::versions::VersionOnDisk;
 
 /// Decisions read at a time.
 const PAGE_ROWS: i64 = 500;
@@ -23,14 +27,21 @@ const CANDIDATES_PER_CORE: u32 = 8;
 /// Follows the log up to decision `last`, or until something differs or is missing.
 pub async fn follow(
     store: &Store,
+    config: &Config,
     replay: &mut Replay,
     report: &mut ReplayReport,
     last: i64,
     bar: &Bar,
 ) -> Result<(), CommandError> {
     let mut prefetch = Prefetch::new(replay.is_exact());
-    for first in pages(last) {
+    for first in pages(1, last) {
         for recorded in &page(store, first, last).await? {
+            if recorded.kind == VERSION {
+                let now = take_up_version(store, config, replay, recorded).await?;
+                prefetch.ready.clear();
+                report.add(LogEntry { decision: recorded, candidate: None }, now, replay.is_exact());
+                continue;
+            }
             let candidate = match recorded.candidate {
                 Some(_) if replay.is_reached(recorded).map_err(failure)? => {
                     Some(prefetch.take(store, replay, recorded.sequence).await?)
@@ -54,9 +65,24 @@ pub async fn follow(
     Ok(())
 }
 
-/// The first decisions of the pages up to decision `last`.
-pub fn pages(last: i64) -> impl Iterator<Item = i64> {
-    (1..=last).step_by(PAGE_ROWS as usize)
+/// Replays the decision to take up a version of the potential, with the model and the mixture of that version.
+async fn take_up_version(
+    store: &Store,
+    config: &Config,
+    replay: &mut Replay,
+    recorded: &LoggedDecision,
+) -> Result<Option<ReplayedDecision>, CommandError> {
+    let directory = tempfile::tempdir().map_err(CommandError::failed)?;
+    let found = VersionOnDisk::taken_up_by(store, recorded, directory.path()).await?;
+    let name = format!("(version {})", found.version.version);
+    let (model, artifact, training) = campaign::load_for_grades(&found.applied_to(config), Path::new(&name))?;
+    let original = Arc::new(artifact.mixture);
+    replay.take_up_version(recorded, grader(&model), original, training).map_err(failure)
+}
+
+/// The first decisions of the pages from decision `first` to decision `last`.
+pub fn pages(first: i64, last: i64) -> impl Iterator<Item = i64> {
+    (first..=last).step_by(PAGE_ROWS as usize)
 }
 
 /// The page of decisions from `first` on, up to decision `last`.

@@ -42,7 +42,7 @@ pub async fn replay(
     let end = store.newest_mixture().await?;
     let mut report = ReplayReport::new(&campaign, settings, is_other_processor(&resolved), end.decision);
     let bar = Bar::new(Some(end.decision.unsigned_abs()), BAR);
-    follow::follow(store, &mut replay, &mut report, end.decision, &bar).await?;
+    follow::follow(store, &config, &mut replay, &mut report, end.decision, &bar).await?;
     report.close(&replay, &end).map_err(failure)?;
     report.seconds = begun.elapsed().as_secs_f64();
     Ok(report)

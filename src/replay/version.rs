@@ -13,7 +13,7 @@ use crate::exit_status::CommandError;
 use crate::output::Bar;
 
 /// The mixture of a version between the first and the newest, by the accepted candidates before it. `original` is the artifact
-/// with which the campaign began.
+/// with which the campaign began, or that of the version of the potential that the decision `begin` took up.
 ///
 /// # Errors
 /// Updates that are not reproduced as recorded; a damaged database.
@@ -21,6 +21,7 @@ pub async fn mixture_of(
     store: &Store,
     version: u64,
     original: &Artifact,
+    begin: Option<&LoggedDecision>,
 ) -> Result<Arc<Mixture>, CommandError> {
     let record = store.campaign().await?;
     let settings = recorded_settings(&record)?;
@@ -30,9 +31,10 @@ pub async fn mixture_of(
             "mixture version {version}: no decision made it: the database is damaged"
         ))
     })?;
-    let mut history = MixtureHistory::new(settings.search, Arc::new(original.mixture.clone()));
+    let (before, at_begin) = begin.map_or((0, 0), |begin| (begin.sequence, begin.mixture_version));
+    let mut history = MixtureHistory::new(settings.search, Arc::new(original.mixture.at_version(at_begin)));
     let bar = Bar::new(Some(last.unsigned_abs()), BAR);
-    for first in follow::pages(last) {
+    for first in follow::pages(before + 1, last) {
         for decision in follow::page(store, first, last).await? {
             let update = match history.is_update(&decision) {
                 true => apply_update(store, &mut history, &decision, original).await?,

@@ -34,27 +34,53 @@ use crate::web::agent_metrics::AgentState;
 /// Interval at which the walkers' states are published for the agent's metrics.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Works for a campaign until it is over or this process is asked to stop. Temporary files are kept in `directory`.
+/// How an agent works.
+#[derive(Clone, Debug)]
+pub struct AgentSettings<'a> {
+    /// Where the orchestrator is.
+    pub address: &'a Address,
+    /// Certificates.
+    pub tls: Option<&'a Tls>,
+    /// This agent.
+    pub agent: net::AgentInfo,
+    /// Threads of each walker.
+    pub threads: usize,
+    /// How long it waits for an orchestrator.
+    pub timeout: Duration,
+    /// Where temporary files are kept.
+    pub directory: &'a Path,
+}
+
+/// Works for a campaign until it is over or this process is asked to stop, with one version of the potential after the other.
 ///
 /// Await this on the main thread: the walkers end with the thread that starts them.
-pub async fn run(
-    address: &Address,
-    tls: Option<&Tls>,
-    agent: net::AgentInfo,
-    threads: usize,
-    timeout: Duration,
-    directory: &Path,
-    state: &AgentState,
-) -> Result<ExitStatus, CommandError> {
+pub async fn run(settings: &AgentSettings<'_>, state: &AgentState) -> Result<ExitStatus, CommandError> {
     let stop = CancellationToken::new();
     cancel_on_signal(stop.clone(), STOP_MESSAGE)?;
+    loop {
+        let (ended, has_versions) = run_version(settings, state, &stop).await?;
+        if ended != ExitStatus::Done || !has_versions {
+            return Ok(ended);
+        }
+        log_and_print("no more walks with this version of the potential: waiting for the next one");
+    }
+}
+
+/// Works with one version of the potential. Returns whether there may be another one.
+async fn run_version(
+    settings: &AgentSettings<'_>,
+    state: &AgentState,
+    stop: &CancellationToken,
+) -> Result<(ExitStatus, bool), CommandError> {
+    let AgentSettings { address, tls, agent, threads, timeout, directory } = settings;
+    let (agent, threads, timeout) = (agent.clone(), *threads, *timeout);
     let walkers = agent.walkers;
     let (client, joined, setup) = tokio::select! {
-        joined = join(address, tls, agent, directory) => joined?,
-        () = stop.cancelled() => return Ok(ExitStatus::Interrupted),
+        joined = join(address, *tls, agent, directory) => joined?,
+        () = stop.cancelled() => return Ok((ExitStatus::Interrupted, false)),
         () = address.wait_until_over() => {
             log_and_print("the campaign is over");
-            return Ok(ExitStatus::Done);
+            return Ok((ExitStatus::Done, false));
         }
         () = tokio::time::sleep(timeout) => {
             let minutes = timeout.as_secs_f64() / 60.0;
@@ -79,11 +105,11 @@ pub async fn run(
             OrchestratorEvent::Recovered => log_and_print("the orchestrator answers again"),
         }))
     };
-    let ended = run_in(&shm_dir, &setup, (walkers, threads), &mixture, dispatch, &stop, state).await;
+    let ended = run_in(&shm_dir, &setup, (walkers, threads), &mixture, dispatch, stop, state).await;
     let removed = shm_dir.remove().map_err(CommandError::failed);
     let ended = ended?;
     removed?;
-    Ok(ended)
+    Ok((ended, setup.has_versions))
 }
 
 /// Waits until the orchestrator admits this agent, and loads what the walkers need.

@@ -44,6 +44,7 @@ impl AgentService {
             message_bytes: run.campaign.largest_message(),
             heartbeat_timeout: config.run.heartbeat_timeout.seconds(),
             max_restarts: config.run.max_restarts,
+            has_versions: config.refit.is_some(),
         };
         let bootstrap = AgentBootstrap { setup: process_config::to_bytes(&setup), files };
         let heartbeat_timeout = config.run.agent_heartbeat_timeout.get();

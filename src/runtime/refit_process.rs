@@ -93,7 +93,9 @@ impl<'a> RefitProcess<'a> {
                 _ = ticks.tick() => {}
             }
             match self.check().await {
-                Err(CommandError::Failed(error)) => log_and_warn(format_args!("cannot look for refits: {error}")),
+                Err(CommandError::Failed(error)) => {
+                    log_and_warn(format_args!("cannot look for refits: {error}"))
+                }
                 Err(error) => return error,
                 Ok(()) => {}
             }
@@ -129,7 +131,9 @@ impl<'a> RefitProcess<'a> {
                     let failed = all_failed_message(children);
                     self.children = None;
                     return failed.map_or(Ok(()), |how| {
-                        Err(CommandError::Failed(format!("the refit failed: {how}; the same command continues it")))
+                        Err(CommandError::Failed(format!(
+                            "the refit failed: {how}; the same command continues it"
+                        )))
                     });
                 }
             }

@@ -132,7 +132,8 @@ pub async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Resul
 /// Number of accepted structures at which walks make room for a refit. Walks of a live campaign go on beside it.
 async fn refit_at(campaign: &LoadedCampaign, store: &Store) -> Result<Option<u32>, CommandError> {
     let config = &campaign.config;
-    let Some(refit) = config.refit.as_ref().filter(|_| config.campaign.mode == CampaignMode::Reproducible) else {
+    let Some(refit) = config.refit.as_ref().filter(|_| config.campaign.mode == CampaignMode::Reproducible)
+    else {
         return Ok(None);
     };
     let number = RefitSchedule::read(store).await?.refit_at(refit);

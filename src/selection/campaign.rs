@@ -1,5 +1,6 @@
 //! The candidates of a campaign as a pool.
 
+use orchestrator::selector::VERSION;
 use store::records::{Fate, StoredCandidate};
 use store::{Location, Store};
 
@@ -32,8 +33,8 @@ pub struct CampaignCandidates {
     /// Id of the campaign.
     pub id: String,
     choice: CandidateChoice,
-    /// The stored features are those of the selection.
-    same_features: bool,
+    /// Candidates before this decision have stored features of the selection.
+    same_features_before: i64,
     last: i64,
     /// Candidates that were left out because the store has no features of them for the selection.
     pub left_out: u64,
@@ -47,10 +48,11 @@ impl CampaignCandidates {
     pub fn open(location: &Location, number: u32, choice: CandidateChoice) -> Result<Self, CommandError> {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(CommandError::failed)?;
-        let (store, campaign, files) = runtime.block_on(async {
+        let (store, campaign, files, versions) = runtime.block_on(async {
             let store = Store::open_read_only(location).await?;
             let (campaign, files) = (store.campaign().await?, store.grade_files().await?);
-            Ok::<_, CommandError>((store, campaign, files))
+            let versions = store.decisions_of_kind(VERSION).await?;
+            Ok::<_, CommandError>((store, campaign, files, versions))
         })?;
         let id = campaign.id.to_string();
         let stored = choice.features.is_stored_by(&replay::resolved(&campaign)?, &files);
@@ -60,7 +62,23 @@ impl CampaignCandidates {
             ));
             false
         });
-        Ok(Self { store, number, id, choice, same_features, last: 0, left_out: 0, is_read: false, runtime })
+        // Later versions of the potential have other features.
+        let same_features_before = match (same_features, versions.first()) {
+            (false, _) => 0,
+            (true, None) => i64::MAX,
+            (true, Some(version)) => version.sequence,
+        };
+        Ok(Self {
+            store,
+            number,
+            id,
+            choice,
+            same_features_before,
+            last: 0,
+            left_out: 0,
+            is_read: false,
+            runtime,
+        })
     }
 
     /// The next candidates; none at the end.
@@ -87,10 +105,11 @@ impl CampaignCandidates {
         let view = found.block.view();
         let structure = view.structure();
         let size = structure.len() * self.choice.dimension;
+        let is_same = found.decision < self.same_features_before;
         PoolItem {
             structure,
             source: StructureSource::Candidate { campaign: self.number, decision: found.decision },
-            features: found.features.filter(|features| self.same_features && features.len() == size),
+            features: found.features.filter(|features| is_same && features.len() == size),
             place: ItemPlace::Candidate(view.id().to_string()),
         }
     }

@@ -11,7 +11,6 @@ mod server;
 use std::net::SocketAddr;
 
 use axum::Router;
-use calm::Artifact;
 use monitor::mixture_status::InitialMixture;
 use store::{Location, Store};
 use tokio::net::TcpListener;
@@ -90,12 +89,13 @@ impl ListenArgs {
 
 impl BoundListeners {
     /// Starts the servers. They read through separate connections, so that frequent requests do not slow the
-    /// campaign. Mutations go through `store`.
+    /// campaign. Mutations go through `store`. `initial` is the mixture with which the campaign began, unless it changes with the
+    /// version of the potential.
     pub async fn serve(
         self,
         location: &Location,
         store: &Store,
-        artifact: &Artifact,
+        initial: Option<InitialMixture>,
     ) -> Result<RunningServers, CommandError> {
         let mut serving = RunningServers::default();
         if self.dashboard.is_none() && self.metrics.is_none() {
@@ -107,14 +107,12 @@ impl BoundListeners {
             serving.servers.push(serve_metrics(listener, metrics::router(read_store.clone()))?);
         }
         if let Some(listener) = self.dashboard {
-            let original =
-                InitialMixture { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
             let mutations = Mutations::new(store.clone())?;
             let address = listener.local_addr().map_err(CommandError::failed)?;
             tracing::info!("dashboard at http://{address}/");
             // Print the token, but do not log it.
             print_stderr(format_args!("dashboard at http://{address}/#token={}", mutations.token()));
-            let router = Dashboard::new(read_store, Some(mutations), Some(original)).router();
+            let router = Dashboard::new(read_store, Some(mutations), initial).router();
             serving.servers.push(HttpServer::start(listener, router));
         }
         Ok(serving)

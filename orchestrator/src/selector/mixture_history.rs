@@ -1,7 +1,8 @@
 //! Follows the mixture through the decision log of a campaign.
 //!
-//! Only four kinds of decisions matter: an accepted candidate updates the mixture, a decision on forgetting makes later
-//! updates additive, the end of a walk may restart the original mixture, and a new version of the potential has a mixture of its own. Declined candidates do not matter, so their
+//! Only three kinds of decisions matter: an accepted candidate updates the mixture, a decision on forgetting makes later
+//! updates additive, and the end of a walk may restart the original mixture. A new version of the potential has a mixture, and
+//! so a history, of its own. Declined candidates do not matter, so their
 //! features are not needed.
 
 use std::sync::Arc;
@@ -31,7 +32,8 @@ pub struct AcceptedAtoms<'a> {
 }
 
 impl MixtureHistory {
-    /// The mixture before the first decision. `settings` are those of [`super::SelectorSettings::search`], which never
+    /// The mixture before the first decision, or after the one that took up a version of the potential: `original` at the version
+    /// of the mixture that the log has there. `settings` are those of [`super::SelectorSettings::search`], which never
     /// change during a campaign.
     pub fn new(settings: calm::UpdateSettings, original: Arc<Mixture>) -> Self {
         Self { settings, mixture: Arc::clone(&original), original, switched_to_additive: false }
@@ -40,20 +42,6 @@ impl MixtureHistory {
     /// The mixture after the last decision.
     pub fn mixture(&self) -> &Arc<Mixture> {
         &self.mixture
-    }
-
-    /// Takes the decision of the log on a new version of the potential, whose mixture is `original`.
-    ///
-    /// # Errors
-    /// A damaged log: another version of the mixture after the decision than expected.
-    pub fn take_up_version(
-        &mut self,
-        next: &LoggedDecision,
-        original: Arc<Mixture>,
-    ) -> Result<(), ReplayError> {
-        self.mixture = Arc::new(original.at_version(self.mixture.version() + 1));
-        (self.original, self.switched_to_additive) = (original, false);
-        self.check_version(next)
     }
 
     /// Whether the next decision of the log updated the mixture with its candidate.
@@ -81,15 +69,11 @@ impl MixtureHistory {
         } else if next.kind == FORGETTING {
             self.switched_to_additive = true;
         }
-        self.check_version(next)?;
-        Ok(update)
-    }
-
-    fn check_version(&self, next: &LoggedDecision) -> Result<(), ReplayError> {
-        let (version, recorded) = (self.mixture.version(), next.mixture_version);
-        if version == recorded {
-            return Ok(());
+        let version = self.mixture.version();
+        if version == next.mixture_version {
+            return Ok(update);
         }
+        let recorded = next.mixture_version;
         Err(damaged(next, &format!("mixture version {recorded} after it, expected version {version}")))
     }
 

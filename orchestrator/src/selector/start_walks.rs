@@ -47,7 +47,8 @@ impl DecisionState {
         if self.version == next.version {
             return;
         }
-        let left: Vec<_> = [true, false].into_iter().flat_map(|biased| self.walks.unfinished(biased)).collect();
+        let left: Vec<_> =
+            [true, false].into_iter().flat_map(|biased| self.walks.unfinished(biased)).collect();
         for id in left {
             self.end_walk(id, &WalkEnd::Superseded, commit);
             commit.walks.push(self.walks[id].to_record());

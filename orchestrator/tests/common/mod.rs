@@ -13,8 +13,8 @@ use calm::{
 };
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
-    CampaignMode, OnForgetting, PotentialVersion, Scheduling, SeedStructurePlan, Selector, SelectorSettings, SelectorSnapshot,
-    TrainingFrames, UpdateProtocol,
+    CampaignMode, OnForgetting, PotentialVersion, Scheduling, SeedStructurePlan, Selector, SelectorSettings,
+    SelectorSnapshot, TrainingFrames, UpdateProtocol,
 };
 use store::records::{AtomGrades, Commit};
 use wire::messages::{Assignment, AssignmentReport, Outcome, WalkEnd, WalkProgress};

@@ -7,12 +7,14 @@ use calm::build::ArtifactVersion;
 use calm::{Artifact, Mixture};
 use serde_json::Value;
 use store::Store;
+use tempfile::TempDir;
 
 use super::mixture_files::MixtureFiles;
 use crate::atomic_file::refuse_to_replace;
 use crate::cli::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::output::{count, print};
 use crate::replay::{self, RelocatedFilesArgs};
+use crate::versions::{self, VersionOnDisk};
 
 /// Write the mixture of a campaign, at any version, as a CALM artifact
 ///
@@ -21,7 +23,8 @@ use crate::replay::{self, RelocatedFilesArgs};
 /// the campaign only, which may be running.
 ///
 /// The store has the newest version. Earlier ones are computed from the accepted candidates, whose features are always stored, and every
-/// update must be as recorded. Version 0 is the original mixture. Numbers are rounded to single precision, as in every artifact.
+/// update must be as recorded. Version 0 is the original mixture. The mixture of a new version of the potential has the version that
+/// the decision log gives it. Numbers are rounded to single precision, as in every artifact.
 #[derive(Debug, clap::Args)]
 pub struct CalmExportArgs {
     #[command(flatten)]
@@ -48,6 +51,8 @@ struct Version {
     model: Option<PathBuf>,
     original: Artifact,
     mixture: Arc<Mixture>,
+    /// The files above, if they are those of a version of the potential.
+    _copies: TempDir,
 }
 
 impl CalmExportArgs {
@@ -78,32 +83,40 @@ impl CalmExportArgs {
                     .to_owned(),
             ));
         }
-        let find = |key| replay::find_one(key, &resolved, &files, &self.moved);
-        let artifact = find(replay::ARTIFACT)?;
-        let model = self.embed.as_ref().map(|_| find(replay::MODEL)).transpose()?;
+        let newest = store.newest_mixture().await?;
+        let wanted = self.version.unwrap_or(newest.version);
+        if wanted > newest.version {
+            return Err(CommandError::Input(format!(
+                "--version {wanted}: the mixture of the campaign has versions 0 to {} so far",
+                newest.version
+            )));
+        }
+        let copies = tempfile::tempdir().map_err(CommandError::failed)?;
+        let begin = versions::taken_up_before(store, wanted).await?;
+        let (artifact, model) = match &begin {
+            Some(decision) => {
+                let found = VersionOnDisk::taken_up_by(store, decision, copies.path()).await?;
+                (found.mixture.path, self.embed.as_ref().map(|_| found.model.path))
+            }
+            None => {
+                let find = |key| replay::find_one(key, &resolved, &files, &self.moved);
+                (find(replay::ARTIFACT)?, self.embed.as_ref().map(|_| find(replay::MODEL)).transpose()?)
+            }
+        };
         self.check_outputs(&artifact, model.as_deref())?;
         let original = Artifact::load(&artifact).map_err(CommandError::input)?;
-        let newest = store.newest_mixture().await?;
-        let mixture = match self.version.unwrap_or(newest.version) {
-            0 => Arc::new(original.mixture.clone()),
-            version if version > newest.version => {
-                return Err(CommandError::Input(format!(
-                    "--version {version}: the mixture of the campaign has versions 0 to {} so far",
-                    newest.version
-                )));
-            }
-            version if version == newest.version => {
-                let stored = newest.components.iter();
-                let stored = stored.map(|one| (one.element as usize, one.slot as usize, &one.bytes[..]));
-                let restored = original.mixture.restored(version, stored);
-                Arc::new(
-                    restored.map_err(|error| CommandError::Failed(format!("damaged database: {error}")))?,
-                )
-            }
-            version => replay::mixture_of(store, version, &original).await?,
+        let mixture = if wanted == begin.as_ref().map_or(0, |decision| decision.mixture_version) {
+            Arc::new(original.mixture.at_version(wanted))
+        } else if wanted == newest.version {
+            let stored = newest.components.iter();
+            let stored = stored.map(|one| (one.element as usize, one.slot as usize, &one.bytes[..]));
+            let restored = original.mixture.restored(wanted, stored);
+            Arc::new(restored.map_err(|error| CommandError::Failed(format!("damaged database: {error}")))?)
+        } else {
+            replay::mixture_of(store, wanted, &original, begin.as_ref()).await?
         };
         let (campaign, newest) = (campaign.id.to_string(), newest.version);
-        Ok(Version { campaign, newest, artifact, model, original, mixture })
+        Ok(Version { campaign, newest, artifact, model, original, mixture, _copies: copies })
     }
 
     fn check_outputs(&self, artifact: &Path, model: Option<&Path>) -> Result<(), CommandError> {

@@ -40,16 +40,26 @@ impl FromRow for DecisionRow {
     }
 }
 
+impl DecisionRow {
+    fn decode(self) -> Result<LoggedDecision> {
+        let detail = serde_json::from_str(&self.detail);
+        let detail = detail.map_err(|error| StoreError::damaged("the decision log", error))?;
+        let Self { sequence, round, kind, walk, candidate, mixture_version, .. } = self;
+        Ok(LoggedDecision { sequence, round, kind, walk, candidate, mixture_version, detail })
+    }
+}
+
 impl Store {
     /// Decisions with sequence numbers (from 1) in `range`, in order.
     pub async fn decisions(&self, range: RangeInclusive<i64>) -> Result<Vec<LoggedDecision>> {
-        let decision = |row: DecisionRow| {
-            let detail = serde_json::from_str(&row.detail);
-            let detail = detail.map_err(|error| StoreError::damaged("the decision log", error))?;
-            let DecisionRow { sequence, round, kind, walk, candidate, mixture_version, .. } = row;
-            Ok(LoggedDecision { sequence, round, kind, walk, candidate, mixture_version, detail })
-        };
-        self.decision_rows(range).await?.into_iter().map(decision).collect()
+        self.decision_rows(range).await?.into_iter().map(DecisionRow::decode).collect()
+    }
+
+    /// All decisions of a kind, in order. Reads the whole log.
+    pub async fn decisions_of_kind(&self, kind: &str) -> Result<Vec<LoggedDecision>> {
+        let query = query("SELECT * FROM decision WHERE kind = $1 ORDER BY sequence").bind(kind);
+        let rows: Vec<DecisionRow> = query.fetch_all(&self.database).await?;
+        rows.into_iter().map(DecisionRow::decode).collect()
     }
 
     async fn decision_rows(&self, range: RangeInclusive<i64>) -> Result<Vec<DecisionRow>> {
