@@ -67,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 104] = [
+pub static RANGES: [Range; 105] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -167,6 +167,7 @@ pub static RANGES: [Range; 104] = [
     range("refit.method.native.epochs", "", [0.0, 1e9], [1.0, 1e4], ""),
     range("refit.method.native.batch_size", "", [0.0, 1e6], [1.0, 256.0], ""),
     range("refit.method.native.learning_rate", "", [0.0, 1.0], [1e-6, 0.05], ""),
+    range("refit.method.native.huber_delta", "", [0.0, 1e3], [1e-4, 1.0], ""),
     range("refit.method.native.patience", "", [0.0, 1e9], [1.0, 1e3], ""),
     range("refit.method.command.time_limit", TIME, [1.0, YEAR], [60.0, 30.0 * DAY], ""),
     range("budget.wall_time", TIME, [0.001, 10.0 * YEAR], [60.0, YEAR], ""),

@@ -50,9 +50,41 @@ pub struct RefitSection {
     /// What trains the model.
     #[serde(default)]
     pub method: RefitMethod,
+    /// The weights from which each version is trained.
+    #[serde(default)]
+    pub start: RefitStart,
+    /// What the labels of control frames are for.
+    #[serde(default)]
+    pub control_frames: ControlFrames,
     /// Further labelled structures. The errors of each version on them are shown, and decide nothing.
     #[serde(default)]
     pub test_sets: Vec<TestSetSection>,
+    /// Labelled structures to train a second model with for each version, in place of the campaign's: as many, from the first on. Its
+    /// errors are shown beside those of the version.
+    #[serde(default)]
+    pub comparisons: Vec<TestSetSection>,
+}
+
+/// The weights from which a version is trained.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RefitStart {
+    /// Those of the version in force.
+    #[default]
+    Parent,
+    /// Those of version 0.
+    First,
+}
+
+/// What the labels of control frames are for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ControlFrames {
+    /// Versions are trained on them too.
+    #[default]
+    Train,
+    /// A second model is trained with them for each version, in place of the structures of biased walks.
+    Compare,
 }
 
 /// What trains the model: a table with one key.
@@ -81,6 +113,20 @@ pub struct NativeRefit {
     pub min_learning_rate: Option<f64>,
     /// Weights of the errors of energies, forces and stresses.
     pub loss: RefitLoss,
+    /// Weight of the errors of the energy per atom. Default: that of `loss`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("minimum" = 0))]
+    pub energy_weight: Option<f64>,
+    /// Weight of the errors of force components. Default: that of `loss`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("minimum" = 0))]
+    pub force_weight: Option<f64>,
+    /// Weight of the errors of stress components. Default: that of `loss`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("minimum" = 0))]
+    pub stress_weight: Option<f64>,
+    /// δ of the Huber loss: larger errors count linearly; eV/atom, eV/Å and eV/Å³.
+    pub huber_delta: Positive,
     /// Beginnings of the names of weights that are not trained.
     pub freeze: Vec<String>,
     /// Number of epochs without a new minimum of the validation loss after which the training ends. Default: never.
@@ -135,7 +181,7 @@ pub struct TestSetSection {
 impl RefitSection {
     /// Every file that it names.
     pub(super) fn files(&mut self) -> impl Iterator<Item = &mut PathBuf> {
-        let of_test_sets = self.test_sets.iter_mut().map(|set| &mut set.file);
+        let of_test_sets = self.test_sets.iter_mut().chain(&mut self.comparisons).map(|set| &mut set.file);
         self.replay.iter_mut().chain(of_test_sets).map(Spanned::get_mut)
     }
 
@@ -162,6 +208,10 @@ impl Default for NativeRefit {
             learning_rate: defaults::positive(1e-3),
             min_learning_rate: None,
             loss: RefitLoss::default(),
+            energy_weight: None,
+            force_weight: None,
+            stress_weight: None,
+            huber_delta: defaults::positive(0.01),
             freeze: Vec::new(),
             patience: None,
             average: None,

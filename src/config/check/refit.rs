@@ -6,10 +6,14 @@ use orchestrator::selector::{CampaignMode, UpdateProtocol};
 
 use super::wrong;
 use crate::config::error::InvalidValue;
-use crate::config::{CommandRefit, Config, NativeRefit, RefitMethod, RefitSection};
+use crate::config::{
+    CommandRefit, Config, ControlFrames, NativeRefit, RefitMethod, RefitSection, RefitStart, TestSetSection,
+};
 
 /// Names of the data sets that every version is judged by; no test set may have them.
 const OWN_SETS: [&str; 3] = ["held_out", "seed", "since"];
+/// Name of the comparison with control frames.
+const CONTROL: &str = "control";
 
 /// Everything that is wrong with `[refit]`, and with other sections because of it.
 pub fn check_refit(config: &Config) -> Vec<InvalidValue> {
@@ -20,7 +24,9 @@ pub fn check_refit(config: &Config) -> Vec<InvalidValue> {
         check_replay(refit),
         check_after_time(config, refit),
         check_share("refit.held_out", refit.held_out),
-        check_test_sets(refit),
+        check_names("test_sets", &refit.test_sets, &OWN_SETS),
+        check_names("comparisons", &refit.comparisons, &[CONTROL]),
+        check_comparisons(config, refit),
     ];
     match &refit.method {
         RefitMethod::Native(native) => checks.extend(check_native(native)),
@@ -72,16 +78,37 @@ fn check_share(key: &str, share: f64) -> Result<(), InvalidValue> {
     Ok(())
 }
 
-fn check_test_sets(refit: &RefitSection) -> Result<(), InvalidValue> {
+/// Names in a list of files that are plain, and that neither another entry nor calmwalk itself has.
+fn check_names(key: &str, sets: &[TestSetSection], own: &[&str]) -> Result<(), InvalidValue> {
     let is_plain = |letter: char| letter.is_ascii_alphanumeric() || ['_', '-'].contains(&letter);
-    let mut names = HashSet::from(OWN_SETS);
-    for (number, set) in refit.test_sets.iter().enumerate() {
+    let mut names: HashSet<&str> = own.iter().copied().collect();
+    for (number, set) in sets.iter().enumerate() {
         let name = set.name.as_str();
         if name.is_empty() || !name.chars().all(is_plain) || !names.insert(name) {
-            let expected = "a name of letters, digits, _ and - that no other set has; calmwalk itself makes sets with the names \
-                            held_out, seed and since";
-            return wrong(&format!("refit.test_sets.{number}.name"), format!("{name:?}"), expected);
+            let expected = format!(
+                "a name of letters, digits, _ and - that no other set has; calmwalk itself uses {}",
+                own.join(", ")
+            );
+            return wrong(&format!("refit.{key}.{number}.name"), format!("{name:?}"), expected);
         }
+    }
+    Ok(())
+}
+
+/// Models are compared that begin with the same weights and have the same training.
+fn check_comparisons(config: &Config, refit: &RefitSection) -> Result<(), InvalidValue> {
+    let (key, found) = match (refit.control_frames, refit.comparisons.len()) {
+        (ControlFrames::Train, 0) => return Ok(()),
+        (ControlFrames::Compare, _) => ("refit.control_frames", "\"compare\"".to_owned()),
+        (ControlFrames::Train, number) => ("refit.comparisons", format!("a list of {number}")),
+    };
+    if refit.control_frames == ControlFrames::Compare && !config.campaign.control {
+        return wrong(key, found, "\"train\": without campaign.control there are no control frames");
+    }
+    if refit.start != RefitStart::First || !matches!(refit.method, RefitMethod::Native(_)) {
+        let expected = "refit.start = \"first\" and refit.method = { native = … } beside it: models are compared that begin with \
+                        the same weights and have the same training";
+        return wrong(key, found, expected);
     }
     Ok(())
 }
@@ -92,6 +119,7 @@ fn check_native(native: &NativeRefit) -> Vec<Result<(), InvalidValue>> {
         check_share("refit.method.native.validation_share", native.validation_share),
         check_last_learning_rate(native),
         check_patience(native),
+        check_weights(native),
     ];
     checks.extend(average);
     checks
@@ -106,6 +134,20 @@ fn check_last_learning_rate(native: &NativeRefit) -> Result<(), InvalidValue> {
         }
         _ => Ok(()),
     }
+}
+
+fn check_weights(native: &NativeRefit) -> Result<(), InvalidValue> {
+    let weights = [
+        ("energy_weight", native.energy_weight),
+        ("force_weight", native.force_weight),
+        ("stress_weight", native.stress_weight),
+    ];
+    for (name, weight) in weights {
+        if let Some(weight) = weight.filter(|weight| !(weight.is_finite() && *weight >= 0.0)) {
+            return wrong(&format!("refit.method.native.{name}"), weight, "a number, 0 or more");
+        }
+    }
+    Ok(())
 }
 
 fn check_patience(native: &NativeRefit) -> Result<(), InvalidValue> {
@@ -167,11 +209,13 @@ mod tests {
     fn a_refit_with_all_its_keys_is_accepted() {
         assert_eq!(errors(&with(REPLAY)), "");
         let native = "epochs = 5, batch_size = 4, learning_rate = 1e-4, min_learning_rate = 1e-4, loss = \"paper\", \
-                      freeze = [\"shift\"], patience = 2, average = 0.99, validation_share = 0.2";
+                      freeze = [\"shift\"], patience = 2, average = 0.99, validation_share = 0.2, energy_weight = 20.0, \
+                      force_weight = 100.0, stress_weight = 0.0, huber_delta = 0.02";
         let sets = "[[refit.test_sets]]\nname = \"liquid-1\"\nfile = \"l.extxyz\"\n[[refit.test_sets]]\nname = \"seeds\"\n\
                     file = \"s.extxyz\"";
         let all = format!(
             "{REPLAY}\nreplay_weight = 0.02\nafter_structures = 50\nafter_time = \"24h\"\nmax_versions = 2\nheld_out = 0\n\
+             start = \"first\"\ncontrol_frames = \"compare\"\ncomparisons = [{{ name = \"cold\", file = \"c.extxyz\" }}]\n\
              max_seed_error_ratio = 2\nmax_held_out_error_ratio = 1.1\nmax_attempts = 2\nthreads = 2\n\
              method = {{ native = {{ {native} }} }}\n{sets}"
         );
@@ -193,6 +237,14 @@ mod tests {
             ("held_out = -0.1", "refit.held_out is -0.1; expected a number from 0"),
             ("max_versions = 0", "refit.max_versions: "),
             ("max_versions = 20000", "refit.max_versions is 20000; expected at most 10000"),
+            (
+                "control_frames = \"compare\"",
+                "refit.control_frames is \"compare\"; expected refit.start = \"first\" and refit.method",
+            ),
+            (
+                "comparisons = [{ name = \"cold\", file = \"c\" }]",
+                "refit.comparisons is a list of 1; expected refit.start = \"first\"",
+            ),
             ("replay_weight = -1.0", "found -1, expected a finite number above 0"),
             ("max_seed_error_ratio = 0", "found 0, expected a finite number above 0"),
             ("threads = 5000", "refit.threads is 5000; expected at most 1024"),
@@ -223,6 +275,10 @@ mod tests {
                 "refit.method.native.patience is 5; expected refit.method.native.validation_share above 0",
             ),
             (
+                "method = { native = { force_weight = -1.0 } }",
+                "refit.method.native.force_weight is -1; expected a number, 0 or more",
+            ),
+            (
                 "method = { native = { learning_rate = 2.0 } }",
                 "refit.method.native.learning_rate is 2; expected at most 1",
             ),
@@ -248,6 +304,12 @@ mod tests {
             let expected = format!("refit.test_sets.0.name is \"{name}\"; expected a name of letters");
             refused(&[(line.as_str(), expected.as_str())]);
         }
+        let control = "start = \"first\"\ncomparisons = [{ name = \"control\", file = \"c\" }]";
+        let found = errors(&with(&format!("{REPLAY}\n{control}")));
+        assert!(
+            found.contains("refit.comparisons.0.name is \"control\"; expected a name of letters"),
+            "{found}"
+        );
         let twice = "[[refit.test_sets]]\nname = \"a\"\nfile = \"t\"\n";
         let text = with(&format!("{REPLAY}\n{twice}{twice}"));
         let found = errors(&text);
