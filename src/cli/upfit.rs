@@ -1,26 +1,25 @@
 //! `calmwalk upfit`
 
-mod data;
 mod display;
 mod figure;
 mod report;
 
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::Write;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use ::upfit::{CosineDecay, LossSettings, TrainingData, UpfitError, UpfitSettings};
+use ::upfit::{CosineDecay, LossSettings, TrainingData, UpfitOutcome, UpfitSettings};
 use figures::to_svg;
 use potentials::grace::TrainableGrace;
 
-use self::data::{DataFile, read_frames};
 use self::display::TrainingDisplay;
 use super::{CommandError, ExitStatus};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::labelled_frames::{DataFile, command_error, read_frames};
 use crate::output::{count, print, print_json, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{StructureReadingArgs, file_weight};
+use crate::upfit_run::{self, UpfitRun};
 
 /// Fine-tune a GRACE model on labelled structures
 ///
@@ -126,38 +125,44 @@ impl UpfitArgs {
         let model = TrainableGrace::load(&self.model).map_err(CommandError::input)?;
         let (data, files) = self.read_data()?;
         let settings = self.settings();
-        let note = report::note((&self.model, &model), &data, &files, &settings);
+        let note = upfit_run::note((&self.model.display().to_string(), &model), &data, &files, &settings);
         let stop = stop_token()?;
         let mut display = TrainingDisplay::new(&checkpoint);
-        let trained = ::upfit::run(model, &data, &settings, Some(&checkpoint), |event| {
-            display.show(&event);
-            if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-        });
+        let run = UpfitRun {
+            model,
+            data,
+            note: note.clone(),
+            settings,
+            output: self.output.clone(),
+            checkpoint: checkpoint.clone(),
+        };
+        let trained = run.run(
+            |event| {
+                display.show(&event);
+                if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            },
+            |outcome| self.draw(outcome),
+        );
         drop(display);
-        let Some(outcome) = trained.map_err(command_error)? else {
+        let Some(outcome) = trained? else {
             print_stderr(format_args!("stopped; the same command continues from {}", checkpoint.display()));
             return Ok(ExitStatus::Interrupted);
         };
-        if let Some(path) = &self.figure {
-            let mut file = AtomicFile::create(path)?;
-            let text = to_svg(&figure::learning_curves(&outcome.history));
-            file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
-            file.finish()?;
-        }
-        write_model(&outcome.model, &self.output, &note.to_string())?;
-        // Without the model, the checkpoint would be needed.
-        match fs::remove_file(&checkpoint) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                return Err(cannot_write(&checkpoint, error));
-            }
-            _ => {}
-        }
         if self.json {
             print_json(&report::to_json(&outcome, &note, &self.output))?;
         } else {
             print(|out| report::write(out, &outcome, &self.output))?;
         }
         Ok(ExitStatus::Done)
+    }
+
+    /// Draws the learning curves, if asked for.
+    fn draw(&self, outcome: &UpfitOutcome) -> Result<(), CommandError> {
+        let Some(path) = &self.figure else { return Ok(()) };
+        let mut file = AtomicFile::create(path)?;
+        let text = to_svg(&figure::learning_curves(&outcome.history));
+        file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
+        file.finish()
     }
 
     fn checkpoint_path(&self) -> PathBuf {
@@ -236,32 +241,6 @@ impl UpfitArgs {
             threads: self.threads.map_or(cores, usize::from),
         }
     }
-}
-
-/// Wrong input: exit code 2; failures on the way: exit code 1.
-fn command_error(error: UpfitError) -> CommandError {
-    if error.is_wrong_input() { CommandError::input(error) } else { CommandError::failed(error) }
-}
-
-/// Writes the model to a file beside its target first, so that the target appears complete or not at all.
-fn write_model(model: &TrainableGrace, output: &Path, note: &str) -> Result<(), CommandError> {
-    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
-    let mut builder = tempfile::Builder::new();
-    let part = builder.prefix(".upfit.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
-    let part = part.map_err(|error| cannot_write(output, error))?.into_temp_path();
-    model.write(&part, note).map_err(|error| cannot_write(output, error))?;
-    // The checkpoint is removed afterwards, so the model must be readable.
-    let written = TrainableGrace::load(&part).map_err(CommandError::failed)?;
-    if written.weights() != model.weights() {
-        return Err(CommandError::Failed(format!(
-            "{}: the model was not written as it is",
-            output.display()
-        )));
-    }
-    let mut file = AtomicFile::create(output)?;
-    let copied = File::open(&part).and_then(|mut written| io::copy(&mut written, &mut file));
-    copied.map_err(|error| cannot_write(output, error))?;
-    file.finish()
 }
 
 fn number(text: &str, is_valid: impl Fn(f64) -> bool, expected: &str) -> Result<f64, String> {

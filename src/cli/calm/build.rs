@@ -4,25 +4,21 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use calm::Projection;
-use calm::build::{BuildSettings, BuiltElement, BuiltMixture, random_projection};
-use npz::NpzFile;
+use calm::build::{BuildSettings, BuiltElement, BuiltMixture};
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
 use super::campaign_updates::UpdateSource;
-use super::mixture_files::MixtureFiles;
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
-use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
+use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
-use crate::mixture_build::{BuildPart, MixtureBuild, PassContext};
+use crate::mixture_build::{BuildPart, MixtureBuild, PROJECTED, PassContext, projected};
+use crate::mixture_files::MixtureFiles;
 use crate::output::{TextTable, log_and_warn, print, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{StructureArgs, StructureFiles, file_weight};
-
-/// Projected features of a model without a projection, as in the paper.
-pub(super) const PROJECTED: usize = 128;
 
 /// Build a CALM mixture from the training data of a model
 ///
@@ -201,37 +197,6 @@ pub(super) fn write_mixture(
         Some(campaign) => campaign.write(mixture, files, model, stop),
         None => files.write_built(mixture).map(|()| Some(String::new())),
     }
-}
-
-/// The model with the features of `variant`, their projection, and the random seed of that if it is known. A model without a
-/// projection gets a random one with `dimension` projected features.
-pub(super) fn projected(
-    path: &Path,
-    mut model: GraceModel,
-    variant: Option<FeatureVariant>,
-    seed: u64,
-    dimension: usize,
-) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
-    let seed = if model.projection().is_some() {
-        let file = NpzFile::open(path).map_err(CommandError::input)?;
-        let key = "uq_rp_seed";
-        let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(CommandError::input)?;
-        seed.and_then(|seed| seed.data.first().copied())
-    } else {
-        let description = model.description();
-        let (rows, layers) = (description.basis_dimension, description.architecture.layers());
-        let drawn = random_projection(seed, rows, dimension, layers);
-        model = with_projection(model, &drawn).map_err(CommandError::failed)?;
-        i64::try_from(seed).ok()
-    };
-    let found = FeatureModel::new(path, model, variant)?;
-    let Some(projection) = found.projection() else {
-        return Err(CommandError::Input(
-            "--feature-variant hidden: a mixture needs projected features; expected normalised or linear"
-                .into(),
-        ));
-    };
-    Ok((found.model, projection, seed))
 }
 
 /// A table of the elements, and what is said of updates, if anything.

@@ -1,6 +1,5 @@
 //! Updates of a built mixture by the unlabelled candidates of a campaign (`--campaign`).
 
-use std::io::{BufWriter, Write};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -8,12 +7,10 @@ use calm::build::{ArtifactVersion, BuiltMixture};
 use calm::{Artifact, Mixture};
 use potentials::grace::GraceModel;
 use store::{Location, Store};
-use tempfile::TempPath;
 use tokio_util::sync::CancellationToken;
 
-use super::mixture_files::MixtureFiles;
-use crate::atomic_file::cannot_write;
 use crate::cli::{CommandError, block_on, campaign_location};
+use crate::mixture_files::{MixtureFiles, write_beside};
 use crate::output::count;
 use crate::unlabelled_updates::{self, MixtureAfterUpdates};
 
@@ -69,19 +66,6 @@ impl UpdateSource {
         store.close().await;
         found
     }
-}
-
-/// Writes the artifact before the updates to a temporary file beside the output.
-fn write_beside(mixture: &BuiltMixture, output: &Path) -> Result<TempPath, CommandError> {
-    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
-    let mut builder = tempfile::Builder::new();
-    let part = builder.prefix(".built.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
-    let mut part = part.map_err(|error| cannot_write(output, error))?;
-    let mut out = BufWriter::new(&mut part);
-    let written = mixture.write(&mut out).and_then(|out| out.flush());
-    written.map_err(|error| cannot_write(output, error))?;
-    drop(out);
-    Ok(part.into_temp_path())
 }
 
 /// A line about the updates.

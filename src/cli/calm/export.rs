@@ -9,9 +9,9 @@ use serde_json::Value;
 use store::Store;
 use tempfile::TempDir;
 
-use super::mixture_files::MixtureFiles;
 use crate::atomic_file::refuse_to_replace;
 use crate::cli::{CampaignArgs, CommandError, ExitStatus, block_on};
+use crate::mixture_files::MixtureFiles;
 use crate::output::{count, print};
 use crate::replay::{self, RelocatedFilesArgs};
 use crate::versions::{self, VersionOnDisk};

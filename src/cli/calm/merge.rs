@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use calm::build::BuildSettings;
 use potentials::grace::GraceModel;
 
-use super::build::{projected, report, stopped, write_mixture};
+use super::build::{report, stopped, write_mixture};
 use super::campaign_updates::UpdateSource;
-use super::mixture_files::MixtureFiles;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
 use crate::feature_variant::FeatureVariant;
 use crate::file_hash;
-use crate::mixture_build::{Merged, PartsMerge};
+use crate::mixture_build::{Merged, PartsMerge, projected};
+use crate::mixture_files::MixtureFiles;
 use crate::output::print;
 use crate::signals::stop_token;
 

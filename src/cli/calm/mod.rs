@@ -8,7 +8,6 @@ mod export;
 mod filter;
 mod info;
 mod merge;
-mod mixture_files;
 mod other_scores;
 mod recalibrate;
 mod sample;

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use calm::Artifact;
 use calm::build::{ElementHistograms, Recalibration, ThresholdRule, read_histograms};
 
-use super::mixture_files::open;
 use crate::artifact_checks::check_sound;
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
+use crate::mixture_files::open;
 use crate::output::{TextTable, print};
 
 /// Set new thresholds from the histograms of a CALM artifact, without its training data

@@ -11,9 +11,9 @@ use calm::weighted_sample::WeightedSampler;
 use potentials::grace::GraceModel;
 use tokio_util::sync::CancellationToken;
 
-use super::build::{PROJECTED, projected};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
 use crate::cli::{CommandError, ExitStatus};
+use crate::mixture_build::{PROJECTED, projected};
 use crate::output::{Bar, TextTable, count, print, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{FRAME_WEIGHT, FileLine, StructureArgs, StructureFiles};

@@ -1,6 +1,5 @@
 //! `calmwalk export`
 
-pub mod frame;
 mod split;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -14,6 +13,7 @@ use store::{DATABASE, ExportCursor, ExportFilter, ExportSource, JobState, LOCK, 
 use self::split::Shares;
 use super::{CampaignArgs, CommandError, ExitStatus, block_on};
 use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::export_frame;
 use crate::filter::StructureFilter;
 use crate::output::{self, Bar, print};
 
@@ -210,7 +210,7 @@ impl ExportArgs {
                 if self
                     .condition
                     .as_ref()
-                    .is_some_and(|condition| !condition.matches(&frame::facts(&row, &conditions)))
+                    .is_some_and(|condition| !condition.matches(&export_frame::facts(&row, &conditions)))
                 {
                     continue;
                 }
@@ -221,7 +221,7 @@ impl ExportArgs {
                 };
                 let part = seed.and_then(|seed| assigned.get(&seed)).copied().unwrap_or_default();
                 let has_stress = row.label.stress.is_some();
-                let frame = frame::frame(row, self.keys.into(), &campaign, &conditions);
+                let frame = export_frame::frame(row, self.keys.into(), &campaign, &conditions);
                 parts[part].write(&frame, seed, has_stress)?;
             }
             bar.set(frames, String::new);

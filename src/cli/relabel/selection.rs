@@ -7,7 +7,7 @@ use store::{ExportFilter, JobState, PendingJobs, Relabellable, Store, StoreError
 use wire::ContentHash;
 
 use super::CommandError;
-use crate::cli::export::frame::facts;
+use crate::export_frame::facts;
 use crate::filter::StructureFilter;
 use crate::output;
 

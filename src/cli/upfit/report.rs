@@ -1,38 +1,12 @@
-//! What a training says at its end: tables, JSON, and the note in the model.
+//! What a training says at its end: tables and JSON.
 
 use std::io::{self, Write};
 use std::path::Path;
 
-use ::upfit::{EnergyZero, SetErrors, TrainingData, UpfitOutcome, UpfitSettings, data_hash};
-use potentials::grace::TrainableGrace;
-use serde_json::{Map, Value, json};
+use ::upfit::{EnergyZero, SetErrors, UpfitOutcome};
+use serde_json::{Value, json};
 
-use super::data::DataFile;
 use crate::output::{TextTable, count, decimals};
-
-/// Where the weights come from, for the model file, with what the file before said. It names no times and no number of threads, so that the same training gives
-/// the same bytes.
-pub fn note(
-    (path, model): (&Path, &TrainableGrace),
-    data: &TrainingData,
-    files: &[DataFile],
-    settings: &UpfitSettings,
-) -> Value {
-    let hash = blake3::hash(model.file_bytes()).to_string();
-    let set =
-        |frames: &[::upfit::LabelledFrame]| json!({ "structures": frames.len(), "hash": data_hash(frames) });
-    let settings: Map<_, _> =
-        settings.entries().into_iter().map(|(name, value)| (name, Value::from(value))).collect();
-    json!({
-        "program": concat!("calmwalk ", env!("CARGO_PKG_VERSION"), " upfit"),
-        "model": { "file": path.display().to_string(), "hash": hash },
-        "files": files,
-        "training": set(&data.training),
-        "validation": set(&data.validation),
-        "settings": settings,
-        "parent": model.note().map(|text| serde_json::from_str(&text).unwrap_or(Value::String(text))),
-    })
-}
 
 /// Says how the zero of the energies was moved, if it was.
 pub fn zero_text(zero: &EnergyZero) -> Option<String> {

@@ -1,17 +1,18 @@
 //! The files of a mixture: an artifact, and a copy of the model's export.
 
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufReader, BufWriter, Write};
 use std::path::Path;
 
 use calm::build::{ArtifactVersion, BuiltMixture};
+use tempfile::TempPath;
 
 use crate::atomic_file::{AtomicFile, cannot_write};
-use crate::cli::CommandError;
+use crate::exit_status::CommandError;
 
 /// Where to write a mixture.
 #[derive(Clone, Copy)]
-pub(super) struct MixtureFiles<'a> {
+pub struct MixtureFiles<'a> {
     /// The model's export, and the copy of it with the mixture, if asked for.
     pub embed: Option<(&'a Path, &'a Path)>,
     /// The artifact.
@@ -53,8 +54,21 @@ impl MixtureFiles<'_> {
 }
 
 /// Opens a file that is copied in parts.
-pub(super) fn open(path: &Path) -> Result<BufReader<File>, CommandError> {
+pub fn open(path: &Path) -> Result<BufReader<File>, CommandError> {
     let file = File::open(path);
     file.map(BufReader::new)
         .map_err(|error| CommandError::Input(format!("{}: cannot be opened: {error}", path.display())))
+}
+
+/// Writes the artifact before the updates to a temporary file beside the output.
+pub fn write_beside(mixture: &BuiltMixture, output: &Path) -> Result<TempPath, CommandError> {
+    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let mut builder = tempfile::Builder::new();
+    let part = builder.prefix(".built.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
+    let mut part = part.map_err(|error| cannot_write(output, error))?;
+    let mut out = BufWriter::new(&mut part);
+    let written = mixture.write(&mut out).and_then(|out| out.flush());
+    written.map_err(|error| cannot_write(output, error))?;
+    drop(out);
+    Ok(part.into_temp_path())
 }

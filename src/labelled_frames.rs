@@ -2,12 +2,11 @@
 
 use std::sync::Arc;
 
-use ::upfit::LabelledFrame;
+use ::upfit::{LabelledFrame, UpfitError};
 use atoms::extxyz::Frame;
 use serde::Serialize;
 
-use super::command_error;
-use crate::cli::CommandError;
+use crate::exit_status::CommandError;
 use crate::file_hash;
 use crate::output::{count, log_and_warn};
 use crate::structure_files::{FileLine, StructureFile, StructureFiles};
@@ -27,6 +26,11 @@ pub struct DataFile {
     weight: f64,
     /// Whether it was named for validation.
     validation: bool,
+}
+
+/// Wrong input: exit code 2; failures on the way: exit code 1.
+pub fn command_error(error: UpfitError) -> CommandError {
+    if error.is_wrong_input() { CommandError::input(error) } else { CommandError::failed(error) }
 }
 
 /// The labelled structures of all files.

@@ -1,0 +1,46 @@
+//! The features of a mixture: the model with its projection.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use calm::Projection;
+use calm::build::random_projection;
+use npz::NpzFile;
+use potentials::grace::GraceModel;
+
+use crate::exit_status::CommandError;
+use crate::feature_variant::{FeatureModel, FeatureVariant, with_projection};
+
+/// Projected features of a model without a projection, as in the paper.
+pub const PROJECTED: usize = 128;
+
+/// The model with the features of `variant`, their projection, and the random seed of that if it is known. A model without a
+/// projection gets a random one with `dimension` projected features.
+pub fn projected(
+    path: &Path,
+    mut model: GraceModel,
+    variant: Option<FeatureVariant>,
+    seed: u64,
+    dimension: usize,
+) -> Result<(Arc<GraceModel>, Projection, Option<i64>), CommandError> {
+    let seed = if model.projection().is_some() {
+        let file = NpzFile::open(path).map_err(CommandError::input)?;
+        let key = "uq_rp_seed";
+        let seed = file.contains(key).then(|| file.integers(key)).transpose().map_err(CommandError::input)?;
+        seed.and_then(|seed| seed.data.first().copied())
+    } else {
+        let description = model.description();
+        let (rows, layers) = (description.basis_dimension, description.architecture.layers());
+        let drawn = random_projection(seed, rows, dimension, layers);
+        model = with_projection(model, &drawn).map_err(CommandError::failed)?;
+        i64::try_from(seed).ok()
+    };
+    let found = FeatureModel::new(path, model, variant)?;
+    let Some(projection) = found.projection() else {
+        return Err(CommandError::Input(
+            "--feature-variant hidden: a mixture needs projected features; expected normalised or linear"
+                .into(),
+        ));
+    };
+    Ok((found.model, projection, seed))
+}

@@ -1,0 +1,98 @@
+//! Trains a model on labelled structures and writes its file, with the state of the training on disk.
+
+use std::fs::{self, File};
+use std::io;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use potentials::grace::TrainableGrace;
+use serde_json::{Map, Value, json};
+use upfit::{LabelledFrame, TrainingData, TrainingEvent, UpfitOutcome, UpfitSettings, data_hash};
+
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::exit_status::CommandError;
+use crate::labelled_frames::{DataFile, command_error};
+
+/// A training and its files.
+pub struct UpfitRun {
+    /// The model to begin with.
+    pub model: TrainableGrace,
+    /// Labelled structures.
+    pub data: TrainingData,
+    /// What the note in the new model says of its origin, see [`note`].
+    pub note: Value,
+    /// How it is trained.
+    pub settings: UpfitSettings,
+    /// File for the new model.
+    pub output: PathBuf,
+    /// File of the state, which is removed at the end.
+    pub checkpoint: PathBuf,
+}
+
+impl UpfitRun {
+    /// Trains, or continues from the state, and writes the model; then calls `finish`, and removes the state. `None` if `on_event` asked
+    /// to stop; the same training continues later.
+    ///
+    /// # Errors
+    /// Those of [`upfit::run`]; a file that cannot be written; `finish`'s.
+    pub fn run(
+        self,
+        on_event: impl FnMut(TrainingEvent<'_>) -> ControlFlow<()>,
+        finish: impl FnOnce(&UpfitOutcome) -> Result<(), CommandError>,
+    ) -> Result<Option<UpfitOutcome>, CommandError> {
+        let Self { model, data, note, settings, output, checkpoint } = self;
+        let trained = upfit::run(model, &data, &settings, Some(&checkpoint), on_event);
+        let Some(outcome) = trained.map_err(command_error)? else { return Ok(None) };
+        finish(&outcome)?;
+        write_model(&outcome.model, &output, &note.to_string())?;
+        // Without the model, the checkpoint would be needed.
+        match fs::remove_file(&checkpoint) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(cannot_write(&checkpoint, error)),
+            _ => Ok(Some(outcome)),
+        }
+    }
+}
+
+/// Where the weights come from, for the model file, with what the file before said: its `name`, the data and the settings. It names no
+/// times and no number of threads, so that the same training gives the same bytes.
+pub fn note(
+    (name, model): (&str, &TrainableGrace),
+    data: &TrainingData,
+    files: &[DataFile],
+    settings: &UpfitSettings,
+) -> Value {
+    let hash = blake3::hash(model.file_bytes()).to_string();
+    let set = |frames: &[LabelledFrame]| json!({ "structures": frames.len(), "hash": data_hash(frames) });
+    let settings: Map<_, _> =
+        settings.entries().into_iter().map(|(name, value)| (name, Value::from(value))).collect();
+    json!({
+        "program": concat!("calmwalk ", env!("CARGO_PKG_VERSION"), " upfit"),
+        "model": { "file": name, "hash": hash },
+        "files": files,
+        "training": set(&data.training),
+        "validation": set(&data.validation),
+        "settings": settings,
+        "parent": model.note().map(|text| serde_json::from_str(&text).unwrap_or(Value::String(text))),
+    })
+}
+
+/// Writes the model to a file beside its target first, so that the target appears complete or not at all.
+fn write_model(model: &TrainableGrace, output: &Path, note: &str) -> Result<(), CommandError> {
+    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let mut builder = tempfile::Builder::new();
+    let part = builder.prefix(".upfit.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
+    let part = part.map_err(|error| cannot_write(output, error))?.into_temp_path();
+    model.write(&part, note).map_err(|error| cannot_write(output, error))?;
+    // The checkpoint is removed afterwards, so the model must be readable.
+    let written = TrainableGrace::load(&part).map_err(CommandError::failed)?;
+    if written.weights() != model.weights() {
+        return Err(CommandError::Failed(format!(
+            "{}: the model was not written as it is",
+            output.display()
+        )));
+    }
+    let mut file = AtomicFile::create(output)?;
+    let copied = File::open(&part).and_then(|mut written| io::copy(&mut written, &mut file));
+    copied.map_err(|error| cannot_write(output, error))?;
+    file.finish()
+}
