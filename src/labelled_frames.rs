@@ -1,5 +1,6 @@
 //! Reads labelled structures.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use ::upfit::{LabelledFrame, UpfitError};
@@ -26,6 +27,14 @@ pub struct DataFile {
     weight: f64,
     /// Whether it was named for validation.
     validation: bool,
+}
+
+impl DataFile {
+    /// The same without the directory of the file.
+    pub fn without_directory(self) -> Self {
+        let name = Path::new(&self.file).file_name();
+        Self { file: name.map_or_else(String::new, |name| name.to_string_lossy().into_owned()), ..self }
+    }
 }
 
 /// Wrong input: exit code 2; failures on the way: exit code 1.

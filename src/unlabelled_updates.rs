@@ -75,10 +75,21 @@ pub async fn apply(
     mixture: Mixture,
     stop: &CancellationToken,
 ) -> Result<Option<MixtureAfterUpdates>, CommandError> {
+    let labelled = labelled(store).await?;
+    apply_others(store, model, mixture, &labelled, stop).await
+}
+
+/// As [`apply`], for all accepted candidates but those of the decisions in `known`.
+pub async fn apply_others(
+    store: &Store,
+    model: &Arc<GraceModel>,
+    mixture: Mixture,
+    known: &HashSet<i64>,
+    stop: &CancellationToken,
+) -> Result<Option<MixtureAfterUpdates>, CommandError> {
     let record = store.campaign().await?;
     let settings = updating_settings(&record)?;
     let search = update_settings_in_force(&settings.search, &store.values().await?);
-    let labelled = labelled(store).await?;
     let campaign = record.id.to_string();
     let found = MixtureAfterUpdates { campaign, mixture, applied: 0, covered: 0, left_out: 0 };
     let calculator = FeatureCalculator::new(Arc::clone(model));
@@ -90,7 +101,7 @@ pub async fn apply(
         let Some(end) = page.last() else { return Ok(Some(updater.found)) };
         last = end.decision;
         let unlabelled = |candidate: &&StoredCandidate| {
-            candidate.fate == Fate::Accepted && !labelled.contains(&candidate.decision)
+            candidate.fate == Fate::Accepted && !known.contains(&candidate.decision)
         };
         for candidate in page.iter().filter(unlabelled) {
             if updater.stop.is_cancelled() {

@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 
 use potentials::grace::TrainableGrace;
 use serde_json::{Map, Value, json};
-use upfit::{LabelledFrame, TrainingData, TrainingEvent, UpfitOutcome, UpfitSettings, data_hash};
+use upfit::{LabelledFrame, TrainingData, TrainingEvent, UpfitError, UpfitOutcome, UpfitSettings, data_hash};
 
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::exit_status::CommandError;
-use crate::labelled_frames::{DataFile, command_error};
+use crate::labelled_frames::DataFile;
 
 /// A training and its files.
 pub struct UpfitRun {
@@ -34,15 +34,16 @@ impl UpfitRun {
     /// to stop; the same training continues later.
     ///
     /// # Errors
-    /// Those of [`upfit::run`]; a file that cannot be written; `finish`'s.
+    /// Those of [`upfit::run`], as `to_error` makes them; a file that cannot be written; `finish`'s.
     pub fn run(
         self,
         on_event: impl FnMut(TrainingEvent<'_>) -> ControlFlow<()>,
         finish: impl FnOnce(&UpfitOutcome) -> Result<(), CommandError>,
+        to_error: fn(UpfitError) -> CommandError,
     ) -> Result<Option<UpfitOutcome>, CommandError> {
         let Self { model, data, note, settings, output, checkpoint } = self;
         let trained = upfit::run(model, &data, &settings, Some(&checkpoint), on_event);
-        let Some(outcome) = trained.map_err(command_error)? else { return Ok(None) };
+        let Some(outcome) = trained.map_err(to_error)? else { return Ok(None) };
         finish(&outcome)?;
         write_model(&outcome.model, &output, &note.to_string())?;
         // Without the model, the checkpoint would be needed.

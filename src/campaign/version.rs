@@ -6,7 +6,7 @@ use potentials::grace::GraceModel;
 
 use super::LoadedCampaign;
 use super::loader::Loader;
-use crate::config::{ConfigError, RefitSection};
+use crate::config::{ConfigError, RefitSection, TestSetSection};
 use crate::exit_status::CommandError;
 use crate::file_hash;
 use crate::process_config::{HashedFile, ModelFiles};
@@ -68,13 +68,7 @@ impl LoadedCampaign {
             refit.replay.iter().enumerate().map(|(number, path)| {
                 self.configured_file(&format!("refit.replay[{number}]"), path.get_ref())
             });
-        let test_sets = refit.test_sets.iter().map(|set| {
-            let path = absolute(set.file.get_ref())?;
-            let hash = file_hash::hash(&path).map_err(|error| {
-                CommandError::Input(format!("refit.test_sets: cannot read {}: {error}", path.display()))
-            })?;
-            Ok(TestSet { name: set.name.clone(), file: HashedFile { path, hash } })
-        });
+        let sets = |sets: &[TestSetSection]| sets.iter().map(test_set).collect::<Result<_, _>>();
         Ok(RefitSettings {
             replay: replay.collect::<Result<_, _>>()?,
             replay_weight: refit.replay_weight.get(),
@@ -83,13 +77,25 @@ impl LoadedCampaign {
             max_seed_error_ratio: refit.max_seed_error_ratio.get(),
             max_held_out_error_ratio: refit.max_held_out_error_ratio.get(),
             threads: refit.threads,
-            test_sets: test_sets.collect::<Result<_, CommandError>>()?,
+            start: refit.start,
+            control_frames: refit.control_frames,
+            test_sets: sets(&refit.test_sets)?,
+            comparisons: sets(&refit.comparisons)?,
         })
     }
 
     fn configured_file(&self, key: &str, path: &Path) -> Result<HashedFile, CommandError> {
         Ok(HashedFile { path: absolute(path)?, hash: self.hash_of(key) })
     }
+}
+
+fn test_set(set: &TestSetSection) -> Result<TestSet, CommandError> {
+    let path = absolute(set.file.get_ref())?;
+    let hash = file_hash::hash(&path);
+    let hash = hash.map_err(|error| {
+        CommandError::Input(format!("[refit], '{}': cannot read {}: {error}", set.name, path.display()))
+    })?;
+    Ok(TestSet { name: set.name.clone(), file: HashedFile { path, hash } })
 }
 
 fn absolute(path: &Path) -> Result<PathBuf, CommandError> {

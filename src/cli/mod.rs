@@ -20,6 +20,7 @@ mod launch;
 mod lower_states;
 mod md;
 mod queue;
+mod refitter;
 mod relabel;
 mod replay;
 mod report;
@@ -92,6 +93,8 @@ enum CliCommand {
     #[command(hide = true)]
     Labeller(labeller::LabellerArgs),
     #[command(hide = true)]
+    Refitter(refitter::RefitterArgs),
+    #[command(hide = true)]
     CalculationRunner(calculation_runner::CalculationRunnerArgs),
 }
 
@@ -129,6 +132,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Clean(command) => command.run(),
         CliCommand::Walker(command) => command.run(),
         CliCommand::Labeller(command) => command.run(),
+        CliCommand::Refitter(command) => command.run(),
         CliCommand::CalculationRunner(command) => command.run(),
     }
 }

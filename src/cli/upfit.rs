@@ -142,6 +142,7 @@ impl UpfitArgs {
                 if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             },
             |outcome| self.draw(outcome),
+            command_error,
         );
         drop(display);
         let Some(outcome) = trained? else {

@@ -1,4 +1,346 @@
-//! Trains new versions of the potential while a campaign runs.
+//! A refit: trains a new version of the potential from the labels of a campaign, builds its mixture, judges it, and registers or
+//! refuses it.
+//!
+//! Each step leaves files in a directory of the refit, and is skipped if they are there. A refit that was killed goes on from them, to
+//! the same bytes.
 
+mod command;
+mod cost;
+mod judge;
+mod mixture;
+mod native;
+pub mod process;
 pub mod schedule;
 pub mod settings;
+mod training_set;
+
+use std::collections::HashSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use atoms::extxyz::write_frame;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use store::{Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds};
+use tokio_util::sync::CancellationToken;
+
+use self::cost::CostMeter;
+use self::judge::{ComparisonFigures, DataSets, SetFigures, refusal};
+use self::native::NativeTraining;
+use self::settings::{RefitterConfig, TestSet};
+use self::training_set::{FrozenSet, LabelFile, LabelFiles, kept};
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::config::{ControlFrames, NativeRefit, RefitMethod};
+use crate::exit_status::CommandError;
+use crate::file_hash::{hash, verify_hash};
+use crate::structure_files::StructureReadingArgs;
+
+/// Folder of the campaign's directory for refits.
+const FOLDER: &str = "refit";
+/// The new model and its mixture.
+const MODEL: &str = command::MODEL;
+const MIXTURE: &str = "mixture.npz";
+/// Name of the comparison with control frames.
+const CONTROL: &str = "control";
+
+/// How a refit ended.
+#[derive(Debug)]
+pub enum RefitOutcome {
+    /// With a new version.
+    Registered(VersionRecord),
+    /// With a version that was refused; the record has the reason.
+    Refused(VersionRecord),
+    /// It was asked to stop. The same refit continues later.
+    Stopped,
+}
+
+/// A training, as it is recorded with the version.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct TrainingRecord {
+    /// Structures trained on, those of the replay data among them; `None` if a program trained.
+    structures: Option<u64>,
+    validation: Option<u64>,
+    epochs: Option<u64>,
+}
+
+/// A refit under way.
+struct Refit<'a> {
+    config: &'a RefitterConfig,
+    store: &'a Store,
+    directory: PathBuf,
+    set: FrozenSet,
+    labels: LabelFiles,
+    stop: &'a CancellationToken,
+    report: &'a (dyn Fn(String) + Sync),
+}
+
+/// Runs a refit, or continues the one that was interrupted. `report` is told about the progress, a line at a time.
+///
+/// # Errors
+/// A file of the configuration that has changed, the database, a full disk. What cannot become a version for other reasons is refused.
+async fn run(
+    config: &RefitterConfig,
+    store: &Store,
+    stop: &CancellationToken,
+    report: &(dyn Fn(String) + Sync),
+) -> Result<RefitOutcome, CommandError> {
+    check_files(config)?;
+    let number = 1 + store.versions().await?.last().map_or(0, |version| version.number);
+    let directory = prepare_directory(&config.directory, number)?;
+    let meter = CostMeter::new(&directory);
+    let set = kept(directory.join("set.json"), async || {
+        let last_decision = store.newest_mixture().await?.decision;
+        let accepted = store.accepted_structures().await?;
+        Ok(Some(FrozenSet { number, last_decision, accepted }))
+    });
+    let Some(set) = set.await? else { return Ok(RefitOutcome::Stopped) };
+    let labels = kept(directory.join("labels.json"), async || {
+        let settings = (&config.settings, config.rng_seed);
+        training_set::write(store, (&directory, &set), settings, false, stop).await
+    });
+    let Some(labels) = labels.await? else { return Ok(RefitOutcome::Stopped) };
+    let report_numbered = |line: String| report(format!("refit {number}: {line}"));
+    let refit = Refit { config, store, directory, set, labels, stop, report: &report_numbered };
+    let judged = refit.train_and_judge(&meter).await;
+    meter.save()?;
+    let (reason, figures) = match judged {
+        Ok(None) => return Ok(RefitOutcome::Stopped),
+        Ok(Some(judged)) => judged,
+        // What cannot become a version.
+        Err(CommandError::Input(reason)) => (Some(reason), Value::Null),
+        Err(error) => return Err(error),
+    };
+    refit.record(reason, figures, &meter).await
+}
+
+/// Fails if a file has another content than when the campaign began, or this refit.
+fn check_files(config: &RefitterConfig) -> Result<(), CommandError> {
+    let RefitterConfig { parent_model, first_model, parent_mixture, settings, .. } = config;
+    let sets = settings.test_sets.iter().chain(&settings.comparisons).map(|set| &set.file);
+    let mut files =
+        [parent_model, first_model, parent_mixture].into_iter().chain(&settings.replay).chain(sets);
+    files.try_for_each(|file| verify_hash(&file.path, &file.hash))
+}
+
+/// The directory of a refit. Those of earlier ones are removed.
+fn prepare_directory(campaign: &Path, number: u32) -> Result<PathBuf, CommandError> {
+    let all = campaign.join(FOLDER);
+    let directory = all.join(number.to_string());
+    fs::create_dir_all(&directory).map_err(|error| cannot_write(&directory, error))?;
+    for entry in fs::read_dir(&all).map_err(CommandError::failed)? {
+        let path = entry.map_err(CommandError::failed)?.path();
+        if path != directory {
+            fs::remove_dir_all(&path).map_err(|error| cannot_write(&path, error))?;
+        }
+    }
+    Ok(directory)
+}
+
+impl Refit<'_> {
+    /// Takes all steps until the version can be recorded: why it is refused, if it is, and its figures. `None` if it was stopped.
+    ///
+    /// # Errors
+    /// Wrong input is a reason to refuse the version.
+    async fn train_and_judge(
+        &self,
+        meter: &CostMeter,
+    ) -> Result<Option<(Option<String>, Value)>, CommandError> {
+        let Some(labels) = self.labels.path(&self.directory, LabelFile::Training) else {
+            return Err(CommandError::input("there are no labels to train on"));
+        };
+        let training = kept(self.directory.join("training.json"), || self.train(&labels));
+        let Some(training) = training.await? else { return Ok(None) };
+        meter.save()?;
+        if !self.build_mixture(&labels).await? {
+            return Ok(None);
+        }
+        meter.save()?;
+        let since = kept(self.directory.join("since.json"), async || {
+            let settings = (&self.config.settings, self.config.rng_seed);
+            training_set::write(self.store, (&self.directory, &self.set), settings, true, self.stop).await
+        });
+        let Some(since) = since.await? else { return Ok(None) };
+        (self.report)("judging".to_owned());
+        let sets = DataSets::read(&self.config.settings, &self.directory, [&self.labels, &since])?;
+        let figures = kept(self.directory.join("errors.json"), async || {
+            let errors = tokio::task::block_in_place(|| sets.errors(self.config, &self.path(MODEL)))?;
+            Ok(Some(errors))
+        });
+        let Some(figures): Option<Vec<SetFigures>> = figures.await? else { return Ok(None) };
+        let reason = refusal(&self.config.settings, &figures);
+        let mut comparisons = Vec::new();
+        if let RefitMethod::Native(native) = &self.config.settings.method {
+            for (name, file) in self.comparisons()? {
+                let Some(found) = self.compare(native, &sets, &name, &file).await? else { return Ok(None) };
+                comparisons.push(found);
+                meter.save()?;
+            }
+        }
+        let figures = json!({ "sets": figures, "comparisons": comparisons, "training": training });
+        Ok(Some((reason, figures)))
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    /// Trains the model.
+    async fn train(&self, labels: &Path) -> Result<Option<TrainingRecord>, CommandError> {
+        match &self.config.settings.method {
+            RefitMethod::Native(native) => self.train_natively(native, "training", labels, self.path(MODEL)),
+            RefitMethod::Command(command) => {
+                (self.report)(format!("training: {}", command.program.join(" ")));
+                let held_out = self.labels.path(&self.directory, LabelFile::HeldOut);
+                let files = (labels, held_out.as_deref());
+                let ended = command::run(command, self.config, &self.directory, files, self.stop).await?;
+                Ok(ended.map(|()| TrainingRecord { structures: None, validation: None, epochs: None }))
+            }
+        }
+    }
+
+    fn train_natively(
+        &self,
+        native: &NativeRefit,
+        what: &str,
+        labels: &Path,
+        output: PathBuf,
+    ) -> Result<Option<TrainingRecord>, CommandError> {
+        let begin = (self.config.begin(), format!("version {}", self.config.begin_version()));
+        let training = NativeTraining { begin, labels, output };
+        let settings = (&self.config.settings, native);
+        let report = |line: String| (self.report)(format!("{what}: {line}"));
+        let trained =
+            tokio::task::block_in_place(|| training.run(settings, self.config.rng_seed, self.stop, &report))?;
+        Ok(trained.map(|summary| TrainingRecord {
+            structures: Some(summary.structures),
+            validation: Some(summary.validation),
+            epochs: Some(summary.epochs),
+        }))
+    }
+
+    /// Builds the mixture. Returns whether it is there.
+    async fn build_mixture(&self, labels: &Path) -> Result<bool, CommandError> {
+        let output = self.path(MIXTURE);
+        if output.exists() {
+            return Ok(true);
+        }
+        (self.report)("building the mixture".to_owned());
+        let trained_on: HashSet<i64> = self.labels.trained_on.iter().copied().collect();
+        let files = (&*self.path(MODEL), labels, &*output);
+        let built = mixture::build(self.config, self.store, files, &trained_on, self.stop).await?;
+        Ok(built.is_some())
+    }
+
+    /// Files to train with in place of the campaign's labels, by name.
+    fn comparisons(&self) -> Result<Vec<(String, PathBuf)>, CommandError> {
+        let settings = &self.config.settings;
+        let control = match settings.control_frames {
+            ControlFrames::Compare => self.labels.path(&self.directory, LabelFile::Control),
+            ControlFrames::Train => None,
+        };
+        let mut all: Vec<_> = control.map(|path| (CONTROL.to_owned(), path)).into_iter().collect();
+        for TestSet { name, file } in &settings.comparisons {
+            all.push((name.clone(), self.first_frames(name, &file.path)?));
+        }
+        Ok(all)
+    }
+
+    /// As many frames of a file as the training set has labels, in a file of their own.
+    fn first_frames(&self, name: &str, file: &Path) -> Result<PathBuf, CommandError> {
+        let path = self.path(&format!("comparison-{name}.extxyz"));
+        if path.exists() {
+            return Ok(path);
+        }
+        let files = StructureReadingArgs::default().files(&[file.to_owned()])?;
+        let mut reader = files.reader(Default::default());
+        let mut out = AtomicFile::create(&path)?;
+        for _ in 0..self.labels.count(LabelFile::Training) {
+            let Some((frame, _)) = reader.next()? else { break };
+            write_frame(&mut out, &frame).map_err(|error| cannot_write(&path, error))?;
+        }
+        out.finish()?;
+        Ok(path)
+    }
+
+    /// Trains a model with other structures, and computes its errors.
+    async fn compare(
+        &self,
+        native: &NativeRefit,
+        sets: &DataSets,
+        name: &str,
+        labels: &Path,
+    ) -> Result<Option<ComparisonFigures>, CommandError> {
+        kept(self.path(&format!("comparison-{name}.json")), async || {
+            let model = self.path(&format!("comparison-{name}.npz"));
+            let what = format!("comparison with {name}");
+            let Some(_) = self.train_natively(native, &what, labels, model.clone())? else { return Ok(None) };
+            let structures = count_frames(labels)?;
+            let sets = tokio::task::block_in_place(|| sets.errors_of_model(self.config, &model))?;
+            Ok(Some(ComparisonFigures { name: name.to_owned(), structures, sets }))
+        })
+        .await
+    }
+
+    /// Registers the version, or records why it is refused.
+    async fn record(
+        self,
+        reason: Option<String>,
+        figures: Value,
+        meter: &CostMeter,
+    ) -> Result<RefitOutcome, CommandError> {
+        let is_refused = reason.is_some();
+        let files = if is_refused { None } else { Some(self.read_files()?) };
+        let of_file = |name| match is_refused {
+            true => Ok(String::new()),
+            false => hash(&self.path(name)).map_err(CommandError::failed),
+        };
+        let method = match &self.config.settings.method {
+            RefitMethod::Native(_) => "native",
+            RefitMethod::Command(_) => "command",
+        };
+        let cost = meter.now();
+        let record = VersionRecord {
+            number: self.set.number,
+            parent: self.config.begin_version(),
+            state: if is_refused { VersionState::Refused } else { VersionState::Registered },
+            reason: reason.unwrap_or_default(),
+            method: method.to_owned(),
+            structures: self.set.accepted,
+            last_decision: self.set.last_decision,
+            labels: self.labels.count(LabelFile::Training),
+            model_hash: of_file(MODEL)?,
+            mixture_hash: of_file(MIXTURE)?,
+            figures,
+            seconds: cost.seconds,
+            core_hours: cost.core_seconds / 3600.0,
+            time: unix_milliseconds(),
+        };
+        self.store.add_version(&record, files.as_ref()).await?;
+        (self.report)(match is_refused {
+            true => format!("refused: {}", record.reason),
+            false => format!("registered version {}", record.number),
+        });
+        // The next refit removes it otherwise.
+        let _ = fs::remove_dir_all(&self.directory);
+        Ok(if is_refused { RefitOutcome::Refused(record) } else { RefitOutcome::Registered(record) })
+    }
+
+    fn read_files(&self) -> Result<VersionFiles, CommandError> {
+        let read = |name: &str| {
+            let path = self.path(name);
+            fs::read(&path)
+                .map_err(|error| CommandError::Failed(format!("cannot read {}: {error}", path.display())))
+        };
+        Ok(VersionFiles { model: read(MODEL)?, mixture: read(MIXTURE)? })
+    }
+}
+
+/// Number of structures in a file.
+fn count_frames(path: &Path) -> Result<u64, CommandError> {
+    let mut reader = StructureReadingArgs::default().files(&[path.to_owned()])?.reader(Default::default());
+    let mut number = 0;
+    while reader.next()?.is_some() {
+        number += 1;
+    }
+    Ok(number)
+}

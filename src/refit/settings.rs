@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use potentials::grace::Precision;
 use serde::{Deserialize, Serialize};
 
-use crate::config::RefitMethod;
+use crate::config::{ControlFrames, RefitMethod, RefitStart};
 use crate::log;
 use crate::process_config::HashedFile;
 
@@ -55,11 +55,45 @@ pub struct RefitSettings {
     pub max_held_out_error_ratio: f64,
     /// Number of threads; 0: all cores.
     pub threads: usize,
+    /// The weights from which a version is trained.
+    pub start: RefitStart,
+    /// What the labels of control frames are for.
+    pub control_frames: ControlFrames,
     /// Structures whose errors are shown.
     pub test_sets: Vec<TestSet>,
+    /// Structures to train with in place of the campaign's.
+    pub comparisons: Vec<TestSet>,
 }
 
-/// Labelled structures whose errors are shown for each version.
+impl RefitterConfig {
+    /// The model from which the version is trained.
+    pub fn begin(&self) -> &HashedFile {
+        match self.settings.start {
+            RefitStart::Parent => &self.parent_model,
+            RefitStart::First => &self.first_model,
+        }
+    }
+
+    /// Number of the version of that model.
+    pub fn begin_version(&self) -> u32 {
+        match self.settings.start {
+            RefitStart::Parent => self.parent_version,
+            RefitStart::First => 0,
+        }
+    }
+}
+
+impl RefitSettings {
+    /// Number of threads to use.
+    pub fn threads(&self) -> usize {
+        match self.threads {
+            0 => std::thread::available_parallelism().map_or(1, |cores| cores.get()),
+            threads => threads,
+        }
+    }
+}
+
+/// A file of labelled structures with a name.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct TestSet {

@@ -25,7 +25,7 @@ pub struct StructureArgs {
 }
 
 /// How files of structures are read.
-#[derive(Debug, Clone, clap::Args)]
+#[derive(Debug, Clone, Default, clap::Args)]
 pub struct StructureReadingArgs {
     /// Use only structures that match FILTER, such as 'atoms < 200 and not element = Gd'; properties: atoms, element,
     /// and of labels energy, energy_per_atom (eV), max_force (eV/Å)

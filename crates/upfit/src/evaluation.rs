@@ -8,8 +8,10 @@ use potentials::grace::{Grace, GraceModel};
 use crate::data::{FrameFault, LabelledFrame};
 use crate::differences::FrameDifferences;
 use crate::error::UpfitError;
+use crate::loss::LossSettings;
 use crate::parallel::for_each;
-use crate::prepared::PreparedFrame;
+use crate::prepared::{NEIGHBOUR_BYTES, PreparedFrame, prepare};
+use crate::progress::SetErrors;
 
 /// What the model says of one frame.
 #[derive(Clone, Copy, Debug)]
@@ -64,6 +66,27 @@ pub fn first_not_finite<'a>(
     Some(frames[index].frame)
 }
 
+/// The errors of a model on these frames. The loss is that of the demonstration ([`LossSettings::demo`]).
+///
+/// # Errors
+/// No frames; a frame that the model cannot evaluate, or whose numbers are not finite.
+pub fn errors_of(
+    model: &GraceModel,
+    frames: &[LabelledFrame],
+    threads: usize,
+) -> Result<SetErrors, UpfitError> {
+    if frames.is_empty() {
+        return Err(UpfitError::NoFrames);
+    }
+    let loss = LossSettings::demo();
+    let prepared = prepare(model, frames, &mut { NEIGHBOUR_BYTES })?;
+    let evaluated = evaluate(model, &prepared, loss.delta, threads)?;
+    if let Some(frame) = first_not_finite(&prepared, &evaluated) {
+        return Err(frame.wrong(FrameFault::ModelNotFinite));
+    }
+    Ok(sum(&evaluated).errors(&loss.stages[0].weights))
+}
+
 fn evaluate_frame(
     grace: &mut Grace,
     evaluation: &mut Evaluation,
@@ -79,8 +102,6 @@ fn evaluate_frame(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::loss::LossSettings;
-    use crate::prepared::prepare;
     use crate::test_frames::{aluminium, model};
 
     #[test]

@@ -57,6 +57,7 @@ pub use heartbeat::{ExitPolicy, serve};
 pub use label_attempt::SingleLabel;
 pub use label_progress::LabelOutcome;
 pub use method::Method;
+pub use process_tree::{MARK as CALCULATION_MARK, terminate_marked};
 pub use recorded_label::{RecordedLabel, give_up_others};
 pub use reference::ReferenceMethod;
 pub use retry::retry_until_written;

@@ -21,7 +21,7 @@ use rustix::process::{Pid, PidfdFlags, Signal, WaitOptions, getpid, pidfd_open, 
 use store::is_running;
 
 /// Environment variable that marks all processes of a calculation; it holds its directory.
-pub(super) const MARK: &str = "CALMWALK_CALCULATION";
+pub const MARK: &str = "CALMWALK_CALCULATION";
 /// Time between two checks whether all have ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(2);
 /// How long a program may take to end the processes that it started. A program that started processes on other
@@ -97,7 +97,7 @@ pub(super) fn memory() -> u64 {
 }
 
 /// Ends every process with the mark of the calculation in this directory.
-pub(super) fn terminate_marked(directory: &Path) -> io::Result<()> {
+pub fn terminate_marked(directory: &Path) -> io::Result<()> {
     let mark = [MARK.as_bytes(), b"=", directory.as_os_str().as_bytes()].concat();
     terminate(|pid| is_marked(pid, &mark))
 }

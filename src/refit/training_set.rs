@@ -1,0 +1,217 @@
+//! The labels of a campaign as files: to train on, to judge with, and to compare with.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use atoms::extxyz::{ExtxyzWriteError, LabelKeys, write_frame};
+use serde::{Deserialize, Serialize};
+use store::{ExportCursor, ExportFilter, ExportRow, ExportSource, Store};
+use tokio_util::sync::CancellationToken;
+use wire::{Origin, WalkConditions, WalkId};
+
+use super::settings::RefitSettings;
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::config::ControlFrames;
+use crate::exit_status::CommandError;
+use crate::export_frame;
+
+/// Rows read at a time.
+const PAGE: u32 = 200;
+
+/// What a refit begins with. It stays the same however often the refit is interrupted.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrozenSet {
+    /// Number of the version to train.
+    pub number: u32,
+    /// The newest decision whose label counts.
+    pub last_decision: i64,
+    /// Number of structures that biased walks had found until then.
+    pub accepted: u64,
+}
+
+/// The labels of a campaign as files in the directory of a refit.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LabelFiles {
+    /// Number of structures in each of the files; a file without structures does not exist.
+    counts: BTreeMap<LabelFile, u64>,
+    /// Decisions on the candidates of the training set.
+    pub trained_on: Vec<i64>,
+}
+
+/// One of the files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LabelFile {
+    /// Labels to train on.
+    Training,
+    /// Labels of seed structures that no version is trained on.
+    HeldOut,
+    /// Labels of control frames, if they are for comparisons.
+    Control,
+    /// Labels of later decisions.
+    Since,
+}
+
+impl LabelFile {
+    const ALL: [Self; 4] = [Self::Training, Self::HeldOut, Self::Control, Self::Since];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Training => "train.extxyz",
+            Self::HeldOut => "held_out.extxyz",
+            Self::Control => "control.extxyz",
+            Self::Since => "since.extxyz",
+        }
+    }
+}
+
+impl LabelFiles {
+    /// The file, unless there are no structures for it.
+    pub fn path(&self, directory: &Path, file: LabelFile) -> Option<PathBuf> {
+        (self.count(file) > 0).then(|| directory.join(file.name()))
+    }
+
+    /// Number of structures in it.
+    pub fn count(&self, file: LabelFile) -> u64 {
+        self.counts.get(&file).copied().unwrap_or(0)
+    }
+}
+
+/// Whether the labels of a seed structure are never trained on: a share of all seed structures, for the whole campaign.
+pub fn is_held_out(seed_structure: &str, rng_seed: u64, share: f64) -> bool {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(b"calmwalk held out 1");
+    hasher.update(&rng_seed.to_le_bytes());
+    hasher.update(seed_structure.as_bytes());
+    let [a, b, c, d, e, f, g, h, ..] = *hasher.finalize().as_bytes();
+    let number = u64::from_le_bytes([a, b, c, d, e, f, g, h]) >> 11;
+    (number as f64) / ((1_u64 << 53) as f64) < share
+}
+
+/// Where each label belongs.
+struct Sorter<'a> {
+    settings: &'a RefitSettings,
+    rng_seed: u64,
+    last_decision: i64,
+}
+
+impl Sorter<'_> {
+    /// The file of a row. `after`: labels after the last decision, otherwise those before.
+    fn file(&self, row: &ExportRow, after: bool) -> Option<LabelFile> {
+        let ExportSource::Candidate { seed_structure_name, origin, .. } = &row.source else {
+            return (!after).then_some(LabelFile::Training);
+        };
+        let is_after =
+            matches!(row.cursor, ExportCursor::Candidate(decision) if decision > self.last_decision);
+        let is_held_out = is_held_out(seed_structure_name, self.rng_seed, self.settings.held_out);
+        match (is_after, after) {
+            (true, true) => Some(LabelFile::Since),
+            (false, false) if is_held_out => Some(LabelFile::HeldOut),
+            (false, false)
+                if *origin == Origin::Control && self.settings.control_frames == ControlFrames::Compare =>
+            {
+                Some(LabelFile::Control)
+            }
+            (false, false) => Some(LabelFile::Training),
+            _ => None,
+        }
+    }
+}
+
+/// Writes the labels until the last decision of the set, or those after it. `None` after a cancellation of `stop`.
+///
+/// # Errors
+/// The database, a full disk.
+pub async fn write(
+    store: &Store,
+    (directory, set): (&Path, &FrozenSet),
+    (settings, rng_seed): (&RefitSettings, u64),
+    after: bool,
+    stop: &CancellationToken,
+) -> Result<Option<LabelFiles>, CommandError> {
+    let mut found = LabelFiles::default();
+    let Some(protocol) = store.protocol_in_force().await? else { return Ok(Some(found)) };
+    let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
+    let sorter = Sorter { settings, rng_seed, last_decision: set.last_decision };
+    let (campaign, conditions) = (store.campaign().await?.id.to_string(), store.walk_conditions().await?);
+    let mut files = BTreeMap::new();
+    let mut last = None;
+    loop {
+        let page = store.labelled(&filter, last, PAGE).await?;
+        let Some(end) = page.last() else { break };
+        last = Some(end.cursor);
+        if stop.is_cancelled() {
+            return Ok(None);
+        }
+        for row in page {
+            let Some(kind) = sorter.file(&row, after) else { continue };
+            let path = directory.join(kind.name());
+            if !files.contains_key(&kind) {
+                files.insert(kind, AtomicFile::create(&path)?);
+            }
+            let Some(file) = files.get_mut(&kind) else { continue };
+            if let (LabelFile::Training, ExportCursor::Candidate(decision)) = (kind, row.cursor) {
+                found.trained_on.push(decision);
+            }
+            write_row(file, row, &campaign, &conditions).map_err(|error| cannot_write(&path, error))?;
+            *found.counts.entry(kind).or_default() += 1;
+        }
+    }
+    for kind in LabelFile::ALL {
+        if let Some(file) = files.remove(&kind) {
+            file.finish()?;
+        }
+    }
+    Ok(Some(found))
+}
+
+fn write_row(
+    file: &mut impl Write,
+    row: ExportRow,
+    campaign: &str,
+    conditions: &BTreeMap<WalkId, WalkConditions>,
+) -> Result<(), ExtxyzWriteError> {
+    write_frame(file, &export_frame::frame(row, LabelKeys::Ase, campaign, conditions))
+}
+
+/// A value that is kept in a file of the directory from its first computation on; `None` if that was stopped.
+pub async fn kept<T: Serialize + for<'a> Deserialize<'a>>(
+    path: PathBuf,
+    compute: impl AsyncFnOnce() -> Result<Option<T>, CommandError>,
+) -> Result<Option<T>, CommandError> {
+    match fs::read(&path) {
+        Ok(bytes) => serde_json::from_slice(&bytes).map(Some).map_err(|error| {
+            CommandError::Failed(format!("{}: {error}: remove its directory to begin again", path.display()))
+        }),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+            let Some(value) = compute().await? else { return Ok(None) };
+            let mut file = AtomicFile::create(&path)?;
+            let text = serde_json::to_string_pretty(&value).map_err(CommandError::failed)?;
+            writeln!(file, "{text}").map_err(|error| cannot_write(&path, error))?;
+            file.finish()?;
+            Ok(Some(value))
+        }
+        Err(error) => Err(CommandError::Failed(format!("cannot read {}: {error}", path.display()))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn about_the_share_of_the_seed_structures_is_held_out_for_good() {
+        let names: Vec<String> = (0..2000).map(|number| format!("seed {number}")).collect();
+        let held_out = |seed, share| names.iter().filter(|name| is_held_out(name, seed, share)).count();
+        // Five standard deviations of a binomial distribution.
+        assert!((held_out(1, 0.1) as f64 - 200.0).abs() < 5.0 * 180_f64.sqrt(), "{}", held_out(1, 0.1));
+        assert_eq!((held_out(1, 0.0), held_out(1, 1.0)), (0, 2000));
+        // A larger share holds out the same and others; another random seed others.
+        assert!(names.iter().all(|name| is_held_out(name, 1, 0.3) || !is_held_out(name, 1, 0.1)));
+        assert!(names.iter().any(|name| is_held_out(name, 1, 0.1) && !is_held_out(name, 2, 0.1)));
+    }
+}
