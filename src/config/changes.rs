@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may change when a campaign is resumed; all others keep their first values.
-pub(super) const CHANGEABLE: [&str; 61] = [
+pub(super) const CHANGEABLE: [&str; 63] = [
     "campaign.control_share",
     "seed_structures",
     "collect.max_per_walk",
@@ -49,6 +49,8 @@ pub(super) const CHANGEABLE: [&str; 61] = [
     "budget.labels",
     "budget.core_hours",
     "budget.wall_time",
+    "stop.max_steps_without_structure",
+    "stop.min_improvement",
     "run.walkers",
     "run.threads_per_walker",
     "run.heartbeat_timeout",

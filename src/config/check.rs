@@ -33,6 +33,7 @@ pub fn check(config: &Config) -> Vec<InvalidValue> {
         check_store(config),
         check_queue(config),
         check_budget(config),
+        check_stop(config),
         check_notify(&config.notify),
         check_seed_structures(config),
     ];
@@ -81,6 +82,19 @@ fn check_budget(config: &Config) -> Result<(), InvalidValue> {
         }
         _ => Ok(()),
     }
+}
+
+/// Versions of the potential have errors on labels that they were not trained on.
+fn check_stop(config: &Config) -> Result<(), InvalidValue> {
+    let Some(least) = config.stop.min_improvement else { return Ok(()) };
+    let expected = match &config.refit {
+        None => "[refit]: without it, no version of the potential is trained",
+        Some(refit) if refit.held_out == 0.0 && refit.test_sets.is_empty() => {
+            "refit.held_out above 0, or refit.test_sets: the improvement is that of errors on such labels"
+        }
+        Some(_) => return Ok(()),
+    };
+    wrong("stop.min_improvement", least.get(), expected)
 }
 
 /// The length of the queue depends on the speed of the labellers, which is not reproducible.

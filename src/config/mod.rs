@@ -17,6 +17,7 @@ mod ranges;
 mod refit;
 mod schema;
 mod sections;
+mod stop;
 mod warning;
 
 use std::path::{Path, PathBuf};
@@ -41,6 +42,7 @@ pub use ranges::{impossible, usual_range};
 pub use refit::*;
 pub use schema::schema_text;
 pub use sections::*;
+pub use stop::StopSection;
 pub use warning::Warning;
 
 /// A whole campaign.
@@ -74,6 +76,9 @@ pub struct Config {
     /// What the campaign may use up.
     #[serde(default)]
     pub budget: BudgetSection,
+    /// What ends the campaign before its walks have made all their steps.
+    #[serde(default)]
+    pub stop: StopSection,
     /// Processes and rounds.
     #[serde(default)]
     pub run: RunSection,
@@ -169,6 +174,7 @@ impl Config {
             .with::<LabelGuard>("label.guard")
             .with::<ReferenceCheckSection>("label.reference_check")
             .with::<BudgetSection>("budget")
+            .with::<StopSection>("stop")
             .with::<RunSection>("run")
             .with::<NotifySection>("notify")
             .with::<RefitSection>("refit")

@@ -67,7 +67,7 @@ const fn range(
 }
 
 /// All ranges, by table.
-pub static RANGES: [Range; 105] = [
+pub static RANGES: [Range; 107] = [
     range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
     range("walk.biased_steps", "", [0.0, STEPS], [10.0, 1e7], ""),
     range("walk.equilibration_steps", "", [0.0, STEPS], [0.0, 1e6], ""),
@@ -171,6 +171,8 @@ pub static RANGES: [Range; 105] = [
     range("refit.method.native.patience", "", [0.0, 1e9], [1.0, 1e3], ""),
     range("refit.method.command.time_limit", TIME, [1.0, YEAR], [60.0, 30.0 * DAY], ""),
     range("budget.wall_time", TIME, [0.001, 10.0 * YEAR], [60.0, YEAR], ""),
+    range("stop.max_steps_without_structure", "", [0.0, STEPS], [1e3, 1e9], ""),
+    range("stop.min_improvement", "", [0.0, 100.0], [1e-3, 0.5], "it is a fraction: 5 % is 0.05"),
     range("run.walkers", "", [0.0, 1024.0], [0.0, 512.0], ""),
     range("run.threads_per_walker", "", [0.0, 256.0], [1.0, 128.0], ""),
     range("run.heartbeat_timeout", TIME, [5.0, 10.0 * DAY], [10.0, DAY], ""),

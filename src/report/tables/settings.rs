@@ -6,7 +6,7 @@ use super::super::report_data::ReportData;
 use super::{PageTable, TableCell, text};
 
 /// Sections in the order of the configuration file. Other sections follow.
-const SECTIONS: [&str; 11] = [
+const SECTIONS: [&str; 12] = [
     "campaign",
     "potential",
     "calm",
@@ -16,6 +16,7 @@ const SECTIONS: [&str; 11] = [
     "guard",
     "label",
     "budget",
+    "stop",
     "run",
     "notify",
 ];
