@@ -29,7 +29,7 @@ pub enum EarlyEndCause {
 /// The walks that ended in one way.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EndCount {
-    /// `completed`, `quota_reached`, `budget`, `superseded`, `trapped`, `diverged` or `invalid_start`.
+    /// `completed`, `quota_reached`, `budget`, `superseded`, `nothing_new`, `trapped`, `diverged` or `invalid_start`.
     pub end: String,
     /// `None` if the walks did not end early.
     pub cause: Option<EarlyEndCause>,
@@ -49,11 +49,13 @@ pub struct EndCount {
 pub struct WalkEnds(Vec<EndCount>);
 
 /// Why a walk with this state and reason ended early. `None` for a walk that is running, made all its steps,
-/// collected all it may, or ended with a budget.
+/// collected all it may, or ended with all others: by a limit, or for a new version.
 pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
     let has = |words: &str| reason.contains(words);
     match state {
-        "waiting" | "running" | "completed" | "quota_reached" | "budget" | "superseded" => None,
+        "waiting" | "running" | "completed" | "quota_reached" | "budget" | "superseded" | "nothing_new" => {
+            None
+        }
         "trapped" => Some(EarlyEndCause::Trapped),
         _ if has("walkers crashed") || has("walker crashed") => Some(EarlyEndCause::Crashed),
         "invalid_start" => Some(EarlyEndCause::InvalidStart),

@@ -4,6 +4,7 @@ mod common;
 
 mod commit_batch;
 mod decisions;
+mod nothing_new;
 mod reactor;
 mod replay;
 mod reproducible;

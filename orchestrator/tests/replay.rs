@@ -299,6 +299,8 @@ fn the_campaigns_cover_the_intended_cases() {
         let campaign = campaign.finish(false);
         check_exact(&campaign, &settings, scripts.len());
         seen.extend(campaign.commits.iter().flat_map(kinds));
+        let decisions = campaign.commits.iter().flat_map(|commit| &commit.decisions);
+        seen.extend(decisions.filter_map(|decision| decision.detail["end"].as_str().map(str::to_owned)));
     }
     for kind in [
         "configuration",
@@ -310,6 +312,7 @@ fn the_campaigns_cover_the_intended_cases() {
         "declined covered",
         "declined duplicate",
         "declined too_close",
+        "nothing_new",
     ] {
         assert!(seen.contains(kind), "no {kind} in {seen:?}");
     }

@@ -107,6 +107,31 @@ fn walks_that_are_under_way_end_when_a_version_is_taken_up() {
     assert_eq!(kinds(&commit), ["ended", "ended"]);
 }
 
+/// They would end at once.
+#[test]
+fn no_walk_starts_with_a_version_while_the_structures_of_the_campaign_are_used_up() {
+    let limited = SelectorSettings { max_structures: Some(1), ..reproducible() };
+    let (mut store, commit) = until_refit(&limited);
+    assert_eq!((kinds(&commit).len(), commit.decisions[1].detail["end"].as_str()), (4, Some("budget")));
+    let mut selector = restore(&with_version(&limited, 1), 3, store.snapshot());
+    let commit = selector.start_walks();
+    assert_eq!(kinds(&commit), ["version"]);
+    assert!(selector.is_done());
+    store.commit(&commit);
+    let mut selector = restore(&with_version(&reproducible(), 1), 3, store.snapshot());
+    assert_eq!(kinds(&selector.start_walks()), ["configuration", "begun", "begun", "begun"]);
+}
+
+#[test]
+fn walks_of_new_seed_structures_wait_for_the_version_that_is_due() {
+    let due = SelectorSettings { refit_at: Some(1), ..reproducible() };
+    let (store, _) = until_refit(&due);
+    let mut selector = restore(&due, 4, store.snapshot());
+    assert!(selector.start_walks().decisions.is_empty());
+    let mut selector = restore(&with_version(&reproducible(), 1), 4, store.snapshot());
+    assert_eq!(selector.start_walks().walks.len(), 4);
+}
+
 /// Each version may collect as much from a seed structure as the first one.
 #[test]
 fn the_limit_of_a_seed_structure_holds_for_each_version() {

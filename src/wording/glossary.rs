@@ -31,6 +31,7 @@ fn every_status_word_is_explained() {
         WalkEnd::QuotaReached,
         WalkEnd::Budget,
         WalkEnd::Superseded,
+        WalkEnd::NothingNew,
         WalkEnd::Trapped { guard: none() },
         WalkEnd::Diverged { reason: none() },
         WalkEnd::InvalidStart { reason: none() },

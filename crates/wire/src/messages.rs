@@ -111,6 +111,8 @@ pub enum WalkEnd {
     Budget,
     /// It made room for a new version of the potential.
     Superseded,
+    /// The biased walks together made their maximum number of steps without a new structure.
+    NothingNew,
     /// A guard rejected it too often, after the allowed number of rollbacks.
     Trapped {
         /// Name of the guard.
@@ -129,7 +131,7 @@ pub enum WalkEnd {
 }
 
 impl WalkEnd {
-    /// The serialized name: `"completed"`, `"quota_reached"`, `"budget"`, `"superseded"`, `"trapped"`,
+    /// The serialized name: `"completed"`, `"quota_reached"`, `"budget"`, `"superseded"`, `"nothing_new"`, `"trapped"`,
     /// `"diverged"` or `"invalid_start"`.
     pub fn name(&self) -> &'static str {
         match self {
@@ -137,6 +139,7 @@ impl WalkEnd {
             Self::QuotaReached => "quota_reached",
             Self::Budget => "budget",
             Self::Superseded => "superseded",
+            Self::NothingNew => "nothing_new",
             Self::Trapped { .. } => "trapped",
             Self::Diverged { .. } => "diverged",
             Self::InvalidStart { .. } => "invalid_start",

@@ -41,7 +41,7 @@ impl DecisionState {
         for report in reports {
             let id = report.walk;
             touched.insert(id);
-            self.apply_report(&report, &mut commit);
+            let (steps, accepted) = (self.apply_report(&report, &mut commit), self.accepted);
             match report.outcome {
                 Outcome::Candidate(regraded) => {
                     let decided = regraded.and_then(|regraded| self.take(id, regraded, &mut commit));
@@ -59,6 +59,7 @@ impl DecisionState {
                 }
                 Outcome::StepsDone | Outcome::Interrupted => {}
             }
+            self.count_steps(steps, self.accepted > accepted);
         }
         self.finish_commit(assigned, touched, &mut commit);
         Ok(commit)
@@ -84,10 +85,15 @@ impl DecisionState {
         self.add_values(commit);
     }
 
-    /// Updates the walk from the report, and logs rollbacks.
-    fn apply_report(&mut self, report: &RegradedReport, commit: &mut Commit) {
+    /// Updates the walk from the report, and logs rollbacks. Returns the number of steps of the assignment if the walk is
+    /// biased; 0 if it rolled back behind its start.
+    fn apply_report(&mut self, report: &RegradedReport, commit: &mut Commit) -> u64 {
         let steps_per_assignment = self.settings.steps_per_assignment;
         let walk = self.walks.count_report(report.walk);
+        let steps = match walk.is_biased() {
+            true => report.progress.step.saturating_sub(walk.counted_step(steps_per_assignment)),
+            false => 0,
+        };
         let returned = report.progress.segment > walk.state.segment;
         walk.state.segment = walk.state.segment.max(report.progress.segment);
         if !matches!(report.outcome, Outcome::Ended(WalkEnd::InvalidStart { .. })) {
@@ -103,6 +109,17 @@ impl DecisionState {
                 "segment": progress.segment, "from": from, "to": to, "tau": progress.tau, "rollbacks": progress.rollbacks,
             });
             commit.decisions.push(self.decision("segment", report.walk, detail));
+        }
+        steps
+    }
+
+    /// Counts the steps of biased walks since the last accepted structure. Structures of assignments that were under way when
+    /// the limit was reached are accepted, but the limit stays reached.
+    fn count_steps(&mut self, steps: u64, found: bool) {
+        if !found {
+            self.steps_without_structure += steps;
+        } else if !self.finds_nothing_new() {
+            self.steps_without_structure = 0;
         }
     }
 
@@ -374,20 +391,18 @@ impl DecisionState {
         self.settings.update == UpdateProtocol::PerSeedStructure && next != Some(seed_structure)
     }
 
-    /// Ends the unassigned biased walks once the campaign has its maximum number of structures or a refit of the potential is
-    /// due, and those whose seed structure has its maximum.
+    /// Ends the unassigned biased walks if all have to end, or those whose seed structure has its maximum number of structures.
     fn end_by_limits(&mut self, assigned: &BTreeMap<WalkId, u32>, commit: &mut Commit) -> BTreeSet<WalkId> {
         let is_idle = |id: &WalkId| !assigned.contains_key(id);
-        let (end, over): (_, BTreeSet<_>) = if self.is_budget_exhausted() {
-            (WalkEnd::Budget, self.walks.unfinished(true).filter(is_idle).collect())
-        } else if self.is_refit_due() {
-            (WalkEnd::Superseded, self.walks.unfinished(true).filter(is_idle).collect())
-        } else {
-            let of_full_seed_structures = self
-                .full_seed_structures
-                .iter()
-                .flat_map(|seed| self.walks.unfinished_of_seed_structure(*seed));
-            (WalkEnd::QuotaReached, of_full_seed_structures.filter(is_idle).collect())
+        let (end, over): (_, BTreeSet<_>) = match self.end_of_all_walks() {
+            Some(end) => (end, self.walks.unfinished(true).filter(is_idle).collect()),
+            None => {
+                let of_full_seed_structures = self
+                    .full_seed_structures
+                    .iter()
+                    .flat_map(|seed| self.walks.unfinished_of_seed_structure(*seed));
+                (WalkEnd::QuotaReached, of_full_seed_structures.filter(is_idle).collect())
+            }
         };
         over.iter().for_each(|id| self.end_walk(*id, &end, commit));
         self.full_seed_structures
@@ -424,7 +439,11 @@ impl DecisionState {
 /// Why a walk ended, as text, if the name of the end is not sufficient.
 fn describe_end(end: &WalkEnd) -> String {
     match end {
-        WalkEnd::Completed | WalkEnd::QuotaReached | WalkEnd::Budget | WalkEnd::Superseded => String::new(),
+        WalkEnd::Completed
+        | WalkEnd::QuotaReached
+        | WalkEnd::Budget
+        | WalkEnd::Superseded
+        | WalkEnd::NothingNew => String::new(),
         WalkEnd::Trapped { guard } => format!("rejected by the {guard} guard again and again"),
         WalkEnd::Diverged { reason } | WalkEnd::InvalidStart { reason } => reason.clone(),
     }

@@ -25,6 +25,9 @@ use crate::grader::Grader;
 /// Name of the value that tells that updates have become additive.
 pub const ADDITIVE: &str = "additive_updates";
 
+/// Name of the value with the steps that biased walks made since the last accepted structure.
+const STEPS_WITHOUT_STRUCTURE: &str = "steps_without_structure";
+
 /// Decides on candidates and walks.
 pub(super) struct DecisionState {
     pub settings: SelectorSettings,
@@ -42,6 +45,9 @@ pub(super) struct DecisionState {
     /// Number of started rounds; always 0 in live mode.
     pub round: u64,
     pub accepted: u32,
+    /// Number of steps of biased walks with the version in force since the last accepted structure. Goes on once it has reached
+    /// the limit. A replay does not count them: the log has the ends that follow.
+    pub steps_without_structure: u64,
     /// Number of structures accepted from the biased walks of each seed structure with the version in force.
     pub accepted_by_seed_structure: HashMap<u32, u32>,
     /// Seed structures that have their maximum number of structures, but walks that have not ended.
@@ -78,6 +84,7 @@ impl DecisionState {
         let (round, version) = (value("round")?, value("mixture_version")?);
         let (declined_feature_bytes, imported) = (value("declined_feature_bytes")?, value("imported")?);
         let left_out = value(store::records::LEFT_OUT)?;
+        let steps_without_structure = value(STEPS_WITHOUT_STRUCTURE)?;
         let staleness = restored(STALENESS, &snapshot.values)?.unwrap_or_default();
         let taken_up = u32::try_from(value(VERSION)?).unwrap_or(u32::MAX);
         let in_force = settings.version.version;
@@ -114,6 +121,7 @@ impl DecisionState {
             known: snapshot.known.into_iter().collect(),
             round,
             accepted,
+            steps_without_structure,
             accepted_by_seed_structure,
             full_seed_structures,
             declined_feature_bytes,
@@ -138,6 +146,7 @@ impl DecisionState {
             ("mixture_version", self.mixture.version()),
             ("declined_feature_bytes", self.declined_feature_bytes),
             ("imported", self.imported.0),
+            (STEPS_WITHOUT_STRUCTURE, self.steps_without_structure),
         ];
         commit.values.extend(values.map(|(name, value)| (name.to_owned(), value.to_string())));
         if !commit.candidates.is_empty() {

@@ -127,7 +127,8 @@ impl Selector {
 
     /// Creates a walk for each seed structure without one: at the start of a campaign, with a new version of the potential, or
     /// when seed structures were added. Resumes walks that ended because of a limit that has been raised since, or for a
-    /// version that was refused. The commit is empty if nothing changes.
+    /// version that was refused. No walk starts while a limit of the whole campaign is reached, or room is made for a new
+    /// version. The commit is empty if nothing changes.
     pub fn start_walks(&mut self) -> Commit {
         let commit = self.decisions.start_walks(&self.seed_structures);
         self.update_ready(commit.walks.iter().map(|walk| walk.walk));

@@ -24,6 +24,9 @@ pub struct ChangeableRules {
     /// See [`SelectorSettings::max_structures`]: the smallest of the configured limits.
     #[serde(rename = "collect.max_structures")]
     pub max_structures: Option<u32>,
+    /// See [`SelectorSettings::max_steps_without_structure`].
+    #[serde(rename = "stop.max_steps_without_structure")]
+    pub max_steps_without_structure: Option<u64>,
     /// See [`ForgettingAlarm`].
     #[serde(rename = "calm.forgetting_alarm")]
     pub forgetting_alarm: Fraction,
@@ -47,6 +50,7 @@ impl SelectorSettings {
             max_per_walk: self.max_per_walk,
             max_per_seed_structure: self.max_per_seed_structure,
             max_structures: self.max_structures,
+            max_steps_without_structure: self.max_steps_without_structure,
             forgetting_alarm: self.forgetting_alarm.share_above_one,
             max_mean_square_growth: self.forgetting_alarm.mean_square_growth,
         }
@@ -58,11 +62,13 @@ impl SelectorSettings {
             max_per_walk,
             max_per_seed_structure,
             max_structures,
+            max_steps_without_structure,
             forgetting_alarm,
             max_mean_square_growth,
         } = *rules;
         (self.max_per_walk, self.max_structures) = (max_per_walk, max_structures);
         self.max_per_seed_structure = max_per_seed_structure;
+        self.max_steps_without_structure = max_steps_without_structure;
         self.forgetting_alarm =
             ForgettingAlarm { share_above_one: forgetting_alarm, mean_square_growth: max_mean_square_growth };
     }

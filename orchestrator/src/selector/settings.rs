@@ -90,6 +90,8 @@ pub struct SelectorSettings {
     pub max_per_seed_structure: Option<u32>,
     /// Maximum number of structures accepted in the campaign.
     pub max_structures: Option<u32>,
+    /// Maximum number of steps that the biased walks make together after the last accepted structure, equilibration included.
+    pub max_steps_without_structure: Option<u64>,
     /// Whether each biased walk that collected structures is followed by its unbiased control walk.
     pub control: bool,
     /// Share of the assignments that control walks get while there are any (live mode).

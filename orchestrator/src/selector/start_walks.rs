@@ -27,6 +27,16 @@ impl DecisionState {
         self.log_rule_changes(&mut commit);
         self.take_up_version(&mut commit);
         self.resume_walks(&mut commit);
+        // Walks that would end at once wait until the limit is raised, or for the next version.
+        if self.end_of_all_walks().is_none() {
+            self.start_planned_walks(seed_structures, &mut commit);
+        }
+        self.add_values(&mut commit);
+        commit
+    }
+
+    /// Starts the walks of the plan that have not begun with the version in force.
+    fn start_planned_walks(&mut self, seed_structures: &[SeedStructurePlan], commit: &mut Commit) {
         let version = self.version;
         let is_of_version = |walk: &&Walk| walk.is_biased() && walk.record.conditions.version == version;
         let begun = self.walks.iter().filter(is_of_version).count();
@@ -36,8 +46,6 @@ impl DecisionState {
             commit.decisions.push(self.start_walk(id, seed, name, conditions));
             commit.walks.push(self.walks[id].to_record());
         }
-        self.add_values(&mut commit);
-        commit
     }
 
     /// Takes up the version of the potential in force, unless the log has it already: walks of earlier versions end, and the
@@ -54,6 +62,7 @@ impl DecisionState {
             commit.walks.push(self.walks[id].to_record());
         }
         self.version = next.version;
+        self.steps_without_structure = 0;
         self.mixture = Arc::new(self.regrader.original.at_version(self.mixture.version() + 1));
         commit.components.clear();
         commit.restart_mixture = true;
@@ -111,16 +120,24 @@ impl DecisionState {
     /// was refused.
     pub fn can_resume(&self, id: WalkId) -> bool {
         let walk = &self.walks[id];
-        let may_go_on = match walk.was_superseded() {
-            true => !self.is_refit_due(),
-            false => walk.ended_by_budget(),
-        };
+        let may_go_on = walk.was_superseded() || walk.ended_by_budget();
         let is_in_force = walk.record.conditions.version == self.version;
-        may_go_on && is_in_force && !self.is_budget_exhausted() && !self.has_collected_enough(walk)
+        may_go_on && is_in_force && self.end_of_all_walks().is_none() && !self.has_collected_enough(walk)
+    }
+
+    /// How all biased walks of the version in force have to end now, if they have to.
+    pub fn end_of_all_walks(&self) -> Option<WalkEnd> {
+        if self.is_budget_exhausted() {
+            Some(WalkEnd::Budget)
+        } else if self.is_refit_due() {
+            Some(WalkEnd::Superseded)
+        } else {
+            self.finds_nothing_new().then_some(WalkEnd::NothingNew)
+        }
     }
 
     /// Whether biased walks make room for a new version of the potential.
-    pub fn is_refit_due(&self) -> bool {
+    fn is_refit_due(&self) -> bool {
         self.settings.refit_at.is_some_and(|structures| self.accepted >= structures)
     }
 
@@ -140,6 +157,11 @@ impl DecisionState {
     /// Whether the campaign has its maximum number of structures.
     pub fn is_budget_exhausted(&self) -> bool {
         self.settings.max_structures.is_some_and(|total| self.accepted >= total)
+    }
+
+    /// Whether the biased walks have made their maximum number of steps without a new structure.
+    pub fn finds_nothing_new(&self) -> bool {
+        self.settings.max_steps_without_structure.is_some_and(|most| self.steps_without_structure >= most)
     }
 
     pub fn next_walk_id(&self) -> WalkId {

@@ -95,6 +95,11 @@ impl Walk {
         self.state.until = self.state.wanted.last().map_or(until, |last| until.min(*last));
     }
 
+    /// Step at the end of the last completed assignment, from which the next one counts. An interrupted walk is beyond it.
+    pub fn counted_step(&self, steps_per_assignment: u64) -> u64 {
+        self.state.until.saturating_sub(steps_per_assignment)
+    }
+
     /// Whether a control walk is past its last frame without having provided it.
     pub fn missed_its_frames(&self) -> bool {
         self.state.wanted.last().is_some_and(|last| self.record.progress.step >= *last)
@@ -110,8 +115,8 @@ impl Walk {
 
     /// Whether it ended only because of a limit.
     pub fn ended_by_budget(&self) -> bool {
-        self.is_biased()
-            && [WalkEnd::QuotaReached, WalkEnd::Budget].iter().any(|end| self.record.state == end.name())
+        let ends = [WalkEnd::QuotaReached, WalkEnd::Budget, WalkEnd::NothingNew];
+        self.is_biased() && ends.iter().any(|end| self.record.state == end.name())
     }
 
     /// Whether it made room for a new version of the potential.

@@ -104,17 +104,23 @@ pub fn any_settings() -> impl Strategy<Value = SelectorSettings> {
         UpdateProtocol::PerSeedStructure,
         UpdateProtocol::Never,
     ]);
-    let limits = (1..6_u32, prop::option::of(1..8_u32), prop::option::of(1..12_u32));
+    let limits = (
+        1..6_u32,
+        prop::option::of(1..8_u32),
+        prop::option::of(1..12_u32),
+        prop::option::weighted(0.3, 1..60_u64),
+    );
     let on_forgetting = prop::sample::select(vec![OnForgetting::Warn, OnForgetting::Additive]);
     (1..5_usize, update, limits, any::<bool>(), 0..300_u64, on_forgetting).prop_map(
         |(walks, update, limits, control, declined_feature_bytes, on_forgetting)| {
-            let (max_per_walk, max_per_seed_structure, total) = limits;
+            let (max_per_walk, max_per_seed_structure, total, max_steps_without_structure) = limits;
             SelectorSettings {
                 walks_per_round: if update == UpdateProtocol::PerSeedStructure { 1 } else { walks },
                 update,
                 max_per_walk,
                 max_per_seed_structure,
                 max_structures: total,
+                max_steps_without_structure,
                 control,
                 declined_feature_bytes,
                 on_forgetting,

@@ -94,6 +94,7 @@ pub fn settings(mode: CampaignMode) -> SelectorSettings {
         max_per_walk: 3,
         max_per_seed_structure: None,
         max_structures: None,
+        max_steps_without_structure: None,
         control: false,
         control_share: 0.5,
         min_distances: MinDistanceRule::Uniform(Uniform::default()),

@@ -26,6 +26,7 @@ fn end() -> impl Strategy<Value = WalkEnd> {
         Just(WalkEnd::Completed),
         Just(WalkEnd::QuotaReached),
         Just(WalkEnd::Superseded),
+        Just(WalkEnd::NothingNew),
         ".{0,40}".prop_map(|guard| WalkEnd::Trapped { guard }),
         ".{0,40}".prop_map(|reason| WalkEnd::Diverged { reason }),
         ".{0,40}".prop_map(|reason| WalkEnd::InvalidStart { reason }),
