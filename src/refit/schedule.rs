@@ -1,8 +1,11 @@
-//! When a refit of the potential is due.
+//! When a refit of the potential is due, and which version walks run with.
 
+use calm::rules::Positive;
+use monitor::improvement::{Improvement, trained_versions};
+use orchestrator::selector::VERSION;
 use store::{Store, StoreError, VersionRecord, VersionState};
 
-use crate::config::RefitSection;
+use crate::config::{RefitSection, StopSection};
 
 /// What the times of refits follow from.
 #[derive(Clone, Debug, Default)]
@@ -11,17 +14,52 @@ pub struct RefitSchedule {
     pub versions: Vec<VersionRecord>,
     /// Number of structures that were accepted from biased walks.
     pub accepted: u64,
+    /// Number of the version that the decision log has taken up.
+    pub taken_up: u32,
+    /// See [`StopSection::min_improvement`].
+    pub min_improvement: Option<f64>,
 }
 
 impl RefitSchedule {
     /// Reads it from the campaign's database.
-    pub async fn read(store: &Store) -> Result<Self, StoreError> {
-        Ok(Self { versions: store.versions().await?, accepted: store.accepted_structures().await? })
+    pub async fn read(store: &Store, stop: &StopSection) -> Result<Self, StoreError> {
+        let values = store.values().await?;
+        let taken_up = values.iter().find(|(name, _)| name == VERSION);
+        Ok(Self {
+            versions: store.versions().await?,
+            accepted: store.accepted_structures().await?,
+            taken_up: taken_up.and_then(|(_, number)| number.parse().ok()).unwrap_or(0),
+            min_improvement: stop.min_improvement.map(Positive::get),
+        })
     }
 
     /// The newest registered version; `None` for that of the configuration.
+    pub fn newest(&self) -> Option<&VersionRecord> {
+        self.registered().next_back()
+    }
+
+    /// The version that walks run with: the newest one unless it is without walks. `None` for that of the configuration.
     pub fn in_force(&self) -> Option<&VersionRecord> {
-        self.versions.iter().rev().find(|version| version.state == VersionState::Registered)
+        match self.is_newest_without_walks() {
+            true => self.registered().find(|version| version.number == self.taken_up),
+            false => self.newest(),
+        }
+    }
+
+    fn registered(&self) -> impl DoubleEndedIterator<Item = &VersionRecord> {
+        self.versions.iter().filter(|version| version.state == VersionState::Registered)
+    }
+
+    /// Whether the newest version improved so little on its parent that no further one is trained.
+    pub fn is_converged(&self) -> bool {
+        let improvement = Improvement::of_newest(&self.versions);
+        let below = |least: f64| improvement.is_some_and(|found| found.per_100_labels() < least);
+        self.min_improvement.is_some_and(below)
+    }
+
+    /// Whether the campaign ends with the newest version, whose walks did not begin before that was known.
+    pub fn is_newest_without_walks(&self) -> bool {
+        self.is_converged() && self.newest().is_some_and(|newest| newest.number > self.taken_up)
     }
 
     /// Number of accepted structures at the last attempt.
@@ -31,14 +69,16 @@ impl RefitSchedule {
 
     /// Whether the campaign trains further versions. Rollbacks do not count.
     fn trains_more(&self, refit: &RefitSection) -> bool {
-        let trained = self.versions.iter().filter(|version| {
-            version.state == VersionState::Registered && version.method != VersionRecord::ROLLBACK
-        });
-        trained.count() < refit.max_versions.get() as usize
+        let trained = trained_versions(&self.versions).count();
+        !self.is_converged() && trained < refit.max_versions.get() as usize
     }
 
-    /// Number of accepted structures at which biased walks make room for the next version.
+    /// Number of accepted structures at which biased walks make room for the next version. Those that made room for the last one
+    /// stay ended.
     pub fn refit_at(&self, refit: &RefitSection) -> Option<u64> {
+        if self.is_newest_without_walks() {
+            return Some(0);
+        }
         let after = refit.after_structures.filter(|_| self.trains_more(refit))?;
         Some(self.accepted_before() + u64::from(after.get()))
     }
@@ -59,6 +99,8 @@ impl RefitSchedule {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     fn section(text: &str) -> RefitSection {
@@ -108,6 +150,45 @@ mod tests {
         assert!(schedule.is_due_after_walks(&refit), "a rollback is no training");
         schedule.versions.push(version(4, VersionState::Registered, 14));
         assert_eq!((schedule.refit_at(&refit), schedule.is_due_after_walks(&refit)), (None, false));
+    }
+
+    #[test]
+    fn the_campaign_ends_with_a_version_that_improves_too_little() {
+        let refit = section("after_structures = 5\nmax_versions = 9");
+        let trained = |number: u32, error: f64| {
+            let [parent, own] = [1.0, error].map(|error| json!({ "force_mae": error }));
+            let set = json!({ "kind": "held_out", "structures": 5, "parent": parent, "version": own });
+            VersionRecord {
+                parent: number - 1,
+                labels: 50 * u64::from(number),
+                figures: json!({ "sets": [set] }),
+                ..version(number, VersionState::Registered, u64::from(number))
+            }
+        };
+        // The first has 40 % less for each 100 labels, the second 20 %.
+        let mut schedule = RefitSchedule {
+            versions: vec![trained(1, 0.8), trained(2, 0.9)],
+            accepted: 20,
+            taken_up: 1,
+            min_improvement: Some(0.15),
+        };
+        let in_force = |schedule: &RefitSchedule| schedule.in_force().map_or(0, |version| version.number);
+        assert!(!schedule.is_converged() && schedule.is_due_after_walks(&refit));
+        assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (2, Some(7)));
+        schedule.min_improvement = Some(0.25);
+        assert!(schedule.is_converged() && schedule.is_newest_without_walks());
+        assert!(!schedule.is_due_after_walks(&refit) && !schedule.is_due_beside_walks(&refit, 0, i64::MAX));
+        assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (1, Some(0)));
+        // Walks that have begun with it run to their end.
+        schedule.taken_up = 2;
+        assert!(!schedule.is_newest_without_walks() && !schedule.is_due_after_walks(&refit));
+        assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (2, None));
+        schedule.min_improvement = None;
+        assert!(schedule.is_due_after_walks(&refit));
+        // The first version is the last one.
+        schedule.versions.pop();
+        (schedule.taken_up, schedule.min_improvement) = (0, Some(0.5));
+        assert_eq!((in_force(&schedule), schedule.refit_at(&refit)), (0, Some(0)));
     }
 
     #[test]

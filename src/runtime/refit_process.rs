@@ -104,8 +104,8 @@ impl<'a> RefitProcess<'a> {
 
     async fn check(&mut self) -> Result<(), CommandError> {
         let RunContext { store, campaign, process, superseded, .. } = self.run;
-        let schedule = RefitSchedule::read(store).await?;
-        let newest = schedule.in_force().map_or(0, |version| version.number);
+        let schedule = RefitSchedule::read(store, &campaign.config.stop).await?;
+        let newest = schedule.newest().map_or(0, |version| version.number);
         if newest > campaign.version_number() {
             superseded.cancel();
         } else if schedule.is_due_beside_walks(self.refit, process.started, store::unix_milliseconds()) {

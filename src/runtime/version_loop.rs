@@ -72,9 +72,9 @@ async fn run_version(
     if ended == RunOutcome::Stopped {
         return Ok(VersionEnd::Campaign(ended));
     }
-    let schedule = RefitSchedule::read(run.store).await?;
-    let newest = schedule.in_force().map_or(0, |version| version.number);
-    let is_newer = newest > run.campaign.version_number();
+    let schedule = RefitSchedule::read(run.store, &run.campaign.config.stop).await?;
+    let next = schedule.in_force().map_or(0, |version| version.number);
+    let is_newer = next > run.campaign.version_number();
     if !is_newer && !schedule.is_due_after_walks(refit) {
         return Ok(VersionEnd::Campaign(ended));
     }
@@ -94,7 +94,7 @@ pub async fn in_force(
     store: &Store,
     directory: &Path,
 ) -> Result<LoadedCampaign, CommandError> {
-    let schedule = RefitSchedule::read(store).await?;
+    let schedule = RefitSchedule::read(store, &campaign.config.stop).await?;
     let Some(record) = schedule.in_force().filter(|found| found.number != campaign.version_number()) else {
         return Ok(campaign.clone());
     };
@@ -129,13 +129,15 @@ pub async fn restore_selector(campaign: &LoadedCampaign, store: &Store) -> Resul
     Ok(selector)
 }
 
-/// Number of accepted structures at which walks make room for a refit. Walks of a live campaign go on beside it.
+/// Number of accepted structures at which walks make room for a refit. Walks of a live campaign go on beside it, until its last
+/// version is there.
 async fn refit_at(campaign: &LoadedCampaign, store: &Store) -> Result<Option<u32>, CommandError> {
     let config = &campaign.config;
-    let Some(refit) = config.refit.as_ref().filter(|_| config.campaign.mode == CampaignMode::Reproducible)
-    else {
+    let Some(refit) = &config.refit else { return Ok(None) };
+    let schedule = RefitSchedule::read(store, &config.stop).await?;
+    if config.campaign.mode == CampaignMode::Live && !schedule.is_newest_without_walks() {
         return Ok(None);
-    };
-    let number = RefitSchedule::read(store).await?.refit_at(refit);
+    }
+    let number = schedule.refit_at(refit);
     Ok(number.map(|number| number.min(u32::MAX.into()) as u32))
 }
