@@ -3,13 +3,14 @@
 use std::fmt;
 
 use calm::forgetting::GradeDistribution;
+use monitor::end_reason::CampaignEnd;
 use monitor::label_statistics::{self, ErrorsByGrade, LabelStatistics};
 use monitor::walk_ends::WalkEnds;
 use store::{CampaignStatus, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
 use crate::output::{count, decimals};
-use crate::wording::{budget, energies, unlabelled, walk_ends};
+use crate::wording::{budget, end_reason, energies, unlabelled, walk_ends};
 
 /// Largest number of seed structures with failed labels to show.
 const MAX_SHOWN: usize = 8;
@@ -18,6 +19,8 @@ const MAX_SHOWN: usize = 8;
 #[derive(Clone, Debug)]
 pub struct Summary {
     status: CampaignStatus,
+    /// Why it ended.
+    end: Option<CampaignEnd>,
     statistics: LabelStatistics,
     /// Structures whose labels failed for good.
     unlabelled: Vec<Unlabelled>,
@@ -28,17 +31,19 @@ pub struct Summary {
 /// Reads the summary of a campaign with the labels of one protocol.
 pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
+    let end = CampaignEnd::read(store, &status).await?;
     let statistics = label_statistics::read(store, protocol).await?;
     let unlabelled = store.unlabelled(protocol, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());
-    Ok(Summary { status, statistics, unlabelled, training: watched })
+    Ok(Summary { status, end, statistics, unlabelled, training: watched })
 }
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.write_walks(f)?;
+        self.write_end(f)?;
         self.write_candidates(f)?;
         self.write_labels(f)?;
         if let Some(budget) = budget::describe(&self.status.budget) {
@@ -57,6 +62,11 @@ impl Summary {
         let ends = WalkEnds::from_walks(walks);
         writeln!(f, "                 ended: {}", walk_ends::all(&ends))?;
         walk_ends::early_ends(&ends).iter().try_for_each(|line| writeln!(f, "                 {line}"))
+    }
+
+    fn write_end(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let end = self.end.as_ref().map(end_reason::describe);
+        end.map_or(Ok(()), |end| writeln!(f, "end              {end}"))
     }
 
     fn write_candidates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -75,7 +75,12 @@ fn the_budget_of_labels_limits_how_many_structures_are_collected() {
         summary.contains("budget           labels 4 of 5; walks were ended by budget.labels"),
         "{summary}"
     );
+    assert!(summary.contains("\nend              budget.labels is used up\n"), "{summary}");
     let ended = status(here);
+    assert_eq!(
+        (&ended["end_reason"]["kind"], &ended["end_reason"]["key"]),
+        (&"budget".into(), &"budget.labels".into())
+    );
     assert_eq!((&ended["candidates"]["accepted"], &ended["labels"]["labelled"]), (&2.into(), &4.into()));
     assert_eq!((&ended["finished"], &ended["budget"]["used_up"]), (&true.into(), &"budget.labels".into()));
     let by_budget = ("budget".to_owned(), "budget.labels".to_owned());
@@ -95,6 +100,31 @@ fn the_budget_of_labels_limits_how_many_structures_are_collected() {
     succeed(here, RUN);
     assert!(!walks(&status(here)).contains(&by_budget));
     outcome(&here.join("here"));
+    succeed(here, ["replay", "here"]);
+}
+
+#[test]
+fn walks_end_when_they_find_nothing_new_and_go_on_with_a_larger_limit() {
+    let directory = write(&Small::default(), "[stop]\nmax_steps_without_structure = 100\n");
+    let here = directory.path();
+    change(
+        here,
+        "criterion = { rule = \"atom_count\", threshold = 1.0",
+        "criterion = { rule = \"atom_count\", threshold = 900.0",
+    );
+    let summary = succeed(here, RUN);
+    let reason = "walks found nothing new in 100 steps (stop.max_steps_without_structure)";
+    assert!(summary.contains(&format!("\nend              {reason}\n")), "{summary}");
+    // Two rounds of two walks.
+    let ended = status(here);
+    assert_eq!(walks(&ended), [(); 2].map(|()| ("nothing_new".to_owned(), String::new())));
+    assert_eq!((&ended["end_reason"]["steps"], &ended["walks"][1]["step"]), (&100.into(), &80.into()));
+    let so_far = decisions(here);
+    succeed(here, RUN);
+    assert_eq!(decisions(here), so_far, "the same run comes to the same end");
+    change(here, "max_steps_without_structure = 100", "max_steps_without_structure = 10000");
+    assert!(succeed(here, RUN).contains("\nend              all walks have ended\n"));
+    assert_eq!(walks(&status(here)), [(); 2].map(|()| ("completed".to_owned(), String::new())));
     succeed(here, ["replay", "here"]);
 }
 

@@ -2,11 +2,12 @@
 //!
 //! [`Snapshot`] is the state of a campaign; [`candidate_details`] the history of one candidate; [`label_statistics`]
 //! the potential's errors against labels; [`label_cost`] what labels cost; [`mixture_status`] how far the mixture has
-//! moved; [`improvement`] what a version of the potential gained. Nothing here writes to the store, and nothing renders: values leave as numbers, or as the JSON that the
+//! moved; [`improvement`] what a version of the potential gained; [`end_reason`] why the campaign ended. Nothing here writes to the store, and nothing renders: values leave as numbers, or as the JSON that the
 //! documents describe.
 
 pub mod candidate_details;
 pub mod disk;
+pub mod end_reason;
 pub mod energy_errors;
 pub mod energy_offsets;
 pub mod expected_end;

@@ -4,6 +4,7 @@ use serde_json::{Value, json};
 use store::{CampaignRecord, CampaignStatus, Store, StoreError};
 
 use crate::disk::{self, DiskUse};
+use crate::end_reason::CampaignEnd;
 use crate::expected_end::ExpectedEnd;
 use crate::label_queue::LabelQueue;
 use crate::mixture_values::MixtureValues;
@@ -31,6 +32,8 @@ pub struct Snapshot {
     pub labels: LabelQueue,
     /// The expected end.
     pub end: ExpectedEnd,
+    /// Why it ended. `None` while it is not finished.
+    pub end_reason: Option<CampaignEnd>,
     /// The check of the reference. `None` if there was none.
     pub check: Option<ReferenceCheck>,
 }
@@ -44,6 +47,7 @@ impl Snapshot {
         let labels = LabelQueue::read(store, &status).await?;
         let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
         Ok(Self {
+            end_reason: CampaignEnd::read(store, &status).await?,
             end: ExpectedEnd::extrapolate(&status, &configuration, &labels.cost),
             origin: Provenance::read(store).await?,
             check: ReferenceCheck::read(store).await?,
@@ -57,7 +61,7 @@ impl Snapshot {
 
     /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system and without sentences.
     pub fn to_json(&self) -> serde_json::Result<Value> {
-        let Self { campaign, origin, status, mixture, disk, labels, end, check } = self;
+        let Self { campaign, origin, status, mixture, disk, labels, end, end_reason, check } = self;
         let mut json = serde_json::to_value(status)?;
         json["version"] = FORMAT.into();
         json["campaign"] = campaign.id.to_string().into();
@@ -73,6 +77,7 @@ impl Snapshot {
         json["disk"]["at_the_end"] = json!(disk.at_the_end(status));
         json["ends"] = json!(WalkEnds::from_walks(&status.walks));
         json["expected_end"] = json!(end);
+        json["end_reason"] = json!(end_reason);
         json["reference_check"] = check.as_ref().map_or(Value::Null, ReferenceCheck::to_json);
         labels.add_to(&mut json, status);
         Ok(json)

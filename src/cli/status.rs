@@ -102,7 +102,7 @@ fn write(
 }
 
 fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> io::Result<()> {
-    let Snapshot { campaign, origin, status, mixture, disk, labels, end, check } = snapshot;
+    let Snapshot { campaign, origin, status, mixture, disk, labels, check, .. } = snapshot;
     let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
     let id = campaign.id.to_string();
     // Ids of candidates start with the same eight characters.
@@ -136,7 +136,7 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> 
         page.titled(out, "budget", &budget)?;
     }
     page.titled(out, "disk", &describe_disk(disk, page, status))?;
-    match expected_end(end) {
+    match end(snapshot) {
         Some(end) => page.titled(out, "end", &end),
         None => Ok(()),
     }
@@ -164,8 +164,14 @@ fn describe_disk(disk: &DiskUse, page: &StatusLayout, status: &CampaignStatus) -
     }
 }
 
+/// The expected end, or why the campaign ended; `None` if it is unknown.
+pub fn end(snapshot: &Snapshot) -> Option<String> {
+    let reason = || snapshot.end_reason.as_ref().map(wording::end_reason::describe);
+    expected_end(&snapshot.end).or_else(reason)
+}
+
 /// The expected end as text; `None` if it is unknown.
-pub fn expected_end(end: &ExpectedEnd) -> Option<String> {
+fn expected_end(end: &ExpectedEnd) -> Option<String> {
     let milliseconds = end.time? - unix_milliseconds();
     let hours = two_digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
     let part = |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", two_digits(hours)));

@@ -6,13 +6,16 @@ use monitor::label_statistics::LabelStatistics;
 use serde_json::Value;
 use store::Protocol;
 
-use super::{energies, reference_check};
+use super::{end_reason, energies, reference_check};
 
 /// The JSON of `calmwalk status` (docs/status.md), without the jobs of a batch system.
 pub fn snapshot(snapshot: &Snapshot) -> serde_json::Result<Value> {
     let mut json = snapshot.to_json()?;
     if let Some(check) = &snapshot.check {
         json["reference_check"]["faults"] = reference_check::faults(check).collect();
+    }
+    if let Some(end) = &snapshot.end_reason {
+        json["end_reason"]["text"] = end_reason::describe(end).into();
     }
     Ok(json)
 }

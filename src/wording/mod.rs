@@ -3,6 +3,7 @@
 pub mod budget;
 pub mod cost;
 pub mod disk;
+pub mod end_reason;
 pub mod energies;
 #[cfg(test)]
 mod glossary;

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use monitor::disk::DiskForecast;
+use monitor::end_reason::CampaignEnd;
 use monitor::label_cost::{CoreHours, QueueCost};
 use monitor::label_queue::LabelQueue;
 use monitor::mixture_values::MixtureValues;
@@ -83,6 +84,7 @@ pub fn large() -> Snapshot {
             by_protocol: Vec::new(),
             shared: Some(12),
         },
+        end_reason: Some(CampaignEnd::Budget { key: "budget.labels".into() }),
         check: Some(crate::wording::reference_check::tests::example()),
         end: ExpectedEnd {
             walks_hours: Some(12.0),
@@ -207,6 +209,12 @@ fn all_walks_are_shown_on_request() {
     assert!(text.contains("more processes"));
 }
 
+#[test]
+fn a_finished_campaign_says_why_it_ended() {
+    let ended = Snapshot { end: ExpectedEnd::default(), ..large() };
+    assert!(text(&ended, 120).contains("\nend         budget.labels is used up\n"));
+}
+
 /// Paths of all scalar values, as docs/status.md writes them.
 fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
     match value {
@@ -225,6 +233,14 @@ fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
 #[test]
 fn every_key_is_documented_and_every_documented_key_is_there() {
     let mut found = BTreeSet::new();
+    for end in [
+        CampaignEnd::NothingNew { steps: Some(500) },
+        CampaignEnd::SmallImprovement { version: 2, improvement: 0.01 },
+        CampaignEnd::AllVersions { versions: 3 },
+    ] {
+        let ended = Snapshot { end_reason: Some(end), ..large() };
+        keys(&crate::wording::json::snapshot(&ended).unwrap(), "", &mut found);
+    }
     for jobs in [BatchJobs::Known(vec![job()]), BatchJobs::Unknown("no answer".into())] {
         let mut json = crate::wording::json::snapshot(&large()).unwrap();
         jobs.add_to(&mut json);

@@ -134,7 +134,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &WatchState) {
                 status.labels_last_hour
             ),
         ),
-        ("end", cli_status::expected_end(&state.snapshot.end).unwrap_or_else(|| "–".into())),
+        ("end", cli_status::end(&state.snapshot).unwrap_or_else(|| "–".into())),
     ];
     let bold = Modifier::BOLD;
     let lines = lines.map(|(title, text)| {
