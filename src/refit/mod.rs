@@ -294,17 +294,13 @@ impl Refit<'_> {
             true => Ok(String::new()),
             false => hash(&self.path(name)).map_err(CommandError::failed),
         };
-        let method = match &self.config.settings.method {
-            RefitMethod::Native(_) => "native",
-            RefitMethod::Command(_) => "command",
-        };
         let cost = meter.now();
         let record = VersionRecord {
             number: self.set.number,
-            parent: self.config.begin_version(),
+            parent: self.config.parent_version,
             state: if is_refused { VersionState::Refused } else { VersionState::Registered },
             reason: reason.unwrap_or_default(),
-            method: method.to_owned(),
+            method: self.config.settings.method.name().to_owned(),
             structures: self.set.accepted,
             last_decision: self.set.last_decision,
             labels: self.labels.count(LabelFile::Training),
