@@ -3,6 +3,8 @@
 
 mod json;
 
+use std::collections::BTreeMap;
+
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
 use serde_json::Value;
@@ -10,6 +12,7 @@ use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Protocol,
 use wire::{ContentHash, Origin};
 
 use crate::energy_errors::{EnergyErrors, ProtocolEnergyOffsets};
+use crate::versions::newest_with_labels;
 
 /// Force errors above this count as large, eV/Å, as in the paper.
 pub const LARGE_FORCE_ERROR: f64 = 1.0;
@@ -18,6 +21,8 @@ pub const LARGE_FORCE_ERROR: f64 = 1.0;
 const PAGE_ROWS: u32 = 256;
 /// Largest number of atoms kept for ranks and quantiles. Beyond it a systematic sample is kept.
 const MAX_SAMPLES: usize = 1 << 20;
+/// The same of each version of the potential, for comparisons between versions.
+const MAX_SAMPLES_OF_VERSION: usize = 1 << 18;
 
 /// Force errors by both grades of the original mixture.
 #[derive(Clone, Debug)]
@@ -30,9 +35,15 @@ pub struct ErrorsByGrade {
     pub gamma_nbr: ForceErrors,
 }
 
-/// Statistics of the labels of one protocol.
+/// Statistics of the labels of one protocol, of structures from walks with one version of the potential: its forces and grades
+/// say nothing about another version.
 #[derive(Clone, Debug)]
 pub struct LabelStatistics {
+    /// The version. `None` in a campaign whose walks all had version 0.
+    pub version: Option<u32>,
+    /// The errors of each version with labels, of all its structures, by number; each by its own grades. Empty in a campaign whose
+    /// walks all had version 0.
+    pub by_version: BTreeMap<u32, ErrorsByGrade>,
     /// Of all structures.
     pub all: ErrorsByGrade,
     /// Of structures from biased walks.
@@ -50,13 +61,24 @@ pub struct LabelStatistics {
     pub by_expansion: Completion<String>,
 }
 
-/// Reads the labels of one protocol page by page.
-pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistics, StoreError> {
+/// Reads the labels of one protocol page by page. Without `version`, the statistics are those of the newest version with labels.
+pub async fn read(
+    store: &Store,
+    protocol: ContentHash,
+    version: Option<u32>,
+) -> Result<LabelStatistics, StoreError> {
+    let versions = store.walk_versions().await?;
+    let version = match version {
+        Some(version) => version,
+        None => newest_with_labels(store, protocol, &versions).await?,
+    };
     let mut statistics = LabelStatistics {
-        all: ErrorsByGrade::new(),
-        biased: ErrorsByGrade::new(),
-        control: ErrorsByGrade::new(),
-        energies: EnergyErrors::new(ProtocolEnergyOffsets::fit(store, protocol).await?),
+        version: (!versions.is_single()).then_some(version),
+        by_version: BTreeMap::new(),
+        all: ErrorsByGrade::new(MAX_SAMPLES),
+        biased: ErrorsByGrade::new(MAX_SAMPLES),
+        control: ErrorsByGrade::new(MAX_SAMPLES),
+        energies: EnergyErrors::new(ProtocolEnergyOffsets::fit(store, protocol, version).await?),
         shared: 0,
         by_gamma: Completion::new(Bins::for_grades()),
         by_expansion: Completion::new(Bins::for_volume_ratio()),
@@ -73,7 +95,15 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
             let forces = block.view().forces;
             let errors = forces.iter().zip(&row.label.forces).map(|(model, label)| norm(sub(*model, *label)));
             let errors: Vec<_> = errors.collect();
-            match (shared.contains(&block.view().id().content), *origin) {
+            let id = block.view().id();
+            let (of, is_shared) = (versions.of(id.walk.0), shared.contains(&id.content));
+            if !versions.is_single() && !(is_shared && *origin == Origin::Control) {
+                statistics.of_version(of).labelled(original, &errors);
+            }
+            if of != version {
+                continue;
+            }
+            match (is_shared, *origin) {
                 (false, origin) => statistics.for_origin(origin, |grades| grades.labelled(original, &errors)),
                 (true, Origin::Biased) => {
                     statistics.shared += 1;
@@ -90,7 +120,8 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
         let page = store.finished(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = last.decision;
-        page.iter().for_each(|candidate| statistics.finished(candidate));
+        let own = page.iter().filter(|candidate| versions.of(candidate.walk) == version);
+        own.for_each(|candidate| statistics.finished(candidate));
     }
     Ok(statistics)
 }
@@ -104,6 +135,10 @@ impl LabelStatistics {
     fn for_origin(&mut self, origin: Origin, mut change: impl FnMut(&mut ErrorsByGrade)) {
         let of_origin = if origin == Origin::Biased { &mut self.biased } else { &mut self.control };
         [&mut self.all, of_origin].into_iter().for_each(&mut change);
+    }
+
+    fn of_version(&mut self, version: u32) -> &mut ErrorsByGrade {
+        self.by_version.entry(version).or_insert_with(|| ErrorsByGrade::new(MAX_SAMPLES_OF_VERSION))
     }
 
     fn finished(&mut self, candidate: &FinishedCandidate) {
@@ -122,8 +157,8 @@ impl LabelStatistics {
 }
 
 impl ErrorsByGrade {
-    fn new() -> Self {
-        let errors = ForceErrors::new(Bins::for_grades(), LARGE_FORCE_ERROR, MAX_SAMPLES);
+    fn new(samples: usize) -> Self {
+        let errors = ForceErrors::new(Bins::for_grades(), LARGE_FORCE_ERROR, samples);
         Self { structures: 0, gamma: errors.clone(), gamma_nbr: errors }
     }
 
