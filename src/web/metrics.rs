@@ -198,7 +198,7 @@ fn versions(text: &mut MetricsText, found: &CampaignVersions) {
         "Whether a version of the potential is being trained.",
         &[(&[], f64::from(u8::from(found.refit.is_some())))],
     );
-    let sum = |of: fn(&VersionSummary) -> f64| found.all.iter().map(of).sum::<f64>();
+    let sum = |of: fn(&VersionSummary) -> f64| found.all.iter().map(of).fold(0.0, |sum, one| sum + one);
     text.counter(
         "calmwalk_refit_seconds_total",
         "Wall time of refits, refused ones included.",
