@@ -105,7 +105,8 @@ impl Summary {
         };
         writeln!(
             f,
-            "labels           {} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
+            "labels           {}{} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
+            versions_note(statistics),
             statistics.biased.structures + statistics.shared,
             statistics.control.structures + statistics.shared,
             shared_note(statistics),
@@ -155,6 +156,13 @@ impl Summary {
         }
         writeln!(f, "{}", energies::offsets(&energy.offsets))
     }
+}
+
+/// The labels of all versions of the potential, before those of the version that the statistics are of.
+fn versions_note(statistics: &LabelStatistics) -> String {
+    let Some(version) = statistics.version else { return String::new() };
+    let all: u64 = statistics.by_version.values().map(|grades| grades.structures).sum();
+    format!("{} in all; of walks with version {version}: ", count(all, "label"))
 }
 
 /// Says that structures found by both biased and control walks are counted twice.

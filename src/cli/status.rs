@@ -128,7 +128,8 @@ fn write_head(out: &mut dyn Write, snapshot: &Snapshot, page: &StatusLayout) -> 
         advice.take(page.few).try_for_each(|line| page.titled(out, "", &line))?;
     }
     versions::write_head(out, versions, page)?;
-    page.titled(out, "mixture", &format!("version {}", status.mixture_version))?;
+    let potential = if page.is_unlimited() { String::new() } else { versions::short(versions) };
+    page.titled(out, "mixture", &format!("version {}{potential}", status.mixture_version))?;
     mixture::write(out, mixture, page, &campaign.mode)?;
     write_candidates(out, page, &status.candidates, mixture.left_out(), labels.shared)?;
     labels::write(out, labels, page, status)?;

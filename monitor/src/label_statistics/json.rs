@@ -28,7 +28,10 @@ pub(super) fn to_json(protocol: &Protocol, statistics: &LabelStatistics) -> Valu
 }
 
 fn version_as_json((version, grades): (&u32, &ErrorsByGrade)) -> Value {
-    let one = |errors: &analysis::ForceErrors| json!({ "spearman": errors.spearman(), "roc_auc": errors.roc_auc(), "sampled_atoms": errors.sampled() });
+    let one = |errors: &analysis::ForceErrors| {
+        let (spearman, roc_auc) = (errors.spearman(), errors.roc_auc());
+        json!({ "spearman": spearman, "roc_auc": roc_auc, "sampled_atoms": errors.sampled() })
+    };
     json!({
         "version": version, "structures": grades.structures, "atoms": grades.gamma.atoms(),
         "mean_error": grades.gamma.mean(), "median_error": grades.gamma.median(), "gamma": one(&grades.gamma),

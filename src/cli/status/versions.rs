@@ -10,18 +10,32 @@ use crate::wording::versions;
 
 const SECONDS_PER_MINUTE: f64 = 60.0;
 
-/// Writes the version in force, refused ones, and the refit under way. Nothing in a campaign that has never trained a version.
+/// Writes the version in force, refused ones, and the refit under way. Nothing in a campaign that has never trained a version, and on
+/// a screen, where [`short`] is shown.
 pub fn write_head(out: &mut dyn Write, found: &CampaignVersions, page: &StatusLayout) -> io::Result<()> {
+    if !page.is_unlimited() {
+        return Ok(());
+    }
     if let Some(version) = found.in_force() {
         page.titled(out, "potential", &versions::in_force(found, version))?;
-        let refused = found.all.iter().rev().filter(|version| !version.is_registered());
-        let most = if page.is_unlimited() { usize::MAX } else { 1 };
-        refused.take(most).try_for_each(|version| page.titled(out, "", &versions::refused(version)))?;
+        let mut refused = found.all.iter().filter(|version| !version.is_registered());
+        refused.try_for_each(|version| page.titled(out, "", &versions::refused(version)))?;
     }
     match &found.refit {
         Some(refit) => page.titled(out, "refit", &versions::refit(refit)),
         None => Ok(()),
     }
+}
+
+/// The same in a few words, after those about the mixture: `; potential version 3, 1 refused; training version 4`.
+pub fn short(found: &CampaignVersions) -> String {
+    let in_force = found.in_force().map(|version| format!("; potential version {}", version.number));
+    let refused = match found.all.iter().filter(|version| !version.is_registered()).count() {
+        0 => String::new(),
+        refused => format!(", {refused} refused"),
+    };
+    let refit = found.refit.as_ref().map(|refit| format!("; training version {}", refit.number));
+    [in_force.unwrap_or_default(), refused, refit.unwrap_or_default()].concat()
 }
 
 /// Writes a table of the versions with the force MAE on each data set.
@@ -60,9 +74,8 @@ mod tests {
     use super::*;
     use crate::wording::versions::tests::example;
 
-    fn text(found: &CampaignVersions, all: bool) -> String {
+    fn text(found: &CampaignVersions) -> String {
         let (mut out, page) = (Vec::new(), StatusLayout { width: 120, ..StatusLayout::unlimited() });
-        let page = if all { page } else { page.screen() };
         write_head(&mut out, found, &page).unwrap();
         write(&mut out, found, &page).unwrap();
         String::from_utf8(out).unwrap()
@@ -70,7 +83,7 @@ mod tests {
 
     #[test]
     fn versions_are_listed_with_their_errors() {
-        let shown = text(&example(), true);
+        let shown = text(&example());
         for expected in [
             "potential   version 3 in force, trained on 120 labels; 1 refused",
             "            version 2 was refused: the force MAE on the held-out set rose from 0.2 to 0.8 eV/Å",
@@ -86,6 +99,8 @@ mod tests {
         );
         let first = shown.lines().find(|line| line.starts_with("0 ")).unwrap();
         assert!(first.split_whitespace().eq(["0", "earlier", "0", "60", "55", "–", "–", "0.2000", "0.4000"]));
-        assert_eq!(text(&CampaignVersions::default(), true), "", "a campaign without versions");
+        assert_eq!(short(&example()), "; potential version 3, 1 refused; training version 4");
+        let none = CampaignVersions::default();
+        assert_eq!((text(&none), short(&none)), (String::new(), String::new()));
     }
 }
