@@ -57,7 +57,7 @@ pub struct VersionSummary {
     pub time: Option<i64>,
 }
 
-/// Errors of a version and its parent on the structures of one data set.
+/// Errors of a version, its parent and version 0 on the structures of one data set.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
 #[serde(default)]
 pub struct VersionSetErrors {
@@ -67,6 +67,8 @@ pub struct VersionSetErrors {
     pub kind: String,
     /// Number of structures.
     pub structures: u64,
+    /// Errors of version 0; `None` for version 0 itself.
+    pub first: Option<ErrorFigures>,
     /// Errors of the parent; `None` for version 0.
     pub parent: Option<ErrorFigures>,
     /// Errors of the version; `None` if they are unknown.
@@ -161,14 +163,6 @@ impl CampaignVersions {
     pub fn core_hours_until(&self, number: u32) -> f64 {
         self.all.iter().filter(|version| version.number <= number).map(|version| version.core_hours).sum()
     }
-
-    /// Change of the force MAE of a version on a data set relative to version 0, as a share (−0.5: half of it). `None` if
-    /// version 0 was not evaluated on the same structures.
-    pub fn change_since_first(&self, set: &VersionSetErrors) -> Option<f64> {
-        let first = self.numbered(0)?.errors.iter().find(|first| first.name == set.name)?;
-        let is_same = first.structures == set.structures && first.kind == set.kind;
-        is_same.then(|| relative_change(first.force_mae()?, set.force_mae()?)).flatten()
-    }
 }
 
 impl VersionSetErrors {
@@ -177,7 +171,12 @@ impl VersionSetErrors {
         self.version?.force_mae
     }
 
-    /// Change of the force MAE relative to the parent on the same structures, as a share.
+    /// Change of the force MAE relative to version 0 on the same structures, as a share (−0.5: half of it).
+    pub fn change_since_first(&self) -> Option<f64> {
+        relative_change(self.first?.force_mae?, self.force_mae()?)
+    }
+
+    /// The same relative to the parent.
     pub fn change_from_parent(&self) -> Option<f64> {
         relative_change(self.parent?.force_mae?, self.force_mae()?)
     }
@@ -288,7 +287,9 @@ fn first(records: &[VersionRecord]) -> VersionSummary {
         structures: 0,
         accepted: 0,
         labelled: 0,
-        errors: errors.map(|set| VersionSetErrors { version: set.parent, parent: None, ..set }).collect(),
+        errors: errors
+            .map(|set| VersionSetErrors { version: set.parent, parent: None, first: None, ..set })
+            .collect(),
         seconds: 0.0,
         core_hours: 0.0,
         time: None,
@@ -345,7 +346,7 @@ mod tests {
         held_out: [f64; 2],
     ) -> VersionRecord {
         let set = |name: &str, kind: &str, structures: u64, [parent, version]: [f64; 2]| {
-            json!({ "name": name, "kind": kind, "structures": structures, "parent": { "force_mae": parent },
+            json!({ "name": name, "kind": kind, "structures": structures, "first": { "force_mae": 0.2 }, "parent": { "force_mae": parent },
                     "version": { "force_mae": version, "stress_mae": null } })
         };
         let refused = state == VersionState::Refused;
@@ -397,10 +398,11 @@ mod tests {
         assert_eq!((first.parent, first.errors_on("liquid").unwrap().force_mae()), (None, Some(0.2)));
         let third = versions.numbered(3).unwrap();
         let liquid = third.errors_on("liquid").unwrap();
-        assert!((versions.change_since_first(liquid).unwrap() - 0.25).abs() < 1e-12);
+        assert!((liquid.change_since_first().unwrap() - 0.25).abs() < 1e-12);
         assert!((liquid.change_from_parent().unwrap() - 1.5).abs() < 1e-12);
         let held_out = third.errors_on("held_out").unwrap();
-        assert_eq!(versions.change_since_first(held_out), None, "other structures than then");
+        assert!(held_out.change_since_first().unwrap().abs() < 1e-12);
+        assert_eq!(first.errors_on("liquid").unwrap().change_since_first(), None);
         assert!((held_out.change_from_parent().unwrap() + 1.0 / 3.0).abs() < 1e-12);
         assert_eq!((versions.core_hours_until(0), versions.core_hours_until(3)), (0.0, 1.5));
     }

@@ -68,7 +68,7 @@ pub fn table(versions: &CampaignVersions) -> String {
                 decimals(energy.map(|error| 1000.0 * error), 1),
                 decimals(set.force_mae(), 4),
                 percent(set.change_from_parent()),
-                percent(versions.change_since_first(set).filter(|_| version.number > 0)),
+                percent(set.change_since_first()),
             ]);
         }
     }
@@ -99,6 +99,7 @@ pub mod tests {
             name: name.into(),
             kind: kind.into(),
             structures,
+            first: parent.and_then(|_| figures(if kind == "test" { 0.2 } else { 0.4 })),
             parent: parent.and_then(figures),
             version: figures(version),
         };
@@ -148,7 +149,7 @@ pub mod tests {
         assert_eq!(rows.len(), 8, "{text}");
         assert_eq!(rows[0], ["0", "0", "liquid", "5", "10.0", "0.2000", "–", "–"]);
         assert_eq!(rows[2], ["1", "40", "liquid", "5", "10.0", "0.1000", "-50", "-50"]);
-        assert_eq!(rows[5], ["2", "refused", "80", "held_out", "20", "10.0", "0.8000", "+300", "–"]);
+        assert_eq!(rows[5], ["2", "refused", "80", "held_out", "20", "10.0", "0.8000", "+300", "+100"]);
         // It rises, and is there all the same.
         assert_eq!(rows[6], ["3", "120", "liquid", "5", "10.0", "0.2500", "+150", "+25"]);
         let line = in_force(&versions, versions.in_force().unwrap());

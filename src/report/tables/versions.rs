@@ -51,14 +51,12 @@ pub fn errors(found: &CampaignVersions) -> PageTable {
         "change from version 0 (%)",
     ];
     let caption = "Errors of each version on each data set, refused ones included, and the changes of its force MAE relative to the \
-                   version from which it was trained, on the same structures, and relative to version 0, where that was evaluated \
-                   on as many structures. Held-out sets grow with the campaign.";
+                   version from which it was trained and to version 0, on the same structures. Held-out sets grow with the campaign.";
     let mut table = PageTable::new("version-errors", caption, &titles);
     for version in &found.all {
         let state = if version.is_registered() { "" } else { " (refused)" };
         for set in &version.errors {
             let VersionSetErrors { name, structures, version: errors, .. } = set;
-            let since_first = found.change_since_first(set).filter(|_| version.number > 0);
             table.rows.push(vec![
                 text(format!("{}{state}", version.number)),
                 text(name),
@@ -68,7 +66,7 @@ pub fn errors(found: &CampaignVersions) -> PageTable {
                 real(errors.and_then(|errors| errors.force_rmse), 4),
                 real(errors.and_then(|errors| errors.stress_mae), 6),
                 percent(set.change_from_parent()),
-                percent(since_first),
+                percent(set.change_since_first()),
             ]);
         }
     }

@@ -27,15 +27,9 @@ function errors(all) {
   const rows = all.flatMap((one) => one.errors.map((set) => {
     const { energy_mae: energy, force_mae: force, force_rmse: rmse, stress_mae: stress } = set.version ?? {};
     return [whole(one.number), set.name, whole(set.structures), energy == null ? null : decimals(1000 * energy, 1), decimals(force, 4),
-      decimals(rmse, 4), digits(stress), change(set.parent?.force_mae, force), one.number > 0 ? change(first(all, set)?.force_mae, force) : null];
+      decimals(rmse, 4), digits(stress), change(set.parent?.force_mae, force), change(set.first?.force_mae, force)];
   }));
   return table("Errors by version and data set", ERRORS, rows);
-}
-
-/** The errors of version 0, if it was evaluated on the same structures. */
-function first(all, { name, kind, structures }) {
-  const found = all.find((one) => one.number === 0)?.errors.find((set) => set.name === name);
-  return found?.kind === kind && found.structures === structures ? found.version : null;
 }
 
 /** A relative change in per cent, with its sign. */
