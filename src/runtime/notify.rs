@@ -6,6 +6,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use monitor::Snapshot;
+use monitor::end_reason::CampaignEnd;
 use monitor::mixture_values::MixtureValues;
 use monitor::versions::CampaignVersions;
 use serde::Deserialize;
@@ -87,8 +88,11 @@ impl<'a> Notifier<'a> {
         let mut status = self.store.status().await?;
         let values = MixtureValues(self.store.values().await?);
         let versions = CampaignVersions::read(self.store, &status, &values.0).await?;
-        // Other walks may follow those of this version of the potential.
-        status.finished &= is_last || !self.has_refits;
+        if self.has_refits {
+            // Other walks may follow those of this version of the potential.
+            let is_over = is_last && CampaignEnd::read(self.store, &status).await?.is_some();
+            status.finished &= is_over;
+        }
         let mut due = self.tracker.check(&status, unix_milliseconds());
         due.extend(self.tracker.check_versions(&versions));
         if let Ok(measured) = ForgettingMeasurement::deserialize(values.training_frames()) {

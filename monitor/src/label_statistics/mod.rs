@@ -3,12 +3,15 @@
 
 mod json;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
 use serde_json::Value;
-use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Protocol, Store, StoreError};
+use store::{
+    AtomGrades, ExportFilter, ExportRow, ExportSource, FinishedCandidate, Protocol, Store, StoreError,
+    WalkVersions,
+};
 use wire::{ContentHash, Origin};
 
 use crate::energy_errors::{EnergyErrors, ProtocolEnergyOffsets};
@@ -90,30 +93,7 @@ pub async fn read(
         let page = store.labelled(&filter, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = Some(last.cursor);
-        for row in &page {
-            let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
-            let forces = block.view().forces;
-            let errors = forces.iter().zip(&row.label.forces).map(|(model, label)| norm(sub(*model, *label)));
-            let errors: Vec<_> = errors.collect();
-            let id = block.view().id();
-            let (of, is_shared) = (versions.of(id.walk.0), shared.contains(&id.content));
-            if !versions.is_single() && !(is_shared && *origin == Origin::Control) {
-                statistics.of_version(of).labelled(original, &errors);
-            }
-            if of != version {
-                continue;
-            }
-            match (is_shared, *origin) {
-                (false, origin) => statistics.for_origin(origin, |grades| grades.labelled(original, &errors)),
-                (true, Origin::Biased) => {
-                    statistics.shared += 1;
-                    statistics.all.labelled(original, &errors);
-                }
-                // Counted with the biased walk.
-                (true, Origin::Control) => continue,
-            }
-            statistics.energies.add(&row.structure, block.view().energy(), row.label.energy);
-        }
+        page.iter().for_each(|row| statistics.labelled(row, (&versions, version), &shared));
     }
     let mut after = 0;
     loop {
@@ -135,6 +115,38 @@ impl LabelStatistics {
     fn for_origin(&mut self, origin: Origin, mut change: impl FnMut(&mut ErrorsByGrade)) {
         let of_origin = if origin == Origin::Biased { &mut self.biased } else { &mut self.control };
         [&mut self.all, of_origin].into_iter().for_each(&mut change);
+    }
+
+    /// Adds a labelled structure if its walk had `version`. `shared`: structures that walks of both origins found.
+    fn labelled(
+        &mut self,
+        row: &ExportRow,
+        (versions, version): (&WalkVersions, u32),
+        shared: &HashSet<ContentHash>,
+    ) {
+        let ExportSource::Candidate { origin, block, original, .. } = &row.source else { return };
+        let view = block.view();
+        let errors = view.forces.iter().zip(&row.label.forces);
+        let errors: Vec<_> = errors.map(|(model, label)| norm(sub(*model, *label))).collect();
+        let (of, is_shared) = (versions.of(view.id().walk.0), shared.contains(&view.id().content));
+        if is_shared && *origin == Origin::Control {
+            // Counted with the biased walk.
+            return;
+        }
+        if !versions.is_single() {
+            self.of_version(of).labelled(original, &errors);
+        }
+        if of != version {
+            return;
+        }
+        match is_shared {
+            false => self.for_origin(*origin, |grades| grades.labelled(original, &errors)),
+            true => {
+                self.shared += 1;
+                self.all.labelled(original, &errors);
+            }
+        }
+        self.energies.add(&row.structure, view.energy(), row.label.energy);
     }
 
     fn of_version(&mut self, version: u32) -> &mut ErrorsByGrade {
