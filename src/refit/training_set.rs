@@ -1,6 +1,7 @@
 //! The labels of a campaign as files: to train on, to judge with, and to compare with.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -150,10 +151,10 @@ pub async fn write(
         for row in page {
             let Some(kind) = sorter.file(&row, after) else { continue };
             let path = directory.join(kind.name());
-            if !files.contains_key(&kind) {
-                files.insert(kind, AtomicFile::create(&path)?);
-            }
-            let Some(file) = files.get_mut(&kind) else { continue };
+            let file = match files.entry(kind) {
+                Entry::Occupied(file) => file.into_mut(),
+                Entry::Vacant(place) => place.insert(AtomicFile::create(&path)?),
+            };
             if let (LabelFile::Training, ExportCursor::Candidate(decision)) = (kind, row.cursor) {
                 found.trained_on.push(decision);
             }
