@@ -3,22 +3,19 @@
 mod data;
 mod display;
 mod figure;
+mod fine_tuning;
+mod model_file;
+mod outputs;
 mod report;
 
-use std::fs::{self, File};
-use std::io::{self, Write};
-use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use ::upfit::{CosineDecay, LossSettings, TrainingData, UpfitError, UpfitSettings};
-use figures::to_svg;
-use potentials::grace::TrainableGrace;
+use ::upfit::{CosineDecay, LossSettings, UpfitError, UpfitSettings};
 
-use self::data::{DataFile, read_frames};
 use self::display::TrainingDisplay;
+use self::fine_tuning::{FineTuned, FineTuning, fine_tune};
 use super::{CommandError, ExitStatus};
-use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
-use crate::output::{count, print, print_json, print_stderr};
+use crate::output::{print, print_json, print_stderr};
 use crate::signals::stop_token;
 use crate::structure_files::{StructureReadingArgs, file_weight};
 
@@ -121,37 +118,16 @@ enum LossName {
 
 impl UpfitArgs {
     pub fn run(self) -> Result<ExitStatus, CommandError> {
-        let checkpoint = self.checkpoint_path();
-        self.check_outputs(&checkpoint)?;
-        let model = TrainableGrace::load(&self.model).map_err(CommandError::input)?;
-        let (data, files) = self.read_data()?;
-        let settings = self.settings();
-        let note = report::note((&self.model, &model), &data, &files, &settings);
+        let request = self.request()?;
         let stop = stop_token()?;
-        let mut display = TrainingDisplay::new(&checkpoint);
-        let trained = ::upfit::run(model, &data, &settings, Some(&checkpoint), |event| {
-            display.show(&event);
-            if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-        });
+        let mut display = TrainingDisplay::new(&request.checkpoint);
+        let trained = fine_tune(&request, &stop, |event| display.show(event));
         drop(display);
-        let Some(outcome) = trained.map_err(command_error)? else {
-            print_stderr(format_args!("stopped; the same command continues from {}", checkpoint.display()));
+        let Some(FineTuned { outcome, note }) = trained? else {
+            let checkpoint = request.checkpoint.display();
+            print_stderr(format_args!("stopped; the same command continues from {checkpoint}"));
             return Ok(ExitStatus::Interrupted);
         };
-        if let Some(path) = &self.figure {
-            let mut file = AtomicFile::create(path)?;
-            let text = to_svg(&figure::learning_curves(&outcome.history));
-            file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
-            file.finish()?;
-        }
-        write_model(&outcome.model, &self.output, &note.to_string())?;
-        // Without the model, the checkpoint would be needed.
-        match fs::remove_file(&checkpoint) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                return Err(cannot_write(&checkpoint, error));
-            }
-            _ => {}
-        }
         if self.json {
             print_json(&report::to_json(&outcome, &note, &self.output))?;
         } else {
@@ -160,54 +136,29 @@ impl UpfitArgs {
         Ok(ExitStatus::Done)
     }
 
+    /// What the arguments ask for.
+    fn request(&self) -> Result<FineTuning, CommandError> {
+        let mut data = self.reading.files(&self.data)?;
+        data.set_weights(&self.weight)?;
+        let is_named = !self.validation.is_empty();
+        Ok(FineTuning {
+            model: self.model.clone(),
+            data,
+            validation: is_named.then(|| self.reading.files(&self.validation)).transpose()?,
+            validation_share: self.validation_share,
+            settings: self.settings(),
+            output: self.output.clone(),
+            checkpoint: self.checkpoint_path(),
+            figure: self.figure.clone(),
+        })
+    }
+
     fn checkpoint_path(&self) -> PathBuf {
         self.checkpoint.clone().unwrap_or_else(|| {
             let mut name = self.output.clone().into_os_string();
             name.push(".upfit");
             name.into()
         })
-    }
-
-    /// Finds errors in paths before hours of work.
-    fn check_outputs(&self, checkpoint: &Path) -> Result<(), CommandError> {
-        let outputs = || [self.output.as_path(), checkpoint].into_iter().chain(self.figure.as_deref());
-        let data = self.data.iter().map(|path| (path.as_path(), "a file of training data"));
-        let validation = self.validation.iter().map(|path| (path.as_path(), "a file of validation data"));
-        let inputs: Vec<_> =
-            std::iter::once((self.model.as_path(), "the model")).chain(data).chain(validation).collect();
-        for (number, output) in outputs().enumerate() {
-            refuse_to_replace(output, inputs.iter().copied())?;
-            if outputs().take(number).any(|other| other == output) {
-                return Err(CommandError::Input(format!("{}: named for two outputs", output.display())));
-            }
-            AtomicFile::create(output).map(drop)?;
-        }
-        Ok(())
-    }
-
-    /// Both sets, and the files that they come from.
-    fn read_data(&self) -> Result<(TrainingData, Vec<DataFile>), CommandError> {
-        let mut files = self.reading.files(&self.data)?;
-        files.set_weights(&self.weight)?;
-        let (frames, mut sources) = read_frames(&files, false)?;
-        let data = if self.validation.is_empty() {
-            ::upfit::split(frames, self.validation_share, self.rng_seed).map_err(command_error)?
-        } else {
-            let (validation, others) = read_frames(&self.reading.files(&self.validation)?, true)?;
-            sources.extend(others);
-            TrainingData { training: frames, validation }
-        };
-        if self.patience.is_some() && data.validation.is_empty() {
-            let message = "--patience: expected a validation set, not --validation-share 0";
-            return Err(CommandError::input(message));
-        }
-        let [training, validation] = [data.training.len(), data.validation.len()];
-        print_stderr(format_args!(
-            "{} to train with, {} for validation",
-            count(training as u64, "structure"),
-            count(validation as u64, "structure")
-        ));
-        Ok((data, sources))
     }
 
     fn settings(&self) -> UpfitSettings {
@@ -241,27 +192,6 @@ impl UpfitArgs {
 /// Wrong input: exit code 2; failures on the way: exit code 1.
 fn command_error(error: UpfitError) -> CommandError {
     if error.is_wrong_input() { CommandError::input(error) } else { CommandError::failed(error) }
-}
-
-/// Writes the model to a file beside its target first, so that the target appears complete or not at all.
-fn write_model(model: &TrainableGrace, output: &Path, note: &str) -> Result<(), CommandError> {
-    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
-    let mut builder = tempfile::Builder::new();
-    let part = builder.prefix(".upfit.").suffix(".part").tempfile_in(parent.unwrap_or(Path::new(".")));
-    let part = part.map_err(|error| cannot_write(output, error))?.into_temp_path();
-    model.write(&part, note).map_err(|error| cannot_write(output, error))?;
-    // The checkpoint is removed afterwards, so the model must be readable.
-    let written = TrainableGrace::load(&part).map_err(CommandError::failed)?;
-    if written.weights() != model.weights() {
-        return Err(CommandError::Failed(format!(
-            "{}: the model was not written as it is",
-            output.display()
-        )));
-    }
-    let mut file = AtomicFile::create(output)?;
-    let copied = File::open(&part).and_then(|mut written| io::copy(&mut written, &mut file));
-    copied.map_err(|error| cannot_write(output, error))?;
-    file.finish()
 }
 
 fn number(text: &str, is_valid: impl Fn(f64) -> bool, expected: &str) -> Result<f64, String> {

@@ -5,14 +5,15 @@
 //! sums, which are added in the order of the frames, and random numbers are a function of random seed and epoch.
 
 mod adam;
+mod batch_gradient;
 mod checkpoint;
 mod data;
 mod differences;
 mod energy_zero;
-mod epoch;
 mod error;
 mod evaluation;
 mod frozen;
+mod identity;
 mod learning_rate;
 mod loss;
 mod parallel;

@@ -3,6 +3,7 @@
 use super::*;
 use crate::learning_rate::CosineDecay;
 use crate::loss::LossSettings;
+use crate::progress::ErrorsBySet;
 use crate::split::split;
 use crate::test_frames::{aluminium, model, settings, stronger};
 

@@ -1,0 +1,92 @@
+//! The start of a training: the zero of the energies, and the errors before the first update.
+
+use analysis::LabelledEnergy;
+
+use super::Trainer;
+use crate::adam::AdamState;
+use crate::checkpoint::{BestWeights, TrainingState};
+use crate::data::{FrameFault, MAX_ENERGY_DIFFERENCE};
+use crate::differences::FrameDifferences;
+use crate::energy_zero::EnergyZero;
+use crate::error::UpfitError;
+use crate::evaluation::{EvaluatedFrame, first_not_finite, sum};
+use crate::prepared::PreparedFrame;
+use crate::progress::ErrorsBySet;
+
+impl<'a> Trainer<'a> {
+    /// Moves the zero of the energies and validates the weights with which the training begins.
+    pub(super) fn begin(&mut self) -> Result<TrainingState, UpfitError> {
+        let mut training = self.evaluate(&self.training)?;
+        let mut validation = self.evaluate_some(&self.validation)?;
+        let none = Vec::new();
+        let validated = validation.as_ref().unwrap_or(&none);
+        for (frames, evaluated) in [(&self.training, &training), (&self.validation, validated)] {
+            if let Some(frame) = first_not_finite(frames, evaluated) {
+                return Err(frame.wrong(FrameFault::ModelNotFinite));
+            }
+        }
+        let zero = self.find_zero(&training, validated)?;
+        let mut weights = self.model.weights().to_vec();
+        zero.apply(&mut weights, self.model.groups(), self.model.model().elements())?;
+        if !zero.shifts.is_empty() {
+            self.model.set_weights(&weights);
+            training = self.evaluate(&self.training)?;
+            validation = self.evaluate_some(&self.validation)?;
+        }
+        Ok(self.first_state(weights, zero, &sum(&training), validation.map(|found| sum(&found))))
+    }
+
+    fn first_state(
+        &self,
+        weights: Vec<f64>,
+        zero: EnergyZero,
+        training: &FrameDifferences,
+        validation: Option<FrameDifferences>,
+    ) -> TrainingState {
+        let ((stage, of_first), (_, of_last)) = (self.stage(0), self.stage(self.settings.epochs));
+        let best = validation.map(|sums| BestWeights {
+            epoch: 0,
+            stage,
+            loss: sums.loss(&of_first),
+            weights: weights.clone(),
+        });
+        let validation = validation.map(|sums| sums.errors(&of_last));
+        TrainingState {
+            epoch: 0,
+            batch: 0,
+            average: self.settings.average.map(|_| weights.clone()),
+            adam: AdamState::new(weights.len()),
+            running: FrameDifferences::default(),
+            best,
+            weights,
+            history: Vec::new(),
+            zero,
+            before: ErrorsBySet { training: training.errors(&of_last), validation },
+        }
+    }
+
+    /// The shifts that move the model's zero to that of the training set. Refuses energies that remain far away.
+    fn find_zero(
+        &self,
+        training: &[EvaluatedFrame],
+        validation: &[EvaluatedFrame],
+    ) -> Result<EnergyZero, UpfitError> {
+        let labelled = |(prepared, evaluated): (&PreparedFrame<'a>, &EvaluatedFrame)| LabelledEnergy {
+            composition: prepared.frame.composition(),
+            model: evaluated.energy,
+            label: prepared.frame.energy,
+        };
+        let energies: Vec<_> = self.training.iter().zip(training).map(labelled).collect();
+        let zero = EnergyZero::find(&energies)?;
+        let validated = self.validation.iter().zip(validation).map(labelled);
+        let frames = self.training.iter().chain(&self.validation);
+        for (prepared, energy) in frames.zip(energies.into_iter().chain(validated)) {
+            let shift = zero.of(&energy.composition);
+            let difference = (energy.label - energy.model - shift) / prepared.frame.structure.len() as f64;
+            if difference.abs() > MAX_ENERGY_DIFFERENCE {
+                return Err(prepared.frame.wrong(FrameFault::FarEnergy { difference }));
+            }
+        }
+        Ok(zero)
+    }
+}

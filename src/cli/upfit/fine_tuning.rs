@@ -1,0 +1,116 @@
+//! A training from files to a file: reads the data, trains, and writes model and figure.
+
+use std::fs;
+use std::io::{self, Write};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use ::upfit::{TrainingData, TrainingEvent, UpfitOutcome, UpfitSettings};
+use figures::to_svg;
+use potentials::grace::TrainableGrace;
+use serde_json::Value;
+use tokio_util::sync::CancellationToken;
+
+use super::data::{DataFile, read_frames};
+use super::model_file::write_model;
+use super::outputs::check_outputs;
+use super::{command_error, figure, report};
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::cli::CommandError;
+use crate::output::{count, print_stderr};
+use crate::structure_files::StructureFiles;
+
+/// What to train, with which data, and where results go.
+pub struct FineTuning {
+    /// The GRACE model.
+    pub model: PathBuf,
+    /// Labelled structures.
+    pub data: StructureFiles,
+    /// Structures to validate with. Without them, a share of `data` is held out.
+    pub validation: Option<StructureFiles>,
+    /// That share, 0 up to, not including, 1.
+    pub validation_share: f64,
+    /// How to train.
+    pub settings: UpfitSettings,
+    /// File for the new model.
+    pub output: PathBuf,
+    /// File of the state, which is removed at the end.
+    pub checkpoint: PathBuf,
+    /// File for the learning curves.
+    pub figure: Option<PathBuf>,
+}
+
+/// A training whose model is written.
+pub struct FineTuned {
+    pub outcome: UpfitOutcome,
+    /// Where the weights come from, as it stands in the model.
+    pub note: Value,
+}
+
+/// Trains, from the checkpoint if there is one, and writes the results. Returns `None` if `stop` was cancelled; then the same call
+/// continues.
+///
+/// # Errors
+/// Wrong files, data or settings; a training that fails; a file that cannot be written.
+pub fn fine_tune(
+    request: &FineTuning,
+    stop: &CancellationToken,
+    mut show: impl FnMut(&TrainingEvent<'_>),
+) -> Result<Option<FineTuned>, CommandError> {
+    let FineTuning { settings, checkpoint, .. } = request;
+    check_outputs(request)?;
+    let model = TrainableGrace::load(&request.model).map_err(CommandError::input)?;
+    let (data, files) = read_data(request)?;
+    let note = report::note((&request.model, &model), &data, &files, settings);
+    let trained = ::upfit::run(model, &data, settings, Some(checkpoint), |event| {
+        show(&event);
+        if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    let Some(outcome) = trained.map_err(command_error)? else { return Ok(None) };
+    if let Some(path) = &request.figure {
+        write_curves(path, &outcome)?;
+    }
+    write_model(&outcome.model, &request.output, &note.to_string())?;
+    // Without the model, the checkpoint would be needed.
+    remove(checkpoint)?;
+    Ok(Some(FineTuned { outcome, note }))
+}
+
+/// Both sets, and the files that they come from.
+fn read_data(request: &FineTuning) -> Result<(TrainingData, Vec<DataFile>), CommandError> {
+    let settings = &request.settings;
+    let (frames, mut sources) = read_frames(&request.data, false)?;
+    let data = match &request.validation {
+        None => ::upfit::split(frames, request.validation_share, settings.seed).map_err(command_error)?,
+        Some(files) => {
+            let (validation, others) = read_frames(files, true)?;
+            sources.extend(others);
+            TrainingData { training: frames, validation }
+        }
+    };
+    if settings.patience.is_some() && data.validation.is_empty() {
+        let message = "--patience: expected a validation set, not --validation-share 0";
+        return Err(CommandError::input(message));
+    }
+    let [training, validation] = [data.training.len(), data.validation.len()];
+    print_stderr(format_args!(
+        "{} to train with, {} for validation",
+        count(training as u64, "structure"),
+        count(validation as u64, "structure")
+    ));
+    Ok((data, sources))
+}
+
+fn write_curves(path: &Path, outcome: &UpfitOutcome) -> Result<(), CommandError> {
+    let mut file = AtomicFile::create(path)?;
+    let text = to_svg(&figure::learning_curves(&outcome.history));
+    file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
+    file.finish()
+}
+
+fn remove(file: &Path) -> Result<(), CommandError> {
+    match fs::remove_file(file) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(cannot_write(file, error)),
+        _ => Ok(()),
+    }
+}
