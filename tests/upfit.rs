@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
+use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::Stdio;
 use std::sync::Arc;
@@ -277,7 +278,19 @@ fn wrong_arguments_are_refused_before_any_work() {
     wrong(&["--validation", "missing.extxyz"], "missing.extxyz: cannot be opened");
     wrong(&and(&["--weight", "other.extxyz=2"]), "--weight other.extxyz: expected one of the files");
     wrong(&and(&["--figure", "data.extxyz"]), "data.extxyz is a file of training data");
-    wrong(&and(&["--figure", "out.npz"]), "out.npz: named for two outputs");
+    wrong(&and(&["--figure", "out.npz"]), "out.npz and out.npz: one file is named for two outputs");
+    wrong(&and(&["--figure", "./out.npz"]), "./out.npz and out.npz: one file is named for two outputs");
+    wrong(
+        &["--validation", "./data.extxyz"],
+        "./data.extxyz, a file of validation data, is the same file as data.extxyz, a file of training data",
+    );
+    symlink("data.extxyz", here.join("link.extxyz")).unwrap();
+    wrong(&["--validation", "link.extxyz"], "link.extxyz, a file of validation data, is the same file");
+    let linked = here.join("link.npz");
+    symlink(config(MODEL), &linked).unwrap();
+    let message = refuse(here, arguments("link.npz", &whole));
+    assert!(message.contains("link.npz is the model"), "{message}");
+    fs::remove_file(linked).unwrap();
     fs::write(here.join("notes.txt"), "no checkpoint").unwrap();
     let output = calmwalk(here, arguments("out.npz", &and(&["--checkpoint", "notes.txt"])));
     assert_eq!(output.status.code(), Some(1));

@@ -5,7 +5,7 @@ mod display;
 mod figure;
 mod fine_tuning;
 mod model_file;
-mod outputs;
+mod paths;
 mod report;
 
 use std::path::PathBuf;
@@ -49,7 +49,7 @@ pub struct UpfitArgs {
     /// Passes over the training set
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     epochs: u64,
-    /// Validate with the structures of this file, and train with all of DATA; may be repeated
+    /// Validate with the structures of this file, which is none of DATA, and train with all of DATA; may be repeated
     #[arg(long, value_name = "FILE", conflicts_with = "validation_share")]
     validation: Vec<PathBuf>,
     /// Share of the structures of DATA for validation, whole seed structures only; 0: none, then the last weights are written

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::data::{DataFile, read_frames};
 use super::model_file::write_model;
-use super::outputs::check_outputs;
+use super::paths::check_paths;
 use super::{command_error, figure, report};
 use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::cli::CommandError;
@@ -58,7 +58,7 @@ pub fn fine_tune(
     mut show: impl FnMut(&TrainingEvent<'_>),
 ) -> Result<Option<FineTuned>, CommandError> {
     let FineTuning { settings, checkpoint, .. } = request;
-    check_outputs(request)?;
+    check_paths(request)?;
     let model = TrainableGrace::load(&request.model).map_err(CommandError::input)?;
     let (data, files) = read_data(request)?;
     let note = report::note((&request.model, &model), &data, &files, settings);
