@@ -270,7 +270,10 @@ fn wrong_arguments_are_refused_before_any_work() {
     let whole = ["--validation-share", "0"];
     let and = |more: &'static [&'static str]| [&whole[..], more].concat();
     // Both frames belong to one seed structure.
-    wrong(&["--validation-share", "0.5"], "the validation set is empty");
+    wrong(
+        &["--validation-share", "0.5"],
+        "2 structures belong to one seed structure, fcc; expected at least 2",
+    );
     wrong(&and(&["--freeze", "no_such_weights"]), "begins with 'no_such_weights'; it has ");
     wrong(&and(&["--patience", "3"]), "--patience: expected a validation set");
     wrong(&and(&["--min-learning-rate", "1"]), "the smallest learning rate is 1");
