@@ -277,6 +277,8 @@ fn wrong_arguments_are_refused_before_any_work() {
     wrong(&and(&["--freeze", "no_such_weights"]), "begins with 'no_such_weights'; it has ");
     wrong(&and(&["--patience", "3"]), "--patience: expected a validation set");
     wrong(&and(&["--min-learning-rate", "1"]), "the smallest learning rate is 1");
+    wrong(&and(&["--epochs", "0"]), "--epochs");
+    wrong(&and(&["--epochs", "1", "--loss", "paper"]), "stage 2 of the loss begins after a share of 0.417");
     wrong(&["--validation-share", "1"], "up to, not including, 1");
     wrong(&["--validation", "missing.extxyz"], "missing.extxyz: cannot be opened");
     wrong(&and(&["--weight", "other.extxyz=2"]), "--weight other.extxyz: expected one of the files");

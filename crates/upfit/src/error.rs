@@ -18,6 +18,19 @@ pub enum UpfitError {
         /// The valid values.
         expected: &'static str,
     },
+    /// A stage of the loss without epochs.
+    #[error(
+        "stage {stage} of the loss begins after a share of {begins:.3} of {epochs} epochs and has none; expected at least one epoch \
+         for each stage: train for more epochs"
+    )]
+    StageWithoutEpochs {
+        /// The stage, from 1.
+        stage: usize,
+        /// Share of the epochs after which it begins.
+        begins: f64,
+        /// Number of epochs.
+        epochs: u64,
+    },
     /// A labelled structure that cannot be used.
     #[error("{place}: {fault}")]
     Frame {
