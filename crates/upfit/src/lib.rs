@@ -7,8 +7,10 @@
 mod adam;
 mod batch_gradient;
 mod checkpoint;
+mod collinearity;
 mod data;
 mod differences;
+mod energy_deviations;
 mod energy_zero;
 mod error;
 mod evaluation;
@@ -26,6 +28,7 @@ mod test_frames;
 mod trainer;
 
 pub use data::{FrameFault, LabelledFrame, MAX_ENERGY_DIFFERENCE, MAX_FORCE, TrainingData, data_hash};
+pub use energy_deviations::{EnergyDeviations, FarStructure};
 pub use energy_zero::{ElementShift, EnergyZero, EnergyZeroFault};
 pub use error::UpfitError;
 pub use learning_rate::CosineDecay;

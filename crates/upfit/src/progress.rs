@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::energy_deviations::EnergyDeviations;
 use crate::energy_zero::EnergyZero;
 
 /// Errors of a model on a set of structures: mean absolute (MAE) and root mean square (RMSE).
@@ -77,6 +78,8 @@ pub enum TrainingEvent<'a> {
         resumed: Option<u64>,
         /// How the zero of the energies was moved.
         zero: &'a EnergyZero,
+        /// How the labels' energies differ from the model's after it was moved.
+        spread: &'a EnergyDeviations,
         /// Errors before the first update.
         before: &'a ErrorsBySet,
     },

@@ -58,7 +58,8 @@ pub fn run(
     };
     trainer.model.set_weights(&state.weights);
     trainer.resumed_updates = state.adam.steps();
-    let begun = TrainingEvent::Begun { resumed, zero: &state.zero, before: &state.before };
+    let begun =
+        TrainingEvent::Begun { resumed, zero: &state.zero, spread: &state.spread, before: &state.before };
     let mut flow = on_event(begun);
     while flow.is_continue() && !trainer.is_over(&state) {
         flow = trainer.train_epoch(&mut state, &mut on_event)?;

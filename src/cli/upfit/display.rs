@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use ::upfit::{EpochRecord, TrainingEvent, UpdateProgress};
 
-use super::report::zero_text;
-use crate::output::{Bar, count, print_stderr};
+use super::report::{spread_text, zero_text};
+use crate::output::{Bar, count, log_and_warn, print_stderr};
 
 /// Time between two lines within an epoch.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
@@ -29,7 +29,7 @@ impl TrainingDisplay {
     /// Shows an event.
     pub fn show(&mut self, event: &TrainingEvent<'_>) {
         match event {
-            TrainingEvent::Begun { resumed, zero, .. } => {
+            TrainingEvent::Begun { resumed, zero, spread, .. } => {
                 if let Some(epochs) = resumed {
                     let (path, epochs) = (self.checkpoint.display(), count(*epochs, "epoch"));
                     self.bar.suspend(|| {
@@ -38,6 +38,9 @@ impl TrainingDisplay {
                 }
                 if let Some(text) = zero_text(zero) {
                     self.bar.suspend(|| print_stderr(text));
+                }
+                if let Some(text) = spread_text(spread) {
+                    self.bar.suspend(|| log_and_warn(text));
                 }
             }
             TrainingEvent::Update(progress) => self.show_update(progress),

@@ -4,6 +4,7 @@ use potentials::grace::TrainableGrace;
 
 use super::Trainer;
 use crate::checkpoint::TrainingState;
+use crate::energy_deviations::EnergyDeviations;
 use crate::energy_zero::EnergyZero;
 use crate::error::UpfitError;
 use crate::evaluation::{first_not_finite, sum};
@@ -15,6 +16,8 @@ pub struct UpfitOutcome {
     pub model: TrainableGrace,
     /// How the zero of the energies was moved.
     pub zero: EnergyZero,
+    /// How the labels' energies differ from those of the model before the first update.
+    pub spread: EnergyDeviations,
     /// Errors before the first update, with the loss of the last stage.
     pub before: ErrorsBySet,
     /// Errors of the model, with the same loss.
@@ -63,6 +66,7 @@ impl Trainer<'_> {
         Ok(UpfitOutcome {
             model: self.model,
             zero: state.zero,
+            spread: state.spread,
             before: state.before,
             after,
             history: state.history,

@@ -7,6 +7,7 @@ use crate::adam::AdamState;
 use crate::checkpoint::{BestWeights, TrainingState};
 use crate::data::{FrameFault, MAX_ENERGY_DIFFERENCE};
 use crate::differences::FrameDifferences;
+use crate::energy_deviations::EnergyDeviations;
 use crate::energy_zero::EnergyZero;
 use crate::error::UpfitError;
 use crate::evaluation::{EvaluatedFrame, first_not_finite, sum};
@@ -25,7 +26,7 @@ impl<'a> Trainer<'a> {
                 return Err(frame.wrong(FrameFault::ModelNotFinite));
             }
         }
-        let zero = self.find_zero(&training, validated)?;
+        let (zero, spread) = self.find_zero(&training, validated)?;
         let mut weights = self.model.weights().to_vec();
         zero.apply(&mut weights, self.model.groups(), self.model.model().elements())?;
         if !zero.shifts.is_empty() {
@@ -33,13 +34,14 @@ impl<'a> Trainer<'a> {
             training = self.evaluate(&self.training)?;
             validation = self.evaluate_some(&self.validation)?;
         }
-        Ok(self.first_state(weights, zero, &sum(&training), validation.map(|found| sum(&found))))
+        let state = self.first_state(weights, &sum(&training), validation.map(|found| sum(&found)));
+        Ok(TrainingState { zero, spread, ..state })
     }
 
+    /// The state before the first update, but for the zero of the energies.
     fn first_state(
         &self,
         weights: Vec<f64>,
-        zero: EnergyZero,
         training: &FrameDifferences,
         validation: Option<FrameDifferences>,
     ) -> TrainingState {
@@ -60,17 +62,19 @@ impl<'a> Trainer<'a> {
             best,
             weights,
             history: Vec::new(),
-            zero,
+            zero: EnergyZero::default(),
+            spread: EnergyDeviations::default(),
             before: ErrorsBySet { training: training.errors(&of_last), validation },
         }
     }
 
-    /// The shifts that move the model's zero to that of the training set. Refuses energies that remain far away.
+    /// The shifts that move the model's zero to that of the training set, and how the energies of all structures differ after them.
+    /// Refuses energies that remain far away.
     fn find_zero(
         &self,
         training: &[EvaluatedFrame],
         validation: &[EvaluatedFrame],
-    ) -> Result<EnergyZero, UpfitError> {
+    ) -> Result<(EnergyZero, EnergyDeviations), UpfitError> {
         let labelled = |(prepared, evaluated): (&PreparedFrame<'a>, &EvaluatedFrame)| LabelledEnergy {
             composition: prepared.frame.composition(),
             model: evaluated.energy,
@@ -80,13 +84,15 @@ impl<'a> Trainer<'a> {
         let zero = EnergyZero::find(&energies)?;
         let validated = self.validation.iter().zip(validation).map(labelled);
         let frames = self.training.iter().chain(&self.validation);
+        let mut differences = Vec::new();
         for (prepared, energy) in frames.zip(energies.into_iter().chain(validated)) {
             let shift = zero.of(&energy.composition);
             let difference = (energy.label - energy.model - shift) / prepared.frame.structure.len() as f64;
             if difference.abs() > MAX_ENERGY_DIFFERENCE {
                 return Err(prepared.frame.wrong(FrameFault::FarEnergy { difference }));
             }
+            differences.push((prepared.frame.place.as_str(), difference));
         }
-        Ok(zero)
+        Ok((zero, EnergyDeviations::new(&differences)))
     }
 }

@@ -125,6 +125,22 @@ fn broken_labels_are_named() {
 }
 
 #[test]
+fn a_structure_whose_energy_has_another_zero_is_named() {
+    let mut data = TrainingData { training: aluminium(5), validation: Vec::new() };
+    data.training[3].energy += 5.0 * 108.0;
+    let mut named = Vec::new();
+    let stopped = run(model(), &data, &settings(), None, |event| {
+        if let TrainingEvent::Begun { spread, zero, .. } = event {
+            assert!(zero.shifts.is_empty(), "{zero:?}");
+            named = spread.far.iter().map(|far| (far.place.clone(), far.difference.round())).collect();
+        }
+        ControlFlow::Break(())
+    });
+    assert!(matches!(stopped, Ok(None)));
+    assert_eq!(named, [(data.training[3].place.clone(), 5.0)]);
+}
+
+#[test]
 fn a_loss_that_is_not_finite_keeps_the_last_checkpoint() {
     let data = TrainingData { training: aluminium(2), validation: Vec::new() };
     let wild = UpfitSettings { learning_rate: CosineDecay { first: 1e200, last: 0.0 }, ..settings() };
