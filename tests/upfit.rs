@@ -133,7 +133,7 @@ fn tables_say_what_was_trained() {
         assert!(printed.contains(expected), "{printed}");
     }
     for expected in
-        ["2 structures to train with, 2 structures for validation", "another zero", "epoch 1: loss"]
+        ["2 structures to train with, 2 structures for validation", "another zero", "epoch 1: loss", "eV/Å³"]
     {
         assert!(progress.contains(expected), "{progress}");
     }

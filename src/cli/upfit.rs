@@ -102,7 +102,7 @@ pub struct UpfitArgs {
     /// File of the state [default: NEW.npz.upfit]
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Also draw the learning curves
+    /// Also draw the learning curves: loss, mean absolute errors and learning rate by epoch
     #[arg(long, value_name = "FILE.svg")]
     figure: Option<PathBuf>,
     /// Print JSON

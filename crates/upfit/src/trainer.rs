@@ -160,17 +160,24 @@ impl<'a> Trainer<'a> {
         made as f64 / self.begun.elapsed().as_secs_f64().max(1e-9)
     }
 
+    /// Expected time until the last epoch ends; `None` before this process has made an update.
+    fn seconds_left(&self, state: &TrainingState) -> Option<f64> {
+        let rate = Some(self.updates_per_second(state)).filter(|rate| *rate > 0.0)?;
+        Some(self.all_updates().saturating_sub(state.adam.steps()) as f64 / rate)
+    }
+
     fn progress(&self, state: &TrainingState, loss: f64) -> UpdateProgress {
-        let (updates, all_updates) = (state.adam.steps(), self.all_updates());
-        let updates_per_second = self.updates_per_second(state);
+        let (_, weights) = self.stage(state.epoch);
         UpdateProgress {
             epoch: state.epoch + 1,
             epochs: self.settings.epochs,
-            updates,
-            all_updates,
-            updates_per_second,
-            seconds_left: all_updates.saturating_sub(updates) as f64 / updates_per_second.max(1e-12),
+            updates: state.adam.steps(),
+            all_updates: self.all_updates(),
+            updates_per_second: self.updates_per_second(state),
+            seconds_left: self.seconds_left(state),
+            learning_rate: self.rate(state.adam.steps().saturating_sub(1)),
             loss,
+            errors: state.running.errors(&weights),
         }
     }
 

@@ -30,10 +30,10 @@ impl Trainer<'_> {
         }
         self.end_epoch(state)?;
         self.save_if_due(state)?;
-        Ok(state
-            .history
-            .last()
-            .map_or(ControlFlow::Continue(()), |record| on_event(TrainingEvent::Epoch(record))))
+        let seconds_left = self.seconds_left(state);
+        Ok(state.history.last().map_or(ControlFlow::Continue(()), |record| {
+            on_event(TrainingEvent::Epoch { record, seconds_left })
+        }))
     }
 
     /// Makes one update. Returns the loss of the batch before it.

@@ -78,6 +78,29 @@ fn a_training_that_is_stopped_anywhere_goes_on_to_the_same_bits() {
 }
 
 #[test]
+fn progress_has_the_errors_of_the_epoch_and_the_expected_end() {
+    let data = data();
+    let (mut updates, mut epochs) = (Vec::new(), Vec::new());
+    let outcome = run(model(), &data, &settings(), None, |event| {
+        match event {
+            TrainingEvent::Update(progress) => updates.push(progress),
+            TrainingEvent::Epoch { record, seconds_left } => {
+                epochs.push((record.errors.training, seconds_left))
+            }
+            TrainingEvent::Begun { .. } => {}
+        }
+        ControlFlow::Continue(())
+    });
+    assert!(matches!(outcome, Ok(Some(_))));
+    let structures: Vec<_> = updates.iter().map(|progress| progress.errors.structures).collect();
+    assert_eq!(structures, [2, 4, 2, 4]);
+    // After the last batch, they are those of the epoch.
+    assert_eq!((updates[1].errors, updates[3].errors), (epochs[0].0, epochs[1].0));
+    assert!(updates[0].seconds_left.unwrap() > 0.0 && updates[0].errors.stress_mae.unwrap() > 0.0);
+    assert_eq!((updates[3].seconds_left, epochs[1].1), (Some(0.0), Some(0.0)));
+}
+
+#[test]
 fn frozen_weights_stay_and_the_others_move() {
     let start = model();
     let name = start.groups()[0].name.clone();
