@@ -158,6 +158,9 @@ fn a_killed_or_stopped_training_goes_on_to_the_same_bytes() {
     signal(killed.0.id(), "KILL");
     killed.0.wait().unwrap();
     assert!(state.exists() && !here.join("out.npz").exists());
+    // A process that is killed while it writes leaves such files.
+    let parts = [".out.npz.aB3x9Z.part", ".out.npz.upfit.aB3x9Z.part"].map(|name| here.join(name));
+    parts.iter().for_each(|part| fs::write(part, "unfinished").unwrap());
 
     // Another training refuses the checkpoint.
     let message = refuse(here, arguments("out.npz", &[&more[..], &["--rng-seed", "7"]].concat()));
@@ -184,7 +187,7 @@ fn a_killed_or_stopped_training_goes_on_to_the_same_bytes() {
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     assert!(stderr(&output).contains("continuing from out.npz.upfit"), "{}", stderr(&output));
     assert!(fs::read(here.join("out.npz")).unwrap() == whole, "the models differ");
-    assert!(!state.exists());
+    assert!(!state.exists() && !parts.iter().any(|part| part.exists()));
 }
 
 #[test]

@@ -4,6 +4,7 @@ mod data;
 mod display;
 mod figure;
 mod fine_tuning;
+mod left_parts;
 mod model_file;
 mod paths;
 mod report;

@@ -17,8 +17,8 @@ use crate::energy_zero::EnergyZero;
 use crate::error::UpfitError;
 use crate::progress::{EpochRecord, ErrorsBySet};
 
-/// First line of a file.
-const FORMAT: &[u8] = b"calmwalk upfit checkpoint 2\n";
+/// First line of a file. The number grows with each change of what follows, or of what a training makes of it.
+const FORMAT: &[u8] = b"calmwalk upfit checkpoint 3\n";
 const HASH_BYTES: usize = blake3::OUT_LEN;
 
 /// The state is saved again once this many times the duration of the last time has passed: it costs at most 5 % of the time.

@@ -11,18 +11,31 @@ pub fn identity(
     data: &TrainingData,
     settings: &UpfitSettings,
 ) -> Vec<(String, String)> {
-    let mut hasher = blake3::Hasher::new();
-    for group in model.groups() {
-        hasher.update(format!("{} {:?}\n", group.name, group.shape).as_bytes());
-    }
-    for weight in model.weights() {
-        hasher.update(&weight.to_le_bytes());
-    }
     let mut entries = vec![
-        ("model (BLAKE3 of its weights)".to_owned(), hasher.finalize().to_string()),
+        ("model (BLAKE3 of its file)".to_owned(), blake3::hash(model.file_bytes()).to_string()),
         ("training set (BLAKE3)".to_owned(), data_hash(&data.training)),
         ("validation set (BLAKE3)".to_owned(), data_hash(&data.validation)),
     ];
     entries.extend(settings.entries());
     entries
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_frames::{aluminium, model, settings};
+
+    #[test]
+    fn every_number_of_the_model_file_counts() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("model.npz");
+        // The same weights, and another note.
+        model().write(&path, "a note").unwrap();
+        let other = TrainableGrace::load(&path).unwrap();
+        assert_eq!(other.weights(), model().weights());
+        let data = TrainingData { training: aluminium(1), validation: Vec::new() };
+        let [of_model, of_other] = [model(), other].map(|model| identity(&model, &data, &settings()));
+        assert_ne!(of_model[0], of_other[0]);
+        assert_eq!(of_model[1..], of_other[1..]);
+    }
 }

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::fine_tuning::FineTuning;
+use super::left_parts::remove_left_parts;
 use crate::atomic_file::{AtomicFile, refuse_to_replace};
 use crate::cli::CommandError;
 
 /// Checks that no file of structures is given twice, and that outputs can be written, and replace neither an input nor each
-/// other. Two names of one file are recognised.
+/// other. Two names of one file are recognised. Removes what a killed process left beside the outputs.
 pub fn check_paths(request: &FineTuning) -> Result<(), CommandError> {
     let FineTuning { model, data, validation, output, checkpoint, figure, .. } = request;
     let data = data.paths().map(|path| (path, "a file of training data"));
@@ -27,6 +28,7 @@ pub fn check_paths(request: &FineTuning) -> Result<(), CommandError> {
                 "{output} and {other}: one file is named for two outputs"
             )));
         }
+        remove_left_parts(output)?;
         AtomicFile::create(output).map(drop)?;
     }
     Ok(())
