@@ -9,7 +9,7 @@ mod model_file;
 mod paths;
 mod report;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use ::upfit::{CosineDecay, LossSettings, UpfitError, UpfitSettings};
 
@@ -126,8 +126,7 @@ impl UpfitArgs {
         let trained = fine_tune(&request, &stop, |event| display.show(event));
         drop(display);
         let Some(FineTuned { outcome, note }) = trained? else {
-            let checkpoint = request.checkpoint.display();
-            print_stderr(format_args!("stopped; the same command continues from {checkpoint}"));
+            print_stderr(stopped_text(&request.checkpoint));
             return Ok(ExitStatus::Interrupted);
         };
         if self.json {
@@ -188,6 +187,13 @@ impl UpfitArgs {
             patience: self.patience,
             threads: self.threads.map_or(cores, usize::from),
         }
+    }
+}
+
+fn stopped_text(checkpoint: &Path) -> String {
+    match checkpoint.exists() {
+        true => format!("stopped; the same command continues from {}", checkpoint.display()),
+        false => "stopped before the first update; the same command begins again".to_owned(),
     }
 }
 

@@ -128,7 +128,7 @@ mod tests {
     #[test]
     fn a_step_against_the_gradient_lowers_the_loss_of_the_batch() {
         let (mut model, frames) = (model(), stronger(3));
-        let prepared = prepare(model.model(), &frames, &mut { usize::MAX }).unwrap();
+        let prepared = prepare(model.model(), &frames, &mut { usize::MAX }, &|| false).unwrap().unwrap();
         let loss = BatchLoss { delta: 0.01, weights: LossSettings::demo().stages[0].weights };
         let found =
             |sums: &mut BatchSums| batch_gradient(&model, &prepared, &[2, 0, 1], sums, &loss).unwrap();
@@ -150,7 +150,8 @@ mod tests {
         let weights: Vec<_> =
             model.weights().iter().zip(&one.gradient).map(|(weight, g)| weight - step * g).collect();
         model.set_weights(&weights);
-        let after = sum(&evaluate(model.model(), &prepared, 0.01, 1).unwrap()).loss(&loss.weights);
+        let evaluated = evaluate(model.model(), &prepared, 0.01, 1, &|| false).unwrap().unwrap();
+        let after = sum(&evaluated).loss(&loss.weights);
         // To first order, the loss falls by a part in 10⁴.
         let fall = (before - after) / before;
         assert!((fall - 1e-4).abs() < 2e-5, "{before} {after} {fall}");

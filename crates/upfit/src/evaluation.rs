@@ -20,7 +20,11 @@ pub struct EvaluatedFrame {
     pub differences: FrameDifferences,
 }
 
-/// Evaluates all frames, with the δ of the loss. The result does not depend on the number of threads.
+/// Asks whether to stop; once it says so, it goes on to say so.
+pub type StopRequest<'a> = &'a (dyn Fn() -> bool + Sync);
+
+/// Evaluates all frames, with the δ of the loss. The result does not depend on the number of threads. Returns `None` if `stop` asked
+/// for it before the last frame.
 ///
 /// # Errors
 /// A frame that the model cannot evaluate.
@@ -29,7 +33,8 @@ pub fn evaluate(
     frames: &[PreparedFrame<'_>],
     delta: f64,
     threads: usize,
-) -> Result<Vec<EvaluatedFrame>, UpfitError> {
+    stop: StopRequest<'_>,
+) -> Result<Option<Vec<EvaluatedFrame>>, UpfitError> {
     let model = Arc::new(model.clone());
     let mut tasks: Vec<_> = frames.iter().map(|frame| (frame, None)).collect();
     for_each(
@@ -37,15 +42,14 @@ pub fn evaluate(
         threads,
         || (Grace::new(Arc::clone(&model)), Evaluation::default()),
         |(grace, evaluation), (frame, result)| {
-            *result = Some(evaluate_frame(grace, evaluation, frame, delta));
+            *result = (!stop()).then(|| evaluate_frame(grace, evaluation, frame, delta));
         },
     );
-    let evaluated = tasks.into_iter().map(|(frame, result)| {
-        // Every task has a result: `for_each` visits each item.
-        let result = result.unwrap_or(Err(FrameFault::ModelNotFinite));
-        result.map_err(|fault| frame.frame.wrong(fault))
-    });
-    evaluated.collect()
+    let evaluated = tasks
+        .into_iter()
+        .map(|(frame, result)| Some(result?.map_err(|fault| frame.frame.wrong(fault))))
+        .collect::<Option<Result<Vec<_>, _>>>();
+    evaluated.transpose()
 }
 
 /// The sums over these frames, in their order.
@@ -86,9 +90,10 @@ mod tests {
     #[test]
     fn the_model_of_the_demonstration_fits_its_training_data() {
         let (model, frames) = (model(), aluminium(3));
-        let prepared = prepare(model.model(), &frames, &mut { usize::MAX }).unwrap();
-        let one = sum(&evaluate(model.model(), &prepared, 0.01, 1).unwrap());
-        let two = sum(&evaluate(model.model(), &prepared, 0.01, 2).unwrap());
+        let prepared = prepare(model.model(), &frames, &mut { usize::MAX }, &|| false).unwrap().unwrap();
+        let [one, two] = [1, 2].map(|threads| {
+            sum(&evaluate(model.model(), &prepared, 0.01, threads, &|| false).unwrap().unwrap())
+        });
         assert_eq!(one, two);
         let errors = one.errors(&LossSettings::demo().stages[0].weights);
         assert_eq!(errors.structures, 3);

@@ -5,7 +5,6 @@ mod outcome;
 mod start;
 
 use std::error::Error;
-use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::Instant;
 
@@ -16,7 +15,7 @@ use crate::batch_gradient::BatchSums;
 use crate::checkpoint::{CheckpointFile, TrainingState};
 use crate::data::TrainingData;
 use crate::error::UpfitError;
-use crate::evaluation::{EvaluatedFrame, evaluate};
+use crate::evaluation::{EvaluatedFrame, StopRequest, evaluate};
 use crate::frozen::frozen_weights;
 use crate::identity::identity;
 use crate::loss::LossWeights;
@@ -24,13 +23,13 @@ use crate::prepared::{NEIGHBOUR_BYTES, PreparedFrame, prepare};
 use crate::progress::{TrainingEvent, UpdateProgress};
 use crate::settings::UpfitSettings;
 
-/// Trains the weights of a model. Continues from the checkpoint if there is one; the result has the same bits. `on_event`
-/// asks to stop by breaking, after which the checkpoint has all that was done.
+/// Trains the weights of a model. Continues from the checkpoint if there is one; the result has the same bits.
 ///
 /// Weights are validated after each epoch, and those with the smallest loss are returned. A new stage of the loss starts a new
 /// search for them. Without validation, the last weights are returned.
 ///
-/// Returns `None` if it was asked to stop.
+/// Asks `stop` after each update, and before each structure of an evaluation. Returns `None` if it was asked to stop; then the
+/// checkpoint has all that was done, but for evaluations. There is none before the first evaluation is complete.
 ///
 /// # Errors
 /// Wrong settings or data; a loss that is not finite, which leaves the last checkpoint as it is; a checkpoint that cannot be
@@ -40,41 +39,39 @@ pub fn run(
     data: &TrainingData,
     settings: &UpfitSettings,
     checkpoint: Option<&Path>,
-    mut on_event: impl FnMut(TrainingEvent<'_>) -> ControlFlow<()>,
+    stop: StopRequest<'_>,
+    mut on_event: impl FnMut(TrainingEvent<'_>),
 ) -> Result<Option<UpfitOutcome>, UpfitError> {
     settings.check()?;
-    let identity = identity(&model, data, settings);
-    let mut trainer = Trainer::new(model, data, settings)?;
-    trainer.checkpoint = checkpoint.map(|path| CheckpointFile::new(path, identity));
+    let checkpoint = checkpoint.map(|path| CheckpointFile::new(path, identity(&model, data, settings)));
+    let Some(mut trainer) = Trainer::new(model, data, settings, stop)? else { return Ok(None) };
+    trainer.checkpoint = checkpoint;
     let saved = trainer.checkpoint.as_ref().map_or(Ok(None), CheckpointFile::read)?;
     let resumed = saved.as_ref().map(|state| state.epoch);
-    let mut state = match saved {
-        Some(state) => state,
-        None => {
-            let state = trainer.begin()?;
-            trainer.save(&state)?;
-            state
-        }
-    };
+    let begun = if saved.is_some() { saved } else { trainer.begin()? };
+    let Some(mut state) = begun else { return Ok(None) };
+    if resumed.is_none() {
+        trainer.save(&state)?;
+    }
     trainer.model.set_weights(&state.weights);
     trainer.resumed_updates = state.adam.steps();
-    let begun =
-        TrainingEvent::Begun { resumed, zero: &state.zero, spread: &state.spread, before: &state.before };
-    let mut flow = on_event(begun);
-    while flow.is_continue() && !trainer.is_over(&state) {
-        flow = trainer.train_epoch(&mut state, &mut on_event)?;
+    let TrainingState { zero, spread, before, .. } = &state;
+    on_event(TrainingEvent::Begun { resumed, zero, spread, before });
+    while !stop() && !trainer.is_over(&state) {
+        trainer.train_epoch(&mut state, &mut on_event)?;
     }
-    if flow.is_break() {
+    let after = if stop() { None } else { trainer.errors_of_chosen(&state)? };
+    if after.is_none() {
         trainer.save(&state)?;
-        return Ok(None);
     }
-    trainer.finish(state).map(Some)
+    Ok(after.map(|after| trainer.finish(state, after)))
 }
 
 /// A training with its data.
 struct Trainer<'a> {
     model: TrainableGrace,
     settings: &'a UpfitSettings,
+    stop: StopRequest<'a>,
     training: Vec<PreparedFrame<'a>>,
     validation: Vec<PreparedFrame<'a>>,
     frozen: Vec<bool>,
@@ -90,22 +87,25 @@ impl<'a> Trainer<'a> {
         mut model: TrainableGrace,
         data: &'a TrainingData,
         settings: &'a UpfitSettings,
-    ) -> Result<Self, UpfitError> {
+        stop: StopRequest<'a>,
+    ) -> Result<Option<Self>, UpfitError> {
         if data.training.is_empty() {
             return Err(UpfitError::NoFrames);
         }
         let frozen = frozen_weights(model.groups(), &settings.frozen)?;
         let mut room = NEIGHBOUR_BYTES;
-        let training = prepare(model.model(), &data.training, &mut room)?;
-        let validation = prepare(model.model(), &data.validation, &mut room)?;
+        let training = prepare(model.model(), &data.training, &mut room, stop)?;
+        let validation = prepare(model.model(), &data.validation, &mut room, stop)?;
+        let Some((training, validation)) = training.zip(validation) else { return Ok(None) };
         let threads = settings.threads;
         let failed = |error: Box<dyn Error>| UpfitError::Threads { threads, reason: error.to_string() };
         model.set_threads(Threads::new(threads).map_err(|error| failed(error.into()))?);
         let begun = Instant::now();
         let sums = BatchSums::new(&model, threads.min(settings.batch_size).min(training.len()));
-        Ok(Self {
+        Ok(Some(Self {
             model,
             settings,
+            stop,
             training,
             validation,
             frozen,
@@ -113,7 +113,7 @@ impl<'a> Trainer<'a> {
             checkpoint: None,
             begun,
             resumed_updates: 0,
-        })
+        }))
     }
 
     /// Number of updates of one epoch.
@@ -127,13 +127,14 @@ impl<'a> Trainer<'a> {
         (stage, self.settings.loss.stages[stage].weights)
     }
 
-    fn evaluate(&self, frames: &[PreparedFrame<'a>]) -> Result<Vec<EvaluatedFrame>, UpfitError> {
-        evaluate(self.model.model(), frames, self.settings.loss.delta, self.settings.threads)
+    fn evaluate(&self, frames: &[PreparedFrame<'a>]) -> Result<Option<Vec<EvaluatedFrame>>, UpfitError> {
+        evaluate(self.model.model(), frames, self.settings.loss.delta, self.settings.threads, self.stop)
     }
 
-    /// Of a set without structures, `None`.
-    fn evaluate_some(&self, frames: &[PreparedFrame<'a>]) -> Result<Option<Vec<EvaluatedFrame>>, UpfitError> {
-        (!frames.is_empty()).then(|| self.evaluate(frames)).transpose()
+    /// Training and validation.
+    fn evaluate_both(&self) -> Result<Option<[Vec<EvaluatedFrame>; 2]>, UpfitError> {
+        let Some(training) = self.evaluate(&self.training)? else { return Ok(None) };
+        Ok(self.evaluate(&self.validation)?.map(|validation| [training, validation]))
     }
 
     /// Whether all epochs are over, or the patience is used up. Only the last stage of the loss ends early.

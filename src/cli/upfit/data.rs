@@ -5,6 +5,7 @@ use std::sync::Arc;
 use ::upfit::LabelledFrame;
 use atoms::extxyz::Frame;
 use serde::Serialize;
+use tokio_util::sync::CancellationToken;
 
 use super::command_error;
 use crate::cli::CommandError;
@@ -29,18 +30,22 @@ pub struct DataFile {
     validation: bool,
 }
 
-/// The labelled structures of all files.
+/// The labelled structures of all files; `None` if it was asked to stop.
 ///
 /// # Errors
 /// A structure that cannot be read; labels that [`LabelledFrame::new`] refuses.
 pub fn read_frames(
     files: &StructureFiles,
     validation: bool,
-) -> Result<(Vec<LabelledFrame>, Vec<DataFile>), CommandError> {
+    stop: &CancellationToken,
+) -> Result<Option<(Vec<LabelledFrame>, Vec<DataFile>)>, CommandError> {
     let mut reader = files.reader(Arc::default());
     let (mut frames, mut counts) = (Vec::new(), vec![0; files.files.len()]);
     let mut stresses_left_out = 0_u64;
     while let Some((frame, file)) = reader.next()? {
+        if stop.is_cancelled() {
+            return Ok(None);
+        }
         counts[reader.file_index()] += 1;
         let (labelled, has_stress) = labelled_frame(frame, &file)?;
         stresses_left_out += u64::from(has_stress && labelled.stress.is_none());
@@ -60,7 +65,7 @@ pub fn read_frames(
         Ok(DataFile { file: name, hash, structures, weight: file.weight, validation })
     };
     let sources = files.files.iter().zip(counts).map(file).collect::<Result<_, _>>()?;
-    Ok((frames, sources))
+    Ok(Some((frames, sources)))
 }
 
 /// The frame with its labels, and whether these have a stress.

@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::io::{self, Write};
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use ::upfit::{TrainingData, TrainingEvent, UpfitOutcome, UpfitSettings};
@@ -60,12 +59,10 @@ pub fn fine_tune(
     let FineTuning { settings, checkpoint, .. } = request;
     check_paths(request)?;
     let model = TrainableGrace::load(&request.model).map_err(CommandError::input)?;
-    let (data, files) = read_data(request)?;
+    let Some((data, files)) = read_data(request, stop)? else { return Ok(None) };
     let note = report::note((&request.model, &model), &data, &files, settings);
-    let trained = ::upfit::run(model, &data, settings, Some(checkpoint), |event| {
-        show(&event);
-        if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
+    let is_stopped = || stop.is_cancelled();
+    let trained = ::upfit::run(model, &data, settings, Some(checkpoint), &is_stopped, |event| show(&event));
     let Some(outcome) = trained.map_err(command_error)? else { return Ok(None) };
     if let Some(path) = &request.figure {
         write_curves(path, &outcome)?;
@@ -76,14 +73,17 @@ pub fn fine_tune(
     Ok(Some(FineTuned { outcome, note }))
 }
 
-/// Both sets, and the files that they come from.
-fn read_data(request: &FineTuning) -> Result<(TrainingData, Vec<DataFile>), CommandError> {
+/// Both sets, and the files that they come from; `None` if it was asked to stop.
+fn read_data(
+    request: &FineTuning,
+    stop: &CancellationToken,
+) -> Result<Option<(TrainingData, Vec<DataFile>)>, CommandError> {
     let settings = &request.settings;
-    let (frames, mut sources) = read_frames(&request.data, false)?;
+    let Some((frames, mut sources)) = read_frames(&request.data, false, stop)? else { return Ok(None) };
     let data = match &request.validation {
         None => ::upfit::split(frames, request.validation_share, settings.seed).map_err(command_error)?,
         Some(files) => {
-            let (validation, others) = read_frames(files, true)?;
+            let Some((validation, others)) = read_frames(files, true, stop)? else { return Ok(None) };
             sources.extend(others);
             TrainingData { training: frames, validation }
         }
@@ -98,7 +98,7 @@ fn read_data(request: &FineTuning) -> Result<(TrainingData, Vec<DataFile>), Comm
         count(training as u64, "structure"),
         count(validation as u64, "structure")
     ));
-    Ok((data, sources))
+    Ok(Some((data, sources)))
 }
 
 fn write_curves(path: &Path, outcome: &UpfitOutcome) -> Result<(), CommandError> {

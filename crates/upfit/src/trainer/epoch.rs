@@ -9,31 +9,34 @@ use crate::batch_gradient::{BatchGradient, BatchLoss, batch_gradient};
 use crate::checkpoint::{BestWeights, TrainingState};
 use crate::differences::FrameDifferences;
 use crate::error::UpfitError;
-use crate::evaluation::{first_not_finite, sum};
+use crate::evaluation::{EvaluatedFrame, first_not_finite, sum};
 use crate::progress::{EpochRecord, ErrorsBySet, TrainingEvent};
 
 impl Trainer<'_> {
-    /// Trains the rest of an epoch.
+    /// Trains the rest of an epoch, or up to where it is asked to stop.
     pub(super) fn train_epoch(
         &mut self,
         state: &mut TrainingState,
-        on_event: &mut impl FnMut(TrainingEvent<'_>) -> ControlFlow<()>,
-    ) -> Result<ControlFlow<()>, UpfitError> {
+        on_event: &mut impl FnMut(TrainingEvent<'_>),
+    ) -> Result<(), UpfitError> {
         let order = shuffled(self.settings.seed, state.epoch, self.training.len());
         let done = usize::try_from(state.batch).unwrap_or(usize::MAX);
         for batch in order.chunks(self.settings.batch_size).skip(done) {
             let loss = self.update(state, batch)?;
-            if on_event(TrainingEvent::Update(self.progress(state, loss))).is_break() {
-                return Ok(ControlFlow::Break(()));
+            on_event(TrainingEvent::Update(self.progress(state, loss)));
+            if (self.stop)() {
+                return Ok(());
             }
             self.save_if_due(state)?;
         }
-        self.end_epoch(state)?;
+        if self.end_epoch(state)?.is_break() {
+            return Ok(());
+        }
         self.save_if_due(state)?;
-        let seconds_left = self.seconds_left(state);
-        Ok(state.history.last().map_or(ControlFlow::Continue(()), |record| {
-            on_event(TrainingEvent::Epoch { record, seconds_left })
-        }))
+        if let Some(record) = state.history.last() {
+            on_event(TrainingEvent::Epoch { record, seconds_left: self.seconds_left(state) });
+        }
+        Ok(())
     }
 
     /// Makes one update. Returns the loss of the batch before it.
@@ -77,10 +80,11 @@ impl Trainer<'_> {
         })
     }
 
-    /// Validates and records the epoch whose batches are all done.
-    fn end_epoch(&mut self, state: &mut TrainingState) -> Result<(), UpfitError> {
+    /// Validates and records the epoch whose batches are all done. Breaks if it was asked to stop before.
+    fn end_epoch(&mut self, state: &mut TrainingState) -> Result<ControlFlow<()>, UpfitError> {
         let (stage, weights) = self.stage(state.epoch);
-        let validated = self.validate(state)?;
+        let Some(evaluated) = self.validate(state)? else { return Ok(ControlFlow::Break(())) };
+        let validated = (!evaluated.is_empty()).then(|| sum(&evaluated));
         let epoch = state.epoch + 1;
         let validation = validated.map(|sums| sums.errors(&weights));
         if let Some(errors) = &validation
@@ -94,13 +98,13 @@ impl Trainer<'_> {
         let updates_per_second = self.updates_per_second(state);
         state.history.push(EpochRecord { epoch, stage, learning_rate, errors, updates_per_second });
         (state.epoch, state.batch, state.running) = (epoch, 0, FrameDifferences::default());
-        Ok(())
+        Ok(ControlFlow::Continue(()))
     }
 
-    /// Differences of the validation set, with the averaged weights if there are any.
-    fn validate(&mut self, state: &TrainingState) -> Result<Option<FrameDifferences>, UpfitError> {
+    /// Evaluates the validation set, with the averaged weights if there are any. Returns `None` if it was asked to stop.
+    fn validate(&mut self, state: &TrainingState) -> Result<Option<Vec<EvaluatedFrame>>, UpfitError> {
         if self.validation.is_empty() {
-            return Ok(None);
+            return Ok(Some(Vec::new()));
         }
         if let Some(average) = &state.average {
             self.model.set_weights(average);
@@ -109,14 +113,15 @@ impl Trainer<'_> {
         if state.average.is_some() {
             self.model.set_weights(&state.weights);
         }
-        if let Some(frame) = first_not_finite(&self.validation, &evaluated) {
-            return Err(UpfitError::NotFinite {
+        let found = evaluated.as_ref().and_then(|evaluated| first_not_finite(&self.validation, evaluated));
+        match found {
+            None => Ok(evaluated),
+            Some(frame) => Err(UpfitError::NotFinite {
                 epoch: state.epoch + 1,
                 place: "validation".to_owned(),
                 what: "the loss",
                 frames: frame.place.clone(),
-            });
+            }),
         }
-        Ok(Some(sum(&evaluated)))
     }
 }

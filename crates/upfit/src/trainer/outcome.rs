@@ -33,22 +33,18 @@ pub struct UpfitOutcome {
 }
 
 impl Trainer<'_> {
-    /// Takes the best weights, or the last ones without validation, and measures their errors.
+    /// Takes the best weights, or the last ones without validation, and measures their errors. Returns `None` if it was asked to stop.
     ///
     /// # Errors
     /// Errors that are not finite: nothing has checked the last update without validation.
-    pub(super) fn finish(mut self, state: TrainingState) -> Result<UpfitOutcome, UpfitError> {
-        let updates = state.adam.steps();
-        let ended_early = state.epoch < self.settings.epochs;
-        let (epoch, weights) = match state.best {
-            Some(best) => (best.epoch, best.weights),
-            None => (state.epoch, state.average.unwrap_or(state.weights)),
-        };
-        self.model.set_weights(&weights);
-        let (_, of_last) = self.stage(self.settings.epochs);
-        let training = self.evaluate(&self.training)?;
-        let validation = self.evaluate(&self.validation)?;
-        for (frames, evaluated) in [(&self.training, &training), (&self.validation, &validation)] {
+    pub(super) fn errors_of_chosen(
+        &mut self,
+        state: &TrainingState,
+    ) -> Result<Option<ErrorsBySet>, UpfitError> {
+        let (epoch, weights) = chosen(state);
+        self.model.set_weights(weights);
+        let Some(evaluated) = self.evaluate_both()? else { return Ok(None) };
+        for (frames, evaluated) in [&self.training, &self.validation].into_iter().zip(&evaluated) {
             if let Some(frame) = first_not_finite(frames, evaluated) {
                 return Err(UpfitError::NotFinite {
                     epoch,
@@ -58,21 +54,33 @@ impl Trainer<'_> {
                 });
             }
         }
-        let validated = !validation.is_empty();
-        let after = ErrorsBySet {
-            training: sum(&training).errors(&of_last),
-            validation: validated.then(|| sum(&validation).errors(&of_last)),
-        };
-        Ok(UpfitOutcome {
+        let (_, of_last) = self.stage(self.settings.epochs);
+        let [training, validation] = evaluated.map(|evaluated| sum(&evaluated).errors(&of_last));
+        let validation = (!self.validation.is_empty()).then_some(validation);
+        Ok(Some(ErrorsBySet { training, validation }))
+    }
+
+    /// The outcome, with the errors of the chosen weights, which the model has.
+    pub(super) fn finish(self, state: TrainingState, after: ErrorsBySet) -> UpfitOutcome {
+        let (epoch, _) = chosen(&state);
+        UpfitOutcome {
             model: self.model,
+            epoch,
+            updates: state.adam.steps(),
+            ended_early: state.epoch < self.settings.epochs,
             zero: state.zero,
             spread: state.spread,
             before: state.before,
             after,
             history: state.history,
-            epoch,
-            updates,
-            ended_early,
-        })
+        }
+    }
+}
+
+/// The best weights, or the last ones without validation, and the number of their epochs.
+fn chosen(state: &TrainingState) -> (u64, &[f64]) {
+    match &state.best {
+        Some(best) => (best.epoch, best.weights.as_slice()),
+        None => (state.epoch, state.average.as_ref().unwrap_or(&state.weights).as_slice()),
     }
 }

@@ -15,27 +15,27 @@ use crate::prepared::PreparedFrame;
 use crate::progress::ErrorsBySet;
 
 impl<'a> Trainer<'a> {
-    /// Moves the zero of the energies and validates the weights with which the training begins.
-    pub(super) fn begin(&mut self) -> Result<TrainingState, UpfitError> {
-        let mut training = self.evaluate(&self.training)?;
-        let mut validation = self.evaluate_some(&self.validation)?;
-        let none = Vec::new();
-        let validated = validation.as_ref().unwrap_or(&none);
-        for (frames, evaluated) in [(&self.training, &training), (&self.validation, validated)] {
+    /// Moves the zero of the energies and validates the weights with which the training begins. Returns `None` if it was asked to
+    /// stop.
+    pub(super) fn begin(&mut self) -> Result<Option<TrainingState>, UpfitError> {
+        let Some(mut evaluated) = self.evaluate_both()? else { return Ok(None) };
+        for (frames, evaluated) in [&self.training, &self.validation].into_iter().zip(&evaluated) {
             if let Some(frame) = first_not_finite(frames, evaluated) {
                 return Err(frame.wrong(FrameFault::ModelNotFinite));
             }
         }
-        let (zero, spread) = self.find_zero(&training, validated)?;
+        let (zero, spread) = self.find_zero(&evaluated)?;
         let mut weights = self.model.weights().to_vec();
         zero.apply(&mut weights, self.model.groups(), self.model.model().elements())?;
         if !zero.shifts.is_empty() {
             self.model.set_weights(&weights);
-            training = self.evaluate(&self.training)?;
-            validation = self.evaluate_some(&self.validation)?;
+            let Some(again) = self.evaluate_both()? else { return Ok(None) };
+            evaluated = again;
         }
-        let state = self.first_state(weights, &sum(&training), validation.map(|found| sum(&found)));
-        Ok(TrainingState { zero, spread, ..state })
+        let [training, validation] = evaluated.map(|evaluated| sum(&evaluated));
+        let validation = (!self.validation.is_empty()).then_some(validation);
+        let state = self.first_state(weights, &training, validation);
+        Ok(Some(TrainingState { zero, spread, ..state }))
     }
 
     /// The state before the first update, but for the zero of the energies.
@@ -72,8 +72,7 @@ impl<'a> Trainer<'a> {
     /// Refuses energies that remain far away.
     fn find_zero(
         &self,
-        training: &[EvaluatedFrame],
-        validation: &[EvaluatedFrame],
+        [training, validation]: &[Vec<EvaluatedFrame>; 2],
     ) -> Result<(EnergyZero, EnergyDeviations), UpfitError> {
         let labelled = |(prepared, evaluated): (&PreparedFrame<'a>, &EvaluatedFrame)| LabelledEnergy {
             composition: prepared.frame.composition(),
