@@ -299,6 +299,12 @@ fn wrong_arguments_are_refused_before_any_work() {
     let message = refuse(here, arguments("link.npz", &whole));
     assert!(message.contains("link.npz is the model"), "{message}");
     fs::remove_file(linked).unwrap();
+    for name in ["POSCAR", "CONTCAR.gz", "a.vasp", "walk.lammpstrj.zst", "dump.a"] {
+        fs::write(here.join(name), "").unwrap();
+        let reason =
+            format!("{name}: POSCAR files and dumps of LAMMPS have no labels; expected extended XYZ");
+        wrong(&["--validation", name], &reason);
+    }
     fs::write(here.join("notes.txt"), "no checkpoint").unwrap();
     let output = calmwalk(here, arguments("out.npz", &and(&["--checkpoint", "notes.txt"])));
     assert_eq!(output.status.code(), Some(1));

@@ -1,5 +1,6 @@
 //! Reads labelled structures.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use ::upfit::LabelledFrame;
@@ -28,6 +29,22 @@ pub struct DataFile {
     weight: f64,
     /// Whether it was named for validation.
     validation: bool,
+}
+
+/// Refuses files whose formats have no labels. The name shows the format, with or without the extension of a compression.
+pub fn check_formats<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<(), CommandError> {
+    for path in paths {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+        let name = name.strip_suffix(".gz").or_else(|| name.strip_suffix(".zst")).unwrap_or(&name);
+        if ![".xyz", ".extxyz"].iter().any(|ending| name.ends_with(ending)) {
+            return Err(CommandError::Input(format!(
+                "{}: POSCAR files and dumps of LAMMPS have no labels; expected extended XYZ with energy and forces, a name that ends in \
+                 .extxyz or .xyz, with or without .gz or .zst",
+                path.display()
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// The labelled structures of all files; `None` if it was asked to stop.

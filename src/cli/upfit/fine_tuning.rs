@@ -10,7 +10,7 @@ use potentials::grace::TrainableGrace;
 use serde_json::Value;
 use tokio_util::sync::CancellationToken;
 
-use super::data::{DataFile, read_frames};
+use super::data::{DataFile, check_formats, read_frames};
 use super::model_file::write_model;
 use super::paths::check_paths;
 use super::{command_error, figure, report};
@@ -57,6 +57,7 @@ pub fn fine_tune(
     mut show: impl FnMut(&TrainingEvent<'_>),
 ) -> Result<Option<FineTuned>, CommandError> {
     let FineTuning { settings, checkpoint, .. } = request;
+    check_formats(request.data.paths().chain(request.validation.iter().flat_map(StructureFiles::paths)))?;
     check_paths(request)?;
     let model = TrainableGrace::load(&request.model).map_err(CommandError::input)?;
     let Some((data, files)) = read_data(request, stop)? else { return Ok(None) };
