@@ -1,14 +1,13 @@
 //! The errors of a model on a set of frames, without derivatives.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use atoms::{Evaluation, Potential};
-use potentials::grace::{Grace, GraceModel};
+use potentials::grace::{Grace, GraceModel, Threads};
 
 use crate::data::{FrameFault, LabelledFrame};
 use crate::differences::FrameDifferences;
 use crate::error::UpfitError;
-use crate::parallel::for_each;
 use crate::prepared::PreparedFrame;
 
 /// What the model says of one frame.
@@ -32,19 +31,24 @@ pub fn evaluate(
     model: &GraceModel,
     frames: &[PreparedFrame<'_>],
     delta: f64,
-    threads: usize,
+    threads: &Threads,
     stop: StopRequest<'_>,
 ) -> Result<Option<Vec<EvaluatedFrame>>, UpfitError> {
     let model = Arc::new(model.clone());
+    let worker = || (Grace::new(Arc::clone(&model)), Evaluation::default());
+    let mut workers: Vec<_> =
+        std::iter::repeat_with(worker).take(threads.count().min(frames.len())).collect();
     let mut tasks: Vec<_> = frames.iter().map(|frame| (frame, None)).collect();
-    for_each(
-        &mut tasks,
-        threads,
-        || (Grace::new(Arc::clone(&model)), Evaluation::default()),
-        |(grace, evaluation), (frame, result)| {
-            *result = (!stop()).then(|| evaluate_frame(grace, evaluation, frame, delta));
-        },
-    );
+    let remaining = Mutex::new(tasks.iter_mut());
+    let next = || remaining.lock().unwrap_or_else(PoisonError::into_inner).next();
+    threads.for_each(&mut workers, |(grace, evaluation)| {
+        while let Some((frame, result)) = next() {
+            if stop() {
+                break;
+            }
+            *result = Some(evaluate_frame(grace, evaluation, frame, delta));
+        }
+    });
     let evaluated = tasks
         .into_iter()
         .map(|(frame, result)| Some(result?.map_err(|fault| frame.frame.wrong(fault))))
@@ -92,7 +96,8 @@ mod tests {
         let (model, frames) = (model(), aluminium(3));
         let prepared = prepare(model.model(), &frames, &mut { usize::MAX }, &|| false).unwrap().unwrap();
         let [one, two] = [1, 2].map(|threads| {
-            sum(&evaluate(model.model(), &prepared, 0.01, threads, &|| false).unwrap().unwrap())
+            let threads = Threads::new(threads).unwrap();
+            sum(&evaluate(model.model(), &prepared, 0.01, &threads, &|| false).unwrap().unwrap())
         });
         assert_eq!(one, two);
         let errors = one.errors(&LossSettings::demo().stages[0].weights);

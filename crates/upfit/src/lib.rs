@@ -18,7 +18,6 @@ mod frozen;
 mod identity;
 mod learning_rate;
 mod loss;
-mod parallel;
 mod prepared;
 mod progress;
 mod settings;

@@ -75,6 +75,7 @@ struct Trainer<'a> {
     training: Vec<PreparedFrame<'a>>,
     validation: Vec<PreparedFrame<'a>>,
     frozen: Vec<bool>,
+    threads: Threads,
     sums: BatchSums,
     checkpoint: Option<CheckpointFile>,
     /// When this process began, and the number of updates of earlier ones.
@@ -99,9 +100,9 @@ impl<'a> Trainer<'a> {
         let Some((training, validation)) = training.zip(validation) else { return Ok(None) };
         let threads = settings.threads;
         let failed = |error: Box<dyn Error>| UpfitError::Threads { threads, reason: error.to_string() };
-        model.set_threads(Threads::new(threads).map_err(|error| failed(error.into()))?);
-        let begun = Instant::now();
-        let sums = BatchSums::new(&model, threads.min(settings.batch_size).min(training.len()));
+        let threads = Threads::new(threads).map_err(|error| failed(error.into()))?;
+        model.set_threads(threads.clone());
+        let sums = BatchSums::new(&model, threads.clone(), settings.batch_size.min(training.len()));
         Ok(Some(Self {
             model,
             settings,
@@ -109,9 +110,10 @@ impl<'a> Trainer<'a> {
             training,
             validation,
             frozen,
+            threads,
             sums,
             checkpoint: None,
-            begun,
+            begun: Instant::now(),
             resumed_updates: 0,
         }))
     }
@@ -128,7 +130,7 @@ impl<'a> Trainer<'a> {
     }
 
     fn evaluate(&self, frames: &[PreparedFrame<'a>]) -> Result<Option<Vec<EvaluatedFrame>>, UpfitError> {
-        evaluate(self.model.model(), frames, self.settings.loss.delta, self.settings.threads, self.stop)
+        evaluate(self.model.model(), frames, self.settings.loss.delta, &self.threads, self.stop)
     }
 
     /// Training and validation.
