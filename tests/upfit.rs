@@ -70,6 +70,10 @@ fn the_loss_falls_and_the_number_of_threads_changes_no_byte() {
     for set in ["training", "validation"] {
         let loss = |when: &str| found[when][set]["loss"].as_f64().unwrap();
         assert!(loss("after") < loss("before"), "{printed}");
+        for error in ["energy_mae", "force_mae", "stress_mae"] {
+            let [before, after] = ["before", "after"].map(|when| found[when][set][error].as_f64().unwrap());
+            assert!(before > 0.0 && after > 0.0 && before != after, "{printed}");
+        }
     }
     assert_eq!((&found["updates"], &found["history"].as_array().unwrap().len()), (&4.into(), &2));
     // The labels' energies are a tenth larger, −0.34 eV/atom.
@@ -127,9 +131,16 @@ fn tables_say_what_was_trained() {
     let output = calmwalk(here, arguments("out.npz", &more));
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let (printed, progress) = (String::from_utf8_lossy(&output.stdout), stderr(&output));
-    for expected in
-        ["training", "validation", "before", "after", "1 update in 1 epoch", "wrote out.npz", "calm build"]
-    {
+    for expected in [
+        "training",
+        "validation",
+        "before",
+        "after",
+        "stress MAE",
+        "1 update in 1 epoch",
+        "wrote out.npz",
+        "calm build",
+    ] {
         assert!(printed.contains(expected), "{printed}");
     }
     for expected in

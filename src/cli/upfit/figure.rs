@@ -39,7 +39,7 @@ pub fn learning_curves(history: &[EpochRecord]) -> Figure {
     let rows = panels.len().div_ceil(COLUMNS) as f64;
     let height = TOP + PITCH * (rows - 1.0) + AREA + 44.0;
     let mut figure = Figure::new("learning-curves", "Loss and errors by epoch", WIDTH, height);
-    let tops = (0..).map(|number| TOP + PITCH * f64::from(number));
+    let tops = (0_i32..).map(|number| TOP + PITCH * f64::from(number));
     let areas = tops.flat_map(|top| row(COLUMNS, [48.0, 54.0, 8.0], top, AREA));
     for ((panel, area), letter) in panels.into_iter().zip(areas).zip('a'..) {
         panel.draw(&mut figure, area, letter, history.len());
