@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use potentials::grace::{GraceModel, Precision, RadialPath};
+use potentials::grace::{GraceModel, Precision, RadialPath, Threads};
 use serde::{Deserialize, Serialize};
+use tokio_util::sync::CancellationToken;
 use upfit::{LabelledFrame, SetErrors, errors_of};
 
 use super::settings::{RefitSettings, RefitterConfig};
@@ -74,7 +75,7 @@ struct DataSet {
 pub struct DataSets(Vec<DataSet>);
 
 impl DataSets {
-    /// Reads the test sets, and what there is of held-out labels, replay data and later labels.
+    /// Reads the test sets, and what there is of held-out labels, replay data and later labels. `None` after a cancellation of `stop`.
     ///
     /// # Errors
     /// A file that cannot be read, labels that are broken.
@@ -82,11 +83,14 @@ impl DataSets {
         settings: &RefitSettings,
         directory: &Path,
         [frozen, since]: [&LabelFiles; 2],
-    ) -> Result<Self, CommandError> {
-        let mut sets = Vec::new();
+        stop: &CancellationToken,
+    ) -> Result<Option<Self>, CommandError> {
+        let (mut sets, mut is_stopped) = (Vec::new(), false);
         let mut add = |name: &str, kind, paths: &[PathBuf]| -> Result<(), CommandError> {
-            let (frames, _) = read_frames(&StructureReadingArgs::default().files(paths)?, true)?;
-            sets.push(DataSet { name: name.to_owned(), kind, frames });
+            match read_frames(&StructureReadingArgs::default().files(paths)?, true, stop)? {
+                Some((frames, _)) => sets.push(DataSet { name: name.to_owned(), kind, frames }),
+                None => is_stopped = true,
+            }
             Ok(())
         };
         for set in &settings.test_sets {
@@ -100,35 +104,46 @@ impl DataSets {
         if let Some(path) = since.path(directory, LabelFile::Since) {
             add("since", SetKind::Since, &[path])?;
         }
-        Ok(Self(sets))
+        Ok((!is_stopped).then_some(Self(sets)))
     }
 
-    /// The errors of the models of version 0, the parent and the new version.
+    /// The errors of the models of version 0, the parent and the new version. `None` after a cancellation of `stop`.
     ///
     /// # Errors
     /// A structure that a model cannot evaluate, errors that are not finite.
-    pub fn errors(&self, config: &RefitterConfig, version: &Path) -> Result<Vec<SetFigures>, CommandError> {
+    pub fn errors(
+        &self,
+        config: &RefitterConfig,
+        version: &Path,
+        stop: &CancellationToken,
+    ) -> Result<Option<Vec<SetFigures>>, CommandError> {
         let load = |path: &Path| load(path, config.precision);
         let [first, parent, version] =
             [&*config.first_model.path, &*config.parent_model.path, version].map(load);
         let (first, parent, version) = (first?, parent?, version?);
         check_compatible(&parent, &version)?;
-        let threads = config.settings.threads();
-        let of_set = |set: &DataSet| -> Result<SetFigures, CommandError> {
-            let errors = |model| errors_of(model, &set.frames, threads).map_err(command_error);
-            Ok(SetFigures {
+        let threads = Threads::new(config.settings.threads()).map_err(CommandError::failed)?;
+        let of_set = |set: &DataSet| -> Result<Option<SetFigures>, CommandError> {
+            let [first, parent, version] = [&first, &parent, &version].map(|model| {
+                errors_of(model, &set.frames, &threads, &|| stop.is_cancelled()).map_err(command_error)
+            });
+            let (Some(first), Some(parent), Some(version)) = (first?, parent?, version?) else {
+                return Ok(None);
+            };
+            let structures = set.frames.len() as u64;
+            Ok(Some(SetFigures {
                 name: set.name.clone(),
                 kind: set.kind,
-                structures: set.frames.len() as u64,
-                first: errors(&first)?,
-                parent: errors(&parent)?,
-                version: errors(&version)?,
-            })
+                structures,
+                first,
+                parent,
+                version,
+            }))
         };
         self.0.iter().map(of_set).collect()
     }
 
-    /// The errors of another model.
+    /// The errors of another model. `None` after a cancellation of `stop`.
     ///
     /// # Errors
     /// A structure that it cannot evaluate, errors that are not finite.
@@ -136,12 +151,14 @@ impl DataSets {
         &self,
         config: &RefitterConfig,
         model: &Path,
-    ) -> Result<Vec<ComparedSet>, CommandError> {
+        stop: &CancellationToken,
+    ) -> Result<Option<Vec<ComparedSet>>, CommandError> {
         let model = load(model, config.precision)?;
-        let threads = config.settings.threads();
+        let threads = Threads::new(config.settings.threads()).map_err(CommandError::failed)?;
         let of_set = |set: &DataSet| {
-            let errors = errors_of(&model, &set.frames, threads).map_err(command_error)?;
-            Ok(ComparedSet { name: set.name.clone(), errors })
+            let errors = errors_of(&model, &set.frames, &threads, &|| stop.is_cancelled());
+            let errors = errors.map_err(command_error)?;
+            Ok(errors.map(|errors| ComparedSet { name: set.name.clone(), errors }))
         };
         self.0.iter().map(of_set).collect()
     }

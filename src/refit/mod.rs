@@ -161,10 +161,10 @@ impl Refit<'_> {
         });
         let Some(since) = since.await? else { return Ok(None) };
         (self.report)("judging".to_owned());
-        let sets = DataSets::read(&self.config.settings, &self.directory, [&self.labels, &since])?;
+        let sets = DataSets::read(&self.config.settings, &self.directory, [&self.labels, &since], self.stop)?;
+        let Some(sets) = sets else { return Ok(None) };
         let figures = kept(self.directory.join("errors.json"), async || {
-            let errors = tokio::task::block_in_place(|| sets.errors(self.config, &self.path(MODEL)))?;
-            Ok(Some(errors))
+            tokio::task::block_in_place(|| sets.errors(self.config, &self.path(MODEL), self.stop))
         });
         let Some(figures): Option<Vec<SetFigures>> = figures.await? else { return Ok(None) };
         let reason = refusal(&self.config.settings, &figures);
@@ -275,8 +275,9 @@ impl Refit<'_> {
             let what = format!("comparison with {name}");
             let Some(_) = self.train_natively(native, &what, labels, model.clone())? else { return Ok(None) };
             let structures = count_frames(labels)?;
-            let sets = tokio::task::block_in_place(|| sets.errors_of_model(self.config, &model))?;
-            Ok(Some(ComparisonFigures { name: name.to_owned(), structures, sets }))
+            let errors =
+                tokio::task::block_in_place(|| sets.errors_of_model(self.config, &model, self.stop))?;
+            Ok(errors.map(|sets| ComparisonFigures { name: name.to_owned(), structures, sets }))
         })
         .await
     }

@@ -1,6 +1,5 @@
 //! Training by calmwalk itself.
 
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use potentials::grace::TrainableGrace;
@@ -51,7 +50,7 @@ impl NativeTraining<'_> {
         let (begin, name) = self.begin;
         let model = TrainableGrace::load(&begin.path).map_err(CommandError::input)?;
         let files = files(settings, self.labels)?;
-        let (frames, sources) = read_frames(&files, false)?;
+        let Some((frames, sources)) = read_frames(&files, false, stop)? else { return Ok(None) };
         let data = upfit::split(frames, native.validation_share, rng_seed).map_err(command_error)?;
         let upfit_settings = upfit_settings(native, rng_seed, settings.threads());
         // Without directories, so that the model has the same bytes wherever the campaign is.
@@ -62,8 +61,9 @@ impl NativeTraining<'_> {
         let epochs = upfit_settings.epochs;
         let run = UpfitRun { model, data, note, settings: upfit_settings, output: self.output, checkpoint };
         let outcome = run.run(
+            stop,
             |event| {
-                if let TrainingEvent::Epoch(record) = event {
+                if let TrainingEvent::Epoch { record, .. } = event {
                     let errors = record.errors.validation.as_ref().unwrap_or(&record.errors.training);
                     report(format!(
                         "epoch {} of {epochs}, force MAE {:.1} meV/Å, energy MAE {:.2} meV/atom",
@@ -72,7 +72,6 @@ impl NativeTraining<'_> {
                         1e3 * errors.energy_mae
                     ));
                 }
-                if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             },
             |_| Ok(()),
             training_error,
