@@ -27,7 +27,7 @@ mod trainer;
 pub use data::{FrameFault, LabelledFrame, MAX_ENERGY_DIFFERENCE, MAX_FORCE, TrainingData, data_hash};
 pub use energy_zero::{ElementShift, EnergyZero, EnergyZeroFault};
 pub use error::UpfitError;
-pub use evaluation::errors_of;
+pub use evaluation::{errors_of, zero_of_labels};
 pub use learning_rate::CosineDecay;
 pub use loss::{LossSettings, LossStage, LossWeights};
 pub use progress::{EpochRecord, ErrorsBySet, SetErrors, TrainingEvent, UpdateProgress};
