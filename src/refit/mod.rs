@@ -26,6 +26,7 @@ use serde_json::{Value, json};
 use store::{Store, VersionFiles, VersionRecord, VersionState, unix_milliseconds};
 use tokio_util::sync::CancellationToken;
 
+pub use self::command::end_marked_when_alone;
 use self::cost::CostMeter;
 use self::failure::RefitFailure;
 use self::judge::{ComparisonFigures, DataSets, EvaluationContext, SetFigures, load_version, refusal};
@@ -257,8 +258,7 @@ impl Refit<'_> {
                 (self.report)(format!("training: {}", command.program.join(" ")));
                 let held_out = self.labels.path(&self.directory, LabelFile::HeldOut);
                 let files = (labels, held_out.as_deref());
-                let ended = command::run(command, self.config, &self.directory, files, self.stop).await;
-                let ended = ended.map_err(RefitFailure::of_input)?;
+                let ended = command::run(command, self.config, &self.directory, files, self.stop).await?;
                 Ok(ended.map(|()| TrainingRecord { structures: None, validation: None, epochs: None }))
             }
         }
