@@ -35,13 +35,13 @@ impl UpfitRun {
     ///
     /// # Errors
     /// Those of [`upfit::run`], as `to_error` makes them; a file that cannot be written; `finish`'s.
-    pub fn run(
+    pub fn run<E: From<CommandError>>(
         self,
         stop: &CancellationToken,
         mut show: impl FnMut(&TrainingEvent<'_>),
         finish: impl FnOnce(&UpfitOutcome) -> Result<(), CommandError>,
-        to_error: fn(UpfitError) -> CommandError,
-    ) -> Result<Option<UpfitOutcome>, CommandError> {
+        to_error: fn(UpfitError) -> E,
+    ) -> Result<Option<UpfitOutcome>, E> {
         let Self { model, data, note, settings, output, checkpoint } = self;
         let is_stopped = || stop.is_cancelled();
         let trained =
@@ -51,7 +51,9 @@ impl UpfitRun {
         write_model(&outcome.model, &output, &note.to_string())?;
         // Without the model, the checkpoint would be needed.
         match fs::remove_file(&checkpoint) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(cannot_write(&checkpoint, error)),
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                Err(cannot_write(&checkpoint, error).into())
+            }
             _ => Ok(Some(outcome)),
         }
     }

@@ -180,22 +180,31 @@ fn write_row(
 }
 
 /// A value that is kept in a file of the directory from its first computation on; `None` if that was stopped.
-pub async fn kept<T: Serialize + for<'a> Deserialize<'a>>(
+///
+/// # Errors
+/// Those of the computation; a file that cannot be read or written.
+pub async fn kept<T: Serialize + for<'a> Deserialize<'a>, E: From<CommandError>>(
     path: PathBuf,
-    compute: impl AsyncFnOnce() -> Result<Option<T>, CommandError>,
-) -> Result<Option<T>, CommandError> {
-    match fs::read(&path) {
+    compute: impl AsyncFnOnce() -> Result<Option<T>, E>,
+) -> Result<Option<T>, E> {
+    if let Some(value) = read_kept(&path)? {
+        return Ok(Some(value));
+    }
+    let Some(value) = compute().await? else { return Ok(None) };
+    let mut file = AtomicFile::create(&path)?;
+    let text = serde_json::to_string_pretty(&value).map_err(CommandError::failed)?;
+    writeln!(file, "{text}").map_err(|error| cannot_write(&path, error))?;
+    file.finish()?;
+    Ok(Some(value))
+}
+
+/// `None` if there is no such file.
+fn read_kept<T: for<'a> Deserialize<'a>>(path: &Path) -> Result<Option<T>, CommandError> {
+    match fs::read(path) {
         Ok(bytes) => serde_json::from_slice(&bytes).map(Some).map_err(|error| {
             CommandError::Failed(format!("{}: {error}: remove its directory to begin again", path.display()))
         }),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            let Some(value) = compute().await? else { return Ok(None) };
-            let mut file = AtomicFile::create(&path)?;
-            let text = serde_json::to_string_pretty(&value).map_err(CommandError::failed)?;
-            writeln!(file, "{text}").map_err(|error| cannot_write(&path, error))?;
-            file.finish()?;
-            Ok(Some(value))
-        }
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(CommandError::Failed(format!("cannot read {}: {error}", path.display()))),
     }
 }

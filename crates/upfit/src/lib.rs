@@ -30,7 +30,7 @@ pub use data::{FrameFault, LabelledFrame, MAX_ENERGY_DIFFERENCE, MAX_FORCE, Trai
 pub use energy_deviations::{EnergyDeviations, FarStructure};
 pub use energy_zero::{ElementShift, EnergyZero, EnergyZeroFault};
 pub use error::UpfitError;
-pub use evaluation::{StopRequest, errors_of};
+pub use evaluation::{StopRequest, errors_of, zero_of_labels};
 pub use learning_rate::CosineDecay;
 pub use loss::{LossSettings, LossStage, LossWeights};
 pub use progress::{EpochRecord, ErrorsBySet, SetErrors, TrainingEvent, UpdateProgress};
