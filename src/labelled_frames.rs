@@ -60,6 +60,9 @@ pub fn check_formats<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<()
     Ok(())
 }
 
+/// Labelled structures, and the files that they come from.
+pub type ReadFrames = (Vec<LabelledFrame>, Vec<DataFile>);
+
 /// The labelled structures of all files; `None` if it was asked to stop.
 ///
 /// # Errors
@@ -68,7 +71,7 @@ pub fn read_frames(
     files: &StructureFiles,
     validation: bool,
     stop: &CancellationToken,
-) -> Result<Option<(Vec<LabelledFrame>, Vec<DataFile>)>, CommandError> {
+) -> Result<Option<ReadFrames>, CommandError> {
     let mut reader = files.reader(Arc::default());
     let (mut frames, mut counts) = (Vec::new(), vec![0; files.files.len()]);
     let mut stresses_left_out = 0_u64;

@@ -134,7 +134,6 @@ impl Summary {
         for refused in self.versions.all.iter().filter(|version| !version.is_registered()) {
             writeln!(f, "                 {}", versions::refused(refused))?;
         }
-        writeln!(f, "errors of each version of the potential, and how they changed:")?;
         versions::table(&self.versions).lines().try_for_each(|line| writeln!(f, "  {line}"))
     }
 

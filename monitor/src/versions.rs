@@ -73,6 +73,21 @@ pub struct VersionSetErrors {
     pub parent: Option<ErrorFigures>,
     /// Errors of the version; `None` if they are unknown.
     pub version: Option<ErrorFigures>,
+    /// Errors of the models that were trained for comparison with the version.
+    pub compared: Vec<ComparedErrors>,
+}
+
+/// Errors of a model that was trained with other structures in place of those of the campaign.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
+pub struct ComparedErrors {
+    /// Where these structures come from: `control`, or a name of `refit.comparisons`.
+    pub name: String,
+    /// Their number.
+    pub structures: u64,
+    /// Mean absolute error of energies, eV/atom.
+    pub energy_mae: Option<f64>,
+    /// Mean absolute error of force components, eV/Å.
+    pub force_mae: Option<f64>,
 }
 
 /// Mean absolute and root mean square errors; `None` if unknown.
@@ -288,7 +303,13 @@ fn first(records: &[VersionRecord]) -> VersionSummary {
         accepted: 0,
         labelled: 0,
         errors: errors
-            .map(|set| VersionSetErrors { version: set.parent, parent: None, first: None, ..set })
+            .map(|set| VersionSetErrors {
+                version: set.parent,
+                parent: None,
+                first: None,
+                compared: Vec::new(),
+                ..set
+            })
             .collect(),
         seconds: 0.0,
         core_hours: 0.0,
@@ -322,7 +343,23 @@ impl VersionSummary {
 /// The errors by data set in the figures of a version; none if another program wrote something else.
 fn errors_of(figures: &Value) -> Vec<VersionSetErrors> {
     let sets = figures["sets"].as_array().into_iter().flatten();
-    sets.filter_map(|set| VersionSetErrors::deserialize(set).ok()).collect()
+    let mut sets: Vec<_> = sets.filter_map(|set| VersionSetErrors::deserialize(set).ok()).collect();
+    for comparison in figures["comparisons"].as_array().into_iter().flatten() {
+        let found = |set: &str| {
+            let all = comparison["sets"].as_array().into_iter().flatten();
+            all.into_iter().find(|found| found["name"] == set).map(|found| &found["errors"])
+        };
+        for set in &mut sets {
+            let Some(errors) = found(&set.name) else { continue };
+            set.compared.push(ComparedErrors {
+                name: comparison["name"].as_str().unwrap_or_default().to_owned(),
+                structures: comparison["structures"].as_u64().unwrap_or(0),
+                energy_mae: errors["energy_mae"].as_f64(),
+                force_mae: errors["force_mae"].as_f64(),
+            });
+        }
+    }
+    sets
 }
 
 /// (new − old) / old, of positive numbers.
@@ -362,7 +399,9 @@ mod tests {
             model_hash: String::new(),
             mixture_hash: String::new(),
             figures: json!({ "sets": [set("liquid", "test", 5, test),
-                set("held_out", "held_out", u64::from(number), held_out), "of another program"] }),
+                set("held_out", "held_out", u64::from(number), held_out), "of another program"],
+                "comparisons": [{ "name": "control", "structures": 9,
+                    "sets": [{ "name": "liquid", "errors": { "force_mae": 0.19 } }] }] }),
             seconds: 60.0,
             core_hours: 0.5,
             time: 1000 * i64::from(number),
@@ -400,6 +439,10 @@ mod tests {
         let liquid = third.errors_on("liquid").unwrap();
         assert!((liquid.change_since_first().unwrap() - 0.25).abs() < 1e-12);
         assert!((liquid.change_from_parent().unwrap() - 1.5).abs() < 1e-12);
+        let [control] = &liquid.compared[..] else { panic!("one comparison: {liquid:?}") };
+        let found = (control.name.as_str(), control.structures, control.force_mae, control.energy_mae);
+        assert_eq!(found, ("control", 9, Some(0.19), None));
+        assert!(third.errors_on("held_out").unwrap().compared.is_empty());
         let held_out = third.errors_on("held_out").unwrap();
         assert!(held_out.change_since_first().unwrap().abs() < 1e-12);
         assert_eq!(first.errors_on("liquid").unwrap().change_since_first(), None);

@@ -27,13 +27,12 @@ mod tests {
 
     use super::*;
     use crate::campaign::LoadedCampaign;
-    use crate::config::compare;
+    use crate::config::{compare, demo_without_refit};
 
     /// The demo without training frames, and with these lines behind it.
     fn load(directory: &Path, lines: &str) -> Result<LoadedCampaign, ConfigError> {
         let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
-        let demo = fs::read_to_string(configs.join("aluminium.toml")).unwrap();
-        let demo = demo.replace("\"data/", &format!("\"{}/data/", configs.display()));
+        let demo = demo_without_refit().replace("\"data/", &format!("\"{}/data/", configs.display()));
         let demo = demo.replacen("\ntraining_frames = ", "\n# training_frames = ", 1);
         let path = directory.join("c.toml");
         fs::write(&path, format!("{demo}\n{lines}")).unwrap();

@@ -25,7 +25,7 @@ fn read(path: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
 }
 
-/// A file of `configs/`. The section of refits, commented out as a whole there, is in force, with its required key alone.
+/// A file of `configs/`. The section of refits is in force; where it is commented out as a whole, with its required key alone.
 fn campaign(name: &str) -> String {
     let (mut is_refit, mut text) = (false, String::new());
     for line in read(&format!("configs/{name}")).lines() {

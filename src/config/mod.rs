@@ -3,6 +3,8 @@
 mod changes;
 mod check;
 mod defaults;
+#[cfg(test)]
+mod demo;
 mod document;
 #[cfg(test)]
 mod documented;
@@ -32,6 +34,8 @@ use workers::labeller::LabelGuard;
 
 pub use changes::{ConfigChange, Refused, changed_keys, compare, without_changeable};
 pub use check::wrong_thermostat;
+#[cfg(test)]
+pub use demo::demo_without_refit;
 pub use document::{Document, FILL_IN};
 pub use error::{ConfigError, location, location_of_offset, read_text, user_message};
 pub use files::{PotentialConfig, PotentialKind};

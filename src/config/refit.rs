@@ -235,14 +235,12 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::config::Config;
-
-    const DEMO: &str = include_str!("../../configs/aluminium.toml");
+    use crate::config::{Config, demo_without_refit};
 
     /// The demo in `directory` with these lines behind it.
     fn config(directory: &str, lines: &str) -> Config {
         let path = Path::new(directory).join("c.toml");
-        Config::from_draft(&path, format!("{DEMO}\n{lines}")).unwrap().config
+        Config::from_draft(&path, format!("{}\n{lines}", demo_without_refit())).unwrap().config
     }
 
     #[test]

@@ -24,16 +24,16 @@ mod tests {
 
     use serde_json::json;
 
-    use crate::config::{Config, compare};
+    use crate::config::{Config, compare, demo_without_refit};
 
-    const DEMO: &str = include_str!("../../configs/aluminium.toml");
     const STEPS: &str = "# max_steps_without_structure = 100000";
     const IMPROVEMENT: &str = "# min_improvement = 0.05";
 
     /// The demo with the last text behind it, and with `line` in place of another.
     fn with(commented: &str, line: &str, behind: &str) -> String {
-        assert!(DEMO.contains(commented), "{commented}");
-        format!("{}\n{behind}", DEMO.replacen(commented, line, 1))
+        let demo = demo_without_refit();
+        assert!(demo.contains(commented), "{commented}");
+        format!("{}\n{behind}", demo.replacen(commented, line, 1))
     }
 
     /// What is wrong with a configuration; empty if nothing is.
@@ -78,7 +78,8 @@ mod tests {
             let config = Config::from_draft(Path::new("c.toml"), text.to_owned()).unwrap().config;
             json!({ "stop": config.stop })
         };
-        let (before, after) = (value(DEMO), value(&with(STEPS, "max_steps_without_structure = 5000", "")));
+        let (before, after) =
+            (value(&demo_without_refit()), value(&with(STEPS, "max_steps_without_structure = 5000", "")));
         let changes = compare(&before, &after).unwrap();
         let shown: Vec<_> = changes.iter().map(ToString::to_string).collect();
         assert_eq!(shown, ["stop.max_steps_without_structure is now 5000 (was left out)"]);

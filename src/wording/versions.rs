@@ -1,6 +1,6 @@
 //! Versions of the potential in words.
 
-use monitor::versions::{CampaignVersions, RefitUnderWay, VersionSummary};
+use monitor::versions::{CampaignVersions, RefitUnderWay, VersionSetErrors, VersionSummary};
 
 use crate::output::{TextTable, count, decimals};
 use crate::wording::cost::two_digits;
@@ -43,39 +43,48 @@ pub fn refit(refit: &RefitUnderWay) -> String {
     format!("training version {}{remark}", refit.number)
 }
 
-/// A table with a row for each version and data set: force and energy MAE, and the changes of the force MAE relative to the parent
-/// and to version 0 in per cent.
+/// A table with a row for each data set: the force MAE of each registered version, and of the models that were trained for comparison
+/// with the newest one.
 pub fn table(versions: &CampaignVersions) -> String {
-    let mut table = TextTable::new(&[
-        "version",
-        ">labels",
-        "set",
-        ">structures",
-        ">energy MAE (meV/atom)",
-        ">force MAE (eV/Å)",
-        ">from parent (%)",
-        ">from version 0 (%)",
-    ]);
-    for version in &versions.all {
-        let state = if version.is_registered() { "" } else { " refused" };
-        for set in &version.errors {
-            let energy = set.version.and_then(|errors| errors.energy_mae);
-            table.push(vec![
-                format!("{}{state}", version.number),
-                version.labels.to_string(),
-                set.name.clone(),
-                set.structures.to_string(),
-                decimals(energy.map(|error| 1000.0 * error), 1),
-                decimals(set.force_mae(), 4),
-                percent(set.change_from_parent()),
-                percent(set.change_since_first()),
-            ]);
+    let registered: Vec<_> = versions.all.iter().filter(|version| version.is_registered()).collect();
+    let newest = registered.last();
+    let mut compared: Vec<&str> = Vec::new();
+    for set in newest.iter().flat_map(|version| &version.errors) {
+        let names = set.compared.iter().map(|found| found.name.as_str());
+        let new: Vec<_> = names.filter(|name| !compared.contains(name)).collect();
+        compared.extend(new);
+    }
+    let titles = registered.iter().map(|version| match version.number {
+        0 => ">version 0".to_owned(),
+        number => format!(">{number} ({})", count(version.labels, "label")),
+    });
+    let titles = ["force MAE (eV/Å)".to_owned(), ">structures".to_owned()].into_iter().chain(titles);
+    let titles: Vec<_> = titles.chain(compared.iter().map(|name| format!(">{name}"))).collect();
+    let titles: Vec<_> = titles.iter().map(String::as_str).collect();
+    let mut table = TextTable::new(&titles);
+    for name in versions.sets() {
+        let last = newest.and_then(|version| version.errors_on(name));
+        let mut row = vec![name.to_owned(), last.map_or("–".to_owned(), |set| set.structures.to_string())];
+        for version in &registered {
+            row.push(decimals(version.errors_on(name).and_then(VersionSetErrors::force_mae), 4));
         }
+        for comparison in &compared {
+            let found = last.and_then(|set| set.compared.iter().find(|found| found.name == *comparison));
+            row.push(decimals(found.and_then(|found| found.force_mae), 4));
+        }
+        table.push(row);
     }
     let mut text = Vec::new();
     // Writing to memory cannot fail.
     let _ = table.write(&mut text);
-    String::from_utf8_lossy(&text).into_owned()
+    let mut text = String::from_utf8_lossy(&text).into_owned();
+    if let (Some(version), false) = (newest, compared.is_empty()) {
+        let (names, number) = (compared.join(", "), version.number);
+        text += &format!(
+            "{names}: trained as version {number}, with as many of these structures in place of the campaign's\n"
+        );
+    }
+    text
 }
 
 /// A change with its sign, in per cent.
@@ -85,7 +94,7 @@ pub fn percent(change: Option<f64>) -> String {
 
 #[cfg(test)]
 pub mod tests {
-    use monitor::versions::{ErrorFigures, VersionSetErrors, VersionStanding};
+    use monitor::versions::{ComparedErrors, ErrorFigures, VersionStanding};
 
     use super::*;
 
@@ -102,6 +111,15 @@ pub mod tests {
             first: parent.and_then(|_| figures(if kind == "test" { 0.2 } else { 0.4 })),
             parent: parent.and_then(figures),
             version: figures(version),
+            compared: match parent {
+                Some(_) if kind == "test" => vec![ComparedErrors {
+                    name: "control".into(),
+                    structures: 9,
+                    energy_mae: None,
+                    force_mae: Some(0.3),
+                }],
+                _ => Vec::new(),
+            },
         };
         let version = |number: u32, state, errors| VersionSummary {
             number,
@@ -142,16 +160,16 @@ pub mod tests {
     }
 
     #[test]
-    fn versions_are_compared_with_their_parent_and_with_version_0() {
+    fn versions_are_compared_set_by_set() {
         let versions = example();
         let text = table(&versions);
         let rows: Vec<Vec<_>> = text.lines().skip(1).map(|line| line.split_whitespace().collect()).collect();
-        assert_eq!(rows.len(), 8, "{text}");
-        assert_eq!(rows[0], ["0", "0", "liquid", "5", "10.0", "0.2000", "–", "–"]);
-        assert_eq!(rows[2], ["1", "40", "liquid", "5", "10.0", "0.1000", "-50", "-50"]);
-        assert_eq!(rows[5], ["2", "refused", "80", "held_out", "20", "10.0", "0.8000", "+300", "+100"]);
-        // It rises, and is there all the same.
-        assert_eq!(rows[6], ["3", "120", "liquid", "5", "10.0", "0.2500", "+150", "+25"]);
+        assert_eq!(rows.len(), 3, "{text}");
+        // Errors that rise are there all the same; those of refused versions are not.
+        assert_eq!(rows[0], ["liquid", "5", "0.2000", "0.1000", "0.2500", "0.3000"]);
+        assert_eq!(rows[1], ["held_out", "30", "0.4000", "0.2000", "0.5000", "–"]);
+        assert!(text.contains("version 0  1 (40 labels)  3 (120 labels)  control\n"), "{text}");
+        assert!(text.contains("control: trained as version 3, with as many of these structures"), "{text}");
         let line = in_force(&versions, versions.in_force().unwrap());
         assert_eq!(line, "version 3 in force, trained on 120 labels; 1 refused");
         assert_eq!(refit(versions.refit.as_ref().unwrap()), "training version 4: epoch 12 of 50");

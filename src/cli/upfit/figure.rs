@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn any_history_can_be_drawn() {
-        let validated = |epoch: u64| (epoch % 2 == 0).then(|| errors(2.0, None));
+        let validated = |epoch: u64| epoch.is_multiple_of(2).then(|| errors(2.0, None));
         let histories = [
             vec![],
             vec![record(1, validated(2))],

@@ -173,8 +173,8 @@ mod tests {
     use std::path::Path;
 
     use super::*;
+    use crate::config::demo_without_refit;
 
-    const DEMO: &str = include_str!("../../../configs/aluminium.toml");
     const REPLAY: &str = "replay = [\"r.extxyz\"]";
 
     /// What is wrong with a configuration; empty if nothing is.
@@ -185,7 +185,7 @@ mod tests {
 
     /// The demo with these lines in `[refit]`.
     fn with(lines: &str) -> String {
-        format!("{DEMO}\n[refit]\n{lines}\n")
+        format!("{}\n[refit]\n{lines}\n", demo_without_refit())
     }
 
     /// `file:line` of the first line that begins with this.
