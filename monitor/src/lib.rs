@@ -20,6 +20,7 @@ pub mod mixture_values;
 pub mod provenance;
 pub mod reference_check;
 pub mod snapshot;
+pub mod version_finds;
 pub mod walk_ends;
 
 pub use snapshot::Snapshot;
