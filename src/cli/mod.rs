@@ -32,6 +32,7 @@ pub mod status;
 mod store;
 mod upfit;
 mod validate;
+mod versions;
 mod walker;
 mod walks;
 mod watch;
@@ -80,6 +81,7 @@ enum CliCommand {
     Export(export::ExportArgs),
     Report(report::ReportArgs),
     Replay(replay::ReplayArgs),
+    Versions(versions::VersionsArgs),
     #[command(subcommand)]
     Calm(calm::CalmCommand),
     Select(select::SelectArgs),
@@ -123,6 +125,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Export(command) => command.run(),
         CliCommand::Report(command) => command.run(),
         CliCommand::Replay(command) => command.run(),
+        CliCommand::Versions(command) => command.run(),
         CliCommand::Calm(command) => command.run(),
         CliCommand::Select(command) => command.run(),
         CliCommand::Upfit(command) => command.run(),
