@@ -20,6 +20,7 @@ mod launch;
 mod lower_states;
 mod md;
 mod queue;
+mod refit;
 mod refitter;
 mod relabel;
 mod replay;
@@ -82,6 +83,7 @@ enum CliCommand {
     Report(report::ReportArgs),
     Replay(replay::ReplayArgs),
     Versions(versions::VersionsArgs),
+    Refit(refit::RefitArgs),
     #[command(subcommand)]
     Calm(calm::CalmCommand),
     Select(select::SelectArgs),
@@ -126,6 +128,7 @@ pub fn run(arguments: Arguments) -> Result<ExitStatus, CommandError> {
         CliCommand::Report(command) => command.run(),
         CliCommand::Replay(command) => command.run(),
         CliCommand::Versions(command) => command.run(),
+        CliCommand::Refit(command) => command.run(),
         CliCommand::Calm(command) => command.run(),
         CliCommand::Select(command) => command.run(),
         CliCommand::Upfit(command) => command.run(),
